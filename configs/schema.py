@@ -1,0 +1,230 @@
+"""Every setting of a bake: frozen, complete, with unit, range and meaning. Nothing else in the project has defaults.
+
+The defaults are the numbers of the paper (the preset `synpick`); where the paper is silent, the docstring says where a
+number comes from. "Released" means the generator that the paper's authors published.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+MODES = ("move",)
+
+
+def setting(
+    default: Any,
+    unit: str,
+    doc: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    above: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """A dataclass field that knows its unit, its meaning and what values it takes.
+
+    `low` and `high` include their end; `above` excludes it. For tuples the bounds hold for each element.
+    """
+    metadata = {"unit": unit, "doc": doc, "low": low, "high": high, "above": above, "choices": choices}
+    return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class Bake:
+    """What to make, and where."""
+
+    mode: str = setting("move", "", "What the gripper does.", choices=MODES)
+    worlds: int = setting(4, "", "Totes simulated side by side.", low=1, high=65536)
+    episodes: int = setting(4, "", "Sequences to make; each becomes one BOP scene a camera.", low=1)
+    seed: int = setting(0, "", "Every random draw follows from it.", low=0, high=2**63 - 1)
+    device: str = setting("auto", "", "cpu, cuda:N, or auto: the first GPU if there is one.")
+    models: str = setting("", "", "Folder of BOP models, or of OBJ/GLB/PLY meshes; empty: the embedded objects.")
+    lights: str = setting("", "", "Folder of .hdr maps and sIBL sets; empty: the embedded skies.")
+    writers: int = setting(0, "", "Processes that write files; 0: one a processor core.", low=0, high=1024)
+
+
+@dataclass(frozen=True)
+class Objects:
+    """How a mesh becomes a body."""
+
+    hull_vertices: int = setting(64, "", "Most vertices of a convex hull; 64 keep 94.5 to 99.5 % of the volume.", low=8, high=256)
+    piece_vertices: int = setting(32, "", "Most vertices of one piece of a convex decomposition.", low=8, high=256)
+    pieces: int = setting(16, "", "Most pieces of a convex decomposition.", low=1, high=64)
+    concavity: float = setting(0.05, "", "CoACD's threshold: smaller follows the surface more closely.", low=0.01, high=1.0)
+    concave_ratio: float = setting(
+        0.6, "", "Objects that no row of the object table names count as concave if mesh volume / hull volume is below this.", low=0.0, high=1.0
+    )
+    density: float = setting(400.0, "kg/m³", "Density over the hull's volume, for objects without a mass.", above=0.0)
+    metallic: float = setting(0.1, "", "Metallic, for objects without a material of their own.", low=0.0, high=1.0)
+    roughness: float = setting(0.5, "", "Roughness, for objects without a material of their own.", low=0.0, high=1.0)
+    diameter_tolerance: float = setting(
+        0.1, "", "A row of the object table is used only for a model whose diameter differs by less than this share.", above=0.0, high=1.0
+    )
+
+
+@dataclass(frozen=True)
+class ObjectRow:
+    """One row of the object table: what a model folder does not say."""
+
+    id: int = setting(0, "", "The model's obj_id.", low=0)
+    name: str = setting("", "", "Name, for people.")
+    diameter: float = setting(0.0, "m", "Diameter by which the model is recognised.", low=0.0)
+    mass: float = setting(0.1, "kg", "Mass.", above=0.0)
+    concave: bool = setting(False, "", "Decompose into convex pieces instead of taking the hull.")
+    metallic: float = setting(0.1, "", "Metallic.", low=0.0, high=1.0)
+    roughness: float = setting(0.5, "", "Roughness.", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class Tote:
+    """The box. Its origin is the centre of the inner floor, z up. Measures of the released mesh."""
+
+    outer_size: tuple[float, float, float] = setting((0.615, 0.373, 0.200), "m", "Outer length, width and height.", above=0.0)
+    floor_size: tuple[float, float] = setting((0.513, 0.319), "m", "Inner floor.", above=0.0)
+    rim_size: tuple[float, float] = setting((0.545, 0.352), "m", "Inner opening at the rim.", above=0.0)
+    wall: float = setting(0.0045, "m", "Thickness of walls and floor.", above=0.0)
+    color: tuple[float, float, float] = setting((0.65, 0.05, 0.04), "sRGB", "Base colour.", low=0.0, high=1.0)
+    metallic: float = setting(0.0, "", "Metallic.", low=0.0, high=1.0)
+    roughness: float = setting(0.5, "", "Roughness.", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """A cone-shaped finger that moves in x, y and z, and a suction cup that tilts about the y axis."""
+
+    finger_length: float = setting(0.35, "m", "Length of the finger, from its top to the tilt axis.", above=0.0)
+    finger_width: float = setting(0.075, "m", "Width of the finger at its top.", above=0.0)
+    cup_width: float = setting(0.042, "m", "Diameter of the suction cup.", above=0.0)
+    cup_length: float = setting(0.055, "m", "From the tilt axis to the tip of the cup.", above=0.0)
+    finger_mass: float = setting(1.5, "kg", "Mass of the finger.", above=0.0)
+    cup_mass: float = setting(0.5, "kg", "Mass of the cup.", above=0.0)
+    tilt_limit: float = setting(90.0, "°", "Largest tilt of the cup.", above=0.0, high=90.0)
+    tilt_stiffness: float = setting(2500.0, "N·m/rad", "Stiffness of the tilt drive.", above=0.0)
+    tilt_damping: float = setting(200.0, "N·m·s/rad", "Damping of the tilt drive.", low=0.0)
+    tilt_torque: float = setting(200.0, "N·m", "Limit of the tilt drive.", above=0.0)
+    color: tuple[float, float, float] = setting((0.55, 0.56, 0.58), "sRGB", "Base colour of the finger.", low=0.0, high=1.0)
+    cup_color: tuple[float, float, float] = setting((0.05, 0.05, 0.055), "sRGB", "Base colour of the cup.", low=0.0, high=1.0)
+    metallic: float = setting(0.01, "", "Metallic (released).", low=0.0, high=1.0)
+    roughness: float = setting(0.9, "", "Roughness (released).", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Three cameras above the tote: pinhole, pixel centres at +0.5, principal point in the middle."""
+
+    resolution: tuple[int, int] = setting((1920, 1080), "px", "Width and height.", low=1, high=8192)
+    fov: float = setting(20.0, "°", "Horizontal field of view.", low=1.0, high=170.0)
+    positions: tuple[tuple[float, float, float], ...] = setting(
+        ((0.0, 0.0, 2.0), (0.0, 0.573, 2.0), (0.0, -0.573, 2.0)), "m", "Where the cameras stand (released)."
+    )
+    target: tuple[float, float, float] = setting((0.0, 0.0, 0.16), "m", "What all cameras look at (released).")
+    ups: tuple[tuple[float, float, float], ...] = setting(
+        ((0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (0.0, 1.0, 0.0)), "", "Direction of the image's upper edge: +y, then the tote's centre line."
+    )
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """Which objects an episode has, and how they are dropped."""
+
+    volume: float = setting(7e-3, "m³", "Objects are drawn while their collision shapes' total stays within this.", above=0.0)
+    max_objects: int = setting(24, "", "Most objects of an episode; the draw stops there.", low=1, high=32)
+    repeats: bool = setting(True, "", "An object may come several times (moving: yes; picking: no).")
+    concave_shortfall: float = setting(
+        1e-4, "", "Accepted probability that a draw needs more concave slots than a world has; such a draw is repeated.", above=0.0, high=0.5
+    )
+    clearance: float = setting(0.01, "m", "Gap between bounding spheres in the drop column.", low=0.0)
+    spread: float = setting(0.3, "", "Drop positions are spread over this share of the free floor.", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class Settle:
+    """When a pile counts as at rest, and what is dropped again."""
+
+    min_time: float = setting(1.0, "s", "Shortest time from the drop to the first frame.", low=0.0)
+    max_time: float = setting(12.0, "s", "A world that has not settled by then draws its arrangement again.", above=0.0)
+    speed: float = setting(2e-3, "m/s", "An object rests if no point of it is faster.", above=0.0)
+    rest_ticks: int = setting(5, "", "All objects must rest for this many ticks in a row.", low=1)
+    stuck_depth: float = setting(0.01, "m", "An object that penetrates another by more is stuck (released).", above=0.0)
+    stuck_time: float = setting(0.4, "s", "A stuck object is dropped again after this time (released).", above=0.0)
+    max_redrops: int = setting(8, "", "An arrangement with more re-drops is drawn again.", low=0)
+    attempts: int = setting(20, "", "Arrangements tried before an episode is given up.", low=1)
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Solver and contact. Values measured with Newton 1.8; see the README."""
+
+    step: float = setting(2e-3, "s", "Time step (paper).", above=0.0, high=0.02)
+    steps_per_tick: int = setting(33, "", "Steps between two frames: 15 Hz (paper).", low=1, high=1000)
+    gravity: float = setting(9.81, "m/s²", "Gravity.", low=0.0)
+    iterations: int = setting(24, "", "Projected Gauss-Seidel iterations a step.", low=1, high=1000)
+    friction: float = setting(0.5, "", "Coulomb friction of every shape.", low=0.0, high=10.0)
+    gap: float = setting(5e-3, "m", "Contacts are made when shapes come this near.", low=0.0)
+    angular_damping: float = setting(0.05, "1/s", "Angular damping of the objects (PhysX's default).", low=0.0)
+    contacts_per_world: int = setting(512, "", "Room for contacts in a world.", low=16)
+    rows_per_world: int = setting(1536, "", "Room for the objects' contact rows in a world.", low=48)
+    gripper_rows_per_world: int = setting(256, "", "Room for the gripper's constraint rows in a world.", low=48)
+    guide_height: float = setting(8.0, "m", "Height of the walls that guide the drop and vanish afterwards.", low=0.0)
+
+
+@dataclass(frozen=True)
+class Move:
+    """Moving: the gripper, with locked rotation, visits the corners of the tote and stirs the pile."""
+
+    stiffness: float = setting(1000.0, "N/m", "Stiffness of the position controller (paper).", above=0.0)
+    damping: float = setting(
+        60.0, "N·s/m", "Damping of the position controller; the paper names none. With the released 1 objects penetrate by up to 7 mm, with 60 by 1.", low=0.0
+    )
+    force: float = setting(30.0, "N", "Largest force of the position controller (paper).", above=0.0)
+    speed: float = setting(0.1, "m/s", "Speed of the goal (paper).", above=0.0)
+    corner: float = setting(0.75, "", "Corners lie at this share of half the inner floor (released).", above=0.0, high=1.0)
+    height: float = setting(0.02, "m", "Height of the cup's tip above the floor at a corner (released).", low=0.0)
+    start_height: float = setting(0.35, "m", "Height of the cup's tip above the first corner at the first frame.", above=0.0)
+    rounds: int = setting(2, "", "How often all four corners are visited (released: eight corners, with replacement).", low=1)
+
+
+@dataclass(frozen=True)
+class Render:
+    """Light and picture."""
+
+    turn_lights: bool = setting(True, "", "Turn each episode's light map by a random angle about the vertical.")
+    exposure: float = setting(1.0, "", "Factor on the automatic exposure.", above=0.0)
+    shadow_rays: int = setting(1, "", "Shadow rays a pixel towards the map's main light; 0: none.", low=0, high=64)
+    ambient_rays: int = setting(2, "", "Rays a pixel that find how much of the sky is hidden; 0: none.", low=0, high=64)
+    color_samples: int = setting(1, "", "Colour samples a pixel; depth and masks always have one.", low=1, high=64)
+    table: bool = setting(True, "", "A table under the tote; without it the light map shows.")
+    table_color: tuple[float, float, float] = setting((0.45, 0.45, 0.44), "sRGB", "Base colour of the table.", low=0.0, high=1.0)
+    views_per_batch: int = setting(0, "", "Views rendered and copied at once; 0: chosen by device and resolution.", low=0)
+
+
+@dataclass(frozen=True)
+class Bop:
+    """The BOP data set."""
+
+    split: str = setting("train_pbr", "", "Name of the split's folder; the toolkit reads JPEG only from *_pbr.")
+    color_format: str = setting("jpg", "", "Format of colour images.", choices=("jpg", "png"))
+    jpeg_quality: int = setting(95, "", "JPEG quality.", low=1, high=100)
+    depth_scale: float = setting(0.1, "mm", "Depth of one count in a depth image; 0.1 reaches 6.5 m.", above=0.0)
+    masks: bool = setting(True, "", "Write mask/ and mask_visib/: one file an instance and view.")
+    coco: bool = setting(True, "", "Write scene_gt_coco.json.")
+    target_visibility: float = setting(0.1, "", "Least visible share of an instance in test_targets_bop19.json.", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class Config:
+    """All settings of a bake."""
+
+    bake: Bake = field(default_factory=Bake)
+    objects: Objects = field(default_factory=Objects)
+    tote: Tote = field(default_factory=Tote)
+    gripper: Gripper = field(default_factory=Gripper)
+    cameras: Cameras = field(default_factory=Cameras)
+    arrangement: Arrangement = field(default_factory=Arrangement)
+    settle: Settle = field(default_factory=Settle)
+    physics: Physics = field(default_factory=Physics)
+    move: Move = field(default_factory=Move)
+    render: Render = field(default_factory=Render)
+    bop: Bop = field(default_factory=Bop)
+    object_rows: tuple[ObjectRow, ...] = ()

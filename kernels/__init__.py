@@ -1,0 +1,1 @@
+"""Device code: Warp functions and kernels. Launched from `synpick_warp.stages` only."""

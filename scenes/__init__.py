@@ -1,0 +1,1 @@
+"""Objects, tote, gripper, cameras, lights, and the model built from them."""

@@ -1,0 +1,115 @@
+"""The plain types that everything in a scene is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleMesh:
+    """A triangle mesh, outward orientation, metres."""
+
+    vertices: np.ndarray
+    """(V, 3) float32 [m]."""
+    faces: np.ndarray
+    """(F, 3) int32, counter-clockwise seen from outside."""
+    normals: np.ndarray
+    """Unit normal of each vertex (V, 3) float32."""
+    uv: np.ndarray
+    """Texture coordinates (V, 2) float32, v grows upward (row 0 of the image is v = 1); zeros without a texture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """Metallic-roughness."""
+
+    color: tuple[float, float, float]
+    """Base colour, sRGB; multiplies the texture (in linear light)."""
+    texture: np.ndarray | None
+    """(H, W, 3) uint8, sRGB, red first, row 0 at the top (v = 1); None: the base colour alone."""
+    metallic: float
+    roughness: float
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexPiece:
+    """One convex collision shape, in the object's frame."""
+
+    vertices: np.ndarray
+    """(V, 3) float32 [m]."""
+    faces: np.ndarray
+    """(F, 3) int32."""
+
+
+@dataclass(frozen=True, eq=False)
+class CatalogEntry:
+    """One object: what it looks like, how it collides, what it weighs."""
+
+    obj_id: int
+    name: str
+    mesh: TriangleMesh
+    material: Material
+    pieces: tuple[ConvexPiece, ...]
+    """Collision shape; more than one piece for concave objects."""
+    volume: float
+    """Volume of the collision shape [m³]; counts against the arrangement's budget."""
+    radius: float
+    """Radius of the bounding sphere about the object's origin [m]."""
+    mass: float
+    """[kg]"""
+    center_of_mass: np.ndarray
+    """In the object's frame (3) float64 [m]."""
+    inertia: np.ndarray
+    """About the centre of mass, in the object's axes (3, 3) float64 [kg·m²]."""
+    diameter: float
+    """Largest distance of two vertices [m]."""
+    symmetries_discrete: tuple[tuple[float, ...], ...]
+    """Row-major 4 x 4 matrices as BOP has them, but in metres."""
+    symmetries_continuous: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
+    """(axis, offset [m])."""
+    source: Path | None
+    """The PLY file the object came from; None: embedded, or from another format."""
+
+
+@dataclass(frozen=True, eq=False)
+class Catalog:
+    """The object set of a bake, ordered by obj_id."""
+
+    entries: tuple[CatalogEntry, ...]
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+
+@dataclass(frozen=True, eq=False)
+class Fixture:
+    """A visible thing that is no object: tote, finger, cup."""
+
+    mesh: TriangleMesh
+    material: Material
+
+
+@dataclass(frozen=True, eq=False)
+class LightMap:
+    """An equirectangular environment. Row 0 looks up (+z); u runs with the azimuth, which is atan2(y, x) at column u = azimuth / 2π + 0.5."""
+
+    name: str
+    radiance: np.ndarray
+    """Linear RGB (H, 2H, 3) float32, finite, not negative."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole in OpenCV's convention: x right, y down, z forward; the centre of pixel (row, column) is (column + 0.5, row + 0.5)."""
+
+    width: int
+    height: int
+    matrix: np.ndarray
+    """K (3, 3) float64 [px]."""
+    rotation: np.ndarray
+    """World to camera (3, 3) float64."""
+    translation: np.ndarray
+    """World to camera (3) float64 [m]."""

@@ -1,0 +1,52 @@
+"""Declarations of device arrays: name, shape, type and unit in one place, allocated and measured from there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, TypeVar
+
+import warp as wp
+
+Arrays = TypeVar("Arrays")
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """Shape names, Warp type and unit of one device array."""
+
+    shape: tuple[str, ...]
+    dtype: Any
+    unit: str
+    fill: float
+
+
+def device_array(*shape: str, dtype: Any, unit: str = "", fill: float = 0) -> Any:
+    """Declare an array field of a dataclass; `allocate` makes it. Dimensions are names, resolved when allocated."""
+    return field(metadata={"array": ArraySpec(shape, dtype, unit, fill)})
+
+
+def allocate(kind: type[Arrays], sizes: dict[str, int], device: wp.Device) -> Arrays:
+    """Make an instance of the dataclass `kind` whose arrays lie on `device`.
+
+    Args:
+        kind: A dataclass all of whose fields were declared by `device_array`.
+        sizes: Extent of every named dimension.
+    """
+    made = {}
+    for item in fields(kind):  # type: ignore[arg-type]
+        spec: ArraySpec = item.metadata["array"]
+        shape = tuple(sizes[name] for name in spec.shape)
+        made[item.name] = wp.full(shape, spec.dtype(spec.fill), dtype=spec.dtype, device=device) if spec.fill else wp.zeros(
+            shape, dtype=spec.dtype, device=device
+        )
+    return kind(**made)
+
+
+def memory_table(*groups: Any) -> list[tuple[str, tuple[int, ...], str, int]]:
+    """Rows (name, shape, unit, bytes) of every declared array in the dataclass instances given."""
+    rows = []
+    for group in groups:
+        for item in fields(group):
+            array = getattr(group, item.name)
+            rows.append((f"{type(group).__name__}.{item.name}", tuple(array.shape), item.metadata["array"].unit, array.capacity))
+    return rows

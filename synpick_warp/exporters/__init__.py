@@ -1,0 +1,1 @@
+"""FrameBatch in, whole episodes on disk out."""

@@ -1,0 +1,63 @@
+"""The one thing that stages hand to exporters: a batch of views with their images and ground truth, on the host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# Values of FrameBatch.instance that are no instance. Instances are 1 + instance_id.
+NOTHING = 0
+TABLE = 252
+TOTE = 253
+FINGER = 254
+CUP = 255
+
+
+@dataclass(frozen=True, eq=False)
+class FrameBatch:
+    """`B` views. Arrays are views into a ring buffer: valid until the batch is released; exporters copy what they keep.
+
+    `I` is the room for instances of a world; `instance_id` runs from 0 and is the index along `I`. An instance_id keeps its
+    object for the whole episode.
+    """
+
+    episode: np.ndarray
+    """Episode number (B) int32."""
+    camera: np.ndarray
+    """Camera index (B) int32."""
+    frame: np.ndarray
+    """Number of the frame in its episode, from 0, (B) int32."""
+    time: np.ndarray
+    """Simulated time since the episode's first frame [s] (B) float64."""
+    color: np.ndarray
+    """Colour, sRGB (B, H, W, 3) uint8, red first."""
+    depth: np.ndarray
+    """Planar depth in counts of the configured depth scale, 0: no surface (B, H, W) uint16."""
+    instance: np.ndarray
+    """0 nothing, 1 + instance_id, or TABLE, TOTE, FINGER, CUP (B, H, W) uint8."""
+    amodal: np.ndarray
+    """Bit i set: the ray hits instance i, hidden or not (B, H, W) uint32."""
+    object_id: np.ndarray
+    """obj_id of each instance; -1: no such instance in this view's world (B, I) int32."""
+    pose: np.ndarray
+    """Object to world: x, y, z [m], quaternion x, y, z, w (B, I, 7) float32."""
+    pixels: np.ndarray
+    """px_count_all, px_count_valid, px_count_visib (B, I, 3) int32."""
+    boxes: np.ndarray
+    """bbox_obj and bbox_visib as x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty (B, I, 2, 4) int32."""
+
+    def __len__(self) -> int:
+        return len(self.episode)
+
+
+@dataclass(frozen=True)
+class EpisodeEnd:
+    """An episode is over. Exporters finish its scenes, or drop them if the outcome delivers nothing."""
+
+    episode: int
+    attempt: int
+    """How often this episode's arrangement was drawn again before."""
+    frames: int
+    outcome: int
+    """Code of an `Outcome`."""

@@ -1,0 +1,54 @@
+"""Device arrays that pass from one stage to the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import warp as wp
+
+from synpick_warp.arrays import device_array
+
+FIXTURES = ("tote", "finger", "cup")
+"""What `Snapshot.fixture_pose` holds, in order."""
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """What every world looks like at the end of a tick; what the renderer and the exporters see."""
+
+    live: wp.array = device_array("world", dtype=wp.int32)
+    """1: this tick is a frame of the world's episode."""
+    episode: wp.array = device_array("world", dtype=wp.int32)
+    """Episode number."""
+    frame: wp.array = device_array("world", dtype=wp.int32)
+    """Number of the frame in its episode."""
+    entry: wp.array = device_array("world", "instance", dtype=wp.int32)
+    """Catalog index of each instance; -1: none."""
+    pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
+    """Object to world."""
+    fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
+    """Tote, finger and cup to world."""
+    fixture_visible: wp.array = device_array("world", "fixture", dtype=wp.int32)
+    """0: not in the picture."""
+    light: wp.array = device_array("world", dtype=wp.int32)
+    """Index of the episode's light map."""
+    light_turn: wp.array = device_array("world", dtype=wp.float32, unit="rad")
+    """The light map is turned counter-clockwise about +z by this angle."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewBuffers:
+    """Images and counts of one batch of views."""
+
+    color: wp.array = device_array("view", "row", "column", dtype=wp.vec3ub)
+    """sRGB, red first."""
+    depth: wp.array = device_array("view", "row", "column", dtype=wp.uint16, unit="depth_scale")
+    """Planar depth in counts of the depth scale; 0: no surface, or farther than 65,535 counts."""
+    instance: wp.array = device_array("view", "row", "column", dtype=wp.uint8)
+    """0, 1 + instance_id, or a code of `frames`."""
+    amodal: wp.array = device_array("view", "row", "column", dtype=wp.uint32)
+    """Bit i: the ray hits instance i."""
+    pixels: wp.array = device_array("view", "instance", "count", dtype=wp.int32, unit="px")
+    """px_count_all, px_count_valid, px_count_visib."""
+    boxes: wp.array = device_array("view", "instance", "box", "edge", dtype=wp.int32, unit="px")
+    """bbox_obj and bbox_visib: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty."""
