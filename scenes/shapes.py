@@ -35,6 +35,26 @@ class Material:
 
 
 @dataclass(frozen=True, eq=False)
+class RawObject:
+    """One object as it was read or made, before it gets a collision shape and mass properties."""
+
+    obj_id: int
+    name: str
+    mesh: TriangleMesh
+    material: Material
+    mass: float | None
+    """[kg]; None: from the configured density."""
+    concave: bool | None
+    """Whether a convex hull is too coarse a collision shape; None: the volumes of mesh and hull decide."""
+    symmetries_discrete: tuple[tuple[float, ...], ...]
+    """Row-major 4 x 4 matrices as BOP has them, but in metres."""
+    symmetries_continuous: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
+    """(axis, offset [m])."""
+    source: Path | None
+    """The PLY file of a BOP model folder; None: embedded, or from another format."""
+
+
+@dataclass(frozen=True, eq=False)
 class ConvexPiece:
     """One convex collision shape, in the object's frame."""
 
