@@ -1,0 +1,86 @@
+"""Checks what single settings cannot show: that they fit each other."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+
+from synpick_warp.configs.check import shown
+from synpick_warp.configs.schema import Config
+
+DEPTH_COUNTS = 65535
+"""Largest value of a 16-bit depth image."""
+_PARALLEL = 1e-6
+"""Sine of the angle below which a camera's up direction says nothing about the image's upper edge."""
+_SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
+
+Complaint = tuple[str, str]
+"""Key at fault, and what is allowed there."""
+
+
+def complaints(config: Config) -> Iterator[Complaint]:
+    """Everything that does not fit, the most basic first."""
+    yield from _tote(config)
+    yield from _cameras(config)
+    yield from _times(config)
+    yield from _bop(config)
+    yield from _object_rows(config)
+
+
+def _tote(config: Config) -> Iterator[Complaint]:
+    tote = config.tote
+    if any(rim < floor for rim, floor in zip(tote.rim_size, tote.floor_size, strict=True)):
+        yield "tote.rim_size", f"at least tote.floor_size on both sides, {shown(tote.floor_size)} [m]"
+    if any(outer < rim + 2 * tote.wall for outer, rim in zip(tote.outer_size[:2], tote.rim_size, strict=True)):
+        yield "tote.outer_size", f"at least tote.rim_size and two walls, {shown([round(rim + 2 * tote.wall, 9) for rim in tote.rim_size])} [m]"
+    if tote.outer_size[2] <= tote.wall:
+        yield "tote.wall", f"less than the tote's height, {tote.outer_size[2]:g} [m]"
+    if config.move.start_height < config.move.height:
+        yield "move.start_height", f"at least move.height, {config.move.height:g} [m]"
+
+
+def _cameras(config: Config) -> Iterator[Complaint]:
+    cameras = config.cameras
+    if not cameras.positions:
+        yield "cameras.positions", "at least one position"
+    if len(cameras.ups) != len(cameras.positions):
+        yield "cameras.ups", f"one direction for each of the {len(cameras.positions)} cameras.positions"
+        return
+    for number, (position, up) in enumerate(zip(cameras.positions, cameras.ups, strict=True)):
+        forward = tuple(b - a for a, b in zip(position, cameras.target, strict=True))
+        if math.hypot(*forward) == 0.0:
+            yield "cameras.positions", f"positions other than cameras.target, where camera {number} stands"
+        elif math.hypot(*_cross(forward, up)) <= _PARALLEL * math.hypot(*forward) * math.hypot(*up):
+            yield "cameras.ups", f"directions across the line of sight; camera {number} looks along its own, or it is zero"
+
+
+def _times(config: Config) -> Iterator[Complaint]:
+    settle = config.settle
+    rest = settle.rest_ticks * config.physics.steps_per_tick * config.physics.step
+    if settle.max_time < settle.min_time:
+        yield "settle.max_time", f"at least settle.min_time, {settle.min_time:g} [s]"
+    if settle.max_time < rest:
+        yield "settle.max_time", f"at least the time of settle.rest_ticks ticks, {rest:g} [s]"
+
+
+def _bop(config: Config) -> Iterator[Complaint]:
+    bop = config.bop
+    if not _SPLIT.fullmatch(bop.split):
+        yield "bop.split", "train, val or test, and after an underscore letters and digits, as in train_pbr"
+    elif (bop.color_format == "jpg") != bop.split.endswith("_pbr"):
+        fitting = "png" if bop.color_format == "jpg" else "jpg"
+        yield "bop.color_format", f"{fitting} with the split {bop.split}: BOP's toolkit reads jpg from splits that end in _pbr, and png from all others"
+    far = max((math.dist(position, (0.0, 0.0, 0.0)) for position in config.cameras.positions), default=0.0)
+    if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
+        yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote from {far:.3g} m [mm]"
+
+
+def _object_rows(config: Config) -> Iterator[Complaint]:
+    ids = [row.id for row in config.object_rows]
+    for repeated in sorted({number for number in ids if ids.count(number) > 1}):
+        yield "object_rows", f"one row an id; {repeated} comes {ids.count(repeated)} times"
+
+
+def _cross(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
