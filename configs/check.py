@@ -12,12 +12,18 @@ from typing import Any
 
 from synpick_warp.errors import ConfigError
 
-_NAMES = {float: ("a finite number", "numbers"), int: ("a whole number", "whole numbers"), bool: ("true or false", "booleans"), str: ("a string", "strings")}
+_NAMES = {
+    float: ("a finite number", "numbers"),
+    int: ("a whole number", "whole numbers"),
+    bool: ("true or false", "true or false"),
+    str: ("a string", "strings"),
+}
+_BOUNDS = (("above", "above"), ("low", "at least"), ("high", "at most"))
 _SHOWN = 60
 """Longer values are cut in messages."""
 
 
-class _Mismatch(Exception):
+class _MismatchError(Exception):
     """The value is not of the setting's type."""
 
 
@@ -36,7 +42,7 @@ def checked(key: str, value: object, item: dataclasses.Field[Any], kind: Any, so
     """
     try:
         result = _converted(value, kind)
-    except _Mismatch:
+    except _MismatchError:
         raise ConfigError(f"{key} is {shown(value)} {source}; allowed: {describe_kind(kind)}{_unit(item)}") from None
     if not all(_inside(leaf, item) for leaf in _leaves(result)):
         hint = did_you_mean(str(value), item.metadata["choices"])
@@ -49,9 +55,7 @@ def allowed(item: dataclasses.Field[Any], kind: Any) -> str:
     rules = item.metadata
     if rules["choices"]:
         return ", ".join(rules["choices"])
-    words = [
-        f"{word} {_number(rules[name])}" for name, word in (("above", "above"), ("low", "at least"), ("high", "at most")) if rules[name] is not None
-    ]
+    words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
     if not words:
         return describe_kind(kind)
     return ("each " if typing.get_origin(kind) is tuple else "") + ", ".join(words)
@@ -89,20 +93,20 @@ def _converted(value: object, kind: Any) -> Any:
         return _converted_tuple(value, typing.get_args(kind))
     if kind is float:
         if not isinstance(value, int | float) or isinstance(value, bool):
-            raise _Mismatch
+            raise _MismatchError
         return _finite(value)
     if type(value) is not kind or (kind is str and not _encodable(str(value))):
-        raise _Mismatch
+        raise _MismatchError
     return value
 
 
 def _converted_tuple(value: object, parts: tuple[Any, ...]) -> tuple[Any, ...]:
     if not isinstance(value, list | tuple):
-        raise _Mismatch
+        raise _MismatchError
     if parts[-1] is Ellipsis:
         return tuple(_converted(one, parts[0]) for one in value)
     if len(value) != len(parts):
-        raise _Mismatch
+        raise _MismatchError
     return tuple(_converted(one, part) for one, part in zip(value, parts, strict=True))
 
 
@@ -111,9 +115,9 @@ def _finite(value: float) -> float:
     try:
         result = float(value)
     except OverflowError:
-        raise _Mismatch from None
+        raise _MismatchError from None
     if not math.isfinite(result):
-        raise _Mismatch
+        raise _MismatchError
     return result
 
 

@@ -33,7 +33,8 @@ def _tote(config: Config) -> Iterator[Complaint]:
     if any(rim < floor for rim, floor in zip(tote.rim_size, tote.floor_size, strict=True)):
         yield "tote.rim_size", f"at least tote.floor_size on both sides, {shown(tote.floor_size)} [m]"
     if any(outer < rim + 2 * tote.wall for outer, rim in zip(tote.outer_size[:2], tote.rim_size, strict=True)):
-        yield "tote.outer_size", f"at least tote.rim_size and two walls, {shown([round(rim + 2 * tote.wall, 9) for rim in tote.rim_size])} [m]"
+        least = [round(rim + 2 * tote.wall, 9) for rim in tote.rim_size]
+        yield "tote.outer_size", f"at least tote.rim_size and two walls, {shown(least)} [m]"
     if tote.outer_size[2] <= tote.wall:
         yield "tote.wall", f"less than the tote's height, {tote.outer_size[2]:g} [m]"
     if config.move.start_height < config.move.height:
@@ -70,7 +71,8 @@ def _bop(config: Config) -> Iterator[Complaint]:
         yield "bop.split", "train, val or test, and after an underscore letters and digits, as in train_pbr"
     elif (bop.color_format == "jpg") != bop.split.endswith("_pbr"):
         fitting = "png" if bop.color_format == "jpg" else "jpg"
-        yield "bop.color_format", f"{fitting} with the split {bop.split}: BOP's toolkit reads jpg from splits that end in _pbr, and png from all others"
+        rule = "BOP's toolkit reads jpg from splits that end in _pbr, and png from all others"
+        yield "bop.color_format", f"{fitting} with the split {bop.split}: {rule}"
     far = max((math.dist(position, (0.0, 0.0, 0.0)) for position in config.cameras.positions), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
         yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote from {far:.3g} m [mm]"

@@ -7,7 +7,7 @@ from typing import Protocol, Self
 
 
 class Progress(Protocol):
-    """A watcher of a bake. Entered when the bake begins, left when it ends or fails."""
+    """A watcher of a bake. Whoever makes it enters it before the bake and leaves it afterwards; the bake only reports."""
 
     def __enter__(self) -> Self: ...
 

@@ -1,0 +1,50 @@
+# make demo    bakes a small data set on the processor and draws a contact sheet of it
+# make test    checks and tests
+# make clean   removes what these two made
+#
+# All that is needed is Python 3.11 or 3.12. PYTHON=... chooses the interpreter.
+
+SHELL := /bin/bash
+
+FITS := import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 13))
+PYTHON ?= $(shell for python in python3 python3.12 python3.11; do \
+	$$python -c '$(FITS)' 2>/dev/null && echo $$python && break; done)
+
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := demo
+WORKERS := 2
+
+.PHONY: demo test checks clean
+.DELETE_ON_ERROR:
+
+demo: $(VENV)/installed
+	rm -rf $(DEMO)
+	$(BIN)/synpick-warp bake --config smoke --device cpu --out $(DEMO)
+	$(BIN)/synpick-warp preview $(DEMO) --out $(DEMO)/contact-sheet.png
+
+test: checks
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+checks: $(VENV)/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/lint-imports --no-logo
+	$(BIN)/basedpyright
+	$(BIN)/python tools/check_kernels.py
+
+clean:
+	rm -rf $(VENV) $(DEMO) build dist *.egg-info .pytest_cache .hypothesis .ruff_cache .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/bin/python:
+	@'$(PYTHON)' -c '$(FITS)' 2>/dev/null || { echo 'make: this needs Python 3.11 or 3.12 with its venv module' \
+		'(Debian and Ubuntu: the package python3-venv); name one with PYTHON=/path/to/python3.12' >&2; exit 2; }
+	'$(PYTHON)' -m venv $(VENV)
+
+$(VENV)/installed: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+$(VENV)/installed-dev: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $(VENV)/installed $@

@@ -1,0 +1,239 @@
+"""The command line. Every user's mistake ends as one line on the standard error and exit code 2."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated
+
+import cyclopts
+from cyclopts import App, Parameter
+
+from synpick_warp import __version__
+from synpick_warp.configs.check import allowed
+from synpick_warp.configs.load import DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.write import config_to_toml
+from synpick_warp.errors import CatalogError, ConfigError, LightError, OutputError, SynpickError
+
+NAME = "synpick-warp"
+EXIT_INCOMPLETE = 1
+EXIT_MISTAKE = 2
+EXIT_INTERRUPTED = 130
+"""128 + SIGINT, as shells have it."""
+EXIT_PIPE = 141
+"""128 + SIGPIPE: whoever read the output has left."""
+_RESOLUTION = re.compile(r"(\d{1,9})[xX](\d{1,9})")
+
+app = App(
+    name=NAME,
+    help="Bake data sets for dynamic bin picking: simulated totes, ray-cast RGB-D, exact 6D ground truth.",
+    version=__version__,
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+
+
+def _help(key: str, extra: str = "") -> str:
+    """Meaning, unit, range and default of a setting, from its declaration."""
+    section, name = key.split(".")
+    item, kind = settings_of(sections()[section])[name]
+    unit = f" {item.metadata['unit']}" if item.metadata["unit"] else ""
+    default = "x".join(map(str, item.default)) if isinstance(item.default, tuple) else str(item.default) or "empty"
+    rule = "" if kind is str and not item.metadata["choices"] else f"{allowed(item, kind)}; "
+    return f"{item.metadata['doc']}{extra} ({rule}default {default}{unit}; {key})"
+
+
+ConfigOption = Annotated[
+    str | None, Parameter(name="--config", help=f"Preset ({', '.join(preset_names())}) or .toml file (default {DEFAULT_PRESET}).")
+]
+SetOption = Annotated[
+    list[str] | None,
+    Parameter(
+        name="--set",
+        negative=(),
+        help=f"Any other setting, as section.key=value; may be repeated. `{NAME} config` prints all, with units, ranges and values.",
+    ),
+]
+WorldsOption = Annotated[int | None, Parameter(help=_help("bake.worlds"))]
+ResolutionOption = Annotated[str | None, Parameter(help=_help("cameras.resolution", " As WIDTHxHEIGHT."))]
+DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
+
+
+@app.command
+def bake(
+    *,
+    out: Annotated[Path, Parameter(help="Folder of the data set: new, or empty.")],
+    config: ConfigOption = None,
+    worlds: WorldsOption = None,
+    episodes: Annotated[int | None, Parameter(help=_help("bake.episodes"))] = None,
+    mode: Annotated[str | None, Parameter(help=_help("bake.mode"))] = None,
+    seed: Annotated[int | None, Parameter(help=_help("bake.seed"))] = None,
+    device: DeviceOption = None,
+    models: Annotated[str | None, Parameter(help=_help("bake.models"))] = None,
+    lights: Annotated[str | None, Parameter(help=_help("bake.lights"))] = None,
+    resolution: ResolutionOption = None,
+    writers: Annotated[int | None, Parameter(help=_help("bake.writers"))] = None,
+    set_: SetOption = None,
+) -> int:
+    """Simulate, render and write a BOP data set.
+
+    Options win over the file, the file over the preset. Exit code: 0, all episodes were delivered; 1, some were given up;
+    2, a mistake in the options, in a file or in a folder; 130, interrupted.
+    """
+    given = {
+        "bake.worlds": worlds,
+        "bake.episodes": episodes,
+        "bake.mode": mode,
+        "bake.seed": seed,
+        "bake.device": device,
+        "bake.models": models,
+        "bake.lights": lights,
+        "bake.writers": writers,
+    }
+    return _bake(_resolve(config, given, resolution, set_), out)
+
+
+@app.command
+def preview(
+    folder: Annotated[Path, Parameter(name="DIR", help="A data set.")],
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="PNG file to write (default contact-sheet.png in the data set).")] = None,
+    views: Annotated[int, Parameter(help="Views to show, spread over the data set.")] = 8,
+) -> int:
+    """Draw a contact sheet of a data set: colour, depth, instances and boxes of sampled views."""
+    if views < 1:
+        raise ConfigError(f"--views is {views}; allowed: at least 1")
+    from synpick_warp.preview import write_contact_sheet
+
+    sheet = out or folder / "contact-sheet.png"
+    write_contact_sheet(folder, sheet, views)
+    print(f"contact sheet: {sheet}")
+    return 0
+
+
+@app.command
+def doctor(
+    *,
+    config: ConfigOption = None,
+    worlds: WorldsOption = None,
+    resolution: ResolutionOption = None,
+    device: DeviceOption = None,
+    set_: SetOption = None,
+) -> int:
+    """Show device, versions and kernel cache, and the memory that a bake's arrays would take."""
+    resolved = _resolve(config, {"bake.worlds": worlds, "bake.device": device}, resolution, set_)
+    from synpick_warp.display import make_console
+    from synpick_warp.doctor import examine
+
+    examine(resolved, make_console())
+    return 0
+
+
+@app.command(name="config")
+def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
+    """Print all settings as TOML, with meaning, unit and range: a file to start your own from."""
+    print(config_to_toml(_resolve(config, {}, None, set_), comments=True), end="")
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code.
+
+    Args:
+        arguments: What follows the program's name; None: of this process.
+    """
+    try:
+        result = app(sys.argv[1:] if arguments is None else list(arguments), exit_on_error=False, print_error=False)
+        sys.stdout.flush()
+        return result or 0
+    except (SynpickError, cyclopts.CycloptsError) as error:
+        print(f"{NAME}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return EXIT_MISTAKE
+    except KeyboardInterrupt:
+        print(f"{NAME}: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_PIPE
+
+
+def parse_resolution(text: str) -> list[int]:
+    """Width and height [px] from "640x360".
+
+    Raises:
+        ConfigError: The text is something else.
+    """
+    match = _RESOLUTION.fullmatch(text)
+    if match is None:
+        raise ConfigError(f'--resolution is "{text}"; allowed: WIDTHxHEIGHT in pixels, such as 640x360')
+    return [int(match[1]), int(match[2])]
+
+
+def _resolve(config: str | None, given: dict[str, object], resolution: str | None, assignments: list[str] | None) -> Config:
+    """Settings from file and options. Options of their own win over --set."""
+    overrides = dict(parse_assignment(text) for text in assignments or [])
+    overrides |= {key: value for key, value in given.items() if value is not None}
+    if resolution is not None:
+        overrides["cameras.resolution"] = parse_resolution(resolution)
+    return load_config(config, overrides)
+
+
+def _bake(config: Config, out: Path) -> int:
+    """Check everything that can be checked cheaply, then bake."""
+    from synpick_warp.device import pick_device
+    from synpick_warp.display import make_console, make_progress, print_summary
+
+    pick_device(config.bake.device)
+    models, lights = config.bake.models, config.bake.lights
+    if models and not os.path.isdir(models):
+        raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes")
+    if lights and not os.path.isdir(lights):
+        raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets")
+    from synpick_warp.bake import run_bake
+
+    console = make_console()
+    with _output_folder(out), make_progress(console) as progress:
+        summary = run_bake(config, out, progress)
+    print_summary(console, summary, out)
+    delivered = sum(1 for row in summary.episodes if row[2].delivers)
+    return 0 if delivered == config.bake.episodes else EXIT_INCOMPLETE
+
+
+@contextlib.contextmanager
+def _output_folder(out: Path) -> Iterator[None]:
+    """Make the folder; if the bake fails before anything is in it, take it away again.
+
+    Raises:
+        OutputError: It is no folder, is not empty, or cannot be written.
+    """
+    made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
+    try:
+        if out.is_dir() and any(out.iterdir()):
+            raise OutputError(f"{out} is not empty; --out takes a new or an empty folder")
+        out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
+    except FileExistsError:
+        raise OutputError(f"{out} is a file; --out takes a new or an empty folder") from None
+    except OSError as error:
+        _remove_empty(made)
+        raise OutputError(f"{out} cannot be written: {error.strerror}; give another folder to --out") from None
+    try:
+        yield
+    except BaseException:
+        _remove_empty(made)
+        raise
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Remove the folders, innermost first, until one holds something."""
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()

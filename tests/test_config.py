@@ -1,0 +1,265 @@
+"""Loading, checking and writing of settings."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import json
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from synpick_warp.configs.load import load_config, parse_assignment, preset_names, sections, settings_of
+from synpick_warp.configs.schema import Config, ObjectRow
+from synpick_warp.configs.write import config_to_toml
+from synpick_warp.errors import ConfigError
+
+COUPLED = {"bop.split", "bop.color_format", "bop.depth_scale", "move.height", "move.start_height"}
+COUPLED_SECTIONS = {"tote", "cameras", "settle", "physics"}
+"""Settings that must fit others: drawn freely they mostly would not."""
+
+
+def write(folder: Path, text: str) -> str:
+    path = folder / "my.toml"
+    path.write_text(text)
+    return str(path)
+
+
+def message(name: str | None, overrides: dict[str, object]) -> str:
+    with pytest.raises(ConfigError) as caught:
+        load_config(name, overrides)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_the_default_is_the_paper():
+    config = load_config(None, {})
+    assert config == load_config("synpick", {})
+    assert dataclasses.replace(config, object_rows=()) == Config()
+    assert (config.physics.step, config.move.force, config.cameras.resolution, config.cameras.fov) == (0.002, 30.0, (1920, 1080), 20.0)
+    assert [row.id for row in config.object_rows] == list(range(1, 22))
+    assert [row.id for row in config.object_rows if row.concave] == [13, 14, 15]
+    assert config.object_rows[11] == ObjectRow(12, "021_bleach_cleanser", 0.2594, 1.131, False, 0.1, 0.5)
+    assert sum(row.mass for row in config.object_rows) == pytest.approx(6.899)
+
+
+def test_object_rows_have_the_diameters_of_the_real_models(real_models):
+    info = json.loads((real_models / "models_info.json").read_text())
+    for row in load_config(None, {}).object_rows:
+        assert row.diameter == pytest.approx(info[str(row.id)]["diameter"] / 1000, abs=1e-4)
+
+
+def test_other_presets_build_on_the_paper():
+    assert preset_names() == ["smoke", "synpick", "synpick-released"]
+    released = load_config("synpick-released", {})
+    assert released.move.damping == 1.0
+    assert released.object_rows == load_config(None, {}).object_rows
+    smoke = load_config("smoke", {})
+    assert (smoke.move.rounds, smoke.bop.color_format, len(smoke.object_rows)) == (1, "png", 21)
+
+
+def test_command_line_wins_over_file_and_file_over_preset(tmp_path):
+    path = write(tmp_path, 'preset = "smoke"\n[bake]\nworlds = 7\nseed = 3\n')
+    config = load_config(path, {"bake.seed": 9})
+    assert (config.bake.worlds, config.bake.seed) == (7, 9)
+    assert config.move.rounds == load_config("smoke", {}).move.rounds
+
+
+def test_a_file_without_preset_builds_on_the_paper(tmp_path):
+    assert load_config(write(tmp_path, ""), {}) == load_config(None, {})
+
+
+def test_object_rows_of_a_file_replace_those_of_the_preset(tmp_path):
+    config = load_config(write(tmp_path, '[[object_rows]]\nid = 5\ndiameter = 0.1\nname = "brick"\n'), {})
+    assert config.object_rows == (ObjectRow(id=5, diameter=0.1, name="brick"),)
+
+
+def test_whole_numbers_do_for_floats():
+    gravity = load_config(None, {"physics.gravity": 10}).physics.gravity
+    assert isinstance(gravity, float)
+    assert gravity == 10.0
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("physics.step", 0.5, "physics.step is 0.5 on the command line; allowed: above 0, at most 0.02 [s]"),
+        ("physics.step", 0, "physics.step is 0 on the command line; allowed: above 0, at most 0.02 [s]"),
+        ("bake.worlds", 0, "bake.worlds is 0 on the command line; allowed: at least 1, at most 65536"),
+        ("bake.worlds", 2.0, "bake.worlds is 2.0 on the command line; allowed: a whole number"),
+        ("bake.worlds", True, "bake.worlds is true on the command line; allowed: a whole number"),
+        ("physics.gravity", True, "physics.gravity is true on the command line; allowed: a finite number [m/s²]"),
+        ("physics.gravity", float("nan"), "physics.gravity is NaN on the command line; allowed: a finite number [m/s²]"),
+        ("physics.gravity", float("inf"), "physics.gravity is Infinity on the command line; allowed: a finite number [m/s²]"),
+        ("render.table", 1, "render.table is 1 on the command line; allowed: true or false"),
+        ("bake.models", 3, "bake.models is 3 on the command line; allowed: a string"),
+        ("bake.mode", "mvoe", 'bake.mode is "mvoe" on the command line; allowed: move; did you mean move?'),
+        ("cameras.resolution", [0, 0], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
+        ("cameras.resolution", [640], "cameras.resolution is [640] on the command line; allowed: 2 whole numbers in a list [px]"),
+        ("cameras.ups", [[1, 2]], "cameras.ups is [[1, 2]] on the command line; allowed: a list of lists of 3 numbers"),
+        ("tote.color", [0.5, 0.5, 1.5], "tote.color is [0.5, 0.5, 1.5] on the command line; allowed: each at least 0, at most 1 [sRGB]"),
+    ],
+)
+def test_a_wrong_value_is_reported_with_what_is_allowed(key, value, expected):
+    assert message(None, {key: value}) == expected
+
+
+def test_huge_whole_numbers_are_no_floats():
+    assert "allowed: a finite number" in message(None, {"physics.gravity": 10**400})
+
+
+@pytest.mark.parametrize(
+    ("key", "hint"),
+    [
+        ("physics.stepp", "did you mean step?"),
+        ("physics.spread", "did you mean arrangement.spread?"),
+        ("phisics.step", "did you mean physics?"),
+        ("friction", "did you mean physics.friction?"),
+        ("object_rows.mass", "write [[object_rows]] tables into a file"),
+    ],
+)
+def test_an_unknown_key_is_reported_with_a_suggestion(key, hint):
+    assert message(None, {key: 1}).endswith(hint)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[physics]\nstep = 0.5\n", "physics.step is 0.5 in {path}; allowed: above 0, at most 0.02 [s]"),
+        ("[physics]\nstepp = 1\n", "there is no key physics.stepp, set in {path}; keys of physics: step, "),
+        ("[fysics]\nstep = 1\n", "there is no section fysics, set in {path}; sections: bake, objects, "),
+        ("physics = 3\n", "physics is 3 in {path}; allowed: a section, [physics]"),
+        ("worlds = 3\n", "there is no section worlds, set in {path}; "),
+        ('preset = "synpik"\n', 'there is no preset "synpik" in {path}; presets: smoke, synpick, synpick-released; '),
+        ("preset = 3\n", "preset is 3 in {path}; allowed: smoke, synpick, synpick-released"),
+        ("object_rows = 3\n", "object_rows is 3 in {path}; allowed: [[object_rows]] tables"),
+        ("[[object_rows]]\nid = 1\n", "object_rows[0] has no diameter in {path}; a row needs id and diameter"),
+        ("[[object_rows]]\nid = 1\nweight = 2\n", "there is no key object_rows[0].weight, set in {path}; keys: id, "),
+        ("[[object_rows]]\nid = 1\ndiameter = 1\nmass = 0\n", "object_rows[0].mass is 0 in {path}; allowed: above 0 [kg]"),
+        ("[physics\n", "{path} is not valid TOML: "),
+    ],
+)
+def test_a_wrong_file_is_reported_with_its_name(tmp_path, text, expected):
+    path = write(tmp_path, text)
+    assert message(path, {}).startswith(expected.format(path=path))
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    assert message(str(tmp_path / "none.toml"), {}).startswith(f"there is no file {tmp_path / 'none.toml'}; ")
+    (tmp_path / "folder.toml").mkdir()
+    assert message(str(tmp_path / "folder.toml"), {}) == f"{tmp_path / 'folder.toml'} cannot be read: Is a directory"
+    (tmp_path / "latin.toml").write_bytes(b"# \xe9\n")
+    assert message(str(tmp_path / "latin.toml"), {}).endswith("is not valid TOML: byte 2 is no UTF-8")
+    assert message("smok", {}).endswith("a file's name ends in .toml; did you mean smoke?")
+
+
+def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_it(tmp_path):
+    assert " in " in message(write(tmp_path, "[bake]\nworlds = 0\n"), {"bake.worlds": 1})
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        ({"cameras.ups": [[0, 1, 0]]}, "cameras.ups is [[0.0, 1.0, 0.0]] on the command line; allowed: one direction for each of the 3"),
+        ({"cameras.ups": [[0, 0, 0]] * 3}, "cameras.ups is .*; allowed: directions across the line of sight; camera 0 "),
+        ({"cameras.target": [0, 0, 2]}, "cameras.positions is .* by default; allowed: positions other than cameras.target"),
+        ({"cameras.positions": [], "cameras.ups": []}, r"cameras.positions is \[\] on the command line; allowed: at least one position"),
+        ({"tote.floor_size": [0.6, 0.3]}, "tote.rim_size is .* by default; allowed: at least tote.floor_size on both sides"),
+        ({"tote.outer_size": [0.55, 0.373, 0.2]}, r"tote.outer_size is .*; allowed: at least .* two walls, \[0.554, 0.361\] \[m\]"),
+        ({"settle.min_time": 20}, r"settle.max_time is 12.0 by default; allowed: at least settle.min_time, 20 \[s\]"),
+        ({"settle.rest_ticks": 1000}, "settle.max_time is 12.0 by default; allowed: at least the time of settle.rest_ticks ticks"),
+        ({"move.start_height": 0.01}, r"move.start_height is 0.01 on the command line; allowed: at least move.height, 0.02 \[m\]"),
+        ({"bop.split": "train"}, 'bop.color_format is "jpg" by default; allowed: png with the split train: '),
+        ({"bop.color_format": "png"}, 'bop.color_format is "png" on the command line; allowed: jpg with the split train_pbr: '),
+        ({"bop.split": "a/b"}, 'bop.split is "a/b" on the command line; allowed: train, val or test'),
+        ({"bop.depth_scale": 0.01}, "bop.depth_scale is 0.01 on the command line; allowed: at least 0.03"),
+    ],
+)
+def test_values_that_do_not_fit_each_other(overrides, expected):
+    assert re.match(expected.replace("[[", r"\[\[").replace("]]", r"\]\]"), message(None, overrides))
+
+
+def test_object_ids_come_once(tmp_path):
+    row = "[[object_rows]]\nid = 4\ndiameter = 0.1\n"
+    path = write(tmp_path, row * 2)
+    assert message(path, {}) == f"object_rows has 2 rows in {path}; allowed: one row an id; 4 comes 2 times"
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "value"),
+    [
+        ("physics.step=0.001", "physics.step", 0.001),
+        (" move.rounds =3", "move.rounds", 3),
+        ("cameras.resolution=[640, 360]", "cameras.resolution", [640, 360]),
+        ("bake.models=/a b/c", "bake.models", "/a b/c"),
+        ('bake.models="/a=b"', "bake.models", "/a=b"),
+        ("bop.split=5", "bop.split", "5"),
+        ("render.table=false", "render.table", False),
+        ("physics.step=fast", "physics.step", "fast"),
+    ],
+)
+def test_assignments(text, key, value):
+    assert parse_assignment(text) == (key, value)
+
+
+@pytest.mark.parametrize("text", ["physics.step", "physics.stepp=1", "step=1", "=1", "object_rows.mass=1"])
+def test_assignments_that_are_none(text):
+    with pytest.raises(ConfigError):
+        parse_assignment(text)
+
+
+@pytest.mark.parametrize("name", ["smoke", "synpick", "synpick-released"])
+@pytest.mark.parametrize("comments", [False, True])
+def test_presets_survive_writing_and_reading(tmp_path, name, comments):
+    config = load_config(name, {})
+    text = config_to_toml(config, comments=comments)
+    assert load_config(write(tmp_path, text), {}) == config
+    assert ("[N·s/m]" in text) == comments
+
+
+TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
+
+
+def values(item: dataclasses.Field, kind: object) -> st.SearchStrategy:
+    """Values that a setting takes."""
+    rules = item.metadata
+    if rules["choices"]:
+        return st.sampled_from(rules["choices"])
+    if kind is float:
+        low = rules["above"] if rules["above"] is not None else rules["low"]
+        return st.floats(low, rules["high"], exclude_min=rules["above"] is not None, allow_nan=False, allow_infinity=False)
+    if kind is int:
+        return st.integers(rules["low"], min(rules["high"] or 2**63 - 1, 2**63 - 1))
+    return st.booleans() if kind is bool else TEXT
+
+
+def free_settings() -> dict[str, st.SearchStrategy]:
+    known = {f"{section}.{name}": pair for section, kind in sections().items() for name, pair in settings_of(kind).items()}
+    free = {key: pair for key, pair in known.items() if key not in COUPLED and key.split(".")[0] not in COUPLED_SECTIONS}
+    return {key: values(*pair) for key, pair in free.items() if pair[1] in (float, int, bool, str)}
+
+
+ROW = st.builds(ObjectRow, **{name: values(*pair) for name, pair in settings_of(ObjectRow).items()})
+ROWS = st.lists(ROW, max_size=3, unique_by=lambda row: row.id)
+WORD = st.text(st.characters(exclude_categories=["Cc", "Cs", "Zl", "Zp"]), max_size=20)
+ANYTHING = st.one_of(st.none(), st.integers(), st.floats(), TEXT, st.lists(st.integers(), max_size=3))
+
+
+@given(overrides=st.fixed_dictionaries({}, optional=free_settings()), rows=ROWS, comments=st.booleans())
+def test_any_settings_survive_writing_and_reading(tmp_path_factory, overrides, rows, comments):
+    config = dataclasses.replace(load_config("smoke", overrides), object_rows=tuple(rows))
+    path = tmp_path_factory.mktemp("config") / "written.toml"
+    path.write_bytes(config_to_toml(config, comments=comments).encode())
+    assert load_config(str(path), {}) == config
+
+
+@given(key=WORD, value=ANYTHING)
+def test_whatever_comes_either_loads_or_is_a_mistake(key, value):
+    for full in (key, f"physics.{key}", "physics.step", "cameras.resolution", "bake.models"):
+        with contextlib.suppress(ConfigError):
+            load_config(None, {full: value})
+        with contextlib.suppress(ConfigError):
+            parse_assignment(f"{full}={value}")

@@ -1,0 +1,97 @@
+"""Rules of the house: sizes, folders, packages, links, words."""
+
+from __future__ import annotations
+
+import ast
+import fnmatch
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.configs.load import sections, settings_of
+from synpick_warp.configs.schema import ObjectRow
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = {"synpick_warp", "kernels", "scenes", "configs", "tests", "tools"}
+FILES = {"pyproject.toml", "README.md", "LICENSE", "Makefile", ".gitignore", ".ci"}
+LINKS = ("kernels", "scenes", "configs")
+MOST_FILE_LINES = 400
+MOST_FUNCTION_LINES = 60
+PRIVATE_PATH = re.compile(r"(?<![\w.~:/])/(home|root|Users|work|mnt)/[\w.-]")
+"""A path on somebody's own machine."""
+
+
+def sources() -> Iterator[Path]:
+    """Every Python file of the project, once."""
+    for folder in sorted(FOLDERS):
+        yield from (path for path in sorted((ROOT / folder).rglob("*.py")) if path.resolve() == path)
+
+
+def ignored(name: str) -> bool:
+    patterns = (ROOT / ".gitignore").read_text().split()
+    return name == ".git" or any(fnmatch.fnmatch(name, pattern.strip("/")) for pattern in patterns)
+
+
+def test_the_top_level_is_fixed():
+    present = {path.name for path in ROOT.iterdir() if not ignored(path.name)}
+    assert present <= FOLDERS | FILES
+    assert present >= FOLDERS
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_links_make_a_bare_checkout_importable(name):
+    link = ROOT / "synpick_warp" / name
+    assert link.is_symlink()
+    assert link.readlink() == Path("..") / name
+
+
+def test_every_package_is_listed():
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    found = {path.parent.relative_to(ROOT) for path in (ROOT / "synpick_warp").rglob("__init__.py")}
+    found |= {Path("synpick_warp") / path.parent.relative_to(ROOT) for name in LINKS for path in (ROOT / name).rglob("__init__.py")}
+    assert set(listed["packages"]) == {".".join(path.parts) for path in found}
+    assert listed["package-dir"] == {f"synpick_warp.{name}": name for name in LINKS}
+
+
+def test_files_are_short():
+    long = {str(path.relative_to(ROOT)): count for path in sources() if (count := len(path.read_text().splitlines())) > MOST_FILE_LINES}
+    assert long == {}
+
+
+def test_functions_are_short():
+    long = {}
+    for path in sources():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                length = (node.end_lineno or node.lineno) - node.lineno + 1
+                if length > MOST_FUNCTION_LINES:
+                    long[f"{path.relative_to(ROOT)}:{node.lineno} {node.name}"] = length
+    assert long == {}
+
+
+def test_host_code_postpones_annotations_and_every_module_says_what_it_is_for():
+    lacking = []
+    for path in sources():
+        tree = ast.parse(path.read_text())
+        postponed = any(isinstance(node, ast.ImportFrom) and node.module == "__future__" for node in tree.body)
+        code = any(isinstance(node, ast.FunctionDef | ast.ClassDef) for node in tree.body)
+        if ast.get_docstring(tree) is None or (code and not postponed and path.parent.name != "kernels"):
+            lacking.append(str(path.relative_to(ROOT)))
+    assert lacking == []
+
+
+def test_nobodys_own_paths_are_in_the_tree():
+    texts = [path for pattern in ("*.py", "*.toml", "*.md") for folder in sorted(FOLDERS) for path in (ROOT / folder).rglob(pattern)]
+    texts += [path for name in FILES if (path := ROOT / name).is_file()] + [ROOT / ".ci" / "run"]
+    assert [str(path.relative_to(ROOT)) for path in texts if PRIVATE_PATH.search(path.read_text())] == []
+
+
+@pytest.mark.parametrize("kind", [*sections().values(), ObjectRow], ids=lambda kind: kind.__name__)
+def test_every_setting_says_what_it_means(kind):
+    assert kind.__doc__
+    for name, (item, _) in settings_of(kind).items():
+        assert item.metadata["doc"].endswith("."), name
+        assert {"unit", "low", "high", "above", "choices"} <= item.metadata.keys(), name
