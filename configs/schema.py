@@ -131,8 +131,8 @@ class Arrangement:
     volume: float = setting(7e-3, "m³", "Objects are drawn while their collision shapes' total stays within this.", above=0.0)
     max_objects: int = setting(24, "", "Most objects of an episode; the draw stops there.", low=1, high=32)
     repeats: bool = setting(True, "", "An object may come several times (moving: yes; picking: no).")
-    concave_shortfall: float = setting(
-        1e-4, "", "Accepted probability that a draw needs more concave slots than a world has; such a draw is repeated.", above=0.0, high=0.5
+    slot_shortfall: float = setting(
+        1e-3, "", "Accepted share of draws that need more slots than a world has; such a draw is repeated, and counted.", above=0.0, high=0.5
     )
     clearance: float = setting(0.01, "m", "Gap between bounding spheres in the drop column.", low=0.0)
     spread: float = setting(0.3, "", "Drop positions are spread over this share of the free floor.", low=0.0, high=1.0)
@@ -163,7 +163,9 @@ class Physics:
     friction: float = setting(0.5, "", "Coulomb friction of every shape.", low=0.0, high=10.0)
     gap: float = setting(5e-3, "m", "Contacts are made when shapes come this near.", low=0.0)
     angular_damping: float = setting(0.05, "1/s", "Angular damping of the objects (PhysX's default).", low=0.0)
-    contacts_per_world: int = setting(512, "", "Room for contacts in a world.", low=16)
+    max_speed: float = setting(4.0, "m/s", "No object is faster: 8 mm a step is less than the gap of two shapes, so nothing passes unseen.", above=0.0)
+    contacts_per_world: int = setting(512, "", "Room for contacts in a world; about 140 are usual.", low=16)
+    pairs_per_world: int = setting(1024, "", "Room for pairs of near shapes in a world.", low=16)
     rows_per_world: int = setting(1536, "", "Room for the objects' contact rows in a world.", low=48)
     gripper_rows_per_world: int = setting(256, "", "Room for the gripper's constraint rows in a world.", low=48)
     guide_height: float = setting(8.0, "m", "Height of the walls that guide the drop and vanish afterwards.", low=0.0)

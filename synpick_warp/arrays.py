@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
@@ -17,12 +18,11 @@ class ArraySpec:
     shape: tuple[str, ...]
     dtype: Any
     unit: str
-    fill: float
 
 
-def device_array(*shape: str, dtype: Any, unit: str = "", fill: float = 0) -> Any:
+def device_array(*shape: str, dtype: Any, unit: str = "") -> Any:
     """Declare an array field of a dataclass; `allocate` makes it. Dimensions are names, resolved when allocated."""
-    return field(metadata={"array": ArraySpec(shape, dtype, unit, fill)})
+    return field(metadata={"array": ArraySpec(shape, dtype, unit)})
 
 
 def allocate(kind: type[Arrays], sizes: dict[str, int], device: wp.Device) -> Arrays:
@@ -36,17 +36,15 @@ def allocate(kind: type[Arrays], sizes: dict[str, int], device: wp.Device) -> Ar
     for item in fields(kind):  # type: ignore[arg-type]
         spec: ArraySpec = item.metadata["array"]
         shape = tuple(sizes[name] for name in spec.shape)
-        made[item.name] = wp.full(shape, spec.dtype(spec.fill), dtype=spec.dtype, device=device) if spec.fill else wp.zeros(
-            shape, dtype=spec.dtype, device=device
-        )
+        made[item.name] = wp.zeros(shape, dtype=spec.dtype, device=device)
     return kind(**made)
 
 
-def memory_table(*groups: Any) -> list[tuple[str, tuple[int, ...], str, int]]:
-    """Rows (name, shape, unit, bytes) of every declared array in the dataclass instances given."""
+def memory_table(kind: type, sizes: dict[str, int]) -> list[tuple[str, tuple[int, ...], str, int]]:
+    """Rows (name, shape, unit, bytes) of the arrays that `kind` declares, for given extents; nothing is allocated."""
     rows = []
-    for group in groups:
-        for item in fields(group):
-            array = getattr(group, item.name)
-            rows.append((f"{type(group).__name__}.{item.name}", tuple(array.shape), item.metadata["array"].unit, array.capacity))
+    for item in fields(kind):
+        spec: ArraySpec = item.metadata["array"]
+        shape = tuple(sizes[name] for name in spec.shape)
+        rows.append((f"{kind.__name__}.{item.name}", shape, spec.unit, math.prod(shape) * wp.types.type_size_in_bytes(spec.dtype)))
     return rows

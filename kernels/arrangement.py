@@ -1,0 +1,236 @@
+"""Which objects a world gets, and where they fall from."""
+
+import warp as wp
+
+from synpick_warp.kernels.draws import DROP, LIGHT, OBJECTS, TAU, stream_key, uniform, uniform_index, uniform_rotation
+from synpick_warp.kernels.phases import (
+    EMPTY,
+    IDLE,
+    OUTCOME_ARRANGEMENT_OVERFLOW,
+    OUTCOME_FINISHED,
+    OUTCOME_RUNNING,
+    OVER,
+    SETTLE,
+    START,
+)
+from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData
+
+wp.set_module_options({"enable_backward": False})
+
+# Draws before an arrangement without repeats is taken as complete; each draw finds a new object with
+# probability 1 / entries at least, so 4,096 miss one with probability e^-8 at 512 entries.
+MAX_DRAWS = wp.constant(4096)
+# Empty slots wait here, far below everything [m].
+PARKED_HEIGHT = wp.constant(-100.0)
+# Numbers that one drop takes from its stream: x, y and three for the rotation.
+DROP_NUMBERS = wp.constant(5)
+
+
+@wp.kernel
+def take_episodes_kernel(
+    # Scene:
+    worlds: int,
+    episodes: int,
+    attempts: int,
+    # State:
+    address_inout: wp.array[wp.vec2i],
+    phase_inout: wp.array[int],
+    outcome_inout: wp.array[int],
+    next_episode_inout: wp.array[int],
+):
+    """Worlds whose episode is over take the next number; an episode that delivered nothing is drawn again where it was.
+
+    One thread walks over the worlds, so that numbers go to worlds in order.
+    """
+    following = next_episode_inout[0]
+    for world in range(worlds):
+        phase = phase_inout[world]
+        episode = address_inout[world][0]
+        attempt = address_inout[world][1]
+        again = phase == OVER and outcome_inout[world] != OUTCOME_FINISHED and attempt + 1 < attempts
+        if again:
+            address_inout[world] = wp.vec2i(episode, attempt + 1)
+            phase_inout[world] = START
+        elif phase == OVER or phase == EMPTY:
+            if following < episodes:
+                address_inout[world] = wp.vec2i(following, 0)
+                phase_inout[world] = START
+                following += 1
+            else:
+                address_inout[world] = wp.vec2i(-1, 0)
+                phase_inout[world] = IDLE
+        if phase == OVER or phase == EMPTY:
+            outcome_inout[world] = OUTCOME_RUNNING
+    next_episode_inout[0] = following
+
+
+@wp.func
+def already_drawn(entry: wp.array2d[int], world: int, count: int, candidate: int) -> bool:
+    found = bool(False)
+    for instance in range(count):
+        if entry[world, instance] == candidate:
+            found = True
+    return found
+
+
+@wp.kernel
+def draw_objects_kernel(
+    # Scene:
+    seed: wp.uint64,
+    layout: LayoutData,
+    catalog: CatalogData,
+    drop: DropData,
+    # State:
+    address: wp.array[wp.vec2i],
+    phase_inout: wp.array[int],
+    outcome_inout: wp.array[int],
+    # Out:
+    entry_out: wp.array2d[int],
+    slot_out: wp.array2d[int],
+    light_out: wp.array[int],
+    light_turn_out: wp.array[float],
+):
+    """Draw objects, uniformly, until the next one would exceed the volume budget V: Σ volume ≤ V.
+
+    The first object may be drawn several times, until one fits. Objects take slots of their kind in the order drawn; if a
+    kind runs out, the episode ends with an overflow and is drawn again.
+    """
+    world = wp.tid()
+    phase = phase_inout[world]
+    if phase != START and phase != IDLE:
+        return
+    for instance in range(layout.instances):
+        entry_out[world, instance] = -1
+        slot_out[world, instance] = -1
+    if phase == IDLE:
+        return
+    key = stream_key(seed, address[world][0], address[world][1], OBJECTS)
+    count = int(0)
+    singles = int(0)
+    compounds = int(0)
+    total = float(0.0)
+    overflow = bool(False)
+    open = bool(True)
+    for draw in range(MAX_DRAWS):
+        if open:
+            candidate = uniform_index(key, draw, catalog.count)
+            known = drop.repeats == 0 and already_drawn(entry_out, world, count, candidate)
+            fits = total + catalog.volume[candidate] <= drop.volume
+            if not known and not fits and count > 0:
+                open = False
+            if not known and fits:
+                slot = singles
+                if catalog.compound[candidate] == 1:
+                    slot = layout.single_slots + compounds
+                    compounds += 1
+                else:
+                    singles += 1
+                overflow = overflow or singles > layout.single_slots or compounds > layout.slots - layout.single_slots
+                entry_out[world, count] = candidate
+                slot_out[world, count] = slot
+                total += catalog.volume[candidate]
+                count += 1
+            if overflow or count == layout.instances or (drop.repeats == 0 and count == catalog.count):
+                open = False
+    light = stream_key(seed, address[world][0], address[world][1], LIGHT)
+    light_out[world] = uniform_index(light, 0, drop.lights)
+    light_turn_out[world] = TAU * uniform(light, 1) * float(drop.turn_lights)
+    if overflow:
+        for instance in range(layout.instances):
+            entry_out[world, instance] = -1
+            slot_out[world, instance] = -1
+        outcome_inout[world] = OUTCOME_ARRANGEMENT_OVERFLOW
+        phase_inout[world] = OVER
+
+
+@wp.func
+def drop_pose(key: wp.uint64, index: int, radius: float, height: float, drop: DropData) -> wp.transform:
+    """A random pose at a height: spread over the part of the rim's opening that the bounding sphere can use."""
+    first = index * DROP_NUMBERS
+    x = (2.0 * uniform(key, first) - 1.0) * drop.spread * wp.max(0.0, 0.5 * drop.rim_length - radius)
+    y = (2.0 * uniform(key, first + 1) - 1.0) * drop.spread * wp.max(0.0, 0.5 * drop.rim_width - radius)
+    return wp.transform(wp.vec3(x, y, height), uniform_rotation(key, first + 2))
+
+
+@wp.func
+def write_body(joint_q: wp.array[float], joint_qd: wp.array[float], first_q: int, first_qd: int, pose: wp.transform):
+    """Put a free body at a pose, at rest."""
+    p = wp.transform_get_translation(pose)
+    r = wp.transform_get_rotation(pose)
+    for axis in range(3):
+        joint_q[first_q + axis] = p[axis]
+    for axis in range(4):
+        joint_q[first_q + 3 + axis] = r[axis]
+    for axis in range(6):
+        joint_qd[first_qd + axis] = 0.0
+
+
+@wp.kernel
+def drop_objects_kernel(
+    # Scene:
+    seed: wp.uint64,
+    layout: LayoutData,
+    catalog: CatalogData,
+    drop: DropData,
+    # State:
+    address: wp.array[wp.vec2i],
+    entry: wp.array2d[int],
+    slot: wp.array2d[int],
+    phase_inout: wp.array[int],
+    progress_inout: wp.array[wp.vec4i],
+    stuck_inout: wp.array2d[int],
+    # Out:
+    variant_out: wp.array[int],
+    joint_q_out: wp.array[float],
+    joint_qd_out: wp.array[float],
+    joint_f_out: wp.array[float],
+    restarted_out: wp.array[wp.bool],
+):
+    """Give body slots their objects and stack them above the tote in a column of bounding spheres, at rest; park empty slots.
+
+    Height of sphere i: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance). An empty slot's weight is cancelled by a force m g.
+    """
+    world = wp.tid()
+    phase = phase_inout[world]
+    fresh = phase == START or phase == IDLE or phase == OVER
+    restarted_out[world] = fresh
+    body = world * layout.bodies + layout.gripper_bodies
+    for s in range(layout.slots):
+        variant_out[body + s] = -1
+    if not fresh:
+        return
+    # Ticks since the drop, ticks at rest, re-drops, guide walls standing.
+    progress_inout[world] = wp.vec4i(0, 0, 0, 1)
+    q = world * layout.coords
+    qd = world * layout.dofs
+    for axis in range(layout.gripper_dofs):
+        joint_q_out[q + axis] = 0.0
+        joint_qd_out[qd + axis] = 0.0
+    for axis in range(3):
+        joint_q_out[q + axis] = drop.gripper_home[axis]
+    parked = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
+    for s in range(layout.slots):
+        empty = catalog.empty_single
+        if s >= layout.single_slots:
+            empty = catalog.empty_compound
+        variant_out[body + s] = empty
+        first = qd + layout.gripper_dofs + 6 * s
+        write_body(joint_q_out, joint_qd_out, q + layout.gripper_dofs + 7 * s, first, parked)
+        for axis in range(6):
+            joint_f_out[first + axis] = 0.0
+        joint_f_out[first + 2] = catalog.empty_mass * drop.gravity
+    key = stream_key(seed, address[world][0], address[world][1], DROP)
+    height = drop.rim_height
+    for instance in range(layout.instances):
+        stuck_inout[world, instance] = 0
+        e = entry[world, instance]
+        if e >= 0:
+            s = slot[world, instance]
+            variant_out[body + s] = catalog.variant[e]
+            first = qd + layout.gripper_dofs + 6 * s
+            pose = drop_pose(key, instance, catalog.radius[e], height + catalog.radius[e], drop)
+            write_body(joint_q_out, joint_qd_out, q + layout.gripper_dofs + 7 * s, first, pose)
+            joint_f_out[first + 2] = 0.0
+            height += 2.0 * catalog.radius[e] + drop.clearance
+    if phase == START:
+        phase_inout[world] = SETTLE

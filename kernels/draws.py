@@ -1,0 +1,65 @@
+"""Random numbers with an address: (seed, episode, attempt, purpose, index) names one number, on every device and in every world.
+
+SplitMix64 (Steele, Lea and Flood, OOPSLA 2014) read as a counter-based generator: number i of a stream with key k is
+mix(k + (i + 1)·γ). Keys come from mixing the address, so that streams of neighbouring addresses are unrelated.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+# What a stream is for; part of its address.
+OBJECTS = wp.constant(1)
+DROP = wp.constant(2)
+REDROP = wp.constant(3)
+CORNERS = wp.constant(4)
+LIGHT = wp.constant(5)
+
+# γ and the two multipliers of SplitMix64.
+GAMMA = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
+MIX_A = wp.constant(wp.uint64(0xBF58476D1CE4E5B9))
+MIX_B = wp.constant(wp.uint64(0x94D049BB133111EB))
+# 2⁻²⁴: a float32 in [0, 1) has 24 bits.
+UNIT = wp.constant(5.9604644775390625e-08)
+TAU = wp.constant(6.283185307179586)
+
+
+@wp.func
+def mix(x: wp.uint64) -> wp.uint64:
+    """SplitMix64's output function."""
+    y = (x ^ (x >> wp.uint64(30))) * MIX_A
+    y = (y ^ (y >> wp.uint64(27))) * MIX_B
+    return y ^ (y >> wp.uint64(31))
+
+
+@wp.func
+def stream_key(seed: wp.uint64, episode: int, attempt: int, purpose: int) -> wp.uint64:
+    """Key of the stream at an address."""
+    key = mix(seed + GAMMA)
+    key = mix((key ^ wp.uint64(episode)) + GAMMA)
+    key = mix((key ^ wp.uint64(attempt)) + GAMMA)
+    return mix((key ^ wp.uint64(purpose)) + GAMMA)
+
+
+@wp.func
+def uniform(key: wp.uint64, index: int) -> float:
+    """Number `index` of a stream, in [0, 1)."""
+    bits = mix(key + (wp.uint64(index) + wp.uint64(1)) * GAMMA)
+    return float(bits >> wp.uint64(40)) * UNIT
+
+
+@wp.func
+def uniform_index(key: wp.uint64, index: int, count: int) -> int:
+    """Number `index` of a stream as an integer in [0, count)."""
+    return wp.min(int(uniform(key, index) * float(count)), count - 1)
+
+
+@wp.func
+def uniform_rotation(key: wp.uint64, index: int) -> wp.quat:
+    """A rotation, uniform over SO(3), from numbers index to index + 2 (Shoemake, Graphics Gems III, 1992)."""
+    u = uniform(key, index)
+    a = TAU * uniform(key, index + 1)
+    b = TAU * uniform(key, index + 2)
+    low = wp.sqrt(1.0 - u)
+    high = wp.sqrt(u)
+    return wp.quat(low * wp.sin(a), low * wp.cos(a), high * wp.sin(b), high * wp.cos(b))

@@ -1,0 +1,345 @@
+"""What every pixel's ray hits: bodies prepared for a view, primary hits with amodal bits, and occlusion queries."""
+
+import warp as wp
+
+from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, projected_box, tile_pixel
+
+wp.set_module_options({"enable_backward": False})
+
+NOTHING = wp.constant(0)
+TABLE = wp.constant(252)
+FIRST_FIXTURE = wp.constant(253)
+"""Codes of `frames`: 0 nothing, 1 + instance_id, 252 table, 253 tote, 254 finger, 255 cup."""
+FAR = wp.constant(1.0e30)
+"""Stands for no hit yet [m]."""
+MAX_COUNTS = wp.constant(65535.0)
+"""Largest depth that fits into 16 bits."""
+
+
+@wp.struct
+class Meshes:
+    """Constant, one row a mesh: the catalog's entries, then tote, finger, cup."""
+
+    id: wp.array[wp.uint64]
+    lower: wp.array[wp.vec3]
+    upper: wp.array[wp.vec3]
+    """Bounds in the mesh's own frame [m]."""
+    center: wp.array[wp.vec3]
+    radius: wp.array[float]
+    """Bounding sphere in the mesh's own frame [m]."""
+    entries: int
+    """Catalog entries; the mesh of fixture f is entries + f."""
+
+
+@wp.struct
+class Table:
+    """A horizontal plane under the tote."""
+
+    visible: int
+    height: float
+    """z in the world [m]."""
+
+
+@wp.struct
+class Bodies:
+    """Scratch, one row a view and body: the world's instances, then tote, finger, cup."""
+
+    mesh: wp.array2d[int]
+    """Row of `Meshes`; -1: not there."""
+    turn: wp.array2d[wp.mat33]
+    """Camera's axes to the body's."""
+    start: wp.array2d[wp.vec3]
+    """Where the optical axis passes depth `near`, in the body's frame [m]: rays start close to the body, so that float32 suffices."""
+    near: wp.array2d[float]
+    """No point of the body is nearer than this planar depth [m]."""
+    box: wp.array2d[wp.vec4i]
+    """Pixels that the body can cover: x_min, y_min, x_max, y_max, inclusive, up to one image size beyond the border."""
+    world_turn: wp.array2d[wp.mat33]
+    """World's axes to the body's."""
+    position: wp.array2d[wp.vec3]
+    """Origin of the body in the world [m]."""
+    sphere: wp.array2d[wp.vec4]
+    """Bounding sphere in the world: centre [m], squared radius [m²]; a negative square: not there."""
+
+
+@wp.struct
+class Hits:
+    """Scratch, one a view and pixel: what shading and later layers read."""
+
+    code: wp.array3d[wp.uint8]
+    """0 nothing, 1 + instance_id, or the code of the table or a fixture."""
+    triangle: wp.array3d[int]
+    barycentric: wp.array3d[wp.vec2]
+    """Weights of the triangle's first and second vertex."""
+    depth: wp.array3d[float]
+    """Planar depth [m]."""
+
+
+@wp.struct
+class Hit:
+    """The nearest hit of one ray."""
+
+    code: int
+    triangle: int
+    barycentric: wp.vec2
+    depth: float
+    amodal: wp.uint32
+
+
+@wp.func
+def body_of(code: int, instances: int) -> int:
+    """Row of `Bodies` for a hit's code, which is neither nothing nor the table."""
+    if code >= FIRST_FIXTURE:
+        return instances + code - FIRST_FIXTURE
+    return code - 1
+
+
+@wp.kernel
+def prepare_bodies_kernel(
+    # Scene:
+    meshes: Meshes,
+    cameras: Cameras,
+    grid: ImageGrid,
+    # State:
+    entry: wp.array2d[int],
+    pose: wp.array2d[wp.transformf],
+    fixture_pose: wp.array2d[wp.transformf],
+    fixture_visible: wp.array2d[int],
+    # In:
+    view_world: wp.array[int],
+    view_camera: wp.array[int],
+    instances: int,
+    # Out:
+    bodies_out: Bodies,
+):
+    """Place every body of a view's world before the view's camera: x_camera = R (x_world - c), in float64, stored in float32."""
+    view, body = wp.tid()
+    world = view_world[view]
+    camera = view_camera[view]
+    mesh = int(-1)
+    placed = wp.transform_identity(dtype=float)
+    if body < instances:
+        mesh = entry[world, body]
+        placed = pose[world, body]
+    elif fixture_visible[world, body - instances] != 0:
+        mesh = meshes.entries + body - instances
+        placed = fixture_pose[world, body - instances]
+    bodies_out.mesh[view, body] = mesh
+    if mesh < 0:
+        bodies_out.box[view, body] = wp.vec4i(0, 0, -1, -1)
+        bodies_out.sphere[view, body] = wp.vec4(0.0, 0.0, 0.0, -1.0)
+        return
+
+    p = wp.transform_get_translation(placed)
+    q = wp.transform_get_rotation(placed)
+    position = wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
+    turn = wp.quat_to_matrix(wp.normalize(wp.quatd(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))))
+    to_camera = cameras.rotation[camera] * turn
+    origin = cameras.rotation[camera] * (position - cameras.center[camera])
+
+    c = meshes.center[mesh]
+    center = wp.vec3d(wp.float64(c[0]), wp.float64(c[1]), wp.float64(c[2]))
+    radius = meshes.radius[mesh]
+    near = wp.max(float((to_camera * center + origin)[2]) - radius, 0.0)
+    start = wp.transpose(to_camera) * (wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(near)) - origin)
+    sphere = turn * center + position
+
+    bodies_out.turn[view, body] = wp.mat33(wp.transpose(to_camera))
+    bodies_out.start[view, body] = wp.vec3(start)
+    bodies_out.near[view, body] = near
+    bodies_out.box[view, body] = projected_box(
+        meshes.lower[mesh], meshes.upper[mesh], to_camera, origin, cameras.intrinsics[camera], grid
+    )
+    bodies_out.world_turn[view, body] = wp.mat33(wp.transpose(turn))
+    bodies_out.position[view, body] = p
+    bodies_out.sphere[view, body] = wp.vec4(float(sphere[0]), float(sphere[1]), float(sphere[2]), radius * radius)
+
+
+@wp.func
+def body_ray_start(bodies: Bodies, view: int, body: int, ray: wp.vec3) -> wp.vec3:
+    """Where a camera ray passes the body's near depth, in the body's frame [m]."""
+    return bodies.start[view, body] + bodies.near[view, body] * (bodies.turn[view, body] * wp.vec3(ray[0], ray[1], 0.0))
+
+
+@wp.func
+def in_box(box: wp.vec4i, row: int, column: int) -> bool:
+    return column >= box[0] and column <= box[2] and row >= box[1] and row <= box[3]
+
+
+@wp.func
+def hits_body(meshes: Meshes, bodies: Bodies, view: int, body: int, ray: wp.vec3) -> bool:
+    """Whether a camera ray hits a body at all."""
+    return wp.mesh_query_ray_anyhit(
+        meshes.id[bodies.mesh[view, body]], body_ray_start(bodies, view, body, ray), bodies.turn[view, body] * ray, FAR
+    )
+
+
+@wp.func
+def trace_camera_ray(
+    meshes: Meshes,
+    bodies: Bodies,
+    view: int,
+    row: int,
+    column: int,
+    ray: wp.vec3,
+    instances: int,
+    amodal: bool,
+) -> Hit:
+    """Nearest hit among the bodies whose box holds the pixel; with `amodal`, hidden instances are tested as well and get their bit."""
+    best = Hit()
+    best.code = NOTHING
+    best.depth = FAR
+    for body in range(instances + 3):
+        if in_box(bodies.box[view, body], row, column):
+            near = bodies.near[view, body]
+            if near < best.depth:
+                # Amodal bits need to know of hits behind the nearest one too; fixtures have no bit.
+                reach = best.depth - near
+                if amodal and body < instances:
+                    reach = FAR
+                query = wp.mesh_query_ray(
+                    meshes.id[bodies.mesh[view, body]],
+                    body_ray_start(bodies, view, body, ray),
+                    bodies.turn[view, body] * ray,
+                    reach,
+                )
+                if query.result:
+                    if body < instances:
+                        best.amodal = best.amodal | (wp.uint32(1) << wp.uint32(body))
+                    depth = near + query.t
+                    if depth < best.depth:
+                        best.depth = depth
+                        best.triangle = query.face
+                        best.barycentric = wp.vec2(query.u, query.v)
+                        best.code = body + 1
+                        if body >= instances:
+                            best.code = FIRST_FIXTURE + body - instances
+            elif amodal and body < instances:
+                if hits_body(meshes, bodies, view, body, ray):
+                    best.amodal = best.amodal | (wp.uint32(1) << wp.uint32(body))
+    return best
+
+
+@wp.func
+def hit_table(table: Table, cameras: Cameras, camera: int, ray: wp.vec3, best: Hit) -> Hit:
+    """The hit given, or the table's if that is nearer."""
+    result = best
+    if table.visible != 0:
+        fall = (cameras.to_world[camera] * ray)[2]
+        height = float(cameras.center[camera][2]) - table.height
+        if fall * height < 0.0:
+            depth = -height / fall
+            if depth < best.depth:
+                result.code = TABLE
+                result.depth = depth
+    return result
+
+
+@wp.func
+def store_hit(hits: Hits, view: int, row: int, column: int, hit: Hit):
+    hits.code[view, row, column] = wp.uint8(hit.code)
+    hits.triangle[view, row, column] = hit.triangle
+    hits.barycentric[view, row, column] = hit.barycentric
+    hits.depth[view, row, column] = hit.depth
+
+
+@wp.kernel
+def trace_hits_kernel(
+    # Scene:
+    meshes: Meshes,
+    table: Table,
+    cameras: Cameras,
+    grid: ImageGrid,
+    # In:
+    bodies: Bodies,
+    view_camera: wp.array[int],
+    instances: int,
+    counts_per_meter: float,
+    first: int,
+    # Out:
+    hits_out: Hits,
+    instance_out: wp.array3d[wp.uint8],
+    depth_out: wp.array3d[wp.uint16],
+    amodal_out: wp.array3d[wp.uint32],
+):
+    """Cast one ray through the centre of each pixel.
+
+    Depth is planar, in counts rounded to nearest, 0 where nothing is hit or the count does not fit. Bit i of `amodal_out` is set
+    where the ray hits instance i, hidden or not.
+    """
+    pixel = tile_pixel(grid, wp.tid() + first)
+    view = pixel[0]
+    row = pixel[1]
+    column = pixel[2]
+    if row >= grid.height or column >= grid.width:
+        return
+    camera = view_camera[view]
+    ray = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
+    hit = trace_camera_ray(meshes, bodies, view, row, column, ray, instances, True)
+    hit = hit_table(table, cameras, camera, ray, hit)
+
+    store_hit(hits_out, view, row, column, hit)
+    instance_out[view, row, column] = wp.uint8(hit.code)
+    amodal_out[view, row, column] = hit.amodal
+    counts = wp.rint(hit.depth * counts_per_meter)
+    if counts > MAX_COUNTS:
+        counts = 0.0
+    depth_out[view, row, column] = wp.uint16(counts)
+
+
+@wp.kernel
+def trace_sample_kernel(
+    # Scene:
+    meshes: Meshes,
+    table: Table,
+    cameras: Cameras,
+    grid: ImageGrid,
+    # In:
+    bodies: Bodies,
+    view_camera: wp.array[int],
+    instances: int,
+    offset: wp.vec2,
+    first: int,
+    # Out:
+    hits_out: Hits,
+):
+    """Cast one ray through each pixel, `offset` [px] off its centre: a colour sample, nearest hit only."""
+    pixel = tile_pixel(grid, wp.tid() + first)
+    view = pixel[0]
+    row = pixel[1]
+    column = pixel[2]
+    if row >= grid.height or column >= grid.width:
+        return
+    camera = view_camera[view]
+    ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
+    hit = trace_camera_ray(meshes, bodies, view, row, column, ray, instances, False)
+    store_hit(hits_out, view, row, column, hit_table(table, cameras, camera, ray, hit))
+
+
+@wp.func
+def is_blocked(
+    meshes: Meshes,
+    table: Table,
+    bodies: Bodies,
+    view: int,
+    instances: int,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    reach: float,
+) -> bool:
+    """Whether anything lies within `reach` [m] of `origin` along the unit vector `direction`, all in the world."""
+    if table.visible != 0 and direction[2] < 0.0:
+        if origin[2] + reach * direction[2] < table.height:
+            return True
+    for body in range(instances + 3):
+        sphere = bodies.sphere[view, body]
+        offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
+        along = wp.clamp(wp.dot(offset, direction), 0.0, reach)
+        closest = offset - along * direction
+        if wp.dot(closest, closest) < sphere[3]:
+            turn = bodies.world_turn[view, body]
+            if wp.mesh_query_ray_anyhit(
+                meshes.id[bodies.mesh[view, body]], turn * (origin - bodies.position[view, body]), turn * direction, reach
+            ):
+                return True
+    return False

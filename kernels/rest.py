@@ -1,0 +1,191 @@
+"""Whether a world's pile is at rest, what must be dropped again, and when an episode ends."""
+
+import warp as wp
+
+from synpick_warp.kernels.arrangement import drop_pose, write_body
+from synpick_warp.kernels.draws import REDROP, stream_key
+from synpick_warp.kernels.phases import (
+    ACT,
+    OUTCOME_FINISHED,
+    OUTCOME_NOT_FINITE,
+    OUTCOME_SOLVER_OVERFLOW,
+    OUTCOME_UNSETTLED,
+    OVER,
+    SETTLE,
+)
+from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData, SettleData
+
+wp.set_module_options({"enable_backward": False})
+
+# An object whose origin is lower than this has left the tote through its floor or beside it [m].
+BELOW_FLOOR = wp.constant(-0.01)
+
+
+@wp.kernel
+def measure_depth_kernel(
+    # State:
+    contact_count: wp.array[int],
+    shape0: wp.array[int],
+    shape1: wp.array[int],
+    point0: wp.array[wp.vec3],
+    point1: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    margin0: wp.array[float],
+    margin1: wp.array[float],
+    shape_body: wp.array[int],
+    body_q: wp.array[wp.transform],
+    # Out:
+    depth_out: wp.array[float],
+):
+    """Deepest penetration of each body [m]: max over its contacts of margin_0 + margin_1 - n·(p_1 - p_0)."""
+    contact = wp.tid()
+    if contact >= contact_count[0]:
+        return
+    a = int(-1)
+    b = int(-1)
+    if shape0[contact] >= 0:
+        a = shape_body[shape0[contact]]
+    if shape1[contact] >= 0:
+        b = shape_body[shape1[contact]]
+    p = point0[contact]
+    q = point1[contact]
+    if a >= 0:
+        p = wp.transform_point(body_q[a], p)
+    if b >= 0:
+        q = wp.transform_point(body_q[b], q)
+    depth = margin0[contact] + margin1[contact] - wp.dot(normal[contact], q - p)
+    if a >= 0:
+        wp.atomic_max(depth_out, a, depth)
+    if b >= 0:
+        wp.atomic_max(depth_out, b, depth)
+
+
+@wp.func
+def is_outside(position: wp.vec3, drop: DropData) -> bool:
+    """Whether an object's origin has left the tote."""
+    beside = wp.abs(position[0]) > 0.5 * drop.rim_length or wp.abs(position[1]) > 0.5 * drop.rim_width
+    return position[2] < BELOW_FLOOR or (beside and position[2] < drop.rim_height)
+
+
+@wp.kernel
+def judge_settling_kernel(
+    # Scene:
+    seed: wp.uint64,
+    layout: LayoutData,
+    catalog: CatalogData,
+    drop: DropData,
+    settle: SettleData,
+    # State:
+    address: wp.array[wp.vec2i],
+    entry: wp.array2d[int],
+    slot: wp.array2d[int],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    depth: wp.array[float],
+    stuck_inout: wp.array2d[int],
+    progress_inout: wp.array[wp.vec4i],
+    phase_inout: wp.array[int],
+    joint_q_inout: wp.array[float],
+    joint_qd_inout: wp.array[float],
+):
+    """One tick of settling: re-drop what left the tote or is stuck, count ticks at rest, take the guide walls away, end.
+
+    An object's speed is |v| + |ω| r, no less than that of any of its points. `progress` holds ticks since the drop, ticks at
+    rest, re-drops, and whether the guide walls stand. `address` is (episode, attempt).
+    """
+    world = wp.tid()
+    if phase_inout[world] != SETTLE:
+        return
+    progress = progress_inout[world]
+    ticks = progress[0] + 1
+    resting = progress[1] + 1
+    redrops = progress[2]
+    guides = progress[3]
+    key = stream_key(seed, address[world][0], address[world][1], REDROP)
+    height = drop.rim_height
+    body = world * layout.bodies + layout.gripper_bodies
+    for instance in range(layout.instances):
+        e = entry[world, instance]
+        if e >= 0:
+            s = slot[world, instance]
+            twist = body_qd[body + s]
+            if wp.length(wp.spatial_top(twist)) + wp.length(wp.spatial_bottom(twist)) * catalog.radius[e] > settle.speed:
+                resting = 0
+            stuck = stuck_inout[world, instance] + 1
+            if depth[body + s] < settle.stuck_depth:
+                stuck = 0
+            if stuck > settle.stuck_ticks or is_outside(wp.transform_get_translation(body_q[body + s]), drop):
+                stuck = 0
+                pose = drop_pose(key, redrops, catalog.radius[e], height + catalog.radius[e], drop)
+                height += 2.0 * catalog.radius[e] + drop.clearance
+                q = world * layout.coords + layout.gripper_dofs + 7 * s
+                write_body(joint_q_inout, joint_qd_inout, q, world * layout.dofs + layout.gripper_dofs + 6 * s, pose)
+                redrops += 1
+                resting = 0
+                guides = 1
+            stuck_inout[world, instance] = stuck
+    if resting >= settle.rest_ticks and ticks >= settle.min_ticks:
+        if guides == 1:
+            guides = 0
+            resting = 0
+        else:
+            phase_inout[world] = ACT
+    progress_inout[world] = wp.vec4i(ticks, resting, redrops, guides)
+
+
+@wp.kernel
+def judge_episodes_kernel(
+    # Scene:
+    layout: LayoutData,
+    settle: SettleData,
+    waypoints: int,
+    # State:
+    entry: wp.array2d[int],
+    slot: wp.array2d[int],
+    body_q: wp.array[wp.transform],
+    overflow: wp.array[wp.bool],
+    progress: wp.array[wp.vec4i],
+    waypoint: wp.array[int],
+    phase_inout: wp.array[int],
+    outcome_inout: wp.array[int],
+):
+    """End episodes: those that failed, and those whose gripper has been everywhere."""
+    world = wp.tid()
+    phase = phase_inout[world]
+    if phase != SETTLE and phase != ACT:
+        return
+    outcome = int(0)
+    if phase == ACT and waypoint[world] >= waypoints:
+        outcome = OUTCOME_FINISHED
+    if phase == SETTLE and (progress[world][0] >= settle.max_ticks or progress[world][2] > settle.max_redrops):
+        outcome = OUTCOME_UNSETTLED
+    if overflow[world]:
+        outcome = OUTCOME_SOLVER_OVERFLOW
+    body = world * layout.bodies + layout.gripper_bodies
+    for instance in range(layout.instances):
+        if entry[world, instance] >= 0:
+            p = wp.transform_get_translation(body_q[body + slot[world, instance]])
+            if not wp.isfinite(p[0] + p[1] + p[2]):
+                outcome = OUTCOME_NOT_FINITE
+    if outcome != 0:
+        outcome_inout[world] = outcome
+        phase_inout[world] = OVER
+
+
+@wp.kernel
+def set_guides_kernel(
+    # Scene:
+    layout: LayoutData,
+    guide_shapes: wp.array[int],
+    collide: int,
+    # State:
+    progress: wp.array[wp.vec4i],
+    shape_flags_inout: wp.array[int],
+):
+    """Let the guide walls of each world collide or not."""
+    world, guide = wp.tid()
+    shape = world * layout.shapes + guide_shapes[guide]
+    flags = shape_flags_inout[shape] & ~collide
+    if progress[world][3] == 1:
+        flags = flags | collide
+    shape_flags_inout[shape] = flags

@@ -1,0 +1,155 @@
+"""The surface at a hit: position, normals, base colour from mip-mapped textures."""
+
+import warp as wp
+
+from synpick_warp.kernels.hits import Bodies, Meshes
+
+wp.set_module_options({"enable_backward": False})
+
+MIN_TILT = wp.constant(0.1)
+"""Bounds how far a pixel stretches on a surface seen edge-on."""
+
+
+@wp.struct
+class Surfaces:
+    """Constant, one row a mesh and a last one for the table; vertices, triangles and texels of all meshes lie one after the other."""
+
+    first_vertex: wp.array[int]
+    first_triangle: wp.array[int]
+    normal: wp.array[wp.vec3]
+    uv: wp.array[wp.vec2]
+    uv_density: wp.array[float]
+    """Texture lengths per metre, one a triangle."""
+    color: wp.array[wp.vec3]
+    """Base colour, linear."""
+    metallic: wp.array[float]
+    roughness: wp.array[float]
+    texture_size: wp.array[wp.vec2i]
+    """Width and height of the finest level; 0, 0: no texture."""
+    first_texel: wp.array2d[int]
+    """Where each mip level starts (mesh, level)."""
+    texture_levels: wp.array[int]
+    texel: wp.array[wp.vec3ub]
+    """sRGB."""
+    linear: wp.array[float]
+    """The linear value of each of the 256 sRGB values."""
+
+
+@wp.struct
+class Surface:
+    """What shading knows of one hit."""
+
+    row: int
+    """Row of `Surfaces`."""
+    position: wp.vec3
+    """In the world [m]."""
+    face_normal: wp.vec3
+    """The triangle's, towards the camera."""
+    normal: wp.vec3
+    """Interpolated, towards the camera."""
+    uv: wp.vec2
+    uv_footprint: float
+    """Width of the pixel on the surface, in texture lengths."""
+
+
+@wp.func
+def towards(normal: wp.vec3, reference: wp.vec3) -> wp.vec3:
+    """`normal`, or its opposite if that points more to `reference`."""
+    if wp.dot(normal, reference) < 0.0:
+        return -normal
+    return normal
+
+
+@wp.func
+def table_surface(meshes: Meshes, position: wp.vec3, view_direction: wp.vec3) -> Surface:
+    result = Surface()
+    result.row = meshes.entries + 3
+    result.position = position
+    result.face_normal = towards(wp.vec3(0.0, 0.0, 1.0), view_direction)
+    result.normal = result.face_normal
+    return result
+
+
+@wp.func
+def mesh_surface(
+    meshes: Meshes,
+    surfaces: Surfaces,
+    bodies: Bodies,
+    view: int,
+    body: int,
+    triangle: int,
+    barycentric: wp.vec2,
+    position: wp.vec3,
+    view_direction: wp.vec3,
+    pixel_width: float,
+) -> Surface:
+    """Surface at a hit. `view_direction` points to the camera; `pixel_width` [m] is the pixel's, across the ray."""
+    mesh = bodies.mesh[view, body]
+    to_world = wp.transpose(bodies.world_turn[view, body])
+    result = Surface()
+    result.row = mesh
+    result.position = position
+    result.face_normal = towards(to_world * wp.mesh_eval_face_normal(meshes.id[mesh], triangle), view_direction)
+    first = surfaces.first_vertex[mesh]
+    i = first + wp.mesh_get_index(meshes.id[mesh], 3 * triangle)
+    j = first + wp.mesh_get_index(meshes.id[mesh], 3 * triangle + 1)
+    k = first + wp.mesh_get_index(meshes.id[mesh], 3 * triangle + 2)
+    u = barycentric[0]
+    v = barycentric[1]
+    w = 1.0 - u - v
+    smooth = to_world * (u * surfaces.normal[i] + v * surfaces.normal[j] + w * surfaces.normal[k])
+    result.normal = result.face_normal
+    if wp.length_sq(smooth) > 0.0:
+        result.normal = wp.normalize(towards(smooth, result.face_normal))
+    result.uv = u * surfaces.uv[i] + v * surfaces.uv[j] + w * surfaces.uv[k]
+    # A tilted pixel is longer one way only; the root is its mean stretch.
+    tilt = wp.sqrt(wp.max(wp.dot(result.face_normal, view_direction), MIN_TILT))
+    result.uv_footprint = pixel_width / tilt * surfaces.uv_density[surfaces.first_triangle[mesh] + triangle]
+    return result
+
+
+@wp.func
+def texel_color(surfaces: Surfaces, index: int) -> wp.vec3:
+    texel = surfaces.texel[index]
+    return wp.vec3(surfaces.linear[int(texel[0])], surfaces.linear[int(texel[1])], surfaces.linear[int(texel[2])])
+
+
+@wp.func
+def level_color(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> wp.vec3:
+    """Bilinear look-up in one mip level. v grows upward, row 0 is the image's top; the texture repeats."""
+    size = surfaces.texture_size[row]
+    width = wp.max(size[0] >> level, 1)
+    height = wp.max(size[1] >> level, 1)
+    x = (uv[0] - wp.floor(uv[0])) * float(width) - 0.5
+    y = (1.0 - uv[1] - wp.floor(1.0 - uv[1])) * float(height) - 0.5
+    left = int(wp.floor(x))
+    top = int(wp.floor(y))
+    right_share = x - float(left)
+    lower_share = y - float(top)
+    right = (left + 1) % width
+    bottom = (top + 1) % height
+    left = (left + width) % width
+    top = (top + height) % height
+    first = surfaces.first_texel[row, level]
+    return wp.lerp(
+        wp.lerp(texel_color(surfaces, first + top * width + left), texel_color(surfaces, first + top * width + right), right_share),
+        wp.lerp(texel_color(surfaces, first + bottom * width + left), texel_color(surfaces, first + bottom * width + right), right_share),
+        lower_share,
+    )
+
+
+@wp.func
+def base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
+    """Linear base colour: material times texture, trilinear between the two mip levels whose texels are as wide as the pixel."""
+    color = surfaces.color[surface.row]
+    size = surfaces.texture_size[surface.row]
+    if size[0] == 0:
+        return color
+    texels = surface.uv_footprint * wp.sqrt(float(size[0]) * float(size[1]))
+    last = surfaces.texture_levels[surface.row] - 1
+    level = wp.clamp(wp.log2(wp.max(texels, 1.0e-6)), 0.0, float(last))
+    lower = int(level)
+    upper = wp.min(lower + 1, last)
+    fine = level_color(surfaces, surface.row, lower, surface.uv)
+    coarse = level_color(surfaces, surface.row, upper, surface.uv)
+    return wp.cw_mul(color, wp.lerp(fine, coarse, level - float(lower)))

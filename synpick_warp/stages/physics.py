@@ -1,0 +1,91 @@
+"""The one place that knows Newton's solver: stepping, and giving worlds new objects without a new model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import newton
+import warp as wp
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.scenes.build import BuiltModel
+
+# A joint limit's row is made when the joint comes this near to it [rad].
+JOINT_LIMIT_GAP = 0.2
+
+
+class Physics:
+    """Newton's model, state, solver and collision pipeline. `state` is the current state before and after `tick`."""
+
+    def __init__(self, config: Config, built: BuiltModel) -> None:
+        self.config = config
+        self.layout = built.layout
+        self.model = built.model
+        self.device = self.model.device
+        physics, worlds = config.physics, built.layout.worlds
+        self.model.rigid_contact_max = physics.contacts_per_world * worlds
+        self.pipeline = newton.CollisionPipeline(
+            self.model, broad_phase="nxn", contact_matching="latest", rigid_contact_max=physics.contacts_per_world * worlds,
+            shape_pairs_max=physics.pairs_per_world * worlds, verify_buffers=False,
+        )
+        self.contacts = self.pipeline.contacts()
+        self.solver = newton.solvers.SolverSteel(
+            self.model,
+            iterations=physics.iterations,
+            contact_warmstart=True,
+            free_body_constraint_max=physics.rows_per_world,
+            articulation_constraint_max=physics.gripper_rows_per_world,
+            enable_joint_limits=True,
+            joint_limit_activation_gap=JOINT_LIMIT_GAP,
+            warn_constraint_overflow=False,
+        )
+        self.state = self.model.state()
+        self._other = self.model.state()
+        self.control = self.model.control()
+        self._graph: wp.Graph | None = None
+
+    def load(self, variant: wp.array, restarted: wp.array) -> None:
+        """Give body slots new objects and forget the history of restarted worlds. Joint coordinates are already written.
+
+        Args:
+            variant: Variant of each body, -1 where nothing changes (body) int32.
+            restarted: Worlds with new objects (world + 1) bool.
+        """
+        flags = self.model.select_body_variants(variant)
+        self.solver.notify_model_changed(flags, world_mask=restarted)
+        self.solver.reset(self.state, world_mask=restarted)
+        self.pipeline.reset_contact_matching(restarted)
+        self.refresh_poses()
+
+    def refresh_poses(self) -> None:
+        """Body poses from joint coordinates, after these were written."""
+        newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
+
+    def tick(self, before_step: Callable[[newton.State], None]) -> None:
+        """Advance all worlds by one tick.
+
+        Args:
+            before_step: Launches what sets the control's forces from a state; runs before each step. Recorded once on a GPU, so it must
+                launch the same kernels on the same arrays every time.
+        """
+        if not self.device.is_cuda:
+            self._run_steps(before_step)
+            return
+        if self._graph is None:
+            # The first tick runs eagerly: it loads the kernels and allocates what Newton allocates late.
+            self._run_steps(before_step)
+            with wp.ScopedCapture(device=self.device) as capture:
+                self._run_steps(before_step)
+            self._graph = capture.graph
+            return
+        wp.capture_launch(self._graph)
+
+    def _run_steps(self, before_step: Callable[[newton.State], None]) -> None:
+        current, following = self.state, self._other
+        for _ in range(self.config.physics.steps_per_tick):
+            before_step(current)
+            self.pipeline.collide(current, self.contacts)
+            self.solver.step(current, following, self.control, self.contacts, self.config.physics.step)
+            current, following = following, current
+        if current is not self.state:
+            self.state.assign(current)

@@ -1,0 +1,178 @@
+"""From snapshots to FrameBatches: which views there are, rendering in batches, and copies to the host that overlap."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.arrays import allocate
+from synpick_warp.configs.schema import Config
+from synpick_warp.frames import FrameBatch
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.render import Renderer
+from synpick_warp.stages.worlds import STATUS_COLUMNS, WorldState
+
+# Bytes of one batch's images on a GPU: large enough to fill it, small enough that several batches are in flight.
+BATCH_BYTES = 256 << 20
+# Colour, depth, instance id and amodal bits of one pixel.
+PIXEL_BYTES = 3 + 2 + 1 + 4
+# Batches in flight: one is rendered while another is copied and a third is read.
+RING = 3
+
+
+def views_per_batch(config: Config, device: wp.Device) -> int:
+    """How many views are rendered at once; a setting, or found from device and resolution."""
+    views = len(config.cameras.positions)
+    if config.render.views_per_batch:
+        return config.render.views_per_batch
+    if not device.is_cuda:
+        return views
+    width, height = config.cameras.resolution
+    return max(1, min(BATCH_BYTES // (width * height * PIXEL_BYTES), views * config.bake.worlds))
+
+
+def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
+    """Extents of the dimensions that `ViewBuffers` names."""
+    width, height = config.cameras.resolution
+    return {
+        "view": views_per_batch(config, device),
+        "row": height,
+        "column": width,
+        "instance": config.arrangement.max_objects,
+        "count": 3,
+        "box": 2,
+        "edge": 4,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class TickReport:
+    """What the host knows of one tick."""
+
+    status: np.ndarray
+    """(world, status) int32; columns as STATUS_COLUMNS."""
+    entry: np.ndarray
+    """Catalog index (world, instance) int32."""
+    pose: np.ndarray
+    """Object to world (world, instance, 7) float32."""
+
+    def column(self, name: str) -> np.ndarray:
+        """One column of the status table (world) int32."""
+        return self.status[:, STATUS_COLUMNS.index(name)]
+
+
+class HostCopy:
+    """Host arrays that mirror device arrays: pinned and filled by asynchronous copies on CUDA, the arrays themselves on the CPU."""
+
+    def __init__(self, arrays: list[wp.array]) -> None:
+        self.source = arrays
+        self.device = arrays[0].device
+        self.target = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays] if self.device.is_cuda else arrays
+        self.done = wp.Event(self.device) if self.device.is_cuda else None
+
+    def start(self, stream: wp.Stream | None) -> None:
+        """Begin to copy, on `stream` after what the current stream holds so far; None: on the current stream."""
+        if self.done is None:
+            return
+        if stream is None:
+            stream = self.device.stream
+        else:
+            stream.wait_stream(self.device.stream)
+        for target, source in zip(self.target, self.source, strict=True):
+            wp.copy(target, source, stream=stream)
+        stream.record_event(self.done)
+
+    def wait(self) -> list[np.ndarray]:
+        """Wait until the copies are there, and give them as NumPy arrays (no further copy)."""
+        if self.done is not None:
+            wp.synchronize_event(self.done)
+        return [array.numpy() for array in self.target]
+
+
+class TickReader:
+    """Brings the status table and the poses of a tick to the host."""
+
+    def __init__(self, state: WorldState, snapshot: Snapshot) -> None:
+        self.copy = HostCopy([state.status, snapshot.entry, snapshot.pose])
+
+    def start(self) -> None:
+        """Begin to copy what the last tick left."""
+        self.copy.start(None)
+
+    def wait(self) -> TickReport:
+        """The tick's report; its arrays are the reader's own and change with the next `start`."""
+        status, entry, pose = self.copy.wait()
+        return TickReport(status.copy(), entry.copy(), pose.copy())
+
+
+class FrameStream:
+    """Renders the live worlds of a snapshot and yields FrameBatches, each while the next is rendered."""
+
+    def __init__(self, config: Config, renderer: Renderer, object_ids: np.ndarray, device: wp.Device) -> None:
+        """Allocate the ring of batches.
+
+        Args:
+            config: Settings.
+            renderer: Renders and annotates.
+            object_ids: obj_id of each catalog entry (entry) int32.
+            device: Where rendering happens.
+        """
+        self.renderer = renderer
+        self.object_ids = np.append(object_ids, -1).astype(np.int32)
+        self.cameras = len(config.cameras.positions)
+        self.tick_time = config.physics.step * config.physics.steps_per_tick
+        sizes = view_sizes(config, device)
+        self.batch = sizes["view"]
+        self.device = device
+        self.copy_stream = wp.Stream(device) if device.is_cuda else None
+        self.buffers = [allocate(ViewBuffers, sizes, device) for _ in range(RING if device.is_cuda else 1)]
+        self.copies = [HostCopy([getattr(buffers, item.name) for item in fields(buffers)]) for buffers in self.buffers]
+        self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.buffers]
+
+    def render(self, snapshot: Snapshot, report: TickReport) -> Iterator[FrameBatch]:
+        """Yield the tick's views, world by world and camera by camera. A batch is valid until the next but one is asked for."""
+        live = np.flatnonzero(report.column("live"))
+        world = np.repeat(live, self.cameras).astype(np.int32)
+        camera = np.tile(np.arange(self.cameras, dtype=np.int32), len(live))
+        waiting: tuple[int, slice] | None = None
+        for number, first in enumerate(range(0, len(world), self.batch)):
+            part = slice(first, min(first + self.batch, len(world)))
+            slot = number % len(self.buffers)
+            if waiting is not None and len(self.buffers) == 1:
+                yield self._collect(waiting, world, camera, report)
+                waiting = None
+            self._launch(slot, snapshot, world[part], camera[part])
+            if waiting is not None:
+                yield self._collect(waiting, world, camera, report)
+            waiting = (slot, part)
+        if waiting is not None:
+            yield self._collect(waiting, world, camera, report)
+
+    def _launch(self, slot: int, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray) -> None:
+        views = self.lists[slot]
+        padded = np.zeros((2, self.batch), dtype=np.int32)
+        padded[:, : len(world)] = world, camera
+        views.assign(padded)
+        self.renderer.render(snapshot, views[0], views[1], len(world), self.buffers[slot])
+        self.copies[slot].start(self.copy_stream)
+
+    def _collect(self, waiting: tuple[int, slice], world: np.ndarray, camera: np.ndarray, report: TickReport) -> FrameBatch:
+        slot, part = waiting
+        count = part.stop - part.start
+        images = {
+            item.name: array[:count] for item, array in zip(fields(self.buffers[slot]), self.copies[slot].wait(), strict=True)
+        }
+        worlds = world[part]
+        frame = report.column("frame")[worlds]
+        return FrameBatch(
+            episode=report.column("episode")[worlds],
+            camera=camera[part],
+            frame=frame,
+            time=frame * self.tick_time,
+            object_id=self.object_ids[report.entry[worlds]],
+            pose=report.pose[worlds],
+            **images,
+        )
