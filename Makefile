@@ -27,7 +27,7 @@ test: checks
 	$(BIN)/python -m pytest -n $(WORKERS)
 
 checks: $(VENV)/installed-dev
-	$(BIN)/ruff check .
+	$(BIN)/ruff check --quiet --output-format concise .
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/basedpyright
 	$(BIN)/python tools/check_kernels.py
