@@ -40,6 +40,11 @@ def linear_to_srgb(value: Any) -> np.ndarray:
     return np.where(value <= _LINEAR_TOE, value * 12.92, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
+def as_color(channels: np.ndarray) -> tuple[float, float, float]:
+    """Three channels (3) in the form that materials have."""
+    return float(channels[0]), float(channels[1]), float(channels[2])
+
+
 def rgb8(image: Image.Image) -> np.ndarray:
     """Any kind of picture as (H, W, 3) uint8.
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.meshes import merge_positions
+from synpick_warp.scenes.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.shapes import ConvexPiece, TriangleMesh
 
 # Part of the cache key: raise it when the same input shall give other shapes.
@@ -26,6 +26,8 @@ _RECIPE = 1
 _LEAST_GAIN = 1e-4
 # Pieces of a decomposition below this share of the whole volume are slivers that only cost contacts.
 _LEAST_PIECE = 1e-4
+# Pieces that fill less than this share of the mesh's volume have lost a part of it.
+_LEAST_COVER = 0.95
 # A hull is flat if it fills less than this share of the cube over its extent: 0.2 µm on a sheet of 0.2 m.
 _FLAT = 1e-6
 # CoACD searches at random; the same seed gives the same pieces.
@@ -143,22 +145,37 @@ def _piece(hull: ConvexHull) -> ConvexPiece:
 
 
 def decompose(mesh: TriangleMesh, recipe: ShapeRecipe) -> tuple[ConvexPiece, ...]:
-    """Cover a concave mesh by convex pieces with CoACD (Wei et al., SIGGRAPH 2022)."""
+    """Cover a concave mesh by convex pieces with CoACD (Wei et al., SIGGRAPH 2022).
+
+    A closed surface is cut as it is. CoACD's own repair, a coarser surface around the first, takes twice as long and thickens
+    thin walls (the bowl's pieces: 0.261 l instead of 0.230), so it is for open surfaces, and for results that lost a part.
+    """
     import coacd  # loads a native library of 20 MB, which nobody needs whose shapes are in the cache
 
     coacd.set_log_level("error")
-    # Merged, the mesh is closed if it is closed at all, which saves CoACD a coarser reconstruction of the surface.
     vertices, faces = merge_positions(mesh.vertices, mesh.faces)
-    found = coacd.run_coacd(
-        coacd.Mesh(vertices.astype(np.float64), faces.astype(np.int32)),
-        threshold=recipe.concavity,
-        max_convex_hull=recipe.pieces,
-        mcts_iterations=_SEARCH_STEPS,
-        seed=_SEED,
-    )
-    volumes = [hull_volume(points) for points, _ in found]
+    inside = signed_volume(vertices, faces)
+    for mode in ("off", "on") if _encloses(faces) else ("on",):
+        found = coacd.run_coacd(
+            coacd.Mesh(vertices.astype(np.float64), faces.astype(np.int32)),
+            threshold=recipe.concavity,
+            max_convex_hull=recipe.pieces,
+            preprocess_mode=mode,
+            mcts_iterations=_SEARCH_STEPS,
+            seed=_SEED,
+        )
+        volumes = [hull_volume(points) for points, _ in found]
+        if sum(volumes) > _LEAST_COVER * inside:
+            break
     kept = [points for (points, _), volume in zip(found, volumes, strict=True) if volume > _LEAST_PIECE * sum(volumes)]
     return tuple(limited_hull(points, recipe.piece_vertices) for points in kept)
+
+
+def _encloses(faces: np.ndarray) -> bool:
+    """Whether each edge is run through as often one way as the other: a closed surface, even where parts of it touch."""
+    start, end = faces[:, (0, 1, 2)].reshape(-1), faces[:, (1, 2, 0)].reshape(-1)
+    edges, index = np.unique(np.stack([np.minimum(start, end), np.maximum(start, end)], axis=1), axis=0, return_inverse=True)
+    return not np.bincount(index, weights=np.where(start < end, 1.0, -1.0), minlength=len(edges)).any()
 
 
 def collision_shapes(
@@ -216,15 +233,16 @@ def _key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
     version = importlib.metadata.version("coacd") if recipe.concave else ""
     search = (_RECIPE, _LEAST_GAIN, _LEAST_PIECE, _SEARCH_STEPS, _SEED)
     digest = hashlib.sha256(f"{search} {recipe} {version} {mesh.vertices.shape} {mesh.faces.shape}".encode())
-    digest.update(np.ascontiguousarray(mesh.vertices, "<f4"))
-    digest.update(np.ascontiguousarray(mesh.faces, "<i4"))
+    digest.update(mesh.vertices.astype("<f4").tobytes())
+    digest.update(mesh.faces.astype("<i4").tobytes())
     return digest.hexdigest()
 
 
 def _load(file: Path) -> tuple[ConvexPiece, ...] | None:
     """The pieces in a cache file; None if there is none, or a damaged one."""
     try:
-        with np.load(file, allow_pickle=False) as data:
+        # Opened here, because np.load leaves a damaged file open.
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
             vertices, faces, counts = data["vertices"], data["faces"], data["counts"]
         ends = np.cumsum(counts, axis=0)[:-1]
         pairs = zip(np.split(vertices, ends[:, 0]), np.split(faces, ends[:, 1]), strict=True)
@@ -237,17 +255,14 @@ def _load(file: Path) -> tuple[ConvexPiece, ...] | None:
 
 def _save(file: Path, pieces: tuple[ConvexPiece, ...], report: Callable[[str], None]) -> bool:
     """Write a cache file whole or not at all: several bakes may share the folder. False if it cannot be written."""
-    arrays = {
-        "vertices": np.concatenate([piece.vertices for piece in pieces]),
-        "faces": np.concatenate([piece.faces for piece in pieces]),
-        "counts": np.array([(len(piece.vertices), len(piece.faces)) for piece in pieces]),
-    }
+    vertices, faces = (np.concatenate(rows) for rows in zip(*((piece.vertices, piece.faces) for piece in pieces), strict=True))
+    counts = np.array([(len(piece.vertices), len(piece.faces)) for piece in pieces])
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=".", suffix=".tmp")
         try:
             with os.fdopen(handle, "wb") as stream:
-                np.savez(stream, **arrays)
+                np.savez(stream, vertices=vertices, faces=faces, counts=counts)
             os.replace(temporary, file)
         except BaseException:
             os.unlink(temporary)

@@ -5,14 +5,18 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
+from PIL import Image
 from trimesh.exchange.ply import load_ply
+from trimesh.geometry import triangulate_quads
+from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.appearance import Finish, bake_vertex_colors, join_textures, linear_to_srgb, read_texture, rgb8
+from synpick_warp.scenes.appearance import Finish, as_color, bake_vertex_colors, join_textures, linear_to_srgb, read_texture, rgb8
 from synpick_warp.scenes.shapes import TriangleMesh
 
 SUFFIXES = (".ply", ".obj", ".glb")
@@ -21,6 +25,8 @@ SUFFIXES = (".ply", ".obj", ".glb")
 _GREY = (0.7, 0.7, 0.7)
 # glTF 2.0, section 3.9.2: a material without factors is white, fully metallic and fully rough.
 _GLTF_FACTOR = 1.0
+# Meshes that reach farther cannot be meant, and lose their shape in 32-bit numbers [m].
+_FARTHEST = 1e4
 # BOP's names first, then those of Blender and MeshLab.
 _UV_COLUMNS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 
@@ -50,9 +56,9 @@ def read_mesh(path: Path, unit: float) -> tuple[TriangleMesh, Finish]:
     """
     parts = _read_ply(path) if path.suffix.lower() == ".ply" else _read_scene(path)
     part = _join([_with_colors(_checked(part, path)) for part in parts], path)
+    if np.abs(part.vertices).max() * unit > _FARTHEST:
+        raise CatalogError(f"{path}: a vertex lies {np.abs(part.vertices).max() * unit:.3g} m from the origin; check the file's unit")
     vertices = (part.vertices * unit).astype(np.float32)
-    if not np.isfinite(vertices).all():
-        raise CatalogError(f"{path}: vertices beyond the range of 32-bit numbers; check the file's unit")
     faces, normals = _outward(vertices, part.faces, part.normals)
     smooth = smooth_normals(vertices, faces)
     if normals is not None:
@@ -140,8 +146,7 @@ def _with_colors(part: _Part) -> _Part:
     if part.colors is None:
         return part
     if (part.colors == part.colors[0]).all():
-        color = tuple(float(channel) / 255.0 for channel in part.colors[0])
-        return replace(part, colors=None, finish=replace(part.finish, color=color))
+        return replace(part, colors=None, finish=replace(part.finish, color=as_color(part.colors[0] / 255.0)))
     uv, texture = bake_vertex_colors(part.faces, part.colors)
     order = part.faces.reshape(-1)
     return _Part(
@@ -196,6 +201,7 @@ def _read_ply(path: Path) -> list[_Part]:
         elements = kwargs["metadata"]["_ply_raw"]
         vertex, face = elements.get("vertex", {}), elements.get("face", {})
         faces = np.asarray(kwargs.get("faces", np.zeros((0, 3))), dtype=np.int64)
+        faces = triangulate_quads(faces, dtype=np.int64) if faces.size else faces
         column = {name: np.asarray(vertex["data"][name], dtype=np.float64).reshape(-1) for name in vertex.get("properties", {})}
         corner_uv = _ply_corner_uv(face, len(faces))
     except Exception as error:  # the reader raises nearly anything on damaged files
@@ -278,7 +284,7 @@ def _scene_part(mesh: trimesh.Trimesh, textures: dict[int, np.ndarray], *, linea
     # Asking for vertex_normals would compute them with visible seams; the cache has them if they came from the file.
     normals = mesh._cache.cache.get("vertex_normals")
     visual, uv, colors, finish = mesh.visual, None, None, Finish(_GREY, None, None, None)
-    if visual.kind == "texture":
+    if isinstance(visual, TextureVisuals):
         finish, picture = _scene_finish(visual.material)
         uv = visual.uv
         if picture is not None and uv is not None and len(uv) == len(mesh.vertices):
@@ -286,7 +292,7 @@ def _scene_part(mesh: trimesh.Trimesh, textures: dict[int, np.ndarray], *, linea
             finish = replace(finish, texture=texture)
         else:
             uv = None
-    elif visual.kind in ("vertex", "face"):
+    elif isinstance(visual, ColorVisuals) and visual.kind is not None:
         # glTF 2.0 keeps vertex colours in linear light; OBJ has no rule, and files are written from sRGB pictures.
         colors = np.asarray(visual.vertex_colors)[:, :3]
         if linear_colors:
@@ -294,13 +300,13 @@ def _scene_part(mesh: trimesh.Trimesh, textures: dict[int, np.ndarray], *, linea
     return _Part(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), normals, uv, colors, finish)
 
 
-def _scene_finish(material) -> tuple[Finish, object]:
+def _scene_finish(material: Any) -> tuple[Finish, Image.Image | None]:
     """A material's numbers, and its base colour picture if it has one."""
     if not isinstance(material, PBRMaterial):
         picture = getattr(material, "image", None)
         # Beside a picture Kd is ignored: exporters leave 0.64, or 0, there.
-        diffuse = (1.0, 1.0, 1.0) if picture is not None else tuple(float(c) / 255.0 for c in material.main_color[:3])
-        return Finish(diffuse, None, None, None), picture
+        color = np.ones(3) if picture is not None else np.asarray(material.main_color)[:3] / 255.0
+        return Finish(as_color(color), None, None, None), picture
     factor = material.baseColorFactor
     linear = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255.0
     metallic = _GLTF_FACTOR if material.metallicFactor is None else float(material.metallicFactor)
@@ -309,8 +315,7 @@ def _scene_finish(material) -> tuple[Finish, object]:
         # glTF 2.0, section 3.9.2: green is roughness, blue is metalness. One number an object is all the renderer takes.
         mean = rgb8(material.metallicRoughnessTexture).reshape(-1, 3).mean(axis=0) / 255.0
         roughness, metallic = roughness * float(mean[1]), metallic * float(mean[2])
-    color = tuple(float(channel) for channel in linear_to_srgb(linear))
-    return Finish(color, None, metallic, roughness), material.baseColorTexture
+    return Finish(as_color(linear_to_srgb(linear)), None, metallic, roughness), material.baseColorTexture
 
 
 def _check_obj_references(path: Path) -> None:

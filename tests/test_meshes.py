@@ -1,0 +1,396 @@
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from trimesh.visual import ColorVisuals, TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.appearance import bake_vertex_colors, linear_to_srgb, rgb8, srgb_to_linear
+from synpick_warp.scenes.meshes import merge_positions, read_mesh, signed_volume, smooth_normals
+
+CORNERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+
+
+def ascii_ply(vertices, faces, columns=("x", "y", "z"), comment="", face_tail=None) -> str:
+    rows = [" ".join(str(value) for value in row) for row in vertices]
+    tails = face_tail or [""] * len(faces)
+    rows += [f"{len(face)} {' '.join(map(str, face))} {tail}".strip() for face, tail in zip(faces, tails, strict=True)]
+    header = ["ply", "format ascii 1.0", *([comment] if comment else []), f"element vertex {len(vertices)}"]
+    header += [f"property {'uchar' if name in ('red', 'green', 'blue') else 'float'} {name}" for name in columns]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
+    header += ["property list uchar float texcoord"] if face_tail else []
+    return "\n".join([*header, "end_header", *rows]) + "\n"
+
+
+def binary_ply(vertices, faces, columns, comment="") -> bytes:
+    header = ["ply", "format binary_little_endian 1.0", *([comment] if comment else []), f"element vertex {len(vertices)}"]
+    header += [f"property float {name}" for name in columns]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    body = np.asarray(vertices, "<f4").tobytes() + b"".join(struct.pack("<B3i", 3, *face) for face in faces)
+    return "\n".join(header).encode() + b"\n" + body
+
+
+def picture(path: Path, color=(200, 10, 30), size=(4, 2)) -> Path:
+    Image.new("RGB", size, color).save(path)
+    return path
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_a_ply_keeps_order_texture_coordinates_and_scale(tmp_path, binary):
+    picture(tmp_path / "skin.png")
+    # The first two rows are one place with two texture coordinates: a seam.
+    columns = ("x", "y", "z", "texture_u", "texture_v")
+    vertices = [(0, 0, 0, 0.1, 0.2), (0, 0, 0, 0.9, 0.8), (1000, 0, 0, 0.3, 0.4), (0, 1000, 0, 0.5, 0.6), (0, 0, 1000, 0.7, 1.0)]
+    faces = [(0, 3, 2), (1, 2, 4), (0, 4, 3), (2, 3, 4)]
+    data = (binary_ply if binary else ascii_ply)(vertices, faces, columns, comment="comment TextureFile skin.png")
+    file = tmp_path / "obj_000001.ply"
+    file.write_bytes(data if isinstance(data, bytes) else data.encode())
+    mesh, finish = read_mesh(file, 1e-3)
+    rows = np.asarray(vertices, np.float32)
+    assert np.allclose(mesh.vertices, rows[:, :3] / 1000, atol=1e-7)
+    assert np.array_equal(mesh.uv, rows[:, 3:])
+    assert np.array_equal(mesh.faces, faces)
+    assert mesh.vertices.dtype == mesh.normals.dtype == mesh.uv.dtype == np.float32
+    assert mesh.faces.dtype == np.int32
+    # The seam does not show: both rows have the normal of the corner of a cube.
+    assert np.allclose(mesh.normals[:2], -np.sqrt(1 / 3), atol=1e-6)
+    assert finish.texture is not None
+    assert finish.texture.shape == (2, 4, 3)
+    assert tuple(finish.texture[0, 0]) == (200, 10, 30)
+    assert finish.color == (1.0, 1.0, 1.0)
+    assert finish.metallic is None
+
+
+def test_normals_of_the_file_are_used_and_made_unit(tmp_path):
+    rows = [(*corner, *np.multiply(2.0, normal)) for corner, normal in zip(CORNERS, np.eye(3)[[0, 1, 2, 0]], strict=True)]
+    rows[3] = (*CORNERS[3], 0.0, 0.0, 0.0)
+    file = tmp_path / "a.ply"
+    file.write_text(ascii_ply(rows, FACES, ("x", "y", "z", "nx", "ny", "nz")))
+    mesh, _ = read_mesh(file, 1.0)
+    assert np.allclose(mesh.normals[:3], np.eye(3))
+    computed = smooth_normals(mesh.vertices, mesh.faces)
+    assert np.allclose(mesh.normals[3], computed[3])
+
+
+def test_texture_coordinates_at_the_faces_split_vertices(tmp_path):
+    picture(tmp_path / "t.png")
+    tails = [f"6 0 0 {i / 4} 0 0 1" for i in range(4)]
+    file = tmp_path / "a.ply"
+    file.write_text(ascii_ply(CORNERS, FACES, comment="comment TextureFile t.png", face_tail=tails))
+    mesh, _ = read_mesh(file, 1.0)
+    assert len(mesh.vertices) == 12
+    assert np.allclose(mesh.uv[4], (0.25, 0.0))
+    assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
+
+
+def test_an_inside_out_mesh_is_turned(tmp_path):
+    file = tmp_path / "a.ply"
+    file.write_text(ascii_ply(CORNERS, [face[::-1] for face in FACES]))
+    mesh, _ = read_mesh(file, 1.0)
+    assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
+    assert mesh.normals[1, 0] > 0.0
+
+
+def test_inside_out_normals_turn_with_their_triangles(tmp_path):
+    inward = [(*corner, *(0.25 - np.array(corner))) for corner in CORNERS]
+    file = tmp_path / "a.ply"
+    file.write_text(ascii_ply(inward, [face[::-1] for face in FACES], ("x", "y", "z", "nx", "ny", "nz")))
+    mesh, _ = read_mesh(file, 1.0)
+    assert np.all(np.einsum("vi,vi->v", mesh.normals, mesh.vertices - 0.25) > 0.0)
+
+
+def test_stray_vertices_and_collapsed_triangles_go(tmp_path):
+    file = tmp_path / "a.ply"
+    file.write_text(ascii_ply([(9, 9, 9), *CORNERS], [*[tuple(i + 1 for i in face) for face in FACES], (1, 1, 2)]))
+    mesh, _ = read_mesh(file, 1.0)
+    assert np.array_equal(mesh.vertices, np.asarray(CORNERS, np.float32))
+    assert np.array_equal(mesh.faces, FACES)
+
+
+def test_quads_become_triangles(tmp_path):
+    box = trimesh.creation.box((1, 1, 1))
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    file = tmp_path / "a.ply"
+    file.write_text(ascii_ply(box.vertices, quads))
+    mesh, _ = read_mesh(file, 1.0)
+    assert len(mesh.faces) == 12
+    assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1.0)
+
+
+def test_vertex_colors_become_a_color_or_a_texture(tmp_path):
+    columns = ("x", "y", "z", "red", "green", "blue")
+    file = tmp_path / "a.ply"
+    file.write_text(ascii_ply([(*corner, 255, 0, 51) for corner in CORNERS], FACES, columns))
+    _, finish = read_mesh(file, 1.0)
+    assert finish.texture is None
+    assert finish.color == pytest.approx((1.0, 0.0, 0.2))
+    file.write_text(ascii_ply([(*corner, 60 * i, 255 - 60 * i, 7) for i, corner in enumerate(CORNERS)], FACES, columns))
+    mesh, finish = read_mesh(file, 1.0)
+    assert finish.texture is not None
+    assert finish.color == (1.0, 1.0, 1.0)
+    height, width = finish.texture.shape[:2]
+    column = np.rint(mesh.uv[:, 0] * width - 0.5).astype(int)
+    row = np.rint((1 - mesh.uv[:, 1]) * height - 0.5).astype(int)
+    corner_of = [CORNERS.index(tuple(int(x) for x in vertex)) for vertex in mesh.vertices]
+    assert np.array_equal(finish.texture[row, column], [(60 * i, 255 - 60 * i, 7) for i in corner_of])
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=3, max_size=3), st.tuples(*[st.floats(0.0, 1.0)] * 3))
+def test_baked_vertex_colors_interpolate_linearly(colors, weights):
+    total = sum(weights)
+    share = np.array(weights) / total if total > 1e-3 else np.full(3, 1 / 3)
+    uv, texture = bake_vertex_colors(np.array([[0, 1, 2]]), np.array(colors, np.uint8))
+    light = srgb_to_linear(texture / 255.0)
+    u, v = share @ uv
+    x, y = u * 2 - 0.5, (1 - v) * 2 - 0.5
+    found = (1 - y) * ((1 - x) * light[0, 0] + x * light[0, 1]) + y * ((1 - x) * light[1, 0] + x * light[1, 1])
+    expected = share @ srgb_to_linear(np.array(colors) / 255.0)
+    # The fourth texel is cut to 0..1: exact where it need not be, never off by more than that cut.
+    fourth = light[0, 1] + light[1, 0] - light[0, 0]
+    cut = np.maximum(np.maximum(fourth - 1.0, -fourth), 0.0) + 0.01
+    assert np.all(np.abs(found - expected) <= cut)
+
+
+@given(st.floats(0.0, 1.0))
+def test_srgb_and_back(value):
+    assert float(linear_to_srgb(srgb_to_linear(value))) == pytest.approx(value, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("mode", "value", "expected"),
+    [
+        ("L", 128, (128, 128, 128)),
+        ("RGBA", (10, 20, 30, 0), (10, 20, 30)),
+        ("LA", (77, 0), (77, 77, 77)),
+        ("I;16", 257 * 100, (100, 100, 100)),
+        ("I", 65535, (255, 255, 255)),
+        ("F", 0.5, (128, 128, 128)),
+        ("CMYK", (0, 255, 255, 0), (255, 0, 0)),
+        ("1", 1, (255, 255, 255)),
+    ],
+)
+def test_every_kind_of_picture_becomes_rgb(mode, value, expected):
+    array = rgb8(Image.new(mode, (3, 2), value))
+    assert array.shape == (2, 3, 3)
+    assert array.dtype == np.uint8
+    assert np.all(array == expected)
+
+
+def test_sixteen_bit_grey_png(tmp_path):
+    Image.fromarray(np.full((4, 4), 257 * 9, np.uint16)).save(tmp_path / "t.png")
+    with Image.open(tmp_path / "t.png") as image:
+        assert np.all(rgb8(image) == 9)
+
+
+def test_a_palette_is_resolved():
+    assert np.all(rgb8(Image.new("RGB", (2, 2), (250, 0, 0)).quantize(2)) == (250, 0, 0))
+
+
+def glb(tmp_path: Path, *meshes: trimesh.Trimesh) -> Path:
+    file = tmp_path / "a.glb"
+    file.write_bytes(trimesh.Scene(list(meshes)).export(file_type="glb"))
+    return file
+
+
+def textured_box(color, **material) -> trimesh.Trimesh:
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    uv = np.random.default_rng(0).random((8, 2))
+    box.visual = TextureVisuals(uv=uv, material=PBRMaterial(baseColorTexture=Image.new("RGB", (8, 8), color), **material))
+    return box
+
+
+def test_a_glb_brings_its_material(tmp_path):
+    box = textured_box((200, 10, 10), metallicFactor=0.7, roughnessFactor=0.2)
+    mesh, finish = read_mesh(glb(tmp_path, box), 1.0)
+    assert np.allclose(mesh.uv, box.visual.uv, atol=1e-6)
+    assert finish.texture is not None
+    assert np.all(finish.texture == (200, 10, 10))
+    assert (finish.metallic, finish.roughness) == pytest.approx((0.7, 0.2))
+
+
+def test_base_color_factors_of_a_glb_are_linear(tmp_path):
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=(55, 255, 0, 255)))
+    _, finish = read_mesh(glb(tmp_path, box), 1.0)
+    assert finish.color == pytest.approx((float(linear_to_srgb(55 / 255)), 1.0, 0.0), abs=0.01)
+    assert (finish.metallic, finish.roughness) == (1.0, 1.0)
+
+
+def test_parts_of_a_glb_are_joined_where_they_stand(tmp_path):
+    red, plain = textured_box((200, 10, 10), metallicFactor=1.0), trimesh.creation.box((0.1, 0.1, 0.1))
+    plain.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=(0, 255, 0, 255), metallicFactor=0.0))
+    plain.apply_translation((0.3, 0, 0))
+    mesh, finish = read_mesh(glb(tmp_path, red, plain), 1.0)
+    assert len(mesh.faces) == 24
+    assert np.allclose((mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)), ((-0.05, -0.05, -0.05), (0.35, 0.05, 0.05)))
+    assert finish.texture is not None
+    height, width = finish.texture.shape[:2]
+    texel = finish.texture[((1 - mesh.uv[:, 1]) * height).astype(int), (mesh.uv[:, 0] * width).astype(int)]
+    assert np.all(texel[mesh.vertices[:, 0] < 0.1] == (200, 10, 10))
+    assert np.all(texel[mesh.vertices[:, 0] > 0.1] == (0, 255, 0))
+    assert finish.metallic == pytest.approx(0.5)
+
+
+def test_parts_with_one_material_share_its_texture(tmp_path):
+    one = textured_box((1, 2, 3))
+    two = one.copy()
+    two.apply_translation((0.3, 0, 0))
+    mesh, finish = read_mesh(glb(tmp_path, one, two), 1.0)
+    assert len(mesh.faces) == 24
+    assert finish.texture is not None
+    assert np.all(finish.texture == (1, 2, 3))
+
+
+def test_a_mirrored_part_stays_outward(tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box((0.1, 0.2, 0.3)), transform=np.diag((-2.0, 1.0, 1.0, 1.0)))
+    file = tmp_path / "a.glb"
+    file.write_bytes(scene.export(file_type="glb"))
+    mesh, _ = read_mesh(file, 1.0)
+    assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(0.012)
+
+
+def test_vertex_colors_of_a_glb_are_linear(tmp_path):
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box.visual = ColorVisuals(box, vertex_colors=np.tile((55, 55, 55, 255), (8, 1)))
+    _, finish = read_mesh(glb(tmp_path, box), 1.0)
+    assert finish.color == pytest.approx((float(linear_to_srgb(55 / 255)),) * 3, abs=0.003)
+
+
+OBJ = """mtllib a.mtl
+v 0 0 0
+v 1 0 0
+v 0 1 0
+v 0 0 1
+vt 0 0
+vt 1 0
+vt 1 1
+usemtl skin
+f 1/1 3/2 2/3
+f 1/1 2/2 4/3
+f 1/1 4/2 3/3
+f 2/1 3/2 4/3
+"""
+
+
+def test_an_obj_with_its_picture(tmp_path):
+    (tmp_path / "a.obj").write_text(OBJ)
+    (tmp_path / "a.mtl").write_text("newmtl skin\nKd 0 0 0\nmap_Kd skin.png\n")
+    picture(tmp_path / "skin.png")
+    mesh, finish = read_mesh(tmp_path / "a.obj", 1.0)
+    assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
+    assert set(map(tuple, mesh.uv)) == {(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)}
+    assert finish.texture is not None
+    assert np.all(finish.texture == (200, 10, 30))
+    assert finish.color == (1.0, 1.0, 1.0)
+
+
+def test_an_obj_with_a_plain_color(tmp_path):
+    (tmp_path / "a.obj").write_text(OBJ)
+    (tmp_path / "a.mtl").write_text("newmtl skin\nKd 0.2 0.4 0.6\n")
+    _, finish = read_mesh(tmp_path / "a.obj", 1.0)
+    assert finish.texture is None
+    assert finish.color == pytest.approx((0.2, 0.4, 0.6), abs=0.003)
+
+
+@pytest.mark.parametrize("missing", ["a.mtl", "skin.png"])
+def test_what_an_obj_names_must_be_there(tmp_path, missing):
+    (tmp_path / "a.obj").write_text(OBJ)
+    if missing != "a.mtl":
+        (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
+    with pytest.raises(CatalogError, match=missing):
+        read_mesh(tmp_path / "a.obj", 1.0)
+
+
+GOOD = ascii_ply(CORNERS, FACES)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.ply", ascii_ply(CORNERS, []), "no triangles"),
+        ("a.ply", binary_ply(CORNERS, [], ("x", "y", "z")), "no triangles"),
+        ("a.ply", GOOD.split("element face")[0] + "end_header\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n", "no triangles"),
+        ("a.ply", ascii_ply(CORNERS, [(1, 1, 2)]), "no triangles"),
+        ("a.ply", ascii_ply([(float("nan"), 0, 0), *CORNERS[1:]], FACES), "1 vertices are not finite"),
+        ("a.ply", binary_ply([(float("inf"), 0, 0), *CORNERS[1:]], FACES, ("x", "y", "z")), "not finite"),
+        ("a.ply", binary_ply([(1e38, 0, 0), *CORNERS[1:]], FACES, ("x", "y", "z")), "unit"),
+        ("a.ply", ascii_ply(CORNERS, [*FACES[:3], (1, 2, 9)]), "names vertex 9"),
+        ("a.ply", ascii_ply(CORNERS, FACES, comment="comment TextureFile gone.png"), "gone.png"),
+        ("a.ply", binary_ply(CORNERS, FACES, ("x", "y", "z"))[:-9], "not readable"),
+        ("a.ply", ascii_ply([c[:2] for c in CORNERS], FACES, ("x", "y")), "a.ply"),
+        ("a.ply", "hello", "not readable"),
+        ("a.ply", "", "not readable"),
+        ("a.ply", b"\x00\xff" * 50, "not readable"),
+        ("a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n", "a.obj"),
+        ("a.obj", "", "a.obj"),
+        ("a.glb", b"glTF", "not readable"),
+        ("a.glb", "", "not readable"),
+    ],
+)
+def test_bad_files_are_one_clear_line(tmp_path, name, content, message):
+    file = tmp_path / name
+    file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(CatalogError, match=message) as caught:
+        read_mesh(file, 1.0)
+    assert str(file) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_texture_needs_coordinates_and_a_readable_picture(tmp_path):
+    file = tmp_path / "a.ply"
+    file.write_text(ascii_ply(CORNERS, FACES, comment="comment TextureFile t.png"))
+    picture(tmp_path / "t.png")
+    with pytest.raises(CatalogError, match="texture_u"):
+        read_mesh(file, 1.0)
+    (tmp_path / "t.png").write_bytes(b"no picture")
+    with pytest.raises(CatalogError, match="not readable as a picture"):
+        read_mesh(file, 1.0)
+
+
+def test_repeating_textures_cannot_be_joined(tmp_path):
+    one, two = textured_box((1, 2, 3)), textured_box((4, 5, 6))
+    two.visual.uv = 3.0 * two.visual.uv
+    with pytest.raises(CatalogError, match="repeats"):
+        read_mesh(glb(tmp_path, one, two), 1.0)
+
+
+def test_normals_where_triangles_cancel():
+    vertices = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], np.float32)
+    normals = smooth_normals(vertices, np.array([(0, 1, 2), (0, 2, 1)]))
+    assert np.array_equal(normals, [(0, 0, 1)] * 3)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_normals_do_not_depend_on_seams(seed):
+    rng = np.random.default_rng(seed)
+    ball = trimesh.creation.icosphere(1)
+    vertices = (ball.vertices * rng.uniform(0.5, 1.5, 3)).astype(np.float32)
+    whole = smooth_normals(vertices, ball.faces)
+    split = ball.faces.reshape(-1)
+    apart = smooth_normals(vertices[split], np.arange(len(split)).reshape(-1, 3))
+    assert np.allclose(apart, whole[split], atol=1e-6)
+    places, faces = merge_positions(vertices[split], np.arange(len(split)).reshape(-1, 3))
+    assert (len(places), len(faces)) == (len(ball.vertices), len(ball.faces))
+
+
+def test_the_real_objects_agree_with_their_table(real_models):
+    extents = json.loads((real_models / "models_info.json").read_text())
+    for obj_id, entry in extents.items():
+        mesh, finish = read_mesh(real_models / f"obj_{int(obj_id):06d}.ply", 1e-3)
+        assert finish.texture is not None
+        assert len(mesh.faces) == 16384
+        assert np.allclose(mesh.vertices.min(axis=0) * 1e3, [entry[f"min_{a}"] for a in "xyz"], atol=1e-2)
+        assert np.allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
+        assert mesh.uv.min() >= -1e-3
+        assert mesh.uv.max() <= 1.001
