@@ -2,17 +2,50 @@
 
 from __future__ import annotations
 
+import functools
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import warp as wp
 
 BLOCK = 128
 """Threads of a block: four tiles of 8 x 4 pixels."""
+CHUNKS = 8
+"""Pieces a processor core gets of a launch, so that cores finish together though some tiles cost more."""
+CHUNK_PIXELS = 8192
+"""Smallest piece: launching one costs as much as shading about a hundred pixels."""
+
+
+@functools.cache
+def _cores() -> int:
+    """Processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_cores(), thread_name_prefix="pixels")
 
 
 def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:
-    """Launch a kernel over a flat range of pixels; its last input is where the range begins."""
+    """Launch a kernel over a flat range of pixels, each thread of which writes its own pixel alone; its last input is the range's begin.
+
+    Warp runs a launch on the CPU in the calling thread and releases the interpreter's lock meanwhile; so pieces of the range run
+    side by side. Which thread takes which piece does not change the result.
+    """
     if device.is_cuda:
         wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=BLOCK)
         return
-    wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device)
+    if _cores() == 1 or pixels <= CHUNK_PIXELS:
+        wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device)
+        return
+    # Loading a module is not safe from several threads at once.
+    kernel.module.load(device, 1)
+    size = max(CHUNK_PIXELS, -(-pixels // (CHUNKS * _cores())))
+
+    def launch_piece(first: int) -> None:
+        wp.launch(kernel, dim=min(size, pixels - first), inputs=[*inputs, first], outputs=outputs, device=device)
+
+    for _ in _pool().map(launch_piece, range(0, pixels, size)):
+        pass

@@ -11,7 +11,8 @@ from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
 from synpick_warp.kernels.hits import Bodies, Hits, prepare_bodies_kernel, trace_hits_kernel, trace_sample_kernel
-from synpick_warp.kernels.shading import OcclusionRays, Sample, develop_kernel, filter_occlusion_kernel, occlude_kernel, shade_kernel
+from synpick_warp.kernels.occlusion import OcclusionRays, Sample, filter_occlusion_kernel, occlude_kernel
+from synpick_warp.kernels.shading import develop_kernel, shade_kernel
 from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels
@@ -136,14 +137,10 @@ class Renderer:
     def prepare_bodies(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int) -> None:
         """Place every body before every view's camera."""
         scene = self.scene
-        wp.launch(
-            prepare_bodies_kernel,
-            dim=(count, self.instances + len(FIXTURES)),
-            inputs=[scene.meshes, scene.cameras, scene.grid, snapshot.entry, snapshot.pose, snapshot.fixture_pose]
-            + [snapshot.fixture_visible, view_world, view_camera, self.instances],
-            outputs=[self.bodies],
-            device=scene.device,
-        )
+        inputs = [scene.meshes, scene.cameras, scene.grid, snapshot.entry, snapshot.pose, snapshot.fixture_pose]
+        inputs += [snapshot.fixture_visible, view_world, view_camera, self.instances]
+        dim = (count, self.instances + len(FIXTURES))
+        wp.launch(prepare_bodies_kernel, dim=dim, inputs=inputs, outputs=[self.bodies], device=scene.device)
 
     def trace_hits(self, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
         """Depth, identities and amodal bits, and the hits for shading."""
@@ -167,7 +164,8 @@ class Renderer:
     def filter_occlusion(self, view_camera: wp.array, count: int, sample: Any) -> None:
         """First pass of the filter over hidden shares."""
         scene = self.scene
-        inputs = [scene.meshes, scene.cameras, scene.grid, self.bodies, self.hits, self.picture.occlusion, view_camera, self.instances, sample]
+        inputs = [scene.meshes, scene.cameras, scene.grid, self.bodies, self.hits, self.picture.occlusion]
+        inputs += [view_camera, self.instances, sample]
         self._launch(filter_occlusion_kernel, count, inputs, [self.picture.smoothed])
 
     def shade(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, sample: Any) -> None:
