@@ -74,7 +74,8 @@ def test_functions_are_short():
 
 
 def test_every_module_says_what_it_is_for():
-    assert [str(path.relative_to(ROOT)) for path in sources() if ast.get_docstring(ast.parse(path.read_text())) is None] == []
+    modules = [path for path in sources() if path.relative_to(ROOT).parts[0] != "tests"]
+    assert [str(path.relative_to(ROOT)) for path in modules if ast.get_docstring(ast.parse(path.read_text())) is None] == []
 
 
 def test_host_code_postpones_annotations():
