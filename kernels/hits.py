@@ -147,9 +147,7 @@ def prepare_bodies_kernel(
     bodies_out.turn[view, body] = wp.mat33(wp.transpose(to_camera))
     bodies_out.start[view, body] = wp.vec3(start)
     bodies_out.near[view, body] = near
-    bodies_out.box[view, body] = projected_box(
-        meshes.lower[mesh], meshes.upper[mesh], to_camera, origin, cameras.intrinsics[camera], grid
-    )
+    bodies_out.box[view, body] = projected_box(meshes.lower[mesh], meshes.upper[mesh], to_camera, origin, cameras.intrinsics[camera], grid)
     bodies_out.world_turn[view, body] = wp.mat33(wp.transpose(turn))
     bodies_out.position[view, body] = p
     bodies_out.sphere[view, body] = wp.vec4(float(sphere[0]), float(sphere[1]), float(sphere[2]), radius * radius)

@@ -5,7 +5,7 @@ import warp as wp
 from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, tile_pixel
 from synpick_warp.kernels.environment import Lights, background_radiance, diffuse_irradiance, reflected_radiance, turned
 from synpick_warp.kernels.hits import NOTHING, TABLE, Bodies, Hits, Meshes, body_of
-from synpick_warp.kernels.occlusion import CELL, Sample, filtered_occlusion, hit_position, is_wide
+from synpick_warp.kernels.occlusion import CELL, Sample, filtered_occlusion, is_wide
 from synpick_warp.kernels.surfaces import Surface, Surfaces, base_color, mesh_surface, table_surface
 
 wp.set_module_options({"enable_backward": False})
@@ -140,21 +140,13 @@ def shade_kernel(
         radiance = background_radiance(lights, light[world], turned(-to_camera, -light_turn[world]))
     else:
         width = depth / cameras.intrinsics[camera][0]
-        position = hit_position(cameras, camera, ray, depth)
-        surface = table_surface(meshes, position, to_camera)
+        surface = table_surface(meshes, to_camera)
         if code != TABLE:
-            surface = mesh_surface(
-                meshes,
-                surfaces,
-                bodies,
-                view,
-                body_of(code, instances),
-                hits.triangle[view, row, column],
-                hits.barycentric[view, row, column],
-                position,
-                to_camera,
-                sample.footprint * width,
-            )
+            triangle = hits.triangle[view, row, column]
+            barycentric = hits.barycentric[view, row, column]
+            footprint = sample.footprint * width
+            body = body_of(code, instances)
+            surface = mesh_surface(meshes, surfaces, bodies, view, body, triangle, barycentric, to_camera, footprint)
         normal = wp.transpose(cameras.to_world[camera]) * surface.face_normal
         share = filtered_occlusion(hits, occlusion, grid, cameras.intrinsics[camera], sample.offset, view, row, column, normal, CELL)
         lit = share[0]

@@ -41,8 +41,6 @@ class Surface:
 
     row: int
     """Row of `Surfaces`."""
-    position: wp.vec3
-    """In the world [m]."""
     face_normal: wp.vec3
     """The triangle's, towards the camera."""
     normal: wp.vec3
@@ -61,10 +59,10 @@ def towards(normal: wp.vec3, reference: wp.vec3) -> wp.vec3:
 
 
 @wp.func
-def table_surface(meshes: Meshes, position: wp.vec3, view_direction: wp.vec3) -> Surface:
+def table_surface(meshes: Meshes, view_direction: wp.vec3) -> Surface:
+    """The table's surface; `view_direction` points to the camera."""
     result = Surface()
     result.row = meshes.entries + 3
-    result.position = position
     result.face_normal = towards(wp.vec3(0.0, 0.0, 1.0), view_direction)
     result.normal = result.face_normal
     return result
@@ -79,7 +77,6 @@ def mesh_surface(
     body: int,
     triangle: int,
     barycentric: wp.vec2,
-    position: wp.vec3,
     view_direction: wp.vec3,
     pixel_width: float,
 ) -> Surface:
@@ -88,7 +85,6 @@ def mesh_surface(
     to_world = wp.transpose(bodies.world_turn[view, body])
     result = Surface()
     result.row = mesh
-    result.position = position
     result.face_normal = towards(to_world * wp.mesh_eval_face_normal(meshes.id[mesh], triangle), view_direction)
     first = surfaces.first_vertex[mesh]
     i = first + wp.mesh_get_index(meshes.id[mesh], 3 * triangle)

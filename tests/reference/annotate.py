@@ -1,0 +1,39 @@
+"""Counts and boxes of instances, straight from images."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def box_of(mask: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[int, int, int, int]:
+    """x_min, y_min, x_max, y_max, inclusive, of a mask whose first pixel has column and row `origin`; (0, 0, -1, -1) if empty."""
+    rows, columns = np.nonzero(mask)
+    if len(rows) == 0:
+        return 0, 0, -1, -1
+    left, top = origin
+    return int(columns.min()) + left, int(rows.min()) + top, int(columns.max()) + left, int(rows.max()) + top
+
+
+def count_pixels(
+    instance: np.ndarray, depth: np.ndarray, amodal: np.ndarray, canvas: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """What annotation must find for one view.
+
+    Args:
+        instance: Codes (H, W).
+        depth: Counts (H, W).
+        amodal: Bits (H, W).
+        canvas: Bits (3H, 3W), of which the middle is the image.
+        count: Instances.
+
+    Returns:
+        px_count_all, px_count_valid, px_count_visib (count, 3); bbox_obj and bbox_visib (count, 2, 4).
+    """
+    height, width = instance.shape
+    pixels, boxes = np.zeros((count, 3), int), np.zeros((count, 2, 4), int)
+    for i in range(count):
+        bit = np.uint32(1) << np.uint32(i)
+        whole, inside, visible = (canvas & bit) != 0, (amodal & bit) != 0, instance == 1 + i
+        pixels[i] = whole.sum(), (inside & (depth != 0)).sum(), visible.sum()
+        boxes[i] = box_of(whole, (-width, -height)), box_of(visible)
+    return pixels, boxes

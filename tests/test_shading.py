@@ -1,0 +1,209 @@
+"""Colour: textures, light, shadow, exposure; the tables behind them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.shapes import LightMap, Material
+from synpick_warp.stages import launch
+from synpick_warp.stages.light_tables import blurred_reflections, harmonics, light_table, map_directions, split_main_light
+from synpick_warp.stages.render_scene import mip_levels, uv_density
+from tests.reference.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, even_light, render, sheet, sun
+
+VIEW = camera(64, 48, 200.0, (0.0, 0.0, 2.0))
+EVEN = even_light()
+FLAT = (0.0, 0.0, 0.0, *UPRIGHT)
+
+
+def with_render(**settings) -> Config:
+    return replace(Config(), render=replace(Config().render, **settings))
+
+
+def matt(color=(1.0, 1.0, 1.0), texture=None) -> Material:
+    return Material(color=color, texture=texture, metallic=0.0, roughness=1.0)
+
+
+def shown(material, device, *, mesh=None, lights=(EVEN,), view=VIEW, pose=FLAT, **more):
+    return render(ToyScene([entry(mesh or sheet(0.4, 0.3), material)], [[(0, pose)]], (view,), lights=lights, **more), device)
+
+
+def test_a_texture_stands_upright_and_is_not_mirrored(device):
+    # Row 0 of the image is v = 1, the sheet's +y edge, the picture's upper edge: red green / blue white.
+    texture = np.zeros((8, 8, 3), np.uint8)
+    texture[:4, :4], texture[:4, 4:], texture[4:, :4], texture[4:, 4:] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
+    color = shown(matt(texture=texture), device).color[0]
+    assert [int(np.argmax(color[row, column])) for row, column in ((17, 22), (17, 42), (31, 22))] == [0, 1, 2]
+    assert color[31, 42].min() > 100
+
+
+def test_a_texture_finer_than_the_pixels_is_averaged_in_linear_light(device):
+    texture = np.zeros((512, 512, 3), np.uint8)
+    texture[::2, ::2] = texture[1::2, 1::2] = 255
+    picture = shown(matt(texture=texture), device)
+    plain = shown(matt(color=(float(linear_to_srgb(0.5)),) * 3), device)
+    middle = (0, slice(15, 33), slice(18, 46))
+    np.testing.assert_allclose(picture.radiance[middle], plain.radiance[middle], rtol=0.01)
+
+
+def test_mip_levels_keep_the_mean_and_take_odd_sizes():
+    texture = np.random.default_rng(0).integers(0, 256, (37, 50, 3), dtype=np.uint8)
+    levels = mip_levels(texture)
+    assert [level.shape[:2] for level in levels] == [(37, 50), (18, 25), (9, 12), (4, 6), (2, 3), (1, 1)]
+    mean = srgb_to_linear(texture / 255.0).mean(axis=(0, 1))
+    np.testing.assert_allclose(srgb_to_linear(levels[-1][0, 0] / 255.0), mean, atol=0.03)
+
+
+def test_texture_density_is_texture_lengths_per_metre():
+    np.testing.assert_allclose(uv_density(sheet(0.5, 0.5)), 2.0, rtol=1e-6)
+    assert not uv_density(ball(0.1, 1)).any()
+
+
+def test_a_white_ball_in_an_even_room_nearly_vanishes(device):
+    # White, diffuse: it sends back what arrives. Four per cent of gloss come on top; the part-3 renderer shares them out.
+    picture = shown(matt(), device, mesh=ball(0.1, 4), lights=(even_light(2.0),), config=with_render(ambient_rays=0))
+    inside = picture.radiance[0][picture.instance[0] == 1]
+    np.testing.assert_allclose(picture.radiance[0, 0, 0], 2.0, rtol=1e-5)
+    assert inside.min() > 2.0 * 0.99
+    assert inside.max() < 2.0 * 1.07
+
+
+def test_exposure_does_not_depend_on_the_maps_scale_but_on_the_setting(device):
+    dim, bright = (shown(GREY, device, lights=(even_light(s),)).color for s in (0.01, 100.0))
+    assert np.abs(dim.astype(int) - bright).max() <= 1
+    more = shown(GREY, device, config=with_render(exposure=1.5)).color
+    assert (more.astype(int) - dim)[0, 24, 32].min() > 10
+
+
+def test_a_grey_sheet_has_the_brightness_worked_out_by_hand(device):
+    # Linear albedo 0.2 under an even map: 0.2 x 1.25 of white, below the shoulder of the tone curve, plus the gloss.
+    value = shown(matt((float(linear_to_srgb(0.2)),) * 3), device, config=with_render(ambient_rays=0)).color[0, 24, 32]
+    assert (value >= np.rint(255 * linear_to_srgb(0.25)) - 1).all()
+    assert (value <= np.rint(255 * linear_to_srgb(0.31))).all()
+
+
+def test_colours_are_finite_and_the_same_twice(device):
+    mirror = entry(ball(0.05, 3), replace(GREY, metallic=1.0, roughness=0.0))
+    toy = ToyScene([entry(box(0.1, 0.1, 0.1)), mirror], [[(0, FLAT), (1, (0.1, 0.0, 0.0, *UPRIGHT))]], (VIEW,))
+    toy.lights, toy.table, toy.fixtures_visible = (sun((0.3, 0.2, 0.8)),), True, (1, 1, 1)
+    first, second = render(toy, device), render(toy, device)
+    assert np.isfinite(first.radiance).all()
+    assert (first.radiance >= 0.0).all()
+    np.testing.assert_array_equal(first.color, second.color)
+
+
+@pytest.mark.parametrize("black", [0.0, 1e-6])
+def test_a_map_without_light_makes_a_black_picture(device, black):
+    picture = shown(GREY, device, lights=(even_light(black),))
+    assert np.isfinite(picture.radiance).all()
+
+
+def shadow_scene(direction, turn=0.0, **settings):
+    """A large sheet and a small one 0.1 m above its middle, under a sun."""
+    toy = ToyScene([entry(sheet(0.6, 0.4)), entry(sheet(0.04, 0.04))], [[(0, FLAT), (1, (0.0, 0.0, 0.1, *UPRIGHT))]], (VIEW,))
+    toy.lights, toy.light_turn, toy.config = (sun(direction),), turn, with_render(ambient_rays=0, **settings)
+    return toy
+
+
+def test_the_shadow_falls_away_from_the_light(device):
+    # The sun stands at 45° over +x, so the shadow of what floats at 0.1 m lies 0.1 m, 10 px, towards -x.
+    lit = render(shadow_scene((1.0, 0.0, 1.0)), device).radiance[0, :, :, 0]
+    assert lit[24, 22] < 0.65 * lit[24, 42]
+    np.testing.assert_allclose(lit[24, 42], lit[24, 50], rtol=0.02)
+    unshadowed = render(shadow_scene((1.0, 0.0, 1.0), shadow_rays=0), device).radiance[0, :, :, 0]
+    np.testing.assert_allclose(unshadowed[24, 22], lit[24, 42], rtol=0.02)
+
+
+def test_turning_the_light_turns_the_shadow(device):
+    # A quarter turn counter-clockwise: the sun stands over +y, the picture's upper edge, and the shadow falls to the lower one.
+    lit = render(shadow_scene((1.0, 0.0, 1.0), turn=np.pi / 2), device).radiance[0, :, :, 0]
+    assert lit[34, 32] < 0.65 * lit[14, 32]
+    np.testing.assert_allclose(lit[24, 22], lit[24, 42], rtol=0.02)
+
+
+def test_more_rays_change_little_but_the_noise(device):
+    few, many = (render(shadow_scene((1.0, 0.0, 1.0), shadow_rays=n), device).radiance[0, :, :, 0] for n in (1, 32))
+    assert np.abs(few - many).mean() < 0.02 * many.mean()
+
+
+def test_walls_darken_what_lies_between_them(device):
+    walls = [(1, (x, 0.0, 0.05, *UPRIGHT)) for x in (0.03, -0.03)]
+    toy = ToyScene([entry(sheet(0.6, 0.4)), entry(box(0.01, 0.2, 0.1))], [[(0, FLAT), *walls]], (VIEW,))
+    toy.config = with_render(ambient_rays=4)
+    lit = render(toy, device).radiance[0, :, :, 0]
+    assert lit[24, 32] < 0.8 * lit[24, 60]
+
+
+def test_an_open_plane_shows_no_pattern_of_rays(device):
+    # The filter's windows see all rays of a block, so that a plane beside a wall is smooth along the wall.
+    toy = ToyScene([entry(sheet(1.0, 1.0)), entry(box(0.01, 2.0, 0.2))], [[(0, FLAT), (1, (0.25, 0.0, 0.1, *UPRIGHT))]], (VIEW,))
+    lit = render(toy, device).radiance[0, 8:40, 8:40, 0]
+    assert (np.ptp(lit, axis=0) < 0.02 * lit.mean()).all()
+
+
+def test_samples_smooth_edges_of_colour_alone(device):
+    turned = (0.0, 0.0, 0.0, 0.0, 0.0, np.sin(0.2), np.cos(0.2))
+    one, many = (
+        shown(matt((0.2, 0.2, 0.2)), device, mesh=sheet(0.2, 0.2), pose=turned, config=with_render(color_samples=count)) for count in (1, 8)
+    )
+    np.testing.assert_array_equal(one.depth, many.depth)
+    np.testing.assert_array_equal(one.amodal, many.amodal)
+    low, high = one.color[0, 24, 32, 0], one.color[0, 0, 0, 0]
+    between = [((image.color[0, :, :, 0] > low + 10) & (image.color[0, :, :, 0] < high - 10)).sum() for image in (one, many)]
+    assert between[0] == 0
+    assert between[1] > 40
+
+
+def test_several_threads_render_what_one_does(device, monkeypatch):
+    toy = shadow_scene((1.0, 0.5, 1.0))
+    monkeypatch.setattr(launch, "_cores", lambda: 1)
+    alone = render(toy, device)
+    monkeypatch.setattr(launch, "_cores", lambda: 2)
+    monkeypatch.setattr(launch, "CHUNK_PIXELS", 256)
+    together = render(toy, device)
+    for name in ("color", "depth", "instance", "amodal"):
+        np.testing.assert_array_equal(getattr(alone, name), getattr(together, name))
+
+
+def test_harmonics_give_the_irradiance_of_an_even_map():
+    coefficients = light_table(even_light(3.0), None).irradiance
+    normals = np.random.default_rng(0).normal(size=(20, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    np.testing.assert_allclose(harmonics(normals) @ coefficients, 3.0 * np.pi, rtol=1e-3)
+
+
+def test_harmonics_give_the_irradiance_of_a_gradient():
+    # Radiance 1 + z: E(n) = π + 2π/3 n_z.
+    directions, _ = map_directions(64)
+    radiance = np.repeat((1.0 + directions[..., 2:]).astype(np.float32), 3, axis=2)
+    coefficients = light_table(LightMap("gradient", radiance), None).irradiance
+    np.testing.assert_allclose(harmonics(np.array([0.6, 0.0, 0.8])) @ coefficients, np.pi + 2 * np.pi / 3 * 0.8, rtol=2e-3)
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.4), (-0.3, -0.8, 0.5)])
+def test_the_main_light_is_where_the_sun_is_and_energy_is_kept(direction):
+    light = sun(direction).radiance.astype(np.float64)
+    _, solid = map_directions(len(light))
+    rest, found, irradiance, spread = split_main_light(light)
+    assert found @ np.array(direction) / np.linalg.norm(direction) > np.cos(np.radians(2.0))
+    np.testing.assert_allclose(irradiance + (rest * solid[..., None]).sum(axis=(0, 1)), (light * solid[..., None]).sum(axis=(0, 1)))
+    assert 0.0 <= spread < 0.03
+    assert rest.max() < 10.0
+
+
+def test_an_even_map_has_no_main_light():
+    assert not split_main_light(np.ones((32, 64, 3)))[2].any()
+
+
+def test_reflections_of_an_even_map_are_even_and_those_of_a_spot_lie_where_it_is():
+    np.testing.assert_allclose(blurred_reflections(np.full((16, 32, 3), 0.7)), 0.7, rtol=1e-6)
+    spot = np.zeros((16, 32, 3))
+    spot[5, 20] = 1.0
+    blurred = blurred_reflections(spot)[..., 0]
+    assert all(np.unravel_index(level.argmax(), level.shape)[1] == 20 for level in blurred)
+    assert np.unravel_index(blurred[0].argmax(), blurred[0].shape) == (5, 20)
+    assert (np.diff(blurred.max(axis=(1, 2))) < 0.0).all()
