@@ -47,6 +47,8 @@ class Label:
     text: Color
     motif: Motif
     seed: int
+    food: bool = True
+    """Food has a table of nutrition facts."""
 
 
 def front(width: int, height: int, label: Label) -> np.ndarray:
@@ -70,7 +72,7 @@ def back(width: int, height: int, label: Label) -> np.ndarray:
     paint.write(image, " ".join(label.title), (0.06, 0.03, 0.94, 0.13), label.text)
     paint.small_print(image, (0.08, 0.2, 0.92, 0.5), (92, 88, 84), 8, label.seed)
     paint.fill(image, (0.08, 0.53, 0.56, 0.94), label.accent)
-    paint.small_print(image, (0.11, 0.56, 0.53, 0.91), paint.PAPER, 7, label.seed + 1)
+    paint.small_print(image, (0.11, 0.56, 0.53, 0.91), paint.legible(label.accent), 7, label.seed + 1)
     paint.bar_code(image, (0.6, 0.72, 0.94, 0.94), label.seed + 2)
     return image
 
@@ -83,7 +85,12 @@ def side(width: int, height: int, label: Label) -> np.ndarray:
         paint.facts(image, (0.68, 0.06, 0.97, 0.94), label.seed + 3)
         return image
     paint.write(image, " ".join(label.title), (0.06, 0.03, 0.94, 0.13), label.text)
-    paint.facts(image, (0.08, 0.16, 0.92, 0.62), label.seed + 3)
+    if label.food:
+        paint.facts(image, (0.08, 0.16, 0.92, 0.62), label.seed + 3)
+    else:
+        paint.fill(image, (0.08, 0.16, 0.92, 0.62), paint.PAPER)
+        paint.write(image, "Directions", (0.14, 0.18, 0.86, 0.26), paint.INK)
+        paint.small_print(image, (0.14, 0.28, 0.86, 0.6), paint.INK, 10, label.seed + 3)
     paint.small_print(image, (0.1, 0.66, 0.9, 0.95), label.text, 9, label.seed + 4)
     return image
 
@@ -91,13 +98,14 @@ def side(width: int, height: int, label: Label) -> np.ndarray:
 def other_side(width: int, height: int, label: Label) -> np.ndarray:
     """The panel with the name alone."""
     image = paint.blank(width, height, label.accent)
+    text = paint.legible(label.accent)
     if width > height:
-        paint.write(image, " ".join(label.title), (0.05, 0.12, 0.7, 0.88), label.text)
+        paint.write(image, " ".join(label.title), (0.05, 0.12, 0.7, 0.88), text)
         paint.bar_code(image, (0.74, 0.15, 0.97, 0.85), label.seed + 5)
         return image
-    paint.write(image, " ".join(label.title), (0.06, 0.06, 0.94, 0.2), label.text)
-    paint.small_print(image, (0.1, 0.3, 0.9, 0.6), label.text, 8, label.seed + 6)
-    paint.write(image, label.net, (0.1, 0.85, 0.9, 0.93), label.text, paint.FONT)
+    paint.write(image, " ".join(label.title), (0.06, 0.06, 0.94, 0.2), text)
+    paint.small_print(image, (0.1, 0.3, 0.9, 0.6), text, 8, label.seed + 6)
+    paint.write(image, label.net, (0.1, 0.85, 0.9, 0.93), text, paint.FONT)
     return image
 
 
@@ -171,7 +179,9 @@ def stamped_end(size: int, color: Color, seed: int, text: str) -> np.ndarray:
 
 
 def bottle(
-    levels: list[tuple[float, float, float, float]], neck: list[tuple[float, float]], band: tuple[int, int],
+    levels: list[tuple[float, float, float, float]],
+    neck: list[tuple[float, float]],
+    band: tuple[int, int],
     images: dict[str, np.ndarray],
 ) -> Shape:
     """A bottle with a screw cap.
@@ -181,7 +191,7 @@ def bottle(
         neck: (radius, z) of the cap's profile, from its lower edge to its top [m].
         band: First and last level that carry the label.
         images: `label` (unrolled), `body`, `cap`.
-    """  # fmt: skip
+    """
     texture, at = paint.pack(images, SHEET)
     rings = np.stack([at_height(ellipse(width, depth, SIDES, exponent), z) for width, depth, exponent, z in levels])
     first, last = band

@@ -33,7 +33,7 @@ STEEL = (186, 189, 194)
 def banana() -> Shape:
     """A banana, lying flat."""
     turn = np.radians(np.linspace(-62, 62, 33))
-    bend = 0.098
+    bend = 0.1065
     path = np.stack([bend * np.cos(turn), bend * np.sin(turn), np.zeros_like(turn)], axis=1)
     share = np.linspace(0, 1, len(turn))
     knots = [0.0, 0.02, 0.07, 0.2, 0.5, 0.75, 0.87, 0.92, 0.98, 1.0]
@@ -61,12 +61,14 @@ def drill() -> Shape:
         cap(parts[0][0], at["black"], below=True), loft(parts[0], at["black"]), loft(parts[1], at["motor"]),
         loft(parts[2], at["black"]), cap(parts[2][-1], at["black"]),
     )  # fmt: skip
-    chuck = solid(lathe([(0.0200, 0.030), (0.0212, 0.033), (0.0212, 0.055), (0.0190, 0.058), (0.0120, 0.087), (0.0085, 0.092)], 40), at["steel"])
+    chuck = solid(
+        lathe([(0.0200, 0.030), (0.0212, 0.033), (0.0212, 0.055), (0.0190, 0.058), (0.0120, 0.087), (0.0085, 0.092)], 40), at["steel"]
+    )
     grip = [
         (-0.040, 0.040, 0.034, -0.072), (-0.037, 0.036, 0.032, -0.050), (-0.035, 0.036, 0.033, -0.020),
         (-0.033, 0.039, 0.035, 0.010), (-0.031, 0.046, 0.038, 0.032), (-0.030, 0.052, 0.040, 0.052),
     ]  # fmt: skip
-    handle = np.stack([at_height(ellipse(width, depth, 32, 2.6) + (x, 0.0), z) for x, width, depth, z in grip])
+    handle = np.stack([at_height(ellipse(width, depth, 32, 2.6) + np.array([x, 0.0]), z) for x, width, depth, z in grip])
     battery = rounded_box((0.114, 0.0565, 0.030), 0.006, dict.fromkeys(BOX_FACES, at["black"])).moved(-0.034, 0.0, -0.0787)
     foot = rounded_box((0.098, 0.050, 0.012), 0.004, dict.fromkeys(BOX_FACES, at["orange"])).moved(-0.036, 0.0, -0.0600)
     trigger = rounded_box((0.016, 0.016, 0.028), 0.004, dict.fromkeys(BOX_FACES, at["orange"])).moved(-0.010, 0.0, 0.020)
@@ -91,7 +93,11 @@ def foam_block() -> Shape:
 
 def scissors() -> Shape:
     """Scissors, nearly closed, with one larger loop."""
-    images = {"steel": paint.brushed(256, 64, STEEL, 1700), "grip": paint.plain((36, 78, 160), 1701), "screw": paint.plain((120, 122, 128), 1702)}
+    images = {
+        "steel": paint.brushed(256, 64, STEEL, 1700),
+        "grip": paint.plain((36, 78, 160), 1701),
+        "screw": paint.plain((120, 122, 128), 1702),
+    }
     texture, at = paint.pack(images, 512)
     parts = []
     for side, center, radii in ((-1.0, (-0.0270, -0.0660), (0.0150, 0.0240)), (1.0, (0.0250, -0.0640), (0.0175, 0.0305))):

@@ -14,7 +14,15 @@ SIDES = 64
 
 def bowl() -> Shape:
     """A bowl of enamel: red outside, cream inside, a dark rim. Nothing on it tells how it is turned."""
-    outside = [(0.032, -0.0275), (0.034, -0.0275), (0.0345, -0.0262), (0.044, -0.0235), (0.058, -0.0150), (0.069, -0.0030), (0.0765, 0.0110)]
+    outside = [
+        (0.032, -0.0275),
+        (0.034, -0.0275),
+        (0.0345, -0.0262),
+        (0.044, -0.0235),
+        (0.058, -0.0150),
+        (0.069, -0.0030),
+        (0.0765, 0.0110),
+    ]
     upper = [(0.0765, 0.0110), (0.0800, 0.0250)]
     rim = [(0.0800, 0.0250), (0.0807, 0.0266), (0.0802, 0.0275), (0.0790, 0.0272), (0.0780, 0.0255)]
     inside = [(0.0780, 0.0255), (0.0742, 0.0110), (0.0668, -0.0024), (0.0560, -0.0136), (0.0425, -0.0215), (0.0260, -0.0240)]
@@ -60,7 +68,8 @@ def pitcher() -> Shape:
         cap(rings[0][0], at["blue"], below=True), loft(rings[0], at["blue"]), loft(rings[1], at["scale"]),
         loft(rings[2], at["blue"]), loft(rings[3], at["blue"]), cap(rings[3][-1], at["blue"]),
     )  # fmt: skip
-    handle = _handle((0.0592, 0.034, 0.075), (0.024, 0.011), at["blue"]).moved(0.0, 0.0, 0.012)
+    along_wall = 2.56  # the wall leans out by this angle [°]
+    handle = _handle((0.0597, 0.030, 0.075), (0.024, 0.011), at["blue"]).turned("y", along_wall).moved(0.0, 0.0, 0.012)
     return join(body, handle), texture
 
 
@@ -94,10 +103,10 @@ def _mug_print(width: int, height: int, color: paint.Color) -> np.ndarray:
     paint.fill(image, (0.0, 0.0, 1.0, 0.08), (240, 236, 224))
     paint.fill(image, (0.0, 0.92, 1.0, 1.0), (240, 236, 224))
     for turn in np.arange(12) * np.pi / 6:
-        paint.dot(image, 0.36 + 0.058 * np.cos(turn), 0.5 + 0.227 * np.sin(turn), 0.055, (246, 190, 60))
-    paint.dot(image, 0.36, 0.5, 0.2, (246, 190, 60))
-    paint.write(image, "GOOD", (0.46, 0.2, 0.68, 0.5), (240, 236, 224))
-    paint.write(image, "MORNING", (0.46, 0.52, 0.68, 0.8), (246, 190, 60))
+        paint.dot(image, 0.32 + 0.058 * np.cos(turn), 0.5 + 0.227 * np.sin(turn), 0.055, (246, 190, 60))
+    paint.dot(image, 0.32, 0.5, 0.2, (246, 190, 60))
+    paint.write(image, "GOOD", (0.405, 0.2, 0.62, 0.5), (240, 236, 224))
+    paint.write(image, "MORNING", (0.405, 0.52, 0.62, 0.8), (246, 190, 60))
     return image
 
 

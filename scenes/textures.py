@@ -26,6 +26,11 @@ def blank(width: int, height: int, color: Color) -> np.ndarray:
     return np.full((height, width, 3), color, np.uint8)
 
 
+def legible(ground: Color) -> Color:
+    """The colour of print that stands out from the ground: dark on light, light on dark."""
+    return INK if 0.3 * ground[0] + 0.6 * ground[1] + 0.1 * ground[2] > 130 else PAPER
+
+
 def pack(images: dict[str, np.ndarray], width: int) -> tuple[np.ndarray, dict[str, Rect]]:
     """Put images on one sheet of the given width [px], in rows in the order given; the sheet and where each image lies."""
     places: dict[str, tuple[int, int]] = {}
@@ -168,7 +173,7 @@ def foam(width: int, height: int, color: Color, seed: int) -> np.ndarray:
     """Fine-pored foam, the same after half a turn."""
     pores = _half_turn(grain(width, height, (3, 3), seed))
     blotch = _half_turn(grain(width, height, (30, 30), seed + 1)) - 0.5
-    tone = 1 - 0.5 * np.clip(0.42 - pores, 0, 1) * 4 * 0.5 + 0.12 * blotch
+    tone = 1 - np.clip(0.42 - pores, 0, 1) + 0.12 * blotch
     return _shade(np.array(color, np.float32) * tone[..., None])
 
 
