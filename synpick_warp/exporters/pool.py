@@ -1,0 +1,277 @@
+"""Writer processes: bounded queues, images handed over through shared memory, and no failure unheard."""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from synpick_warp.errors import OutputError
+from synpick_warp.exporters.files import output_error
+from synpick_warp.exporters.worker import Failure, SharedImage, Task, run
+
+QUEUE = 4
+"""Tasks that a process has at hand, with the one it runs: enough to bridge the time in which the bake makes the next batch."""
+_ALIGNMENT = 64
+"""Images begin at a multiple of a cache line [B]."""
+_END_TIMEOUT = 10.0
+"""How long a process may take to end when it has nothing left to do [s]."""
+_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
+"""The processes are the parallelism: no threads within them."""
+
+
+@dataclass(eq=False)
+class _Job:
+    task: Task
+    path: Path
+    done: Callable[[], None] | None
+    slot: int | None
+
+
+@dataclass(eq=False)
+class _Worker:
+    process: subprocess.Popen[bytes]
+    link: Connection
+    jobs: deque[_Job] = field(default_factory=deque)
+
+
+def shared_bytes(images: Sequence[np.ndarray]) -> int:
+    """Room that images take in shared memory [B]."""
+    return sum(-(-image.nbytes // _ALIGNMENT) * _ALIGNMENT for image in images)
+
+
+class WriterPool:
+    """Processes that write files. Use it as a context manager: it closes after success and aborts after an error.
+
+    The processes are interpreters of their own: not forked, because CUDA and threads do not survive a fork, and not
+    `multiprocessing`'s spawned ones, because those import the main script again, and with it the whole simulator. The
+    shared memory has no name, so there is nothing to leak however the bake ends.
+    """
+
+    def __init__(self, processes: int, slot_bytes: int) -> None:
+        """
+        Args:
+            processes: How many processes; 0: tasks run in this one.
+            slot_bytes: Most room that the images of one task take, see `shared_bytes` [B].
+
+        Raises:
+            OutputError: There is no memory or no process to be had.
+        """
+        self._slot_bytes = -(-max(slot_bytes, 1) // mmap.PAGESIZE) * mmap.PAGESIZE
+        slots = max(1, processes * QUEUE)
+        self._free = list(range(slots))
+        self._waiting: deque[_Job] = deque()
+        self._workers: list[_Worker] = []
+        self._failure: OutputError | None = None
+        self._ended = False
+        try:
+            handle, self._memory = _shared_memory(slots * self._slot_bytes)
+        except OSError as error:
+            raise OutputError(f"no shared memory for {processes} writer processes: {error}; set bake.writers lower") from error
+        try:
+            for _ in range(processes):
+                self._workers.append(_start(handle))
+        except OSError as error:
+            self.abort()
+            raise OutputError(f"cannot start {processes} writer processes: {error}; set bake.writers lower") from error
+        finally:
+            os.close(handle)
+
+    def submit(
+        self,
+        function: Callable[..., None],
+        images: Sequence[np.ndarray],
+        arguments: tuple[Any, ...],
+        *,
+        path: Path,
+        done: Callable[[], None] | None = None,
+    ) -> None:
+        """Have `function(*images, *arguments)` called in a process. Tasks with images wait until there is room for these.
+
+        Args:
+            function: Stands at the top of a module that imports quickly.
+            images: Copied into shared memory before this returns.
+            arguments: Pickled; keep them small.
+            path: What the task writes, for error messages.
+            done: Called from a later call of the pool, in the caller's thread, once the task succeeded. It may submit tasks without images.
+
+        Raises:
+            OutputError: This or an earlier task failed, or a process died.
+        """
+        self._check()
+        slot = None
+        if images:
+            while not self._free:
+                self._collect(None)
+            slot = self._free.pop()
+        self._waiting.append(_Job(Task(function, self._share(images, slot), arguments), path, done, slot))
+        self._collect(0.0)
+
+    def poll(self) -> None:
+        """Hear from the processes without waiting. Raises like `submit`."""
+        self._check()
+        self._collect(0.0)
+
+    def wait(self) -> None:
+        """Wait until every task is done. Raises like `submit`."""
+        self._check()
+        self._collect(0.0)
+        while self._waiting or any(worker.jobs for worker in self._workers):
+            self._collect(None)
+
+    def close(self) -> None:
+        """Wait until every task is done, and end the processes. Raises like `submit`; the processes end in any case."""
+        if self._ended:
+            return
+        try:
+            self.wait()
+            for worker in self._workers:
+                worker.link.send(None)
+            for worker in self._workers:
+                worker.process.wait(_END_TIMEOUT)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise OutputError(f"a writer process did not end: {error}") from error
+        finally:
+            self.abort()
+
+    def abort(self) -> None:
+        """End the processes at once. Never raises."""
+        self._ended = True
+        for worker in self._workers:
+            worker.process.kill()
+            worker.process.wait()
+            worker.link.close()
+        self._workers.clear()
+        self._waiting.clear()
+        with contextlib.suppress(BufferError):
+            self._memory.close()
+
+    def __enter__(self) -> WriterPool:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abort()
+
+    def _share(self, images: Sequence[np.ndarray], slot: int | None) -> tuple[SharedImage, ...]:
+        if slot is None:
+            return ()
+        if shared_bytes(images) > self._slot_bytes:
+            raise ValueError(f"images of {shared_bytes(images)} bytes exceed the {self._slot_bytes} that the pool was made for")
+        offset = slot * self._slot_bytes
+        shared = []
+        for image in images:
+            place = SharedImage(offset, image.shape, image.dtype.str)
+            np.copyto(place.of(self._memory), image)
+            shared.append(place)
+            offset += shared_bytes((image,))
+        return tuple(shared)
+
+    def _collect(self, timeout: float | None) -> None:
+        """Hand out tasks and hear about finished ones; `None` waits for at least one."""
+        if not self._workers:
+            self._run_here()
+            return
+        self._hand_out()
+        links = {worker.link: worker for worker in self._workers}
+        for link in wait(list(links), timeout):
+            worker = links[link]  # type: ignore[index]
+            try:
+                failure: Failure | None = worker.link.recv()
+            except (EOFError, OSError):
+                self._fail_dead(worker)
+            job = worker.jobs.popleft()
+            self._finish(job, failure)
+        self._hand_out()
+
+    def _hand_out(self) -> None:
+        while self._waiting:
+            worker = min(self._workers, key=lambda candidate: len(candidate.jobs))
+            if len(worker.jobs) == QUEUE:
+                return
+            job = self._waiting.popleft()
+            worker.jobs.append(job)
+            try:
+                worker.link.send(job.task)
+            except OSError:
+                self._fail_dead(worker)
+
+    def _run_here(self) -> None:
+        while self._waiting:
+            job = self._waiting.popleft()
+            self._finish(job, run(job.task, self._memory))
+
+    def _finish(self, job: _Job, failure: Failure | None) -> None:
+        if failure is not None:
+            self._fail(_describe(failure, job.path), failure.trace)
+        if job.slot is not None:
+            self._free.append(job.slot)
+        if job.done is not None:
+            job.done()
+
+    def _fail_dead(self, worker: _Worker) -> NoReturn:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            worker.process.wait(_END_TIMEOUT)
+        code = worker.process.returncode
+        how = f"was ended by {signal.Signals(-code).name}" if code and code < 0 else f"ended with exit code {code}"
+        what = f"while it wrote {worker.jobs[0].path}" if worker.jobs else "while it had nothing to do"
+        self._fail(OutputError(f"a writer process {how} {what}; if memory ran out, set bake.writers to a smaller number"), "")
+
+    def _fail(self, error: OutputError, trace: str) -> NoReturn:
+        if trace:
+            error.add_note(trace)
+        self._failure = error
+        raise error
+
+    def _check(self) -> None:
+        if self._failure is not None:
+            raise self._failure
+        if self._ended:
+            raise OutputError("the writer processes have ended; make a new pool")
+
+
+def _describe(failure: Failure, path: Path) -> OutputError:
+    if failure.system is None:
+        return OutputError(f"cannot write {path}: {failure.error}")
+    code, reason, name = failure.system
+    return output_error(path, OSError(code, reason, name or str(path)))
+
+
+def _shared_memory(size: int) -> tuple[int, mmap.mmap]:
+    """Memory without a name, as an open file handle and mapped. Unlike /dev/shm, its size is not limited in containers."""
+    if hasattr(os, "memfd_create"):
+        handle = os.memfd_create("synpick-warp")
+    else:
+        with tempfile.TemporaryFile() as file:
+            handle = os.dup(file.fileno())
+    os.ftruncate(handle, size)
+    return handle, mmap.mmap(handle, size)
+
+
+def _start(memory: int) -> _Worker:
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
+        process = subprocess.Popen(
+            (sys.executable, "-P", "-c", "from synpick_warp.exporters.worker import main; main()", str(theirs.fileno()), str(memory)),
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": paths},
+            pass_fds=(theirs.fileno(), memory),
+            process_group=0,  # A terminal's Ctrl-C goes to the bake alone, even before the process can ignore it.
+        )
+        return _Worker(process, Connection(ours.detach()))
