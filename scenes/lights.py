@@ -73,8 +73,11 @@ def _read_set(path: Path) -> LightMap:
     if _number(parser, path, "REFmap", 1.0) != 1.0:
         raise LightError(f"{path} has REFmap = {_text(parser, 'Reflection', 'REFmap')}; only 1, a spherical map, can be read")
     gain = _number(parser, path, "REFmulti", 1.0)
-    image = _read_image(path.parent / file, gamma=_number(parser, path, "REFgamma", 1.0))
-    return LightMap(path.stem, _finish(image * np.float32(gain), path))
+    picture = path.parent / file
+    image = _read_image(picture, gamma=_number(parser, path, "REFgamma", 1.0))
+    with np.errstate(over="ignore"):  # what becomes infinite is refused with the rest
+        image = image * np.float32(gain)
+    return LightMap(path.stem, _finish(image, picture))
 
 
 def _text(parser: configparser.ConfigParser, section: str, key: str) -> str:
@@ -101,12 +104,7 @@ def _read_image(path: Path, gamma: float) -> np.ndarray:
     Radiance maps are linear by their format; published sets nevertheless name a gamma for them, as a hint for renderers
     that do not work in linear light, so it is applied to pictures of 8 or 16 bits alone.
     """
-    image = None
-    try:
-        if np.fromfile(path, dtype=np.uint8, count=2).size == 2:
-            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_ANYDEPTH)
-    except cv2.error:
-        image = None
+    image = _decode(path)
     if image is None:
         raise LightError(f"{path} cannot be read as an image: it is empty, cut short or of another format; replace it")
     if image.ndim != 3 or image.shape[2] < 3:
@@ -115,6 +113,21 @@ def _read_image(path: Path, gamma: float) -> np.ndarray:
     if image.dtype in (np.uint8, np.uint16):
         linear = (linear / np.float32(255 if image.dtype == np.uint8 else 65535)) ** np.float32(gamma)
     return linear
+
+
+def _decode(path: Path) -> np.ndarray | None:
+    """The picture as stored, channels as OpenCV has them; None if it cannot be read. OpenCV's own messages are kept quiet."""
+    if not path.stat().st_size:
+        return None
+    logging = cv2.utils.logging
+    level = logging.getLogLevel()
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_ANYDEPTH)
+    except cv2.error:
+        return None
+    finally:
+        logging.setLogLevel(level)
 
 
 def _finish(image: np.ndarray, path: Path) -> np.ndarray:
