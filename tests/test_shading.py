@@ -9,10 +9,11 @@ import pytest
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
-from synpick_warp.scenes.shapes import LightMap, Material
+from synpick_warp.scenes.shapes import Catalog, LightMap, Material
 from synpick_warp.stages import launch
 from synpick_warp.stages.light_tables import blurred_reflections, harmonics, light_table, map_directions, split_main_light
-from synpick_warp.stages.render_scene import mip_levels, uv_density
+from synpick_warp.stages.render import Renderer
+from synpick_warp.stages.render_scene import build_render_scene, mip_levels, uv_density
 from tests.reference.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, even_light, render, sheet, sun
 
 VIEW = camera(64, 48, 200.0, (0.0, 0.0, 2.0))
@@ -207,3 +208,11 @@ def test_reflections_of_an_even_map_are_even_and_those_of_a_spot_lie_where_it_is
     assert all(np.unravel_index(level.argmax(), level.shape)[1] == 20 for level in blurred)
     assert np.unravel_index(blurred[0].argmax(), blurred[0].shape) == (5, 20)
     assert (np.diff(blurred.max(axis=(1, 2))) < 0.0).all()
+
+
+def test_a_batch_larger_than_the_scratch_is_refused(device):
+    toy = ToyScene([entry(sheet(0.1, 0.1))], [[(0, FLAT)]], (VIEW,))
+    scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+    renderer = Renderer(toy.settings(), scene, toy.room, 1)
+    with pytest.raises(ValueError, match="2 views in a batch; this renderer has scratch for 1"):
+        renderer.render(None, None, None, 2, None)

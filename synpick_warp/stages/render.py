@@ -87,15 +87,18 @@ class Renderer:
     """Renders and annotates batches of views. Owns its scratch; `render` only launches, so a CUDA graph can capture it."""
 
     def __init__(self, config: Config, scene: RenderScene, instances: int, views: int) -> None:
-        """Args:
-        config: All settings.
-        scene: Constant data.
-        instances: Room for instances of a world, at most 32: one bit each.
-        views: Most views of a batch.
+        """Allocate scratch.
+
+        Args:
+            config: All settings.
+            scene: Constant data.
+            instances: Room for instances of a world, at most 32: one bit each.
+            views: Most views of a batch.
         """
         sizes = {"view": views, "body": instances + len(FIXTURES), "row": scene.height, "column": scene.width}
         self.scene = scene
         self.instances = instances
+        self.views = views
         self.counts_per_meter = 1000.0 / config.bop.depth_scale
         self.arrays = (
             allocate(BodyArrays, sizes, scene.device),
@@ -120,11 +123,17 @@ class Renderer:
             view_camera: Camera of each view (B) int32.
             count: Views in use, known on the host.
             out: Written.
+
+        Raises:
+            ValueError: More views than there is scratch for.
         """
+        if count > self.views:
+            raise ValueError(f"{count} views in a batch; this renderer has scratch for {self.views}")
         if count == 0:
             return
         self.prepare_bodies(snapshot, view_world, view_camera, count)
         self.trace_hits(view_camera, count, out)
+        # Layers made from `hits` belong here: further colour samples replace them.
         for sample in self.samples:
             if len(self.samples) > 1:
                 self.trace_sample(view_camera, count, sample)
