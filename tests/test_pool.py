@@ -57,6 +57,24 @@ def interrupt(path: Path) -> None:
     path.write_text(" ".join(sorted(sys.modules)))
 
 
+def submit_and_wait(pool: WriterPool, function: object, argument: Path, path: Path) -> None:
+    pool.submit(function, (), (argument,), path=path)
+    pool.wait()
+
+
+def run_one(count: int, function: object, argument: Path, path: Path) -> None:
+    with WriterPool(count, SIZE) as pool:
+        submit_and_wait(pool, function, argument, path)
+
+
+def kill_one(path: Path) -> None:
+    with WriterPool(2, SIZE) as pool:
+        processes(pool)[1].kill()
+        processes(pool)[1].wait()
+        pool.submit(note, (), (path, "a"), path=path)
+        pool.wait()
+
+
 def processes(pool: WriterPool) -> list[subprocess.Popen[bytes]]:
     return [worker.process for worker in pool._workers]
 
@@ -141,9 +159,8 @@ def test_an_abort_ends_what_runs(tmp_path):
 @pytest.mark.parametrize("count", [0, 2])
 def test_a_full_disk_is_one_clear_line(tmp_path, count):
     path = tmp_path / "picture.png"
-    with pytest.raises(OutputError) as caught, WriterPool(count, SIZE) as pool:
-        pool.submit(fill_the_disk, (), (path,), path=tmp_path)
-        pool.wait()
+    with pytest.raises(OutputError) as caught:
+        run_one(count, fill_the_disk, path, tmp_path)
     line = str(caught.value)
     assert line == f"cannot write {path}: No space left on device; free space or rights there, or name another folder with --out"
 
@@ -152,8 +169,7 @@ def test_a_full_disk_is_one_clear_line(tmp_path, count):
 def test_a_failure_comes_up_at_the_next_call_and_stays(tmp_path, count):
     pool = WriterPool(count, SIZE)
     with pytest.raises(OutputError, match="ValueError: two lines") as caught:
-        pool.submit(stumble, (), (tmp_path,), path=tmp_path)
-        pool.wait()
+        submit_and_wait(pool, stumble, tmp_path, tmp_path)
     assert str(tmp_path) in str(caught.value)
     assert "Traceback" in caught.value.__notes__[0]
     for call in (pool.poll, pool.wait, pool.close):
@@ -163,17 +179,13 @@ def test_a_failure_comes_up_at_the_next_call_and_stays(tmp_path, count):
 
 
 def test_a_dead_process_is_reported_with_what_it_wrote(tmp_path):
-    with pytest.raises(OutputError, match=r"was ended by SIGKILL while it wrote .*scene 3"), WriterPool(2, SIZE) as pool:
-        pool.submit(die, (), (tmp_path,), path=tmp_path / "scene 3")
-        pool.wait()
+    with pytest.raises(OutputError, match=r"was ended by SIGKILL while it wrote .*scene 3"):
+        run_one(2, die, tmp_path, tmp_path / "scene 3")
 
 
 def test_a_process_that_dies_while_it_waits_is_noticed(tmp_path):
-    with pytest.raises(OutputError, match="while it had nothing to do"), WriterPool(2, SIZE) as pool:
-        processes(pool)[1].kill()
-        processes(pool)[1].wait()
-        pool.submit(note, (), (tmp_path / "a", "a"), path=tmp_path)
-        pool.wait()
+    with pytest.raises(OutputError, match="while it had nothing to do"):
+        kill_one(tmp_path / "a")
 
 
 def test_processes_survive_ctrl_c_and_never_load_the_simulator(tmp_path):
@@ -186,7 +198,7 @@ def test_processes_survive_ctrl_c_and_never_load_the_simulator(tmp_path):
 
 
 def test_the_processes_end_when_the_bake_is_killed(tmp_path):
-    script = f"""
+    script = """
 import os, signal
 from synpick_warp.exporters.pool import WriterPool
 pool = WriterPool(2, 1 << 16)

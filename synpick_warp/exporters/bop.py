@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from dataclasses import dataclass
 from functools import partial
@@ -10,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.bop_models import write_constants
+from synpick_warp.exporters.bop_models import CAMERA_FILE, MODEL_FOLDERS, NOTES_FILE, write_constants
 from synpick_warp.exporters.bop_scene import SceneSettings, drop_scenes, finish_episode, make_scene
 from synpick_warp.exporters.bop_view import MILLIMETERS, ViewSettings, ViewTruth, write_view
 from synpick_warp.exporters.files import PARTIAL, output_error, prepare_output
 from synpick_warp.exporters.pool import WriterPool
-from synpick_warp.exporters.targets import join_targets, write_scene_targets
+from synpick_warp.exporters.targets import BOP19, BOP24, join_targets, write_scene_targets
 from synpick_warp.frames import EpisodeEnd, FrameBatch
 from synpick_warp.outcome import Outcome
 from synpick_warp.scenes.shapes import Camera, Catalog
@@ -63,6 +64,7 @@ class BopExporter:
             (out / PARTIAL).mkdir()
             write_constants(out, config, catalog, cameras, episodes)
         except OSError as error:
+            self._remove_all()
             raise output_error(out, error) from error
 
     def write(self, batch: FrameBatch) -> None:
@@ -103,10 +105,22 @@ class BopExporter:
             raise output_error(self._out, error) from error
 
     def abort(self) -> None:
-        """See `Exporter`."""
+        """See `Exporter`. Without any whole scene, nothing stays at all."""
         self._pool.abort()
         self._episodes.clear()
         shutil.rmtree(self._out / PARTIAL, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            self._split.rmdir()
+            self._remove_all()
+
+    def _remove_all(self) -> None:
+        """Remove what the exporter made, but no whole scene."""
+        for name in (PARTIAL, *MODEL_FOLDERS):
+            shutil.rmtree(self._out / name, ignore_errors=True)
+        for name in (CAMERA_FILE, NOTES_FILE, BOP19, BOP24):
+            (self._out / name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self._split.rmdir()
 
     def _begin(self, number: int) -> _Episode:
         # A number of its own for every attempt: the last one's folders may not be removed yet.

@@ -15,6 +15,7 @@ from synpick_warp.exporters.bop_view import MILLIMETERS
 from synpick_warp.exporters.png import encode_png
 from synpick_warp.scenes.shapes import Camera, Catalog, CatalogEntry, Material
 
+CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
 MODEL_FOLDERS = ("models", "models_eval")
 """The toolkit renders from the first and evaluates with the second; ours are the same."""
 _TEXTURE_COMMENT = b"comment TextureFile "
@@ -30,8 +31,8 @@ def write_constants(out: Path, config: Config, catalog: Catalog, cameras: tuple[
     """
     for name in MODEL_FOLDERS:
         write_models(out / name, catalog)
-    _write_json(out / "camera.json", _camera_record(cameras[0], config.bop.depth_scale))
-    (out / "dataset_info.md").write_text(_notes(config, catalog, cameras, episodes), encoding="utf-8", newline="\n")
+    _write_json(out / CAMERA_FILE, _camera_record(cameras[0], config.bop.depth_scale))
+    (out / NOTES_FILE).write_text(_notes(config, catalog, cameras, episodes), encoding="utf-8", newline="\n")
 
 
 def write_models(folder: Path, catalog: Catalog) -> None:
