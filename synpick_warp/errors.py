@@ -25,3 +25,7 @@ class DeviceError(SynpickError):
 
 class OutputError(SynpickError):
     """The output folder cannot be written."""
+
+
+class DatasetError(SynpickError):
+    """A folder is no data set, or lacks a file that it should have."""

@@ -16,10 +16,10 @@ import pytest
 import trimesh
 
 from synpick_warp.errors import CatalogError, OutputError
-from synpick_warp.exporters.bop import BopExporter
+from synpick_warp.exporters.bop import BopExporter, view_bytes
 from synpick_warp.exporters.bop_models import encode_model, write_models
 from synpick_warp.exporters.files import PARTIAL, prepare_output
-from synpick_warp.exporters.pool import WriterPool, shared_bytes
+from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.outcome import Outcome
 from synpick_warp.scenes.shapes import Catalog
 from tests.reference.box_views import OBJECT_IDS, SIZES, batches, cameras, catalog, config, ends, poses
@@ -29,7 +29,7 @@ EPISODES = (0, 2)
 FRAMES = 3
 LENSES = cameras()
 VIEW = next(batches(1, (0,), 1, LENSES))
-VIEW_BYTES = shared_bytes((VIEW.color, VIEW.depth, VIEW.instance, VIEW.amodal))
+VIEW_BYTES = view_bytes(LENSES[0])
 
 
 def export(out: Path, processes: int = 2, episodes: tuple[int, ...] = EPISODES, **bop: object) -> Path:

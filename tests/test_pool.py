@@ -94,7 +94,7 @@ def test_images_arrive_whole_though_the_callers_buffer_changes(tmp_path, count):
 
 def test_several_images_of_different_types_share_a_slot(tmp_path):
     images = (np.arange(7, dtype=np.uint8), np.arange(6.0).reshape(2, 3), np.zeros((0, 4), np.uint16), np.full((3, 3), 7, np.uint32))
-    with WriterPool(1, shared_bytes(images)) as pool:
+    with WriterPool(1, shared_bytes(image.nbytes for image in images)) as pool:
         pool.submit(save_all, images, (tmp_path / "all.npz",), path=tmp_path)
     with np.load(tmp_path / "all.npz") as file:
         for image, back in zip(images, file.values(), strict=True):

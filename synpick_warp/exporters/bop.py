@@ -15,11 +15,14 @@ from synpick_warp.exporters.bop_models import CAMERA_FILE, MODEL_FOLDERS, NOTES_
 from synpick_warp.exporters.bop_scene import SceneSettings, drop_scenes, finish_episode, make_scene
 from synpick_warp.exporters.bop_view import MILLIMETERS, ViewSettings, ViewTruth, write_view
 from synpick_warp.exporters.files import PARTIAL, output_error, prepare_output
-from synpick_warp.exporters.pool import WriterPool
+from synpick_warp.exporters.pool import WriterPool, shared_bytes
 from synpick_warp.exporters.targets import BOP19, BOP24, join_targets, write_scene_targets
 from synpick_warp.frames import EpisodeEnd, FrameBatch
 from synpick_warp.outcome import Outcome
 from synpick_warp.scenes.shapes import Camera, Catalog
+
+_PIXEL_BYTES = (3, 2, 1, 4)
+"""Of `FrameBatch`'s color, depth, instance and amodal."""
 
 
 @dataclass(eq=False)
@@ -168,6 +171,11 @@ class BopExporter:
             "depth_scale": self._config.depth_scale,
         }
         return ViewSettings(self._suffix, self._config.jpeg_quality, self._config.masks, self._config.coco, record)
+
+
+def view_bytes(camera: Camera) -> int:
+    """Room that a view's images take in the pool's shared memory [B]."""
+    return shared_bytes(camera.height * camera.width * size for size in _PIXEL_BYTES)
 
 
 def _truth(batch: FrameBatch, view: int) -> ViewTruth:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -48,9 +48,9 @@ class _Worker:
     jobs: deque[_Job] = field(default_factory=deque)
 
 
-def shared_bytes(images: Sequence[np.ndarray]) -> int:
-    """Room that images take in shared memory [B]."""
-    return sum(-(-image.nbytes // _ALIGNMENT) * _ALIGNMENT for image in images)
+def shared_bytes(sizes: Iterable[int]) -> int:
+    """Room that images of these sizes take in shared memory [B]."""
+    return sum(-(-size // _ALIGNMENT) * _ALIGNMENT for size in sizes)
 
 
 class WriterPool:
@@ -171,15 +171,15 @@ class WriterPool:
     def _share(self, images: Sequence[np.ndarray], slot: int | None) -> tuple[SharedImage, ...]:
         if slot is None:
             return ()
-        if shared_bytes(images) > self._slot_bytes:
-            raise ValueError(f"images of {shared_bytes(images)} bytes exceed the {self._slot_bytes} that the pool was made for")
+        if (size := shared_bytes(image.nbytes for image in images)) > self._slot_bytes:
+            raise ValueError(f"images of {size} bytes exceed the {self._slot_bytes} that the pool was made for")
         offset = slot * self._slot_bytes
         shared = []
         for image in images:
             place = SharedImage(offset, image.shape, image.dtype.str)
             np.copyto(place.of(self._memory), image)
             shared.append(place)
-            offset += shared_bytes((image,))
+            offset += shared_bytes((image.nbytes,))
         return tuple(shared)
 
     def _collect(self, timeout: float | None) -> None:
