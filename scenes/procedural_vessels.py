@@ -8,7 +8,7 @@ from synpick_warp.scenes import textures as paint
 from synpick_warp.scenes.procedural_meshes import Patch, Rect, cap, ellipse, join, lathe, loft, solid, sweep
 from synpick_warp.scenes.procedural_packs import Shape
 
-SIDES = 64
+SIDES = 48
 """Points around a vessel."""
 
 

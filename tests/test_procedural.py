@@ -178,8 +178,8 @@ def rotations(raw):
     for axis, offset in raw.symmetries_continuous:
         assert offset == (0.0, 0.0, 0.0)
         name = "xyz"[int(np.argmax(axis))]
-        # The turned surfaces have 32 or 64 sides: these turns meet them.
-        yield from (rotation(name, 360 / 32 * step) for step in (1, 7, 16))
+        # The turned surfaces have 32 or 48 sides: these turns meet both.
+        yield from (rotation(name, 360 / 16 * step) for step in (1, 3, 8))
 
 
 def test_symmetries_keep_shape_and_colour(raw):
