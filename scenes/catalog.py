@@ -14,7 +14,9 @@ from scipy.spatial.distance import cdist
 from synpick_warp.configs.schema import Config, ObjectRow, Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.appearance import Finish
-from synpick_warp.scenes.collision import ShapeRecipe, collision_shapes, default_cache_dir, hull_volume, mass_properties
+from synpick_warp.scenes.collision import collision_shapes, default_cache_dir
+from synpick_warp.scenes.decomposition import ShapeRecipe
+from synpick_warp.scenes.hulls import hull_volume, mass_properties
 from synpick_warp.scenes.meshes import SUFFIXES, read_mesh, signed_volume
 from synpick_warp.scenes.models_info import ModelInfo, bop_files, read_models_info
 from synpick_warp.scenes.procedural import procedural_objects
@@ -51,7 +53,7 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     origins = [str(raw.source or raw.name) for raw in raws]
     hulls = [_checked_hull_volume(raw, origin, config) for raw, origin in zip(raws, origins, strict=True)]
     recipes = [_recipe(raw, hull, config.objects) for raw, hull in zip(raws, hulls, strict=True)]
-    shapes = collision_shapes(origins, [raw.mesh for raw in raws], recipes, cache_dir or default_cache_dir(), report)
+    shapes = collision_shapes([raw.name for raw in raws], [raw.mesh for raw in raws], recipes, cache_dir or default_cache_dir(), report)
     entries = [
         _entry(raw, pieces, raw.mass if raw.mass is not None else config.objects.density * hull)
         for raw, pieces, hull in zip(raws, shapes, hulls, strict=True)

@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes import collision
-from synpick_warp.scenes.collision import ShapeRecipe, collision_shapes, default_cache_dir, hull_volume, limited_hull, mass_properties
+from synpick_warp.scenes.collision import collision_shapes, default_cache_dir
+from synpick_warp.scenes.decomposition import ShapeRecipe, decompose
+from synpick_warp.scenes.hulls import hull_volume, limited_hull, mass_properties
 from synpick_warp.scenes.meshes import smooth_normals
 from synpick_warp.scenes.shapes import ConvexPiece, TriangleMesh
 
@@ -60,16 +62,16 @@ def test_a_cube_keeps_its_eight_corners():
 
 def test_mass_properties_of_a_cube_far_from_its_origin():
     box = trimesh.creation.box((1.0, 1.0, 1.0))
-    found = mass_properties([ConvexPiece((box.vertices + (3.0, -2.0, 7.0)).astype(np.float32), box.faces.astype(np.int32))])
+    box.apply_translation((3.0, -2.0, 7.0))
+    found = mass_properties([ConvexPiece(box.vertices.astype(np.float32), box.faces.astype(np.int32))])
     assert found.volume == pytest.approx(1.0)
     assert found.center_of_mass == pytest.approx((3.0, -2.0, 7.0))
     assert np.allclose(found.unit_inertia, np.eye(3) / 6)
 
 
 def test_mass_properties_of_two_boxes_are_those_of_one():
-    halves = [trimesh.creation.box((0.1, 0.2, 0.3)) for _ in range(2)]
-    pieces = [ConvexPiece((h.vertices + (s, 0, 0)).astype(np.float32), h.faces.astype(np.int32)) for h, s in zip(halves, (-0.05, 0.05), strict=True)]
-    found = mass_properties(pieces)
+    halves = [trimesh.creation.box(bounds=((left, 0.0, 0.0), (left + 0.1, 0.2, 0.3))) for left in (0.0, 0.1)]
+    found = mass_properties([ConvexPiece(half.vertices.astype(np.float32), half.faces.astype(np.int32)) for half in halves])
     assert found.volume == pytest.approx(0.012)
     assert np.allclose(np.diag(found.unit_inertia), np.array((0.2**2 + 0.3**2, 0.2**2 + 0.3**2, 0.2**2 + 0.2**2)) / 12)
 
@@ -216,18 +218,35 @@ def test_a_failed_decomposition_is_a_clear_line(tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("drop", "lost", "modes"), [(0, False, ["off"]), (1, False, ["on"]), (0, True, ["off", "on"])])
-def test_repair_is_for_open_surfaces_and_lost_parts(monkeypatch, drop, lost, modes):
+@pytest.mark.parametrize(
+    ("kind", "modes"),
+    [
+        ("closed", ["off"]),
+        ("open", ["auto"]),
+        ("apart", ["off"]),
+        ("joined", ["auto"]),
+        ("folded", ["off"]),
+        ("lost", ["off", "auto"]),
+    ],
+)
+def test_repair_is_for_open_surfaces_inner_walls_and_lost_parts(monkeypatch, kind, modes):
     shell, asked = bowl(), []
-    shell.update_faces(np.arange(len(shell.faces)) >= drop)
+    if kind == "open":
+        shell.update_faces(np.arange(len(shell.faces)) > 0)
+    if kind in ("apart", "joined"):
+        other = trimesh.creation.icosphere(2, 0.05)
+        other.apply_translation((0.5 if kind == "apart" else 0.0, 0.0, 0.0))
+        shell = trimesh.util.concatenate([trimesh.creation.box((0.06, 0.2, 0.06)), other])
+    if kind == "folded":
+        shell = trimesh.Trimesh(shell.vertices, [*shell.faces, (0, 9, 30), (9, 0, 30)], process=False)
 
     def run_coacd(mesh, *, preprocess_mode, **_):
         asked.append(preprocess_mode)
-        small = lost and preprocess_mode == "off"
+        small = kind == "lost" and preprocess_mode == "off"
         return [(mesh.vertices * (0.1 if small else 1.0), mesh.indices)]
 
     monkeypatch.setattr(coacd, "run_coacd", run_coacd)
-    (piece,) = collision.decompose(as_mesh(shell), CONCAVE)
+    (piece,) = decompose(as_mesh(shell), CONCAVE)
     assert asked == modes
     assert_sound(piece)
 
@@ -235,7 +254,7 @@ def test_repair_is_for_open_surfaces_and_lost_parts(monkeypatch, drop, lost, mod
 def test_slivers_are_left_out(monkeypatch):
     big, flat = trimesh.creation.box((0.1, 0.1, 0.1)).vertices, trimesh.creation.box((0.01, 0.01, 1e-5)).vertices
     monkeypatch.setattr(coacd, "run_coacd", lambda *_, **__: [(big, None), (flat, None), (flat * (1, 1, 0), None)])
-    (piece,) = collision.decompose(as_mesh(trimesh.creation.box((0.1, 0.1, 0.1))), CONCAVE)
+    (piece,) = decompose(as_mesh(trimesh.creation.box((0.1, 0.1, 0.1))), CONCAVE)
     assert mass_properties([piece]).volume == pytest.approx(1e-3)
 
 
