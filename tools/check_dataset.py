@@ -29,8 +29,6 @@ EDGE = 5.0
 """A pixel counts as a border if the models' depth changes by more within one pixel of it, or ends there [mm]."""
 CHUNK = 2_000_000
 """Pairs of triangle and pixel that are intersected at once."""
-WORLD_TOLERANCE = 1e-3
-"""Between the places at which two cameras see a point of an instance [mm]."""
 
 
 class UnusableError(Exception):
@@ -73,7 +71,7 @@ class Report:
 
     missing: Measure = field(default_factory=lambda: Measure("files missing, lists of different length", "", 0))
     rotation: Measure = field(default_factory=lambda: Measure("rotations: deviation from orthonormal", "", 1e-9))
-    world: Measure = field(default_factory=lambda: Measure("instance in the world, camera against camera", "mm", WORLD_TOLERANCE))
+    world: Measure = field(default_factory=lambda: Measure("instance in the world, camera against camera", "mm", 1e-3))
     depth: Measure = field(default_factory=lambda: Measure("depth against models, inside", "mm", DEPTH_TOLERANCE))
     border: Measure = field(default_factory=lambda: Measure("depth against models, borders beyond tolerance", "% of px", 0.05))
     unknown: Measure = field(default_factory=lambda: Measure("visible instance without depth", "% of px", 0))
@@ -265,8 +263,9 @@ def read_view(scene: Path, frame: str) -> View:
         paths = [scene / name / f"{stem}_{index:06d}.png" for index in range(len(records))] if (scene / name).is_dir() else []
         images[name] = np.array([read_image(path) > 0 for path in paths]).reshape(len(paths), height, width)
     depth = np.where(counts > 0, counts * float(camera["depth_scale"]), np.inf)
-    infos = read_json(scene / "scene_gt_info.json")[frame]
-    return View(f"{scene.name} image {frame}", infos, depth, images["mask"], images["mask_visib"], hits)
+    return View(
+        f"{scene.name} image {frame}", read_json(scene / "scene_gt_info.json")[frame], depth, images["mask"], images["mask_visib"], hits
+    )
 
 
 def check_images(view: View, report: Report) -> None:
@@ -327,7 +326,6 @@ def check_coco(scene: Path, frame: str, view: View, report: Report) -> None:
         return
     coco = read_json(scene / "scene_gt_coco.json")
     found = [annotation for annotation in coco["annotations"] if annotation["image_id"] == int(frame)]
-    records = read_json(scene / "scene_gt.json")[frame]
     expected = [index for index, seen in enumerate(view.seen) if seen.any()]
     wrong = abs(len(found) - len(expected)) + (int(frame) not in {image["id"] for image in coco["images"]})
     for annotation, index in zip(found, expected, strict=False):
@@ -339,7 +337,7 @@ def check_coco(scene: Path, frame: str, view: View, report: Report) -> None:
             same
             and annotation["bbox"] == [x, y, box_width + 1, box_height + 1]
             and annotation["area"] == np.count_nonzero(view.seen[index])
-            and annotation["category_id"] == records[index]["obj_id"]
+            and annotation["category_id"] == read_json(scene / "scene_gt.json")[frame][index]["obj_id"]
             and annotation["ignore"] == (view.infos[index]["visib_fract"] < 0.1)
         )
     report.coco.see(wrong, view.where)
