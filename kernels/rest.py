@@ -60,6 +60,36 @@ def measure_depth_kernel(
         wp.atomic_max(depth_out, b, depth)
 
 
+@wp.kernel
+def measure_shift_kernel(
+    # Scene:
+    layout: LayoutData,
+    catalog: CatalogData,
+    # State:
+    entry: wp.array2d[int],
+    slot: wp.array2d[int],
+    body_q: wp.array[wp.transform],
+    previous_inout: wp.array2d[wp.transform],
+    # Out:
+    shift_out: wp.array2d[float],
+):
+    """How far any point of an object moved since the last tick, at most [m]: |Δp| + θ r, with the rotation's angle θ.
+
+    Over a tick, not an instant: a solver that has not converged makes a pile buzz about its place without going anywhere.
+    """
+    world, instance = wp.tid()
+    e = entry[world, instance]
+    if e < 0:
+        return
+    pose = body_q[world * layout.bodies + layout.gripper_bodies + slot[world, instance]]
+    turn = wp.transform_inverse(previous_inout[world, instance]) * pose
+    shift = wp.length(wp.transform_get_translation(pose) - wp.transform_get_translation(previous_inout[world, instance]))
+    q = wp.transform_get_rotation(turn)
+    angle = 2.0 * wp.atan2(wp.length(wp.vec3(q[0], q[1], q[2])), wp.abs(q[3]))
+    shift_out[world, instance] = shift + angle * catalog.radius[e]
+    previous_inout[world, instance] = pose
+
+
 @wp.func
 def is_outside(position: wp.vec3, drop: DropData) -> bool:
     """Whether an object's origin has left the tote."""
@@ -80,7 +110,7 @@ def judge_settling_kernel(
     entry: wp.array2d[int],
     slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
+    shift: wp.array2d[float],
     depth: wp.array[float],
     stuck_inout: wp.array2d[int],
     progress_inout: wp.array[wp.vec4i],
@@ -90,8 +120,8 @@ def judge_settling_kernel(
 ):
     """One tick of settling: re-drop what left the tote or is stuck, count ticks at rest, take the guide walls away, end.
 
-    An object's speed is |v| + |ω| r, no less than that of any of its points. `progress` holds ticks since the drop, ticks at
-    rest, re-drops, and whether the guide walls stand. `address` is (episode, attempt).
+    Rest is no object moving by more than `rest_shift` in a tick; at the end of the time, `last_shift` will do. `progress` holds
+    ticks since the drop, ticks at rest, re-drops, and whether the guide walls stand. `address` is (episode, attempt).
     """
     world = wp.tid()
     if phase_inout[world] != SETTLE:
@@ -100,6 +130,9 @@ def judge_settling_kernel(
     ticks = progress[0] + 1
     resting = progress[1] + 1
     redrops = progress[2]
+    allowed = settle.rest_shift
+    if ticks > settle.late_ticks:
+        allowed = settle.last_shift
     guides = progress[3]
     key = stream_key(seed, address[world][0], address[world][1], REDROP)
     height = drop.rim_height
@@ -108,8 +141,7 @@ def judge_settling_kernel(
         e = entry[world, instance]
         if e >= 0:
             s = slot[world, instance]
-            twist = body_qd[body + s]
-            if wp.length(wp.spatial_top(twist)) + wp.length(wp.spatial_bottom(twist)) * catalog.radius[e] > settle.speed:
+            if shift[world, instance] > allowed:
                 resting = 0
             stuck = stuck_inout[world, instance] + 1
             if depth[body + s] < settle.stuck_depth:

@@ -60,7 +60,9 @@ class SettleData:
     max_ticks: int
     rest_ticks: int
     stuck_ticks: int
-    speed: float
+    late_ticks: int
+    rest_shift: float
+    last_shift: float
     stuck_depth: float
     max_redrops: int
 

@@ -59,14 +59,26 @@ def measure_depth(state: WorldState, physics: Physics) -> None:
     )
 
 
+def measure_shift(scene: SceneData, state: WorldState, physics: Physics) -> None:
+    """How far each instance moved in the last tick."""
+    wp.launch(
+        rest.measure_shift_kernel,
+        dim=state.entry.shape,
+        inputs=[scene.layout, scene.catalog, state.entry, state.slot, physics.state.body_q, state.previous],
+        outputs=[state.shift],
+        device=state.phase.device,
+    )
+
+
 def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
     """Count ticks at rest, re-drop what left the tote or is stuck, let worlds at rest act."""
     measure_depth(state, physics)
+    measure_shift(scene, state, physics)
     wp.launch(
         rest.judge_settling_kernel,
         dim=state.phase.shape[0],
         inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, scene.settle, state.address, state.entry, state.slot,
-                physics.state.body_q, physics.state.body_qd, state.depth, state.stuck, state.progress, state.phase,
+                physics.state.body_q, state.shift, state.depth, state.stuck, state.progress, state.phase,
                 physics.state.joint_q, physics.state.joint_qd],
         device=state.phase.device,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 
 import warp as wp
 
@@ -14,7 +15,19 @@ from synpick_warp.scenes.shapes import Catalog
 from synpick_warp.stages import act, arrange
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.physics import Physics
-from synpick_warp.stages.worlds import SceneData, WorldState, make_scene_data, world_sizes
+from synpick_warp.stages.worlds import SceneData, WorldState, WorldStatus, make_scene_data, world_sizes
+
+
+# A tick is recorded while the last one's record is still read.
+RECORDS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class TickRecord:
+    """What one tick leaves for pictures and for the host."""
+
+    snapshot: Snapshot
+    status: WorldStatus
 
 
 class Simulation:
@@ -35,13 +48,17 @@ class Simulation:
         self.layout = built.layout
         self.physics = Physics(config, built)
         self.scene: SceneData = make_scene_data(config, catalog, built, lights, device)
-        sizes = world_sizes(config, built.layout)
+        sizes = world_sizes(config, built.layout.bodies_per_world)
         self.state = allocate(WorldState, sizes, device)
-        self.snapshot = allocate(Snapshot, sizes, device)
-        self.snapshot.fixture_visible.fill_(1)
+        self.records = tuple(self._make_record(sizes) for _ in range(RECORDS))
 
-    def tick(self) -> None:
-        """Hand out episodes, simulate one tick, judge, and take a snapshot."""
+    def _make_record(self, sizes: dict[str, int]) -> TickRecord:
+        record = TickRecord(allocate(Snapshot, sizes, self.device), allocate(WorldStatus, sizes, self.device))
+        record.snapshot.fixture_visible.fill_(1)
+        return record
+
+    def tick(self, record: TickRecord) -> None:
+        """Hand out episodes, simulate one tick, judge, and record what came of it in one of `records`."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
         arrange.take_episodes(state, self.config.bake.episodes, self.config.settle.attempts)
         arrange.draw_objects(scene, state, seed)
@@ -53,16 +70,17 @@ class Simulation:
         act.begin_moving(scene, state, physics, seed)
         physics.refresh_poses()
         arrange.judge_episodes(scene, state, physics)
-        self._take_snapshot()
+        self._take_snapshot(record)
 
-    def _take_snapshot(self) -> None:
-        state, snapshot = self.state, self.snapshot
+    def _take_snapshot(self, record: TickRecord) -> None:
+        state, snapshot = self.state, record.snapshot
         wp.launch(
             pack.take_snapshot_kernel,
             dim=self.layout.worlds,
             inputs=[self.scene.layout, state.phase, state.outcome, state.address, state.frame, state.entry, state.slot,
                     self.physics.state.body_q],
-            outputs=[snapshot.live, snapshot.episode, snapshot.frame, snapshot.entry, snapshot.pose, snapshot.fixture_pose, state.status],
+            outputs=[snapshot.live, snapshot.episode, snapshot.frame, snapshot.entry, snapshot.pose, snapshot.fixture_pose,
+                     record.status.table],
             device=self.device,
         )
         wp.copy(snapshot.light, state.light)

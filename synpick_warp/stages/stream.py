@@ -13,7 +13,8 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.render import Renderer
-from synpick_warp.stages.worlds import STATUS_COLUMNS, WorldState
+from synpick_warp.stages.simulate import TickRecord
+from synpick_warp.stages.worlds import STATUS_COLUMNS
 
 # Bytes of one batch's images on a GPU: large enough to fill it, small enough that several batches are in flight.
 BATCH_BYTES = 256 << 20
@@ -95,11 +96,11 @@ class HostCopy:
 class TickReader:
     """Brings the status table and the poses of a tick to the host."""
 
-    def __init__(self, state: WorldState, snapshot: Snapshot) -> None:
-        self.copy = HostCopy([state.status, snapshot.entry, snapshot.pose])
+    def __init__(self, record: TickRecord) -> None:
+        self.copy = HostCopy([record.status.table, record.snapshot.entry, record.snapshot.pose])
 
     def start(self) -> None:
-        """Begin to copy what the last tick left."""
+        """Begin to copy what the tick left."""
         self.copy.start(None)
 
     def wait(self) -> TickReport:

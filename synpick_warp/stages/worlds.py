@@ -13,13 +13,14 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import structs
 from synpick_warp.scenes import build
 from synpick_warp.scenes.shapes import Catalog
+from synpick_warp.stages.buffers import FIXTURES
 
 # Where the gripper waits while objects fall [m]: beside the tote, outside every camera's view.
 GRIPPER_HOME = (3.0, 0.0, 1.0)
 # Corners of the tote that a round of moving visits.
 CORNERS = 4
 STATUS_COLUMNS = ("phase", "outcome", "episode", "attempt", "frame", "live")
-"""Columns of `WorldState.status`."""
+"""Columns of `WorldStatus.table`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +43,10 @@ class WorldState:
     """Body slot of each instance."""
     stuck: wp.array = device_array("world", "instance", dtype=wp.int32, unit="ticks")
     """How long the instance has been stuck."""
+    previous: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
+    """Object to world, one tick ago."""
+    shift: wp.array = device_array("world", "instance", dtype=wp.float32, unit="m")
+    """How far the instance moved in the last tick."""
     depth: wp.array = device_array("body", dtype=wp.float32, unit="m")
     """Deepest penetration of each body."""
     variant: wp.array = device_array("body", dtype=wp.int32)
@@ -60,8 +65,14 @@ class WorldState:
     """Light map of the episode."""
     light_turn: wp.array = device_array("world", dtype=wp.float32, unit="rad")
     """Its turn about +z."""
-    status: wp.array = device_array("world", "status", dtype=wp.int32)
-    """What the host reads; see STATUS_COLUMNS."""
+
+
+@dataclass(frozen=True, eq=False)
+class WorldStatus:
+    """The few numbers of each world that the host reads."""
+
+    table: wp.array = device_array("world", "status", dtype=wp.int32)
+    """Columns as STATUS_COLUMNS."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,17 +87,18 @@ class SceneData:
     guide_shapes: wp.array
 
 
-def world_sizes(config: Config, layout: build.Layout) -> dict[str, int]:
-    """Extents of the dimensions that `WorldState` and `Snapshot` name."""
+def world_sizes(config: Config, bodies_per_world: int) -> dict[str, int]:
+    """Extents of the dimensions that `WorldState`, `WorldStatus` and `Snapshot` name."""
+    worlds = config.bake.worlds
     return {
         "one": 1,
-        "world": layout.worlds,
-        "world_and_global": layout.worlds + 1,
-        "instance": layout.instances,
-        "body": layout.worlds * layout.bodies_per_world,
+        "world": worlds,
+        "world_and_global": worlds + 1,
+        "instance": config.arrangement.max_objects,
+        "body": worlds * bodies_per_world,
         "waypoint": CORNERS * config.move.rounds,
         "status": len(STATUS_COLUMNS),
-        "fixture": 3,
+        "fixture": len(FIXTURES),
     }
 
 
@@ -155,7 +167,9 @@ def _settle_data(config: Config) -> structs.SettleData:
     data.max_ticks = math.ceil(config.settle.max_time / tick)
     data.rest_ticks = config.settle.rest_ticks
     data.stuck_ticks = math.ceil(config.settle.stuck_time / tick)
-    data.speed = config.settle.speed
+    data.late_ticks = math.ceil(config.settle.late_time / tick)
+    data.rest_shift = config.settle.rest_shift
+    data.last_shift = config.settle.last_shift
     data.stuck_depth = config.settle.stuck_depth
     data.max_redrops = config.settle.max_redrops
     return data
