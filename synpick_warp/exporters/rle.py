@@ -54,22 +54,18 @@ def _cut(image: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, int, int]:
 def run_lengths(crop: Crop, height: int, width: int) -> list[int]:
     """COCO's uncompressed run lengths of the full mask: down the columns, False first, in turn; they sum to height · width."""
     rows, columns = crop.mask.shape
-    padded = np.zeros((columns, rows + 2), np.int8)
-    padded[:, 1:-1] = crop.mask.T
-    change = np.diff(padded, axis=1)
-    starts, ends = (_addresses(change == sign, crop, height) for sign in (1, -1))
-    if not starts.size:
+    # One column of the mask after the other, each with a False at its foot, so that no run goes on into the next.
+    line = np.zeros(columns * (rows + 1) + 1, bool)
+    line[1:].reshape(columns, rows + 1)[:, :rows] = crop.mask.T
+    column, row = np.divmod(np.flatnonzero(line[1:] != line[:-1]), rows + 1)
+    changes = (crop.left + column) * height + crop.top + row
+    if not changes.size:
         return [height * width]
-    # A run that reaches a column's foot and one that begins at the next column's head are one.
-    apart = starts[1:] != ends[:-1]
+    # If the crop is as high as the image, a run may go on after all.
+    apart = changes[2::2] != changes[1:-1:2]
     edges = np.empty(2 * np.count_nonzero(apart) + 4, np.int64)
     edges[0], edges[-1] = 0, height * width
-    edges[1:-1:2] = starts[np.append(True, apart)]
-    edges[2:-1:2] = ends[np.append(apart, True)]
+    edges[1:-1:2] = changes[::2][np.append(True, apart)]
+    edges[2:-1:2] = changes[1::2][np.append(apart, True)]
     counts = np.diff(edges)
     return (counts if counts[-1] else counts[:-1]).tolist()
-
-
-def _addresses(marks: np.ndarray, crop: Crop, height: int) -> np.ndarray:
-    column, row = np.nonzero(marks)
-    return (crop.left + column) * height + crop.top + row
