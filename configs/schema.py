@@ -53,7 +53,7 @@ class Objects:
     pieces: int = setting(16, "", "Most pieces of a convex decomposition.", low=1, high=64)
     concavity: float = setting(0.05, "", "CoACD's threshold: smaller follows the surface more closely.", low=0.01, high=1.0)
     concave_ratio: float = setting(
-        0.6, "", "Objects that no row of the object table names count as concave if mesh volume / hull volume is below this.", low=0.0, high=1.0
+        0.6, "", "Objects without a row in the object table are concave if mesh volume / hull volume is below this.", low=0.0, high=1.0
     )
     density: float = setting(400.0, "kg/m³", "Density over the hull's volume, for objects without a mass.", above=0.0)
     metallic: float = setting(0.1, "", "Metallic, for objects without a material of their own.", low=0.0, high=1.0)
@@ -132,7 +132,7 @@ class Arrangement:
     max_objects: int = setting(24, "", "Most objects of an episode; the draw stops there.", low=1, high=32)
     repeats: bool = setting(True, "", "An object may come several times (moving: yes; picking: no).")
     slot_shortfall: float = setting(
-        1e-3, "", "Accepted share of draws that need more slots than a world has; such a draw is repeated, and counted.", above=0.0, high=0.5
+        1e-3, "", "Accepted share of draws that need more slots than a world has; they are repeated, and counted.", above=0.0, high=0.5
     )
     clearance: float = setting(0.01, "m", "Gap between bounding spheres in the drop column.", low=0.0)
     spread: float = setting(0.3, "", "Drop positions are spread over this share of the free floor.", low=0.0, high=1.0)
@@ -165,7 +165,9 @@ class Physics:
     friction: float = setting(0.5, "", "Coulomb friction of every shape.", low=0.0, high=10.0)
     gap: float = setting(2e-3, "m", "Half the distance at which contacts are made; 5 mm costs a third more and settles no better.", low=0.0)
     angular_damping: float = setting(0.05, "1/s", "Angular damping of the objects (PhysX's default).", low=0.0)
-    max_speed: float = setting(2.0, "m/s", "No object is faster: 4 mm a step is no more than two shapes' gap, so that falling objects stop at the surface.", above=0.0)
+    max_speed: float = setting(
+        2.0, "m/s", "No object is faster: 4 mm a step is no more than two shapes' gap, so falling objects stop at a surface.", above=0.0
+    )
     contacts_per_world: int = setting(512, "", "Room for contacts in a world; about 140 are usual.", low=16)
     pairs_per_world: int = setting(1024, "", "Room for pairs of near shapes in a world.", low=16)
     rows_per_world: int = setting(1536, "", "Room for the objects' contact rows in a world.", low=48)
@@ -179,7 +181,7 @@ class Move:
 
     stiffness: float = setting(1000.0, "N/m", "Stiffness of the position controller (paper).", above=0.0)
     damping: float = setting(
-        60.0, "N·s/m", "Damping of the position controller; the paper names none. With the released 1 objects penetrate by up to 7 mm, with 60 by 1.", low=0.0
+        60.0, "N·s/m", "Damping of the position controller; the paper names none. With the released 1, objects sink in by 7 mm.", low=0.0
     )
     force: float = setting(30.0, "N", "Largest force of the position controller (paper).", above=0.0)
     speed: float = setting(0.1, "m/s", "Speed of the goal (paper).", above=0.0)

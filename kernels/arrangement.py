@@ -87,8 +87,6 @@ def draw_objects_kernel(
     # Out:
     entry_out: wp.array2d[int],
     slot_out: wp.array2d[int],
-    light_out: wp.array[int],
-    light_turn_out: wp.array[float],
 ):
     """Draw objects, uniformly, until the next one would exceed the volume budget V: Σ volume ≤ V.
 
@@ -101,7 +99,6 @@ def draw_objects_kernel(
         return
     for instance in range(layout.instances):
         entry_out[world, instance] = -1
-        slot_out[world, instance] = -1
     if phase == IDLE:
         return
     key = stream_key(seed, address[world][0], address[world][1], OBJECTS)
@@ -132,15 +129,32 @@ def draw_objects_kernel(
                 count += 1
             if overflow or count == layout.instances or (drop.repeats == 0 and count == catalog.count):
                 open = False
-    light = stream_key(seed, address[world][0], address[world][1], LIGHT)
-    light_out[world] = uniform_index(light, 0, drop.lights)
-    light_turn_out[world] = TAU * uniform(light, 1) * float(drop.turn_lights)
     if overflow:
         for instance in range(layout.instances):
             entry_out[world, instance] = -1
-            slot_out[world, instance] = -1
         outcome_inout[world] = OUTCOME_ARRANGEMENT_OVERFLOW
         phase_inout[world] = OVER
+
+
+@wp.kernel
+def draw_lights_kernel(
+    # Scene:
+    seed: wp.uint64,
+    drop: DropData,
+    # State:
+    address: wp.array[wp.vec2i],
+    phase: wp.array[int],
+    # Out:
+    light_out: wp.array[int],
+    light_turn_out: wp.array[float],
+):
+    """Draw the light map of worlds that start an episode, and its turn about the vertical."""
+    world = wp.tid()
+    if phase[world] != START:
+        return
+    key = stream_key(seed, address[world][0], address[world][1], LIGHT)
+    light_out[world] = uniform_index(key, 0, drop.lights)
+    light_turn_out[world] = TAU * uniform(key, 1) * float(drop.turn_lights)
 
 
 @wp.func
@@ -166,6 +180,58 @@ def write_body(joint_q: wp.array[float], joint_qd: wp.array[float], first_q: int
 
 
 @wp.kernel
+def empty_worlds_kernel(
+    # Scene:
+    layout: LayoutData,
+    catalog: CatalogData,
+    drop: DropData,
+    # State:
+    phase: wp.array[int],
+    # Out:
+    variant_out: wp.array[int],
+    joint_q_out: wp.array[float],
+    joint_qd_out: wp.array[float],
+    joint_f_out: wp.array[float],
+    restarted_out: wp.array[wp.bool],
+    progress_out: wp.array[wp.vec4i],
+    stuck_out: wp.array2d[int],
+):
+    """Worlds that start, and worlds without an episode: empty all slots, park them, and send the gripper home.
+
+    A parked body's weight is cancelled by a force m g. Elsewhere variants are -1: nothing changes.
+    """
+    world = wp.tid()
+    fresh = phase[world] == START or phase[world] == IDLE or phase[world] == OVER
+    restarted_out[world] = fresh
+    body = world * layout.bodies + layout.gripper_bodies
+    for s in range(layout.slots):
+        variant_out[body + s] = -1
+    if not fresh:
+        return
+    # Ticks since the drop, ticks at rest, re-drops, guide walls standing.
+    progress_out[world] = wp.vec4i(0, 0, 0, 1)
+    for instance in range(layout.instances):
+        stuck_out[world, instance] = 0
+    q = world * layout.coords
+    qd = world * layout.dofs
+    for axis in range(layout.gripper_dofs):
+        joint_q_out[q + axis] = 0.0
+        joint_qd_out[qd + axis] = 0.0
+    for axis in range(3):
+        joint_q_out[q + axis] = drop.gripper_home[axis]
+    parked = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
+    for s in range(layout.slots):
+        variant_out[body + s] = catalog.empty_single
+        if s >= layout.single_slots:
+            variant_out[body + s] = catalog.empty_compound
+        first = qd + layout.gripper_dofs + 6 * s
+        write_body(joint_q_out, joint_qd_out, q + layout.gripper_dofs + 7 * s, first, parked)
+        for axis in range(6):
+            joint_f_out[first + axis] = 0.0
+        joint_f_out[first + 2] = catalog.empty_mass * drop.gravity
+
+
+@wp.kernel
 def drop_objects_kernel(
     # Scene:
     seed: wp.uint64,
@@ -177,60 +243,30 @@ def drop_objects_kernel(
     entry: wp.array2d[int],
     slot: wp.array2d[int],
     phase_inout: wp.array[int],
-    progress_inout: wp.array[wp.vec4i],
-    stuck_inout: wp.array2d[int],
     # Out:
     variant_out: wp.array[int],
     joint_q_out: wp.array[float],
     joint_qd_out: wp.array[float],
     joint_f_out: wp.array[float],
-    restarted_out: wp.array[wp.bool],
 ):
-    """Give body slots their objects and stack them above the tote in a column of bounding spheres, at rest; park empty slots.
+    """Give slots their objects and stack these above the tote in a column of bounding spheres, at rest.
 
-    Height of sphere i: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance). An empty slot's weight is cancelled by a force m g.
+    Height of sphere i: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance).
     """
     world = wp.tid()
-    phase = phase_inout[world]
-    fresh = phase == START or phase == IDLE or phase == OVER
-    restarted_out[world] = fresh
-    body = world * layout.bodies + layout.gripper_bodies
-    for s in range(layout.slots):
-        variant_out[body + s] = -1
-    if not fresh:
+    if phase_inout[world] != START:
         return
-    # Ticks since the drop, ticks at rest, re-drops, guide walls standing.
-    progress_inout[world] = wp.vec4i(0, 0, 0, 1)
-    q = world * layout.coords
-    qd = world * layout.dofs
-    for axis in range(layout.gripper_dofs):
-        joint_q_out[q + axis] = 0.0
-        joint_qd_out[qd + axis] = 0.0
-    for axis in range(3):
-        joint_q_out[q + axis] = drop.gripper_home[axis]
-    parked = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
-    for s in range(layout.slots):
-        empty = catalog.empty_single
-        if s >= layout.single_slots:
-            empty = catalog.empty_compound
-        variant_out[body + s] = empty
-        first = qd + layout.gripper_dofs + 6 * s
-        write_body(joint_q_out, joint_qd_out, q + layout.gripper_dofs + 7 * s, first, parked)
-        for axis in range(6):
-            joint_f_out[first + axis] = 0.0
-        joint_f_out[first + 2] = catalog.empty_mass * drop.gravity
+    body = world * layout.bodies + layout.gripper_bodies
     key = stream_key(seed, address[world][0], address[world][1], DROP)
     height = drop.rim_height
     for instance in range(layout.instances):
-        stuck_inout[world, instance] = 0
         e = entry[world, instance]
         if e >= 0:
             s = slot[world, instance]
             variant_out[body + s] = catalog.variant[e]
-            first = qd + layout.gripper_dofs + 6 * s
-            pose = drop_pose(key, instance, catalog.radius[e], height + catalog.radius[e], drop)
-            write_body(joint_q_out, joint_qd_out, q + layout.gripper_dofs + 7 * s, first, pose)
-            joint_f_out[first + 2] = 0.0
+            q = world * layout.coords + layout.gripper_dofs + 7 * s
+            qd = world * layout.dofs + layout.gripper_dofs + 6 * s
+            write_body(joint_q_out, joint_qd_out, q, qd, drop_pose(key, instance, catalog.radius[e], height + catalog.radius[e], drop))
+            joint_f_out[qd + 2] = 0.0
             height += 2.0 * catalog.radius[e] + drop.clearance
-    if phase == START:
-        phase_inout[world] = SETTLE
+    phase_inout[world] = SETTLE

@@ -98,7 +98,7 @@ def is_outside(position: wp.vec3, drop: DropData) -> bool:
 
 
 @wp.kernel
-def judge_settling_kernel(
+def redrop_objects_kernel(
     # Scene:
     seed: wp.uint64,
     layout: LayoutData,
@@ -107,33 +107,25 @@ def judge_settling_kernel(
     settle: SettleData,
     # State:
     address: wp.array[wp.vec2i],
+    phase: wp.array[int],
     entry: wp.array2d[int],
     slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
-    shift: wp.array2d[float],
     depth: wp.array[float],
     stuck_inout: wp.array2d[int],
     progress_inout: wp.array[wp.vec4i],
-    phase_inout: wp.array[int],
     joint_q_inout: wp.array[float],
     joint_qd_inout: wp.array[float],
 ):
-    """One tick of settling: re-drop what left the tote or is stuck, count ticks at rest, take the guide walls away, end.
+    """Drop again what left the tote, or penetrates something deeply for some time, one above the other; guide walls come back.
 
-    Rest is no object moving by more than `rest_shift` in a tick; at the end of the time, `last_shift` will do. `progress` holds
-    ticks since the drop, ticks at rest, re-drops, and whether the guide walls stand. `address` is (episode, attempt).
+    `progress` holds ticks since the drop, ticks at rest, re-drops, and whether the guide walls stand. `address` is (episode,
+    attempt).
     """
     world = wp.tid()
-    if phase_inout[world] != SETTLE:
+    if phase[world] != SETTLE:
         return
     progress = progress_inout[world]
-    ticks = progress[0] + 1
-    resting = progress[1] + 1
-    redrops = progress[2]
-    allowed = settle.rest_shift
-    if ticks > settle.late_ticks:
-        allowed = settle.last_shift
-    guides = progress[3]
     key = stream_key(seed, address[world][0], address[world][1], REDROP)
     height = drop.rim_height
     body = world * layout.bodies + layout.gripper_bodies
@@ -141,28 +133,54 @@ def judge_settling_kernel(
         e = entry[world, instance]
         if e >= 0:
             s = slot[world, instance]
-            if shift[world, instance] > allowed:
-                resting = 0
             stuck = stuck_inout[world, instance] + 1
             if depth[body + s] < settle.stuck_depth:
                 stuck = 0
             if stuck > settle.stuck_ticks or is_outside(wp.transform_get_translation(body_q[body + s]), drop):
                 stuck = 0
-                pose = drop_pose(key, redrops, catalog.radius[e], height + catalog.radius[e], drop)
+                pose = drop_pose(key, progress[2], catalog.radius[e], height + catalog.radius[e], drop)
                 height += 2.0 * catalog.radius[e] + drop.clearance
                 q = world * layout.coords + layout.gripper_dofs + 7 * s
                 write_body(joint_q_inout, joint_qd_inout, q, world * layout.dofs + layout.gripper_dofs + 6 * s, pose)
-                redrops += 1
-                resting = 0
-                guides = 1
+                progress = wp.vec4i(progress[0], -1, progress[2] + 1, 1)
             stuck_inout[world, instance] = stuck
+    progress_inout[world] = progress
+
+
+@wp.kernel
+def judge_rest_kernel(
+    # Scene:
+    layout: LayoutData,
+    settle: SettleData,
+    # State:
+    entry: wp.array2d[int],
+    shift: wp.array2d[float],
+    phase_inout: wp.array[int],
+    progress_inout: wp.array[wp.vec4i],
+):
+    """Count ticks at rest; after enough of them take the guide walls away, and after as many again let the gripper act.
+
+    Rest is no object moving by more than `rest_shift` in a tick; from `late_ticks` on, `last_shift` will do.
+    """
+    world = wp.tid()
+    if phase_inout[world] != SETTLE:
+        return
+    ticks = progress_inout[world][0] + 1
+    resting = progress_inout[world][1] + 1
+    guides = progress_inout[world][3]
+    allowed = settle.rest_shift
+    if ticks > settle.late_ticks:
+        allowed = settle.last_shift
+    for instance in range(layout.instances):
+        if entry[world, instance] >= 0 and shift[world, instance] > allowed:
+            resting = 0
     if resting >= settle.rest_ticks and ticks >= settle.min_ticks:
         if guides == 1:
             guides = 0
             resting = 0
         else:
             phase_inout[world] = ACT
-    progress_inout[world] = wp.vec4i(ticks, resting, redrops, guides)
+    progress_inout[world] = wp.vec4i(ticks, resting, progress_inout[world][2], guides)
 
 
 @wp.kernel

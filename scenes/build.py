@@ -139,10 +139,11 @@ def _add_gripper(world: newton.ModelBuilder, config: Config, shape: newton.Model
                             com=wp.vec3(0.0, 0.0, gripper.finger_length / 2), lock_inertia=True, label="finger")
     cup = world.add_link(mass=gripper.cup_mass, inertia=wp.mat33(np.diag(_rod_inertia(gripper.cup_mass, gripper.cup_length))),
                          com=wp.vec3(0.0, 0.0, -gripper.cup_length / 2), lock_inertia=True, label="cup")
-    slide = world.add_joint_d6(-1, finger, linear_axes=[dof(axis=axis, **free) for axis in (newton.Axis.X, newton.Axis.Y, newton.Axis.Z)])
+    axes = [dof(axis=axis, **free) for axis in (newton.Axis.X, newton.Axis.Y, newton.Axis.Z)]
+    slide = world.add_joint_d6(-1, finger, linear_axes=axes)
     limit = np.radians(gripper.tilt_limit)
-    tilt = world.add_joint_revolute(finger, cup, axis=newton.Axis.Y, limit_lower=-limit, limit_upper=limit, target_ke=gripper.tilt_stiffness,
-                                    target_kd=gripper.tilt_damping, effort_limit=gripper.tilt_torque, armature=CUP_ARMATURE)
+    drive = {"target_ke": gripper.tilt_stiffness, "target_kd": gripper.tilt_damping, "effort_limit": gripper.tilt_torque}
+    tilt = world.add_joint_revolute(finger, cup, axis=newton.Axis.Y, limit_lower=-limit, limit_upper=limit, armature=CUP_ARMATURE, **drive)
     world.add_articulation([slide, tilt], label="gripper")
     finger_shape = world.add_shape_convex_hull(finger, mesh=_hull(finger_collider(gripper)), cfg=shape)
     cup_shape = world.add_shape_convex_hull(cup, mesh=_hull(cup_collider(gripper)), cfg=shape)

@@ -114,7 +114,7 @@ class Fixture:
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """An equirectangular environment. Row 0 looks up (+z); u runs with the azimuth, which is atan2(y, x) at column u = azimuth / 2π + 0.5."""
+    """An equirectangular environment. Row 0 looks up (+z); azimuth atan2(y, x) lies at column share u = azimuth / 2π + 0.5."""
 
     name: str
     radiance: np.ndarray

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
@@ -16,7 +17,7 @@ from rich.table import Table
 from synpick_warp.progress import Progress
 
 if TYPE_CHECKING:
-    from synpick_warp.bake import BakeSummary
+    from synpick_warp.bake import BakeSummary, EpisodeRow
 
 PLAIN_WIDTH = 120
 """Width of tables where there is no terminal [characters]."""
@@ -122,7 +123,7 @@ def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
     console.print(f"data set: {out}", markup=False, soft_wrap=True)
 
 
-def _listing(rows: list[tuple]) -> Table:
+def _listing(rows: Sequence[EpisodeRow]) -> Table:
     table = Table("episode", "outcome", "drawn again", "frames", "time")
     for column in (0, 2, 3, 4):
         table.columns[column].justify = "right"

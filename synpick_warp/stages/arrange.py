@@ -21,25 +21,41 @@ def take_episodes(state: WorldState, episodes: int, attempts: int) -> None:
 
 
 def draw_objects(scene: SceneData, state: WorldState, seed: int) -> None:
-    """Draw the objects of worlds that start an episode."""
+    """Draw objects and light of worlds that start an episode."""
+    worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
         arrangement.draw_objects_kernel,
-        dim=state.phase.shape[0],
+        dim=worlds,
         inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, state.address, state.phase, state.outcome],
-        outputs=[state.entry, state.slot, state.light, state.light_turn],
-        device=state.phase.device,
+        outputs=[state.entry, state.slot],
+        device=device,
+    )
+    wp.launch(
+        arrangement.draw_lights_kernel,
+        dim=worlds,
+        inputs=[wp.uint64(seed), scene.drop, state.address, state.phase],
+        outputs=[state.light, state.light_turn],
+        device=device,
     )
 
 
 def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
-    """Stack the drawn objects above the tote and load them into the physics."""
+    """Empty the worlds that start, stack the drawn objects above the tote, and load all that into the physics."""
+    worlds, device = state.phase.shape[0], state.phase.device
+    joints = [physics.state.joint_q, physics.state.joint_qd, physics.control.joint_f]
+    wp.launch(
+        arrangement.empty_worlds_kernel,
+        dim=worlds,
+        inputs=[scene.layout, scene.catalog, scene.drop, state.phase],
+        outputs=[state.variant, *joints, state.restarted, state.progress, state.stuck],
+        device=device,
+    )
     wp.launch(
         arrangement.drop_objects_kernel,
-        dim=state.phase.shape[0],
-        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, state.address, state.entry, state.slot, state.phase,
-                state.progress, state.stuck],
-        outputs=[state.variant, physics.state.joint_q, physics.state.joint_qd, physics.control.joint_f, state.restarted],
-        device=state.phase.device,
+        dim=worlds,
+        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, state.address, state.entry, state.slot, state.phase],
+        outputs=[state.variant, *joints],
+        device=device,
     )
     physics.load(state.variant, state.restarted)
 
@@ -71,15 +87,21 @@ def measure_shift(scene: SceneData, state: WorldState, physics: Physics) -> None
 
 
 def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
-    """Count ticks at rest, re-drop what left the tote or is stuck, let worlds at rest act."""
+    """Re-drop what left the tote or is stuck, count ticks at rest, let worlds at rest act."""
     measure_depth(state, physics)
     measure_shift(scene, state, physics)
     wp.launch(
-        rest.judge_settling_kernel,
+        rest.redrop_objects_kernel,
         dim=state.phase.shape[0],
-        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, scene.settle, state.address, state.entry, state.slot,
-                physics.state.body_q, state.shift, state.depth, state.stuck, state.progress, state.phase,
-                physics.state.joint_q, physics.state.joint_qd],
+        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, scene.settle, state.address, state.phase, state.entry,
+                state.slot, physics.state.body_q, state.depth, state.stuck, state.progress, physics.state.joint_q,
+                physics.state.joint_qd],
+        device=state.phase.device,
+    )
+    wp.launch(
+        rest.judge_rest_kernel,
+        dim=state.phase.shape[0],
+        inputs=[scene.layout, scene.settle, state.entry, state.shift, state.phase, state.progress],
         device=state.phase.device,
     )
 

@@ -17,7 +17,6 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.physics import Physics
 from synpick_warp.stages.worlds import SceneData, WorldState, WorldStatus, make_scene_data, world_sizes
 
-
 # A tick is recorded while the last one's record is still read.
 RECORDS = 2
 
