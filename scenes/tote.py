@@ -57,9 +57,10 @@ def tote_fixture(tote: Tote) -> Fixture:
 
 
 def tote_colliders(tote: Tote) -> tuple[ConvexPiece, ...]:
-    """Floor and four walls; their inner faces are those of the visible tote, their corners sharp.
+    """Floor, four walls and four corners; floor and walls have the inner faces of the visible tote.
 
-    The walls lean outward with the draft, reach from below the floor to the rim, and outward to the edge of the flange.
+    The walls lean outward with the draft, reach from below the floor to the rim, and outward to the edge of the flange. A corner is
+    one plane at 45° that touches the visible round: nowhere is there more room than is seen, but for 8 % of the round's radius.
 
     Raises:
         ConfigError: As `tote_fixture`.
@@ -75,7 +76,18 @@ def tote_colliders(tote: Tote) -> tuple[ConvexPiece, ...]:
         for side in (1.0, -1.0):
             points = [(side * across, end, z) for across, z in outline for end in (-along, along)]
             walls.append(_piece(points if axis == 0 else [(y, x, z) for x, y, z in points]))
-    return (floor, *walls)
+    return (floor, *walls, *(_corner(tote, x, y) for x in (1.0, -1.0) for y in (1.0, -1.0)))
+
+
+def _corner(tote: Tote, x: float, y: float) -> ConvexPiece:
+    """The wedge that fills a vertical edge up to the tangent at 45° of its round; (x, y) are the signs of the corner."""
+    points = []
+    for level, z in ((0.0, -FLOOR_DEPTH), (0.0, 0.0), (rim_height(tote), rim_height(tote))):
+        half, radius = _opening(tote, level)
+        reach = (2.0 - np.sqrt(2.0)) * radius
+        for along, across in ((-reach, 0.0), (0.0, -reach), (MIN_WALL, 0.0), (0.0, MIN_WALL), (MIN_WALL, MIN_WALL)):
+            points.append((x * (half[0] + along), y * (half[1] + across), z))
+    return _piece(points)
 
 
 def guide_walls(tote: Tote, height: float) -> tuple[ConvexPiece, ...]:
@@ -113,11 +125,16 @@ def _check(tote: Tote) -> None:
 
 def _ring(tote: Tote, level: float, offset: float, z: float) -> np.ndarray:
     """Outline (n, 3) of the inside at a level above the floor, widened by an offset, drawn at height z [m]."""
-    share = level / rim_height(tote)
-    length, width = (low + share * (high - low) for low, high in zip(tote.floor_size, tote.rim_size, strict=True))
-    radius = CORNER_RADIUS + share * min(high - low for low, high in zip(tote.floor_size, tote.rim_size, strict=True)) / 2
-    outline = rounded_rectangle(length + 2 * offset, width + 2 * offset, radius + offset, CORNER_SEGMENTS)
+    (length, width), radius = _opening(tote, level)
+    outline = rounded_rectangle(2 * (length + offset), 2 * (width + offset), radius + offset, CORNER_SEGMENTS)
     return np.column_stack([outline, np.full(len(outline), z)])
+
+
+def _opening(tote: Tote, level: float) -> tuple[np.ndarray, float]:
+    """Half length and half width (2) of the inside at a level above the floor, and the radius of its corners [m]."""
+    share = level / rim_height(tote)
+    floor, rim = np.array(tote.floor_size), np.array(tote.rim_size)
+    return (floor + share * (rim - floor)) / 2, CORNER_RADIUS + share * float((rim - floor).min()) / 2
 
 
 def _outer_ring(tote: Tote, z: float) -> np.ndarray:

@@ -13,7 +13,7 @@ from synpick_warp.configs.schema import Gripper, Tote
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture
 from synpick_warp.scenes.meshes import merge_positions, signed_volume
-from synpick_warp.scenes.tote import FLOOR_DEPTH, MIN_WALL, guide_walls, rim_height, tote_colliders, tote_fixture
+from synpick_warp.scenes.tote import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, guide_walls, rim_height, tote_colliders, tote_fixture
 from tests.reference.rays import edges_match, first_hit
 
 TOTE = Tote()
@@ -113,7 +113,7 @@ def test_colliders_are_convex_and_thick():
         assert convex(piece)
     assert floor.vertices[:, 2].min() == pytest.approx(-FLOOR_DEPTH)
     assert floor.vertices[:, 2].max() == 0
-    assert len(walls) == 4
+    assert len(walls) == 8
     for wall in walls:
         assert wall.vertices[:, 2].max() == pytest.approx(TOP)
     reach = np.abs(np.concatenate([wall.vertices for wall in walls])).max(axis=0)[:2]
@@ -124,14 +124,18 @@ def test_colliders_are_convex_and_thick():
 def test_the_inside_is_free_and_its_walls_are_full(x, y, share):
     half = [(low + share * (high - low)) / 2 for low, high in zip(TOTE.floor_size, TOTE.rim_size, strict=True)]
     within = np.array([[2 * x * (half[0] - 1e-4), 2 * y * (half[1] - 1e-4), share * TOP]])
-    assert not any(inside(piece, within).any() for piece in tote_colliders(TOTE))
+    radius = CORNER_RADIUS + share * min(high - low for low, high in zip(TOTE.floor_size, TOTE.rim_size, strict=True)) / 2
+    # A plane at 45° touches the corner's round: it cuts (2 - √2) r off both sides.
+    beyond = (2 - 2**0.5) * radius - sum(half[axis] - abs(within[0, axis]) for axis in (0, 1))
+    if abs(beyond) > 1e-5:
+        assert any(inside(piece, within).any() for piece in tote_colliders(TOTE)) == (beyond > 0)
     wall = np.array([[half[0] + 0.005, 2 * y * half[1], 0.99 * share * TOP], [2 * x * half[0], -half[1] - 0.005, 0.99 * share * TOP]])
     assert np.any([inside(piece, wall) for piece in tote_colliders(TOTE)], axis=0).all()
 
 
 def test_guide_walls_stand_on_the_rim_flush_with_the_opening():
     walls = guide_walls(TOTE, 2.0)
-    assert len(walls) == 4
+    assert len(walls) == 8
     everything = np.concatenate([wall.vertices for wall in walls])
     assert everything[:, 2].min() == pytest.approx(TOP)
     assert everything[:, 2].max() == pytest.approx(TOP + 2.0)
