@@ -135,7 +135,7 @@ def test_the_inside_is_free_and_its_walls_are_full(x, y, share):
 
 def test_guide_walls_stand_on_the_rim_flush_with_the_opening():
     walls = guide_walls(TOTE, 2.0)
-    assert len(walls) == 8
+    assert len(walls) == 4
     everything = np.concatenate([wall.vertices for wall in walls])
     assert everything[:, 2].min() == pytest.approx(TOP)
     assert everything[:, 2].max() == pytest.approx(TOP + 2.0)
