@@ -161,12 +161,13 @@ class Physics:
     step: float = setting(2e-3, "s", "Time step (paper).", above=0.0, high=0.02)
     steps_per_tick: int = setting(33, "", "Steps between two frames: 15 Hz (paper).", low=1, high=1000)
     gravity: float = setting(9.81, "m/s²", "Gravity.", low=0.0)
-    iterations: int = setting(24, "", "Projected Gauss-Seidel iterations a step.", low=1, high=1000)
+    substeps: int = setting(2, "", "Collision and solver steps in a step: two of 12 iterations calm a pile more than one of 48.", low=1, high=100)
+    iterations: int = setting(12, "", "Projected Gauss-Seidel iterations a solver step.", low=1, high=1000)
     friction: float = setting(0.5, "", "Coulomb friction of every shape.", low=0.0, high=10.0)
     gap: float = setting(2e-3, "m", "Half the distance at which contacts are made; 5 mm costs a third more and settles no better.", low=0.0)
     angular_damping: float = setting(0.05, "1/s", "Angular damping of the objects (PhysX's default).", low=0.0)
     max_speed: float = setting(
-        2.0, "m/s", "No object is faster: 4 mm a step is no more than two shapes' gap, so falling objects stop at a surface.", above=0.0
+        4.0, "m/s", "No object is faster: 4 mm a solver step are no more than two shapes' gap, so falling objects stop at a surface.", above=0.0
     )
     contacts_per_world: int = setting(512, "", "Room for contacts in a world; about 140 are usual.", low=16)
     pairs_per_world: int = setting(1024, "", "Room for pairs of near shapes in a world.", low=16)
@@ -198,7 +199,7 @@ class Render:
     turn_lights: bool = setting(True, "", "Turn each episode's light map by a random angle about the vertical.")
     exposure: float = setting(1.0, "", "Factor on the automatic exposure.", above=0.0)
     shadow_rays: int = setting(1, "", "Shadow rays a pixel towards the map's main light; 0: none.", low=0, high=64)
-    ambient_rays: int = setting(2, "", "Rays a pixel that find how much of the sky is hidden; 0: none.", low=0, high=64)
+    ambient_rays: int = setting(1, "", "Rays a pixel that find how much of the sky is hidden; 0: none.", low=0, high=64)
     color_samples: int = setting(1, "", "Colour samples a pixel; depth and masks always have one.", low=1, high=64)
     table: bool = setting(True, "", "A table under the tote; without it the light map shows.")
     table_color: tuple[float, float, float] = setting((0.45, 0.45, 0.44), "sRGB", "Base colour of the table.", low=0.0, high=1.0)

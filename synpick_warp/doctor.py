@@ -29,10 +29,15 @@ def examine(config: Config, console: Console) -> None:
     """
     device = pick_device(config.bake.device)
     table = Table(show_header=False, box=None)
-    for name, value in [*_software(), *_host(), *_device(device), *_cache()]:
+    for name, value in [*describe_machine(device), *_cache()]:
         table.add_row(name, value)
     console.print(table)
     console.print(memory_report(config))
+
+
+def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
+    """Rows (name, value): versions, processor, memory and device, as measurements should name them."""
+    return [*_software(), *_host(), *_device(device)]
 
 
 def memory_report(config: Config) -> Table:

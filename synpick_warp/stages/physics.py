@@ -82,10 +82,12 @@ class Physics:
 
     def _run_steps(self, before_step: Callable[[newton.State], None]) -> None:
         current, following = self.state, self._other
-        for _ in range(self.config.physics.steps_per_tick):
+        physics = self.config.physics
+        for _ in range(physics.steps_per_tick):
             before_step(current)
-            self.pipeline.collide(current, self.contacts)
-            self.solver.step(current, following, self.control, self.contacts, self.config.physics.step)
-            current, following = following, current
+            for _ in range(physics.substeps):
+                self.pipeline.collide(current, self.contacts)
+                self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps)
+                current, following = following, current
         if current is not self.state:
             self.state.assign(current)
