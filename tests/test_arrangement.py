@@ -1,0 +1,280 @@
+"""Which objects are drawn, where they fall from, and who gets which episode."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from synpick_warp.kernels import arrangement as kernels
+from synpick_warp.kernels import phases
+from synpick_warp.outcome import Outcome
+from synpick_warp.stages import arrange
+from tests.reference import arrangement, draws
+from tests.reference.kernel_worlds import KernelWorlds
+
+WORLDS = 24
+SEED = 2**40 + 3
+
+
+@st.composite
+def catalogs(draw):
+    count = draw(st.integers(1, 12))
+    numbers = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    volume = numbers.uniform(0.02, draw(st.sampled_from((0.1, 0.5, 2.0))), count)
+    compound = (numbers.uniform(size=count) < draw(st.sampled_from((0.0, 0.3, 1.0)))).astype(np.int32)
+    return {
+        "volume": volume,
+        "compound": compound,
+        "radius": numbers.uniform(0.02, 0.3, count),
+        "instances": draw(st.integers(1, 16)),
+        "single_slots": draw(st.integers(0, 16)),
+        "compound_slots": draw(st.integers(0, 6)),
+        "drop": {"volume": draw(st.floats(0.01, 3.0)), "repeats": draw(st.integers(0, 1))},
+    }
+
+
+def made(device, worlds: int = WORLDS, **sizes) -> KernelWorlds:
+    default = {"volume": np.array([0.1, 0.2, 0.3]), "compound": np.array([0, 1, 0]), "radius": np.array([0.05, 0.1, 0.2]), "instances": 8,
+               "single_slots": 8, "compound_slots": 8}
+    return KernelWorlds(device, worlds, **(default | sizes))
+
+
+def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangement]:
+    """What the twin draws for each world."""
+    return [
+        arrangement.draw_objects(
+            seed, *map(int, address), volume=worlds.volume, compound=worlds.compound, budget=worlds.scene.drop.volume,
+            repeats=bool(worlds.scene.drop.repeats), room=worlds.instances, single_slots=worlds.single_slots,
+            compound_slots=worlds.compound_slots,
+        )
+        for address in worlds.state.address.numpy()
+    ]
+
+
+@given(sizes=catalogs(), seed=st.integers(0, 2**63 - 1), first=st.integers(0, 2**30), attempt=st.integers(0, 20))
+def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, attempt, device):
+    worlds = made(device, **sizes)
+    worlds.begin(phases.START, first + np.arange(WORLDS), attempt)
+    worlds.set(worlds.state.entry, 99)
+    arrange.draw_objects(worlds.scene, worlds.state, seed)
+    entry, slot = worlds.state.entry.numpy(), worlds.state.slot.numpy()
+    for world, expected in enumerate(drawn(worlds, seed)):
+        count = len(expected.entries)
+        assert tuple(entry[world, :count]) == expected.entries
+        assert (entry[world, count:] == -1).all()
+        assert tuple(slot[world, :count]) == expected.slots
+        state = (worlds.state.phase.numpy()[world], worlds.state.outcome.numpy()[world])
+        assert state == ((phases.OVER, Outcome.ARRANGEMENT_OVERFLOW) if expected.overflow else (phases.START, Outcome.RUNNING))
+        check_law(worlds, entry[world, :count], slot[world, :count])
+
+
+def check_law(worlds: KernelWorlds, entry: np.ndarray, slot: np.ndarray) -> None:
+    assert worlds.volume[entry].sum() <= worlds.scene.drop.volume * (1 + 1e-6)
+    assert len(set(slot)) == len(slot)
+    np.testing.assert_array_equal(slot >= worlds.single_slots, worlds.compound[entry] == 1)
+    assert (slot < worlds.slots).all()
+    if not worlds.scene.drop.repeats:
+        assert len(set(entry)) == len(entry)
+
+
+def test_a_budget_for_everything_draws_everything_without_repeats(device):
+    worlds = made(device, drop={"volume": 10.0, "repeats": 0})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    assert (np.sort(worlds.state.entry.numpy(), axis=1)[:, -3:] == [0, 1, 2]).all()
+    assert len(np.unique(worlds.state.entry.numpy(), axis=0)) == 6
+
+
+def test_the_budget_may_be_met_exactly(device):
+    worlds = made(device, volume=np.array([0.25]), compound=np.array([0]), radius=np.array([0.1]), drop={"volume": 1.0})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    assert ((worlds.state.entry.numpy() == 0).sum(axis=1) == 4).all()
+
+
+def test_an_object_that_never_fits_is_never_drawn(device):
+    worlds = made(device, drop={"volume": 0.25})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    entry = worlds.state.entry.numpy()
+    assert (entry[:, 0] >= 0).all()
+    assert not (entry == 2).any()
+
+
+@pytest.mark.parametrize("phase", [phases.EMPTY, phases.SETTLE, phases.ACT, phases.OVER])
+def test_worlds_at_work_keep_their_objects(device, phase):
+    worlds = made(device)
+    worlds.begin(phase)
+    worlds.set(worlds.state.entry, 2)
+    worlds.set(worlds.state.light, 7)
+    joints = worlds.physics.state.joint_q
+    worlds.set(joints, 0.5)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    assert (worlds.state.entry.numpy() == 2).all()
+    assert (worlds.state.light.numpy() == 7).all()
+    if phase != phases.OVER:
+        assert (worlds.state.variant.numpy().reshape(WORLDS, -1)[:, 2:] == -1).all()
+        assert (joints.numpy() == 0.5).all()
+        assert not worlds.state.restarted.numpy().any()
+
+
+def test_lights_are_even_and_turn(device):
+    worlds = made(device, worlds=2000)
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    counts = np.bincount(worlds.state.light.numpy(), minlength=5)
+    assert counts.min() > 330
+    assert len(counts) == 5
+    keys = [draws.stream_key(SEED, episode, 0, draws.LIGHT) for episode in range(2000)]
+    np.testing.assert_allclose(worlds.state.light_turn.numpy(), [2 * np.pi * draws.uniform(key, 1) for key in keys], rtol=1e-6)
+    still = made(device, drop={"turn_lights": 0})
+    still.begin(phases.START)
+    arrange.draw_objects(still.scene, still.state, SEED)
+    assert (still.state.light_turn.numpy() == 0.0).all()
+
+
+@given(sizes=catalogs(), spread=st.floats(0.0, 1.0), clearance=st.floats(0.0, 0.05), episode=st.integers(0, 2**30))
+def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance, episode, device):
+    sizes["drop"] |= {"spread": spread, "clearance": clearance}
+    worlds = made(device, **sizes)
+    worlds.begin(phases.START, episode + np.arange(WORLDS))
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    over = worlds.state.phase.numpy() == phases.OVER
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    np.testing.assert_array_equal(worlds.state.phase.numpy(), np.where(over, phases.OVER, phases.SETTLE))
+    drop = worlds.scene.drop
+    rim = (drop.rim_length, drop.rim_width, drop.rim_height)
+    for world in range(WORLDS):
+        entry = worlds.state.entry.numpy()[world]
+        entry = entry[entry >= 0]
+        poses = worlds.coordinates()[world, worlds.state.slot.numpy()[world, : len(entry)]]
+        radius = worlds.radius[entry]
+        expected = arrangement.drop_poses(SEED, episode + world, 0, radius, rim=rim, clearance=clearance, spread=spread)
+        np.testing.assert_allclose(poses, expected, atol=1e-5)
+        place, bottom = poses[:, :3].astype(np.float64), poses[:, 2] - radius
+        assert (bottom >= drop.rim_height - 1e-5).all()
+        gaps = np.linalg.norm(place[:, None] - place[None], axis=2) - radius[:, None] - radius[None]
+        assert (gaps[~np.eye(len(entry), dtype=bool)] >= -1e-5).all()
+        for axis in range(2):
+            assert (np.abs(place[:, axis]) <= np.maximum(0.0, rim[axis] / 2 - radius) + 1e-6).all()
+
+
+def test_the_drop_uses_the_whole_spread(device):
+    worlds = made(device, worlds=500, radius=np.full(3, 0.05), drop={"spread": 1.0})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    full = worlds.coordinates()[worlds.forces()[:, :, 2] == 0.0]
+    np.testing.assert_allclose(full[:, :2].min(axis=0), [-0.2, -0.1], atol=5e-3)
+    np.testing.assert_allclose(full[:, :2].max(axis=0), [0.2, 0.1], atol=5e-3)
+
+
+def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device):
+    worlds = made(device)
+    worlds.begin(phases.START)
+    worlds.set(worlds.physics.state.joint_qd, 1.0)
+    worlds.set(worlds.physics.control.joint_f, 7.0)
+    worlds.set(worlds.state.stuck, 5)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    state, catalog = worlds.state, worlds.scene.catalog
+    variant = state.variant.numpy().reshape(WORLDS, -1)
+    full = np.zeros((WORLDS, worlds.slots), dtype=bool)
+    for world, instance in zip(*np.nonzero(state.entry.numpy() >= 0), strict=True):
+        slot, entry = state.slot.numpy()[world, instance], state.entry.numpy()[world, instance]
+        full[world, slot] = True
+        assert variant[world, 2 + slot] == catalog.variant.numpy()[entry]
+    empty = np.where(np.arange(worlds.slots) < worlds.single_slots, catalog.empty_single, catalog.empty_compound)
+    np.testing.assert_array_equal(variant[:, 2:][~full], np.broadcast_to(empty, full.shape)[~full])
+    weight = np.array([0.0, 0.0, catalog.empty_mass * worlds.scene.drop.gravity, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(worlds.forces(), np.where(full[:, :, None], 0.0, weight), rtol=1e-6)
+    parked = [0.0, 0.0, kernels.PARKED_HEIGHT, 0.0, 0.0, 0.0, 1.0]
+    np.testing.assert_array_equal(worlds.coordinates()[~full], np.broadcast_to(np.float32(parked), worlds.coordinates()[~full].shape))
+    assert (worlds.physics.state.joint_qd.numpy() == 0.0).all()
+    assert (state.stuck.numpy() == 0).all()
+    np.testing.assert_array_equal(state.progress.numpy(), np.broadcast_to([0, 0, 0, 1], (WORLDS, 4)))
+    assert state.restarted.numpy()[:-1].all()
+    assert not state.restarted.numpy()[-1]
+    gripper = worlds.physics.state.joint_q.numpy().reshape(WORLDS, -1)[:, :4]
+    np.testing.assert_array_equal(gripper, np.tile([3.0, 0.0, 1.0, 0.0], (WORLDS, 1)))
+
+
+def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
+    worlds = made(device, compound_slots=0)
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    over = worlds.state.outcome.numpy() == Outcome.ARRANGEMENT_OVERFLOW
+    assert over.any()
+    assert not over.all()
+    assert (worlds.state.entry.numpy()[over] == -1).all()
+    assert (worlds.coordinates()[over][:, :, 2] == kernels.PARKED_HEIGHT).all()
+    assert (worlds.forces()[over][:, :, 2] > 0.0).all()
+
+
+def test_outcomes_have_the_same_codes_on_both_sides():
+    assert {f"OUTCOME_{outcome.name}": int(outcome) for outcome in Outcome} == {
+        name: int(value) for name, value in vars(phases).items() if name.startswith("OUTCOME_")
+    }
+
+
+def take(device, phase, outcome, address, following: int, *, episodes: int, attempts: int):
+    """State after numbers are handed out: phase, outcome, address, next number."""
+    worlds = made(device, worlds=len(phase))
+    state = worlds.state
+    for array, values in ((state.phase, phase), (state.outcome, outcome), (state.address, address), (state.next_episode, following)):
+        worlds.set(array, values)
+    arrange.take_episodes(state, episodes, attempts)
+    return state.phase.numpy().tolist(), state.outcome.numpy().tolist(), state.address.numpy().tolist(), int(state.next_episode.numpy()[0])
+
+
+def test_empty_worlds_take_numbers_in_order(device):
+    assert take(device, [phases.EMPTY] * 3, 0, -1, 0, episodes=2, attempts=1) == (
+        [phases.START, phases.START, phases.IDLE], [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2
+    )
+
+
+def test_an_episode_that_delivered_nothing_is_drawn_again_in_its_world_until_it_is_given_up(device):
+    over = [phases.OVER] * 4
+    outcome = [Outcome.UNSETTLED, Outcome.FINISHED, Outcome.NOT_FINITE, Outcome.UNSETTLED]
+    address = [[3, 0], [4, 0], [5, 1], [6, 2]]
+    assert take(device, over, outcome, address, 9, episodes=100, attempts=3) == (
+        [phases.START] * 4, [Outcome.RUNNING] * 4, [[3, 1], [9, 0], [5, 2], [10, 0]], 11
+    )
+
+
+def test_worlds_at_work_keep_their_numbers(device):
+    phase = [phases.SETTLE, phases.ACT, phases.IDLE]
+    assert take(device, phase, 0, [[0, 0], [1, 0], [-1, 0]], 2, episodes=9, attempts=3) == (phase, [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2)
+
+
+@given(worlds=st.integers(1, 6), episodes=st.integers(1, 20), attempts=st.integers(1, 4), seed=st.integers(0, 2**32 - 1))
+def test_every_episode_ends_once(worlds, episodes, attempts, seed, device):
+    """Whatever becomes of episodes, each number is delivered or given up exactly once; then all worlds are idle."""
+    numbers = np.random.default_rng(seed)
+    made_worlds = made(device, worlds=worlds)
+    state = made_worlds.state
+    made_worlds.begin(phases.EMPTY, -1)
+    started, ended = [], []
+    for _ in range(8 * episodes * attempts):
+        arrange.take_episodes(state, episodes, attempts)
+        phase, outcome, address = state.phase.numpy(), state.outcome.numpy(), state.address.numpy()
+        started += [tuple(address[world]) for world in np.flatnonzero(phase == phases.START)]
+        for world in np.flatnonzero(phase != phases.IDLE):
+            phase[world], outcome[world] = phases.ACT, Outcome.RUNNING
+            if numbers.uniform() < 0.5:
+                phase[world], outcome[world] = phases.OVER, numbers.choice([Outcome.FINISHED, Outcome.UNSETTLED])
+                if outcome[world] == Outcome.FINISHED or address[world, 1] == attempts - 1:
+                    ended.append(int(address[world, 0]))
+        if (phase == phases.IDLE).all():
+            break
+        made_worlds.set(state.phase, phase)
+        made_worlds.set(state.outcome, outcome)
+    assert (state.phase.numpy() == phases.IDLE).all()
+    assert sorted(ended) == list(range(episodes))
+    assert len(set(started)) == len(started)
+    assert [episode for episode, attempt in started if attempt == 0] == list(range(episodes))
+    assert (state.address.numpy()[:, 0] == -1).all()
