@@ -161,13 +161,13 @@ class Physics:
     step: float = setting(2e-3, "s", "Time step (paper).", above=0.0, high=0.02)
     steps_per_tick: int = setting(33, "", "Steps between two frames: 15 Hz (paper).", low=1, high=1000)
     gravity: float = setting(9.81, "m/s²", "Gravity.", low=0.0)
-    substeps: int = setting(2, "", "Collision and solver steps in a step: two of 12 iterations calm a pile more than one of 48.", low=1, high=100)
+    substeps: int = setting(2, "", "Solver steps in a step: two of 12 iterations calm a pile more than one of 48.", low=1, high=100)
     iterations: int = setting(12, "", "Projected Gauss-Seidel iterations a solver step.", low=1, high=1000)
     friction: float = setting(0.5, "", "Coulomb friction of every shape.", low=0.0, high=10.0)
     gap: float = setting(2e-3, "m", "Half the distance at which contacts are made; 5 mm costs a third more and settles no better.", low=0.0)
     angular_damping: float = setting(0.05, "1/s", "Angular damping of the objects (PhysX's default).", low=0.0)
     max_speed: float = setting(
-        4.0, "m/s", "No object is faster: 4 mm a solver step are no more than two shapes' gap, so falling objects stop at a surface.", above=0.0
+        4.0, "m/s", "No object is faster: 4 mm a solver step are no more than two shapes' gap, so none passes a surface.", above=0.0
     )
     contacts_per_world: int = setting(512, "", "Room for contacts in a world; about 140 are usual.", low=16)
     pairs_per_world: int = setting(1024, "", "Room for pairs of near shapes in a world.", low=16)
