@@ -166,7 +166,8 @@ def settle(simulation: Simulation, catalog: Catalog) -> Findings:
 
 def _finish(simulation: Simulation, worlds: np.ndarray) -> None:
     """End the episodes of these worlds as if the gripper had done its work, so that the next tick hands out new ones."""
-    for array, value in ((simulation.state.phase, phases.OVER), (simulation.state.outcome, phases.OUTCOME_FINISHED)):
+    state = simulation.state
+    for array, value in ((state.phase, phases.OVER), (state.outcome, phases.OUTCOME_FINISHED)):
         host = array.numpy()
         host[worlds] = int(value)
         array.assign(host)
@@ -177,7 +178,9 @@ def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: 
     state, layout = simulation.state, simulation.layout
     tick = simulation.config.physics.step * simulation.config.physics.steps_per_tick
     progress, slots = state.progress.numpy(), state.slot.numpy()
-    depths, velocities = state.depth.numpy(), simulation.physics.state.body_qd.numpy().astype(np.float64)
+    body_qd = simulation.physics.state.body_qd
+    assert body_qd is not None  # Newton's models of rigid bodies have it.
+    depths, velocities = state.depth.numpy(), body_qd.numpy().astype(np.float64)
     piles = []
     for world in worlds:
         instances = np.flatnonzero(now.entry[world] >= 0)
@@ -238,7 +241,7 @@ def report(findings: Findings) -> list[Row]:
     ticks, volume, energy = over_piles("ticks"), over_piles("volume"), 1e6 * over_piles("energy")
     speed, tick_speed, depth = over_objects("speed"), over_objects("tick_speed"), over_objects("depth")
     inside = 100.0 * float(over_objects("inside").mean())
-    rows = [
+    return [
         Row("arrangements at rest", len(piles), ""),
         Row("arrangements given up", findings.given_up, "", "= 0", findings.given_up == 0),
         *(Row(f"drawn again: {name}", count, "") for name, count in sorted(findings.redrawn.items())),
@@ -255,7 +258,6 @@ def report(findings: Findings) -> list[Row]:
         Row("objects inside the tote", inside, "%", f">= {LEAST_INSIDE:g}", inside >= LEAST_INSIDE),
         *_percentiles("kinetic energy of a world", energy, "µJ", (50, 90, 100)),
     ]
-    return rows
 
 
 def _bounded(name: str, value: float, unit: str, most: float, bound: str) -> Row:

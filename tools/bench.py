@@ -1,0 +1,423 @@
+"""Measure how fast a bake's parts are on this machine: physics, rendering, writing, and a whole small bake.
+
+Everything is warmed up first; numbers are medians of repeated, synchronised measurements. Physics and rendering use the same
+worlds; writing gets views of them over and over. Files go to the system's temporary folder (TMPDIR) and are removed.
+
+    python tools/bench.py --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import functools
+import itertools
+import json
+import os
+import resource
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import warp as wp
+from rich.console import Console
+from rich.table import Table
+
+from synpick_warp.bake import Factory, build_factory, run_bake
+from synpick_warp.cli import parse_resolution
+from synpick_warp.configs.load import load_config, parse_assignment
+from synpick_warp.configs.schema import Config
+from synpick_warp.device import pick_device
+from synpick_warp.doctor import GIB, describe_machine
+from synpick_warp.errors import SynpickError
+from synpick_warp.exporters.bop import BopExporter, view_bytes
+from synpick_warp.exporters.pool import WriterPool
+from synpick_warp.frames import FrameBatch
+from synpick_warp.kernels import phases
+from synpick_warp.progress import SilentProgress
+from synpick_warp.stages import act
+from synpick_warp.stages.annotate import annotate
+from synpick_warp.stages.simulate import Simulation
+from synpick_warp.stages.stream import STATUS_COLUMNS, FrameStream, TickReader, TickReport
+
+PARTS = ("physics", "render", "write", "bake")
+FOREVER = 1 << 30
+"""More ticks than any measurement takes."""
+FALL_TICKS = 4
+"""From the drop until the first objects land."""
+SETTLE_TICKS = 60
+"""From the drop until piles are at rest: 4 s at 15 Hz."""
+START_HEIGHT = 0.2
+"""Where the gripper starts, just above the pile [m]."""
+STIR_TICKS = 30
+"""From there until it is in the pile's midst: 2 s at 15 Hz."""
+LEAST_REPEATS = 3
+BURST = 2
+"""Ticks, or passes of the renderer, between two synchronisations: as in a bake, the device does not wait for the host."""
+STREAM_BATCHES = 12
+"""Batches that are rendered and copied in a row."""
+WRITE_VIEWS = 12
+"""Views that the writers get over and over."""
+BAKE_WORLDS = 16
+"""Most worlds of the small bake."""
+BAKE_ROUNDS, BAKE_SPEED = 1, 0.4
+"""Rounds and speed [m/s] of its gripper: short episodes."""
+BAKE_METHODS = (
+    (Simulation, "tick", "launch ticks"),
+    (TickReader, "wait", "wait for ticks"),
+    (FrameStream, "_launch", "launch views"),
+    (FrameStream, "_collect", "wait for views"),
+    (BopExporter, "write", "hand views to writers"),
+    (BopExporter, "end", "end episodes"),
+    (BopExporter, "close", "wait for writers, finish files"),
+)
+"""Where the main process of a bake spends its time; on the CPU, launching is computing."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured number."""
+
+    part: str
+    name: str
+    value: float
+    unit: str
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Measure, print, and return the exit code."""
+    options = _parse(arguments)
+    console = Console(highlight=False)
+    rows: list[Row] = []
+    try:
+        config = _config(options)
+        device = pick_device(config.bake.device)
+        machine = describe_machine(device)
+        _print_machine(console, machine, config)
+        for row in measure(config, options.parts, options.seconds):
+            rows.append(row)
+            console.print(f"{row.part:8} {row.name:52} {row.value:14,.3f} {row.unit}")
+    except SynpickError as error:
+        print(f"bench: {error}", file=sys.stderr)
+        return 2
+    if options.json:
+        record = {"machine": dict(machine), "worlds": config.bake.worlds, "resolution": config.cameras.resolution,
+                  "models": bool(config.bake.models), "rows": [dataclasses.asdict(row) for row in rows]}
+        options.json.write_text(json.dumps(record, indent=1) + "\n")
+    return 0
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--device", default="auto", help="cpu, cuda:N or auto (default)")
+    parser.add_argument("--worlds", type=int, default=512, help="totes side by side (default 512)")
+    parser.add_argument("--resolution", default="1920x1080", help="WIDTHxHEIGHT [px] (default 1920x1080)")
+    parser.add_argument("--models", default="", help="folder of BOP models (default: the embedded objects)")
+    parser.add_argument("--lights", default="", help="folder of light maps (default: the embedded skies)")
+    parser.add_argument("--parts", type=_parts, default=PARTS, help=f"what to measure, with commas (default {','.join(PARTS)})")
+    parser.add_argument("--seconds", type=float, default=2.0, help="least time a measurement is repeated [s] (default 2)")
+    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any other setting; may be repeated")
+    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
+    return parser.parse_args(arguments)
+
+
+def _parts(text: str) -> tuple[str, ...]:
+    parts = tuple(text.split(","))
+    if unknown := [part for part in parts if part not in PARTS]:
+        raise argparse.ArgumentTypeError(f"no such part: {', '.join(unknown)}; parts: {', '.join(PARTS)}")
+    return parts
+
+
+def _config(options: argparse.Namespace) -> Config:
+    overrides: dict[str, object] = dict(parse_assignment(text) for text in options.set)
+    overrides |= {
+        "bake.device": options.device,
+        "bake.worlds": options.worlds,
+        "bake.episodes": options.worlds,
+        "bake.models": options.models,
+        "bake.lights": options.lights,
+        "cameras.resolution": parse_resolution(options.resolution),
+    }
+    return load_config(None, overrides)
+
+
+def _print_machine(console: Console, machine: list[tuple[str, str]], config: Config) -> None:
+    table = Table(show_header=False, box=None)
+    for name, value in machine:
+        table.add_row(name, value)
+    width, height = config.cameras.resolution
+    table.add_row("measured", f"{config.bake.worlds} worlds, {len(config.cameras.positions)} cameras, {width}x{height}")
+    console.print(table)
+
+
+def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Row]:
+    """All numbers of the parts, as they come. `least` is the time a measurement is repeated [s]."""
+    if {"physics", "render", "write"} & set(parts):
+        started = time.perf_counter()
+        factory = build_factory(config, SilentProgress())
+        wp.synchronize_device(factory.simulation.device)
+        yield Row("setup", "load and build", time.perf_counter() - started, "s")
+        for row in _physics(factory, least, "physics" in parts):
+            if row.part in ("setup", *parts):
+                yield row
+        if "render" in parts:
+            yield from _render(config, factory, least)
+        if "write" in parts:
+            yield from _write(config, factory, least)
+        yield _memory(factory.simulation.device)
+        del factory
+    if "bake" in parts:
+        yield from _bake(config)
+
+
+def seconds_per_call(function: Callable[[], object], device: wp.Device, least: float, calls: int = 1) -> float:
+    """Median time of a call [s], the device's work included, of at least `LEAST_REPEATS` bursts of `calls`, after one as warm-up."""
+    times: list[float] = []
+    for repeat in itertools.count():
+        wp.synchronize_device(device)
+        started = time.perf_counter()
+        for _ in range(calls):
+            function()
+        wp.synchronize_device(device)
+        if repeat > 0:
+            times.append((time.perf_counter() - started) / calls)
+        if len(times) >= LEAST_REPEATS and sum(times) * calls >= least:
+            break
+    return statistics.median(times)
+
+
+def _memory(device: wp.Device) -> Row:
+    if device.is_cuda:
+        return Row("setup", "device memory in use, by anybody", (device.total_memory - device.free_memory) / GIB, "GiB")
+    return Row("setup", "memory of the process, most", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2, "GiB")
+
+
+def _physics(factory: Factory, least: float, thorough: bool) -> Iterator[Row]:
+    """Drop, settle and stir all worlds; on the way, if `thorough`, measure ticks."""
+    simulation = factory.simulation
+    tick = functools.partial(simulation.tick, simulation.records[0])
+    settle = simulation.scene.settle
+    rest_ticks, settle.rest_ticks, settle.max_ticks = settle.rest_ticks, FOREVER, FOREVER
+    simulation.scene.move.start_height = START_HEIGHT
+    started = time.perf_counter()
+    for _ in range(FALL_TICKS):
+        tick()
+    wp.synchronize_device(simulation.device)
+    yield Row("setup", f"load kernels, record the steps, first {FALL_TICKS} ticks", time.perf_counter() - started, "s")
+    if thorough:
+        yield from _ticks(simulation, tick, least, "falling and landing")
+    for _ in range(SETTLE_TICKS):
+        tick()
+    # Guide walls go away as they do in a bake; then piles are held at rest.
+    for count in (1, FOREVER):
+        settle.rest_ticks = count
+        tick()
+    if thorough:
+        yield from _ticks(simulation, tick, least, "at rest")
+        yield from _within_a_tick(simulation, tick, least)
+    settle.rest_ticks = rest_ticks
+    for _ in range(STIR_TICKS + 2 * rest_ticks):
+        tick()
+    if thorough:
+        acting = float((simulation.state.phase.numpy() == int(phases.ACT)).mean())
+        yield Row("physics", "worlds being stirred", 100.0 * acting, "%")
+        yield from _ticks(simulation, tick, least, "being stirred")
+        contacts = int(simulation.physics.contacts.rigid_contact_count.numpy()[0])
+        yield Row("physics", "contacts a world", contacts / simulation.layout.worlds, "")
+
+
+def _ticks(simulation: Simulation, tick: Callable[[], None], least: float, state: str) -> Iterator[Row]:
+    """How fast whole ticks are."""
+    physics = simulation.config.physics
+    seconds = seconds_per_call(tick, simulation.device, least, BURST)
+    steps = physics.steps_per_tick * simulation.layout.worlds
+    yield Row("physics", f"{state}: world-steps", steps / seconds, "1/s")
+    yield Row("physics", f"{state}: a step of all worlds", 1e3 * seconds / physics.steps_per_tick, "ms")
+    yield Row("physics", f"{state}: simulated time by time", steps * physics.step / seconds, "")
+
+
+def _within_a_tick(simulation: Simulation, tick: Callable[[], None], least: float) -> Iterator[Row]:
+    """What a tick's time goes to."""
+    physics, device = simulation.physics, simulation.device
+    drive = functools.partial(act.drive_gripper, simulation.scene, simulation.state, physics)
+    steps = seconds_per_call(lambda: physics.tick(drive), device, least, BURST)
+    started = time.perf_counter()
+    tick()
+    host = time.perf_counter() - started
+    with mock.patch.object(physics, "tick"):
+        outside = seconds_per_call(tick, device, least / 4, BURST)
+    collide = _recorded(lambda: physics.pipeline.collide(physics.state, physics.contacts), device)
+    yield Row("physics", "a tick: its steps", 1e3 * steps, "ms")
+    yield Row("physics", "a tick: all but its steps", 1e3 * outside, "ms")
+    yield Row("physics", "a tick: the host until all is launched", 1e3 * host, "ms")
+    yield Row("physics", "collision, once", 1e3 * seconds_per_call(collide, device, least / 4, BURST), "ms")
+
+
+def _recorded(function: Callable[[], object], device: wp.Device) -> Callable[[], object]:
+    """The same launches as a CUDA graph, so that launching does not count; on the CPU, the function."""
+    function()
+    if not device.is_cuda:
+        return function
+    with wp.ScopedCapture(device=device) as capture:
+        function()
+    graph = capture.graph
+    assert graph is not None  # It is there once the capture has ended.
+    return lambda: wp.capture_launch(graph)
+
+
+def _all_live(simulation: Simulation, worlds: int) -> TickReport:
+    """The report of the last tick, as if it were a frame of the first `worlds` worlds and of no other."""
+    reader = TickReader(simulation.records[0])
+    reader.start()
+    report = reader.wait()
+    report.status[:, STATUS_COLUMNS.index("live")] = np.arange(simulation.layout.worlds) < worlds
+    return report
+
+
+def _render(config: Config, factory: Factory, least: float) -> Iterator[Row]:
+    """Time of each stage of a view, of a batch in one go, and of batches with copies beside them."""
+    simulation, stream = factory.simulation, factory.stream
+    device, cameras = simulation.device, len(factory.cameras)
+    count = min(stream.batch, simulation.layout.worlds * cameras)
+    yield Row("render", "views in a batch", count, "")
+    spent = {}
+    for name, launch in _render_stages(factory, count).items():
+        spent[name] = seconds_per_call(launch, device, least / 4, BURST) / count
+        yield Row("render", f"a view: {name}", 1e3 * spent[name], "ms")
+    yield Row("render", "views, ground truth alone", 1.0 / (spent["prepare bodies"] + spent["trace hits"] + spent["annotate"]), "1/s")
+    yield Row("render", "views, all stages", 1.0 / spent["all"], "1/s")
+    if device.is_cuda:
+        size = sum(array.capacity for array in stream.copies[0].source)
+
+        def copy() -> None:
+            stream.copies[0].start(stream.copy_stream)
+            stream.copies[0].wait()
+
+        seconds = seconds_per_call(copy, device, least / 4)
+        yield Row("render", "copy to the host", 1e-9 * size / seconds, "GB/s")
+        yield Row("render", "views copied to the host", stream.batch / seconds, "1/s")
+    worlds = min(simulation.layout.worlds, -(-STREAM_BATCHES * stream.batch // cameras))
+    report = _all_live(simulation, worlds)
+    seconds = seconds_per_call(lambda: [len(batch) for batch in stream.render(simulation.records[0].snapshot, report)], device, least)
+    yield Row("render", "views, all stages and copies", worlds * cameras / seconds, "1/s")
+
+
+def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], object]]:
+    """Launches of each stage of a batch of `count` views, by name, in order; "all" is all of them."""
+    simulation, renderer, out = factory.simulation, factory.stream.renderer, factory.stream.buffers[0]
+    cameras, snapshot, samples = len(factory.cameras), simulation.records[0].snapshot, renderer.samples
+    view = np.arange(count, dtype=np.int32)
+    world, camera = (wp.array(values, dtype=wp.int32, device=simulation.device) for values in (view // cameras, view % cameras))
+    stages: dict[str, Callable[[], object]] = {
+        "prepare bodies": lambda: renderer.prepare_bodies(snapshot, world, camera, count),
+        "trace hits": lambda: renderer.trace_hits(camera, count, out),
+        "trace colour samples": lambda: [renderer.trace_sample(camera, count, sample) for sample in samples],
+        "occlude": lambda: [renderer.occlude(snapshot, world, camera, count, sample) for sample in samples],
+        "filter occlusion": lambda: [renderer.filter_occlusion(camera, count, sample) for sample in samples],
+        "shade": lambda: [renderer.shade(snapshot, world, camera, count, sample) for sample in samples],
+        "develop": lambda: renderer.develop(snapshot, world, count, out),
+        "annotate": lambda: annotate(renderer.scene, renderer.bodies, camera, count, out),
+        "all": lambda: renderer.render(snapshot, world, camera, count, out),
+    }
+    if len(samples) == 1:
+        del stages["trace colour samples"]
+    return stages
+
+
+def _write(config: Config, factory: Factory, least: float) -> Iterator[Row]:
+    """Views a second that go through the exporter and its processes, by number of processes."""
+    simulation, cameras = factory.simulation, len(factory.cameras)
+    worlds = min(simulation.layout.worlds, -(-WRITE_VIEWS // cameras))
+    batch = _copied(next(factory.stream.render(simulation.records[0].snapshot, _all_live(simulation, worlds))))
+    cores = len(os.sched_getaffinity(0))
+    size = 0.0
+    for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
+        rate, size = _write_rate(config, factory, batch, processes, least)
+        yield Row("write", f"views, {processes} process{'es' if processes > 1 else ''}", rate, "1/s")
+    yield Row("write", "files of a view", 1e-6 * size, "MB")
+
+
+def _write_rate(config: Config, factory: Factory, batch: FrameBatch, processes: int, least: float) -> tuple[float, float]:
+    """Views a second that so many processes write, and the size of a view's files [B]."""
+    with tempfile.TemporaryDirectory() as folder, WriterPool(processes, view_bytes(factory.cameras[0])) as pool:
+        exporter = BopExporter(Path(folder) / "out", config, factory.catalog, factory.cameras, config.bake.episodes, pool)
+        constants = _size(folder)
+        exporter.write(batch)
+        pool.wait()
+        written, started = 0, time.perf_counter()
+        while written < LEAST_REPEATS * len(batch) or time.perf_counter() - started < least:
+            written += len(batch)
+            exporter.write(dataclasses.replace(batch, frame=np.full(len(batch), written)))
+        pool.wait()
+        seconds = time.perf_counter() - started
+        size = (_size(folder) - constants) / (written + len(batch))
+        exporter.abort()
+    return written / seconds, size
+
+
+def _size(folder: str) -> int:
+    return sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
+
+
+def _copied(batch: FrameBatch) -> FrameBatch:
+    """The same views, out of the ring buffer."""
+    arrays = {item.name: np.array(getattr(batch, item.name)[:WRITE_VIEWS]) for item in dataclasses.fields(batch)}
+    return FrameBatch(**arrays)
+
+
+class _StageTimes(SilentProgress):
+    """Notes when each stage of a bake begins."""
+
+    def __init__(self) -> None:
+        self.begun: list[tuple[str, float]] = []
+
+    def stage(self, text: str) -> None:
+        self.begun.append((text, time.perf_counter()))
+
+
+def _bake(config: Config) -> Iterator[Row]:
+    """A small bake: seconds by stage, and where the main process spends them."""
+    worlds = min(config.bake.worlds, BAKE_WORLDS)
+    small = dataclasses.replace(
+        config,
+        bake=dataclasses.replace(config.bake, worlds=worlds, episodes=worlds),
+        move=dataclasses.replace(config.move, rounds=BAKE_ROUNDS, speed=BAKE_SPEED),
+    )
+    progress, spent = _StageTimes(), dict.fromkeys((name for _, _, name in BAKE_METHODS), 0.0)
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as patches:
+        for kind, method, name in BAKE_METHODS:
+            patches.enter_context(mock.patch.object(kind, method, _timed(getattr(kind, method), spent, name)))
+        summary = run_bake(small, Path(folder) / "out", progress)
+        progress.stage("")
+    yield Row("bake", "worlds, and episodes", worlds, "")
+    yield Row("bake", "views", summary.views, "")
+    yield Row("bake", "views", summary.views / summary.wall_seconds, "1/s")
+    for (text, begun), (_, ended) in itertools.pairwise(progress.begun):
+        yield Row("bake", f"stage: {text}", ended - begun, "s")
+    for name, seconds in spent.items():
+        yield Row("bake", f"main process: {name}", seconds, "s")
+
+
+def _timed(function: Callable[..., object], spent: dict[str, float], name: str) -> Callable[..., object]:
+    """The function, whose time is added to `spent[name]`."""
+
+    @functools.wraps(function)
+    def wrapper(*arguments: object, **options: object) -> object:
+        started = time.perf_counter()
+        try:
+            return function(*arguments, **options)
+        finally:
+            spent[name] += time.perf_counter() - started
+
+    return wrapper
+
+
+if __name__ == "__main__":
+    sys.exit(main())
