@@ -19,6 +19,8 @@ wp.set_module_options({"enable_backward": False})
 
 # An object whose origin is lower than this has left the tote through its floor or beside it [m].
 BELOW_FLOOR = wp.constant(-0.01)
+# Guide walls that do not stand are this much higher, above whatever falls [m].
+GUIDES_AWAY = wp.constant(1000.0)
 
 
 @wp.kernel
@@ -227,15 +229,17 @@ def set_guides_kernel(
     # Scene:
     layout: LayoutData,
     guide_shapes: wp.array[int],
-    collide: int,
     # State:
     progress: wp.array[wp.vec4i],
-    shape_flags_inout: wp.array[int],
+    # Out:
+    shape_transform_out: wp.array[wp.transform],
 ):
-    """Let the guide walls of each world collide or not."""
+    """Put the guide walls of each world in place, or far above.
+
+    Moved, not switched off: Newton's all-pairs broad phase reads a shape's collision flag when it is made, and never again.
+    """
     world, guide = wp.tid()
-    shape = world * layout.shapes + guide_shapes[guide]
-    flags = shape_flags_inout[shape] & ~collide
+    height = GUIDES_AWAY
     if progress[world][3] == 1:
-        flags = flags | collide
-    shape_flags_inout[shape] = flags
+        height = 0.0
+    shape_transform_out[world * layout.shapes + guide_shapes[guide]] = wp.transform(wp.vec3(0.0, 0.0, height), wp.quat_identity())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import newton
 import numpy as np
 import pytest
 import warp as wp
@@ -16,7 +15,6 @@ from tests.reference import draws
 from tests.reference.kernel_worlds import GUIDES, SHAPES, KernelWorlds
 
 SEED = 11
-COLLIDE = int(newton.ShapeFlags.COLLIDE_SHAPES)
 INSIDE = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0])
 
 
@@ -213,17 +211,20 @@ def test_only_settling_worlds_are_judged_for_rest(device, phase):
     np.testing.assert_array_equal(worlds.physics.state.joint_q.numpy(), before)
 
 
-def test_guides_collide_while_they_stand(device):
+def test_guides_stand_or_are_far_above_everything(device):
     worlds = made(device, worlds=2)
-    worlds.set(worlds.physics.model.shape_flags, 8 | COLLIDE)
+    worlds.set(worlds.physics.model.shape_transform, [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0])
     worlds.set(worlds.state.progress, [[0, 0, 0, 1], [0, 0, 0, 0]])
     arrange.set_guides(worlds.scene, worlds.state, worlds.physics)
-    expected = np.full((2, SHAPES), 8 | COLLIDE)
-    expected[1, list(GUIDES)] = 8
-    np.testing.assert_array_equal(worlds.physics.model.shape_flags.numpy().reshape(2, SHAPES), expected)
+    poses = worlds.physics.model.shape_transform.numpy().reshape(2, SHAPES, 7)
+    others = np.delete(poses, GUIDES, axis=1)
+    assert (others == [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]).all()
+    assert (poses[0, list(GUIDES)] == [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]).all()
+    assert (poses[1, list(GUIDES)] == [0.0, 0.0, rest.GUIDES_AWAY, 0.0, 0.0, 0.0, 1.0]).all()
     worlds.set(worlds.state.progress, [0, 0, 0, 1])
     arrange.set_guides(worlds.scene, worlds.state, worlds.physics)
-    assert (worlds.physics.model.shape_flags.numpy() == 8 | COLLIDE).all()
+    poses = worlds.physics.model.shape_transform.numpy().reshape(2, SHAPES, 7)
+    assert (poses[1, list(GUIDES), :3] == 0.0).all()
 
 
 # ---- dropped again ----

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import newton
 import warp as wp
 
 from synpick_warp.kernels import arrangement, rest
@@ -122,6 +121,7 @@ def set_guides(scene: SceneData, state: WorldState, physics: Physics) -> None:
     wp.launch(
         rest.set_guides_kernel,
         dim=(state.phase.shape[0], scene.guide_shapes.shape[0]),
-        inputs=[scene.layout, scene.guide_shapes, int(newton.ShapeFlags.COLLIDE_SHAPES), state.progress, physics.model.shape_flags],
+        inputs=[scene.layout, scene.guide_shapes, state.progress],
+        outputs=[physics.model.shape_transform],
         device=state.phase.device,
     )

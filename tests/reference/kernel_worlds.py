@@ -79,7 +79,7 @@ class KernelWorlds:
             state=SimpleNamespace(joint_q=made(self.coords), joint_qd=made(self.dofs), body_q=body_q),
             control=SimpleNamespace(joint_f=made(self.dofs)),
             solver=SimpleNamespace(constraint_overflow=made(1, wp.bool)),
-            model=SimpleNamespace(shape_flags=made(SHAPES, int), shape_body=made(SHAPES, int)),
+            model=SimpleNamespace(shape_transform=made(SHAPES, wp.transform), shape_body=made(SHAPES, int)),
             contacts=contacts,
             load=lambda variant, restarted: None,
         )
