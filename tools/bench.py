@@ -28,7 +28,6 @@ from unittest import mock
 import numpy as np
 import warp as wp
 from rich.console import Console
-from rich.table import Table
 
 from synpick_warp.bake import Factory, build_factory, run_bake
 from synpick_warp.cli import parse_resolution
@@ -38,6 +37,7 @@ from synpick_warp.device import pick_device
 from synpick_warp.doctor import GIB, describe_machine
 from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.bop import BopExporter, view_bytes
+from synpick_warp.exporters.files import PARTIAL
 from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.frames import FrameBatch
 from synpick_warp.kernels import phases
@@ -75,7 +75,6 @@ BAKE_METHODS = (
     (FrameStream, "_launch", "launch views"),
     (FrameStream, "_collect", "wait for views"),
     (BopExporter, "write", "hand views to writers"),
-    (BopExporter, "end", "end episodes"),
     (BopExporter, "close", "wait for writers, finish files"),
 )
 """Where the main process of a bake spends its time; on the CPU, launching is computing."""
@@ -99,8 +98,11 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = _config(options)
         device = pick_device(config.bake.device)
-        machine = describe_machine(device)
-        _print_machine(console, machine, config)
+        width, height = config.cameras.resolution
+        measured = f"{config.bake.worlds} worlds, {len(config.cameras.positions)} cameras, {width}x{height}"
+        machine = dict([*describe_machine(device), ("measured", measured)])
+        for name, value in machine.items():
+            console.print(f"{name:20} {value}")
         for row in measure(config, options.parts, options.seconds):
             rows.append(row)
             console.print(f"{row.part:8} {row.name:52} {row.value:14,.3f} {row.unit}")
@@ -108,8 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"bench: {error}", file=sys.stderr)
         return 2
     if options.json:
-        record = {"machine": dict(machine), "worlds": config.bake.worlds, "resolution": config.cameras.resolution,
-                  "models": bool(config.bake.models), "rows": [dataclasses.asdict(row) for row in rows]}
+        record = {"machine": machine, "real_objects": bool(config.bake.models), "rows": [dataclasses.asdict(row) for row in rows]}
         options.json.write_text(json.dumps(record, indent=1) + "\n")
     return 0
 
@@ -148,15 +149,6 @@ def _config(options: argparse.Namespace) -> Config:
     return load_config(None, overrides)
 
 
-def _print_machine(console: Console, machine: list[tuple[str, str]], config: Config) -> None:
-    table = Table(show_header=False, box=None)
-    for name, value in machine:
-        table.add_row(name, value)
-    width, height = config.cameras.resolution
-    table.add_row("measured", f"{config.bake.worlds} worlds, {len(config.cameras.positions)} cameras, {width}x{height}")
-    console.print(table)
-
-
 def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Row]:
     """All numbers of the parts, as they come. `least` is the time a measurement is repeated [s]."""
     if {"physics", "render", "write"} & set(parts):
@@ -172,25 +164,22 @@ def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Ro
         if "write" in parts:
             yield from _write(config, factory, least)
         yield _memory(factory.simulation.device)
-        del factory
     if "bake" in parts:
         yield from _bake(config)
 
 
 def seconds_per_call(function: Callable[[], object], device: wp.Device, least: float, calls: int = 1) -> float:
     """Median time of a call [s], the device's work included, of at least `LEAST_REPEATS` bursts of `calls`, after one as warm-up."""
+    function()
     times: list[float] = []
-    for repeat in itertools.count():
+    while len(times) < LEAST_REPEATS or sum(times) < least:
         wp.synchronize_device(device)
         started = time.perf_counter()
         for _ in range(calls):
             function()
         wp.synchronize_device(device)
-        if repeat > 0:
-            times.append((time.perf_counter() - started) / calls)
-        if len(times) >= LEAST_REPEATS and sum(times) * calls >= least:
-            break
-    return statistics.median(times)
+        times.append(time.perf_counter() - started)
+    return statistics.median(times) / calls
 
 
 def _memory(device: wp.Device) -> Row:
@@ -240,7 +229,6 @@ def _ticks(simulation: Simulation, tick: Callable[[], None], least: float, state
     steps = physics.steps_per_tick * simulation.layout.worlds
     yield Row("physics", f"{state}: world-steps", steps / seconds, "1/s")
     yield Row("physics", f"{state}: a step of all worlds", 1e3 * seconds / physics.steps_per_tick, "ms")
-    yield Row("physics", f"{state}: simulated time by time", steps * physics.step / seconds, "")
 
 
 def _within_a_tick(simulation: Simulation, tick: Callable[[], None], least: float) -> Iterator[Row]:
@@ -335,7 +323,8 @@ def _write(config: Config, factory: Factory, least: float) -> Iterator[Row]:
     """Views a second that go through the exporter and its processes, by number of processes."""
     simulation, cameras = factory.simulation, len(factory.cameras)
     worlds = min(simulation.layout.worlds, -(-WRITE_VIEWS // cameras))
-    batch = _copied(next(factory.stream.render(simulation.records[0].snapshot, _all_live(simulation, worlds))))
+    ring = next(factory.stream.render(simulation.records[0].snapshot, _all_live(simulation, worlds)))
+    batch = FrameBatch(**{item.name: np.array(getattr(ring, item.name)[:WRITE_VIEWS]) for item in dataclasses.fields(ring)})
     cores = len(os.sched_getaffinity(0))
     size = 0.0
     for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
@@ -348,7 +337,6 @@ def _write_rate(config: Config, factory: Factory, batch: FrameBatch, processes: 
     """Views a second that so many processes write, and the size of a view's files [B]."""
     with tempfile.TemporaryDirectory() as folder, WriterPool(processes, view_bytes(factory.cameras[0])) as pool:
         exporter = BopExporter(Path(folder) / "out", config, factory.catalog, factory.cameras, config.bake.episodes, pool)
-        constants = _size(folder)
         exporter.write(batch)
         pool.wait()
         written, started = 0, time.perf_counter()
@@ -357,19 +345,9 @@ def _write_rate(config: Config, factory: Factory, batch: FrameBatch, processes: 
             exporter.write(dataclasses.replace(batch, frame=np.full(len(batch), written)))
         pool.wait()
         seconds = time.perf_counter() - started
-        size = (_size(folder) - constants) / (written + len(batch))
+        size = sum(path.stat().st_size for path in (Path(folder) / "out" / PARTIAL).rglob("*.*"))
         exporter.abort()
-    return written / seconds, size
-
-
-def _size(folder: str) -> int:
-    return sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file())
-
-
-def _copied(batch: FrameBatch) -> FrameBatch:
-    """The same views, out of the ring buffer."""
-    arrays = {item.name: np.array(getattr(batch, item.name)[:WRITE_VIEWS]) for item in dataclasses.fields(batch)}
-    return FrameBatch(**arrays)
+    return written / seconds, size / (written + len(batch))
 
 
 class _StageTimes(SilentProgress):
@@ -411,10 +389,9 @@ def _timed(function: Callable[..., object], spent: dict[str, float], name: str) 
     @functools.wraps(function)
     def wrapper(*arguments: object, **options: object) -> object:
         started = time.perf_counter()
-        try:
-            return function(*arguments, **options)
-        finally:
-            spent[name] += time.perf_counter() - started
+        result = function(*arguments, **options)
+        spent[name] += time.perf_counter() - started
+        return result
 
     return wrapper
 

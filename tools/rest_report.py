@@ -110,7 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
     wall = time.perf_counter() - started
     tables(console, machine, rows, config, wall)
     if options.json:
-        record = {"machine": dict(machine), "worlds": config.bake.worlds, "seed": config.bake.seed, "models": bool(config.bake.models),
+        record = {"machine": dict(machine), "worlds": config.bake.worlds, "seed": config.bake.seed, "real_objects": bool(config.bake.models),
                   "seconds": wall, "rows": [dataclasses.asdict(row) for row in rows]}
         options.json.write_text(json.dumps(record, indent=1) + "\n")
     return 0 if all(row.holds for row in rows) else 1
