@@ -186,6 +186,21 @@ def judge_rest_kernel(
 
 
 @wp.kernel
+def flag_lost_pairs_kernel(
+    # Scene:
+    room: int,
+    # State:
+    pair_count: wp.array[int],
+    # Out:
+    overflow_out: wp.array[wp.bool],
+):
+    """Flag all worlds if the broad phase found more pairs of near shapes than it has room for: any world's may be lost."""
+    world = wp.tid()
+    if pair_count[0] > room:
+        overflow_out[world] = True
+
+
+@wp.kernel
 def judge_episodes_kernel(
     # Scene:
     layout: LayoutData,

@@ -8,6 +8,7 @@ import newton
 import warp as wp
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.kernels import rest
 from synpick_warp.scenes.build import BuiltModel
 
 # A joint limit's row is made when the joint comes this near to it [rad].
@@ -80,6 +81,16 @@ class Physics:
             return
         wp.capture_launch(self._graph)
 
+    def flag_lost_pairs(self) -> None:
+        """What the solver does with contacts and rows that find no room, for the pairs of the broad phase: Newton drops these silently."""
+        wp.launch(
+            rest.flag_lost_pairs_kernel,
+            dim=self.layout.worlds,
+            inputs=[self.pipeline.broad_phase_shape_pairs.shape[0], self.pipeline.broad_phase_pair_count],
+            outputs=[self.solver.constraint_overflow],
+            device=self.device,
+        )
+
     def _run_steps(self, before_step: Callable[[newton.State], None]) -> None:
         current, following = self.state, self._other
         physics = self.config.physics
@@ -87,6 +98,7 @@ class Physics:
             before_step(current)
             for _ in range(physics.substeps):
                 self.pipeline.collide(current, self.contacts)
+                self.flag_lost_pairs()
                 self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps)
                 current, following = following, current
         if current is not self.state:
