@@ -50,14 +50,10 @@ from synpick_warp.stages.stream import STATUS_COLUMNS, FrameStream, TickReader, 
 PARTS = ("physics", "render", "write", "bake")
 FOREVER = 1 << 30
 """More ticks than any measurement takes."""
-FALL_TICKS = 4
-"""From the drop until the first objects land."""
-SETTLE_TICKS = 60
-"""From the drop until piles are at rest: 4 s at 15 Hz."""
-START_HEIGHT = 0.2
-"""Where the gripper starts, just above the pile [m]."""
-STIR_TICKS = 30
-"""From there until it is in the pile's midst: 2 s at 15 Hz."""
+FALL_TICKS, SETTLE_TICKS = 4, 60
+"""From the drop until the first objects land, and from there until piles are at rest: 4 s at 15 Hz."""
+START_HEIGHT, STIR_TICKS = 0.2, 30
+"""Where the gripper starts, just above the pile [m]; from there until it is in the pile's midst: 2 s at 15 Hz."""
 LEAST_REPEATS = 3
 BURST = 2
 """Ticks, or passes of the renderer, between two synchronisations: as in a bake, the device does not wait for the host."""
@@ -65,10 +61,8 @@ STREAM_BATCHES = 12
 """Batches that are rendered and copied in a row."""
 WRITE_VIEWS = 12
 """Views that the writers get over and over."""
-BAKE_WORLDS = 16
-"""Most worlds of the small bake."""
-BAKE_ROUNDS, BAKE_SPEED = 1, 0.4
-"""Rounds and speed [m/s] of its gripper: short episodes."""
+BAKE_WORLDS, BAKE_ROUNDS, BAKE_SPEED = 16, 1, 0.4
+"""Most worlds of the small bake; rounds and speed [m/s] of its gripper: short episodes."""
 BAKE_METHODS = (
     (Simulation, "tick", "launch ticks"),
     (TickReader, "wait", "wait for ticks"),
@@ -91,10 +85,12 @@ class Row:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure, print, and return the exit code."""
+    """Measure, print, and return the exit code. What was measured before an interruption is kept."""
     options = _parse(arguments)
     console = Console(highlight=False)
     rows: list[Row] = []
+    machine: dict[str, str] = {}
+    code = 0
     try:
         config = _config(options)
         device = pick_device(config.bake.device)
@@ -109,10 +105,13 @@ def main(arguments: list[str] | None = None) -> int:
     except SynpickError as error:
         print(f"bench: {error}", file=sys.stderr)
         return 2
-    if options.json:
-        record = {"machine": machine, "real_objects": bool(config.bake.models), "rows": [dataclasses.asdict(row) for row in rows]}
+    except KeyboardInterrupt:
+        print("bench: interrupted", file=sys.stderr)
+        code = 130
+    if options.json and rows:
+        record = {"machine": machine, "real_objects": bool(options.models), "rows": [dataclasses.asdict(row) for row in rows]}
         options.json.write_text(json.dumps(record, indent=1) + "\n")
-    return 0
+    return code
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:

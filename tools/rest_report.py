@@ -101,19 +101,26 @@ def main(arguments: list[str] | None = None) -> int:
         catalog = load_catalog(config, report=console.print)
         started = time.perf_counter()
         simulation = Simulation(config, catalog, 1, device)
-        findings = settle(simulation, catalog)
     except SynpickError as error:
         print(f"rest_report: {error}", file=sys.stderr)
         return 2
+    findings = Findings()
+    interrupted = False
+    try:
+        settle(simulation, catalog, findings)
+    except KeyboardInterrupt:
+        interrupted = True
+        print(f"rest_report: interrupted; {len(findings.piles)} of {config.bake.episodes} arrangements are at rest", file=sys.stderr)
     machine = describe_machine(device)
     rows = report(findings)
     wall = time.perf_counter() - started
     tables(console, machine, rows, config, wall)
     if options.json:
-        record = {"machine": dict(machine), "worlds": config.bake.worlds, "seed": config.bake.seed, "real_objects": bool(config.bake.models),
-                  "seconds": wall, "rows": [dataclasses.asdict(row) for row in rows]}
+        record = {"machine": dict(machine), "arrangements": config.bake.episodes, "worlds": config.bake.worlds, "seed": config.bake.seed,
+                  "real_objects": bool(options.models), "interrupted": interrupted, "seconds": wall,
+                  "rows": [dataclasses.asdict(row) | {"value": row.value if np.isfinite(row.value) else None} for row in rows]}
         options.json.write_text(json.dumps(record, indent=1) + "\n")
-    return 0 if all(row.holds for row in rows) else 1
+    return 130 if interrupted else 0 if all(row.holds for row in rows) else 1
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
@@ -140,9 +147,9 @@ def _config(options: argparse.Namespace) -> Config:
     return load_config(None, overrides)
 
 
-def settle(simulation: Simulation, catalog: Catalog) -> Findings:
-    """Let every arrangement come to rest or be given up, and measure those at rest."""
-    config, findings = simulation.config, Findings()
+def settle(simulation: Simulation, catalog: Catalog, findings: Findings) -> None:
+    """Let every arrangement come to rest or be given up, and enter into `findings` what those at rest are like."""
+    config = simulation.config
     record = simulation.records[0]
     reader = TickReader(record)
     before: TickReport | None = None
@@ -160,7 +167,7 @@ def settle(simulation: Simulation, catalog: Catalog) -> Findings:
             findings.piles += _measure(simulation, catalog, before, report, resting)
             _finish(simulation, resting)
         if (phase == phases.IDLE).all():
-            return findings
+            return
         before = report
 
 
