@@ -10,7 +10,7 @@ import warp as wp
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import rest
-from synpick_warp.scenes.build import BuiltModel
+from synpick_warp.scenes import build
 
 # A joint limit's row is made when the joint comes this near to it [rad].
 JOINT_LIMIT_GAP = 0.2
