@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.gripper import cup_collider, finger_collider
 from synpick_warp.scenes.shapes import Catalog, CatalogEntry, ConvexPiece
 from synpick_warp.scenes.tote import guide_walls, tote_colliders
@@ -82,15 +83,21 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
 
     Found by drawing: the volume budget couples the number of objects with which ones they are, so there is no simple formula.
     Without repeats no more than all objects of a kind are needed.
+
+    Raises:
+        ConfigError: No object fits into the volume budget.
     """
-    room = config.arrangement.max_objects
+    room, budget = config.arrangement.max_objects, config.arrangement.volume
     compound = np.array([len(entry.pieces) > 1 for entry in catalog.entries])
     volume = np.array([entry.volume for entry in catalog.entries])
+    if volume.min() > budget:
+        raise ConfigError(f"arrangement.volume is {budget:g} m³, but the smallest object takes {volume.min():.3g} m³; make it larger")
     if not config.arrangement.repeats:
         return min(room, int((~compound).sum())), min(room, int(compound.sum()))
     drawn = np.random.default_rng(0).integers(len(catalog), size=(SLOT_TRIALS, room))
-    inside = np.cumsum(volume[drawn], axis=1) <= config.arrangement.volume
-    inside[:, 0] = True
+    # The first object is drawn again until one fits.
+    drawn = drawn[volume[drawn[:, 0]] <= budget]
+    inside = np.cumsum(volume[drawn], axis=1) <= budget
     level = 1.0 - config.arrangement.slot_shortfall
     needed = [np.quantile((inside & (compound[drawn] == kind)).sum(axis=1), level, method="higher") for kind in (False, True)]
     return int(needed[0]), int(needed[1])
