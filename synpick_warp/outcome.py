@@ -29,7 +29,7 @@ _SENTENCES = {
     Outcome.RUNNING: "the episode is still running",
     Outcome.FINISHED: "the gripper did all it was to do",
     Outcome.UNSETTLED: "the objects did not come to rest in time, so the arrangement was drawn again",
-    Outcome.ARRANGEMENT_OVERFLOW: "more concave objects were drawn than a world has room for, so the arrangement was drawn again",
+    Outcome.ARRANGEMENT_OVERFLOW: "more objects of a kind were drawn than a world has room for, so the arrangement was drawn again",
     Outcome.SOLVER_OVERFLOW: "more contacts arose than the solver has room for, so the episode was drawn again",
     Outcome.NOT_FINITE: "a pose became infinite or not a number, so the episode was drawn again",
 }

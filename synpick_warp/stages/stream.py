@@ -134,7 +134,7 @@ class FrameStream:
         self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.buffers]
 
     def render(self, snapshot: Snapshot, report: TickReport) -> Iterator[FrameBatch]:
-        """Yield the tick's views, world by world and camera by camera. A batch is valid until the next but one is asked for."""
+        """Yield the tick's views, world by world and camera by camera. A batch is valid until the next is asked for."""
         live = np.flatnonzero(report.column("live"))
         world = np.repeat(live, self.cameras).astype(np.int32)
         camera = np.tile(np.arange(self.cameras, dtype=np.int32), len(live))

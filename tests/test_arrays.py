@@ -1,0 +1,67 @@
+"""Declared arrays: what is declared is what is allocated, and what the table says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import pytest
+import warp as wp
+
+from synpick_warp.arrays import allocate, device_array, memory_table
+from synpick_warp.bake import describe_arrays
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays
+from synpick_warp.stages.worlds import WorldState, WorldStatus
+from tests.reference.small_worlds import settings
+
+NAMES = "one world world_and_global instance body waypoint status fixture view row column count box edge"
+SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
+DECLARED = [WorldState, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays, PictureArrays]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    gap: wp.array = device_array("world", "cup", dtype=wp.float32, unit="m")
+    pose: wp.array = device_array("world", dtype=wp.transformf)
+    flag: wp.array = device_array("cup", "cup", "world", dtype=wp.uint8)
+
+
+def test_arrays_have_the_declared_shapes_and_types_and_begin_as_zeros(device):
+    made = allocate(Sample, {"world": 3, "cup": 2}, device)
+    assert [made.gap.shape, made.pose.shape, made.flag.shape] == [(3, 2), (3,), (2, 2, 3)]
+    assert [made.gap.dtype, made.pose.dtype, made.flag.dtype] == [wp.float32, wp.transformf, wp.uint8]
+    assert all(array.device == device and not array.numpy().any() for array in (made.gap, made.pose, made.flag))
+
+
+def test_the_table_counts_bytes_and_allocates_nothing():
+    rows = memory_table(Sample, {"world": 3, "cup": 2})
+    assert rows == [("Sample.gap", (3, 2), "m", 24), ("Sample.pose", (3,), "", 84), ("Sample.flag", (2, 2, 3), "", 12)]
+    huge = memory_table(Sample, {"world": 10**9, "cup": 1000})
+    assert huge[0][3] == 4 * 10**12
+
+
+def test_a_size_that_is_not_given_is_an_error(device):
+    with pytest.raises(KeyError, match="cup"):
+        allocate(Sample, {"world": 3}, device)
+
+
+@pytest.mark.parametrize("kind", DECLARED, ids=lambda kind: kind.__name__)
+def test_the_table_is_true_of_every_declaration(device, kind):
+    made = allocate(kind, SIZES, device)
+    rows = {name: (shape, size) for name, shape, _, size in memory_table(kind, SIZES)}
+    assert len(rows) == len(fields(kind))
+    for item in fields(kind):
+        array = getattr(made, item.name)
+        assert rows[f"{kind.__name__}.{item.name}"] == (array.shape, array.numpy().nbytes)
+
+
+def test_a_bakes_table_lists_every_array_with_its_copies():
+    config = settings(bake__worlds=7, cameras__resolution=[8, 6])
+    rows = describe_arrays(config)
+    names = [name for name, *_ in rows]
+    assert {name.split(".")[0] for name in names} == {kind.__name__ for kind in DECLARED}
+    assert names.count("Snapshot.pose") == names.count("WorldStatus.table") == 2
+    assert names.count("WorldState.phase") == names.count("ViewBuffers.color") == 1
+    by_name = {name: (shape, unit, size) for name, shape, unit, size in rows}
+    assert by_name["Snapshot.pose"] == ((7, config.arrangement.max_objects), "m", 28 * 7 * config.arrangement.max_objects)
+    assert by_name["ViewBuffers.color"] == ((3, 6, 8), "", 3 * 6 * 8 * 3)

@@ -1,0 +1,172 @@
+"""From ticks to frame batches: which views, in which order, in which batches, with what in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from synpick_warp.arrays import allocate
+from synpick_warp.kernels import pack, phases
+from synpick_warp.stages import stream, worlds
+from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
+from synpick_warp.stages.simulate import TickRecord
+from synpick_warp.stages.stream import FrameStream, HostCopy, TickReader, TickReport, view_sizes, views_per_batch
+from tests.reference.small_worlds import settings
+
+WORLDS, ROOM = 5, 3
+OBJECT_IDS = np.array([4, 7, 11], np.int32)
+
+
+@dataclass
+class FakeRenderer:
+    """Writes into each view which world and camera it was made for; remembers how it was called."""
+
+    calls: list[tuple[Any, list[int], list[int], int]]
+
+    def render(self, snapshot, view_world, view_camera, count, out) -> None:
+        world, camera = view_world.numpy(), view_camera.numpy()
+        self.calls.append((snapshot, world.tolist(), camera.tolist(), count))
+        for name in vars(out):
+            array = getattr(out, name)
+            values = array.numpy()
+            shape = (count,) + (1,) * (values.ndim - 1)
+            values[:count] = (10 * world[:count] + camera[:count] + 1).reshape(shape)
+            array.assign(values)
+
+
+def config_of(**overrides: object):
+    return settings(bake__worlds=WORLDS, arrangement__max_objects=ROOM, cameras__resolution=[8, 6], **overrides)
+
+
+def report_of(live: list[int]) -> TickReport:
+    """Worlds as `live` says; world w has episode 20 + w, frame 2 w, entries w mod 4 - 1, ..., and poses of its own."""
+    status = np.zeros((WORLDS, len(worlds.STATUS_COLUMNS)), np.int32)
+    number = np.arange(WORLDS)
+    for name, values in {"live": live, "episode": 20 + number, "frame": 2 * number}.items():
+        status[:, worlds.STATUS_COLUMNS.index(name)] = values
+    entry = ((number[:, None] + np.arange(ROOM)) % 4 - 1).astype(np.int32)
+    pose = np.arange(WORLDS * ROOM * 7, dtype=np.float32).reshape(WORLDS, ROOM, 7)
+    return TickReport(status, entry, pose)
+
+
+def rendered(device, live: list[int], batch: int) -> tuple[list[dict[str, np.ndarray]], FakeRenderer]:
+    renderer = FakeRenderer([])
+    frames = FrameStream(config_of(render__views_per_batch=batch), renderer, OBJECT_IDS, device)
+    batches = frames.render("snapshot", report_of(live))
+    return [{name: np.array(value) for name, value in vars(made).items()} | {"length": len(made)} for made in batches], renderer
+
+
+@pytest.mark.parametrize("live", [[1, 1, 1, 1, 1], [0, 1, 0, 1, 1], [0, 0, 0, 0, 1]])
+@pytest.mark.parametrize("batch", [1, 2, 3, 4, 7, 100])
+def test_live_views_come_world_by_world_and_camera_by_camera(device, live, batch):
+    batches, renderer = rendered(device, live, batch)
+    expected = [(world, camera) for world in np.flatnonzero(live) for camera in range(3)]
+    views = [(int(episode) - 20, int(camera)) for made in batches for episode, camera in zip(made["episode"], made["camera"], strict=True)]
+    assert views == expected
+    assert [made["length"] for made in batches] == [min(batch, len(expected) - first) for first in range(0, len(expected), batch)]
+    for made, (snapshot, world, camera, count) in zip(batches, renderer.calls, strict=True):
+        assert snapshot == "snapshot"
+        assert count == made["length"]
+        assert len(world) == len(camera) == batch
+        # What pads the batch must be worlds and cameras that exist.
+        assert world[count:] == camera[count:] == [0] * (batch - count)
+        code = 10 * (made["episode"] - 20) + made["camera"] + 1
+        for name in ("color", "depth", "instance", "amodal", "pixels", "boxes"):
+            assert len(made[name]) == count
+            assert (made[name].reshape(count, -1) == code[:, None]).all(), name
+
+
+def test_no_live_world_gives_no_batch(device):
+    batches, renderer = rendered(device, [0] * WORLDS, 4)
+    assert batches == []
+    assert renderer.calls == []
+
+
+def test_what_a_batch_says_of_its_views(device):
+    (made,), _ = rendered(device, [0, 1, 0, 0, 1], 100)
+    config = config_of()
+    tick = config.physics.step * config.physics.steps_per_tick
+    world = np.repeat([1, 4], 3)
+    known = report_of([0] * WORLDS)
+    np.testing.assert_array_equal(made["episode"], 20 + world)
+    np.testing.assert_array_equal(made["frame"], 2 * world)
+    np.testing.assert_allclose(made["time"], 2 * world * tick, rtol=1e-12)
+    np.testing.assert_array_equal(made["pose"], known.pose[world])
+    ids = np.where(known.entry >= 0, OBJECT_IDS[known.entry], -1)
+    np.testing.assert_array_equal(made["object_id"], ids[world])
+    assert ids.min() == -1
+    assert {made[name].dtype.name for name in ("episode", "camera", "frame", "object_id", "pixels", "boxes")} == {"int32"}
+    assert [made[name].dtype.name for name in ("time", "pose", "color", "depth", "instance", "amodal")] == [
+        "float64", "float32", "uint8", "uint16", "uint8", "uint32"
+    ]
+    assert made["color"].shape == (6, 6, 8, 3)
+    assert made["boxes"].shape == (6, ROOM, 2, 4)
+
+
+def test_a_tick_that_is_stopped_early_leaves_nothing_behind(device):
+    """Whoever stops reading a tick's batches gets the next tick's from its first."""
+    frames = FrameStream(config_of(render__views_per_batch=2), FakeRenderer([]), OBJECT_IDS, device)
+    next(frames.render("first", report_of([1] * WORLDS)))
+    batches = frames.render("second", report_of([0, 0, 1, 0, 0]))
+    assert [int(episode) for made in batches for episode in made.episode] == [22, 22, 22]
+
+
+# ---- sizes ----
+
+
+def test_batch_sizes(device):
+    assert views_per_batch(config_of(), device) == 3
+    assert views_per_batch(config_of(render__views_per_batch=17), device) == 17
+    gpu = SimpleNamespace(is_cuda=True)
+    assert views_per_batch(config_of(), gpu) == 3 * WORLDS
+    huge = settings(bake__worlds=1000, cameras__resolution=[1920, 1080])
+    count = views_per_batch(huge, gpu)
+    assert count * 1920 * 1080 * stream.PIXEL_BYTES <= stream.BATCH_BYTES < (count + 1) * 1920 * 1080 * stream.PIXEL_BYTES
+    assert views_per_batch(settings(cameras__resolution=[8192, 8192]), gpu) == 1
+
+
+def test_view_sizes_are_those_of_the_buffers(device):
+    buffers = allocate(ViewBuffers, view_sizes(config_of(), device), device)
+    assert buffers.color.shape == (3, 6, 8)
+    assert buffers.pixels.shape == (3, ROOM, 3)
+    pixel = sum(wp.types.type_size_in_bytes(getattr(buffers, name).dtype) for name in ("color", "depth", "instance", "amodal"))
+    assert pixel == stream.PIXEL_BYTES
+
+
+# ---- from the device ----
+
+
+def test_status_columns_are_those_of_the_kernel():
+    assert [int(getattr(pack, f"STATUS_{name.upper()}")) for name in worlds.STATUS_COLUMNS] == list(range(len(worlds.STATUS_COLUMNS)))
+    assert len(FIXTURES) == pack.FIXTURES
+
+
+def test_a_report_outlives_the_next_tick(device):
+    sizes = worlds.world_sizes(config_of(), 4)
+    record = TickRecord(allocate(Snapshot, sizes, device), allocate(worlds.WorldStatus, sizes, device))
+    record.snapshot.entry.fill_(2)
+    record.status.table.fill_(phases.ACT)
+    reader = TickReader(record)
+    reader.start()
+    report = reader.wait()
+    for array in (record.snapshot.entry, record.status.table):
+        array.fill_(-5)
+    record.snapshot.pose.fill_(wp.transform_identity())
+    assert (report.entry == 2).all()
+    assert report.column("phase").tolist() == [phases.ACT] * WORLDS
+    assert (report.pose == 0.0).all()
+    assert report.pose.shape == (WORLDS, ROOM, 7)
+
+
+def test_on_the_processor_a_host_copy_is_the_array_itself(device):
+    array = wp.array(np.arange(4.0), dtype=float, device=device)
+    copy = HostCopy([array])
+    copy.start(None)
+    (seen,) = copy.wait()
+    array.fill_(3.0)
+    assert seen.tolist() == [3.0] * 4
