@@ -75,6 +75,7 @@ class PlainProgress:
 
     def __init__(self, console: Console) -> None:
         self._console = console
+        self._started = time.monotonic()
         self._printed_at = float("-inf")
 
     def __enter__(self) -> Self:
@@ -97,8 +98,8 @@ class PlainProgress:
             self.note(f"episodes {episodes_done}/{episodes} · {_detail(worlds_active, views, views_per_s, seconds_left)}")
 
     def note(self, text: str) -> None:
-        """Print a line."""
-        self._console.print(text, markup=False, soft_wrap=True)
+        """Print a line, after the time since the start."""
+        self._console.print(f"{_duration(time.monotonic() - self._started):>7}  {text}", markup=False, soft_wrap=True)
         self._console.file.flush()
 
 

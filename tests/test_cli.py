@@ -261,7 +261,8 @@ def test_progress_displays(kind):
     assert "note [x]" in text
     assert "1:30 left" in text
     if kind is PlainProgress:
-        assert text.splitlines() == ["baking [bold]", "episodes 0/50 · worlds 4 · views 0 · 3.0 views/s · 1:30 left", "note [x]"]
+        lines = ["baking [bold]", "episodes 0/50 · worlds 4 · views 0 · 3.0 views/s · 1:30 left", "note [x]"]
+        assert text.splitlines() == [f"   0:00  {line}" for line in lines]
 
 
 def test_silence():
