@@ -121,6 +121,25 @@ def test_a_finished_task_may_have_others_done(tmp_path, count):
         assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
 
 
+def test_answers_that_come_together_are_each_heard_once(tmp_path):
+    gate = tmp_path / "gate"
+    with WriterPool(4, 1) as pool:
+
+        def more() -> None:
+            pool.submit(note, (), (tmp_path / "more", "x"), path=tmp_path)
+
+        for _ in range(4):
+            pool.submit(wait_for, (), (gate,), path=gate, done=more)
+        gate.touch()
+        # All four have answered before anybody listens.
+        time.sleep(0.5)
+        listener = threading.Thread(target=pool.wait, daemon=True)
+        listener.start()
+        listener.join(30.0)
+        assert not listener.is_alive()
+    assert (tmp_path / "more").read_text() == "xxxx"
+
+
 def test_one_process_keeps_the_order(tmp_path):
     with WriterPool(1, SIZE) as pool:
         for letter in "abcdefghijklmnop":

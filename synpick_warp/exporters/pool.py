@@ -77,6 +77,7 @@ class WriterPool:
         self._workers: list[_Worker] = []
         self._failure: OutputError | None = None
         self._ended = False
+        self._hearing = False
         try:
             handle, self._memory = _shared_memory(slots * self._slot_bytes)
         except OSError as error:
@@ -188,6 +189,17 @@ class WriterPool:
             self._run_here()
             return
         self._hand_out()
+        if self._hearing:
+            # Called by a `done`: the caller below has yet to hear from the processes that it found ready, once each.
+            return
+        self._hearing = True
+        try:
+            self._hear(timeout)
+        finally:
+            self._hearing = False
+        self._hand_out()
+
+    def _hear(self, timeout: float | None) -> None:
         links = {worker.link: worker for worker in self._workers}
         for link in wait(list(links), timeout):
             worker = links[link]  # type: ignore[index]
@@ -197,7 +209,6 @@ class WriterPool:
                 self._fail_dead(worker)
             job = worker.jobs.popleft()
             self._finish(job, failure)
-        self._hand_out()
 
     def _hand_out(self) -> None:
         while self._waiting:
