@@ -1,0 +1,301 @@
+"""Bakes from settings to files: the same bytes every time, truth that fits the images, and what is left when something fails."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import subprocess
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from synpick_warp import bake, cli
+from synpick_warp.bake import run_bake
+from synpick_warp.configs.load import load_config
+from synpick_warp.errors import OutputError
+from synpick_warp.exporters.bop import BopExporter
+from synpick_warp.outcome import Outcome
+from synpick_warp.progress import SilentProgress
+from tests.reference.small_worlds import QUICK, catalog, settings
+
+EPISODES, CAMERAS = 3, 3
+WIDTH, HEIGHT = 96, 54
+TINY = {
+    "bake.worlds": 2,
+    "bake.episodes": EPISODES,
+    "cameras.resolution": [WIDTH, HEIGHT],
+    "physics.step": 4e-3,
+    "physics.steps_per_tick": 16,
+    "physics.substeps": 1,
+    "physics.iterations": 6,
+    "move.speed": 4.0,
+}
+
+
+def tiny(**overrides: object):
+    given = TINY | {key.replace("__", "."): value for key, value in overrides.items()}
+    return settings(**{key.replace(".", "__"): value for key, value in given.items()})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def boxes():
+    """All bakes here are of boxes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bake, "load_catalog", lambda config, report: catalog())
+        yield
+
+
+class Baked:
+    """A finished bake."""
+
+    def __init__(self, out: Path, **overrides: object) -> None:
+        self.out, self.config = out, tiny(**overrides)
+        self.summary = run_bake(self.config, out, SilentProgress())
+        self.split = out / self.config.bop.split
+
+    def files(self, folder: str = ".") -> dict[str, str]:
+        """Digest of every file below a folder."""
+        base = self.out / folder
+        return {str(path.relative_to(base)): hashlib.sha256(path.read_bytes()).hexdigest() for path in base.rglob("*") if path.is_file()}
+
+    def scenes(self) -> list[Path]:
+        return sorted(self.split.iterdir())
+
+
+def truth(scene: Path, name: str) -> dict[int, object]:
+    return {int(number): record for number, record in json.loads((scene / f"{name}.json").read_text()).items()}
+
+
+def mask(scene: Path, kind: str, view: int, instance: int) -> np.ndarray:
+    image = cv2.imread(str(scene / kind / f"{view:06d}_{instance:06d}.png"), cv2.IMREAD_UNCHANGED)
+    assert set(np.unique(image)) <= {0, 255}
+    return image > 0
+
+
+@pytest.fixture(scope="module")
+def baked(tmp_path_factory) -> Baked:
+    return Baked(tmp_path_factory.mktemp("bake") / "set")
+
+
+# ---- the same bytes ----
+
+
+def test_the_same_settings_give_the_same_bytes(baked, tmp_path):
+    again = Baked(tmp_path / "again")
+    assert again.files() == baked.files()
+    assert len(again.files()) > 100
+
+
+@pytest.mark.parametrize("worlds", [1, 4])
+def test_the_number_of_worlds_changes_no_scene(baked, tmp_path, worlds):
+    other = Baked(tmp_path / "other", bake__worlds=worlds)
+    split = baked.config.bop.split
+    assert other.files(split) == baked.files(split)
+    assert {name for name, _ in other.files().items() ^ baked.files().items()} == {"config.toml"}
+
+
+def test_neither_writers_nor_batches_change_a_file(baked, tmp_path):
+    other = Baked(tmp_path / "other", bake__writers=2, render__views_per_batch=4)
+    split = baked.config.bop.split
+    assert other.files(split) == baked.files(split)
+
+
+def test_another_seed_gives_other_scenes(baked, tmp_path):
+    other = Baked(tmp_path / "other", bake__seed=1, bake__episodes=1, bake__worlds=1)
+    for scene in other.scenes():
+        assert (scene / "scene_gt.json").read_bytes() != (baked.split / scene.name / "scene_gt.json").read_bytes()
+
+
+# ---- what is there ----
+
+
+def test_every_episode_has_a_scene_for_each_camera_and_every_frame_its_files(baked):
+    assert [scene.name for scene in baked.scenes()] == [f"{number:06d}" for number in range(CAMERAS * EPISODES)]
+    for number, scene in enumerate(baked.scenes()):
+        frames = baked.summary.episodes[number // CAMERAS].frames
+        assert sorted(truth(scene, "scene_gt")) == sorted(truth(scene, "scene_camera")) == list(range(frames))
+        for kind in ("rgb", "depth"):
+            pictures = sorted((scene / kind).iterdir())
+            assert [path.name for path in pictures] == [f"{frame:06d}.png" for frame in range(frames)]
+            assert cv2.imread(str(pictures[-1]), cv2.IMREAD_UNCHANGED).shape[:2] == (HEIGHT, WIDTH)
+    assert baked.summary.views == CAMERAS * sum(row.frames for row in baked.summary.episodes)
+    assert [path.name for path in baked.out.iterdir() if path.name.startswith(".")] == []
+
+
+def test_the_list_of_episodes_is_right(baked):
+    rows = [json.loads(line) for line in (baked.out / "episodes.jsonl").read_text().splitlines()]
+    assert [row["episode"] for row in rows] == list(range(EPISODES))
+    assert [row["outcome"] for row in rows] == ["finished"] * EPISODES
+    assert {row["sentence"] for row in rows} == {Outcome.FINISHED.sentence}
+    tick = baked.config.physics.step * baked.config.physics.steps_per_tick
+    for row, known in zip(rows, baked.summary.episodes, strict=True):
+        assert (row["attempt"], row["frames"]) == (known.attempt, known.frames)
+        assert row["seconds"] == pytest.approx((row["frames"] - 1) * tick, abs=1e-6)
+
+
+def test_the_settings_are_kept_and_can_be_used_again(baked):
+    path = baked.out / "config.toml"
+    assert load_config(str(path), {}) == baked.config
+    assert tomllib.loads(path.read_text())["bake"]["seed"] == baked.config.bake.seed
+
+
+# ---- truth and images ----
+
+
+def test_all_cameras_tell_the_same_poses_in_the_world(baked):
+    """World poses from each camera's own numbers agree within 1e-3 mm."""
+    for first in range(0, CAMERAS * EPISODES, CAMERAS):
+        places = []
+        for scene in baked.scenes()[first : first + CAMERAS]:
+            cameras = truth(scene, "scene_camera")
+            for view, records in truth(scene, "scene_gt").items():
+                turn = np.array(cameras[view]["cam_R_w2c"]).reshape(3, 3)
+                shift = np.array(cameras[view]["cam_t_w2c"])
+                places.append([turn.T @ (np.array(record["cam_t_m2c"]) - shift) for record in records])
+        views = np.array(places).reshape(CAMERAS, -1, len(places[0]), 3)
+        assert np.abs(views - views[0]).max() < 1e-3
+        # Inside the tote.
+        half = 500 * np.array(baked.config.tote.rim_size)
+        assert (np.abs(views[..., :2]) < half).all()
+        assert (views[..., 2] > -1).all()
+
+
+def test_counts_and_boxes_are_those_of_the_masks(baked):
+    for scene in baked.scenes():
+        for view, records in truth(scene, "scene_gt_info").items():
+            depth = cv2.imread(str(scene / "depth" / f"{view:06d}.png"), cv2.IMREAD_UNCHANGED)
+            for instance, record in enumerate(records):
+                whole, visible = mask(scene, "mask", view, instance), mask(scene, "mask_visib", view, instance)
+                assert record["px_count_visib"] == visible.sum()
+                assert record["px_count_valid"] == (whole & (depth > 0)).sum()
+                # What lies beyond the border counts as well.
+                assert record["px_count_all"] >= whole.sum()
+                share = record["px_count_visib"] / record["px_count_all"] if record["px_count_all"] else 0.0
+                assert record["visib_fract"] == pytest.approx(share, abs=1e-6)
+                if visible.any():
+                    rows, columns = np.flatnonzero(visible.any(axis=1)), np.flatnonzero(visible.any(axis=0))
+                    # As the toolkit measures: from the first to the last pixel.
+                    assert record["bbox_visib"] == [columns[0], rows[0], np.ptp(columns), np.ptp(rows)]
+
+
+def test_visible_masks_are_disjoint_and_inside_the_masks(baked):
+    seen = 0
+    for scene in baked.scenes():
+        for view, records in truth(scene, "scene_gt").items():
+            visible = [mask(scene, "mask_visib", view, instance) for instance in range(len(records))]
+            assert np.sum(visible, axis=0).max() <= 1
+            for instance, part in enumerate(visible):
+                assert not (part & ~mask(scene, "mask", view, instance)).any()
+                seen += int(part.any())
+    assert seen > 0.8 * sum(len(records) for scene in baked.scenes() for records in truth(scene, "scene_gt").values())
+
+
+def test_an_instance_keeps_its_object_through_the_episode(baked):
+    for scene in baked.scenes():
+        objects = {tuple(record["obj_id"] for record in records) for records in truth(scene, "scene_gt").values()}
+        assert len(objects) == 1
+
+
+# ---- when something fails ----
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_an_error_leaves_whole_scenes_only(tmp_path, monkeypatch, baked, share):
+    """The first batch cannot be written, one in the middle, or the last."""
+    left = [int(share * (baked.summary.views // CAMERAS - 1))]
+    write = BopExporter.write
+
+    def failing(self, batch):
+        if left[0] == 0:
+            raise OutputError("no more")
+        left[0] -= 1
+        write(self, batch)
+
+    monkeypatch.setattr(BopExporter, "write", failing)
+    out = tmp_path / "set"
+    with pytest.raises(OutputError, match="no more"):
+        run_bake(tiny(), out, SilentProgress())
+    split = out / baked.config.bop.split
+    for scene in sorted(split.iterdir()) if split.exists() else []:
+        whole = {path.relative_to(scene) for path in scene.rglob("*")}
+        assert whole == {path.relative_to(baked.split / scene.name) for path in (baked.split / scene.name).rglob("*")}
+    names = {path.name for path in out.iterdir()} if out.exists() else set()
+    assert not {name for name in names if name.startswith(".")}
+    assert "episodes.jsonl" not in names
+
+
+def arguments(**overrides: object) -> list[str]:
+    given = QUICK | TINY | {key.replace("__", "."): value for key, value in overrides.items()}
+    return ["--config", "smoke", *(part for key, value in given.items() for part in ("--set", f"{key}={json.dumps(value)}"))]
+
+
+def test_episodes_that_are_given_up(tmp_path, capsys):
+    """One attempt without time to settle: no scenes, exit code 1, and the reason in the list of episodes."""
+    out = tmp_path / "set"
+    given = arguments(settle__max_time=0.1, settle__attempts=1, bake__episodes=2)
+    assert cli.main(["bake", "--out", str(out), *given]) == cli.EXIT_INCOMPLETE
+    capsys.readouterr()
+    rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    assert [(row["episode"], row["outcome"], row["frames"], row["seconds"]) for row in rows] == [(n, "unsettled", 0, 0.0) for n in range(2)]
+    assert {row["sentence"] for row in rows} == {Outcome.UNSETTLED.sentence}
+    assert list(out.rglob("scene_gt.json")) == []
+
+
+def test_drawn_again_and_counted(tmp_path):
+    """Two attempts without time to settle: one is noted, the second given up."""
+    noted = []
+
+    class Notes(SilentProgress):
+        def note(self, text: str) -> None:
+            noted.append(text)
+
+    config = tiny(settle__max_time=0.1, settle__attempts=2, bake__episodes=1, bake__worlds=1)
+    summary = run_bake(config, tmp_path / "set", Notes())
+    assert (summary.redraws, summary.redrawn) == (1, {Outcome.UNSETTLED: 1})
+    assert [(row.episode, row.attempt, row.outcome) for row in summary.episodes] == [(0, 1, Outcome.UNSETTLED)]
+    assert noted == [f"episode 0, attempt 1: {Outcome.UNSETTLED.sentence}"]
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system too small for the bake."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    try:
+        made = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", folder], capture_output=True).returncode
+    except OSError:
+        made = 1
+    if made:
+        pytest.skip("no rights to mount a small file system")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_a_full_disk_is_one_line_and_exit_code_2(small_disk, capsys):
+    out = small_disk / "set"
+    assert cli.main(["bake", "--out", str(out), *arguments()]) == cli.EXIT_MISTAKE
+    said = capsys.readouterr().err.strip().splitlines()
+    assert said[-1].startswith("synpick-warp: error: cannot write ")
+    assert "No space left on device" in said[-1]
+    assert list(out.rglob(".*")) == []
+
+
+def test_a_worker_that_fails_ends_the_bake_with_one_line(tmp_path, capsys, monkeypatch):
+    """As with a full disk, where no small file system can be had: a file stands where a folder must be made."""
+    begin = BopExporter.write
+
+    def blocked(self, batch):
+        split = out / "train"
+        if split.is_dir() and not any(split.iterdir()):
+            split.rmdir()
+            split.write_text("")
+        begin(self, batch)
+
+    out = tmp_path / "set"
+    monkeypatch.setattr(BopExporter, "write", blocked)
+    assert cli.main(["bake", "--out", str(out), *arguments()]) == cli.EXIT_MISTAKE
+    said = capsys.readouterr().err.strip().splitlines()
+    assert said[-1].startswith("synpick-warp: error: cannot write ")
