@@ -18,7 +18,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.device import pick_device
 from synpick_warp.exporters.bop import BopExporter, view_bytes
-from synpick_warp.exporters.files import output_error, prepare_output, write_whole
+from synpick_warp.exporters.files import output_error, write_whole
 from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.kernels import phases
@@ -111,7 +111,6 @@ def run_bake(config: Config, out: Path, progress: Progress) -> BakeSummary:
     Raises:
         SynpickError: Something a user can mend; no half-written scene stays.
     """
-    prepare_output(out)
     factory = build_factory(config, progress)
     writers = config.bake.writers or len(os.sched_getaffinity(0))
     with WriterPool(writers, view_bytes(factory.cameras[0])) as pool:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import sys
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -19,7 +17,7 @@ from synpick_warp.configs.check import allowed
 from synpick_warp.configs.load import DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml
-from synpick_warp.errors import CatalogError, ConfigError, LightError, OutputError, SynpickError
+from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 
 NAME = "synpick-warp"
 EXIT_INCOMPLETE = 1
@@ -189,6 +187,7 @@ def _bake(config: Config, out: Path) -> int:
     """Check everything that can be checked cheaply, then bake."""
     from synpick_warp.device import pick_device
     from synpick_warp.display import make_console, make_progress, print_summary
+    from synpick_warp.exporters.files import prepare_output
 
     pick_device(config.bake.device)
     models, lights = config.bake.models, config.bake.lights
@@ -196,44 +195,12 @@ def _bake(config: Config, out: Path) -> int:
         raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes")
     if lights and not os.path.isdir(lights):
         raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets")
+    prepare_output(out)
     from synpick_warp.bake import run_bake
 
     console = make_console()
-    with _output_folder(out), make_progress(console) as progress:
+    with make_progress(console) as progress:
         summary = run_bake(config, out, progress)
     print_summary(console, summary, out)
     delivered = sum(1 for row in summary.episodes if row[2].delivers)
     return 0 if delivered == config.bake.episodes else EXIT_INCOMPLETE
-
-
-@contextlib.contextmanager
-def _output_folder(out: Path) -> Iterator[None]:
-    """Make the folder; if the bake fails before anything is in it, take it away again.
-
-    Raises:
-        OutputError: It is no folder, is not empty, or cannot be written.
-    """
-    made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
-    try:
-        if out.is_dir() and any(out.iterdir()):
-            raise OutputError(f"{out} is not empty; --out takes a new or an empty folder")
-        out.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=out):
-            pass
-    except FileExistsError:
-        raise OutputError(f"{out} is a file; --out takes a new or an empty folder") from None
-    except OSError as error:
-        _remove_empty(made)
-        raise OutputError(f"{out} cannot be written: {error.strerror}; give another folder to --out") from None
-    try:
-        yield
-    except BaseException:
-        _remove_empty(made)
-        raise
-
-
-def _remove_empty(folders: list[Path]) -> None:
-    """Remove the folders, innermost first, until one holds something."""
-    with contextlib.suppress(OSError):
-        for folder in folders:
-            folder.rmdir()

@@ -320,9 +320,11 @@ def test_output_folders_that_cannot_be_used(tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "note").write_text("")
     before = digests(tmp_path)
-    with pytest.raises(OutputError, match="is not empty; name a new or empty folder"):
+    with pytest.raises(OutputError, match="is not empty; --out takes a new or an empty folder"):
         prepare_output(tmp_path / "full")
-    for bad in (tmp_path / "file", tmp_path / "file" / "below", Path("/dev/null/x")):
+    with pytest.raises(OutputError, match="is a file; --out takes a new or an empty folder"):
+        prepare_output(tmp_path / "file")
+    for bad in (tmp_path / "file" / "below", Path("/dev/null/x")):
         with pytest.raises(OutputError, match="cannot write"):
             prepare_output(bad)
     with WriterPool(0, VIEW_BYTES) as pool, pytest.raises(OutputError, match="is not empty"):

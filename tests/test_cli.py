@@ -155,7 +155,7 @@ def test_output_folder_that_is_a_file(tmp_path, bakes, capsys):
     said = mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "file"))
     assert said == f"{tmp_path / 'file'} is a file; --out takes a new or an empty folder"
     said = mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "file" / "data"))
-    assert said == f"{tmp_path / 'file' / 'data'} cannot be written: Not a directory; give another folder to --out"
+    assert said.startswith(f"cannot write {tmp_path / 'file' / 'data'}: Not a directory; ")
 
 
 def test_output_folder_that_cannot_be_written(tmp_path, bakes, capsys):

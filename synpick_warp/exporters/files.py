@@ -23,10 +23,12 @@ def prepare_output(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
-            raise OutputError(f"the output folder {out} is not empty; name a new or empty folder with --out")
+            raise OutputError(f"{out} is not empty; --out takes a new or an empty folder")
         probe = out / f".{uuid.uuid4().hex}"
         probe.write_bytes(b"\0")
         probe.unlink()
+    except FileExistsError:
+        raise OutputError(f"{out} is a file; --out takes a new or an empty folder") from None
     except OSError as error:
         raise output_error(out, error) from error
     finally:
