@@ -162,7 +162,7 @@ def test_output_folder_that_cannot_be_written(tmp_path, bakes, capsys):
     if os.geteuid() == 0:
         pytest.skip("root may write everywhere")
     tmp_path.chmod(0o500)
-    assert "cannot be written: Permission denied" in mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "data"))
+    assert ": Permission denied; " in mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "data"))
 
 
 def test_a_mistake_found_while_baking_takes_empty_folders_away_again(tmp_path, bakes, capsys):
