@@ -14,6 +14,7 @@ import json
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -44,6 +45,8 @@ MOST_VOLUME = 7.0
 """Total volume of an arrangement's collision shapes [l]."""
 HEAP = 0.1
 """How far above the rim the centre of mass of an object on the heap may lie [m]."""
+SAY_EVERY = 10.0
+"""Time between two lines about how far it is [s]."""
 ROUNDING = 1e-6
 """Relative error of a total volume that was summed in single precision."""
 
@@ -107,7 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
     findings = Findings()
     interrupted = False
     try:
-        settle(simulation, catalog, findings)
+        settle(simulation, catalog, findings, console.print)
     except KeyboardInterrupt:
         interrupted = True
         print(f"rest_report: interrupted; {len(findings.piles)} of {config.bake.episodes} arrangements are at rest", file=sys.stderr)
@@ -147,9 +150,10 @@ def _config(options: argparse.Namespace) -> Config:
     return load_config(None, overrides)
 
 
-def settle(simulation: Simulation, catalog: Catalog, findings: Findings) -> None:
-    """Let every arrangement come to rest or be given up, and enter into `findings` what those at rest are like."""
+def settle(simulation: Simulation, catalog: Catalog, findings: Findings, say: Callable[[str], None]) -> None:
+    """Let every arrangement come to rest or be given up, enter into `findings` what those at rest are like, and say how far it is."""
     config = simulation.config
+    said = time.perf_counter()
     record = simulation.records[0]
     reader = TickReader(record)
     before: TickReport | None = None
@@ -168,6 +172,9 @@ def settle(simulation: Simulation, catalog: Catalog, findings: Findings) -> None
             _finish(simulation, resting)
         if (phase == phases.IDLE).all():
             return
+        if time.perf_counter() - said >= SAY_EVERY:
+            said = time.perf_counter()
+            say(f"{len(findings.piles)} of {config.bake.episodes} arrangements at rest")
         before = report
 
 
