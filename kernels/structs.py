@@ -27,7 +27,6 @@ class CatalogData:
     count: int
     volume: wp.array[float]
     radius: wp.array[float]
-    mass: wp.array[float]
     compound: wp.array[int]
     variant: wp.array[int]
     empty_single: int

@@ -137,7 +137,6 @@ def _catalog_data(catalog: Catalog, built: build.BuiltModel, device: wp.Device) 
     data.count = len(entries)
     data.volume = column([entry.volume for entry in entries], float)
     data.radius = column([entry.radius for entry in entries], float)
-    data.mass = column([entry.mass for entry in entries], float)
     data.compound = column([int(len(entry.pieces) > 1) for entry in entries], int)
     data.variant = wp.array(built.variant, dtype=int, device=device)
     data.empty_single, data.empty_compound = built.empty_variant

@@ -62,7 +62,7 @@ class KernelWorlds:
         compound = np.asarray(self.compound, np.int32)
         # Position among the entries of its kind, as scenes.build numbers variants.
         variant = np.where(compound == 1, np.cumsum(compound), np.cumsum(1 - compound)) - 1
-        columns = {"volume": (self.volume, float), "radius": (self.radius, float), "mass": (np.ones(len(compound)), float),
+        columns = {"volume": (self.volume, float), "radius": (self.radius, float),
                    "compound": (compound, int), "variant": (variant, int)}
         arrays = {name: wp.array(np.asarray(values), dtype=dtype, device=self.device) for name, (values, dtype) in columns.items()}
         return filled(structs.CatalogData(), {"count": len(compound), **arrays, "empty_single": int((compound == 0).sum()),
