@@ -151,10 +151,9 @@ def _known_section(section: str, source: str) -> None:
     if section == ROWS:
         raise ConfigError(f"{ROWS} cannot be set {source}; write [[{ROWS}]] tables into a file")
     if section not in known:
-        hint = did_you_mean(section, list(known))
+        # A setting's own name, without its section, is a surer sign than a section of a similar name.
         homes = [f"{home}.{section}" for home, kind in known.items() if section in settings_of(kind)]
-        if homes and not hint:
-            hint = f"; did you mean {' or '.join(homes)}?"
+        hint = f"; did you mean {' or '.join(homes)}?" if homes else did_you_mean(section, list(known))
         raise ConfigError(f"there is no section {section}, set {source}; sections: {', '.join(known)}, {ROWS}{hint}")
 
 

@@ -9,7 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-MODES = ("move",)
+MODES = ("pick", "target", "move")
+"""What the gripper does in an episode."""
+MIXED = "mixed"
+"""Every episode draws its mode."""
 
 
 def setting(
@@ -34,7 +37,11 @@ def setting(
 class Bake:
     """What to make, and where."""
 
-    mode: str = setting("move", "", "What the gripper does.", choices=MODES)
+    mode: str = setting(
+        "pick", "", "pick: empty the tote; target: dig for what lies lowest; move: stir; mixed: drawn for each episode.",
+        choices=(*MODES, MIXED),
+    )
+    mix: tuple[float, float, float] = setting((1.0, 1.0, 1.0), "", "With mode mixed: weights of pick, target and move.", low=0.0)
     worlds: int = setting(4, "", "Totes simulated side by side.", low=1, high=65536)
     episodes: int = setting(4, "", "Sequences to make; each becomes one BOP scene a camera.", low=1)
     seed: int = setting(0, "", "Every random draw follows from it.", low=0, high=2**63 - 1)
@@ -130,7 +137,6 @@ class Arrangement:
 
     volume: float = setting(7e-3, "m³", "Objects are drawn while their collision shapes' total stays within this.", above=0.0)
     max_objects: int = setting(24, "", "Most objects of an episode; the draw stops there.", low=1, high=32)
-    repeats: bool = setting(True, "", "An object may come several times (moving: yes; picking: no).")
     slot_shortfall: float = setting(
         1e-3, "", "Accepted share of draws that need more slots than a world has; they are repeated, and counted.", above=0.0, high=0.5
     )
@@ -151,7 +157,7 @@ class Settle:
     stuck_depth: float = setting(0.01, "m", "An object that penetrates another by more is stuck (released).", above=0.0)
     stuck_time: float = setting(0.4, "s", "A stuck object is dropped again after this time (released).", above=0.0)
     max_redrops: int = setting(8, "", "An arrangement with more re-drops is drawn again.", low=0)
-    attempts: int = setting(20, "", "Arrangements tried before an episode is given up.", low=1)
+    tries: int = setting(20, "", "Arrangements tried before an episode is given up.", low=1)
 
 
 @dataclass(frozen=True)
@@ -190,7 +196,79 @@ class Move:
     height: float = setting(0.02, "m", "Height of the cup's tip above the floor at a corner (released).", low=0.0)
     start_height: float = setting(0.35, "m", "Height of the cup's tip above the first corner at the first frame.", above=0.0)
     rounds: int = setting(2, "", "How often all four corners are visited (released: eight corners, with replacement).", low=1)
+    repeats: bool = setting(True, "", "An object may come several times in a tote (paper).")
 
+
+@dataclass(frozen=True)
+class Pick:
+    """Picking: look, approach, suck, lift, until the tote is empty or too many attempts have failed."""
+
+    stiffness: float = setting(2500.0, "N/m", "Stiffness of the position controller (paper).", above=0.0)
+    damping: float = setting(200.0, "N·s/m", "Damping of the position controller (paper).", low=0.0)
+    force: float = setting(200.0, "N", "Largest force of the position controller (paper).", above=0.0)
+    appear_height: float = setting(1.0, "m", "The gripper appears so far above the grasp (released).", above=0.0)
+    speed: float = setting(1.0, "m/s", "Speed of the goal far from the grasp point (released).", above=0.0)
+    near: float = setting(0.05, "m", "So near to the grasp point the goal is slow and moves along the normal (released).", low=0.0)
+    near_speed: float = setting(0.1, "m/s", "Speed of the goal from there (released).", above=0.0)
+    press_time: float = setting(0.1, "s", "The goal rests at the grasp point, so that the cup, which lags, touches.", low=0.0)
+    lift_height: float = setting(1.0, "m", "How far the goal is lifted (released).", above=0.0)
+    lift_speed: float = setting(0.5, "m/s", "Speed of the goal then (released).", above=0.0)
+    failures: int = setting(3, "", "So many failed attempts end the episode (released: four).", low=1)
+    floor: float = setting(-0.1, "m", "An object that falls lower leaves the scene (released).", high=0.0)
+    repeats: bool = setting(False, "", "An object may come several times in a tote (paper: no).")
+
+
+@dataclass(frozen=True)
+class Target:
+    """Targeted picking: as picking, but for the object that is occluded most."""
+
+    forgive: bool = setting(False, "", "A success sets the count of failed attempts back to zero (released).")
+    random_after_failure: bool = setting(False, "", "After a failed attempt the next target is drawn at random (released).")
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How the gripper's side sees: an image of camera 0 without the gripper, and the rules by which it chooses."""
+
+    resolution: tuple[int, int] = setting((1920, 1080), "px", "Width and height of the image; lengths below belong to it.", low=16, high=8192)
+    views: int = setting(0, "", "Images worked on at once; 0: chosen by device and resolution.", low=0)
+    contour_points: int = setting(8192, "", "Room for the points of one contour; more end the episode.", low=16)
+    center_share: float = setting(
+        0.8, "", "Centroid, or the point half-way to it, is taken if its distance to the contour exceeds this share of the pole's.", low=0.0
+    )
+    heavy_mass: float = setting(0.8, "kg", "Heavier objects are gripped nearer to their centroid.", low=0.0)
+    heavy_center_share: float = setting(0.4, "", "As center_share, for heavy objects.", low=0.0)
+    contour_offset: float = setting(3.0, "px", "Neighbours are compared so far inside and outside of the contour.", above=0.0)
+    deep_distance: float = setting(0.02, "m", "A neighbour lower than the suction point by more has little weight.", low=0.0)
+    deep_weight: float = setting(0.1, "", "That weight.", low=0.0, high=1.0)
+    min_votes: float = setting(5.0, "", "Votes that make an edge of the clutter graph.", above=0.0)
+    reach: float = setting(
+        1.2, "", "A neighbour whose contour reaches farther from the suction point than this many of its diagonals has no vote.", above=0.0
+    )
+    exact_cycle: int = setting(10, "", "Cycles of at most so many objects are broken at least cost; larger ones greedily.", low=2, high=12)
+    normal_window: int = setting(10, "px", "The normal is averaged so far to each side of the suction point.", low=0, high=256)
+
+
+@dataclass(frozen=True)
+class Suction:
+    """The suction cup: which objects it catches, and what holds them."""
+
+    rays: int = setting(10, "", "Rays on a circle at the cup's tip (paper).", low=3, high=64)
+    radius: float = setting(0.01, "m", "Radius of that circle (released).", above=0.0)
+    reach: float = setting(0.03, "m", "Length of the rays (paper).", above=0.0)
+    surface: str = setting(
+        "hull", "", "What the rays hit: collision hulls, on which the cup rests, or the visual mesh, where an open pitcher is open.",
+        choices=("hull", "mesh"),
+    )
+    tolerated_misses: int = setting(0, "", "A seal is good if no more rays miss (paper: 0; released: 2).", low=0)
+    good_force: float = setting(40.0, "N", "Break force of a good seal (paper).", above=0.0)
+    poor_force: float = setting(2.0, "N", "Break force of any other (paper; released: 0.2).", above=0.0)
+    stiffness: float = setting(2e4, "N/m", "Stiffness of a seal: 40 N stretch it by 2 mm, within the paper's 5 mm.", above=0.0)
+    damping: float = setting(100.0, "N·s/m", "Damping of a seal.", low=0.0)
+    twist_stiffness: float = setting(50.0, "N·m/rad", "Stiffness against twist about the cup's axis.", low=0.0)
+    twist_damping: float = setting(0.1, "N·m·s/rad", "Damping of twist and swing.", low=0.0)
+    swing_limit: float = setting(5.0, "°", "An object swings freely so far (released).", low=0.0, high=90.0)
+    swing_stiffness: float = setting(10.0, "N·m/rad", "Stiffness against swing beyond that.", low=0.0)
 
 @dataclass(frozen=True)
 class Render:
@@ -232,6 +310,10 @@ class Config:
     settle: Settle = field(default_factory=Settle)
     physics: Physics = field(default_factory=Physics)
     move: Move = field(default_factory=Move)
+    pick: Pick = field(default_factory=Pick)
+    target: Target = field(default_factory=Target)
+    sight: Sight = field(default_factory=Sight)
+    suction: Suction = field(default_factory=Suction)
     render: Render = field(default_factory=Render)
     bop: Bop = field(default_factory=Bop)
     object_rows: tuple[ObjectRow, ...] = ()

@@ -2,18 +2,21 @@
 
 import warp as wp
 
-from synpick_warp.kernels.draws import DROP, LIGHT, OBJECTS, TAU, stream_key, uniform, uniform_index, uniform_rotation
+from synpick_warp.kernels.draws import DROP, LIGHT, MODE, OBJECTS, TAU, stream_key, uniform, uniform_index, uniform_rotation
 from synpick_warp.kernels.phases import (
     EMPTY,
+    ENDING_ARRANGEMENT_OVERFLOW,
+    ENDING_RUNNING,
     IDLE,
-    OUTCOME_ARRANGEMENT_OVERFLOW,
-    OUTCOME_FINISHED,
-    OUTCOME_RUNNING,
+    MOVE,
     OVER,
+    PICK,
     SETTLE,
     START,
+    TARGET,
+    delivers,
 )
-from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData
+from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData, ModeData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,11 +34,11 @@ def take_episodes_kernel(
     # Scene:
     worlds: int,
     episodes: int,
-    attempts: int,
+    tries: int,
     # State:
     address_inout: wp.array[wp.vec2i],
     phase_inout: wp.array[int],
-    outcome_inout: wp.array[int],
+    ending_inout: wp.array[int],
     next_episode_inout: wp.array[int],
 ):
     """Worlds whose episode is over take the next number; an episode that delivered nothing is drawn again where it was.
@@ -46,10 +49,10 @@ def take_episodes_kernel(
     for world in range(worlds):
         phase = phase_inout[world]
         episode = address_inout[world][0]
-        attempt = address_inout[world][1]
-        again = phase == OVER and outcome_inout[world] != OUTCOME_FINISHED and attempt + 1 < attempts
+        redraw = address_inout[world][1]
+        again = phase == OVER and not delivers(ending_inout[world]) and redraw + 1 < tries
         if again:
-            address_inout[world] = wp.vec2i(episode, attempt + 1)
+            address_inout[world] = wp.vec2i(episode, redraw + 1)
             phase_inout[world] = START
         elif phase == OVER or phase == EMPTY:
             if following < episodes:
@@ -60,8 +63,38 @@ def take_episodes_kernel(
                 address_inout[world] = wp.vec2i(-1, 0)
                 phase_inout[world] = IDLE
         if phase == OVER or phase == EMPTY:
-            outcome_inout[world] = OUTCOME_RUNNING
+            ending_inout[world] = ENDING_RUNNING
     next_episode_inout[0] = following
+
+
+@wp.kernel
+def draw_modes_kernel(
+    # Scene:
+    seed: wp.uint64,
+    mode: ModeData,
+    # State:
+    address: wp.array[wp.vec2i],
+    phase: wp.array[int],
+    # Out:
+    mode_out: wp.array[int],
+):
+    """Draw the mode of worlds that start an episode. Another arrangement of the episode has the same mode."""
+    world = wp.tid()
+    if phase[world] != START:
+        return
+    number = uniform(stream_key(seed, address[world][0], 0, MODE), 0)
+    if number < mode.pick_share:
+        mode_out[world] = PICK
+    elif number < mode.pick_or_target_share:
+        mode_out[world] = TARGET
+    else:
+        mode_out[world] = MOVE
+
+
+@wp.func
+def clear_entries(entry: wp.array2d[int], world: int, instances: int):
+    for instance in range(instances):
+        entry[world, instance] = -1
 
 
 @wp.func
@@ -82,8 +115,9 @@ def draw_objects_kernel(
     drop: DropData,
     # State:
     address: wp.array[wp.vec2i],
+    mode: wp.array[int],
     phase_inout: wp.array[int],
-    outcome_inout: wp.array[int],
+    ending_inout: wp.array[int],
     # Out:
     entry_out: wp.array2d[int],
     slot_out: wp.array2d[int],
@@ -97,11 +131,11 @@ def draw_objects_kernel(
     phase = phase_inout[world]
     if phase != START and phase != IDLE:
         return
-    for instance in range(layout.instances):
-        entry_out[world, instance] = -1
+    clear_entries(entry_out, world, layout.instances)
     if phase == IDLE:
         return
     key = stream_key(seed, address[world][0], address[world][1], OBJECTS)
+    repeats = wp.where(mode[world] == MOVE, drop.move_repeats, drop.pick_repeats)
     count = int(0)
     singles = int(0)
     compounds = int(0)
@@ -111,7 +145,7 @@ def draw_objects_kernel(
     for draw in range(MAX_DRAWS):
         if open:
             candidate = uniform_index(key, draw, catalog.count)
-            known = drop.repeats == 0 and already_drawn(entry_out, world, count, candidate)
+            known = repeats == 0 and already_drawn(entry_out, world, count, candidate)
             fits = total + catalog.volume[candidate] <= drop.volume
             if not known and not fits and count > 0:
                 open = False
@@ -127,12 +161,11 @@ def draw_objects_kernel(
                 slot_out[world, count] = slot
                 total += catalog.volume[candidate]
                 count += 1
-            if overflow or count == layout.instances or (drop.repeats == 0 and count == catalog.count):
+            if overflow or count == layout.instances or (repeats == 0 and count == catalog.count):
                 open = False
     if overflow:
-        for instance in range(layout.instances):
-            entry_out[world, instance] = -1
-        outcome_inout[world] = OUTCOME_ARRANGEMENT_OVERFLOW
+        clear_entries(entry_out, world, layout.instances)
+        ending_inout[world] = ENDING_ARRANGEMENT_OVERFLOW
         phase_inout[world] = OVER
 
 

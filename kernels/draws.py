@@ -1,4 +1,4 @@
-"""Random numbers with an address: (seed, episode, attempt, purpose, index) names one number, on every device and in every world.
+"""Random numbers with an address: (seed, episode, redraw, purpose, index) names one number, on every device and in every world.
 
 SplitMix64 (Steele, Lea and Flood, OOPSLA 2014) read as a counter-based generator: number i of a stream with key k is
 mix(k + (i + 1)·γ). Keys come from mixing the address, so that streams of neighbouring addresses are unrelated.
@@ -14,6 +14,8 @@ DROP = wp.constant(2)
 REDROP = wp.constant(3)
 CORNERS = wp.constant(4)
 LIGHT = wp.constant(5)
+MODE = wp.constant(6)
+TARGETS = wp.constant(7)
 
 # γ and the two multipliers of SplitMix64.
 GAMMA = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
@@ -33,11 +35,11 @@ def mix(x: wp.uint64) -> wp.uint64:
 
 
 @wp.func
-def stream_key(seed: wp.uint64, episode: int, attempt: int, purpose: int) -> wp.uint64:
+def stream_key(seed: wp.uint64, episode: int, redraw: int, purpose: int) -> wp.uint64:
     """Key of the stream at an address."""
     key = mix(seed + GAMMA)
     key = mix((key ^ wp.uint64(episode)) + GAMMA)
-    key = mix((key ^ wp.uint64(attempt)) + GAMMA)
+    key = mix((key ^ wp.uint64(redraw)) + GAMMA)
     return mix((key ^ wp.uint64(purpose)) + GAMMA)
 
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import ACT, OUTCOME_FINISHED, OVER
+from synpick_warp.kernels.phases import ACT, OVER, delivers
 from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
@@ -24,7 +24,7 @@ def take_snapshot_kernel(
     layout: LayoutData,
     # State:
     phase: wp.array[int],
-    outcome: wp.array[int],
+    ending: wp.array[int],
     address: wp.array[wp.vec2i],
     frame: wp.array[int],
     entry: wp.array2d[int],
@@ -42,7 +42,7 @@ def take_snapshot_kernel(
     """Copy what pictures need. A tick is a frame while the gripper acts, and once more when it has finished."""
     world = wp.tid()
     live = int(0)
-    if phase[world] == ACT or (phase[world] == OVER and outcome[world] == OUTCOME_FINISHED):
+    if phase[world] == ACT or (phase[world] == OVER and delivers(ending[world])):
         live = 1
     live_out[world] = live
     episode_out[world] = address[world][0]
@@ -56,7 +56,7 @@ def take_snapshot_kernel(
     fixture_pose_out[world, 1] = body_q[body]
     fixture_pose_out[world, 2] = body_q[body + 1]
     status_out[world, STATUS_PHASE] = phase[world]
-    status_out[world, STATUS_OUTCOME] = outcome[world]
+    status_out[world, STATUS_OUTCOME] = ending[world]
     status_out[world, STATUS_EPISODE] = address[world][0]
     status_out[world, STATUS_ATTEMPT] = address[world][1]
     status_out[world, STATUS_FRAME] = frame[world]

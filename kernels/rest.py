@@ -6,10 +6,10 @@ from synpick_warp.kernels.arrangement import drop_pose, write_body
 from synpick_warp.kernels.draws import REDROP, stream_key
 from synpick_warp.kernels.phases import (
     ACT,
-    OUTCOME_FINISHED,
-    OUTCOME_NOT_FINITE,
-    OUTCOME_SOLVER_OVERFLOW,
-    OUTCOME_UNSETTLED,
+    ENDING_FINISHED,
+    ENDING_NOT_FINITE,
+    ENDING_SOLVER_OVERFLOW,
+    ENDING_UNSETTLED,
     OVER,
     SETTLE,
 )
@@ -122,7 +122,7 @@ def redrop_objects_kernel(
     """Drop again what left the tote, or penetrates something deeply for some time, one above the other; guide walls come back.
 
     `progress` holds ticks since the drop, ticks at rest, re-drops, and whether the guide walls stand. `address` is (episode,
-    attempt).
+    redraw).
     """
     world = wp.tid()
     if phase[world] != SETTLE:
@@ -214,28 +214,28 @@ def judge_episodes_kernel(
     progress: wp.array[wp.vec4i],
     waypoint: wp.array[int],
     phase_inout: wp.array[int],
-    outcome_inout: wp.array[int],
+    ending_inout: wp.array[int],
 ):
     """End episodes: those that failed, and those whose gripper has been everywhere."""
     world = wp.tid()
     phase = phase_inout[world]
     if phase != SETTLE and phase != ACT:
         return
-    outcome = int(0)
+    ending = int(0)
     if phase == ACT and waypoint[world] >= waypoints:
-        outcome = OUTCOME_FINISHED
+        ending = ENDING_FINISHED
     if phase == SETTLE and (progress[world][0] >= settle.max_ticks or progress[world][2] > settle.max_redrops):
-        outcome = OUTCOME_UNSETTLED
+        ending = ENDING_UNSETTLED
     if overflow[world]:
-        outcome = OUTCOME_SOLVER_OVERFLOW
+        ending = ENDING_SOLVER_OVERFLOW
     body = world * layout.bodies + layout.gripper_bodies
     for instance in range(layout.instances):
         if entry[world, instance] >= 0:
             p = wp.transform_get_translation(body_q[body + slot[world, instance]])
             if not wp.isfinite(p[0] + p[1] + p[2]):
-                outcome = OUTCOME_NOT_FINITE
-    if outcome != 0:
-        outcome_inout[world] = outcome
+                ending = ENDING_NOT_FINITE
+    if ending != 0:
+        ending_inout[world] = ending
         phase_inout[world] = OVER
 
 

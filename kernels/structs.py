@@ -22,11 +22,14 @@ class LayoutData:
 
 @wp.struct
 class CatalogData:
-    """What the simulation knows of each catalog entry."""
+    """What the simulation knows of each catalog entry: `area` is the product of the two larger extents of its mesh's box [m²]."""
 
     count: int
     volume: wp.array[float]
     radius: wp.array[float]
+    mass: wp.array[float]
+    area: wp.array[float]
+    diagonal: wp.array[float]
     compound: wp.array[int]
     variant: wp.array[int]
     empty_single: int
@@ -39,7 +42,8 @@ class DropData:
     """How objects are drawn and dropped."""
 
     volume: float
-    repeats: int
+    move_repeats: int
+    pick_repeats: int
     clearance: float
     spread: float
     rim_length: float
@@ -67,6 +71,14 @@ class SettleData:
 
 
 @wp.struct
+class ModeData:
+    """How episodes get their mode: shares of PICK and of PICK or TARGET among all, from 0 to 1."""
+
+    pick_share: float
+    pick_or_target_share: float
+
+
+@wp.struct
 class MoveData:
     """The gripper's task and controller in move mode."""
 
@@ -81,3 +93,62 @@ class MoveData:
     gravity: float
     step: float
     tip: float
+
+
+@wp.struct
+class PickData:
+    """The gripper's task and controller in the modes PICK and TARGET. Lengths of time in steps."""
+
+    stiffness: float
+    damping: float
+    force: float
+    appear_height: float
+    speed: float
+    near: float
+    near_speed: float
+    press_steps: int
+    lift_height: float
+    lift_speed: float
+    failures: int
+    floor: float
+    tilt_limit: float
+    forgive: int
+    random_after_failure: int
+
+
+@wp.struct
+class SightData:
+    """How the target and the grasp are chosen; see configs.schema.Sight. Lengths in pixels, heights in metres."""
+
+    center_share: float
+    heavy_mass: float
+    heavy_center_share: float
+    contour_offset: float
+    deep_distance: float
+    deep_weight: float
+    min_votes: float
+    reach: float
+    exact_cycle: int
+    normal_window: int
+
+
+@wp.struct
+class SuctionData:
+    """The cup's rays and seals; see configs.schema.Suction. Angles in radians."""
+
+    rays: int
+    radius: float
+    reach: float
+    tolerated_misses: int
+    good_force: float
+    poor_force: float
+    stiffness: float
+    damping: float
+    twist_stiffness: float
+    twist_damping: float
+    swing_limit: float
+    swing_stiffness: float
+    tip: float
+    finger_mass: float
+    cup_mass: float
+    step: float

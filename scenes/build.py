@@ -13,7 +13,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import MIXED, MODES, Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.gripper import cup_collider, finger_collider
 from synpick_warp.scenes.shapes import Catalog, CatalogEntry, ConvexPiece
@@ -92,7 +92,7 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
     volume = np.array([entry.volume for entry in catalog.entries])
     if volume.min() > budget:
         raise ConfigError(f"arrangement.volume is {budget:g} m³, but the smallest object takes {volume.min():.3g} m³; make it larger")
-    if not config.arrangement.repeats:
+    if not repeats_occur(config):
         return min(room, int((~compound).sum())), min(room, int(compound.sum()))
     drawn = np.random.default_rng(0).integers(len(catalog), size=(SLOT_TRIALS, room))
     # The first object is drawn again until one fits.
@@ -101,6 +101,12 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
     level = 1.0 - config.arrangement.slot_shortfall
     needed = [np.quantile((inside & (compound[drawn] == kind)).sum(axis=1), level, method="higher") for kind in (False, True)]
     return int(needed[0]), int(needed[1])
+
+
+def repeats_occur(config: Config) -> bool:
+    """Whether an object may come several times in a tote, in any mode that episodes can have."""
+    pick, target, move = config.bake.mix if config.bake.mode == MIXED else (config.bake.mode == mode for mode in MODES)
+    return bool((config.move.repeats and move) or (config.pick.repeats and (pick or target)))
 
 
 def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltModel:

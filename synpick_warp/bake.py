@@ -22,7 +22,7 @@ from synpick_warp.exporters.files import output_error, write_whole
 from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.kernels import phases
-from synpick_warp.outcome import Outcome
+from synpick_warp.outcome import Ending
 from synpick_warp.progress import Progress
 from synpick_warp.scenes import build
 from synpick_warp.scenes.cameras import make_cameras
@@ -48,9 +48,9 @@ class EpisodeRow(NamedTuple):
     """One line of the summary."""
 
     episode: int
-    attempt: int
+    redraw: int
     """How often the episode was drawn again before."""
-    outcome: Outcome
+    ending: Ending
     frames: int
     seconds: float
     """Simulated time from the first frame to the last [s]."""
@@ -65,9 +65,9 @@ class BakeSummary:
     wall_seconds: float = 0.0
     """From the first tick to the last file [s]."""
     redraws: int = 0
-    """Attempts that ended with an outcome that delivers nothing, and were drawn again."""
-    redrawn: dict[Outcome, int] = field(default_factory=dict)
-    """The same, by outcome."""
+    """Arrangements that ended in a way that delivers nothing, and were drawn again."""
+    redrawn: dict[Ending, int] = field(default_factory=dict)
+    """The same, by ending."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,20 +158,20 @@ def _run(config: Config, factory: Factory, exporter: BopExporter, summary: BakeS
 
 def _ends(report: TickReport) -> Iterator[EpisodeEnd]:
     for world in np.flatnonzero(report.column("phase") == phases.OVER):
-        episode, attempt, frame, outcome = (int(report.column(name)[world]) for name in ("episode", "attempt", "frame", "outcome"))
-        yield EpisodeEnd(episode, attempt, frame + 1, outcome)
+        episode, redraw, frame, ending = (int(report.column(name)[world]) for name in ("episode", "redraw", "frame", "ending"))
+        yield EpisodeEnd(episode, redraw, frame + 1, ending)
 
 
 def _count(config: Config, summary: BakeSummary, end: EpisodeEnd, progress: Progress) -> None:
     """Enter an episode's end into the summary."""
-    outcome = Outcome(end.outcome)
-    if not outcome.delivers and end.attempt + 1 < config.settle.attempts:
+    ending = Ending(end.ending)
+    if not ending.delivers and end.redraw + 1 < config.settle.tries:
         summary.redraws += 1
-        summary.redrawn[outcome] = summary.redrawn.get(outcome, 0) + 1
-        progress.note(f"episode {end.episode}, attempt {end.attempt + 1}: {outcome.sentence}")
+        summary.redrawn[ending] = summary.redrawn.get(ending, 0) + 1
+        progress.note(f"episode {end.episode}, arrangement {end.redraw + 1}: {ending.sentence}")
         return
     tick = config.physics.step * config.physics.steps_per_tick
-    summary.episodes.append(EpisodeRow(end.episode, end.attempt, outcome, end.frames, max(0, end.frames - 1) * tick))
+    summary.episodes.append(EpisodeRow(end.episode, end.redraw, ending, end.frames, max(0, end.frames - 1) * tick))
     summary.episodes.sort()
 
 
@@ -189,7 +189,7 @@ class _Meter:
         if self.started is None and summary.views:
             self.started = now
         elapsed = now - self.started if self.started is not None else 0.0
-        done = [row for row in summary.episodes if row.outcome.delivers]
+        done = [row for row in summary.episodes if row.ending.delivers]
         left = None
         if done and elapsed > 0.0:
             total = self.config.bake.episodes * self.cameras * sum(row.frames for row in done) / len(done)
@@ -203,7 +203,7 @@ class _Meter:
 def _write_records(config: Config, out: Path, summary: BakeSummary) -> None:
     """The settings, and how every episode ended. Nothing in them depends on the machine or the time."""
     rows = [
-        {"episode": row.episode, "attempt": row.attempt, "outcome": row.outcome.name.lower(), "sentence": row.outcome.sentence,
+        {"episode": row.episode, "redraw": row.redraw, "ending": row.ending.name.lower(), "sentence": row.ending.sentence,
          "frames": row.frames, "seconds": round(row.seconds, 6)}
         for row in summary.episodes
     ]

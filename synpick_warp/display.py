@@ -125,24 +125,24 @@ def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
 
 
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
-    table = Table("episode", "outcome", "drawn again", "frames", "time")
+    table = Table("episode", "ending", "drawn again", "frames", "time")
     for column in (0, 2, 3, 4):
         table.columns[column].justify = "right"
-    for episode, attempt, outcome, frames, seconds in rows:
-        table.add_row(str(episode), outcome.sentence, str(attempt), str(frames), _duration(seconds))
+    for episode, redraw, ending, frames, seconds in rows:
+        table.add_row(str(episode), ending.sentence, str(redraw), str(frames), _duration(seconds))
     return table
 
 
 def _counts(summary: BakeSummary) -> Table:
-    table = Table("outcome", "episodes", "frames")
+    table = Table("ending", "episodes", "frames")
     table.columns[1].justify = table.columns[2].justify = "right"
     episodes: Counter = Counter()
     frames: Counter = Counter()
-    for _, _, outcome, count, _ in summary.episodes:
-        episodes[outcome] += 1
-        frames[outcome] += count
-    for outcome, number in episodes.most_common():
-        table.add_row(outcome.sentence, f"{number:,}", f"{frames[outcome]:,}")
+    for _, _, ending, count, _ in summary.episodes:
+        episodes[ending] += 1
+        frames[ending] += count
+    for ending, number in episodes.most_common():
+        table.add_row(ending.sentence, f"{number:,}", f"{frames[ending]:,}")
     return table
 
 

@@ -53,11 +53,11 @@ class FrameBatch:
 
 @dataclass(frozen=True)
 class EpisodeEnd:
-    """An episode is over. Exporters finish its scenes, or drop them if the outcome delivers nothing."""
+    """An episode is over. Exporters finish its scenes, or drop them if the ending delivers nothing."""
 
     episode: int
-    attempt: int
+    redraw: int
     """How often this episode's arrangement was drawn again before."""
     frames: int
-    outcome: int
-    """Code of an `Outcome`."""
+    ending: int
+    """Code of an `Ending`."""

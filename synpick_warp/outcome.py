@@ -1,35 +1,53 @@
-"""How an episode ended. Codes live in device arrays; their sentences are for people."""
+"""How episodes and attempts end. Their codes live in device arrays; the enums' values are sentences for people."""
 
 from __future__ import annotations
 
 import enum
+from typing import Self
 
 
-class Outcome(enum.IntEnum):
-    """Why an episode stopped. `describe` gives the sentence."""
+class _Coded(enum.IntEnum):
+    """An enum that is declared by its sentences; as a number, a member is its place in that order."""
 
-    RUNNING = 0
-    FINISHED = 1
-    UNSETTLED = 2
-    ARRANGEMENT_OVERFLOW = 3
-    SOLVER_OVERFLOW = 4
-    NOT_FINITE = 5
+    sentence: str
 
-    @property
-    def sentence(self) -> str:
-        return _SENTENCES[self]
+    def __new__(cls, sentence: str) -> Self:
+        member = int.__new__(cls, len(cls.__members__))
+        member._value_ = len(cls.__members__)
+        member.sentence = sentence
+        return member
+
+
+class Ending(_Coded):
+    """Why an episode stopped."""
+
+    RUNNING = "the episode is still running"
+    FINISHED = "the gripper has been everywhere it was to go"
+    EMPTIED = "no object is left in the tote"
+    GAVE_UP = "too many attempts have failed"
+    UNSETTLED = "the objects did not come to rest in time, so the arrangement was drawn again"
+    ARRANGEMENT_OVERFLOW = "more objects of a kind were drawn than a world has room for, so the arrangement was drawn again"
+    SOLVER_OVERFLOW = "more contacts arose than the solver has room for, so the episode was drawn again"
+    NOT_FINITE = "a pose became infinite or not a number, so the episode was drawn again"
+    SIGHT_OVERFLOW = "a contour has more points than there is room for, so the episode was drawn again"
 
     @property
     def delivers(self) -> bool:
-        """Whether an episode with this outcome becomes part of the data set."""
-        return self is Outcome.FINISHED
+        """Whether an episode with this ending becomes part of the data set."""
+        return self in (Ending.FINISHED, Ending.EMPTIED, Ending.GAVE_UP)
 
 
-_SENTENCES = {
-    Outcome.RUNNING: "the episode is still running",
-    Outcome.FINISHED: "the gripper did all it was to do",
-    Outcome.UNSETTLED: "the objects did not come to rest in time, so the arrangement was drawn again",
-    Outcome.ARRANGEMENT_OVERFLOW: "more objects of a kind were drawn than a world has room for, so the arrangement was drawn again",
-    Outcome.SOLVER_OVERFLOW: "more contacts arose than the solver has room for, so the episode was drawn again",
-    Outcome.NOT_FINITE: "a pose became infinite or not a number, so the episode was drawn again",
-}
+class Outcome(_Coded):
+    """What came of an attempt to pick."""
+
+    NONE = "no attempt has ended"
+    TARGET_PICKED = "the target hung on the cup after the lift"
+    OTHER_PICKED = "another object than the target hung on the cup after the lift"
+    DROPPED = "every seal broke during the lift"
+    NOTHING_CAUGHT = "no ray of the cup hit an object"
+    NOTHING_SEEN = "no object in the tote is visible"
+
+    @property
+    def succeeded(self) -> bool:
+        """Whether something was picked."""
+        return self in (Outcome.TARGET_PICKED, Outcome.OTHER_PICKED)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.kernels import arrangement as kernels
 from synpick_warp.kernels import phases
-from synpick_warp.outcome import Outcome
+from synpick_warp.outcome import Ending
 from synpick_warp.stages import arrange
 from tests.reference import arrangement, draws
 from tests.reference.kernel_worlds import KernelWorlds
@@ -31,7 +31,7 @@ def catalogs(draw):
         "instances": draw(st.integers(1, 16)),
         "single_slots": draw(st.integers(0, 16)),
         "compound_slots": draw(st.integers(0, 6)),
-        "drop": {"volume": draw(st.floats(0.01, 3.0)), "repeats": draw(st.integers(0, 1))},
+        "drop": {"volume": draw(st.floats(0.01, 3.0)), "move_repeats": draw(st.integers(0, 1))},
     }
 
 
@@ -46,17 +46,17 @@ def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangemen
     return [
         arrangement.draw_objects(
             seed, *map(int, address), volume=worlds.volume, compound=worlds.compound, budget=worlds.scene.drop.volume,
-            repeats=bool(worlds.scene.drop.repeats), room=worlds.instances, single_slots=worlds.single_slots,
+            repeats=bool(worlds.scene.drop.move_repeats), room=worlds.instances, single_slots=worlds.single_slots,
             compound_slots=worlds.compound_slots,
         )
         for address in worlds.state.address.numpy()
     ]
 
 
-@given(sizes=catalogs(), seed=st.integers(0, 2**63 - 1), first=st.integers(0, 2**30), attempt=st.integers(0, 20))
-def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, attempt, device):
+@given(sizes=catalogs(), seed=st.integers(0, 2**63 - 1), first=st.integers(0, 2**30), redraw=st.integers(0, 20))
+def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, redraw, device):
     worlds = made(device, **sizes)
-    worlds.begin(phases.START, first + np.arange(WORLDS), attempt)
+    worlds.begin(phases.START, first + np.arange(WORLDS), redraw)
     worlds.set(worlds.state.entry, 99)
     arrange.draw_objects(worlds.scene, worlds.state, seed)
     entry, slot = worlds.state.entry.numpy(), worlds.state.slot.numpy()
@@ -65,8 +65,8 @@ def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, attempt, devic
         assert tuple(entry[world, :count]) == expected.entries
         assert (entry[world, count:] == -1).all()
         assert tuple(slot[world, :count]) == expected.slots
-        state = (worlds.state.phase.numpy()[world], worlds.state.outcome.numpy()[world])
-        assert state == ((phases.OVER, Outcome.ARRANGEMENT_OVERFLOW) if expected.overflow else (phases.START, Outcome.RUNNING))
+        state = (worlds.state.phase.numpy()[world], worlds.state.ending.numpy()[world])
+        assert state == ((phases.OVER, Ending.ARRANGEMENT_OVERFLOW) if expected.overflow else (phases.START, Ending.RUNNING))
         check_law(worlds, entry[world, :count], slot[world, :count])
 
 
@@ -75,12 +75,12 @@ def check_law(worlds: KernelWorlds, entry: np.ndarray, slot: np.ndarray) -> None
     assert len(set(slot)) == len(slot)
     np.testing.assert_array_equal(slot >= worlds.single_slots, worlds.compound[entry] == 1)
     assert (slot < worlds.slots).all()
-    if not worlds.scene.drop.repeats:
+    if not worlds.scene.drop.move_repeats:
         assert len(set(entry)) == len(entry)
 
 
 def test_a_budget_for_everything_draws_everything_without_repeats(device):
-    worlds = made(device, drop={"volume": 10.0, "repeats": 0})
+    worlds = made(device, drop={"volume": 10.0, "move_repeats": 0})
     worlds.begin(phases.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     assert (np.sort(worlds.state.entry.numpy(), axis=1)[:, -3:] == [0, 1, 2]).all()
@@ -207,7 +207,7 @@ def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
     worlds.begin(phases.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
-    over = worlds.state.outcome.numpy() == Outcome.ARRANGEMENT_OVERFLOW
+    over = worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW
     assert over.any()
     assert not over.all()
     assert (worlds.state.entry.numpy()[over] == -1).all()
@@ -215,66 +215,60 @@ def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
     assert (worlds.forces()[over][:, :, 2] > 0.0).all()
 
 
-def test_outcomes_have_the_same_codes_on_both_sides():
-    assert {f"OUTCOME_{outcome.name}": int(outcome) for outcome in Outcome} == {
-        name: int(value) for name, value in vars(phases).items() if name.startswith("OUTCOME_")
-    }
-
-
-def take(device, phase, outcome, address, following: int, *, episodes: int, attempts: int):
-    """State after numbers are handed out: phase, outcome, address, next number."""
+def take(device, phase, ending, address, following: int, *, episodes: int, tries: int):
+    """State after numbers are handed out: phase, ending, address, next number."""
     worlds = made(device, worlds=len(phase))
     state = worlds.state
-    for array, values in ((state.phase, phase), (state.outcome, outcome), (state.address, address), (state.next_episode, following)):
+    for array, values in ((state.phase, phase), (state.ending, ending), (state.address, address), (state.next_episode, following)):
         worlds.set(array, values)
-    arrange.take_episodes(state, episodes, attempts)
-    return state.phase.numpy().tolist(), state.outcome.numpy().tolist(), state.address.numpy().tolist(), int(state.next_episode.numpy()[0])
+    arrange.take_episodes(state, episodes, tries)
+    return state.phase.numpy().tolist(), state.ending.numpy().tolist(), state.address.numpy().tolist(), int(state.next_episode.numpy()[0])
 
 
 def test_empty_worlds_take_numbers_in_order(device):
-    assert take(device, [phases.EMPTY] * 3, 0, -1, 0, episodes=2, attempts=1) == (
+    assert take(device, [phases.EMPTY] * 3, 0, -1, 0, episodes=2, tries=1) == (
         [phases.START, phases.START, phases.IDLE], [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2
     )
 
 
 def test_an_episode_that_delivered_nothing_is_drawn_again_in_its_world_until_it_is_given_up(device):
     over = [phases.OVER] * 4
-    outcome = [Outcome.UNSETTLED, Outcome.FINISHED, Outcome.NOT_FINITE, Outcome.UNSETTLED]
+    ending = [Ending.UNSETTLED, Ending.FINISHED, Ending.NOT_FINITE, Ending.UNSETTLED]
     address = [[3, 0], [4, 0], [5, 1], [6, 2]]
-    assert take(device, over, outcome, address, 9, episodes=100, attempts=3) == (
-        [phases.START] * 4, [Outcome.RUNNING] * 4, [[3, 1], [9, 0], [5, 2], [10, 0]], 11
+    assert take(device, over, ending, address, 9, episodes=100, tries=3) == (
+        [phases.START] * 4, [Ending.RUNNING] * 4, [[3, 1], [9, 0], [5, 2], [10, 0]], 11
     )
 
 
 def test_worlds_at_work_keep_their_numbers(device):
     phase = [phases.SETTLE, phases.ACT, phases.IDLE]
-    assert take(device, phase, 0, [[0, 0], [1, 0], [-1, 0]], 2, episodes=9, attempts=3) == (phase, [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2)
+    assert take(device, phase, 0, [[0, 0], [1, 0], [-1, 0]], 2, episodes=9, tries=3) == (phase, [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2)
 
 
-@given(worlds=st.integers(1, 6), episodes=st.integers(1, 20), attempts=st.integers(1, 4), seed=st.integers(0, 2**32 - 1))
-def test_every_episode_ends_once(worlds, episodes, attempts, seed, device):
+@given(worlds=st.integers(1, 6), episodes=st.integers(1, 20), tries=st.integers(1, 4), seed=st.integers(0, 2**32 - 1))
+def test_every_episode_ends_once(worlds, episodes, tries, seed, device):
     """Whatever becomes of episodes, each number is delivered or given up exactly once; then all worlds are idle."""
     numbers = np.random.default_rng(seed)
     made_worlds = made(device, worlds=worlds)
     state = made_worlds.state
     made_worlds.begin(phases.EMPTY, -1)
     started, ended = [], []
-    for _ in range(8 * episodes * attempts):
-        arrange.take_episodes(state, episodes, attempts)
-        phase, outcome, address = state.phase.numpy(), state.outcome.numpy(), state.address.numpy()
+    for _ in range(8 * episodes * tries):
+        arrange.take_episodes(state, episodes, tries)
+        phase, ending, address = state.phase.numpy(), state.ending.numpy(), state.address.numpy()
         started += [tuple(address[world]) for world in np.flatnonzero(phase == phases.START)]
         for world in np.flatnonzero(phase != phases.IDLE):
-            phase[world], outcome[world] = phases.ACT, Outcome.RUNNING
+            phase[world], ending[world] = phases.ACT, Ending.RUNNING
             if numbers.uniform() < 0.5:
-                phase[world], outcome[world] = phases.OVER, numbers.choice([Outcome.FINISHED, Outcome.UNSETTLED])
-                if outcome[world] == Outcome.FINISHED or address[world, 1] == attempts - 1:
+                phase[world], ending[world] = phases.OVER, numbers.choice([Ending.FINISHED, Ending.UNSETTLED])
+                if ending[world] == Ending.FINISHED or address[world, 1] == tries - 1:
                     ended.append(int(address[world, 0]))
         if (phase == phases.IDLE).all():
             break
         made_worlds.set(state.phase, phase)
-        made_worlds.set(state.outcome, outcome)
+        made_worlds.set(state.ending, ending)
     assert (state.phase.numpy() == phases.IDLE).all()
     assert sorted(ended) == list(range(episodes))
     assert len(set(started)) == len(started)
-    assert [episode for episode, attempt in started if attempt == 0] == list(range(episodes))
+    assert [episode for episode, redraw in started if redraw == 0] == list(range(episodes))
     assert (state.address.numpy()[:, 0] == -1).all()

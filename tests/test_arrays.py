@@ -14,7 +14,7 @@ from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays
 from synpick_warp.stages.worlds import WorldState, WorldStatus
 from tests.reference.small_worlds import settings
 
-NAMES = "one world world_and_global instance body waypoint status fixture view row column count box edge"
+NAMES = "one world world_and_global instance body waypoint status measure fixture view row column count box edge"
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 DECLARED = [WorldState, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays, PictureArrays]
 

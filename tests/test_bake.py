@@ -17,7 +17,7 @@ from synpick_warp.bake import run_bake
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop import BopExporter
-from synpick_warp.outcome import Outcome
+from synpick_warp.outcome import Ending
 from synpick_warp.progress import SilentProgress
 from tests.reference.small_worlds import QUICK, catalog, settings
 
@@ -128,11 +128,11 @@ def test_every_episode_has_a_scene_for_each_camera_and_every_frame_its_files(bak
 def test_the_list_of_episodes_is_right(baked):
     rows = [json.loads(line) for line in (baked.out / "episodes.jsonl").read_text().splitlines()]
     assert [row["episode"] for row in rows] == list(range(EPISODES))
-    assert [row["outcome"] for row in rows] == ["finished"] * EPISODES
-    assert {row["sentence"] for row in rows} == {Outcome.FINISHED.sentence}
+    assert [row["ending"] for row in rows] == ["finished"] * EPISODES
+    assert {row["sentence"] for row in rows} == {Ending.FINISHED.sentence}
     tick = baked.config.physics.step * baked.config.physics.steps_per_tick
     for row, known in zip(rows, baked.summary.episodes, strict=True):
-        assert (row["attempt"], row["frames"]) == (known.attempt, known.frames)
+        assert (row["redraw"], row["frames"]) == (known.redraw, known.frames)
         assert row["seconds"] == pytest.approx((row["frames"] - 1) * tick, abs=1e-6)
 
 
@@ -233,30 +233,30 @@ def arguments(**overrides: object) -> list[str]:
 
 
 def test_episodes_that_are_given_up(tmp_path, capsys):
-    """One attempt without time to settle: no scenes, exit code 1, and the reason in the list of episodes."""
+    """One arrangement without time to settle: no scenes, exit code 1, and the reason in the list of episodes."""
     out = tmp_path / "set"
-    given = arguments(settle__max_time=0.1, settle__attempts=1, bake__episodes=2)
+    given = arguments(settle__max_time=0.1, settle__tries=1, bake__episodes=2)
     assert cli.main(["bake", "--out", str(out), *given]) == cli.EXIT_INCOMPLETE
     capsys.readouterr()
     rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
-    assert [(row["episode"], row["outcome"], row["frames"], row["seconds"]) for row in rows] == [(n, "unsettled", 0, 0.0) for n in range(2)]
-    assert {row["sentence"] for row in rows} == {Outcome.UNSETTLED.sentence}
+    assert [(row["episode"], row["ending"], row["frames"], row["seconds"]) for row in rows] == [(n, "unsettled", 0, 0.0) for n in range(2)]
+    assert {row["sentence"] for row in rows} == {Ending.UNSETTLED.sentence}
     assert list(out.rglob("scene_gt.json")) == []
 
 
 def test_drawn_again_and_counted(tmp_path):
-    """Two attempts without time to settle: one is noted, the second given up."""
+    """Two arrangements without time to settle: one is noted, the second given up."""
     noted = []
 
     class Notes(SilentProgress):
         def note(self, text: str) -> None:
             noted.append(text)
 
-    config = tiny(settle__max_time=0.1, settle__attempts=2, bake__episodes=1, bake__worlds=1)
+    config = tiny(settle__max_time=0.1, settle__tries=2, bake__episodes=1, bake__worlds=1)
     summary = run_bake(config, tmp_path / "set", Notes())
-    assert (summary.redraws, summary.redrawn) == (1, {Outcome.UNSETTLED: 1})
-    assert [(row.episode, row.attempt, row.outcome) for row in summary.episodes] == [(0, 1, Outcome.UNSETTLED)]
-    assert noted == [f"episode 0, attempt 1: {Outcome.UNSETTLED.sentence}"]
+    assert (summary.redraws, summary.redrawn) == (1, {Ending.UNSETTLED: 1})
+    assert [(row.episode, row.redraw, row.ending) for row in summary.episodes] == [(0, 1, Ending.UNSETTLED)]
+    assert noted == [f"episode 0, arrangement 1: {Ending.UNSETTLED.sentence}"]
 
 
 @pytest.fixture

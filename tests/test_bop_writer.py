@@ -20,7 +20,7 @@ from synpick_warp.exporters.bop import BopExporter, view_bytes
 from synpick_warp.exporters.bop_models import encode_model, write_models
 from synpick_warp.exporters.files import PARTIAL, prepare_output
 from synpick_warp.exporters.pool import WriterPool
-from synpick_warp.outcome import Outcome
+from synpick_warp.outcome import Ending
 from synpick_warp.scenes.shapes import Catalog
 from tests.reference.box_views import OBJECT_IDS, SIZES, batches, cameras, catalog, config, ends, poses
 from tests.test_rle import decode
@@ -40,10 +40,10 @@ def export(out: Path, processes: int = 2, episodes: tuple[int, ...] = EPISODES, 
     return out
 
 
-def feed(exporter: BopExporter, episodes: tuple[int, ...], frames: int = FRAMES, outcome: Outcome = Outcome.FINISHED) -> None:
+def feed(exporter: BopExporter, episodes: tuple[int, ...], frames: int = FRAMES, ending: Ending = Ending.FINISHED) -> None:
     for batch in batches(4, episodes, frames, LENSES):
         exporter.write(batch)
-    for end in ends(episodes, frames, outcome):
+    for end in ends(episodes, frames, ending):
         exporter.end(end)
 
 
@@ -226,8 +226,8 @@ def test_png_colour_without_masks_and_coco(tmp_path):
 def test_an_attempt_that_failed_leaves_nothing_and_comes_again(tmp_path, dataset):
     with WriterPool(2, VIEW_BYTES) as pool:
         exporter = BopExporter(tmp_path / "set", config(), catalog(), LENSES, len(EPISODES), pool)
-        feed(exporter, EPISODES, frames=2, outcome=Outcome.NOT_FINITE)
-        for end in ends((2,), 0, Outcome.UNSETTLED, attempt=1):
+        feed(exporter, EPISODES, frames=2, ending=Ending.NOT_FINITE)
+        for end in ends((2,), 0, Ending.UNSETTLED, redraw=1):
             exporter.end(end)
         feed(exporter, EPISODES)
         exporter.close()

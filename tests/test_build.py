@@ -168,7 +168,7 @@ def needs(config, volume, compound, episodes: int) -> np.ndarray:
     taken = []
     for episode in range(episodes):
         drawn = arrangement.draw_objects(
-            0, episode, 0, volume=volume, compound=compound, budget=config.arrangement.volume, repeats=config.arrangement.repeats,
+            0, episode, 0, volume=volume, compound=compound, budget=config.arrangement.volume, repeats=config.move.repeats,
             room=room, single_slots=room, compound_slots=room,
         )
         kinds = compound[list(drawn.entries)] == 1
@@ -197,7 +197,7 @@ def test_slots_hold_all_but_the_accepted_share_of_draws(seed, size, share, objec
 def test_without_repeats_every_object_has_a_slot(objects):
     five = fake(np.full(5, 1e-4), np.array([0, 1, 1, 0, 0]), objects)
     for room, slots in ((8, (3, 2)), (2, (2, 2))):
-        assert build.count_slots(settings(arrangement__repeats=False, arrangement__max_objects=room), five) == slots
+        assert build.count_slots(settings(move__repeats=False, arrangement__max_objects=room), five) == slots
 
 
 def test_no_kind_takes_more_slots_than_there_is_room_for_objects(objects):
@@ -209,7 +209,7 @@ def test_no_kind_takes_more_slots_than_there_is_room_for_objects(objects):
 
 @pytest.mark.parametrize("repeats", [True, False])
 def test_a_budget_below_the_smallest_object_is_a_mistake(objects, repeats):
-    config = settings(arrangement__volume=1e-4, arrangement__repeats=repeats)
+    config = settings(arrangement__volume=1e-4, move__repeats=repeats)
     with pytest.raises(ConfigError, match=r"arrangement\.volume is 0\.0001 m³, but the smallest object takes 0\.000125 m³; make it larger"):
         build.count_slots(config, objects)
 

@@ -21,7 +21,7 @@ from synpick_warp.cli import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.display import LiveProgress, PlainProgress, print_summary
 from synpick_warp.errors import OutputError
-from synpick_warp.outcome import Outcome
+from synpick_warp.outcome import Ending
 from synpick_warp.progress import Progress, SilentProgress
 
 needs_bake = pytest.mark.skipif(importlib.util.find_spec("synpick_warp.bake") is None, reason="there is no bake yet")
@@ -38,7 +38,7 @@ class Summary:
 
 
 def finished(number: int) -> Summary:
-    return Summary([(episode, 0, Outcome.FINISHED, 10, 1.0) for episode in range(number)], views=30 * number, wall_seconds=2.0, redraws=1)
+    return Summary([(episode, 0, Ending.FINISHED, 10, 1.0) for episode in range(number)], views=30 * number, wall_seconds=2.0, redraws=1)
 
 
 @pytest.fixture
@@ -89,7 +89,7 @@ def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
 
 
 def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, capsys):
-    bakes.result = Summary([(0, 0, Outcome.FINISHED, 10, 1.0), (1, 19, Outcome.UNSETTLED, 0, 99.0)], views=30, wall_seconds=1.0, redraws=19)
+    bakes.result = Summary([(0, 0, Ending.FINISHED, 10, 1.0), (1, 19, Ending.UNSETTLED, 0, 99.0)], views=30, wall_seconds=1.0, redraws=19)
     assert main(["bake", "--out", str(tmp_path / "a"), "--device", "cpu", "--episodes", "2"]) == 1
     assert "did not come to rest" in capsys.readouterr().out
 
@@ -233,17 +233,17 @@ def printed(summary: Summary) -> str:
 
 
 def test_a_short_bake_lists_every_episode():
-    text = printed(Summary([(0, 0, Outcome.FINISHED, 120, 61.0), (1, 2, Outcome.FINISHED, 119, 3661.0)], views=717, wall_seconds=10.0))
+    text = printed(Summary([(0, 0, Ending.FINISHED, 120, 61.0), (1, 2, Ending.FINISHED, 119, 3661.0)], views=717, wall_seconds=10.0))
     assert "1:01 " in text
     assert "1:01:01" in text
-    assert text.count(Outcome.FINISHED.sentence) == 2
+    assert text.count(Ending.FINISHED.sentence) == 2
 
 
 def test_a_long_bake_lists_counts_and_failures():
-    rows = [(episode, 0, Outcome.NOT_FINITE if episode % 4 == 0 else Outcome.FINISHED, 5, 1.0) for episode in range(100)]
+    rows = [(episode, 0, Ending.NOT_FINITE if episode % 4 == 0 else Ending.FINISHED, 5, 1.0) for episode in range(100)]
     text = printed(Summary(rows, views=1500, wall_seconds=10.0))
-    assert text.count(Outcome.FINISHED.sentence) == 1
-    assert text.count(Outcome.NOT_FINITE.sentence) == 1 + 20
+    assert text.count(Ending.FINISHED.sentence) == 1
+    assert text.count(Ending.NOT_FINITE.sentence) == 1 + 20
     assert "and 5 more that delivered nothing" in text
     assert "75 of 100 episodes" in text
 

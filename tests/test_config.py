@@ -96,7 +96,7 @@ def test_whole_numbers_do_for_floats():
         ("physics.gravity", float("inf"), "physics.gravity is Infinity on the command line; allowed: a finite number [m/s²]"),
         ("render.table", 1, "render.table is 1 on the command line; allowed: true or false"),
         ("bake.models", 3, "bake.models is 3 on the command line; allowed: a string"),
-        ("bake.mode", "mvoe", 'bake.mode is "mvoe" on the command line; allowed: move; did you mean move?'),
+        ("bake.mode", "mvoe", 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed; did you mean move?'),
         ("cameras.resolution", [0, 0], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
         ("cameras.resolution", [640], "cameras.resolution is [640] on the command line; allowed: 2 whole numbers in a list [px]"),
         ("cameras.ups", [[1, 2]], "cameras.ups is [[1, 2]] on the command line; allowed: a list of lists of 3 numbers"),

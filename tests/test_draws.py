@@ -28,9 +28,9 @@ def draw(device, seeds, addresses, count: int = 21):
     return [output.numpy() for output in outputs]
 
 
-def stream(device, length: int, seed: int = 0, episode: int = 0, attempt: int = 0, purpose: int = draws.DROP, step: int = 1):
+def stream(device, length: int, seed: int = 0, episode: int = 0, redraw: int = 0, purpose: int = draws.DROP, step: int = 1):
     index = step * np.arange(length)
-    return draw(device, seed, np.stack([np.full(length, episode), np.full(length, attempt), np.full(length, purpose), index], axis=1))
+    return draw(device, seed, np.stack([np.full(length, episode), np.full(length, redraw), np.full(length, purpose), index], axis=1))
 
 
 def chi_square(counts: np.ndarray) -> float:
@@ -89,7 +89,7 @@ def test_low_bits_of_numbers_are_even(device):
     assert abs(chi_square(np.bincount(low, minlength=64))) < SIGMA
 
 
-NEIGHBOURS = [{}, {"seed": 1}, {"seed": 2}, {"episode": 1}, {"episode": 2}, {"attempt": 1}, {"attempt": 2}, {"purpose": draws.OBJECTS}]
+NEIGHBOURS = [{}, {"seed": 1}, {"seed": 2}, {"episode": 1}, {"episode": 2}, {"redraw": 1}, {"redraw": 2}, {"purpose": draws.OBJECTS}]
 
 
 @pytest.mark.parametrize(("one", "other"), list(itertools.combinations(NEIGHBOURS, 2)))
@@ -104,8 +104,8 @@ def test_streams_of_neighbouring_addresses_are_independent(device, one, other):
 
 def test_the_first_number_is_even_over_episodes_and_attempts(device):
     """What each episode draws first must not depend on how episodes are counted."""
-    episode, attempt = np.divmod(np.arange(20_000), 4)
-    addresses = np.stack([episode, attempt, np.full(20_000, draws.OBJECTS), np.zeros(20_000)], axis=1)
+    episode, redraw = np.divmod(np.arange(20_000), 4)
+    addresses = np.stack([episode, redraw, np.full(20_000, draws.OBJECTS), np.zeros(20_000)], axis=1)
     _, _, index, _ = draw(device, 7, addresses)
     assert abs(chi_square(np.bincount(index, minlength=21))) < SIGMA
     following = np.bincount(21 * index[:-1] + index[1:], minlength=441)

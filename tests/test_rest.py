@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.kernels import phases, rest
-from synpick_warp.outcome import Outcome
+from synpick_warp.outcome import Ending
 from synpick_warp.stages import arrange
 from tests.reference import draws
 from tests.reference.kernel_worlds import GUIDES, SHAPES, KernelWorlds
@@ -61,7 +61,7 @@ def judge(worlds: KernelWorlds, shift: float = 0.0, contacts: list[dict] | None 
 
 def state_of(worlds: KernelWorlds, world: int = 0) -> tuple[int, int, list[int]]:
     state = worlds.state
-    return int(state.phase.numpy()[world]), int(state.outcome.numpy()[world]), state.progress.numpy()[world].tolist()
+    return int(state.phase.numpy()[world]), int(state.ending.numpy()[world]), state.progress.numpy()[world].tolist()
 
 
 def turned(axis: int, angle: float) -> np.ndarray:
@@ -194,9 +194,9 @@ def test_a_pile_that_never_rests_ends_its_episode(device):
     worlds = made(device, settle={"max_ticks": 7})
     for _ in range(6):
         judge(worlds, 0.01)
-        assert state_of(worlds)[:2] == (phases.SETTLE, Outcome.RUNNING)
+        assert state_of(worlds)[:2] == (phases.SETTLE, Ending.RUNNING)
     judge(worlds, 0.01)
-    assert state_of(worlds)[:2] == (phases.OVER, Outcome.UNSETTLED)
+    assert state_of(worlds)[:2] == (phases.OVER, Ending.UNSETTLED)
 
 
 @pytest.mark.parametrize("phase", [phases.EMPTY, phases.ACT, phases.OVER, phases.IDLE])
@@ -207,7 +207,7 @@ def test_only_settling_worlds_are_judged_for_rest(device, phase):
     before = worlds.physics.state.joint_q.numpy().copy()
     for _ in range(10):
         judge(worlds)
-    assert state_of(worlds) == (phase, Outcome.RUNNING, [0, 0, 0, 1])
+    assert state_of(worlds) == (phase, Ending.RUNNING, [0, 0, 0, 1])
     np.testing.assert_array_equal(worlds.physics.state.joint_q.numpy(), before)
 
 
@@ -300,7 +300,7 @@ def test_too_many_redrops_end_the_episode(device):
     for expected in (phases.SETTLE, phases.SETTLE, phases.OVER):
         judge(worlds)
         assert state_of(worlds)[0] == expected
-    assert state_of(worlds)[1] == Outcome.UNSETTLED
+    assert state_of(worlds)[1] == Ending.UNSETTLED
 
 
 # ---- ends ----
@@ -316,8 +316,8 @@ def test_a_pose_that_is_no_number_ends_the_episode(device, phase, value, axis):
     pose[axis] = value
     worlds.place(1, 1, pose)
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.physics)
-    assert state_of(worlds, 0)[:2] == (phase, Outcome.RUNNING)
-    assert state_of(worlds, 1)[:2] == (phases.OVER, Outcome.NOT_FINITE)
+    assert state_of(worlds, 0)[:2] == (phase, Ending.RUNNING)
+    assert state_of(worlds, 1)[:2] == (phases.OVER, Ending.NOT_FINITE)
 
 
 @pytest.mark.parametrize("phase", [phases.SETTLE, phases.ACT])
@@ -326,8 +326,8 @@ def test_a_solver_overflow_ends_the_episode(device, phase):
     worlds.begin(phase)
     worlds.set(worlds.physics.solver.constraint_overflow, [True, False])
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.physics)
-    assert state_of(worlds, 0)[:2] == (phases.OVER, Outcome.SOLVER_OVERFLOW)
-    assert state_of(worlds, 1)[:2] == (phase, Outcome.RUNNING)
+    assert state_of(worlds, 0)[:2] == (phases.OVER, Ending.SOLVER_OVERFLOW)
+    assert state_of(worlds, 1)[:2] == (phase, Ending.RUNNING)
 
 
 def test_a_gripper_that_has_been_everywhere_ends_the_episode(device):
@@ -335,8 +335,8 @@ def test_a_gripper_that_has_been_everywhere_ends_the_episode(device):
     worlds.begin(phases.ACT)
     worlds.set(worlds.state.waypoint, [worlds.scene.move.waypoints - 1, worlds.scene.move.waypoints])
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.physics)
-    assert state_of(worlds, 0)[:2] == (phases.ACT, Outcome.RUNNING)
-    assert state_of(worlds, 1)[:2] == (phases.OVER, Outcome.FINISHED)
+    assert state_of(worlds, 0)[:2] == (phases.ACT, Ending.RUNNING)
+    assert state_of(worlds, 1)[:2] == (phases.OVER, Ending.FINISHED)
 
 
 def test_worlds_without_an_episode_end_none(device):
@@ -345,7 +345,7 @@ def test_worlds_without_an_episode_end_none(device):
         worlds.begin(phase)
         worlds.set(worlds.physics.solver.constraint_overflow, True)
         arrange.judge_episodes(worlds.scene, worlds.state, worlds.physics)
-        assert state_of(worlds)[:2] == (phase, Outcome.RUNNING)
+        assert state_of(worlds)[:2] == (phase, Ending.RUNNING)
 
 
 def test_what_counts_as_through_the_floor_is_thinner_than_its_collision_shape():

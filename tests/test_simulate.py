@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from synpick_warp.kernels import phases
-from synpick_warp.outcome import Outcome
+from synpick_warp.outcome import Ending
 from synpick_warp.scenes import build
 from synpick_warp.stages import act, arrange
+from synpick_warp.stages.constants import GRIPPER_HOME
 from synpick_warp.stages.simulate import Simulation
-from synpick_warp.stages.worlds import GRIPPER_HOME
 from tests.reference.small_worlds import ANGLE, BOX, CUBE, catalog, report, run_ticks, settings
 
 EPISODES = 3
@@ -24,7 +24,7 @@ LONGEST = 150
 
 
 def track(device, worlds: int, disturb=None, episodes: int = EPISODES) -> dict[tuple[int, int], list[bytes]]:
-    """Everything that each tick of each (episode, attempt) leaves, run in so many worlds; `disturb(simulation, tick)` before each tick."""
+    """Everything that each tick of each (episode, redraw) leaves, run in so many worlds; `disturb(simulation, tick)` before each tick."""
     config = settings(bake__worlds=worlds, bake__episodes=episodes, **COARSE)
     simulation = Simulation(config, catalog(), LIGHTS, device)
     ticks = defaultdict(list)
@@ -36,7 +36,7 @@ def track(device, worlds: int, disturb=None, episodes: int = EPISODES) -> dict[t
         seen, snapshot = report(record), record.snapshot
         fixtures, light, turn = snapshot.fixture_pose.numpy(), snapshot.light.numpy(), snapshot.light_turn.numpy()
         for world in range(worlds):
-            address = (int(seen.column("episode")[world]), int(seen.column("attempt")[world]))
+            address = (int(seen.column("episode")[world]), int(seen.column("redraw")[world]))
             full = seen.entry[world] >= 0
             parts = (seen.status[world], seen.entry[world], seen.pose[world][full], fixtures[world], light[world], turn[world])
             ticks[address].append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
@@ -83,7 +83,7 @@ def test_episodes_differ(together):
 
 
 def test_a_world_that_was_not_finite_is_as_good_as_new(device):
-    """Poisoned with NaN while another world runs: the next attempt there, and the other world, know nothing of it."""
+    """Poisoned with NaN while another world runs: the next redraw there, and the other world, know nothing of it."""
 
     def poison(simulation: Simulation, tick: int) -> None:
         if tick == 3:
@@ -93,14 +93,14 @@ def test_a_world_that_was_not_finite_is_as_good_as_new(device):
 
     def end(simulation: Simulation, tick: int) -> None:
         if tick == 3:
-            for array, value in ((simulation.state.phase, phases.OVER), (simulation.state.outcome, Outcome.UNSETTLED)):
+            for array, value in ((simulation.state.phase, phases.OVER), (simulation.state.ending, Ending.UNSETTLED)):
                 values = array.numpy()
                 values[0] = value
                 array.assign(values)
 
     poisoned, ended = track(device, 2, poison, episodes=2), track(device, 2, end, episodes=2)
     last = np.frombuffer(poisoned[0, 0][-1][:8], np.int32)
-    assert last.tolist() == [phases.OVER, Outcome.NOT_FINITE]
+    assert last.tolist() == [phases.OVER, Ending.NOT_FINITE]
     assert poisoned[0, 1] == ended[0, 1]
     assert poisoned[1, 0] == ended[1, 0]
 
@@ -152,7 +152,7 @@ def test_piles_come_to_rest_on_the_floor(resting):
     config, reports, _, _ = resting
     last = reports[-1]
     assert (last.column("phase") == phases.ACT).any()
-    assert not last.column("outcome").any()
+    assert not last.column("ending").any()
     for world, instance in zip(*np.nonzero(last.entry >= 0), strict=True):
         low = corners(last.entry[world, instance], last.pose[world, instance])
         # Nothing sinks into the floor, or hangs higher than the pile's objects could carry it.
@@ -200,7 +200,7 @@ def test_the_gripper_waits_outside_and_then_stands_above_the_first_corner(device
     first, count = live.index(True), sum(live)
     assert live == [False] * first + [True] * count + [False] * (len(live) - first - count)
     assert frames[first : first + count] == list(range(count))
-    assert [int(row.column("outcome")[0]) for row, _ in seen[first + count - 2 :][:2]] == [Outcome.RUNNING, Outcome.FINISHED]
+    assert [int(row.column("ending")[0]) for row, _ in seen[first + count - 2 :][:2]] == [Ending.RUNNING, Ending.FINISHED]
     assert (np.array([pose[1, 0] for _, pose in seen[:first]]) > 1.0).all()
     corner = config.move.corner * np.array(config.tote.floor_size) / 2
     np.testing.assert_allclose(np.abs(seen[first][1][1:, :2]), np.tile(corner, (2, 1)), atol=1e-4)
@@ -296,18 +296,18 @@ def test_guide_walls_stop_what_flies_while_they_stand(bench):
 def test_too_little_room_for_contacts_ends_episodes(device, key):
     """Contacts, pairs or rows that find no room are never lost in silence."""
     room = 48 if "rows" in key else 16
-    config = settings(arrangement__max_objects=12, arrangement__volume=3e-3, settle__attempts=1, **COARSE | {key: room})
+    config = settings(arrangement__max_objects=12, arrangement__volume=3e-3, settle__tries=1, **COARSE | {key: room})
     simulation = Simulation(config, catalog(BOX, CUBE), 1, device)
-    outcomes = [int(row.column("outcome")[0]) for row in run_ticks(simulation, 20)]
-    assert Outcome.SOLVER_OVERFLOW in outcomes
+    endings = [int(row.column("ending")[0]) for row in run_ticks(simulation, 20)]
+    assert Ending.SOLVER_OVERFLOW in endings
 
 
 def test_a_pile_without_time_is_unsettled(device):
-    config = settings(settle__max_time=0.1, settle__attempts=2, bake__episodes=1, **COARSE)
+    config = settings(settle__max_time=0.1, settle__tries=2, bake__episodes=1, **COARSE)
     seen = run_ticks(Simulation(config, catalog(ANGLE), 1, device), 6)
-    rows = [(int(row.column("phase")[0]), int(row.column("outcome")[0]), int(row.column("attempt")[0])) for row in seen]
-    settle = (phases.SETTLE, Outcome.RUNNING)
-    over = (phases.OVER, Outcome.UNSETTLED)
+    rows = [(int(row.column("phase")[0]), int(row.column("ending")[0]), int(row.column("redraw")[0])) for row in seen]
+    settle = (phases.SETTLE, Ending.RUNNING)
+    over = (phases.OVER, Ending.UNSETTLED)
     ticks = int(np.ceil(0.1 / (config.physics.step * config.physics.steps_per_tick)))
     expected = [(*settle, 0)] * (ticks - 1) + [(*over, 0)] + [(*settle, 1)] * (ticks - 1) + [(*over, 1)]
     assert rows[: 2 * ticks] == expected

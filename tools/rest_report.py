@@ -28,7 +28,7 @@ from synpick_warp.device import pick_device
 from synpick_warp.doctor import describe_machine
 from synpick_warp.errors import SynpickError
 from synpick_warp.kernels import phases
-from synpick_warp.outcome import Outcome
+from synpick_warp.outcome import Ending
 from synpick_warp.scenes import build
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.shapes import Catalog
@@ -79,7 +79,7 @@ class Findings:
 
     piles: list[Pile] = field(default_factory=list)
     redrawn: Counter[str] = field(default_factory=Counter)
-    """Arrangements drawn again, by outcome."""
+    """Arrangements drawn again, by ending."""
     given_up: int = 0
 
 
@@ -163,8 +163,8 @@ def settle(simulation: Simulation, catalog: Catalog, findings: Findings, say: Ca
         report = reader.wait()
         phase = report.column("phase")
         for world in np.flatnonzero(phase == phases.OVER):
-            findings.redrawn[Outcome(int(report.column("outcome")[world])).name.lower()] += 1
-            findings.given_up += int(report.column("attempt")[world]) + 1 == config.settle.attempts
+            findings.redrawn[Ending(int(report.column("ending")[world])).name.lower()] += 1
+            findings.given_up += int(report.column("redraw")[world]) + 1 == config.settle.tries
         resting = np.flatnonzero(phase == phases.ACT)
         if len(resting):
             assert before is not None  # A pile rests for several ticks before it counts as settled.
@@ -181,7 +181,7 @@ def settle(simulation: Simulation, catalog: Catalog, findings: Findings, say: Ca
 def _finish(simulation: Simulation, worlds: np.ndarray) -> None:
     """End the episodes of these worlds as if the gripper had done its work, so that the next tick hands out new ones."""
     state = simulation.state
-    for array, value in ((state.phase, phases.OVER), (state.outcome, phases.OUTCOME_FINISHED)):
+    for array, value in ((state.phase, phases.OVER), (state.ending, phases.ENDING_FINISHED)):
         host = array.numpy()
         host[worlds] = int(value)
         array.assign(host)

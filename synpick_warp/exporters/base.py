@@ -18,7 +18,7 @@ class Exporter(Protocol):
         ...
 
     def end(self, end: EpisodeEnd) -> None:
-        """Finish the episode's files, or drop them if its outcome delivers nothing: it then comes again from frame 0."""
+        """Finish the episode's files, or drop them if its ending delivers nothing: it then comes again from frame 0."""
         ...
 
     def close(self) -> None:

@@ -18,7 +18,7 @@ from synpick_warp.exporters.files import PARTIAL, output_error, prepare_output
 from synpick_warp.exporters.pool import WriterPool, shared_bytes
 from synpick_warp.exporters.targets import BOP19, BOP24, join_targets, write_scene_targets
 from synpick_warp.frames import EpisodeEnd, FrameBatch
-from synpick_warp.outcome import Outcome
+from synpick_warp.outcome import Ending
 from synpick_warp.scenes.shapes import Camera, Catalog
 
 _PIXEL_BYTES = (3, 2, 1, 4)
@@ -27,7 +27,7 @@ _PIXEL_BYTES = (3, 2, 1, 4)
 
 @dataclass(eq=False)
 class _Episode:
-    """An attempt at an episode whose files are being written."""
+    """An arrangement of an episode whose files are being written."""
 
     scenes: tuple[Path, ...]
     """Hidden folder of each camera's scene."""
@@ -126,7 +126,7 @@ class BopExporter:
             self._split.rmdir()
 
     def _begin(self, number: int) -> _Episode:
-        # A number of its own for every attempt: the last one's folders may not be removed yet.
+        # A number of its own for every arrangement: the last one's folders may not be removed yet.
         self._begun += 1
         names = (f"{self._place(number, camera).name}-{self._begun}" for camera in range(len(self._cameras)))
         episode = _Episode(tuple(self._out / PARTIAL / name for name in names))
@@ -145,7 +145,7 @@ class BopExporter:
     def _finish_if_whole(self, number: int, episode: _Episode) -> None:
         if episode.end is None or episode.pending:
             return
-        if not Outcome(episode.end.outcome).delivers:
+        if not Ending(episode.end.ending).delivers:
             self._pool.submit(drop_scenes, (), (episode.scenes,), path=episode.scenes[0])
             return
         places = tuple(self._place(number, camera) for camera in range(len(self._cameras)))

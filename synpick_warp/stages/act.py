@@ -6,8 +6,9 @@ import newton
 import warp as wp
 
 from synpick_warp.kernels import impedance
+from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.physics import Physics
-from synpick_warp.stages.worlds import SceneData, WorldState
+from synpick_warp.stages.worlds import WorldState
 
 
 def begin_moving(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:

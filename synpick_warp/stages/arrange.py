@@ -5,27 +5,35 @@ from __future__ import annotations
 import warp as wp
 
 from synpick_warp.kernels import arrangement, rest
+from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.physics import Physics
-from synpick_warp.stages.worlds import SceneData, WorldState
+from synpick_warp.stages.worlds import WorldState
 
 
-def take_episodes(state: WorldState, episodes: int, attempts: int) -> None:
+def take_episodes(state: WorldState, episodes: int, tries: int) -> None:
     """Give worlds whose episode is over the next episode number, or their own again if it delivered nothing."""
     wp.launch(
         arrangement.take_episodes_kernel,
         dim=1,
-        inputs=[state.phase.shape[0], episodes, attempts, state.address, state.phase, state.outcome, state.next_episode],
+        inputs=[state.phase.shape[0], episodes, tries, state.address, state.phase, state.ending, state.next_episode],
         device=state.phase.device,
     )
 
 
 def draw_objects(scene: SceneData, state: WorldState, seed: int) -> None:
-    """Draw objects and light of worlds that start an episode."""
+    """Draw mode, objects and light of worlds that start an episode."""
     worlds, device = state.phase.shape[0], state.phase.device
+    wp.launch(
+        arrangement.draw_modes_kernel,
+        dim=worlds,
+        inputs=[wp.uint64(seed), scene.mode, state.address, state.phase],
+        outputs=[state.mode],
+        device=device,
+    )
     wp.launch(
         arrangement.draw_objects_kernel,
         dim=worlds,
-        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, state.address, state.phase, state.outcome],
+        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, state.address, state.mode, state.phase, state.ending],
         outputs=[state.entry, state.slot],
         device=device,
     )
@@ -111,7 +119,7 @@ def judge_episodes(scene: SceneData, state: WorldState, physics: Physics) -> Non
         rest.judge_episodes_kernel,
         dim=state.phase.shape[0],
         inputs=[scene.layout, scene.settle, scene.move.waypoints, state.entry, state.slot, physics.state.body_q,
-                physics.solver.constraint_overflow, state.progress, state.waypoint, state.phase, state.outcome],
+                physics.solver.constraint_overflow, state.progress, state.waypoint, state.phase, state.ending],
         device=state.phase.device,
     )
 

@@ -14,8 +14,9 @@ from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.shapes import Catalog
 from synpick_warp.stages import act, arrange
 from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.constants import SceneData, make_scene_data
 from synpick_warp.stages.physics import Physics
-from synpick_warp.stages.worlds import SceneData, WorldState, WorldStatus, make_scene_data, world_sizes
+from synpick_warp.stages.worlds import WorldState, WorldStatus, world_sizes
 
 # A tick is recorded while the last one's record is still read.
 RECORDS = 2
@@ -59,7 +60,7 @@ class Simulation:
     def tick(self, record: TickRecord) -> None:
         """Hand out episodes, simulate one tick, judge, and record what came of it in one of `records`."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
-        arrange.take_episodes(state, self.config.bake.episodes, self.config.settle.attempts)
+        arrange.take_episodes(state, self.config.bake.episodes, self.config.settle.tries)
         arrange.draw_objects(scene, state, seed)
         arrange.drop_objects(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
@@ -76,7 +77,7 @@ class Simulation:
         wp.launch(
             pack.take_snapshot_kernel,
             dim=self.layout.worlds,
-            inputs=[self.scene.layout, state.phase, state.outcome, state.address, state.frame, state.entry, state.slot,
+            inputs=[self.scene.layout, state.phase, state.ending, state.address, state.frame, state.entry, state.slot,
                     self.physics.state.body_q],
             outputs=[snapshot.live, snapshot.episode, snapshot.frame, snapshot.entry, snapshot.pose, snapshot.fixture_pose,
                      record.status.table],

@@ -1,26 +1,24 @@
-"""Device state of all worlds, and the constants that the simulation's kernels share."""
+"""Device state of all worlds."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import device_array
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels import structs
-from synpick_warp.scenes import build
-from synpick_warp.scenes.shapes import Catalog
 from synpick_warp.stages.buffers import FIXTURES
 
-# Where the gripper waits while objects fall [m]: beside the tote, outside every camera's view.
-GRIPPER_HOME = (3.0, 0.0, 1.0)
 # Corners of the tote that a round of moving visits.
 CORNERS = 4
-STATUS_COLUMNS = ("phase", "outcome", "episode", "attempt", "frame", "live")
-"""Columns of `WorldStatus.table`."""
+STATUS_COLUMNS = (
+    "phase", "ending", "episode", "redraw", "frame", "live", "mode", "task", "attempt", "outcome", "target", "hits", "caught", "held",
+)
+"""Columns of `WorldStatus.table`; see `WorldState` and `AttemptState`. Attempt, target, hits and caught are the running attempt's, or in
+a tick with an outcome those of the attempt that ended; held: bit i, instance i hangs on the cup."""
+MEASURE_COLUMNS = ("load",)
+"""Columns of `WorldStatus.measures`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,11 +26,13 @@ class WorldState:
     """Changes every tick; lives on the device."""
 
     address: wp.array = device_array("world", dtype=wp.vec2i)
-    """Episode number and attempt; episode -1: none."""
+    """Episode number and redraw; episode -1: none."""
     phase: wp.array = device_array("world", dtype=wp.int32)
     """A phase of `kernels.phases`."""
-    outcome: wp.array = device_array("world", dtype=wp.int32)
-    """An `Outcome`."""
+    ending: wp.array = device_array("world", dtype=wp.int32)
+    """An `Ending`."""
+    mode: wp.array = device_array("world", dtype=wp.int32)
+    """A mode of `kernels.phases`."""
     next_episode: wp.array = device_array("one", dtype=wp.int32)
     """The first episode number that no world has taken."""
     progress: wp.array = device_array("world", dtype=wp.vec4i, unit="ticks")
@@ -68,27 +68,65 @@ class WorldState:
 
 
 @dataclass(frozen=True, eq=False)
+class AttemptState:
+    """What each world's gripper tries to pick, and how far it has come."""
+
+    task: wp.array = device_array("world", dtype=wp.int32)
+    """A task of `kernels.phases`."""
+    steps: wp.array = device_array("world", dtype=wp.int32, unit="steps")
+    """Time since the task began."""
+    attempt: wp.array = device_array("world", dtype=wp.int32)
+    """Number of the running attempt in its episode, or of the one that ended in this tick; -1: none yet."""
+    outcome: wp.array = device_array("world", dtype=wp.int32)
+    """`Outcome` of the attempt that ended in this tick."""
+    failures: wp.array = device_array("world", dtype=wp.int32)
+    """Attempts that have failed and count."""
+    target: wp.array = device_array("world", dtype=wp.int32)
+    """The chosen instance; -1: none."""
+    point: wp.array = device_array("world", dtype=wp.vec3f, unit="m")
+    """Grasp point."""
+    normal: wp.array = device_array("world", dtype=wp.vec3f)
+    """Unit normal there, out of the object."""
+    yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
+    """Turn of the finger about the vertical."""
+    tilt: wp.array = device_array("world", dtype=wp.float32, unit="rad")
+    """Tilt of the cup about the finger's y axis."""
+    hits: wp.array = device_array("world", dtype=wp.int32)
+    """Rays that hit an object when the suction was switched on."""
+    caught: wp.array = device_array("world", dtype=wp.uint32)
+    """Bit i: instance i was caught then."""
+    removed: wp.array = device_array("world", "instance", dtype=wp.int32)
+    """Whether the instance has left the scene: 0 no, 1 picked, 2 lost."""
+
+
+@dataclass(frozen=True, eq=False)
+class SealState:
+    """What hangs on each world's cup."""
+
+    held: wp.array = device_array("world", "instance", dtype=wp.int32)
+    """1: a seal holds the instance."""
+    anchor: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
+    """Object to the frame at the cup's tip (axes of the cup) when it was caught."""
+    load: wp.array = device_array("world", "instance", dtype=wp.float32, unit="N")
+    """Tension and shear that the seal bore in the last step."""
+    limit: wp.array = device_array("world", dtype=wp.float32, unit="N")
+    """Break force of every seal of the world."""
+    peak: wp.array = device_array("world", dtype=wp.float32, unit="N")
+    """Largest load of any seal since the tick began."""
+
+
+@dataclass(frozen=True, eq=False)
 class WorldStatus:
     """The few numbers of each world that the host reads."""
 
     table: wp.array = device_array("world", "status", dtype=wp.int32)
     """Columns as STATUS_COLUMNS."""
-
-
-@dataclass(frozen=True, eq=False)
-class SceneData:
-    """Constants for the kernels."""
-
-    layout: structs.LayoutData
-    catalog: structs.CatalogData
-    drop: structs.DropData
-    settle: structs.SettleData
-    move: structs.MoveData
-    guide_shapes: wp.array
+    measures: wp.array = device_array("world", "measure", dtype=wp.float32)
+    """Columns as MEASURE_COLUMNS: largest load of any seal in the tick [N]."""
 
 
 def world_sizes(config: Config, bodies_per_world: int) -> dict[str, int]:
-    """Extents of the dimensions that `WorldState`, `WorldStatus` and `Snapshot` name."""
+    """Extents of the dimensions that the dataclasses here, `Snapshot` and `Sighting` name."""
     worlds = config.bake.worlds
     return {
         "one": 1,
@@ -98,92 +136,6 @@ def world_sizes(config: Config, bodies_per_world: int) -> dict[str, int]:
         "body": worlds * bodies_per_world,
         "waypoint": CORNERS * config.move.rounds,
         "status": len(STATUS_COLUMNS),
+        "measure": len(MEASURE_COLUMNS),
         "fixture": len(FIXTURES),
     }
-
-
-def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, lights: int, device: wp.Device) -> SceneData:
-    """Put settings and catalog into the structs that kernels take."""
-    return SceneData(
-        _layout_data(built.layout),
-        _catalog_data(catalog, built, device),
-        _drop_data(config, lights),
-        _settle_data(config),
-        _move_data(config),
-        wp.array(np.array(built.layout.guide_shapes, dtype=np.int32), device=device),
-    )
-
-
-def _layout_data(layout: build.Layout) -> structs.LayoutData:
-    data = structs.LayoutData()
-    data.instances = layout.instances
-    data.single_slots = layout.single_slots
-    data.slots = layout.slots
-    data.gripper_bodies = build.GRIPPER_BODIES
-    data.gripper_dofs = build.GRIPPER_DOFS
-    data.bodies = layout.bodies_per_world
-    data.coords = layout.coords_per_world
-    data.dofs = layout.dofs_per_world
-    data.shapes = layout.shapes_per_world
-    return data
-
-
-def _catalog_data(catalog: Catalog, built: build.BuiltModel, device: wp.Device) -> structs.CatalogData:
-    def column(values: list[float], dtype: type) -> wp.array:
-        return wp.array(np.array(values), dtype=dtype, device=device)
-
-    data = structs.CatalogData()
-    entries = catalog.entries
-    data.count = len(entries)
-    data.volume = column([entry.volume for entry in entries], float)
-    data.radius = column([entry.radius for entry in entries], float)
-    data.compound = column([int(len(entry.pieces) > 1) for entry in entries], int)
-    data.variant = wp.array(built.variant, dtype=int, device=device)
-    data.empty_single, data.empty_compound = built.empty_variant
-    data.empty_mass = build.EMPTY_MASS
-    return data
-
-
-def _drop_data(config: Config, lights: int) -> structs.DropData:
-    data = structs.DropData()
-    data.volume = config.arrangement.volume
-    data.repeats = int(config.arrangement.repeats)
-    data.clearance = config.arrangement.clearance
-    data.spread = config.arrangement.spread
-    data.rim_length, data.rim_width = config.tote.rim_size
-    data.rim_height = config.tote.outer_size[2] - config.tote.wall
-    data.gravity = config.physics.gravity
-    data.gripper_home = wp.vec3(*GRIPPER_HOME)
-    data.lights = lights
-    data.turn_lights = int(config.render.turn_lights)
-    return data
-
-
-def _settle_data(config: Config) -> structs.SettleData:
-    tick = config.physics.step * config.physics.steps_per_tick
-    data = structs.SettleData()
-    data.min_ticks = math.ceil(config.settle.min_time / tick)
-    data.max_ticks = math.ceil(config.settle.max_time / tick)
-    data.rest_ticks = config.settle.rest_ticks
-    data.stuck_ticks = math.ceil(config.settle.stuck_time / tick)
-    data.late_ticks = math.ceil(config.settle.late_time / tick)
-    data.rest_shift = config.settle.rest_shift
-    data.last_shift = config.settle.last_shift
-    data.stuck_depth = config.settle.stuck_depth
-    data.max_redrops = config.settle.max_redrops
-    return data
-
-
-def _move_data(config: Config) -> structs.MoveData:
-    move, gripper = config.move, config.gripper
-    data = structs.MoveData()
-    data.stiffness, data.damping, data.force, data.speed = move.stiffness, move.damping, move.force, move.speed
-    length, width = config.tote.floor_size
-    data.corner = wp.vec3(move.corner * length / 2, move.corner * width / 2, move.height)
-    data.start_height = move.start_height
-    data.waypoints = CORNERS * move.rounds
-    data.mass = gripper.finger_mass + gripper.cup_mass
-    data.gravity = config.physics.gravity
-    data.step = config.physics.step
-    data.tip = gripper.cup_length
-    return data

@@ -23,7 +23,7 @@ class Arrangement:
 def draw_objects(
     seed: int,
     episode: int,
-    attempt: int,
+    redraw: int,
     *,
     volume: np.ndarray,
     compound: np.ndarray,
@@ -34,7 +34,7 @@ def draw_objects(
     compound_slots: int,
 ) -> Arrangement:
     """Draw until the next object would exceed the budget; sums in float32, as on the device."""
-    key = draws.stream_key(seed, episode, attempt, draws.OBJECTS)
+    key = draws.stream_key(seed, episode, redraw, draws.OBJECTS)
     sequence = draws.uniform_index(key, np.arange(MOST_DRAWS), len(volume))
     entries: list[int] = []
     slots: list[int] = []
@@ -59,11 +59,11 @@ def draw_objects(
 
 
 def drop_poses(
-    seed: int, episode: int, attempt: int, radius: np.ndarray, *, rim: tuple[float, float, float], clearance: float, spread: float
+    seed: int, episode: int, redraw: int, radius: np.ndarray, *, rim: tuple[float, float, float], clearance: float, spread: float
 ) -> np.ndarray:
     """Poses (instance, 7) of the drop column of bounding spheres: z_i = rim + r_i + sum over j < i of (2 r_j + clearance)."""
     count = len(radius)
-    key = draws.stream_key(seed, episode, attempt, draws.DROP)
+    key = draws.stream_key(seed, episode, redraw, draws.DROP)
     poses = np.zeros((count, 7))
     for axis in range(2):
         side = 2.0 * draws.uniform(key, 5 * np.arange(count) + axis).astype(np.float64) - 1.0

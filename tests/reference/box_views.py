@@ -9,7 +9,7 @@ import trimesh
 
 from synpick_warp.configs.schema import Bop, Config
 from synpick_warp.frames import FINGER, TABLE, EpisodeEnd, FrameBatch
-from synpick_warp.outcome import Outcome
+from synpick_warp.outcome import Ending
 from synpick_warp.scenes.shapes import Camera, Catalog, CatalogEntry, Material, TriangleMesh
 
 ROOM = 5
@@ -87,8 +87,8 @@ def batches(
         yield FrameBatch(**{name: np.stack([row[name] for row in rows]) for name in rows[0]})
 
 
-def ends(episodes: tuple[int, ...], frames: int, outcome: Outcome = Outcome.FINISHED, attempt: int = 0) -> list[EpisodeEnd]:
-    return [EpisodeEnd(episode, attempt, frames, int(outcome)) for episode in episodes]
+def ends(episodes: tuple[int, ...], frames: int, ending: Ending = Ending.FINISHED, redraw: int = 0) -> list[EpisodeEnd]:
+    return [EpisodeEnd(episode, redraw, frames, int(ending)) for episode in episodes]
 
 
 def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: float) -> dict[str, np.ndarray]:

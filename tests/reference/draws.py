@@ -15,11 +15,11 @@ def mix(x: np.ndarray | np.uint64) -> np.ndarray:
         return y ^ (y >> np.uint64(31))
 
 
-def stream_key(seed, episode, attempt, purpose) -> np.ndarray:
+def stream_key(seed, episode, redraw, purpose) -> np.ndarray:
     """Key of the stream at an address; negative numbers wrap around."""
     with np.errstate(over="ignore"):
         key = mix(np.uint64(seed) + GAMMA)
-        for part in (episode, attempt, purpose):
+        for part in (episode, redraw, purpose):
             key = mix((key ^ np.asarray(part, np.int64).astype(np.uint64)) + GAMMA)
     return key
 

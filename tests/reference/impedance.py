@@ -7,9 +7,9 @@ import numpy as np
 from tests.reference import draws
 
 
-def corner_order(seed: int, episode: int, attempt: int, rounds: int) -> list[int]:
+def corner_order(seed: int, episode: int, redraw: int, rounds: int) -> list[int]:
     """A Fisher-Yates shuffle of the four corners for each round."""
-    key = draws.stream_key(seed, episode, attempt, draws.CORNERS)
+    key = draws.stream_key(seed, episode, redraw, draws.CORNERS)
     order: list[int] = []
     for visit in range(4 * rounds):
         if visit % 4 == 0:

@@ -11,7 +11,8 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.kernels import structs
-from synpick_warp.stages.worlds import SceneData, WorldState
+from synpick_warp.stages.constants import SceneData
+from synpick_warp.stages.worlds import WorldState
 
 GRIPPER_BODIES, GRIPPER_DOFS = 2, 4
 GUIDES = (6, 7, 8, 9)
@@ -40,14 +41,17 @@ class KernelWorlds:
     def __post_init__(self) -> None:
         self.slots = self.single_slots + self.compound_slots
         self.bodies, self.coords, self.dofs = GRIPPER_BODIES + self.slots, GRIPPER_DOFS + 7 * self.slots, GRIPPER_DOFS + 6 * self.slots
-        drop = {"volume": 1.0, "repeats": 1, "clearance": 0.01, "spread": 0.5, "rim_length": 0.5, "rim_width": 0.3, "rim_height": 0.2,
+        drop = {"volume": 1.0, "move_repeats": 1, "pick_repeats": 1, "clearance": 0.01, "spread": 0.5,
+                "rim_length": 0.5, "rim_width": 0.3, "rim_height": 0.2,
                 "gravity": 9.81, "gripper_home": wp.vec3(3.0, 0.0, 1.0), "lights": 5, "turn_lights": 1, **self.drop}
         settle = {"min_ticks": 3, "max_ticks": 100, "rest_ticks": 2, "stuck_ticks": 2, "late_ticks": 50, "rest_shift": 1e-4,
                   "last_shift": 1e-3, "stuck_depth": 0.01, "max_redrops": 8, **self.settle}
         move = {"waypoints": 8, "corner": wp.vec3(0.2, 0.1, 0.02), "start_height": 0.3, "tip": 0.05, "mass": 2.0, "gravity": 9.81,
                 "step": 2e-3, "stiffness": 1000.0, "damping": 60.0, "force": 30.0, "speed": 0.1, **self.move}
         self.scene = SceneData(self._layout(), self._catalog(), filled(structs.DropData(), drop), filled(structs.SettleData(), settle),
-                               filled(structs.MoveData(), move), wp.array(GUIDES, dtype=int, device=self.device))
+                               filled(structs.ModeData(), {"pick_share": 0.0, "pick_or_target_share": 0.0}),
+                               filled(structs.MoveData(), move), structs.PickData(), structs.SightData(), structs.SuctionData(),
+                               wp.array(GUIDES, dtype=int, device=self.device))
         sizes = {"one": 1, "world": self.worlds, "world_and_global": self.worlds + 1, "instance": self.instances,
                  "body": self.worlds * self.bodies, "waypoint": move["waypoints"]}
         self.state = allocate(WorldState, sizes, self.device)
@@ -63,6 +67,7 @@ class KernelWorlds:
         # Position among the entries of its kind, as scenes.build numbers variants.
         variant = np.where(compound == 1, np.cumsum(compound), np.cumsum(1 - compound)) - 1
         columns = {"volume": (self.volume, float), "radius": (self.radius, float),
+                   "mass": (np.ones_like(self.radius), float), "area": (np.ones_like(self.radius), float), "diagonal": (self.radius, float),
                    "compound": (compound, int), "variant": (variant, int)}
         arrays = {name: wp.array(np.asarray(values), dtype=dtype, device=self.device) for name, (values, dtype) in columns.items()}
         return filled(structs.CatalogData(), {"count": len(compound), **arrays, "empty_single": int((compound == 0).sum()),
@@ -88,10 +93,10 @@ class KernelWorlds:
         """Write an array of the state."""
         array.assign(np.broadcast_to(np.asarray(values, array.numpy().dtype), array.numpy().shape).copy())
 
-    def begin(self, phase: int, episodes: Any = None, attempt: Any = 0) -> None:
+    def begin(self, phase: int, episodes: Any = None, redraw: Any = 0) -> None:
         """All worlds in a phase; world w has episode w."""
         episodes = np.arange(self.worlds) if episodes is None else episodes
-        self.set(self.state.address, np.stack(np.broadcast_arrays(episodes, attempt), axis=-1))
+        self.set(self.state.address, np.stack(np.broadcast_arrays(episodes, redraw), axis=-1))
         self.set(self.state.phase, phase)
 
     def coordinates(self) -> np.ndarray:

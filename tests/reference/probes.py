@@ -17,7 +17,7 @@ def draw_kernel(
     index_out: wp.array[int],
     rotation_out: wp.array[wp.quat],
 ):
-    """One number of each kind at each address: episode, attempt, purpose, index."""
+    """One number of each kind at each address: episode, redraw, purpose, index."""
     i = wp.tid()
     key = draws.stream_key(seed[i], address[i, 0], address[i, 1], address[i, 2])
     key_out[i] = key

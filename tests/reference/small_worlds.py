@@ -30,7 +30,7 @@ QUICK = {
     "settle.min_time": 0.1,
     "settle.rest_ticks": 1,
     "settle.late_time": 0.6,
-    "settle.attempts": 3,
+    "settle.tries": 3,
     "move.rounds": 1,
     "move.speed": 2.0,
     "move.start_height": 0.15,
