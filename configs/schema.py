@@ -230,7 +230,7 @@ class Target:
 class Sight:
     """How the gripper's side sees: an image of camera 0 without the gripper, and the rules by which it chooses."""
 
-    resolution: tuple[int, int] = setting((1920, 1080), "px", "Width and height of the image; lengths below belong to it.", low=16, high=8192)
+    resolution: tuple[int, int] = setting((1920, 1080), "px", "Width and height of the image.", low=16, high=8192)
     views: int = setting(0, "", "Images worked on at once; 0: chosen by device and resolution.", low=0)
     contour_points: int = setting(8192, "", "Room for the points of one contour; more end the episode.", low=16)
     center_share: float = setting(

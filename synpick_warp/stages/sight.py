@@ -62,3 +62,19 @@ class Sighting:
     """Bit j: there is a path from j to this instance."""
     overflow: wp.array = device_array("world", dtype=wp.int32)
     """1: a contour had no room."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What was chosen when the world was last looked at."""
+
+    target: wp.array = device_array("world", dtype=wp.int32)
+    """The chosen instance; -1: none."""
+    point: wp.array = device_array("world", dtype=wp.vec3f, unit="m")
+    """Grasp point."""
+    normal: wp.array = device_array("world", dtype=wp.vec3f)
+    """Unit normal there, out of the object."""
+    yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
+    """Turn of the finger about the vertical."""
+    tilt: wp.array = device_array("world", dtype=wp.float32, unit="rad")
+    """Tilt of the cup about the finger's y axis."""

@@ -15,8 +15,9 @@ CORNERS = 4
 STATUS_COLUMNS = (
     "phase", "ending", "episode", "redraw", "frame", "live", "mode", "task", "attempt", "outcome", "target", "hits", "caught", "held",
 )
-"""Columns of `WorldStatus.table`; see `WorldState` and `AttemptState`. Attempt, target, hits and caught are the running attempt's, or in
-a tick with an outcome those of the attempt that ended; held: bit i, instance i hangs on the cup."""
+"""Columns of `WorldStatus.table`; see `WorldState`, `AttemptState` and `Plan`. They tell of the end of the tick, before worlds are looked at:
+attempt, target, hits and caught are the running attempt's, or in a tick with an outcome those of the attempt that ended. held: bit i,
+instance i hangs on the cup, or was picked in this tick."""
 MEASURE_COLUMNS = ("load",)
 """Columns of `WorldStatus.measures`."""
 
@@ -81,16 +82,6 @@ class AttemptState:
     """`Outcome` of the attempt that ended in this tick."""
     failures: wp.array = device_array("world", dtype=wp.int32)
     """Attempts that have failed and count."""
-    target: wp.array = device_array("world", dtype=wp.int32)
-    """The chosen instance; -1: none."""
-    point: wp.array = device_array("world", dtype=wp.vec3f, unit="m")
-    """Grasp point."""
-    normal: wp.array = device_array("world", dtype=wp.vec3f)
-    """Unit normal there, out of the object."""
-    yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
-    """Turn of the finger about the vertical."""
-    tilt: wp.array = device_array("world", dtype=wp.float32, unit="rad")
-    """Tilt of the cup about the finger's y axis."""
     hits: wp.array = device_array("world", dtype=wp.int32)
     """Rays that hit an object when the suction was switched on."""
     caught: wp.array = device_array("world", dtype=wp.uint32)
