@@ -18,6 +18,8 @@ class LayoutData:
     coords: int
     dofs: int
     shapes: int
+    finger_shape: int
+    cup_shape: int
 
 
 @wp.struct

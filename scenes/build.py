@@ -48,6 +48,9 @@ class Layout:
     shapes_per_world: int
     guide_shapes: tuple[int, ...]
     """Guide walls, as shape indices inside a world."""
+    finger_shape: int
+    cup_shape: int
+    """Collision shapes of the gripper, likewise."""
 
     @property
     def slots(self) -> int:
@@ -128,14 +131,14 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     guides = tuple(
         world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape) for piece in guide_walls(config.tote, config.physics.guide_height)
     )
-    _add_gripper(world, config, shape)
+    gripper = _add_gripper(world, config, shape)
     variant = np.zeros(len(catalog), dtype=np.int32)
     empty = _add_slots(world, config, catalog, shape, (single, compound), variant)
     scene = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(scene)
     scene.replicate(world, copy_count=config.bake.worlds)
     model = scene.finalize(device=device)
-    layout = Layout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, guides)
+    layout = Layout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, guides, *gripper)
     return BuiltModel(model, layout, variant, empty)
 
 
@@ -143,8 +146,8 @@ def _hull(piece: ConvexPiece) -> newton.Mesh:
     return newton.Mesh(piece.vertices, piece.faces.reshape(-1), compute_inertia=False)
 
 
-def _add_gripper(world: newton.ModelBuilder, config: Config, shape: newton.ModelBuilder.ShapeConfig) -> None:
-    """Finger on three linear axes, cup on a hinge about y. Their weight is carried by the impedance controller."""
+def _add_gripper(world: newton.ModelBuilder, config: Config, shape: newton.ModelBuilder.ShapeConfig) -> tuple[int, int]:
+    """Finger on three linear axes, cup on a hinge about y; returns their shapes. Their weight is carried by the impedance controller."""
     gripper = config.gripper
     dof = newton.ModelBuilder.JointDofConfig
     free = {"limit_lower": -np.inf, "limit_upper": np.inf, "armature": 0.0}
@@ -161,6 +164,7 @@ def _add_gripper(world: newton.ModelBuilder, config: Config, shape: newton.Model
     finger_shape = world.add_shape_convex_hull(finger, mesh=_hull(finger_collider(gripper)), cfg=shape)
     cup_shape = world.add_shape_convex_hull(cup, mesh=_hull(cup_collider(gripper)), cfg=shape)
     world.add_shape_collision_filter_pair(finger_shape, cup_shape)
+    return finger_shape, cup_shape
 
 
 def _rod_inertia(mass: float, length: float) -> tuple[float, float, float]:

@@ -61,6 +61,7 @@ def _layout_data(layout: build.Layout) -> structs.LayoutData:
     data.coords = layout.coords_per_world
     data.dofs = layout.dofs_per_world
     data.shapes = layout.shapes_per_world
+    data.finger_shape, data.cup_shape = layout.finger_shape, layout.cup_shape
     return data
 
 

@@ -15,9 +15,9 @@ CORNERS = 4
 STATUS_COLUMNS = (
     "phase", "ending", "episode", "redraw", "frame", "live", "mode", "task", "attempt", "outcome", "target", "hits", "caught", "held",
 )
-"""Columns of `WorldStatus.table`; see `WorldState`, `AttemptState` and `Plan`. They tell of the end of the tick, before worlds are looked at:
-attempt, target, hits and caught are the running attempt's, or in a tick with an outcome those of the attempt that ended. held: bit i,
-instance i hangs on the cup, or was picked in this tick."""
+"""Columns of `WorldStatus.table`; see `WorldState`, `AttemptState` and `Plan`. They tell of the end of the tick, before worlds are looked
+at: attempt, target, hits and caught are the running attempt's, or in a tick with an outcome those of the attempt that ended. held: bit
+i, instance i hangs on the cup, or was picked in this tick."""
 MEASURE_COLUMNS = ("load",)
 """Columns of `WorldStatus.measures`."""
 

@@ -60,7 +60,8 @@ class KernelWorlds:
     def _layout(self) -> Any:
         return filled(structs.LayoutData(), {
             "instances": self.instances, "single_slots": self.single_slots, "slots": self.slots, "gripper_bodies": GRIPPER_BODIES,
-            "gripper_dofs": GRIPPER_DOFS, "bodies": self.bodies, "coords": self.coords, "dofs": self.dofs, "shapes": SHAPES})
+            "gripper_dofs": GRIPPER_DOFS, "bodies": self.bodies, "coords": self.coords, "dofs": self.dofs, "shapes": SHAPES,
+            "finger_shape": 10, "cup_shape": 11})
 
     def _catalog(self) -> Any:
         compound = np.asarray(self.compound, np.int32)
