@@ -78,7 +78,10 @@ def draw_modes_kernel(
     # Out:
     mode_out: wp.array[int],
 ):
-    """Draw the mode of worlds that start an episode. Another arrangement of the episode has the same mode."""
+    """Draw the mode of worlds that start an episode: PICK if u < p, else TARGET if u < p + t, else MOVE, with shares p and t of the modes.
+
+    u is the first number of the stream (seed, episode, 0, MODE): another arrangement of the episode has the same mode.
+    """
     world = wp.tid()
     if phase[world] != START:
         return

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,8 +12,10 @@ from hypothesis import strategies as st
 from synpick_warp.kernels import arrangement as kernels
 from synpick_warp.kernels import phases
 from synpick_warp.outcome import Ending
+from synpick_warp.scenes import build
 from synpick_warp.stages import arrange
-from tests.reference import arrangement, draws
+from synpick_warp.stages.constants import make_scene_data
+from tests.reference import arrangement, draws, small_worlds
 from tests.reference.kernel_worlds import KernelWorlds
 
 WORLDS = 24
@@ -31,25 +35,35 @@ def catalogs(draw):
         "instances": draw(st.integers(1, 16)),
         "single_slots": draw(st.integers(0, 16)),
         "compound_slots": draw(st.integers(0, 6)),
-        "drop": {"volume": draw(st.floats(0.01, 3.0)), "move_repeats": draw(st.integers(0, 1))},
+        "drop": {"volume": draw(st.floats(0.01, 3.0)), "move_repeats": draw(st.integers(0, 1)), "pick_repeats": draw(st.integers(0, 1))},
+        "mix": draw(st.sampled_from(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (1.0, 1.0, 2.0)))),
     }
 
 
-def made(device, worlds: int = WORLDS, **sizes) -> KernelWorlds:
+def made(device, worlds: int = WORLDS, mix: tuple[float, float, float] = (0.0, 0.0, 1.0), **sizes) -> KernelWorlds:
+    """Worlds whose episodes have modes with these weights of pick, target and move."""
     default = {"volume": np.array([0.1, 0.2, 0.3]), "compound": np.array([0, 1, 0]), "radius": np.array([0.05, 0.1, 0.2]), "instances": 8,
                "single_slots": 8, "compound_slots": 8}
-    return KernelWorlds(device, worlds, **(default | sizes))
+    made_worlds = KernelWorlds(device, worlds, **(default | sizes))
+    made_worlds.scene.mode.pick_share, made_worlds.scene.mode.pick_or_target_share = np.cumsum(mix)[:2] / np.sum(mix)
+    return made_worlds
+
+
+def may_repeat(worlds: KernelWorlds, world: int) -> bool:
+    """Whether objects may come several times in the mode that this world has."""
+    drop = worlds.scene.drop
+    return bool(drop.move_repeats if worlds.state.mode.numpy()[world] == phases.MOVE else drop.pick_repeats)
 
 
 def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangement]:
-    """What the twin draws for each world."""
+    """What the twin draws for each world, in the mode that it has."""
     return [
         arrangement.draw_objects(
             seed, *map(int, address), volume=worlds.volume, compound=worlds.compound, budget=worlds.scene.drop.volume,
-            repeats=bool(worlds.scene.drop.move_repeats), room=worlds.instances, single_slots=worlds.single_slots,
+            repeats=may_repeat(worlds, world), room=worlds.instances, single_slots=worlds.single_slots,
             compound_slots=worlds.compound_slots,
         )
-        for address in worlds.state.address.numpy()
+        for world, address in enumerate(worlds.state.address.numpy())
     ]
 
 
@@ -67,16 +81,79 @@ def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, redraw, device
         assert tuple(slot[world, :count]) == expected.slots
         state = (worlds.state.phase.numpy()[world], worlds.state.ending.numpy()[world])
         assert state == ((phases.OVER, Ending.ARRANGEMENT_OVERFLOW) if expected.overflow else (phases.START, Ending.RUNNING))
-        check_law(worlds, entry[world, :count], slot[world, :count])
+        check_law(worlds, world, entry[world, :count], slot[world, :count])
 
 
-def check_law(worlds: KernelWorlds, entry: np.ndarray, slot: np.ndarray) -> None:
+def check_law(worlds: KernelWorlds, world: int, entry: np.ndarray, slot: np.ndarray) -> None:
     assert worlds.volume[entry].sum() <= worlds.scene.drop.volume * (1 + 1e-6)
     assert len(set(slot)) == len(slot)
     np.testing.assert_array_equal(slot >= worlds.single_slots, worlds.compound[entry] == 1)
     assert (slot < worlds.slots).all()
-    if not worlds.scene.drop.move_repeats:
+    if not may_repeat(worlds, world):
         assert len(set(entry)) == len(entry)
+
+
+# ---- modes ----
+
+
+@pytest.fixture(scope="module")
+def built(device) -> build.BuiltModel:
+    return build.build_model(small_worlds.settings(), small_worlds.catalog(), device)
+
+
+def modes(built, device, mode: str, mix: tuple[float, float, float], episodes: np.ndarray, redraw: object = 0) -> np.ndarray:
+    """Mode of each episode, one world an episode, from settings to the device and back."""
+    config = small_worlds.settings(bake__mode=mode, bake__mix=list(mix))
+    worlds = made(device, worlds=len(episodes))
+    scene = make_scene_data(config, small_worlds.catalog(), built, 1, device)
+    worlds.scene = dataclasses.replace(worlds.scene, mode=scene.mode)
+    worlds.begin(phases.START, episodes, redraw)
+    worlds.set(worlds.state.mode, 99)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    return worlds.state.mode.numpy()
+
+
+@pytest.mark.parametrize(("mode", "code"), [("pick", phases.PICK), ("target", phases.TARGET), ("move", phases.MOVE)])
+def test_a_single_mode_is_every_episodes(built, device, mode, code):
+    assert (modes(built, device, mode, (1.0, 2.0, 3.0), np.arange(500)) == code).all()
+
+
+@given(mix=st.tuples(*[st.integers(0, 5)] * 3).filter(any), first=st.integers(0, 2**30))
+def test_mixed_modes_are_the_twins(mix, first, built, device):
+    episodes = first + np.arange(WORLDS)
+    np.testing.assert_array_equal(modes(built, device, "mixed", mix, episodes), arrangement.draw_modes(SEED, episodes, mix))
+
+
+@pytest.mark.parametrize("mix", [(1.0, 1.0, 1.0), (0.5, 0.3, 0.2), (3.0, 0.0, 1.0), (0.0, 2.0, 0.0), (1e-6, 0.0, 1e6), (1e6, 0.0, 1e-6)])
+def test_shares_of_modes_are_the_weights(built, device, mix):
+    """Within four standard deviations; a mode of weight 0 never comes, on whichever side it stands."""
+    episodes = 4000
+    found = modes(built, device, "mixed", mix, np.arange(episodes))
+    for code, share in zip((phases.PICK, phases.TARGET, phases.MOVE), np.array(mix) / sum(mix), strict=True):
+        assert (found == code).mean() == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / episodes))
+
+
+def test_an_episode_keeps_its_mode_in_any_world_and_arrangement(built, device):
+    """Whatever world has the episode, of however many, and however often its arrangement was drawn again."""
+    mix, episodes = (1.0, 1.0, 1.0), np.arange(60)
+    expected = modes(built, device, "mixed", mix, episodes)
+    numbers = np.random.default_rng(5)
+    for count in (7, 60):
+        some = numbers.permutation(episodes)[:count]
+        redraw = numbers.integers(0, 20, count)
+        np.testing.assert_array_equal(modes(built, device, "mixed", mix, some, redraw), expected[some])
+
+
+def test_modes_are_drawn_apart_from_objects(device):
+    """Where modes differ and the rules of repeating do not, all else of an episode is the same."""
+    episodes, objects = np.arange(WORLDS), []
+    for mix in ((1.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
+        worlds = made(device, mix=mix, drop={"move_repeats": 1, "pick_repeats": 1})
+        worlds.begin(phases.START, episodes)
+        arrange.draw_objects(worlds.scene, worlds.state, SEED)
+        objects.append((worlds.state.entry.numpy(), worlds.state.light_turn.numpy()))
+    for pick, mixed in zip(*objects, strict=True):
+        np.testing.assert_array_equal(pick, mixed)
 
 
 def test_a_budget_for_everything_draws_everything_without_repeats(device):
@@ -103,18 +180,32 @@ def test_an_object_that_never_fits_is_never_drawn(device):
     assert not (entry == 2).any()
 
 
+def test_each_mode_has_its_own_rule_of_repeating(device):
+    """One bake: episodes of picking without repeats, episodes of moving with them."""
+    worlds = made(device, worlds=200, mix=(1.0, 1.0, 1.0), drop={"volume": 10.0, "move_repeats": 1, "pick_repeats": 0})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    moving = worlds.state.mode.numpy() == phases.MOVE
+    assert 0 < moving.sum() < 200
+    count = (worlds.state.entry.numpy() >= 0).sum(axis=1)
+    # Three entries, room for eight instances, a budget for all.
+    np.testing.assert_array_equal(count, np.where(moving, 8, 3))
+
+
 @pytest.mark.parametrize("phase", [phases.EMPTY, phases.SETTLE, phases.ACT, phases.OVER])
 def test_worlds_at_work_keep_their_objects(device, phase):
     worlds = made(device)
     worlds.begin(phase)
     worlds.set(worlds.state.entry, 2)
     worlds.set(worlds.state.light, 7)
+    worlds.set(worlds.state.mode, 9)
     joints = worlds.physics.state.joint_q
     worlds.set(joints, 0.5)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     assert (worlds.state.entry.numpy() == 2).all()
     assert (worlds.state.light.numpy() == 7).all()
+    assert (worlds.state.mode.numpy() == 9).all()
     if phase != phases.OVER:
         assert (worlds.state.variant.numpy().reshape(WORLDS, -1)[:, 2:] == -1).all()
         assert (joints.numpy() == 0.5).all()

@@ -9,6 +9,8 @@ import numpy as np
 from tests.reference import draws
 
 MOST_DRAWS = 4096
+DRAWN_MODES = (1, 2, 0)
+"""Codes of the modes in the order of their weights: pick, target, move."""
 
 
 @dataclass(frozen=True)
@@ -18,6 +20,13 @@ class Arrangement:
     entries: tuple[int, ...]
     slots: tuple[int, ...]
     overflow: bool = False
+
+
+def draw_modes(seed: int, episodes: np.ndarray, weights: tuple[float, float, float]) -> np.ndarray:
+    """Mode of each episode: the first whose cumulative share of the weights exceeds the episode's number."""
+    number = draws.uniform(draws.stream_key(seed, episodes, 0, draws.MODE), 0)
+    share = (np.cumsum(weights) / np.sum(weights)).astype(np.float32)
+    return np.array(DRAWN_MODES)[np.searchsorted(share, number, side="right")]
 
 
 def draw_objects(

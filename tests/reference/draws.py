@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-OBJECTS, DROP, REDROP, CORNERS, LIGHT = range(1, 6)
+OBJECTS, DROP, REDROP, CORNERS, LIGHT, MODE, TARGETS = range(1, 8)
 GAMMA = np.uint64(0x9E3779B97F4A7C15)
 
 
