@@ -2,20 +2,28 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import ACT, OVER, delivers
+from synpick_warp.kernels.phases import ACT, LOOK, OVER, delivers
 from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
 
-# Columns of the status table.
+# Columns of the status table; a test keeps them in step with stages.worlds.STATUS_COLUMNS.
 STATUS_PHASE = wp.constant(0)
-STATUS_OUTCOME = wp.constant(1)
+STATUS_ENDING = wp.constant(1)
 STATUS_EPISODE = wp.constant(2)
-STATUS_ATTEMPT = wp.constant(3)
+STATUS_REDRAW = wp.constant(3)
 STATUS_FRAME = wp.constant(4)
 STATUS_LIVE = wp.constant(5)
-# Tote, finger, cup.
-FIXTURES = wp.constant(3)
+STATUS_MODE = wp.constant(6)
+STATUS_TASK = wp.constant(7)
+STATUS_ATTEMPT = wp.constant(8)
+STATUS_OUTCOME = wp.constant(9)
+STATUS_TARGET = wp.constant(10)
+STATUS_HITS = wp.constant(11)
+STATUS_CAUGHT = wp.constant(12)
+STATUS_HELD = wp.constant(13)
+# Columns of the table of measures.
+MEASURE_LOAD = wp.constant(0)
 
 
 @wp.kernel
@@ -27,6 +35,7 @@ def take_snapshot_kernel(
     ending: wp.array[int],
     address: wp.array[wp.vec2i],
     frame: wp.array[int],
+    task: wp.array[int],
     entry: wp.array2d[int],
     slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
@@ -37,9 +46,12 @@ def take_snapshot_kernel(
     entry_out: wp.array2d[int],
     pose_out: wp.array2d[wp.transform],
     fixture_pose_out: wp.array2d[wp.transform],
-    status_out: wp.array2d[int],
+    fixture_visible_out: wp.array2d[int],
 ):
-    """Copy what pictures need. A tick is a frame while the gripper acts, and once more when it has finished."""
+    """Copy what pictures need. A tick is a frame while the gripper acts, and once more when it has finished.
+
+    The gripper is not in the picture while it LOOKs: it then waits at home.
+    """
     world = wp.tid()
     live = int(0)
     if phase[world] == ACT or (phase[world] == OVER and delivers(ending[world])):
@@ -52,12 +64,49 @@ def take_snapshot_kernel(
         entry_out[world, instance] = entry[world, instance]
         if entry[world, instance] >= 0:
             pose_out[world, instance] = body_q[body + layout.gripper_bodies + slot[world, instance]]
+    gripper = wp.where(task[world] == LOOK, 0, 1)
     fixture_pose_out[world, 0] = wp.transform_identity()
-    fixture_pose_out[world, 1] = body_q[body]
-    fixture_pose_out[world, 2] = body_q[body + 1]
+    fixture_visible_out[world, 0] = 1
+    for link in range(2):
+        fixture_pose_out[world, 1 + link] = body_q[body + link]
+        fixture_visible_out[world, 1 + link] = gripper
+
+
+@wp.kernel
+def pack_status_kernel(
+    # State:
+    live: wp.array[int],
+    phase: wp.array[int],
+    ending: wp.array[int],
+    address: wp.array[wp.vec2i],
+    frame: wp.array[int],
+    mode: wp.array[int],
+    task: wp.array[int],
+    attempt: wp.array[int],
+    outcome: wp.array[int],
+    target: wp.array[int],
+    hits: wp.array[int],
+    caught: wp.array[wp.uint32],
+    hanging: wp.array[wp.uint32],
+    peak: wp.array[float],
+    # Out:
+    status_out: wp.array2d[int],
+    measure_out: wp.array2d[float],
+):
+    """Gather the few numbers of each world that the host reads."""
+    world = wp.tid()
     status_out[world, STATUS_PHASE] = phase[world]
-    status_out[world, STATUS_OUTCOME] = ending[world]
+    status_out[world, STATUS_ENDING] = ending[world]
     status_out[world, STATUS_EPISODE] = address[world][0]
-    status_out[world, STATUS_ATTEMPT] = address[world][1]
+    status_out[world, STATUS_REDRAW] = address[world][1]
     status_out[world, STATUS_FRAME] = frame[world]
-    status_out[world, STATUS_LIVE] = live
+    status_out[world, STATUS_LIVE] = live[world]
+    status_out[world, STATUS_MODE] = mode[world]
+    status_out[world, STATUS_TASK] = task[world]
+    status_out[world, STATUS_ATTEMPT] = attempt[world]
+    status_out[world, STATUS_OUTCOME] = outcome[world]
+    status_out[world, STATUS_TARGET] = target[world]
+    status_out[world, STATUS_HITS] = hits[world]
+    status_out[world, STATUS_CAUGHT] = int(caught[world])
+    status_out[world, STATUS_HELD] = int(hanging[world])
+    measure_out[world, MEASURE_LOAD] = peak[world]

@@ -1,4 +1,4 @@
-"""Whether a world's pile is at rest, what must be dropped again, and when an episode ends."""
+"""Whether a world's pile is at rest, and what must be dropped again."""
 
 import warp as wp
 
@@ -6,11 +6,6 @@ from synpick_warp.kernels.arrangement import drop_pose, write_body
 from synpick_warp.kernels.draws import REDROP, stream_key
 from synpick_warp.kernels.phases import (
     ACT,
-    ENDING_FINISHED,
-    ENDING_NOT_FINITE,
-    ENDING_SOLVER_OVERFLOW,
-    ENDING_UNSETTLED,
-    OVER,
     SETTLE,
 )
 from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData, SettleData
@@ -198,45 +193,6 @@ def flag_lost_pairs_kernel(
     world = wp.tid()
     if pair_count[0] > room:
         overflow_out[world] = True
-
-
-@wp.kernel
-def judge_episodes_kernel(
-    # Scene:
-    layout: LayoutData,
-    settle: SettleData,
-    waypoints: int,
-    # State:
-    entry: wp.array2d[int],
-    slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
-    overflow: wp.array[wp.bool],
-    progress: wp.array[wp.vec4i],
-    waypoint: wp.array[int],
-    phase_inout: wp.array[int],
-    ending_inout: wp.array[int],
-):
-    """End episodes: those that failed, and those whose gripper has been everywhere."""
-    world = wp.tid()
-    phase = phase_inout[world]
-    if phase != SETTLE and phase != ACT:
-        return
-    ending = int(0)
-    if phase == ACT and waypoint[world] >= waypoints:
-        ending = ENDING_FINISHED
-    if phase == SETTLE and (progress[world][0] >= settle.max_ticks or progress[world][2] > settle.max_redrops):
-        ending = ENDING_UNSETTLED
-    if overflow[world]:
-        ending = ENDING_SOLVER_OVERFLOW
-    body = world * layout.bodies + layout.gripper_bodies
-    for instance in range(layout.instances):
-        if entry[world, instance] >= 0:
-            p = wp.transform_get_translation(body_q[body + slot[world, instance]])
-            if not wp.isfinite(p[0] + p[1] + p[2]):
-                ending = ENDING_NOT_FINITE
-    if ending != 0:
-        ending_inout[world] = ending
-        phase_inout[world] = OVER
 
 
 @wp.kernel

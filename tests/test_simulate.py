@@ -237,7 +237,7 @@ def bench(device):
 def advance(simulation: Simulation, ticks: int) -> np.ndarray:
     """Poses (world, 7) of the first slots after so many ticks of physics alone; a view of the state."""
     for _ in range(ticks):
-        simulation.physics.tick(functools.partial(act.drive_gripper, simulation.scene, simulation.state, simulation.physics))
+        simulation.physics.tick(simulation._drive)
     return simulation.physics.state.body_q.numpy().reshape(simulation.layout.worlds, -1, 7)[:, build.GRIPPER_BODIES]
 
 

@@ -233,7 +233,7 @@ def _ticks(simulation: Simulation, tick: Callable[[], None], least: float, state
 def _within_a_tick(simulation: Simulation, tick: Callable[[], None], least: float) -> Iterator[Row]:
     """What a tick's time goes to."""
     physics, device = simulation.physics, simulation.device
-    drive = functools.partial(act.drive_gripper, simulation.scene, simulation.state, physics)
+    drive = functools.partial(act.drive_gripper, simulation.scene, simulation.state, simulation.attempts, simulation.plan, physics)
     steps = seconds_per_call(lambda: physics.tick(drive), device, least, BURST)
     started = time.perf_counter()
     tick()

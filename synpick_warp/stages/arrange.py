@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import warp as wp
 
-from synpick_warp.kernels import arrangement, rest
+from synpick_warp.kernels import arrangement, endings, rest
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.physics import Physics
-from synpick_warp.stages.worlds import WorldState
+from synpick_warp.stages.sight import Sighting
+from synpick_warp.stages.worlds import AttemptState, WorldState
 
 
 def take_episodes(state: WorldState, episodes: int, tries: int) -> None:
@@ -113,14 +114,23 @@ def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: 
     )
 
 
-def judge_episodes(scene: SceneData, state: WorldState, physics: Physics) -> None:
+def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, sighting: Sighting, physics: Physics) -> None:
     """End episodes that failed or are finished."""
+    worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
-        rest.judge_episodes_kernel,
-        dim=state.phase.shape[0],
-        inputs=[scene.layout, scene.settle, scene.move.waypoints, state.entry, state.slot, physics.state.body_q,
-                physics.solver.constraint_overflow, state.progress, state.waypoint, state.phase, state.ending],
-        device=state.phase.device,
+        endings.judge_tasks_kernel,
+        dim=worlds,
+        inputs=[scene.layout, scene.move, scene.pick, state.phase, state.mode, state.entry, state.waypoint, attempts.task,
+                attempts.failures],
+        outputs=[state.ending],
+        device=device,
+    )
+    wp.launch(
+        endings.judge_episodes_kernel,
+        dim=worlds,
+        inputs=[scene.layout, scene.settle, state.entry, state.slot, physics.state.body_q, physics.solver.constraint_overflow,
+                sighting.overflow, state.progress, state.phase, state.ending],
+        device=device,
     )
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
+import newton
 import warp as wp
 
 from synpick_warp.arrays import allocate
@@ -16,7 +16,9 @@ from synpick_warp.stages import act, arrange
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData, make_scene_data
 from synpick_warp.stages.physics import Physics
-from synpick_warp.stages.worlds import WorldState, WorldStatus, world_sizes
+from synpick_warp.stages.render_scene import RenderScene
+from synpick_warp.stages.sight import Plan, Sighting
+from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 
 # A tick is recorded while the last one's record is still read.
 RECORDS = 2
@@ -28,12 +30,14 @@ class TickRecord:
 
     snapshot: Snapshot
     status: WorldStatus
+    sighting: Sighting
+    plan: Plan
 
 
 class Simulation:
     """N worlds that take episodes by number until none is left."""
 
-    def __init__(self, config: Config, catalog: Catalog, lights: int, device: wp.Device) -> None:
+    def __init__(self, config: Config, catalog: Catalog, lights: int, device: wp.Device, render_scene: RenderScene | None = None) -> None:
         """Build the model and allocate all state.
 
         Args:
@@ -41,6 +45,10 @@ class Simulation:
             catalog: The objects.
             lights: How many light maps there are to draw from.
             device: Where everything lies.
+            render_scene: What the gripper's side sees; not needed if all episodes move.
+
+        Raises:
+            ValueError: There is nothing to see, but episodes that pick.
         """
         self.config = config
         self.device = device
@@ -50,38 +58,88 @@ class Simulation:
         self.scene: SceneData = make_scene_data(config, catalog, built, lights, device)
         sizes = world_sizes(config, built.layout.bodies_per_world)
         self.state = allocate(WorldState, sizes, device)
+        self.attempts = allocate(AttemptState, sizes, device)
+        self.seals = allocate(SealState, sizes, device)
+        self.sighting = allocate(Sighting, sizes, device)
+        self.plan = allocate(Plan, sizes, device)
         self.records = tuple(self._make_record(sizes) for _ in range(RECORDS))
+        self.suction = None
+        self.looker = None
+        if self.scene.mode.pick_or_target_share > 0.0:
+            if render_scene is None:
+                raise ValueError("episodes that pick need a render_scene to look at")
+            from synpick_warp.stages.hold import Suction
+            from synpick_warp.stages.look import Looker
+
+            self.suction = Suction(config, catalog, render_scene, device)
+            self.looker = Looker(config, render_scene, self.scene, self.state, self.attempts, self.sighting, self.plan)
 
     def _make_record(self, sizes: dict[str, int]) -> TickRecord:
-        record = TickRecord(allocate(Snapshot, sizes, self.device), allocate(WorldStatus, sizes, self.device))
-        record.snapshot.fixture_visible.fill_(1)
-        return record
+        return TickRecord(*(allocate(kind, sizes, self.device) for kind in (Snapshot, WorldStatus, Sighting, Plan)))
 
     def tick(self, record: TickRecord) -> None:
-        """Hand out episodes, simulate one tick, judge, and record what came of it in one of `records`."""
+        """Hand out episodes, simulate one tick, judge, record what came of it in one of `records`, and look where one must choose."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
         arrange.take_episodes(state, self.config.bake.episodes, self.config.settle.tries)
         arrange.draw_objects(scene, state, seed)
         arrange.drop_objects(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
-        physics.tick(functools.partial(act.drive_gripper, scene, state, physics))
+        act.set_fingers(scene, state, physics)
+        self.seals.peak.zero_()
+        physics.tick(self._drive, self._let_go_of_contacts) if self.suction else physics.tick(self._drive)
         arrange.judge_settling(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
         act.begin_moving(scene, state, physics, seed)
+        act.begin_picking(scene, state, self.attempts, self.seals, self.sighting, self.plan, physics)
+        act.remove_lost(scene, state, self.attempts, self.seals, physics)
+        if self.suction is not None:
+            self.suction.count_seal_rays(scene, state, self.attempts, self.seals, physics)
+            act.end_attempts(scene, state, self.attempts, self.seals, self.plan, physics)
+        act.park_removed(scene, state, self.attempts, physics)
         physics.refresh_poses()
-        arrange.judge_episodes(scene, state, physics)
+        arrange.judge_episodes(scene, state, self.attempts, self.sighting, physics)
         self._take_snapshot(record)
+        if self.looker is not None:
+            self.looker.look(record.snapshot)
+            act.begin_attempts(scene, state, self.attempts, self.plan, physics)
+        _copy(record.sighting, self.sighting)
+        _copy(record.plan, self.plan)
+
+    def _drive(self, current: newton.State) -> None:
+        """Forces before a step."""
+        act.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current)
+        if self.suction is not None:
+            self.suction.hold_objects(self.scene, self.state, self.attempts, self.seals, self.physics, current)
+
+    def _let_go_of_contacts(self) -> None:
+        """After contacts were found."""
+        if self.suction is not None:
+            self.suction.ignore_held_contacts(self.scene, self.state, self.seals, self.physics)
 
     def _take_snapshot(self, record: TickRecord) -> None:
-        state, snapshot = self.state, record.snapshot
+        state, attempts, snapshot, status = self.state, self.attempts, record.snapshot, record.status
+        device = self.device
         wp.launch(
             pack.take_snapshot_kernel,
             dim=self.layout.worlds,
-            inputs=[self.scene.layout, state.phase, state.ending, state.address, state.frame, state.entry, state.slot,
+            inputs=[self.scene.layout, state.phase, state.ending, state.address, state.frame, attempts.task, state.entry, state.slot,
                     self.physics.state.body_q],
             outputs=[snapshot.live, snapshot.episode, snapshot.frame, snapshot.entry, snapshot.pose, snapshot.fixture_pose,
-                     record.status.table],
-            device=self.device,
+                     snapshot.fixture_visible],
+            device=device,
+        )
+        wp.launch(
+            pack.pack_status_kernel,
+            dim=self.layout.worlds,
+            inputs=[snapshot.live, state.phase, state.ending, state.address, state.frame, state.mode, attempts.task, attempts.attempt,
+                    attempts.outcome, self.plan.target, attempts.hits, attempts.caught, attempts.hanging, self.seals.peak],
+            outputs=[status.table, status.measures],
+            device=device,
         )
         wp.copy(snapshot.light, state.light)
         wp.copy(snapshot.light_turn, state.light_turn)
+
+
+def _copy(target: Sighting | Plan, source: Sighting | Plan) -> None:
+    for item in fields(source):
+        wp.copy(getattr(target, item.name), getattr(source, item.name))

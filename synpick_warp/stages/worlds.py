@@ -86,6 +86,8 @@ class AttemptState:
     """Rays that hit an object when the suction was switched on."""
     caught: wp.array = device_array("world", dtype=wp.uint32)
     """Bit i: instance i was caught then."""
+    hanging: wp.array = device_array("world", dtype=wp.uint32)
+    """Bit i: instance i hung on the cup at the end of the tick."""
     removed: wp.array = device_array("world", "instance", dtype=wp.int32)
     """Whether the instance has left the scene: 0 no, 1 picked, 2 lost."""
 

@@ -12,7 +12,8 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.kernels import structs
 from synpick_warp.stages.constants import SceneData
-from synpick_warp.stages.worlds import WorldState
+from synpick_warp.stages.sight import Plan, Sighting
+from synpick_warp.stages.worlds import AttemptState, SealState, WorldState
 
 GRIPPER_BODIES, GRIPPER_DOFS = 2, 4
 GUIDES = (6, 7, 8, 9)
@@ -36,7 +37,12 @@ class KernelWorlds:
     move: dict[str, Any] = field(default_factory=dict)
     scene: Any = None
     state: Any = None
+    attempts: Any = None
+    seals: Any = None
+    sighting: Any = None
+    plan: Any = None
     physics: Any = None
+    pick: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.slots = self.single_slots + self.compound_slots
@@ -50,11 +56,16 @@ class KernelWorlds:
                 "step": 2e-3, "stiffness": 1000.0, "damping": 60.0, "force": 30.0, "speed": 0.1, **self.move}
         self.scene = SceneData(self._layout(), self._catalog(), filled(structs.DropData(), drop), filled(structs.SettleData(), settle),
                                filled(structs.ModeData(), {"pick_share": 0.0, "pick_or_target_share": 0.0}),
-                               filled(structs.MoveData(), move), structs.PickData(), structs.SightData(), structs.SuctionData(),
+                               filled(structs.MoveData(), move), filled(structs.PickData(), self.pick),
+                               structs.SightData(), structs.SuctionData(),
                                wp.array(GUIDES, dtype=int, device=self.device))
         sizes = {"one": 1, "world": self.worlds, "world_and_global": self.worlds + 1, "instance": self.instances,
                  "body": self.worlds * self.bodies, "waypoint": move["waypoints"]}
         self.state = allocate(WorldState, sizes, self.device)
+        self.attempts = allocate(AttemptState, sizes, self.device)
+        self.seals = allocate(SealState, sizes, self.device)
+        self.sighting = allocate(Sighting, sizes, self.device)
+        self.plan = allocate(Plan, sizes, self.device)
         self.physics = self._physics()
 
     def _layout(self) -> Any:
@@ -83,7 +94,7 @@ class KernelWorlds:
         contacts = SimpleNamespace(rigid_contact_max=0)
         return SimpleNamespace(
             state=SimpleNamespace(joint_q=made(self.coords), joint_qd=made(self.dofs), body_q=body_q),
-            control=SimpleNamespace(joint_f=made(self.dofs)),
+            control=SimpleNamespace(joint_f=made(self.dofs), joint_target_q=made(self.coords)),
             solver=SimpleNamespace(constraint_overflow=made(1, wp.bool)),
             model=SimpleNamespace(shape_transform=made(SHAPES, wp.transform), shape_body=made(SHAPES, int)),
             contacts=contacts,

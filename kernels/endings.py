@@ -1,0 +1,105 @@
+"""When an episode ends."""
+
+import warp as wp
+
+from synpick_warp.kernels.phases import (
+    ACT,
+    ENDING_EMPTIED,
+    ENDING_FINISHED,
+    ENDING_GAVE_UP,
+    ENDING_NOT_FINITE,
+    ENDING_RUNNING,
+    ENDING_SIGHT_OVERFLOW,
+    ENDING_SOLVER_OVERFLOW,
+    ENDING_UNSETTLED,
+    LOOK,
+    MOVE,
+    OVER,
+    SETTLE,
+)
+from synpick_warp.kernels.structs import LayoutData, MoveData, PickData, SettleData
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def judge_tasks_kernel(
+    # Scene:
+    layout: LayoutData,
+    move: MoveData,
+    pick: PickData,
+    # State:
+    phase: wp.array[int],
+    mode: wp.array[int],
+    entry: wp.array2d[int],
+    waypoint: wp.array[int],
+    task: wp.array[int],
+    failures: wp.array[int],
+    # Out:
+    ending_out: wp.array[int],
+):
+    """What an episode that goes well ends with: the gripper has been everywhere; no object is left; too many attempts have failed."""
+    world = wp.tid()
+    if phase[world] != ACT:
+        return
+    if mode[world] == MOVE:
+        if waypoint[world] >= move.waypoints:
+            ending_out[world] = ENDING_FINISHED
+        return
+    if task[world] != LOOK:
+        return
+    left = int(0)
+    for instance in range(layout.instances):
+        if entry[world, instance] >= 0:
+            left += 1
+    if left == 0:
+        ending_out[world] = ENDING_EMPTIED
+    elif failures[world] >= pick.failures:
+        ending_out[world] = ENDING_GAVE_UP
+
+
+@wp.func
+def is_finite(pose: wp.transform) -> bool:
+    """Whether a body's position is a number."""
+    p = wp.transform_get_translation(pose)
+    return wp.isfinite(p[0] + p[1] + p[2])
+
+
+@wp.kernel
+def judge_episodes_kernel(
+    # Scene:
+    layout: LayoutData,
+    settle: SettleData,
+    # State:
+    entry: wp.array2d[int],
+    slot: wp.array2d[int],
+    body_q: wp.array[wp.transform],
+    solver_overflow: wp.array[wp.bool],
+    sight_overflow: wp.array[int],
+    progress: wp.array[wp.vec4i],
+    phase_inout: wp.array[int],
+    ending_inout: wp.array[int],
+):
+    """End the episodes that have an ending, and those that failed: a failure counts for more."""
+    world = wp.tid()
+    phase = phase_inout[world]
+    if phase != SETTLE and phase != ACT:
+        return
+    ending = ending_inout[world]
+    if phase == SETTLE and (progress[world][0] >= settle.max_ticks or progress[world][2] > settle.max_redrops):
+        ending = ENDING_UNSETTLED
+    if sight_overflow[world] != 0:
+        ending = ENDING_SIGHT_OVERFLOW
+    if solver_overflow[world]:
+        ending = ENDING_SOLVER_OVERFLOW
+    body = world * layout.bodies
+    for link in range(layout.gripper_bodies):
+        if not is_finite(body_q[body + link]):
+            ending = ENDING_NOT_FINITE
+    for instance in range(layout.instances):
+        if entry[world, instance] >= 0:
+            if not is_finite(body_q[body + layout.gripper_bodies + slot[world, instance]]):
+                ending = ENDING_NOT_FINITE
+    if ending != ENDING_RUNNING:
+        ending_inout[world] = ending
+        phase_inout[world] = OVER
