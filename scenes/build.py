@@ -82,34 +82,54 @@ class BuiltModel:
 
 
 def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
-    """Body slots (single, compound) that hold every draw but a share of `slot_shortfall`.
+    """Body slots (single, compound) that hold every draw but a share of `slot_shortfall`, in each mode that episodes can have.
 
     Found by drawing: the volume budget couples the number of objects with which ones they are, so there is no simple formula.
-    Without repeats no more than all objects of a kind are needed.
+    Slots cost time whether full or not, and compound ones most: of these there are as few as possible, the single ones follow.
 
     Raises:
         ConfigError: No object fits into the volume budget.
     """
-    room, budget = config.arrangement.max_objects, config.arrangement.volume
+    budget, shortfall = config.arrangement.volume, config.arrangement.slot_shortfall
     compound = np.array([len(entry.pieces) > 1 for entry in catalog.entries])
     volume = np.array([entry.volume for entry in catalog.entries])
     if volume.min() > budget:
         raise ConfigError(f"arrangement.volume is {budget:g} m³, but the smallest object takes {volume.min():.3g} m³; make it larger")
-    if not repeats_occur(config):
-        return min(room, int((~compound).sum())), min(room, int(compound.sum()))
-    drawn = np.random.default_rng(0).integers(len(catalog), size=(SLOT_TRIALS, room))
-    # The first object is drawn again until one fits.
-    drawn = drawn[volume[drawn[:, 0]] <= budget]
-    inside = np.cumsum(volume[drawn], axis=1) <= budget
-    level = 1.0 - config.arrangement.slot_shortfall
-    needed = [np.quantile((inside & (compound[drawn] == kind)).sum(axis=1), level, method="higher") for kind in (False, True)]
-    return int(needed[0]), int(needed[1])
+    needed = []
+    for repeats in repeats_that_occur(config):
+        drawn = _draw_trials(volume, budget, config.arrangement.max_objects, repeats)
+        singles, compounds = (((drawn >= 0) & (compound[drawn] == kind)).sum(axis=1) for kind in (False, True))
+        most = np.quantile(compounds, 1.0 - shortfall, method="higher")
+        # Draws that find no room among the compound slots are lost already; all others and these together may be `shortfall`.
+        needed.append((np.quantile(np.where(compounds > most, np.inf, singles), 1.0 - shortfall, method="higher"), most))
+    return int(max(single for single, _ in needed)), int(max(most for _, most in needed))
 
 
-def repeats_occur(config: Config) -> bool:
-    """Whether an object may come several times in a tote, in any mode that episodes can have."""
-    pick, target, move = config.bake.mix if config.bake.mode == MIXED else (config.bake.mode == mode for mode in MODES)
-    return bool((config.move.repeats and move) or (config.pick.repeats and (pick or target)))
+def repeats_that_occur(config: Config) -> set[bool]:
+    """Whether an object may come several times in a tote, for all modes that episodes can have."""
+    weights = config.bake.mix if config.bake.mode == MIXED else [float(config.bake.mode == mode) for mode in MODES]
+    rules = (config.pick.repeats, config.pick.repeats, config.move.repeats)
+    return {repeats for weight, repeats in zip(weights, rules, strict=True) if weight > 0.0}
+
+
+def _draw_trials(volume: np.ndarray, budget: float, room: int, repeats: bool) -> np.ndarray:
+    """Draw as kernels.arrangement.draw_objects_kernel does: catalog indices (SLOT_TRIALS, room), -1 after the last."""
+    numbers = np.random.default_rng(0)
+    drawn = np.full((SLOT_TRIALS, room), -1, dtype=np.int32)
+    total = np.zeros(SLOT_TRIALS)
+    # Trials that still draw. The first object is drawn again until one fits.
+    going, choice = np.arange(SLOT_TRIALS), np.flatnonzero(volume <= budget)
+    for position in range(room if repeats else min(room, len(volume))):
+        candidate = numbers.choice(choice, size=len(going))
+        known = np.arange(0 if repeats else len(going))
+        while len(known := known[(drawn[going[known], :position] == candidate[known, None]).any(axis=1)]):
+            candidate[known] = numbers.choice(choice, size=len(known))
+        fits = total[going] + volume[candidate] <= budget
+        going, candidate = going[fits], candidate[fits]
+        drawn[going, position] = candidate
+        total[going] += volume[candidate]
+        choice = np.arange(len(volume))
+    return drawn
 
 
 def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltModel:
