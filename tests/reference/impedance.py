@@ -41,3 +41,16 @@ def step_response(time: np.ndarray, stiffness: float, damping: float, mass: floa
     # x = 1 + a exp(r0 t) + b exp(r1 t) with x(0) = 0, x'(0) = 0.
     a, b = roots[1] / (roots[0] - roots[1]), -roots[0] / (roots[0] - roots[1])
     return (1 + a * np.exp(roots[0] * time) + b * np.exp(roots[1] * time)).real
+
+
+def stepped_response(steps: int, stiffness: float, damping: float, mass: float, step: float, substeps: int) -> np.ndarray:
+    """The same, as it is simulated: the force is held for a step, in which speed, then position, take `substeps` Euler steps."""
+    position = velocity = 0.0
+    positions = []
+    for _ in range(steps):
+        acceleration = force([1.0 - position], [velocity], stiffness, damping, np.inf, mass, step)[0] / mass
+        for _ in range(substeps):
+            velocity += step / substeps * acceleration
+            position += step / substeps * velocity
+        positions.append(position)
+    return np.array(positions)
