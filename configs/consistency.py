@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 
 from synpick_warp.configs.check import shown
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import MIXED, Config
 
 DEPTH_COUNTS = 65535
 """Largest value of a 16-bit depth image."""
@@ -21,11 +21,19 @@ Complaint = tuple[str, str]
 
 def complaints(config: Config) -> Iterator[Complaint]:
     """Everything that does not fit, the most basic first."""
+    yield from _mix(config)
     yield from _tote(config)
     yield from _cameras(config)
     yield from _times(config)
+    yield from _pick(config)
+    yield from _suction(config)
     yield from _bop(config)
     yield from _object_rows(config)
+
+
+def _mix(config: Config) -> Iterator[Complaint]:
+    if config.bake.mode == MIXED and not any(config.bake.mix):
+        yield "bake.mix", "at least one weight above 0, with the mode mixed"
 
 
 def _tote(config: Config) -> Iterator[Complaint]:
@@ -63,6 +71,26 @@ def _times(config: Config) -> Iterator[Complaint]:
         yield "settle.max_time", f"at least settle.min_time, {settle.min_time:g} [s]"
     if settle.max_time < rest:
         yield "settle.max_time", f"at least the time of settle.rest_ticks ticks, {rest:g} [s]"
+
+
+def _pick(config: Config) -> Iterator[Complaint]:
+    pick, height = config.pick, config.tote.outer_size[2] - config.tote.wall
+    if pick.appear_height < pick.near:
+        yield "pick.appear_height", f"at least pick.near, {pick.near:g} [m]"
+    if pick.speed < pick.near_speed:
+        yield "pick.speed", f"at least pick.near_speed, {pick.near_speed:g} [m/s]"
+    if pick.lift_height < height:
+        yield "pick.lift_height", f"at least the inner height of the tote, {height:g}: what hangs on the cup must have left it [m]"
+
+
+def _suction(config: Config) -> Iterator[Complaint]:
+    suction, widest = config.suction, config.gripper.cup_width / 2
+    if suction.radius > widest:
+        yield "suction.radius", f"at most half of gripper.cup_width, {widest:g} [m]"
+    if suction.tolerated_misses >= suction.rays:
+        yield "suction.tolerated_misses", f"less than suction.rays, {suction.rays}: a ray must hit"
+    if suction.poor_force > suction.good_force:
+        yield "suction.poor_force", f"at most suction.good_force, {suction.good_force:g} [N]"
 
 
 def _bop(config: Config) -> Iterator[Complaint]:

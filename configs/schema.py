@@ -41,7 +41,7 @@ class Bake:
         "pick", "", "pick: empty the tote; target: dig for what lies lowest; move: stir; mixed: drawn for each episode.",
         choices=(*MODES, MIXED),
     )
-    mix: tuple[float, float, float] = setting((1.0, 1.0, 1.0), "", "With mode mixed: weights of pick, target and move.", low=0.0)
+    mix: tuple[float, float, float] = setting((1.0, 1.0, 1.0), "", "With mode mixed: weights of pick, target and move.", low=0.0, high=1000)
     worlds: int = setting(4, "", "Totes simulated side by side.", low=1, high=65536)
     episodes: int = setting(4, "", "Sequences to make; each becomes one BOP scene a camera.", low=1)
     seed: int = setting(0, "", "Every random draw follows from it.", low=0, high=2**63 - 1)
@@ -230,7 +230,10 @@ class Target:
 class Sight:
     """How the gripper's side sees: an image of camera 0 without the gripper, and the rules by which it chooses."""
 
-    resolution: tuple[int, int] = setting((1920, 1080), "px", "Width and height of the image.", low=16, high=8192)
+    resolution: tuple[int, int] = setting(
+        (1920, 1080), "px", "Width and height of the image; its field of view is cameras.fov across the width, so a flatter one sees less.",
+        low=16, high=8192,
+    )
     views: int = setting(0, "", "Images worked on at once; 0: chosen by device and resolution.", low=0)
     contour_points: int = setting(8192, "", "Room for the points of one contour; more end the episode.", low=16)
     center_share: float = setting(
@@ -269,6 +272,7 @@ class Suction:
     twist_damping: float = setting(0.1, "N·m·s/rad", "Damping of twist and swing.", low=0.0)
     swing_limit: float = setting(5.0, "°", "An object swings freely so far (released).", low=0.0, high=90.0)
     swing_stiffness: float = setting(10.0, "N·m/rad", "Stiffness against swing beyond that.", low=0.0)
+
 
 @dataclass(frozen=True)
 class Render:

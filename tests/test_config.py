@@ -17,7 +17,11 @@ from synpick_warp.configs.schema import Config, ObjectRow
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
 
-COUPLED = {"bop.split", "bop.color_format", "bop.depth_scale", "move.height", "move.start_height"}
+COUPLED = {
+    "bop.split", "bop.color_format", "bop.depth_scale", "move.height", "move.start_height", "pick.near", "pick.appear_height", "pick.speed",
+    "pick.near_speed", "pick.lift_height", "suction.radius", "gripper.cup_width", "suction.rays", "suction.tolerated_misses",
+    "suction.good_force", "suction.poor_force",
+}
 COUPLED_SECTIONS = {"tote", "cameras", "settle", "physics"}
 """Settings that must fit others: drawn freely they mostly would not."""
 
@@ -61,6 +65,36 @@ def test_other_presets_build_on_the_paper():
     assert (smoke.move.rounds, smoke.bop.color_format, len(smoke.object_rows)) == (1, "png", 21)
 
 
+def resolved(name: str) -> dict[str, object]:
+    """Full key -> value of every setting of a preset."""
+    config = load_config(name, {})
+    return {f"{section}.{key}": getattr(getattr(config, section), key) for section, kind in sections().items() for key in settings_of(kind)}
+
+
+def test_the_released_generator_differs_in_exactly_this():
+    paper, released = resolved("synpick"), resolved("synpick-released")
+    assert {key: (paper[key], value) for key, value in released.items() if value != paper[key]} == {
+        "move.damping": (60.0, 1.0),
+        "pick.failures": (3, 4),
+        "target.forgive": (False, True),
+        "target.random_after_failure": (False, True),
+        "suction.tolerated_misses": (0, 2),
+        "suction.poor_force": (2.0, 0.2),
+        "bop.coco": (True, False),
+    }
+
+
+def test_the_smoke_preset_stirs_few_objects_in_small_pictures():
+    paper, smoke = resolved("synpick"), resolved("smoke")
+    changed = {key for key, value in smoke.items() if value != paper[key]}
+    assert (paper["bake.mode"], smoke["bake.mode"]) == ("pick", "move")
+    # Physics and the rules of picking are the paper's; what is measured in pixels shrinks with the picture.
+    assert {key.split(".")[0] for key in changed} == {"bake", "cameras", "arrangement", "move", "sight", "bop"}
+    assert {key for key in changed if key.startswith("sight.")} == {
+        f"sight.{name}" for name in ("resolution", "contour_points", "contour_offset", "min_votes", "normal_window")
+    }
+
+
 def test_command_line_wins_over_file_and_file_over_preset(tmp_path):
     path = write(tmp_path, 'preset = "smoke"\n[bake]\nworlds = 7\nseed = 3\n')
     config = load_config(path, {"bake.seed": 9})
@@ -97,6 +131,10 @@ def test_whole_numbers_do_for_floats():
         ("render.table", 1, "render.table is 1 on the command line; allowed: true or false"),
         ("bake.models", 3, "bake.models is 3 on the command line; allowed: a string"),
         ("bake.mode", "mvoe", 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed; did you mean move?'),
+        ("bake.mix", [1, -1, 1], "bake.mix is [1, -1, 1] on the command line; allowed: each at least 0, at most 1000"),
+        ("bake.mix", [1, 1], "bake.mix is [1, 1] on the command line; allowed: 3 numbers in a list"),
+        ("sight.exact_cycle", 13, "sight.exact_cycle is 13 on the command line; allowed: at least 2, at most 12"),
+        ("suction.rays", 2, "suction.rays is 2 on the command line; allowed: at least 3, at most 64"),
         ("cameras.resolution", [0, 0], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
         ("cameras.resolution", [640], "cameras.resolution is [640] on the command line; allowed: 2 whole numbers in a list [px]"),
         ("cameras.ups", [[1, 2]], "cameras.ups is [[1, 2]] on the command line; allowed: a list of lists of 3 numbers"),
@@ -172,6 +210,14 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
         ({"settle.min_time": 20}, r"settle.max_time is [0-9.]+ by default; allowed: at least settle.min_time, 20 \[s\]"),
         ({"settle.rest_ticks": 1000}, "settle.max_time is [0-9.]+ by default; allowed: at least the time of settle.rest_ticks ticks"),
         ({"move.start_height": 0.01}, r"move.start_height is 0.01 on the command line; allowed: at least move.height, 0.02 \[m\]"),
+        ({"bake.mode": "mixed", "bake.mix": [0, 0, 0]},
+         r"bake.mix is \[0.0, 0.0, 0.0\] on the command line; allowed: at least one weight above 0, with the mode mixed"),
+        ({"pick.near": 1.5}, r"pick.appear_height is 1.0 by default; allowed: at least pick.near, 1.5 \[m\]"),
+        ({"pick.near_speed": 1.5}, r"pick.speed is 1.0 by default; allowed: at least pick.near_speed, 1.5 \[m/s\]"),
+        ({"pick.lift_height": 0.1}, r"pick.lift_height is 0.1 on the command line; allowed: at least the inner height of the tote, 0.195"),
+        ({"suction.radius": 0.022}, r"suction.radius is 0.022 on .*; allowed: at most half of gripper.cup_width, 0.021 \[m\]"),
+        ({"suction.rays": 4, "suction.tolerated_misses": 4}, "suction.tolerated_misses is 4 on .*; allowed: less than suction.rays, 4: "),
+        ({"suction.poor_force": 41}, r"suction.poor_force is 41.0 on the command line; allowed: at most suction.good_force, 40 \[N\]"),
         ({"bop.split": "train"}, 'bop.color_format is "jpg" by default; allowed: png with the split train: '),
         ({"bop.color_format": "png"}, 'bop.color_format is "png" on the command line; allowed: jpg with the split train_pbr: '),
         ({"bop.split": "a/b"}, 'bop.split is "a/b" on the command line; allowed: train, val or test'),
@@ -180,6 +226,20 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
 )
 def test_values_that_do_not_fit_each_other(overrides, expected):
     assert re.match(expected.replace("[[", r"\[\[").replace("]]", r"\]\]"), message(None, overrides))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        {"bake.mode": "move", "bake.mix": [0, 0, 0]},
+        {"bake.mode": "mixed", "bake.mix": [0, 0.5, 0]},
+        {"pick.near": 1.0, "pick.near_speed": 1.0, "pick.lift_height": 0.2},
+        {"suction.radius": 0.021, "suction.tolerated_misses": 9, "suction.poor_force": 40},
+        {"sight.resolution": [640, 160]},
+    ],
+)
+def test_values_that_just_fit_each_other(overrides):
+    load_config(None, overrides)
 
 
 def test_object_ids_come_once(tmp_path):
