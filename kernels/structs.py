@@ -136,7 +136,10 @@ class SightData:
 
 @wp.struct
 class SuctionData:
-    """The cup's rays and seals; see configs.schema.Suction. Angles in radians."""
+    """The cup's rays and seals; see configs.schema.Suction. Angles in radians.
+
+    `tilt_inertia` is what a torque of one step meets at the tilt axis: its drive, implicit in velocity and position [kg·m²].
+    """
 
     rays: int
     radius: float
@@ -153,4 +156,5 @@ class SuctionData:
     tip: float
     finger_mass: float
     cup_mass: float
+    tilt_inertia: float
     step: float

@@ -176,4 +176,5 @@ def _suction_data(config: Config) -> structs.SuctionData:
     data.swing_limit, data.swing_stiffness = math.radians(suction.swing_limit), suction.swing_stiffness
     data.tip, data.step = gripper.cup_length, config.physics.step
     data.finger_mass, data.cup_mass = gripper.finger_mass, gripper.cup_mass
+    data.tilt_inertia = build.CUP_ARMATURE + data.step * (gripper.tilt_damping + data.step * gripper.tilt_stiffness)
     return data

@@ -6,12 +6,15 @@ from collections.abc import Callable
 from typing import Any
 
 import newton
+import numpy as np
 import warp as wp
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels import rest
+from synpick_warp.kernels import joints, rest
 from synpick_warp.scenes import build
 
+# The cup's tilt among a world's joint coordinates: x, y, z, tilt.
+TILT = 3
 # A joint limit's row is made when the joint comes this near to it [rad].
 JOINT_LIMIT_GAP = 0.2
 
@@ -45,6 +48,30 @@ class Physics:
         self._other = self.model.state()
         self.control = self.model.control()
         self._graph: wp.Graph | None = None
+        fingers = np.arange(worlds) * built.layout.bodies_per_world
+        self._finger_joint = wp.array(np.argsort(self.model.joint_child.numpy())[fingers], dtype=wp.int32, device=self.device)
+
+    @property
+    def tilt_targets(self) -> wp.array:
+        """Where each cup's drive turns it (world) [rad]: a view of the control's targets, which are laid out as the joint coordinates."""
+        return self.control.joint_target_q.reshape((self.layout.worlds, self.layout.coords_per_world))[:, TILT]
+
+    def turn_fingers(self, yaw: wp.array) -> None:
+        """Turn each finger about the vertical through its origin; the cup turns with it, x, y and z stay the world's axes.
+
+        Takes effect with the next step, and in body poses with `refresh_poses`. Nothing is read back from the device.
+
+        Args:
+            yaw: Counter-clockwise from above (world) float32 [rad].
+        """
+        wp.launch(
+            joints.turn_fingers_kernel,
+            dim=self.layout.worlds,
+            inputs=[self._finger_joint, yaw],
+            outputs=[self.model.joint_X_c],
+            device=self.device,
+        )
+        self.solver.notify_model_changed(newton.ModelFlags.JOINT_PROPERTIES)
 
     def load(self, variant: wp.array, restarted: wp.array) -> None:
         """Give body slots new objects and forget the history of restarted worlds. Joint coordinates are already written.
@@ -63,21 +90,23 @@ class Physics:
         """Body poses from joint coordinates, after these were written."""
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
-    def tick(self, before_step: Callable[[newton.State], None]) -> None:
+    def tick(self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None) -> None:
         """Advance all worlds by one tick.
 
+        Both hooks are recorded once on a GPU, so they must launch the same kernels on the same arrays every time.
+
         Args:
-            before_step: Launches what sets the control's forces from a state; runs before each step. Recorded once on a GPU, so it must
-                launch the same kernels on the same arrays every time.
+            before_step: Launches what sets the control's forces from a state; runs before each step.
+            after_collide: Launches what edits `contacts` before the solver sees them.
         """
         if not self.device.is_cuda:
-            self._run_steps(before_step)
+            self._run_steps(before_step, after_collide)
             return
         if self._graph is None:
             # The first tick runs eagerly: it loads the kernels and allocates what Newton allocates late.
-            self._run_steps(before_step)
+            self._run_steps(before_step, after_collide)
             with wp.ScopedCapture(device=self.device) as capture:
-                self._run_steps(before_step)
+                self._run_steps(before_step, after_collide)
             self._graph = capture.graph
             return
         wp.capture_launch(self._graph)
@@ -92,7 +121,7 @@ class Physics:
             device=self.device,
         )
 
-    def _run_steps(self, before_step: Callable[[newton.State], None]) -> None:
+    def _run_steps(self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None) -> None:
         current, following = self.state, self._other
         physics = self.config.physics
         for _ in range(physics.steps_per_tick):
@@ -100,6 +129,8 @@ class Physics:
             for _ in range(physics.substeps):
                 self.pipeline.collide(current, self.contacts)
                 self.flag_lost_pairs()
+                if after_collide is not None:
+                    after_collide()
                 self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps)
                 current, following = following, current
         if current is not self.state:
