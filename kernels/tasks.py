@@ -30,6 +30,8 @@ PICKED = wp.constant(1)
 LOST = wp.constant(2)
 # Room between objects that have left and are parked, more than any two of them need [m].
 PARKED_PITCH = wp.constant(5.0)
+# A goal so near to its target has arrived [m]; two kernels may round the target differently.
+ARRIVED = wp.constant(1.0e-4)
 # A collision shape that is to touch nothing is this much higher [m].
 AWAY = wp.constant(1000.0)
 
@@ -174,7 +176,7 @@ def advance_tasks_kernel(
     if task == PRESS and steps_inout[world] >= pick.press_steps:
         task_inout[world] = LIFT
         steps_inout[world] = 0
-    elif task == LIFT and goal[world] == task_target(LIFT, point[world], normal[world], pick, move.tip):
+    elif task == LIFT and wp.length(goal[world] - task_target(LIFT, point[world], normal[world], pick, move.tip)) < ARRIVED:
         outcome = judge_attempt(target[world], caught[world], hanging[world])
     elif task == LOOK and target[world] < 0 and steps_inout[world] > 0:
         outcome = OUTCOME_NOTHING_SEEN
