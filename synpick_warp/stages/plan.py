@@ -1,0 +1,135 @@
+"""From what was seen to what is picked: votes, clutter graph, choice, grasp."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import warp as wp
+
+from synpick_warp.arrays import allocate, device_array
+from synpick_warp.kernels.acyclic import Cycles, order_clutter_kernel
+from synpick_warp.kernels.choice import choose_target_kernel
+from synpick_warp.kernels.clutter import CONTOUR_LANES, count_votes_kernel, weigh_votes_kernel
+from synpick_warp.kernels.grasp import frame_grasp_kernel, smooth_normal_kernel
+from synpick_warp.stages.constants import SceneData
+from synpick_warp.stages.render import filled
+from synpick_warp.stages.render_scene import RenderScene
+from synpick_warp.stages.sight import LookArrays, Plan, Sighting
+from synpick_warp.stages.worlds import AttemptState, WorldState
+
+VIEW_BLOCK = 32
+"""Threads of a block where a thread works on a whole view: small blocks spread few views over many processors."""
+
+
+class Seen(Protocol):
+    """What planning needs of the images of a batch."""
+
+    look: LookArrays
+    hits: Any
+    bodies: Any
+    cameras: Any
+    grid: Any
+
+
+@dataclass(frozen=True, eq=False)
+class VoteArrays:
+    """Scratch of the votes."""
+
+    count: wp.array = device_array("view", "instance", "instance", "kind", dtype=wp.int32)
+    """Full and deep votes."""
+
+
+@dataclass(frozen=True, eq=False)
+class CycleArrays:
+    """Arrays of the struct `Cycles`."""
+
+    member: wp.array = device_array("view", "instance", dtype=wp.int32)
+    weight: wp.array = device_array("view", "instance", "instance", dtype=wp.float32)
+    rank: wp.array = device_array("view", "instance", dtype=wp.int32)
+    best: wp.array = device_array("view", "subset", dtype=wp.float32)
+
+
+class Planner:
+    """Chooses a target and a grasp for the worlds of a batch of looks. Owns its scratch; `plan` only launches."""
+
+    def __init__(self, scene: SceneData, render: RenderScene, views: int) -> None:
+        """Allocate scratch.
+
+        Args:
+            scene: Constants; instances at most 32: one bit each.
+            render: Whose meshes and surfaces the images show.
+            views: Views of a batch.
+        """
+        instances = scene.layout.instances
+        sizes = {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(scene.sight.exact_cycle, instances)}
+        self.scene = scene
+        self.meshes, self.surfaces = render.meshes, render.surfaces
+        self.device = render.device
+        self.views = views
+        self.count = allocate(VoteArrays, sizes, self.device).count
+        self.arrays = allocate(CycleArrays, sizes, self.device)
+        self.cycles = filled(Cycles, self.arrays)
+
+    def plan(self, seen: Seen, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, seed: int) -> None:
+        """Write votes and clutter graph to `sighting`, target and grasp to `plan`, for the worlds that the views name.
+
+        Args:
+            seen: Images, components and contours of at most `views` views; unused views have the world -1.
+            state: The worlds.
+            attempts: Their attempts; the outcome is that of the attempt that ended in this tick.
+            sighting: Visible, share, suction and depth are read.
+            plan: Written; a world in which nothing is visible gets the target -1 and keeps the rest.
+            seed: Of all draws.
+        """
+        self.count_votes(seen, sighting)
+        self.weigh_votes(seen, state, sighting)
+        self.order_clutter(seen, sighting)
+        self.choose_target(seen, state, attempts, sighting, plan, seed)
+        self.smooth_normal(seen, sighting, plan)
+        self.frame_grasp(seen, sighting, plan)
+
+    def count_votes(self, seen: Seen, sighting: Sighting) -> None:
+        """Votes of every contour, by kind."""
+        look, (views, instances) = seen.look, seen.look.largest.shape
+        self.count.zero_()
+        inputs = [seen.grid, self.scene.sight, seen.hits, look.world, look.component, look.largest, look.contour, look.contour_length]
+        inputs += [sighting.depth]
+        dim = (views, instances, int(CONTOUR_LANES))
+        wp.launch(count_votes_kernel, dim=dim, inputs=inputs, outputs=[self.count], device=self.device)
+
+    def weigh_votes(self, seen: Seen, state: WorldState, sighting: Sighting) -> None:
+        """Votes by weight, of neighbours in reach."""
+        look, (views, instances) = seen.look, seen.look.largest.shape
+        inputs = [self.scene.catalog, seen.cameras, self.scene.sight, state.entry, look.world, look.camera, look.contour]
+        inputs += [look.contour_length, sighting.suction, sighting.depth, self.count]
+        dim = (views, instances, instances)
+        wp.launch(weigh_votes_kernel, dim=dim, inputs=inputs, outputs=[sighting.votes], device=self.device)
+
+    def order_clutter(self, seen: Seen, sighting: Sighting) -> None:
+        """The clutter graph without cycles."""
+        inputs = [self.scene.sight, seen.look.world, sighting.votes]
+        self._launch(order_clutter_kernel, inputs, [self.cycles, sighting.above, sighting.all_above])
+
+    def choose_target(
+        self, seen: Seen, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, seed: int
+    ) -> None:
+        """The instance to pick."""
+        inputs = [wp.uint64(seed), self.scene.pick, state.address, state.mode, attempts.attempt, attempts.outcome]
+        inputs += [seen.look.world, sighting.visible, sighting.share, sighting.all_above]
+        self._launch(choose_target_kernel, inputs, [plan.target])
+
+    def smooth_normal(self, seen: Seen, sighting: Sighting, plan: Plan) -> None:
+        """Sum of the normals about the target's suction point."""
+        look = seen.look
+        inputs = [self.meshes, self.surfaces, seen.cameras, seen.grid, self.scene.sight.normal_window, seen.bodies, seen.hits]
+        inputs += [look.world, look.camera, look.component, look.largest, sighting.suction, plan.target]
+        self._launch(smooth_normal_kernel, inputs, [plan.normal])
+
+    def frame_grasp(self, seen: Seen, sighting: Sighting, plan: Plan) -> None:
+        """Grasp point, normal and the gripper's angles."""
+        inputs = [seen.cameras, self.scene.pick, plan.normal, seen.hits, seen.look.world, seen.look.camera, sighting.suction, plan.target]
+        self._launch(frame_grasp_kernel, inputs, [plan.point, plan.yaw, plan.tilt])
+
+    def _launch(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=self.views, inputs=inputs, outputs=outputs, device=self.device, block_dim=VIEW_BLOCK)
