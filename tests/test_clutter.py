@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+
 from tests.reference import planning
 from tests.reference.planning import Looks, paint, paint_shapes
 

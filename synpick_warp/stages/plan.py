@@ -64,7 +64,7 @@ class Planner:
         instances = scene.layout.instances
         sizes = {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(scene.sight.exact_cycle, instances)}
         self.scene = scene
-        self.meshes, self.surfaces = render.meshes, render.surfaces
+        self.render = render
         self.device = render.device
         self.views = views
         self.count = allocate(VoteArrays, sizes, self.device).count
@@ -122,7 +122,7 @@ class Planner:
     def smooth_normal(self, seen: Seen, sighting: Sighting, plan: Plan) -> None:
         """Sum of the normals about the target's suction point."""
         look = seen.look
-        inputs = [self.meshes, self.surfaces, seen.cameras, seen.grid, self.scene.sight.normal_window, seen.bodies, seen.hits]
+        inputs = [self.render.meshes, self.render.surfaces, seen.cameras, seen.grid, self.scene.sight.normal_window, seen.bodies, seen.hits]
         inputs += [look.world, look.camera, look.component, look.largest, sighting.suction, plan.target]
         self._launch(smooth_normal_kernel, inputs, [plan.normal])
 

@@ -20,7 +20,7 @@ from synpick_warp.stages.worlds import AttemptState
 from tests.reference import kernel_worlds
 
 FOCAL = 100.0
-ROOM = 512
+ROOM = 1024
 """Points of a contour."""
 SIGHT = {"contour_offset": 3.0, "deep_distance": 0.02, "deep_weight": 0.1, "min_votes": 5.0, "reach": 1.2, "exact_cycle": 10,
          "normal_window": 10}
