@@ -94,7 +94,10 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
     compound = np.array([len(entry.pieces) > 1 for entry in catalog.entries])
     volume = np.array([entry.volume for entry in catalog.entries])
     if volume.min() > budget:
-        raise ConfigError(f"arrangement.volume is {budget:g} m³, but the smallest object takes {volume.min():.3g} m³; make it larger")
+        least = catalog.entries[int(volume.argmin())]
+        raise ConfigError(
+            f"arrangement.volume is {budget:g} m³, but the smallest object, {least.name}, takes {least.volume:.3g} m³; make it larger"
+        )
     needed = []
     for repeats in repeats_that_occur(config):
         drawn = _draw_trials(volume, budget, config.arrangement.max_objects, repeats)

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.distance import cdist
+from trimesh.bounds import oriented_bounds
 
-from synpick_warp.configs.schema import Config, ObjectRow, Objects
+from synpick_warp.configs.schema import Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.appearance import Finish
 from synpick_warp.scenes.collision import collision_shapes, default_cache_dir
@@ -28,6 +29,9 @@ _LEAST_DIAMETER = 2e-3
 # An origin farther than this many diameters from the farthest vertex lies well outside the body, whose bounding sphere about
 # the origin (which spaces the drop) would be mostly empty.
 _FARTHEST_ORIGIN = 1.5
+# Masses outside have no inverse, or none of use, in 32-bit numbers [kg].
+_MASSES = (1e-7, 1e4)
+_UNITS = "files named obj_NNNNNN.ply are read in millimetres, all others in metres"
 
 
 def _say_nothing(line: str) -> None:
@@ -46,18 +50,17 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
         report: Takes one line of progress at a time.
 
     Raises:
-        CatalogError: The folder or one of its files cannot be used.
+        CatalogError: The folder or one of its files cannot be used, or an object is too large for the tote or has no sensible mass.
     """
     folder = Path(config.bake.models).expanduser()
     raws = _read_folder(folder, config, report) if config.bake.models else procedural_objects()
     origins = [str(raw.source or raw.name) for raw in raws]
     hulls = [_checked_hull_volume(raw, origin, config) for raw, origin in zip(raws, origins, strict=True)]
+    masses = [_checked_mass(raw, hull, origin, config) for raw, hull, origin in zip(raws, hulls, origins, strict=True)]
     recipes = [_recipe(raw, hull, config.objects) for raw, hull in zip(raws, hulls, strict=True)]
     shapes = collision_shapes([raw.name for raw in raws], [raw.mesh for raw in raws], recipes, cache_dir or default_cache_dir(), report)
-    entries = [
-        _entry(raw, pieces, raw.mass if raw.mass is not None else config.objects.density * hull)
-        for raw, pieces, hull in zip(raws, shapes, hulls, strict=True)
-    ]
+    entries = [_entry(raw, pieces, mass) for raw, pieces, mass in zip(raws, shapes, masses, strict=True)]
+    _report_never_drawn(entries, config.arrangement.volume, report)
     return Catalog(tuple(sorted(entries, key=lambda entry: entry.obj_id)))
 
 
@@ -149,24 +152,61 @@ def _fits(row: ObjectRow, size: float, tolerance: float) -> bool:
 
 
 def _checked_hull_volume(raw: RawObject, origin: str, config: Config) -> float:
-    """Volume of the convex hull [m³] of an object whose size, place and mass are fit for the tote."""
+    """Volume of the convex hull [m³] of an object whose size and place are fit for the tote."""
     volume = hull_volume(raw.mesh.vertices)
     if volume == 0.0:
         raise CatalogError(f"{origin}: all vertices lie in one plane; a body needs a volume")
-    size, most = diameter(raw.mesh.vertices), float(np.linalg.norm(config.tote.outer_size))
-    if not _LEAST_DIAMETER <= size <= most:
-        raise CatalogError(
-            f"{origin}: diameter {size:.4g} m, but the tote takes {_LEAST_DIAMETER:g} to {most:.3g} m; "
-            "files named obj_NNNNNN.ply are read in millimetres, all others in metres"
-        )
+    size = diameter(raw.mesh.vertices)
+    if size < _LEAST_DIAMETER:
+        raise CatalogError(f"{origin}: diameter {size:.4g} m; a body needs at least {_LEAST_DIAMETER:g} m; {_UNITS}")
+    _check_room(raw.mesh.vertices, size, origin, config.tote)
     radius = float(np.linalg.norm(raw.mesh.vertices, axis=1).max())
     if radius > _FARTHEST_ORIGIN * size:
         raise CatalogError(
             f"{origin}: a vertex lies {radius:.4g} m from the origin, but the body's diameter is {size:.4g} m; move the mesh to its origin"
         )
-    if raw.mass is not None and not 0.0 < raw.mass < np.inf:
-        raise CatalogError(f"{origin}: mass {raw.mass:g} kg; a mass must be above 0")
     return volume
+
+
+def _check_room(vertices: np.ndarray, size: float, origin: str, tote: Tote) -> None:
+    """Refuse an object of this diameter [m] that cannot lie in the tote, or cannot pass its opening upright, in any pose.
+
+    It passes if the two smaller sides of a box about it are no longer than the opening's. The box along the object's own axes is tried
+    first, since the least box takes long to find for fine meshes.
+    """
+    inside = float(np.linalg.norm((*tote.rim_size, tote.outer_size[2] - tote.wall)))
+    opening = sorted(tote.rim_size)
+    box = sorted(np.ptp(vertices, axis=0).tolist())
+    if size <= inside and box[0] <= opening[0] and box[1] <= opening[1]:
+        return
+    box = sorted(oriented_bounds(vertices)[1].tolist())
+    if size <= inside and box[0] <= opening[0] and box[1] <= opening[1]:
+        return
+    raise CatalogError(
+        f"{origin}: too large for the tote: {_by(box)} m, {size:.4g} m from end to end, but the tote's opening is {_by(opening)} m, "
+        f"and {inside:.3g} m the longest way through it; {_UNITS}"
+    )
+
+
+def _by(sides: list[float]) -> str:
+    return " x ".join(f"{side:.3g}" for side in sides)
+
+
+def _checked_mass(raw: RawObject, hull: float, origin: str, config: Config) -> float:
+    """Mass [kg]: the object's own, or by the density over its hull's volume [m³]."""
+    mass = config.objects.density * hull if raw.mass is None else raw.mass
+    if not _MASSES[0] <= mass <= _MASSES[1]:
+        source = "by objects.density" if raw.mass is None else "in its row of the object table"
+        raise CatalogError(f"{origin}: mass {mass:g} kg {source}; allowed: {_MASSES[0]:g} to {_MASSES[1]:g} kg")
+    return mass
+
+
+def _report_never_drawn(entries: list[CatalogEntry], budget: float, report: Callable[[str], None]) -> None:
+    """Name the objects that alone exceed the volume budget [m³]. That all of them do is a mistake, found when slots are counted."""
+    never = [entry for entry in entries if entry.volume > budget]
+    if never and len(never) < len(entries):
+        names = ", ".join(f"{entry.name} ({entry.volume:.3g} m³)" for entry in never)
+        report(f"never drawn, since larger than arrangement.volume, {budget:g} m³: {names}")
 
 
 def _recipe(raw: RawObject, hull: float, objects: Objects) -> ShapeRecipe:

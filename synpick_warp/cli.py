@@ -70,7 +70,7 @@ def bake(
     config: ConfigOption = None,
     worlds: WorldsOption = None,
     episodes: Annotated[int | None, Parameter(help=_help("bake.episodes"))] = None,
-    mode: Annotated[str | None, Parameter(help=_help("bake.mode"))] = None,
+    mode: Annotated[str | None, Parameter(help=_help("bake.mode", " Weights of mixed: --set bake.mix=[pick, target, move]."))] = None,
     seed: Annotated[int | None, Parameter(help=_help("bake.seed"))] = None,
     device: DeviceOption = None,
     models: Annotated[str | None, Parameter(help=_help("bake.models"))] = None,

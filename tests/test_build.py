@@ -278,7 +278,7 @@ def test_no_kind_takes_more_slots_than_there_is_room_for_objects(objects):
 @pytest.mark.parametrize("mode", ["move", "pick"])
 def test_a_budget_below_the_smallest_object_is_a_mistake(objects, mode):
     config = settings(arrangement__volume=1e-4, bake__mode=mode)
-    with pytest.raises(ConfigError, match=r"arrangement\.volume is 0\.0001 m³, but the smallest object takes 0\.000125 m³; make it larger"):
+    with pytest.raises(ConfigError, match=r"volume is 0\.0001 m³, but the smallest object, boxes_3, takes 0\.000125 m³; make it larger"):
         build.count_slots(config, objects)
 
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.configs.load import load_config
-from synpick_warp.configs.schema import Bake, Config, ObjectRow, Objects
+from synpick_warp.configs.schema import Arrangement, Bake, Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes import catalog
 from synpick_warp.scenes.catalog import diameter, load_catalog
@@ -170,8 +170,8 @@ def test_two_files_for_one_object(tmp_path):
 @pytest.mark.parametrize(
     ("extents", "offset", "words"),
     [
-        ((100, 100, 100), (0, 0, 0), ("173.2 m", "millimetres")),
-        ((1e-4, 1e-4, 1e-4), (0, 0, 0), ("0.0001732 m",)),
+        ((100, 100, 100), (0, 0, 0), ("too large for the tote", "173.2 m", "millimetres")),
+        ((1e-4, 1e-4, 1e-4), (0, 0, 0), ("0.0001732 m", "millimetres")),
         ((0.1, 0.1, 0), (0, 0, 0), ("one plane",)),
         ((0.1, 0.1, 0.1), (1, 0, 0), ("origin",)),
     ],
@@ -181,9 +181,68 @@ def test_sizes_and_places_that_cannot_be_meant(tmp_path, extents, offset, words)
     fails(config_for(tmp_path), tmp_path, "thing", *words)
 
 
-def test_a_mass_must_be_positive(tmp_path):
+@pytest.mark.parametrize("mass", [0.0, -1.0, 1e-9, 1e5, np.inf, np.nan])
+def test_a_mass_must_be_one_that_bodies_have(tmp_path, mass):
     write_box(tmp_path / "thing.ply")
-    fails(config_for(tmp_path, (ObjectRow(name="thing", mass=0.0),)), tmp_path, "thing", "mass 0 kg")
+    said = f"mass {mass:g} kg in its row of the object table; allowed: 1e-07 to 10000 kg"
+    fails(config_for(tmp_path, (ObjectRow(name="thing", mass=mass),)), tmp_path, "thing", said)
+
+
+def test_a_density_that_leaves_no_mass(tmp_path):
+    write_box(tmp_path / "thing.ply")
+    fails(config_for(tmp_path, density=1e-12), tmp_path, "thing", "mass 1e-15 kg by objects.density")
+
+
+def turned_box(file: Path, extents: tuple[float, float, float], seed: int | None) -> Path:
+    """A box in some rotation: the pose in the file must not count."""
+    box = trimesh.creation.box(np.array(extents))
+    if seed is not None:
+        box.apply_transform(trimesh.transformations.random_rotation_matrix(np.random.default_rng(seed).uniform(size=3)))
+    file.write_bytes(box.export(file_type="ply"))
+    return file
+
+
+@pytest.mark.parametrize("seed", [None, 1, 2])
+@pytest.mark.parametrize(
+    ("extents", "said"),
+    [
+        ((0.4, 0.41, 0.42), "0.4 x 0.41 x 0.42 m, 0.7103 m from end to end, "),
+        ((0.36, 0.37, 0.38), "0.36 x 0.37 x 0.38 m, 0.641 m from end to end, "),
+        ((0.02, 0.55, 0.3), ""),
+        ((0.02, 0.57, 0.56), "0.02 x 0.56 x 0.57 m, "),
+        ((0.7, 0.03, 0.03), "0.03 x 0.03 x 0.7 m, 0.7013 m from end to end, but "),
+        ((0.6, 0.03, 0.03), ""),
+        ((0.54, 0.34, 0.1), ""),
+        ((0.3, 0.3, 0.3), ""),
+    ],
+)
+def test_objects_that_the_tote_cannot_take(tmp_path, extents, said, seed):
+    """By their tightest box, however they lie in their file. Those that it can take come to rest in simulations."""
+    write_box(tmp_path / "a.ply")
+    turned_box(tmp_path / "thing.ply", extents, seed)
+    if said:
+        tote = "but the tote's opening is 0.352 x 0.545 m, and 0.678 m the longest way through it; "
+        fails(config_for(tmp_path), tmp_path, f"thing: too large for the tote: {said}", tote, "millimetres")
+    else:
+        assert len(load(config_for(tmp_path), tmp_path)) == 2
+
+
+def test_a_small_tote_takes_small_objects(tmp_path):
+    write_box(tmp_path / "thing.ply", (0.2, 0.2, 0.2))
+    small = Tote(outer_size=(0.3, 0.2, 0.1), floor_size=(0.2, 0.1), rim_size=(0.25, 0.15))
+    fails(replace(config_for(tmp_path), tote=small), tmp_path, "thing", "opening is 0.15 x 0.25 m")
+
+
+def test_objects_that_no_budget_allows_are_named(tmp_path):
+    write_box(tmp_path / "large.ply", (0.2, 0.2, 0.2))
+    write_box(tmp_path / "small.ply")
+    lines: list[str] = []
+    assert len(load_catalog(config_for(tmp_path), tmp_path / "cache", lines.append)) == 2
+    assert lines == ["never drawn, since larger than arrangement.volume, 0.007 m³: large (0.008 m³)"]
+    roomy = replace(config_for(tmp_path), arrangement=Arrangement(volume=0.0081))
+    lines.clear()
+    load_catalog(roomy, tmp_path / "cache", lines.append)
+    assert not lines
 
 
 @pytest.mark.parametrize(

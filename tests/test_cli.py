@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import trimesh
 import warp as wp
 from rich.console import Console
 
@@ -103,7 +104,12 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
         (["--resolution", "0x0"], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
         (["--resolution", "640"], '--resolution is "640"; allowed: WIDTHxHEIGHT in pixels, such as 640x360'),
         (["--resolution", "640x-1"], '--resolution is "640x-1"; allowed: WIDTHxHEIGHT in pixels, such as 640x360'),
-        (["--mode", "juggle"], 'bake.mode is "juggle" on the command line; allowed: move'),
+        (["--mode", "juggle"], 'bake.mode is "juggle" on the command line; allowed: pick, target, move, mixed'),
+        (["--mode", "mvoe"], 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed; did you mean move?'),
+        (["--mode", ""], 'bake.mode is "" on the command line; allowed: pick, target, move, mixed'),
+        (["--mode", "mixed", "--set", "bake.mix=[0, 0, 0]"], "bake.mix is [0.0, 0.0, 0.0] on the command line; allowed: at least one "),
+        (["--mode", "mixed", "--set", "bake.mix=pick"], 'bake.mix is "pick" on the command line; allowed: 3 numbers in a list'),
+        (["--set", "suction.poor_force=50"], "suction.poor_force is 50.0 on the command line; allowed: at most suction.good_force, 40 [N]"),
         (["--device", "tpu"], 'bake.device is "tpu"; allowed: cpu, cuda:N such as cuda:0, or auto'),
         (["--models", "no-such"], "there is no models folder no-such; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes"),
         (["--lights", "no-such"], "there is no lights folder no-such; --lights takes a folder of .hdr maps and sIBL sets"),
@@ -133,7 +139,7 @@ def test_a_gpu_that_is_not_there(tmp_path, bakes, capsys):
 def test_unknown_key_in_a_file(tmp_path, bakes, capsys):
     (tmp_path / "my.toml").write_text("[bake]\nworld = 3\n")
     said = mistake(capsys, "bake", "--out", str(tmp_path / "data"), "--config", str(tmp_path / "my.toml"))
-    assert said.startswith(f"there is no key bake.world, set in {tmp_path / 'my.toml'}; keys of bake: mode, worlds, ")
+    assert said.startswith(f"there is no key bake.world, set in {tmp_path / 'my.toml'}; keys of bake: mode, mix, worlds, ")
     assert said.endswith("did you mean worlds?")
 
 
@@ -194,6 +200,20 @@ def test_help_shows_units_and_defaults(capsys):
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "default 1920x1080 px; cameras.resolution" in text
     assert "Totes simulated side by side. (at least 1, at most 65536; default 4; bake.worlds)" in text
+
+
+def test_help_says_how_modes_are_mixed(capsys):
+    assert main(["bake", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "Weights of mixed: --set bake.mix=[pick, target, move]" in text
+    assert "(pick, target, move, mixed; default pick; bake.mode)" in text
+
+
+@pytest.mark.parametrize("mode", ["pick", "target", "move", "mixed"])
+def test_every_mode_is_passed_on(tmp_path, bakes, mode):
+    assert main(["bake", "--out", str(tmp_path), "--device", "cpu", "--mode", mode, "--set", "bake.mix=[1, 2, 0]"]) == 0
+    [(config, _)] = bakes.calls
+    assert (config.bake.mode, config.bake.mix) == (mode, (1.0, 2.0, 0.0))
 
 
 def test_config_prints_what_it_would_use(capsys):
@@ -294,3 +314,34 @@ def test_models_that_cannot_be_used(tmp_path, capsys, ply):
     said = mistake(capsys, "bake", "--config", "smoke", "--device", "cpu", "--models", str(models), "--out", str(tmp_path / "data"))
     assert "obj_000001.ply" in said
     assert not (tmp_path / "data").exists()
+
+
+def boxes(folder: Path, *sides: float) -> None:
+    """A folder of cubes with these sides [m], as OBJ files."""
+    folder.mkdir()
+    for number, side in enumerate(sides):
+        (folder / f"cube_{number}.obj").write_bytes(trimesh.creation.box((side, side, side)).export(file_type="obj").encode())
+
+
+@needs_bake
+@pytest.mark.parametrize(
+    ("sides", "settings", "said"),
+    [
+        ((), "", "models folder {models}: no models in it; "),
+        ((0.05, 0.6), "", "cube_1: too large for the tote: 0.6 x 0.6 x 0.6 m, 1.039 m from end to end, but the tote's opening is "),
+        ((0.05, 50.0), "", "cube_1: too large for the tote: 50 x 50 x 50 m, "),
+        ((0.25, 0.2), "", "arrangement.volume is 0.003 m³, but the smallest object, cube_1, takes 0.008 m³; make it larger"),
+        ((0.05,), '[[object_rows]]\nid = 1\nname = "cube_0"\ndiameter = 0.0866\nmass = 0\n', "object_rows[0].mass is 0 in {file}; "),
+        ((0.05,), '[[object_rows]]\nid = 1\nname = "cube_0"\ndiameter = 0.0866\nmass = 1e-30\n', "cube_0: mass 1e-30 kg in its row "),
+        ((0.05,), "[objects]\ndensity = 1e-12\n", "cube_0: mass 1.25e-16 kg by objects.density; "),
+    ],
+    ids=["empty", "too large", "millimetres", "over budget", "no mass", "hardly a mass", "hardly a density"],
+)
+def test_objects_that_cannot_be_baked(tmp_path, capsys, sides, settings, said):
+    """One line, before anything is simulated, and nothing in the data set's place."""
+    models, file, out = tmp_path / "models", tmp_path / "my.toml", tmp_path / "deep" / "data"
+    boxes(models, *sides)
+    file.write_text(f'preset = "smoke"\n{settings}')
+    heard = mistake(capsys, "bake", "--config", str(file), "--device", "cpu", "--models", str(models), "--out", str(out))
+    assert heard.startswith(said.format(models=models, file=file))
+    assert not out.parent.exists()
