@@ -88,7 +88,7 @@ def test_unused_views_write_nothing(device):
     assert votes[0, 0, 1] == 40
     assert (votes[1] == 7.0).all()
     made.sighting.above.fill_(3)
-    made.planner.order_clutter(made.seen, made.sighting)
+    made.planner.order_clutter(made.scene, made.seen, made.sighting)
     assert made.sighting.above.numpy().tolist() == [[2, 0, 0, 0, 0], [3] * 5]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -124,13 +125,15 @@ class Grasps:
                                    single_slots=instances, compound_slots=0)
         filled(self.worlds.scene.sight, {**planning.SIGHT, "normal_window": window})
         self.worlds.scene.pick.tilt_limit = tilt_limit
-        self.planner = Planner(self.worlds.scene, scene, views)
-        self.seen = SimpleNamespace(look=self.look, hits=renderer.hits, bodies=renderer.bodies, cameras=scene.cameras, grid=scene.grid)
+        self.scene = self.worlds.scene
+        self.seen: Any = SimpleNamespace(scene=scene, look=self.look, hits=renderer.hits, bodies=renderer.bodies, cameras=scene.cameras,
+                                         grid=scene.grid)
+        self.planner = Planner(toy.settings(), self.seen, device)
 
     def frame(self) -> Plan:
         self.sighting.suction.assign(self.suction)
-        self.planner.smooth_normal(self.seen, self.sighting, self.grasp)
-        self.planner.frame_grasp(self.seen, self.sighting, self.grasp)
+        self.planner.smooth_normal(self.scene, self.seen, self.sighting, self.grasp)
+        self.planner.frame_grasp(self.scene, self.seen, self.sighting, self.grasp)
         return self.grasp
 
 
@@ -245,7 +248,7 @@ def test_all_of_planning_in_one_go(device):
         getattr(made.sighting, name).assign(made.found[name])
     made.grasp.target.fill_(7)
     worlds.state.mode.assign(np.array([phases.PICK, phases.TARGET, phases.PICK, phases.PICK]))
-    made.planner.plan(made.seen, worlds.state, attempts, made.sighting, made.grasp, 0)
+    made.planner.plan(made.scene, made.seen, worlds.state, attempts, made.sighting, made.grasp, 0)
     assert made.sighting.above.numpy().tolist() == [[0b10, 0, 0, 0], [0, 0b01, 0, 0], [0] * 4, [0] * 4]
     assert made.grasp.target.numpy().tolist() == [1, 1, -1, 7]
     np.testing.assert_allclose(made.grasp.normal.numpy()[:2], [(np.sin(0.1), 0, np.cos(0.1)), (0, 0, 1)], atol=1e-5)

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
+from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.acyclic import Cycles, order_clutter_kernel
 from synpick_warp.kernels.choice import choose_target_kernel
 from synpick_warp.kernels.clutter import CONTOUR_LANES, count_votes_kernel, weigh_votes_kernel
@@ -25,6 +26,7 @@ VIEW_BLOCK = 32
 class Seen(Protocol):
     """What planning needs of the images of a batch."""
 
+    scene: RenderScene
     look: LookArrays
     hits: Any
     bodies: Any
@@ -53,82 +55,82 @@ class CycleArrays:
 class Planner:
     """Chooses a target and a grasp for the worlds of a batch of looks. Owns its scratch; `plan` only launches."""
 
-    def __init__(self, scene: SceneData, render: RenderScene, views: int) -> None:
-        """Allocate scratch.
+    def __init__(self, config: Config, seen: Seen, device: wp.Device) -> None:
+        """Allocate scratch for as many views and instances as the images have room for.
 
         Args:
-            scene: Constants; instances at most 32: one bit each.
-            render: Whose meshes and surfaces the images show.
-            views: Views of a batch.
+            config: All settings.
+            seen: Images of a batch; instances at most 32: one bit each.
+            device: Where they are.
         """
-        instances = scene.layout.instances
-        sizes = {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(scene.sight.exact_cycle, instances)}
-        self.scene = scene
-        self.render = render
-        self.device = render.device
-        self.views = views
-        self.count = allocate(VoteArrays, sizes, self.device).count
-        self.arrays = allocate(CycleArrays, sizes, self.device)
+        self.views, instances = seen.look.largest.shape
+        sizes = {"view": self.views, "instance": instances, "kind": 2, "subset": 1 << min(config.sight.exact_cycle, instances)}
+        self.device = device
+        self.count = allocate(VoteArrays, sizes, device).count
+        self.arrays = allocate(CycleArrays, sizes, device)
         self.cycles = filled(Cycles, self.arrays)
 
-    def plan(self, seen: Seen, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, seed: int) -> None:
+    def plan(
+        self, scene: SceneData, seen: Seen, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, seed: int
+    ) -> None:
         """Write votes and clutter graph to `sighting`, target and grasp to `plan`, for the worlds that the views name.
 
         Args:
-            seen: Images, components and contours of at most `views` views; unused views have the world -1.
+            scene: Constants.
+            seen: Images, components and contours; unused views have the world -1.
             state: The worlds.
             attempts: Their attempts; the outcome is that of the attempt that ended in this tick.
             sighting: Visible, share, suction and depth are read.
             plan: Written; a world in which nothing is visible gets the target -1 and keeps the rest.
             seed: Of all draws.
         """
-        self.count_votes(seen, sighting)
-        self.weigh_votes(seen, state, sighting)
-        self.order_clutter(seen, sighting)
-        self.choose_target(seen, state, attempts, sighting, plan, seed)
-        self.smooth_normal(seen, sighting, plan)
-        self.frame_grasp(seen, sighting, plan)
+        self.count_votes(scene, seen, sighting)
+        self.weigh_votes(scene, seen, state, sighting)
+        self.order_clutter(scene, seen, sighting)
+        self.choose_target(scene, seen, state, attempts, sighting, plan, seed)
+        self.smooth_normal(scene, seen, sighting, plan)
+        self.frame_grasp(scene, seen, sighting, plan)
 
-    def count_votes(self, seen: Seen, sighting: Sighting) -> None:
+    def count_votes(self, scene: SceneData, seen: Seen, sighting: Sighting) -> None:
         """Votes of every contour, by kind."""
         look, (views, instances) = seen.look, seen.look.largest.shape
         self.count.zero_()
-        inputs = [seen.grid, self.scene.sight, seen.hits, look.world, look.component, look.largest, look.contour, look.contour_length]
+        inputs = [seen.grid, scene.sight, seen.hits, look.world, look.component, look.largest, look.contour, look.contour_length]
         inputs += [sighting.depth]
         dim = (views, instances, int(CONTOUR_LANES))
         wp.launch(count_votes_kernel, dim=dim, inputs=inputs, outputs=[self.count], device=self.device)
 
-    def weigh_votes(self, seen: Seen, state: WorldState, sighting: Sighting) -> None:
+    def weigh_votes(self, scene: SceneData, seen: Seen, state: WorldState, sighting: Sighting) -> None:
         """Votes by weight, of neighbours in reach."""
         look, (views, instances) = seen.look, seen.look.largest.shape
-        inputs = [self.scene.catalog, seen.cameras, self.scene.sight, state.entry, look.world, look.camera, look.contour]
+        inputs = [scene.catalog, seen.cameras, scene.sight, state.entry, look.world, look.camera, look.contour]
         inputs += [look.contour_length, sighting.suction, sighting.depth, self.count]
         dim = (views, instances, instances)
         wp.launch(weigh_votes_kernel, dim=dim, inputs=inputs, outputs=[sighting.votes], device=self.device)
 
-    def order_clutter(self, seen: Seen, sighting: Sighting) -> None:
+    def order_clutter(self, scene: SceneData, seen: Seen, sighting: Sighting) -> None:
         """The clutter graph without cycles."""
-        inputs = [self.scene.sight, seen.look.world, sighting.votes]
+        inputs = [scene.sight, seen.look.world, sighting.votes]
         self._launch(order_clutter_kernel, inputs, [self.cycles, sighting.above, sighting.all_above])
 
     def choose_target(
-        self, seen: Seen, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, seed: int
+        self, scene: SceneData, seen: Seen, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, seed: int
     ) -> None:
         """The instance to pick."""
-        inputs = [wp.uint64(seed), self.scene.pick, state.address, state.mode, attempts.attempt, attempts.outcome]
+        inputs = [wp.uint64(seed), scene.pick, state.address, state.mode, attempts.attempt, attempts.outcome]
         inputs += [seen.look.world, sighting.visible, sighting.share, sighting.all_above]
         self._launch(choose_target_kernel, inputs, [plan.target])
 
-    def smooth_normal(self, seen: Seen, sighting: Sighting, plan: Plan) -> None:
+    def smooth_normal(self, scene: SceneData, seen: Seen, sighting: Sighting, plan: Plan) -> None:
         """Sum of the normals about the target's suction point."""
         look = seen.look
-        inputs = [self.render.meshes, self.render.surfaces, seen.cameras, seen.grid, self.scene.sight.normal_window, seen.bodies, seen.hits]
+        inputs = [seen.scene.meshes, seen.scene.surfaces, seen.cameras, seen.grid, scene.sight.normal_window, seen.bodies, seen.hits]
         inputs += [look.world, look.camera, look.component, look.largest, sighting.suction, plan.target]
         self._launch(smooth_normal_kernel, inputs, [plan.normal])
 
-    def frame_grasp(self, seen: Seen, sighting: Sighting, plan: Plan) -> None:
+    def frame_grasp(self, scene: SceneData, seen: Seen, sighting: Sighting, plan: Plan) -> None:
         """Grasp point, normal and the gripper's angles."""
-        inputs = [seen.cameras, self.scene.pick, plan.normal, seen.hits, seen.look.world, seen.look.camera, sighting.suction, plan.target]
+        inputs = [seen.cameras, scene.pick, plan.normal, seen.hits, seen.look.world, seen.look.camera, sighting.suction, plan.target]
         self._launch(frame_grasp_kernel, inputs, [plan.point, plan.yaw, plan.tilt])
 
     def _launch(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.arrays import allocate
+from synpick_warp.configs.schema import Config, Sight
 from synpick_warp.kernels.hits import Hits
 from synpick_warp.scenes.shapes import Camera
 from synpick_warp.stages.plan import Planner
@@ -63,19 +64,20 @@ class Looks:
         self.hits.code.assign((ids + 1).astype(np.uint8))
         self.hits.depth.assign(depths)
         camera = Camera(width, height, np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1.0]]), np.eye(3), np.zeros(3))
-        self.seen = SimpleNamespace(look=self.look, hits=filled(Hits, self.hits), bodies=None, cameras=build_cameras((camera,), device),
-                                    grid=build_grid(width, height))
+        self.seen: Any = SimpleNamespace(scene=None, look=self.look, hits=filled(Hits, self.hits), bodies=None,
+                                         cameras=build_cameras((camera,), device), grid=build_grid(width, height))
         self.found = look_at(ids, depths, instances)
         self.look.world.assign(np.arange(self.views))
         for name in ("component", "largest", "contour", "contour_length"):
             getattr(self.look, name).assign(self.found[name])
         for name in ("visible", "suction", "depth", "share"):
             getattr(self.sighting, name).assign(self.found[name])
-        self.planner = Planner(self.worlds.scene, SimpleNamespace(meshes=None, surfaces=None, device=device), self.views)
+        self.scene = self.worlds.scene
+        self.planner = Planner(Config(sight=Sight(exact_cycle=self.scene.sight.exact_cycle)), self.seen, device)
 
     def votes(self) -> np.ndarray:
-        self.planner.count_votes(self.seen, self.sighting)
-        self.planner.weigh_votes(self.seen, self.worlds.state, self.sighting)
+        self.planner.count_votes(self.scene, self.seen, self.sighting)
+        self.planner.weigh_votes(self.scene, self.seen, self.worlds.state, self.sighting)
         return self.sighting.votes.numpy()
 
     def graph(self, votes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -84,12 +86,12 @@ class Looks:
             self.votes()
         else:
             self.sighting.votes.assign(votes)
-        self.planner.order_clutter(self.seen, self.sighting)
+        self.planner.order_clutter(self.scene, self.seen, self.sighting)
         bits = np.arange(self.look.largest.shape[1])
         return tuple((array.numpy()[..., None] >> bits) & 1 == 1 for array in (self.sighting.above, self.sighting.all_above))
 
     def choose(self, seed: int = 0) -> list[int]:
-        self.planner.choose_target(self.seen, self.worlds.state, self.attempts, self.sighting, self.target, seed)
+        self.planner.choose_target(self.scene, self.seen, self.worlds.state, self.attempts, self.sighting, self.target, seed)
         return self.target.target.numpy().tolist()
 
 
