@@ -95,6 +95,20 @@ def body_of(code: int, instances: int) -> int:
 
 
 @wp.kernel
+def aim_views_kernel(
+    # In:
+    view_world: wp.array[int],
+    # Out:
+    view_camera_out: wp.array[int],
+):
+    """Views of a world look through camera 0, views of none (-1) through none (-1)."""
+    view = wp.tid()
+    view_camera_out[view] = 0
+    if view_world[view] < 0:
+        view_camera_out[view] = -1
+
+
+@wp.kernel
 def prepare_bodies_kernel(
     # Scene:
     meshes: Meshes,
@@ -112,13 +126,18 @@ def prepare_bodies_kernel(
     # Out:
     bodies_out: Bodies,
 ):
-    """Place every body of a view's world before the view's camera: x_camera = R (x_world - c), in float64, stored in float32."""
+    """Place every body of a view's world before the view's camera: x_camera = R (x_world - c), in float64, stored in float32.
+
+    A view of no world (-1) has no bodies.
+    """
     view, body = wp.tid()
     world = view_world[view]
     camera = view_camera[view]
     mesh = int(-1)
     placed = wp.transform_identity(dtype=float)
-    if body < instances:
+    if world < 0:
+        mesh = -1
+    elif body < instances:
         mesh = entry[world, body]
         placed = pose[world, body]
     elif fixture_visible[world, body - instances] != 0:
@@ -301,7 +320,7 @@ def trace_sample_kernel(
     # Out:
     hits_out: Hits,
 ):
-    """Cast one ray through each pixel, `offset` [px] off its centre: a colour sample, nearest hit only."""
+    """Cast one ray through each pixel, `offset` [px] off its centre: a colour sample, nearest hit only. No camera (-1): no rays."""
     pixel = tile_pixel(grid, wp.tid() + first)
     view = pixel[0]
     row = pixel[1]
@@ -309,6 +328,8 @@ def trace_sample_kernel(
     if row >= grid.height or column >= grid.width:
         return
     camera = view_camera[view]
+    if camera < 0:
+        return
     ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
     hit = trace_camera_ray(meshes, bodies, view, row, column, ray, instances, False)
     store_hit(hits_out, view, row, column, hit_table(table, cameras, camera, ray, hit))

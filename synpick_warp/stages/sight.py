@@ -19,7 +19,7 @@ class LookArrays:
     world: wp.array = device_array("view", dtype=wp.int32)
     """World of each view; -1: the view is not in use."""
     camera: wp.array = device_array("view", dtype=wp.int32)
-    """Zero: all look through camera 0."""
+    """Zero: all look through camera 0; -1: the view is not in use."""
     component: wp.array = device_array("view", "row", "column", dtype=wp.int32)
     """Connected component of pixels (8 neighbours) of one instance: the least row-major index of its pixels; -1: no instance."""
     area: wp.array = device_array("view", "row", "column", dtype=wp.int32, unit="px")
@@ -27,7 +27,8 @@ class LookArrays:
     largest: wp.array = device_array("view", "instance", dtype=wp.int32)
     """Largest component of each instance, the one with the least index of equal ones; -1: the instance is not visible."""
     distance: wp.array = device_array("view", "row", "column", dtype=wp.float32, unit="px")
-    """Distance to the centre of the nearest pixel that is not of the same component; what lies beyond the border is not. 0: no instance."""
+    """Distance to the centre of the nearest pixel that is not of the same component; what lies beyond the border is not. 0: no instance,
+    or not the largest component of one."""
     contour: wp.array = device_array("view", "instance", "point", dtype=wp.vec2i, unit="px")
     """Outer contour of the largest component, in order, as OpenCV's findContours with CHAIN_APPROX_NONE has it."""
     contour_length: wp.array = device_array("view", "instance", dtype=wp.int32)
