@@ -126,10 +126,7 @@ def prepare_bodies_kernel(
     # Out:
     bodies_out: Bodies,
 ):
-    """Place every body of a view's world before the view's camera: x_camera = R (x_world - c), in float64, stored in float32.
-
-    A view of no world (-1) has no bodies.
-    """
+    """Place bodies of a view's world (-1: none) before the view's camera: x_camera = R (x_world - c), in float64, stored in float32."""
     view, body = wp.tid()
     world = view_world[view]
     camera = view_camera[view]
