@@ -36,7 +36,7 @@ class Looker:
         self.scene, self.state, self.attempts, self.sighting, self.plan = scene, state, attempts, sighting, plan
         self.seed = config.bake.seed
         self.device = state.phase.device
-        self.sight = Sight(config, render_scene, self.device)
+        self.sight = Sight(config, render_scene, config.arrangement.max_objects)
         self.planner = Planner(config, self.sight, self.device)
         self._looker = wp.zeros(state.phase.shape[0], dtype=wp.int32, device=self.device)
         self._count, self._first, self._left = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(3))

@@ -15,6 +15,8 @@ from synpick_warp.scenes.shapes import Catalog
 from synpick_warp.stages import act, arrange
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData, make_scene_data
+from synpick_warp.stages.hold import Suction
+from synpick_warp.stages.look import Looker
 from synpick_warp.stages.physics import Physics
 from synpick_warp.stages.render_scene import RenderScene
 from synpick_warp.stages.sight import Plan, Sighting
@@ -63,14 +65,11 @@ class Simulation:
         self.sighting = allocate(Sighting, sizes, device)
         self.plan = allocate(Plan, sizes, device)
         self.records = tuple(self._make_record(sizes) for _ in range(RECORDS))
-        self.suction = None
-        self.looker = None
+        self.suction: Suction | None = None
+        self.looker: Looker | None = None
         if self.scene.mode.pick_or_target_share > 0.0:
             if render_scene is None:
                 raise ValueError("episodes that pick need a render_scene to look at")
-            from synpick_warp.stages.hold import Suction
-            from synpick_warp.stages.look import Looker
-
             self.suction = Suction(config, catalog, render_scene, device)
             self.looker = Looker(config, render_scene, self.scene, self.state, self.attempts, self.sighting, self.plan)
 
@@ -86,7 +85,7 @@ class Simulation:
         arrange.set_guides(scene, state, physics)
         act.set_fingers(scene, state, physics)
         self.seals.peak.zero_()
-        physics.tick(self._drive, self._let_go_of_contacts) if self.suction else physics.tick(self._drive)
+        physics.tick(self._drive, self._let_go_of_contacts)
         arrange.judge_settling(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
         act.begin_moving(scene, state, physics, seed)
