@@ -192,6 +192,24 @@ def test_each_mode_has_its_own_rule_of_repeating(device):
     np.testing.assert_array_equal(count, np.where(moving, 8, 3))
 
 
+@pytest.mark.parametrize("mix", [(1.0, 0.0, 0.0), (1.0, 1.0, 2.0)])
+def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
+    """What scenes.build counts is enough for what the device draws, but for the accepted share."""
+    shortfall, episodes = 0.02, 2000
+    config = small_worlds.settings(bake__mode="mixed", bake__mix=list(mix), arrangement__volume=1.2e-3, arrangement__max_objects=12,
+                                   arrangement__slot_shortfall=shortfall)
+    objects = small_worlds.catalog()
+    single, compound = build.count_slots(config, objects)
+    worlds = made(device, episodes, mix, volume=np.array([entry.volume for entry in objects.entries]),
+                  compound=np.array([len(entry.pieces) > 1 for entry in objects.entries]), instances=12, single_slots=single,
+                  compound_slots=compound, drop={"volume": 1.2e-3, "move_repeats": 1, "pick_repeats": 0})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    over = (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).mean()
+    assert over <= shortfall + 4 * np.sqrt(shortfall / episodes)
+    assert (single, compound) == (2, 1) if mix[2] == 0.0 else over > 0.0
+
+
 @pytest.mark.parametrize("phase", [phases.EMPTY, phases.SETTLE, phases.ACT, phases.OVER])
 def test_worlds_at_work_keep_their_objects(device, phase):
     worlds = made(device)
