@@ -117,8 +117,9 @@ def weigh_votes_kernel(
 ):
     """votes[i, j] = full + deep_weight · deep, or 0 where the farthest point of j's contour is too far from i's suction point.
 
-    Too far is more than reach · diagonal_j · f_x / depth_j pixels: a thing that extends far away from the suction point for its size
-    does not obstruct it. The source names the rule and its number only; from where to where is our reading.
+    Too far is more than reach · diagonal_j · f_x / depth_j pixels: a small thing that lies far from the suction point does not obstruct.
+    From the suction point is our reading of the rule; the released generator measures from the pixel that it compares, which rejects
+    segments too large for their object, and true masks have none of these.
     """
     view, instance, neighbour = wp.tid()
     world = view_world[view]

@@ -69,7 +69,7 @@ def test_neighbours_lower_than_the_suction_point_weigh_little(device):
         assert made.votes()[0, 0, 1] == pytest.approx(40 * weight)
 
 
-def test_a_small_thing_that_reaches_far_does_not_vote(device):
+def test_a_small_thing_far_from_the_suction_point_does_not_vote(device):
     """Farthest corner of the neighbour (100, 69) from the suction point; f = 100 px, its depth 1.8 m."""
     picture = paint([(20, 20, 49, 59, LOW), (50, 10, 100, 69, HIGH)])
     suction = looks(device, picture).found["suction"][0, 0]
