@@ -106,7 +106,10 @@ def pack_status_kernel(
     status_out[world, STATUS_ATTEMPT] = attempt[world]
     status_out[world, STATUS_OUTCOME] = outcome[world]
     status_out[world, STATUS_TARGET] = target[world]
-    status_out[world, STATUS_HITS] = hits[world]
-    status_out[world, STATUS_CAUGHT] = int(caught[world])
+    status_out[world, STATUS_HITS] = 0
+    status_out[world, STATUS_CAUGHT] = 0
+    if attempt[world] >= 0:
+        status_out[world, STATUS_HITS] = hits[world]
+        status_out[world, STATUS_CAUGHT] = int(caught[world])
     status_out[world, STATUS_HELD] = int(hanging[world])
     measure_out[world, MEASURE_LOAD] = peak[world]

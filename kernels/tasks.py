@@ -244,34 +244,51 @@ def park_removed_kernel(
 
 @wp.kernel
 def begin_attempts_kernel(
+    # State:
+    phase: wp.array[int],
+    target: wp.array[int],
+    task_inout: wp.array[int],
+    attempt_inout: wp.array[int],
+    # Out:
+    steps_out: wp.array[int],
+    hits_out: wp.array[int],
+    caught_out: wp.array[wp.uint32],
+):
+    """Worlds that have looked begin an attempt; with a target, they APPROACH it."""
+    world = wp.tid()
+    if phase[world] != ACT or task_inout[world] != LOOK:
+        return
+    attempt_inout[world] = attempt_inout[world] + 1
+    steps_out[world] = 0
+    hits_out[world] = 0
+    caught_out[world] = wp.uint32(0)
+    if target[world] >= 0:
+        task_inout[world] = APPROACH
+
+
+@wp.kernel
+def place_grippers_kernel(
     # Scene:
     layout: LayoutData,
     move: MoveData,
     pick: PickData,
     # State:
     phase: wp.array[int],
-    target: wp.array[int],
+    task: wp.array[int],
+    steps: wp.array[int],
     point: wp.array[wp.vec3],
     normal: wp.array[wp.vec3],
     tilt: wp.array[float],
-    task_inout: wp.array[int],
     # Out:
-    attempt_inout: wp.array[int],
-    steps_out: wp.array[int],
     goal_out: wp.array[wp.vec3],
     joint_q_out: wp.array[float],
     joint_qd_out: wp.array[float],
     tilt_out: wp.array[float],
 ):
-    """Worlds that have looked begin an attempt: with a target, the gripper appears above the grasp, its cup tilted, and APPROACHes."""
+    """Where an APPROACH begins, the gripper appears far above the grasp, its cup tilted."""
     world = wp.tid()
-    if phase[world] != ACT or task_inout[world] != LOOK:
+    if phase[world] != ACT or task[world] != APPROACH or steps[world] != 0:
         return
-    attempt_inout[world] = attempt_inout[world] + 1
-    steps_out[world] = 0
-    if target[world] < 0:
-        return
-    task_inout[world] = APPROACH
     goal = point[world] + move.tip * normal[world] + wp.vec3(0.0, 0.0, pick.appear_height)
     goal_out[world] = goal
     place_gripper(layout, world, goal, tilt[world], joint_q_out, joint_qd_out)

@@ -119,12 +119,19 @@ def park_removed(scene: SceneData, state: WorldState, attempts: AttemptState, ph
 
 def begin_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
     """Where a world has looked, put the gripper above the grasp."""
+    worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
         tasks.begin_attempts_kernel,
-        dim=state.phase.shape[0],
-        inputs=[scene.layout, scene.move, scene.pick, state.phase, plan.target, plan.point, plan.normal, plan.tilt, attempts.task],
-        outputs=[attempts.attempt, attempts.steps, state.goal, physics.state.joint_q, physics.state.joint_qd,
-                 physics.control.joint_target_q],
-        device=state.phase.device,
+        dim=worlds,
+        inputs=[state.phase, plan.target, attempts.task, attempts.attempt],
+        outputs=[attempts.steps, attempts.hits, attempts.caught],
+        device=device,
+    )
+    wp.launch(
+        tasks.place_grippers_kernel,
+        dim=worlds,
+        inputs=[scene.layout, scene.move, scene.pick, state.phase, attempts.task, attempts.steps, plan.point, plan.normal, plan.tilt],
+        outputs=[state.goal, physics.state.joint_q, physics.state.joint_qd, physics.control.joint_target_q],
+        device=device,
     )
     physics.turn_fingers(plan.yaw)
