@@ -117,6 +117,28 @@ def preview(
 
 
 @app.command
+def explain(
+    folder: Annotated[Path, Parameter(name="DIR", help="A data set in which something was picked.")],
+    /,
+    *,
+    episode: Annotated[int, Parameter(help="Number of the episode.")],
+    attempt: Annotated[int | None, Parameter(help="Number of the attempt in the episode (default: all, below each other).")] = None,
+    out: Annotated[
+        Path | None,
+        Parameter(help="PNG or JPEG file to write (default explain-EPISODE.png or explain-EPISODE-ATTEMPT.png in the data set)."),
+    ] = None,
+) -> int:
+    """Draw attempts to pick: image with contours and suction points, clutter graph, what was chosen and why, the seal's load."""
+    from synpick_warp.explain import write_explanation
+
+    number = "" if attempt is None else f"-{attempt:03d}"
+    picture = out or folder / f"explain-{episode:06d}{number}.png"
+    write_explanation(folder, picture, episode, attempt)
+    print(f"explanation: {picture}")
+    return 0
+
+
+@app.command
 def doctor(
     *,
     config: ConfigOption = None,

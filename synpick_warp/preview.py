@@ -20,7 +20,7 @@ _CAPTION = 20
 """Height of the line above a picture [px]."""
 _GAP = 4
 """Between pictures [px]."""
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
+FONT = cv2.FONT_HERSHEY_SIMPLEX
 _GOLDEN = 0.6180339887498949
 """(√5 - 1) / 2: its multiples modulo 1 are evenly spread, however many are taken."""
 _SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -53,16 +53,30 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
         DatasetError: The folder is no data set, or a file is missing or damaged.
         OutputError: The picture cannot be written.
     """
-    if out.suffix.lower() not in _SUFFIXES:
-        raise OutputError(f"{out} is no picture file; the contact sheet's name must end in {', '.join(_SUFFIXES)}")
+    check_picture_name(out)
     if views < 1:
         raise OutputError(f"{views} views asked for; a contact sheet has at least 1")
     rows = [_row(_read_view(scene, frame)) for scene, frame in sample(find_scenes(dataset), views)]
     width = max(row.shape[1] for row in rows)
     sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
+    return write_picture(out, sheet)
+
+
+def check_picture_name(out: Path) -> None:
+    """Raise OutputError unless the file's name is that of a PNG or JPEG picture."""
+    if out.suffix.lower() not in _SUFFIXES:
+        raise OutputError(f"{out} is no picture file; its name must end in {', '.join(_SUFFIXES)}")
+
+
+def write_picture(out: Path, picture: Image) -> Path:
+    """Write a picture in the format that its name says; its folder is made.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_bytes(cv2.imencode(out.suffix, sheet)[1].tobytes())
+        out.write_bytes(cv2.imencode(out.suffix, picture)[1].tobytes())
     except OSError as error:
         raise OutputError(f"cannot write {out}: {error.strerror}") from error
     return out
@@ -89,7 +103,7 @@ def sample(scenes: list[Path], views: int) -> list[tuple[Path, int]]:
     """
     by_camera: dict[tuple[float, ...], list[tuple[Path, list[int]]]] = {}
     for scene in scenes:
-        cameras = _read_json(scene / "scene_camera.json")
+        cameras = read_json(scene / "scene_camera.json")
         if cameras:
             first = cameras[min(cameras, key=int)]
             group = by_camera.setdefault((*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())), [])
@@ -107,13 +121,18 @@ def sample(scenes: list[Path], views: int) -> list[tuple[Path, int]]:
 
 
 def _read_view(scene: Path, frame: int) -> _View:
-    camera, truth, infos = (_read_json(scene / f"scene_{name}.json").get(str(frame)) for name in ("camera", "gt", "gt_info"))
+    camera, truth, infos = (read_json(scene / f"scene_{name}.json").get(str(frame)) for name in ("camera", "gt", "gt_info"))
     if camera is None or truth is None or infos is None or len(truth) != len(infos):
         raise DatasetError(f"{scene}: scene_camera.json, scene_gt.json and scene_gt_info.json do not agree about image {frame}")
     return _View(scene, frame, float(camera["depth_scale"]), list(zip(truth, infos, strict=True)))
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON file's object.
+
+    Raises:
+        DatasetError: The file is missing, or no JSON.
+    """
     try:
         return json.loads(path.read_bytes())
     except OSError as error:
@@ -122,7 +141,12 @@ def _read_json(path: Path) -> dict[str, Any]:
         raise DatasetError(f"{path} is no JSON file: {error}") from error
 
 
-def _read_image(folder: Path, stem: str, flags: int) -> np.ndarray:
+def read_image(folder: Path, stem: str, flags: int) -> np.ndarray:
+    """The picture of that name, PNG or JPEG, as OpenCV reads it with these flags.
+
+    Raises:
+        DatasetError: There is none, or OpenCV cannot read it.
+    """
     for suffix in (".png", ".jpg"):
         path = folder / f"{stem}{suffix}"
         if path.is_file():
@@ -135,8 +159,8 @@ def _read_image(folder: Path, stem: str, flags: int) -> np.ndarray:
 
 def _row(view: _View) -> Image:
     stem = f"{view.frame:06d}"
-    color = _read_image(view.scene / "rgb", stem, cv2.IMREAD_COLOR)
-    depth = _read_image(view.scene / "depth", stem, cv2.IMREAD_UNCHANGED) * view.depth_scale
+    color = read_image(view.scene / "rgb", stem, cv2.IMREAD_COLOR)
+    depth = read_image(view.scene / "depth", stem, cv2.IMREAD_UNCHANGED) * view.depth_scale
     panels: list[tuple[str, Callable[[float], Image]]] = [
         (f"{view.scene.parent.name}/{view.scene.name} image {view.frame}", lambda scale: _fit(color, scale)),
         (_depth_caption(depth), lambda scale: _fit(_color_depth(depth), scale, smooth=False)),
@@ -154,12 +178,13 @@ def _fit(image: Image, scale: float, smooth: bool = True) -> Image:
 
 def _captioned(image: Image, caption: str) -> Image:
     head = np.zeros((_CAPTION, image.shape[1], 3), np.uint8)
-    _put(head, caption, (4, 14), 0.42, (230, 230, 230))
+    put_text(head, caption, (4, 14), 0.42, (230, 230, 230))
     return np.pad(np.concatenate((head, image)), ((0, _GAP), (0, _GAP), (0, 0)))
 
 
-def _put(image: Image, text: str, place: tuple[int, int], size: float, color: tuple[int, int, int]) -> None:
-    cv2.putText(image, text, place, _FONT, size, color, 1, cv2.LINE_AA)
+def put_text(image: Image, text: str, place: tuple[int, int], size: float, color: tuple[int, int, int], thickness: int = 1) -> None:
+    """Text; the place is its lower left corner [px], the size OpenCV's font scale."""
+    cv2.putText(image, text, place, FONT, size, color, thickness, cv2.LINE_AA)
 
 
 def _depth_limits(depth: np.ndarray) -> tuple[float, float] | None:
@@ -194,17 +219,16 @@ def _color_instances(view: _View, color: Image) -> Image:
     drawn = np.repeat(grey[..., None], 3, axis=2)
     folder = view.scene / "mask_visib"
     if not folder.is_dir():
-        _put(drawn, "no masks in this data set", (8, 24), 0.5, (230, 230, 230))
+        put_text(drawn, "no masks in this data set", (8, 24), 0.5, (230, 230, 230))
         return drawn
     for index, (record, _) in enumerate(view.truth):
-        mask = _read_image(folder, f"{view.frame:06d}_{index:06d}", cv2.IMREAD_GRAYSCALE)
-        drawn[mask > 0] = _instance_color(record, index)
+        mask = read_image(folder, f"{view.frame:06d}_{index:06d}", cv2.IMREAD_GRAYSCALE)
+        drawn[mask > 0] = instance_color(record.get("instance_id", index))
     return drawn
 
 
-def _instance_color(record: dict[str, Any], index: int) -> tuple[int, int, int]:
-    """The same in all pictures of an episode: by instance_id where there is one."""
-    number = record.get("instance_id", index)
+def instance_color(number: int) -> tuple[int, int, int]:
+    """Colour of an instance, the same in all pictures of an episode; blue first."""
     red, green, blue = colorsys.hsv_to_rgb(number * _GOLDEN % 1.0, 0.85 - 0.3 * (number % 2), 1.0)
     return round(255 * blue), round(255 * green), round(255 * red)
 
@@ -213,7 +237,7 @@ def _draw_boxes(view: _View, image: Image, scale: float) -> Image:
     for index, (record, info) in enumerate(view.truth):
         if info["px_count_visib"] == 0:
             continue
-        color = _instance_color(record, index)
+        color = instance_color(record.get("instance_id", index))
         for name, thickness in (("bbox_obj", 1), ("bbox_visib", 2)):
             x, y, width, height = info[name]
             # A box's far edge belongs to its last pixel; OpenCV takes the pixel that it starts in.
@@ -222,6 +246,6 @@ def _draw_boxes(view: _View, image: Image, scale: float) -> Image:
         x, y = info["bbox_visib"][:2]
         place = (max(0, round(scale * x) + 3), max(10, round(scale * y) + 11))
         text = f"{record['obj_id']}: {info['visib_fract']:.2f}"
-        cv2.putText(image, text, place, _FONT, 0.36, (0, 0, 0), 3, cv2.LINE_AA)
-        _put(image, text, place, 0.36, (255, 255, 255))
+        cv2.putText(image, text, place, FONT, 0.36, (0, 0, 0), 3, cv2.LINE_AA)
+        put_text(image, text, place, 0.36, (255, 255, 255))
     return image
