@@ -1,7 +1,8 @@
-"""Measure how fast a bake's parts are on this machine: physics, rendering, writing, and a whole small bake.
+"""Measure how fast a bake's parts are on this machine: physics, seeing and planning, rendering, writing, and a whole small bake.
 
-Everything is warmed up first; numbers are medians of repeated, synchronised measurements. Physics and rendering use the same
-worlds; writing gets views of them over and over. Files go to the system's temporary folder (TMPDIR) and are removed.
+Everything is warmed up first; numbers are medians of repeated, synchronised measurements. Physics, sight and rendering use the same
+worlds, which pick; with `--set bake.mode=move` they are stirred. Writing gets views of them over and over. Files go to the system's
+temporary folder (TMPDIR) and are removed.
 
     python tools/bench.py --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
 """
@@ -16,17 +17,16 @@ import itertools
 import json
 import os
 import resource
-import statistics
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
 import numpy as np
 import warp as wp
+from bench_physics import BURST, LEAST_REPEATS, Row, measure_simulation, seconds_per_call
 from rich.console import Console
 
 from synpick_warp.bake import Factory, build_factory, run_bake
@@ -40,29 +40,18 @@ from synpick_warp.exporters.bop import BopExporter, view_bytes
 from synpick_warp.exporters.files import PARTIAL
 from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.frames import FrameBatch
-from synpick_warp.kernels import phases
 from synpick_warp.progress import SilentProgress
-from synpick_warp.stages import act
 from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.simulate import Simulation
 from synpick_warp.stages.stream import STATUS_COLUMNS, FrameStream, TickReader, TickReport
 
-PARTS = ("physics", "render", "write", "bake")
-FOREVER = 1 << 30
-"""More ticks than any measurement takes."""
-FALL_TICKS, SETTLE_TICKS = 4, 60
-"""From the drop until the first objects land, and from there until piles are at rest: 4 s at 15 Hz."""
-START_HEIGHT, STIR_TICKS = 0.2, 30
-"""Where the gripper starts, just above the pile [m]; from there until it is in the pile's midst: 2 s at 15 Hz."""
-LEAST_REPEATS = 3
-BURST = 2
-"""Ticks, or passes of the renderer, between two synchronisations: as in a bake, the device does not wait for the host."""
+PARTS = ("physics", "sight", "render", "write", "bake")
 STREAM_BATCHES = 12
 """Batches that are rendered and copied in a row."""
 WRITE_VIEWS = 12
 """Views that the writers get over and over."""
 BAKE_WORLDS, BAKE_ROUNDS, BAKE_SPEED = 16, 1, 0.4
-"""Most worlds of the small bake; rounds and speed [m/s] of its gripper: short episodes."""
+"""Most worlds of the small bake; rounds and speed [m/s] of its gripper, which moves: short episodes."""
 BAKE_METHODS = (
     (Simulation, "tick", "launch ticks"),
     (TickReader, "wait", "wait for ticks"),
@@ -72,16 +61,6 @@ BAKE_METHODS = (
     (BopExporter, "close", "wait for writers, finish files"),
 )
 """Where the main process of a bake spends its time; on the CPU, launching is computing."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One measured number."""
-
-    part: str
-    name: str
-    value: float
-    unit: str
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -150,16 +129,16 @@ def _config(options: argparse.Namespace) -> Config:
 
 def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Row]:
     """All numbers of the parts, as they come. `least` is the time a measurement is repeated [s]."""
-    if {"physics", "render", "write"} & set(parts):
+    if {"physics", "sight", "render", "write"} & set(parts):
         started = time.perf_counter()
         factory = build_factory(config, SilentProgress())
         wp.synchronize_device(factory.simulation.device)
         yield Row("setup", "load and build", time.perf_counter() - started, "s")
-        for row in _physics(factory, least, "physics" in parts):
-            if row.part in ("setup", *parts):
-                yield row
-        if "render" in parts:
-            yield from _render(config, factory, least)
+        values: dict[str, float] = {}
+        for row in _worlds(config, factory, least, parts):
+            values[row.name] = row.value
+            yield row
+        yield from _share_of_a_bake(config, values)
         if "write" in parts:
             yield from _write(config, factory, least)
         yield _memory(factory.simulation.device)
@@ -167,96 +146,26 @@ def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Ro
         yield from _bake(config)
 
 
-def seconds_per_call(function: Callable[[], object], device: wp.Device, least: float, calls: int = 1) -> float:
-    """Median time of a call [s], the device's work included, of at least `LEAST_REPEATS` bursts of `calls`, after one as warm-up."""
-    function()
-    times: list[float] = []
-    while len(times) < LEAST_REPEATS or sum(times) < least:
-        wp.synchronize_device(device)
-        started = time.perf_counter()
-        for _ in range(calls):
-            function()
-        wp.synchronize_device(device)
-        times.append(time.perf_counter() - started)
-    return statistics.median(times) / calls
+def _worlds(config: Config, factory: Factory, least: float, parts: tuple[str, ...]) -> Iterator[Row]:
+    """Simulated, and seen."""
+    yield from measure_simulation(factory, least, parts)
+    if "render" in parts:
+        yield from _render(config, factory, least)
+
+
+def _share_of_a_bake(config: Config, values: dict[str, float]) -> Iterator[Row]:
+    """What looks and plans take of a tick in which every world picks and is rendered, if all that was measured."""
+    looks, step, rate = (values.get(name) for name in ("looks and plans, a tick", "picking: a step of all worlds", "views, all stages"))
+    if looks is not None and step and rate:
+        views = 1e3 * config.bake.worlds * len(config.cameras.positions) / rate
+        share = looks / (step * config.physics.steps_per_tick + views)
+        yield Row("sight", "looks and plans: share of the time with rendering", 100.0 * share, "%")
 
 
 def _memory(device: wp.Device) -> Row:
     if device.is_cuda:
         return Row("setup", "device memory in use, by anybody", (device.total_memory - device.free_memory) / GIB, "GiB")
     return Row("setup", "memory of the process, most", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2, "GiB")
-
-
-def _physics(factory: Factory, least: float, thorough: bool) -> Iterator[Row]:
-    """Drop, settle and stir all worlds; on the way, if `thorough`, measure ticks."""
-    simulation = factory.simulation
-    tick = functools.partial(simulation.tick, simulation.records[0])
-    settle = simulation.scene.settle
-    rest_ticks, settle.rest_ticks, settle.max_ticks = settle.rest_ticks, FOREVER, FOREVER
-    simulation.scene.move.start_height = START_HEIGHT
-    started = time.perf_counter()
-    for _ in range(FALL_TICKS):
-        tick()
-    wp.synchronize_device(simulation.device)
-    yield Row("setup", f"load kernels, record the steps, first {FALL_TICKS} ticks", time.perf_counter() - started, "s")
-    if thorough:
-        yield from _ticks(simulation, tick, least, "falling and landing")
-    for _ in range(SETTLE_TICKS):
-        tick()
-    # Guide walls go away as they do in a bake; then piles are held at rest.
-    for count in (1, FOREVER):
-        settle.rest_ticks = count
-        tick()
-    if thorough:
-        yield from _ticks(simulation, tick, least, "at rest")
-        yield from _within_a_tick(simulation, tick, least)
-    settle.rest_ticks = rest_ticks
-    for _ in range(STIR_TICKS + 2 * rest_ticks):
-        tick()
-    if thorough:
-        acting = float((simulation.state.phase.numpy() == int(phases.ACT)).mean())
-        yield Row("physics", "worlds being stirred", 100.0 * acting, "%")
-        yield from _ticks(simulation, tick, least, "being stirred")
-        contacts = int(simulation.physics.contacts.rigid_contact_count.numpy()[0])
-        yield Row("physics", "contacts a world", contacts / simulation.layout.worlds, "")
-
-
-def _ticks(simulation: Simulation, tick: Callable[[], None], least: float, state: str) -> Iterator[Row]:
-    """How fast whole ticks are."""
-    physics = simulation.config.physics
-    seconds = seconds_per_call(tick, simulation.device, least, BURST)
-    steps = physics.steps_per_tick * simulation.layout.worlds
-    yield Row("physics", f"{state}: world-steps", steps / seconds, "1/s")
-    yield Row("physics", f"{state}: a step of all worlds", 1e3 * seconds / physics.steps_per_tick, "ms")
-
-
-def _within_a_tick(simulation: Simulation, tick: Callable[[], None], least: float) -> Iterator[Row]:
-    """What a tick's time goes to."""
-    physics, device = simulation.physics, simulation.device
-    drive = functools.partial(act.drive_gripper, simulation.scene, simulation.state, simulation.attempts, simulation.plan, physics)
-    steps = seconds_per_call(lambda: physics.tick(drive), device, least, BURST)
-    started = time.perf_counter()
-    tick()
-    host = time.perf_counter() - started
-    with mock.patch.object(physics, "tick"):
-        outside = seconds_per_call(tick, device, least / 4, BURST)
-    collide = _recorded(lambda: physics.pipeline.collide(physics.state, physics.contacts), device)
-    yield Row("physics", "a tick: its steps", 1e3 * steps, "ms")
-    yield Row("physics", "a tick: all but its steps", 1e3 * outside, "ms")
-    yield Row("physics", "a tick: the host until all is launched", 1e3 * host, "ms")
-    yield Row("physics", "collision, once", 1e3 * seconds_per_call(collide, device, least / 4, BURST), "ms")
-
-
-def _recorded(function: Callable[[], object], device: wp.Device) -> Callable[[], object]:
-    """The same launches as a CUDA graph, so that launching does not count; on the CPU, the function."""
-    function()
-    if not device.is_cuda:
-        return function
-    with wp.ScopedCapture(device=device) as capture:
-        function()
-    graph = capture.graph
-    assert graph is not None  # It is there once the capture has ended.
-    return lambda: wp.capture_launch(graph)
 
 
 def _all_live(simulation: Simulation, worlds: int) -> TickReport:
@@ -364,7 +273,7 @@ def _bake(config: Config) -> Iterator[Row]:
     worlds = min(config.bake.worlds, BAKE_WORLDS)
     small = dataclasses.replace(
         config,
-        bake=dataclasses.replace(config.bake, worlds=worlds, episodes=worlds),
+        bake=dataclasses.replace(config.bake, mode="move", worlds=worlds, episodes=worlds),
         move=dataclasses.replace(config.move, rounds=BAKE_ROUNDS, speed=BAKE_SPEED),
     )
     progress, spent = _StageTimes(), dict.fromkeys((name for _, _, name in BAKE_METHODS), 0.0)

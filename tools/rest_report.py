@@ -140,7 +140,9 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
 
 def _config(options: argparse.Namespace) -> Config:
     overrides: dict[str, object] = dict(parse_assignment(text) for text in options.set)
+    # Arrangements of moving: any object may come several times. Nothing is picked, so nothing need be seen.
     overrides |= {
+        "bake.mode": "move",
         "bake.models": options.models,
         "bake.episodes": options.arrangements,
         "bake.worlds": options.worlds or options.arrangements,
