@@ -145,8 +145,10 @@ def test_each_ray_catches_what_is_nearest(device):
     assert (cups.seals.limit.numpy() == GOOD).all()
 
 
-# In the angle's frame: over the bar, the other arm, the notch, the arm's edge, and the notch's corner, whose quarter takes three rays.
-@pytest.mark.parametrize(("x", "y", "count"), [(0.03, 0.0, 10), (-0.03, 0.05, 10), (0.02, 0.045, 0), (-0.015, 0.045, 5), (-0.015, 0.016, 7)])
+# In the angle's frame: over the bar, the arm, the notch, the arm's edge, and the notch's corner, into whose quarter three rays fall.
+@pytest.mark.parametrize(
+    ("x", "y", "count"), [(0.03, 0.0, 10), (-0.03, 0.05, 10), (0.02, 0.045, 0), (-0.015, 0.045, 5), (-0.015, 0.016, 7)]
+)
 def test_the_notch_of_an_angle_is_open(device, x, y, count):
     """The bar is 9 cm x 3 cm about the origin; the arm, 3 cm x 6 cm, stands beside it at x < -1.5 cm."""
     cups = Cups(device)

@@ -1,8 +1,10 @@
-"""The cup's rays in NumPy, from the rule in kernels.suction's docstrings: triangle by triangle instead of half-space by half-space."""
+"""The cup's rays and seals in NumPy, from the laws in the kernels' docstrings: triangle by triangle, and by whole matrices."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -45,3 +47,60 @@ def catch(entries: Sequence[CatalogEntry | None], poses: np.ndarray, starts: np.
             hits += 1
             caught |= 1 << nearest
     return hits, caught
+
+
+@dataclass(frozen=True)
+class Body:
+    """Pose (7), velocity of the centre of mass and spin (6), mass properties in the body's frame."""
+
+    pose: np.ndarray
+    velocity: np.ndarray
+    mass: float
+    inertia: np.ndarray
+    center: np.ndarray
+
+    def lever(self, point: np.ndarray) -> np.ndarray:
+        """From the centre of mass to a point of the world."""
+        return point - self.pose[:3] - rotation_of(self.pose[3:]) @ self.center
+
+    def motion(self, point: np.ndarray) -> np.ndarray:
+        """(6, 6): from velocity and spin to those of the frame at a point."""
+        return np.block([[np.eye(3), -_cross(self.lever(point))], [np.zeros((3, 3)), np.eye(3)]])
+
+
+def seal_wrench(cup: Body, body: Body, anchor: np.ndarray, law: SimpleNamespace, seals: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Generalized forces of one of `seals` seals on its object (6) and on x, y, z and tilt of the gripper (4), and its load [N].
+
+    By the whole 6 x 6 system: w = K (e + h u') + D u' with u' = u - h W w, and W = J M⁻¹ Jᵀ of both sides.
+    """
+    turn, held = rotation_of(cup.pose[3:]), rotation_of(body.pose[3:])
+    axis, hinge = turn[:, 2], turn[:, 1]
+    tip = cup.pose[:3] - law.tip * axis
+    caught = held @ rotation_of(anchor[3:]).T
+    origin = body.pose[:3] - caught @ anchor[:3]
+    stiffness, swing = law.twist_stiffness * np.outer(axis, axis), turn.T @ caught
+    torque = -law.twist_stiffness * 2 * np.arctan2(swing[1, 0] - swing[0, 1], 1 + np.trace(swing)) * axis
+    beyond = np.arccos(np.clip(swing[2, 2], -1, 1)) - law.swing_limit
+    if beyond > 0:
+        normal = np.cross(axis, caught[:, 2])
+        normal /= np.linalg.norm(normal)
+        torque -= law.swing_stiffness * beyond * normal
+        stiffness = stiffness + law.swing_stiffness * np.outer(normal, normal)
+    zero, one, h = np.zeros((3, 3)), np.eye(3), law.step
+    gain = h * np.block([[law.stiffness * one, zero], [zero, stiffness]])
+    gain += np.block([[law.damping * one, zero], [zero, law.twist_damping * one]])
+    object_inverse = np.block([[one / body.mass, zero], [zero, held @ np.linalg.inv(body.inertia) @ held.T]])
+    slide = np.zeros((6, 4))
+    slide[:3, :3], slide[:3, 3], slide[3:, 3] = one, np.cross(hinge, tip - cup.pose[:3]), hinge
+    gripper_inverse = np.diag(1 / np.array([law.finger_mass + law.cup_mass] * 3 + [law.tilt_inertia]))
+    response = body.motion(tip) @ object_inverse @ body.motion(tip).T + seals * slide @ gripper_inverse @ slide.T
+    relative = cup.motion(tip) @ cup.velocity - body.motion(tip) @ body.velocity
+    spring = np.concatenate([law.stiffness * (tip - origin), torque])
+    wrench = np.linalg.solve(np.eye(6) + h * gain @ response, spring + gain @ relative)
+    borne = wrench[:3] - min(wrench[:3] @ axis, 0.0) * axis
+    return body.motion(tip).T @ wrench, -slide.T @ wrench, float(np.linalg.norm(borne))
+
+
+def _cross(v: np.ndarray) -> np.ndarray:
+    """Matrix of v x."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
