@@ -30,6 +30,8 @@ _MARGIN = 38
 """From the picture's border to the outermost nodes' centres [px]."""
 _SWEEPS = 8
 """Down and up again, each: more change nothing in graphs of this size."""
+_BEND = 0.32
+"""How far an edge that is not in the graph is bent aside, as a share of its length; the curve goes half as far."""
 _SAMPLES = 12
 """Points of a curve between two layers."""
 _SHIFT = 4
@@ -257,7 +259,7 @@ def _draw_arrow(canvas: Image, route: np.ndarray, color: tuple[int, int, int], t
 def _draw_bent(canvas: Image, edge: Edge, layout: Layout) -> None:
     """An edge that is not in the graph, beside the straight line, where its opposite runs."""
     start, end = (np.array(layout.nodes[node]) for node in (edge.upper, edge.lower))
-    bend = (start + end) / 2 + 0.18 * np.array([end[1] - start[1], start[0] - end[0]])
+    bend = (start + end) / 2 + _BEND * np.array([end[1] - start[1], start[0] - end[0]])
     t = np.linspace(0.0, 1.0, 3 * _SAMPLES)[:, None]
     _draw_arrow(canvas, (1 - t) ** 2 * start + 2 * t * (1 - t) * bend + t**2 * end, GREY if edge.state == OUTVOTED else RED, 1, dashed=True)
 
