@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import memory_table
+from synpick_warp.attempts import AttemptLog, EpisodeRecord, may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.device import pick_device
@@ -22,7 +24,7 @@ from synpick_warp.exporters.files import output_error, write_whole
 from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.kernels import phases
-from synpick_warp.outcome import Ending
+from synpick_warp.outcome import Ending, Outcome
 from synpick_warp.progress import Progress
 from synpick_warp.scenes import build
 from synpick_warp.scenes.cameras import make_cameras
@@ -32,16 +34,21 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.shapes import Camera, Catalog
 from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
+from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
+from synpick_warp.stages.plan import CycleArrays, VoteArrays, plan_sizes
 from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays, Renderer
 from synpick_warp.stages.render_scene import build_render_scene
+from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.simulate import RECORDS, Simulation
 from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, view_sizes
-from synpick_warp.stages.worlds import WorldState, WorldStatus, world_sizes
+from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 
 CONFIG_FILE = "config.toml"
 """The resolved settings, in the data set."""
 EPISODES_FILE = "episodes.jsonl"
 """How every episode ended, in the data set."""
+ATTEMPTS_FILE = "attempts.jsonl"
+"""Every attempt to pick, in the data set, by episode and number; a bake that only moves has none."""
 
 
 class EpisodeRow(NamedTuple):
@@ -54,6 +61,17 @@ class EpisodeRow(NamedTuple):
     frames: int
     seconds: float
     """Simulated time from the first frame to the last [s]."""
+    mode: str
+    """What follows is 0 if the episode delivered nothing."""
+    objects: int
+    """At the first frame."""
+    attempts: int
+    picked: int
+    """Objects."""
+    lost: int
+    """Objects that left the scene otherwise."""
+    left: int
+    """Objects at the last frame."""
 
 
 @dataclass
@@ -68,6 +86,10 @@ class BakeSummary:
     """Arrangements that ended in a way that delivers nothing, and were drawn again."""
     redrawn: dict[Ending, int] = field(default_factory=dict)
     """The same, by ending."""
+    outcomes: Counter[Outcome] = field(default_factory=Counter)
+    """Attempts, by outcome."""
+    attempts: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    """Lines of ATTEMPTS_FILE, by episode."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +100,7 @@ class Factory:
     cameras: tuple[Camera, ...]
     simulation: Simulation
     stream: FrameStream
+    log: AttemptLog
 
 
 def build_factory(config: Config, progress: Progress) -> Factory:
@@ -93,11 +116,11 @@ def build_factory(config: Config, progress: Progress) -> Factory:
     catalog = load_catalog(config, report=progress.note)
     lights = load_lights(config.bake.lights)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
-    simulation = Simulation(config, catalog, len(lights), device)
     scene = build_render_scene(config, catalog, fixtures, cameras, lights, device)
+    simulation = Simulation(config, catalog, len(lights), device, render_scene=scene)
     renderer = Renderer(config, scene, config.arrangement.max_objects, view_sizes(config, device)["view"])
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
-    return Factory(catalog, cameras, simulation, FrameStream(config, renderer, object_ids, device))
+    return Factory(catalog, cameras, simulation, FrameStream(config, renderer, object_ids, device), AttemptLog(config, object_ids))
 
 
 def run_bake(config: Config, out: Path, progress: Progress) -> BakeSummary:
@@ -146,9 +169,10 @@ def _run(config: Config, factory: Factory, exporter: BopExporter, summary: BakeS
         for batch in factory.stream.render(simulation.records[current].snapshot, report):
             exporter.write(batch)
             summary.views += len(batch)
+        records = factory.log.see(report)
         for end in _ends(report):
             exporter.end(end)
-            _count(config, summary, end, progress)
+            _count(config, summary, end, records[end.episode], progress)
         phase = report.column("phase")
         meter.show(int(np.isin(phase, (phases.SETTLE, phases.ACT)).sum()))
         if (phase == phases.IDLE).all():
@@ -162,7 +186,7 @@ def _ends(report: TickReport) -> Iterator[EpisodeEnd]:
         yield EpisodeEnd(episode, redraw, frame + 1, ending)
 
 
-def _count(config: Config, summary: BakeSummary, end: EpisodeEnd, progress: Progress) -> None:
+def _count(config: Config, summary: BakeSummary, end: EpisodeEnd, record: EpisodeRecord, progress: Progress) -> None:
     """Enter an episode's end into the summary."""
     ending = Ending(end.ending)
     if not ending.delivers and end.redraw + 1 < config.settle.tries:
@@ -171,8 +195,13 @@ def _count(config: Config, summary: BakeSummary, end: EpisodeEnd, progress: Prog
         progress.note(f"episode {end.episode}, arrangement {end.redraw + 1}: {ending.sentence}")
         return
     tick = config.physics.step * config.physics.steps_per_tick
-    summary.episodes.append(EpisodeRow(end.episode, end.redraw, ending, end.frames, max(0, end.frames - 1) * tick))
+    summary.episodes.append(EpisodeRow(
+        end.episode, end.redraw, ending, end.frames, max(0, end.frames - 1) * tick,
+        record.mode, record.objects, len(record.attempts), record.picked, record.lost, record.left,
+    ))  # fmt: skip
     summary.episodes.sort()
+    summary.outcomes.update(attempt.outcome for attempt in record.attempts)
+    summary.attempts[end.episode] = tuple(attempt.line() for attempt in record.attempts)
 
 
 class _Meter:
@@ -201,14 +230,17 @@ class _Meter:
 
 
 def _write_records(config: Config, out: Path, summary: BakeSummary) -> None:
-    """The settings, and how every episode ended. Nothing in them depends on the machine or the time."""
+    """The settings, how every episode ended, and every attempt. Nothing in them depends on the machine or the time."""
     rows = [
         {"episode": row.episode, "redraw": row.redraw, "ending": row.ending.name.lower(), "sentence": row.ending.sentence,
-         "frames": row.frames, "seconds": round(row.seconds, 6)}
+         "frames": row.frames, "seconds": round(row.seconds, 6), "mode": row.mode, "objects": row.objects, "attempts": row.attempts,
+         "picked": row.picked, "lost": row.lost, "left": row.left}
         for row in summary.episodes
     ]
     try:
         write_whole(out / CONFIG_FILE, config_to_toml(config).encode())
+        if may_pick(config):
+            write_whole(out / ATTEMPTS_FILE, "".join(line for row in summary.episodes for line in summary.attempts[row.episode]).encode())
         write_whole(out / EPISODES_FILE, "".join(json.dumps(row) + "\n" for row in rows).encode())
     except OSError as error:
         raise output_error(out, error) from error
@@ -225,6 +257,12 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     views = view_sizes(config, device)
     views["body"] = room + len(FIXTURES)
     ring = RING if device.is_cuda else 1
-    groups = [(WorldState, worlds, 1), (WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
+    groups = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState)]
+    groups += [(kind, worlds, 1 + RECORDS) for kind in (Sighting, Plan)]
+    groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
     groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
+    if may_pick(config):
+        looks = count_views(config, room, device)
+        groups += [(kind, sight_sizes(config, room, looks), 1) for kind in SCRATCH]
+        groups += [(kind, plan_sizes(config, room, looks), 1) for kind in (VoteArrays, CycleArrays)]
     return [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]

@@ -18,6 +18,7 @@ from synpick_warp.progress import Progress
 
 if TYPE_CHECKING:
     from synpick_warp.bake import BakeSummary, EpisodeRow
+    from synpick_warp.outcome import Outcome
 
 PLAIN_WIDTH = 120
 """Width of tables where there is no terminal [characters]."""
@@ -108,7 +109,7 @@ def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
     many = len(summary.episodes) > LISTED
     if many:
         console.print(_counts(summary))
-    failed = [row for row in summary.episodes if not row[2].delivers]
+    failed = [row for row in summary.episodes if not row.ending.delivers]
     rows = failed if many else summary.episodes
     if rows:
         console.print(_listing(rows[:LISTED]))
@@ -121,29 +122,56 @@ def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
         markup=False,
         soft_wrap=True,
     )
+    if summary.outcomes:
+        console.print(_attempts(summary), markup=False, soft_wrap=True)
     console.print(f"data set: {out}", markup=False, soft_wrap=True)
 
 
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
-    table = Table("episode", "ending", "drawn again", "frames", "time")
-    for column in (0, 2, 3, 4):
-        table.columns[column].justify = "right"
-    for episode, redraw, ending, frames, seconds in rows:
-        table.add_row(str(episode), ending.sentence, str(redraw), str(frames), _duration(seconds))
+    columns = ["episode", "mode", "ending", "redraws", "frames", "time"]
+    cells = [
+        [str(row.episode), row.mode, row.ending.sentence, str(row.redraw), str(row.frames), _duration(row.seconds)] for row in rows
+    ]
+    if any(row.attempts for row in rows):
+        columns += ["attempts", "picked", "lost"]
+        for row, line in zip(rows, cells, strict=True):
+            line += [str(row.attempts), f"{row.picked} of {row.objects}", str(row.lost)]
+    table = Table(*columns)
+    for column in table.columns:
+        column.justify = "left" if column.header in ("mode", "ending") else "right"
+    for line in cells:
+        table.add_row(*line)
     return table
 
 
 def _counts(summary: BakeSummary) -> Table:
-    table = Table("ending", "episodes", "frames")
-    table.columns[1].justify = table.columns[2].justify = "right"
+    table = Table("mode", "ending", "episodes", "frames")
+    table.columns[2].justify = table.columns[3].justify = "right"
     episodes: Counter = Counter()
     frames: Counter = Counter()
-    for _, _, ending, count, _ in summary.episodes:
-        episodes[ending] += 1
-        frames[ending] += count
-    for ending, number in episodes.most_common():
-        table.add_row(ending.sentence, f"{number:,}", f"{frames[ending]:,}")
+    for row in summary.episodes:
+        kind = row.mode, row.ending
+        episodes[kind] += 1
+        frames[kind] += row.frames
+    for kind in sorted(episodes, key=lambda kind: (kind[0], -episodes[kind])):
+        mode, ending = kind
+        table.add_row(mode, ending.sentence, f"{episodes[kind]:,}", f"{frames[kind]:,}")
     return table
+
+
+def _attempts(summary: BakeSummary) -> str:
+    """How attempts ended, the most frequent outcome first, and how many objects they took away."""
+    total = summary.outcomes.total()
+    shares = [f"{_words(outcome)} {count:,} ({count / total:.0%})" for outcome, count in summary.outcomes.most_common()]
+    picked, objects, lost = (
+        sum(getattr(row, name) for row in summary.episodes if row.mode != "move") for name in ("picked", "objects", "lost")
+    )
+    return f"{total:,} attempts: {', '.join(shares)}; {picked:,} of {objects:,} objects picked, {lost:,} lost otherwise"
+
+
+def _words(outcome: Outcome) -> str:
+    """Its name: its sentence is too long for a list of shares."""
+    return outcome.name.lower().replace("_", " ")
 
 
 def _detail(worlds_active: int, views: int, views_per_s: float, seconds_left: float | None) -> str:

@@ -9,14 +9,22 @@ import warp as wp
 
 from synpick_warp.arrays import allocate, device_array, memory_table
 from synpick_warp.bake import describe_arrays
+from synpick_warp.device import pick_device
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.perceive import SightScratch, count_views
+from synpick_warp.stages.plan import CycleArrays, VoteArrays
 from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays
-from synpick_warp.stages.worlds import WorldState, WorldStatus
+from synpick_warp.stages.sight import LookArrays, Plan, Sighting
+from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus
 from tests.reference.small_worlds import settings
 
-NAMES = "one world world_and_global instance body waypoint status measure fixture view row column count box edge"
+NAMES = "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset"
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
-DECLARED = [WorldState, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays, PictureArrays]
+MOVING = [
+    WorldState, AttemptState, SealState, Sighting, Plan, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays, PictureArrays,
+]  # fmt: skip
+LOOKING = [LookArrays, SightScratch, VoteArrays, CycleArrays]
+DECLARED = MOVING + LOOKING
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +67,28 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
     config = settings(bake__worlds=7, cameras__resolution=[8, 6])
     rows = describe_arrays(config)
     names = [name for name, *_ in rows]
-    assert {name.split(".")[0] for name in names} == {kind.__name__ for kind in DECLARED}
+    assert {name.split(".")[0] for name in names} == {kind.__name__ for kind in MOVING}
+    assert names.count("Sighting.votes") == names.count("Plan.target") == 3
     assert names.count("Snapshot.pose") == names.count("WorldStatus.table") == 2
     assert names.count("WorldState.phase") == names.count("ViewBuffers.color") == 1
     by_name = {name: (shape, unit, size) for name, shape, unit, size in rows}
     assert by_name["Snapshot.pose"] == ((7, config.arrangement.max_objects), "m", 28 * 7 * config.arrangement.max_objects)
     assert by_name["ViewBuffers.color"] == ((3, 6, 8), "", 3 * 6 * 8 * 3)
+
+
+@pytest.mark.parametrize("mode", [{"bake__mode": "target"}, {"bake__mode": "mixed", "bake__mix": [1, 0, 3]}])
+def test_a_bake_that_may_pick_has_the_arrays_of_looking_as_well(mode):
+    config = settings(bake__worlds=7, sight__resolution=[64, 48], **mode)
+    room = config.arrangement.max_objects
+    looks = count_views(config, room, pick_device("cpu"))
+    rows = describe_arrays(config)
+    assert {name.split(".")[0] for name, *_ in rows} == {kind.__name__ for kind in DECLARED}
+    shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in LOOKING}}
+    assert shapes["LookArrays.component"] == shapes["SightScratch.gap"] == (looks, 48, 64)
+    assert shapes["VoteArrays.count"] == (looks, room, room, 2)
+    assert [name for name, *_ in rows].count("HitArrays.depth") == 2
+
+
+def test_a_mixture_without_picking_has_none():
+    config = settings(bake__mode="mixed", bake__mix=[0, 0, 1])
+    assert {name.split(".")[0] for name, *_ in describe_arrays(config)} == {kind.__name__ for kind in MOVING}

@@ -9,8 +9,10 @@ import subprocess
 import sys
 import tomllib
 import types
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 import trimesh
@@ -22,24 +24,42 @@ from synpick_warp.cli import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.display import LiveProgress, PlainProgress, print_summary
 from synpick_warp.errors import OutputError
-from synpick_warp.outcome import Ending
+from synpick_warp.outcome import Ending, Outcome
 from synpick_warp.progress import Progress, SilentProgress
 
 needs_bake = pytest.mark.skipif(importlib.util.find_spec("synpick_warp.bake") is None, reason="there is no bake yet")
+
+
+class Row(NamedTuple):
+    """Stands for bake.EpisodeRow."""
+
+    episode: int
+    redraw: int
+    ending: Ending
+    frames: int
+    seconds: float
+    mode: str = "move"
+    objects: int = 9
+    attempts: int = 0
+    picked: int = 0
+    lost: int = 0
+    left: int = 9
 
 
 @dataclass
 class Summary:
     """Stands for bake.BakeSummary."""
 
-    episodes: list
+    episodes: list[Row]
     views: int = 0
     wall_seconds: float = 0.0
     redraws: int = 0
+    outcomes: Counter[Outcome] = field(default_factory=Counter)
 
 
 def finished(number: int) -> Summary:
-    return Summary([(episode, 0, Ending.FINISHED, 10, 1.0) for episode in range(number)], views=30 * number, wall_seconds=2.0, redraws=1)
+    rows = [Row(episode, 0, Ending.FINISHED, 10, 1.0) for episode in range(number)]
+    return Summary(rows, views=30 * number, wall_seconds=2.0, redraws=1)
 
 
 @pytest.fixture
@@ -90,7 +110,8 @@ def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
 
 
 def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, capsys):
-    bakes.result = Summary([(0, 0, Ending.FINISHED, 10, 1.0), (1, 19, Ending.UNSETTLED, 0, 99.0)], views=30, wall_seconds=1.0, redraws=19)
+    rows = [Row(0, 0, Ending.FINISHED, 10, 1.0), Row(1, 19, Ending.UNSETTLED, 0, 99.0)]
+    bakes.result = Summary(rows, views=30, wall_seconds=1.0, redraws=19)
     assert main(["bake", "--out", str(tmp_path / "a"), "--device", "cpu", "--episodes", "2"]) == 1
     assert "did not come to rest" in capsys.readouterr().out
 
@@ -253,14 +274,32 @@ def printed(summary: Summary) -> str:
 
 
 def test_a_short_bake_lists_every_episode():
-    text = printed(Summary([(0, 0, Ending.FINISHED, 120, 61.0), (1, 2, Ending.FINISHED, 119, 3661.0)], views=717, wall_seconds=10.0))
+    rows = [Row(0, 0, Ending.FINISHED, 120, 61.0), Row(1, 2, Ending.FINISHED, 119, 3661.0)]
+    text = printed(Summary(rows, views=717, wall_seconds=10.0))
     assert "1:01 " in text
     assert "1:01:01" in text
     assert text.count(Ending.FINISHED.sentence) == 2
+    assert "attempts" not in text
+    assert "picked" not in text
+
+
+def test_a_bake_that_picked_tells_of_attempts():
+    rows = [
+        Row(0, 0, Ending.EMPTIED, 573, 38.2, "pick", 9, 10, 9, 0, 0),
+        Row(1, 0, Ending.GAVE_UP, 90, 6.0, "target", 8, 4, 2, 1, 5),
+        Row(2, 0, Ending.FINISHED, 416, 27.7),
+    ]
+    outcomes = Counter({Outcome.DROPPED: 3, Outcome.TARGET_PICKED: 10, Outcome.OTHER_PICKED: 1})
+    text = printed(Summary(rows, views=3000, wall_seconds=10.0, outcomes=outcomes))
+    lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines()]
+    assert [line[-3:] for line in lines if line and line[0] in "012"][:2] == [["10", "9 of 9", "0"], ["4", "2 of 8", "1"]]
+    assert {line[1] for line in lines if line and line[1]} == {"pick", "target", "move"}
+    expected = "14 attempts: target picked 10 (71%), dropped 3 (21%), other picked 1 (7%); 11 of 17 objects picked, 1 lost otherwise"
+    assert expected in text.splitlines()
 
 
 def test_a_long_bake_lists_counts_and_failures():
-    rows = [(episode, 0, Ending.NOT_FINITE if episode % 4 == 0 else Ending.FINISHED, 5, 1.0) for episode in range(100)]
+    rows = [Row(episode, 0, Ending.NOT_FINITE if episode % 4 == 0 else Ending.FINISHED, 5, 1.0) for episode in range(100)]
     text = printed(Summary(rows, views=1500, wall_seconds=10.0))
     assert text.count(Ending.FINISHED.sentence) == 1
     assert text.count(Ending.NOT_FINITE.sentence) == 1 + 20

@@ -13,7 +13,8 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.kernels import pack, phases
 from synpick_warp.stages import stream, worlds
-from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.simulate import TickRecord
 from synpick_warp.stages.stream import FrameStream, HostCopy, TickReader, TickReport, view_sizes, views_per_batch
 from tests.reference.small_worlds import settings
@@ -51,7 +52,8 @@ def report_of(live: list[int]) -> TickReport:
         status[:, worlds.STATUS_COLUMNS.index(name)] = values
     entry = ((number[:, None] + np.arange(ROOM)) % 4 - 1).astype(np.int32)
     pose = np.arange(WORLDS * ROOM * 7, dtype=np.float32).reshape(WORLDS, ROOM, 7)
-    return TickReport(status, entry, pose)
+    measures = np.zeros((WORLDS, len(worlds.MEASURE_COLUMNS)), np.float32)
+    return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace())
 
 
 def rendered(device, live: list[int], batch: int) -> tuple[list[dict[str, np.ndarray]], FakeRenderer]:
@@ -143,24 +145,58 @@ def test_view_sizes_are_those_of_the_buffers(device):
 
 def test_status_columns_are_those_of_the_kernel():
     assert [int(getattr(pack, f"STATUS_{name.upper()}")) for name in worlds.STATUS_COLUMNS] == list(range(len(worlds.STATUS_COLUMNS)))
-    assert len(FIXTURES) == pack.FIXTURES
+    measures = [int(getattr(pack, f"MEASURE_{name.upper()}")) for name in worlds.MEASURE_COLUMNS]
+    assert measures == list(range(len(worlds.MEASURE_COLUMNS)))
+
+
+def new_record(device) -> TickRecord:
+    sizes = worlds.world_sizes(config_of(), 4)
+    return TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, worlds.WorldStatus, Sighting, Plan)))
 
 
 def test_a_report_outlives_the_next_tick(device):
-    sizes = worlds.world_sizes(config_of(), 4)
-    record = TickRecord(allocate(Snapshot, sizes, device), allocate(worlds.WorldStatus, sizes, device))
+    record = new_record(device)
     record.snapshot.entry.fill_(2)
     record.status.table.fill_(phases.ACT)
     reader = TickReader(record)
     reader.start()
     report = reader.wait()
-    for array in (record.snapshot.entry, record.status.table):
-        array.fill_(-5)
+    everything = (record.snapshot.entry, record.status.table, record.status.measures, *vars(record.sighting).values())
+    for array in (*everything, *vars(record.plan).values()):
+        array.fill_(5)
     record.snapshot.pose.fill_(wp.transform_identity())
     assert (report.entry == 2).all()
     assert report.column("phase").tolist() == [phases.ACT] * WORLDS
     assert (report.pose == 0.0).all()
     assert report.pose.shape == (WORLDS, ROOM, 7)
+    assert not report.measures.any()
+    assert not any(array.any() for part in (report.sighting, report.plan) for array in vars(part).values())
+
+
+def test_a_report_has_every_array_under_its_name(device):
+    """Each is filled with a number of its own."""
+    record = new_record(device)
+    parts = {"sighting": record.sighting, "plan": record.plan}
+    given = {(part, name): 2 + number for part, arrays in parts.items() for number, name in enumerate(vars(arrays))}
+    for (part, name), number in given.items():
+        getattr(parts[part], name).fill_(number)
+    for index in range(len(worlds.MEASURE_COLUMNS)):
+        values = record.status.measures.numpy()
+        values[:, index] = np.arange(WORLDS) + 10 * index
+        record.status.measures.assign(values)
+    reader = TickReader(record)
+    reader.start()
+    report = reader.wait()
+    for (part, name), number in given.items():
+        array = getattr(getattr(report, part), name)
+        assert (array == number).all(), name
+        assert len(array) == WORLDS
+    assert report.sighting.distances.shape == (WORLDS, ROOM, 3)
+    assert report.sighting.votes.shape == (WORLDS, ROOM, ROOM)
+    assert report.sighting.suction.dtype == np.int32
+    assert report.sighting.above.dtype == np.uint32
+    assert report.plan.point.shape == (WORLDS, 3)
+    assert report.measure("load").tolist() == list(range(WORLDS))
 
 
 def test_on_the_processor_a_host_copy_is_the_array_itself(device):

@@ -52,6 +52,11 @@ class CycleArrays:
     best: wp.array = device_array("view", "subset", dtype=wp.float32)
 
 
+def plan_sizes(config: Config, instances: int, views: int) -> dict[str, int]:
+    """Extents of the dimensions that `VoteArrays` and `CycleArrays` name."""
+    return {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(config.sight.exact_cycle, instances)}
+
+
 class Planner:
     """Chooses a target and a grasp for the worlds of a batch of looks. Owns its scratch; `plan` only launches."""
 
@@ -64,7 +69,7 @@ class Planner:
             device: Where they are.
         """
         self.views, instances = seen.look.largest.shape
-        sizes = {"view": self.views, "instance": instances, "kind": 2, "subset": 1 << min(config.sight.exact_cycle, instances)}
+        sizes = plan_sizes(config, instances, self.views)
         self.device = device
         self.count = allocate(VoteArrays, sizes, device).count
         self.arrays = allocate(CycleArrays, sizes, device)

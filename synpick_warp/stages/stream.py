@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
@@ -14,7 +15,7 @@ from synpick_warp.frames import FrameBatch
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.render import Renderer
 from synpick_warp.stages.simulate import TickRecord
-from synpick_warp.stages.worlds import STATUS_COLUMNS
+from synpick_warp.stages.worlds import MEASURE_COLUMNS, STATUS_COLUMNS
 
 # Bytes of one batch's images on a GPU: large enough to fill it, small enough that several batches are in flight.
 BATCH_BYTES = 256 << 20
@@ -55,14 +56,24 @@ class TickReport:
 
     status: np.ndarray
     """(world, status) int32; columns as STATUS_COLUMNS."""
+    measures: np.ndarray
+    """(world, measure) float32; columns as MEASURE_COLUMNS."""
     entry: np.ndarray
     """Catalog index (world, instance) int32."""
     pose: np.ndarray
     """Object to world (world, instance, 7) float32."""
+    sighting: SimpleNamespace
+    """Arrays named and shaped as those of `Sighting`; vectors have their components as a last dimension. After the tick's look."""
+    plan: SimpleNamespace
+    """The same of `Plan`."""
 
     def column(self, name: str) -> np.ndarray:
         """One column of the status table (world) int32."""
         return self.status[:, STATUS_COLUMNS.index(name)]
+
+    def measure(self, name: str) -> np.ndarray:
+        """One column of the table of measures (world) float32."""
+        return self.measures[:, MEASURE_COLUMNS.index(name)]
 
 
 class HostCopy:
@@ -94,19 +105,22 @@ class HostCopy:
 
 
 class TickReader:
-    """Brings the status table and the poses of a tick to the host."""
+    """Brings to the host what a tick left, but for its pictures: some kilobytes a world."""
 
     def __init__(self, record: TickRecord) -> None:
-        self.copy = HostCopy([record.status.table, record.snapshot.entry, record.snapshot.pose])
+        self.parts = [(part, [item.name for item in fields(part)]) for part in (record.sighting, record.plan)]
+        arrays = [record.status.table, record.status.measures, record.snapshot.entry, record.snapshot.pose]
+        self.copy = HostCopy(arrays + [getattr(part, name) for part, names in self.parts for name in names])
 
     def start(self) -> None:
         """Begin to copy what the tick left."""
         self.copy.start(None)
 
     def wait(self) -> TickReport:
-        """The tick's report; its arrays are the reader's own and change with the next `start`."""
-        status, entry, pose = self.copy.wait()
-        return TickReport(status.copy(), entry.copy(), pose.copy())
+        """The tick's report; its arrays are its own."""
+        arrays = iter([array.copy() for array in self.copy.wait()])
+        first = [next(arrays) for _ in range(4)]
+        return TickReport(*first, *(SimpleNamespace(**{name: next(arrays) for name in names}) for _, names in self.parts))
 
 
 class FrameStream:
