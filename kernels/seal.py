@@ -53,16 +53,29 @@ def object_response(inverse_mass: float, inverse_inertia: wp.mat33, lever: wp.ve
 
 
 @wp.func
-def gripper_response(suction: SuctionData, axis: wp.vec3, lever: wp.vec3) -> Response:
-    """Of the gripper at `lever` from the tilt axis: it slides as a whole, and turns about the axis against its drive.
+def gripper_response(suction: SuctionData, axis: wp.vec3, lever: wp.vec3, seals: int) -> Response:
+    """Of an n-th of the gripper at `lever` from the tilt axis: it slides as a whole, and turns about the axis against its drive.
 
-    An approximation, which shapes how a seal swings in, not what it bears: sliding and tilting are taken as independent.
+    With n seals that pull at the same mass, each may reckon with an n-th of it. An approximation, which shapes how a seal swings in,
+    not what it bears: sliding and tilting are taken as independent.
     """
     way = wp.cross(axis, lever)
+    slide = float(seals) / (suction.finger_mass + suction.cup_mass)
+    tilt = float(seals) / suction.tilt_inertia
     made = Response()
-    made.linear = wp.identity(n=3, dtype=float) / (suction.finger_mass + suction.cup_mass) + wp.outer(way, way) / suction.tilt_inertia
-    made.mixed = wp.outer(way, axis) / suction.tilt_inertia
-    made.angular = wp.outer(axis, axis) / suction.tilt_inertia
+    made.linear = slide * wp.identity(n=3, dtype=float) + tilt * wp.outer(way, way)
+    made.mixed = tilt * wp.outer(way, axis)
+    made.angular = tilt * wp.outer(axis, axis)
+    return made
+
+
+@wp.func
+def sum_responses(a: Response, b: Response) -> Response:
+    """Of one body against the other."""
+    made = Response()
+    made.linear = a.linear + b.linear
+    made.mixed = a.mixed + b.mixed
+    made.angular = a.angular + b.angular
     return made
 
 
@@ -162,10 +175,7 @@ def hold_objects_kernel(
     peak_inout: wp.array[float],
     joint_f_inout: wp.array[float],
 ):
-    """Wrench of every seal on its object, and the opposite on the gripper; a seal whose load exceeds the limit breaks instead.
-
-    The gripper's response counts once for each seal: with n seals that pull at the same mass, each may reckon with an n-th of it.
-    """
+    """Wrench of every seal on its object, and the opposite on the gripper; a seal whose load exceeds the limit breaks instead."""
     world = wp.tid()
     seals = int(0)
     for instance in range(layout.instances):
@@ -180,8 +190,7 @@ def hold_objects_kernel(
     lever = place - wp.transform_get_translation(body_q[cup])
     spin = wp.spatial_bottom(body_qd[cup])
     velocity = wp.spatial_top(body_qd[cup]) + wp.cross(spin, place - wp.transform_point(body_q[cup], body_com[cup]))
-    gripper = gripper_response(suction, hinge, lever)
-    share = float(seals)
+    gripper = gripper_response(suction, hinge, lever, seals)
     dof = world * layout.dofs
     for instance in range(layout.instances):
         if held_inout[world, instance] != 0:
@@ -190,14 +199,12 @@ def hold_objects_kernel(
             caught = body_q[body] * wp.transform_inverse(anchor[world, instance])
             arm = place - wp.transform_point(body_q[body], body_com[body])
             turned = wp.quat_to_matrix(wp.transform_get_rotation(body_q[body]))
-            both = object_response(body_inv_mass[body], turned * body_inv_inertia[body] * wp.transpose(turned), arm)
-            both.linear = both.linear + share * gripper.linear
-            both.mixed = both.mixed + share * gripper.mixed
-            both.angular = both.angular + share * gripper.angular
+            own = object_response(body_inv_mass[body], turned * body_inv_inertia[body] * wp.transpose(turned), arm)
             rate = wp.spatial_bottom(body_qd[body])
             slip = velocity - wp.spatial_top(body_qd[body]) - wp.cross(rate, arm)
             turn = seal_turn(wp.transform_get_rotation(tip), wp.transform_get_rotation(caught), suction)
-            wrench = seal_wrench(place - wp.transform_get_translation(caught), turn, slip, spin - rate, both, suction)
+            wrench = seal_wrench(place - wp.transform_get_translation(caught), turn, slip, spin - rate, sum_responses(own, gripper),
+                                 suction)
             load = seal_load(wrench.force, axis)
             first = dof + layout.gripper_dofs + 6 * s
             if load > limit[world]:

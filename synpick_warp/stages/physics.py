@@ -13,14 +13,15 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import joints, rest
 from synpick_warp.scenes import build
 
-# The cup's tilt among a world's joint coordinates: x, y, z, tilt.
-TILT = 3
 # A joint limit's row is made when the joint comes this near to it [rad].
 JOINT_LIMIT_GAP = 0.2
 
 
 class Physics:
-    """Newton's model, state, solver and collision pipeline. `state` is the current state before and after `tick`."""
+    """Newton's model, state, solver and collision pipeline. `state` is the current state before and after `tick`.
+
+    Targets of drives are laid out as joint coordinates: the cup of world w turns to `control.joint_target_q[w * coords + 3]` [rad].
+    """
 
     def __init__(self, config: Config, built: build.BuiltModel) -> None:
         self.config = config
@@ -50,11 +51,6 @@ class Physics:
         self._graph: wp.Graph | None = None
         fingers = np.arange(worlds) * built.layout.bodies_per_world
         self._finger_joint = wp.array(np.argsort(self.model.joint_child.numpy())[fingers], dtype=wp.int32, device=self.device)
-
-    @property
-    def tilt_targets(self) -> wp.array:
-        """Where each cup's drive turns it (world) [rad]: a view of the control's targets, which are laid out as the joint coordinates."""
-        return self.control.joint_target_q.reshape((self.layout.worlds, self.layout.coords_per_world))[:, TILT]
 
     def turn_fingers(self, yaw: wp.array) -> None:
         """Turn each finger about the vertical through its origin; the cup turns with it, x, y and z stay the world's axes.
