@@ -105,8 +105,8 @@ def test_the_target_is_bright_tinted_and_has_a_contour_where_its_mask_is(dataset
     assert np.median(np.abs(image[beside] - 0.62 * color[beside]).max(axis=1)) <= 1
     assert edge_share(image, target, 2) > 0.9
     assert edge_share(image, other, 0) > 0.8
-    near = cv2.dilate(target.astype(np.uint8), np.ones((7, 7))) > 0
-    around = near & (cv2.dilate(target.astype(np.uint8), np.ones((5, 5))) == 0)
+    away = cv2.distanceTransform((~target).astype(np.uint8), cv2.DIST_L2, 5)
+    around = (away > 3) & (away < 4)
     assert (image[around] > 230).all(axis=1).mean() > 0.8
 
 
