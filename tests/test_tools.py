@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import subprocess
 import sys
 import time
@@ -33,9 +34,9 @@ GLANCE = (
 """Small images to choose by."""
 DASH = (
     "--set", "pick.appear_height=0.2", "--set", "pick.speed=4.0", "--set", "pick.near_speed=0.5", "--set", "pick.lift_height=0.2",
-    "--set", "pick.lift_speed=2.0", "--set", "pick.failures=1",
+    "--set", "pick.lift_speed=2.0", "--set", "pick.failures=1", "--set", "settle.rest_shift=1e-3",
 )
-"""Attempts that are over soon."""
+"""Episodes of picking that are over soon."""
 
 
 def load_tool(name: str):
@@ -126,7 +127,7 @@ HOME = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0])
 
 
 def tick_report(*worlds: dict) -> TickReport:
-    """What a tick tells of worlds that act, three objects each; keys: status columns, `gone` instances, `poses` by instance."""
+    """What a tick tells of worlds that act, three objects each; keys: status columns, load, `gone` instances, `poses` by instance."""
     status = np.zeros((len(worlds), len(STATUS_COLUMNS)), np.int32)
     entry, pose = np.zeros((len(worlds), ROOM), np.int32), np.tile(HOME, (len(worlds), ROOM, 1))
     acting = {"phase": phases.ACT, "live": 1, "mode": phases.PICK, "task": phases.LIFT}
@@ -137,27 +138,28 @@ def tick_report(*worlds: dict) -> TickReport:
         entry[world, list(values.get("gone", ()))] = -1
         for instance, moved in values.get("poses", {}).items():
             pose[world, instance] = moved
-    return TickReport(status, entry, pose.astype(np.float32))
+    measures = np.array([[values.get("load", 0.0)] for values in worlds], np.float32)
+    return TickReport(status, measures, entry, pose.astype(np.float32), SimpleNamespace(), SimpleNamespace())
 
 
-def tallied(*ticks: TickReport, wanted: int = 1, loads=None, modes=("pick",)):
-    tally = pick_tally.Tally(Config(), catalog(), modes, wanted)
-    for number, now in enumerate(ticks):
-        tally.see(now, np.full(len(now.status), loads[number] if loads else 0.0), {0: (1.5, 2, 3)})
+def tallied(*ticks: TickReport, modes=("pick",)):
+    tally = pick_tally.Tally(Config(), catalog(), modes, 1)
+    for now in ticks:
+        tally.see(now, {0: (1.5, 2, 3)})
     return tally
 
 
+PICKED = {"outcome": Outcome.TARGET_PICKED}
 OVER = {"phase": phases.OVER, "ending": Ending.GAVE_UP}
 
 
 def test_a_sequence_is_counted_frame_by_frame():
     tally = tallied(
         tick_report({"task": phases.LOOK}),
-        tick_report({"task": phases.LIFT, "held": 0b110, "caught": 0b110}),
-        tick_report({"task": phases.LOOK, "outcome": Outcome.TARGET_PICKED, "caught": 0b110, "hits": 9, "held": 0b100, "gone": [2]}),
-        tick_report({"task": phases.LIFT, "gone": [0, 2], "held": 0b001}),
+        tick_report({"task": phases.LIFT, "held": 0b110, "caught": 0b110, "load": 7.0}),
+        tick_report({**PICKED, "task": phases.LOOK, "caught": 0b110, "hits": 9, "held": 0b100, "gone": [2], "load": 3.0}),
+        tick_report({"task": phases.LIFT, "gone": [0, 2], "held": 0b001, "load": 5.0}),
         tick_report({**OVER, "task": phases.LOOK, "gone": [0, 2], "outcome": Outcome.NOTHING_CAUGHT}),
-        loads=[0.0, 7.0, 3.0, 5.0, 0.0],
     )
     (found,) = tally.sequences("pick")
     assert (found.frames, found.objects, found.left, found.picked, found.lost) == (5, 3, 1, 1, 1)
@@ -301,7 +303,28 @@ def test_mistakes_are_one_line(tool, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_the_gpu_script_is_bash_and_wants_a_folder():
-    done = subprocess.run(["bash", FOLDER / "gpu_run.sh"], capture_output=True, text=True, check=False)
+@pytest.mark.parametrize(
+    ("arguments", "steps", "message"), [((), "", "usage:"), (("folder",), "rest dance", "gpu_run: no such step: dance")]
+)
+def test_the_gpu_script_is_bash_and_says_what_it_wants(tmp_path, arguments, steps, message):
+    command = ["bash", FOLDER / "gpu_run.sh", *(tmp_path / name for name in arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ, "STEPS": steps})
     assert done.returncode == 2
-    assert done.stderr.startswith("usage:")
+    assert done.stderr.startswith(message)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_gpu_script_does_what_it_is_told_within_its_time(tmp_path):
+    """With a stand-in for Python that says what it was asked for, and fails once."""
+    python = tmp_path / "python"
+    python.write_text('#!/bin/sh\ncase "$*" in *rest_report*) exit 3;; esac\necho "asked: $*"\n')
+    python.chmod(0o755)
+    variables = {"STEPS": "rest pick", "PYTHON": python, "DATA": tmp_path, "PICK_SETTINGS": "pick.failures=4", "TMPDIR": tmp_path}
+    environment = {name: value for name, value in os.environ.items() if name != "WARP_CACHE_PATH"} | variables
+    done = subprocess.run(["bash", FOLDER / "gpu_run.sh", tmp_path / "out"], capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 1
+    assert [line.partition(" after")[0] for line in done.stdout.splitlines() if line.startswith("==")] == [
+        "== piles at rest", "== piles at rest: exit code 3", "== picking", "== picking: exit code 0",
+    ]  # fmt: skip
+    assert "tools/pick_report.py --device cuda:0 --episodes 64 --set pick.failures=4" in done.stdout
+    assert (tmp_path / "out" / "run.log").read_text() == done.stdout

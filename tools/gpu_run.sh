@@ -1,25 +1,34 @@
 #!/usr/bin/env bash
-# Everything that is measured on a machine with a GPU, in one go of about 8 minutes: piles at rest, speeds, one large bake.
+# What is measured on a machine with a GPU, in one go of less than 10 minutes: piles at rest, speeds, sequences of picking, a bake.
 #
 #     PYTHONPATH=... WARP_CACHE_PATH=... tools/gpu_run.sh RESULTS
 #
-# Run it in the project's root; RESULTS is a folder that gets the log, the numbers as JSON, a contact sheet, the bake's settings and
-# episodes, and, for the next run, the compiled kernels (unpack wpcache.txz to WARP_CACHE_PATH first: cold kernels cost minutes).
+# Run it in the project's root; RESULTS is a folder that gets the log, the numbers as JSON, of the bake a contact sheet, an explained
+# episode, settings, episodes and attempts, and, for the next run, the compiled kernels (unpack wpcache.txz to WARP_CACHE_PATH first:
+# cold kernels cost minutes). Each step gets its share of the time that is left, and ends with what it has: all four are a survey,
+# and numbers to quote come from runs of one or two, as STEPS="pick". Thus the README's large bake:
+#     STEPS=bake BAKE_MODE=move BAKE_EPISODES=512 BAKE_WORLDS=512 BAKE_SETTINGS="move.rounds=1 move.speed=0.4" tools/gpu_run.sh RESULTS
 # The bake itself goes to the temporary folder and is removed; 512 short episodes at 640x360 are about 100,000 views, 2 million
 # files and 20 GB. Longer episodes, or full HD, fill a small disk.
 #
 # Environment:
+#     STEPS              "rest bench pick bake": what to do, in this order
 #     PYTHON             interpreter (python3)
 #     DATA               folder of data (.gpu/data): ycbv_models/, hdri/ and cache/ in it are used if they are there
 #     DEVICE             cuda:0
-#     WORLDS             512: of measurements and bake
 #     ARRANGEMENTS       64: of piles at rest
+#     WORLDS             512: of speeds
+#     BENCH_PARTS        physics,sight,render,write
 #     BENCH_RESOLUTION   1920x1080
+#     PICK_EPISODES      64: of each of the modes pick and target
+#     PICK_SETTINGS      none, such as "pick.failures=4"
+#     BAKE_MODE          mixed; or pick, target, move
+#     BAKE_WORLDS        64
+#     BAKE_EPISODES      64
 #     BAKE_RESOLUTION    640x360
-#     BAKE_EPISODES      512
-#     BAKE_SETTINGS      "move.rounds=1 move.speed=0.4": short episodes
-#     REST_LIMIT BENCH_LIMIT BAKE_LIMIT   most seconds of each step (130 170 240)
-#     TOTAL_LIMIT        most seconds of all steps (470); the last ones get what is left
+#     BAKE_SETTINGS      "move.rounds=1 move.speed=0.4 pick.failures=1": short episodes
+#     REST_LIMIT BENCH_LIMIT PICK_LIMIT BAKE_LIMIT   most seconds of each step (its share of what is left)
+#     TOTAL_LIMIT        most seconds of all steps (490)
 #
 # DATA/cache is a cache folder as XDG has it, so that concave objects need not be decomposed on the GPU machine, which takes minutes.
 # Fill it where there is time, by any command that loads the same models with the same settings:
@@ -31,14 +40,22 @@ if [ $# -ne 1 ]; then
     echo "usage: tools/gpu_run.sh RESULTS" >&2
     exit 2
 fi
+# Shares of the time; a step whose name is not here does not exist.
+declare -A shares=([rest]=60 [bench]=130 [pick]=210 [bake]=90)
+read -ra steps <<<"${STEPS:-rest bench pick bake}"
+for name in "${steps[@]}"; do
+    if [ -z "${shares[$name]:-}" ]; then
+        echo "gpu_run: no such step: $name; steps: rest bench pick bake" >&2
+        exit 2
+    fi
+done
 mkdir -p "$1" || exit 2
 results=$(cd "$1" && pwd)
 
 python=${PYTHON:-python3}
 data=${DATA:-.gpu/data}
 device=${DEVICE:-cuda:0}
-worlds=${WORLDS:-512}
-deadline=$((SECONDS + ${TOTAL_LIMIT:-470}))
+deadline=$((SECONDS + ${TOTAL_LIMIT:-490}))
 failed=0
 export PYTHONUNBUFFERED=1 COLUMNS=160
 
@@ -51,7 +68,8 @@ models=() lights=()
 bakes=$(mktemp -d) || exit 2
 trap 'rm -rf "$bakes"' EXIT
 
-# step NAME LIMIT COMMAND...: runs it for at most LIMIT seconds, and not past the deadline. An interrupted bake keeps its whole scenes.
+# step NAME LIMIT COMMAND...: runs it for at most LIMIT seconds, and not past the deadline. What is interrupted keeps what it has: the
+# tools print it, a bake keeps its whole scenes.
 step() {
     local name=$1 limit=$2 left=$((deadline - SECONDS)) begun=$SECONDS code
     shift 2
@@ -67,29 +85,68 @@ step() {
     [ "$code" -eq 0 ] || failed=1
 }
 
-measure() {
-    command -v nvidia-smi >/dev/null && nvidia-smi --query-gpu=name,driver_version,memory.total,clocks.max.sm --format=csv,noheader
+# share STEP...: the first step's share of the time that is left for all of them.
+share() {
+    local first=$1 all=0 name
+    for name in "$@"; do
+        all=$((all + shares[$name]))
+    done
+    echo $(((deadline - SECONDS) * shares[$first] / all))
+}
 
-    step "piles at rest" "${REST_LIMIT:-130}" "$python" tools/rest_report.py --device "$device" "${models[@]}" \
-        --arrangements "${ARRANGEMENTS:-64}" --json "$results/rest.json"
-
-    step "speeds" "${BENCH_LIMIT:-170}" "$python" tools/bench.py --device "$device" "${models[@]}" "${lights[@]}" \
-        --worlds "$worlds" --resolution "${BENCH_RESOLUTION:-1920x1080}" --parts physics,render,write --json "$results/bench.json"
-
-    local settings=() assignment file
-    for assignment in ${BAKE_SETTINGS-move.rounds=1 move.speed=0.4}; do
+# settings_of ASSIGNMENTS: as options, in the array settings.
+settings_of() {
+    local assignment
+    settings=()
+    for assignment in $1; do
         settings+=(--set "$assignment")
     done
-    step "bake" "${BAKE_LIMIT:-240}" "${synpick[@]}" bake --mode move --device "$device" "${models[@]}" "${lights[@]}" \
-        --worlds "$worlds" --episodes "${BAKE_EPISODES:-512}" --resolution "${BAKE_RESOLUTION:-640x360}" "${settings[@]}" --out "$bakes/set"
-    for file in config.toml episodes.jsonl; do
+}
+
+measure_rest() {
+    step "piles at rest" "${REST_LIMIT:-$1}" "$python" tools/rest_report.py --device "$device" "${models[@]}" \
+        --arrangements "${ARRANGEMENTS:-64}" --json "$results/rest.json"
+}
+
+measure_bench() {
+    step "speeds" "${BENCH_LIMIT:-$1}" "$python" tools/bench.py --device "$device" "${models[@]}" "${lights[@]}" \
+        --worlds "${WORLDS:-512}" --resolution "${BENCH_RESOLUTION:-1920x1080}" --parts "${BENCH_PARTS:-physics,sight,render,write}" \
+        --json "$results/bench.json"
+}
+
+measure_pick() {
+    settings_of "${PICK_SETTINGS:-}"
+    step "picking" "${PICK_LIMIT:-$1}" "$python" tools/pick_report.py --device "$device" "${models[@]}" \
+        --episodes "${PICK_EPISODES:-64}" "${settings[@]}" --json "$results/picks.json"
+}
+
+measure_bake() {
+    local file
+    settings_of "${BAKE_SETTINGS-move.rounds=1 move.speed=0.4 pick.failures=1}"
+    step "bake" "${BAKE_LIMIT:-$1}" "${synpick[@]}" bake --mode "${BAKE_MODE:-mixed}" --device "$device" "${models[@]}" "${lights[@]}" \
+        --worlds "${BAKE_WORLDS:-64}" --episodes "${BAKE_EPISODES:-64}" --resolution "${BAKE_RESOLUTION:-640x360}" "${settings[@]}" \
+        --out "$bakes/set"
+    for file in config.toml episodes.jsonl attempts.jsonl; do
         [ -f "$bakes/set/$file" ] && cp "$bakes/set/$file" "$results/"
     done
     df -h "$bakes" | tail -1
+}
+
+measure() {
+    local i
+    command -v nvidia-smi >/dev/null && nvidia-smi --query-gpu=name,driver_version,memory.total,clocks.max.sm --format=csv,noheader
+    for i in "${!steps[@]}"; do
+        "measure_${steps[$i]}" "$(share "${steps[@]:$i}")"
+    done
 
     # What follows is quick, and wanted above all when something failed: it has its own time.
     deadline=$((SECONDS + 60))
-    step "contact sheet" 20 "${synpick[@]}" preview "$bakes/set" --views 8 --out "$results/contact-sheet.png"
+    if [ -d "$bakes/set" ]; then
+        step "contact sheet" 20 "${synpick[@]}" preview "$bakes/set" --views 8 --out "$results/contact-sheet.png"
+        local episode picture=$results/explained.png
+        episode=$(grep -o -m 1 '"episode": [0-9]*' "$bakes/set/attempts.jsonl" 2>/dev/null | grep -o '[0-9]*')
+        [ -n "$episode" ] && step "explained episode" 20 "${synpick[@]}" explain "$bakes/set" --episode "$episode" --out "$picture"
+    fi
     if [ -n "${WARP_CACHE_PATH:-}" ] && [ -d "$WARP_CACHE_PATH" ]; then
         step "kernel cache" 40 tar -cJf "$results/wpcache.txz" -C "$WARP_CACHE_PATH" .
     fi

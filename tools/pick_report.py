@@ -192,28 +192,24 @@ def simulate(factory: Factory, eyes: Eyes | None, tally: Tally) -> Iterator[None
     """
     simulation = factory.simulation
     readers = [TickReader(record) for record in simulation.records]
-    loads = [HostCopy([record.status.measures]) for record in simulation.records]
     simulation.tick(simulation.records[0])
     readers[0].start()
-    loads[0].start(None)
-    waiting: tuple[TickReport, np.ndarray] | None = None
+    waiting: TickReport | None = None
     ticks = 0
     while not tally.complete():
         current, following = ticks % RECORDS, (ticks + 1) % RECORDS
         simulation.tick(simulation.records[following])
         readers[following].start()
-        loads[following].start(None)
         now = readers[current].wait()
-        load = loads[current].wait()[0][:, 0].copy()
         if waiting is not None:
-            tally.see(*waiting, eyes.wait() if eyes is not None else {})
+            tally.see(waiting, eyes.wait() if eyes is not None else {})
         if eyes is not None:
             eyes.look(simulation.records[current].snapshot, now)
-        waiting = now, load
+        waiting = now
         ticks += 1
         yield
         if (now.column("phase") == phases.IDLE).all():
-            tally.see(*waiting, {})
+            tally.see(now, eyes.wait() if eyes is not None else {})
             return
 
 

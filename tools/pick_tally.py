@@ -108,12 +108,11 @@ class Tally:
         self.redrawn: Counter[str] = Counter()
         self._before: TickReport | None = None
 
-    def see(self, report: TickReport, load: np.ndarray, shares: dict[int, tuple[float, int, int]]) -> None:
+    def see(self, report: TickReport, shares: dict[int, tuple[float, int, int]]) -> None:
         """Count one tick.
 
         Args:
             report: The tick.
-            load: Largest load of a seal in the tick (world) [N].
             shares: Of live worlds that were rendered: sum of visible shares, number of instances, number of views.
         """
         places = self._speeds(report)
@@ -126,7 +125,7 @@ class Tally:
             self.numbers[mode].add(number)
             if status["live"][world]:
                 sequence = self.running.setdefault(world, Sequence(mode, number))
-                self._count_frame(sequence, report, world, float(load[world]))
+                self._count_frame(sequence, report, world)
                 sequence.tasks[TASKS.get(status["task"][world], "no task")] += 1
                 sequence.speed = np.maximum(sequence.speed, places[world]).tolist()
                 share, instances, views = shares.get(world, (0.0, 0, 0))
@@ -137,7 +136,7 @@ class Tally:
                 self._end(world, number, Ending(status["ending"][world]), status["redraw"][world])
         self._before = report
 
-    def _count_frame(self, sequence: Sequence, report: TickReport, world: int, load: float) -> None:
+    def _count_frame(self, sequence: Sequence, report: TickReport, world: int) -> None:
         """Objects that are there and that have gone, and the attempt that ended in this tick."""
         present = report.entry[world] >= 0
         held = _bits(int(report.column("held")[world]), len(present))
@@ -152,7 +151,7 @@ class Tally:
         sequence.frames += 1
         sequence.left = int(present.sum())
         sequence.not_finite += int((~np.isfinite(report.pose[world][present]).all(axis=1)).sum())
-        sequence.load = max(sequence.load, load)
+        sequence.load = max(sequence.load, float(report.measure("load")[world]))
         if outcome is not Outcome.NONE:
             sequence.outcomes[outcome.name] += 1
             if report.column("caught")[world] != 0:
