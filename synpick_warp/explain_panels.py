@@ -15,8 +15,8 @@ from synpick_warp.preview import FONT, Image, instance_color, put_text
 WORDS_WIDTH = 470
 """Of the words and the table [px]."""
 PLOT_HEIGHT = 190
-"""Least height of the plot [px]."""
 _PLOT_MOST = 260
+"""Least and largest height of the plot [px]."""
 LINE = 22
 """Of text [px]."""
 TEXT = 0.46
@@ -93,12 +93,12 @@ def draw_load(attempt: Attempt, config: Config, width: int, height: int) -> Imag
     put_text(canvas, "load of the seal [N] (the largest, if several)", (0, 14), TEXT, SOFT)
     cv2.line(canvas, (left, bottom), (right, bottom), INK, 1)
     cv2.line(canvas, (left, top), (left, bottom), INK, 1)
-    if not attempt.load:
+    if not attempt.load or not attempt.hits:
         put_text(canvas, "no load: nothing was caught", (left + 20, (top + bottom) // 2), TEXT, SOFT)
         return canvas
     tick = config.physics.step * config.physics.steps_per_tick
     limit = break_force(attempt, config)
-    span, most = tick * len(attempt.load), 1.12 * max(limit, *attempt.load)
+    span, most = tick * max(1, len(attempt.load) - 1), 1.12 * max(limit, *attempt.load)
 
     def place(time: float, load: float) -> tuple[float, float]:
         return left + (right - left) * time / span, bottom - (bottom - top) * load / most
@@ -116,7 +116,7 @@ def draw_load(attempt: Attempt, config: Config, width: int, height: int) -> Imag
     y = round(place(0.0, limit)[1])
     cv2.line(canvas, (left, y), (right, y), RED, 2)
     put_text(canvas, f"breaks at {limit:g} N", (left + 8, y - 6), SMALL, RED)
-    points = [place(tick * (number + 1), load) for number, load in enumerate(attempt.load)]
+    points = [place(tick * number, load) for number, load in enumerate(attempt.load)]
     cv2.polylines(canvas, [fixed(np.array(points))], False, _BLUE, 2, cv2.LINE_AA, 4)
     for point in points:
         disc(canvas, point, 3, _BLUE)

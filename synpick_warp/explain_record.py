@@ -63,7 +63,7 @@ class Attempt:
     caught: tuple[int, ...]
     picked: tuple[int, ...]
     load: tuple[float, ...]
-    """Largest load of any seal in every tick since the suction was switched on [N]."""
+    """Largest load of any seal in each tick of the lift [N]; the suction was switched on at the end of the first."""
     resolution: tuple[int, int]
     """Width and height of the sight image [px]."""
     seen: tuple[SeenObject, ...]
@@ -91,7 +91,7 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
     records = _read_records(path)
     episodes = sorted({record["episode"] for _, record in records})
     if episode not in episodes:
-        raise DatasetError(f"{path} has no episode {episode}; {_which('episodes', episodes)}")
+        raise DatasetError(f"{path} has no attempt of episode {episode}; {_which('episodes that have', episodes)}")
     rows = sorted((record["attempt"], line, record) for line, record in records if record["episode"] == episode)
     numbers = [row[0] for row in rows]
     if number is not None and number not in numbers:
@@ -262,10 +262,8 @@ def seal_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> li
     lines = [f"rays: {attempt.hits} of {attempt.rays} hit"]
     if attempt.hits:
         lines[0] += f"; {'good' if attempt.good_seal else 'poor'} seal, breaks at {break_force(attempt, config):g} N"
-        lines.append(f"caught: {_listed(attempt.caught, full)}")
-    if attempt.load:
-        lines[-1] += f"; largest load {max(attempt.load):.1f} N"
-    if attempt.hits:
+        peak = f"; largest load {max(attempt.load):.1f} N" if attempt.load else ""
+        lines.append(f"caught: {_listed(attempt.caught, full)}{peak}")
         lines.append(f"picked: {_listed(attempt.picked, full)}")
     return lines
 

@@ -221,7 +221,7 @@ def test_what_the_seal_bore():
     poor = attempt((FIRST,), {}, 0, hits=3, good_seal=False, caught=(7,))
     said = ["rays: 3 of 10 hit; poor seal, breaks at 2 N", "caught: instance 7, unseen", "picked: nothing"]
     assert seal_words(poor, NAMES, Config()) == said
-    assert seal_words(attempt((FIRST,), {}, 0, hits=0), NAMES, Config()) == ["rays: 0 of 10 hit"]
+    assert seal_words(attempt((FIRST,), {}, 0, hits=0, load=(0.0, 0.0)), NAMES, Config()) == ["rays: 0 of 10 hit"]
     assert seal_words(attempt((), {}), NAMES, Config()) == []
 
 
@@ -293,7 +293,7 @@ def test_a_damaged_record_is_one_clear_line(dataset, line, said):
         (lambda folder: shutil.rmtree(folder), r"there is no folder .*set; name the folder of a BOP data set"),
         (lambda folder: (folder / "attempts.jsonl").unlink(), r"has no attempts\.jsonl: nothing was picked; .*mode pick, target or mixed"),
         (lambda folder: (folder / "attempts.jsonl").write_bytes(b"\xff"), r"attempts\.jsonl is no text: byte 0 is no UTF-8"),
-        (lambda folder: (folder / "attempts.jsonl").write_text(""), r"has no episode 1; episodes: none"),
+        (lambda folder: (folder / "attempts.jsonl").write_text(""), r"has no attempt of episode 1; episodes that have: none"),
         (lambda folder: (folder / "config.toml").unlink(), r"has no config\.toml"),
         (lambda folder: (folder / "models" / "models_info.json").unlink(), r"cannot read .*models_info\.json: No such file"),
         (lambda folder: shutil.rmtree(folder / "train" / "000003"), r"cannot read .*000003/scene_gt\.json: No such file"),
@@ -311,7 +311,7 @@ def test_what_is_missing_is_named_in_one_line(dataset, tmp_path, harm, said):
 
 
 def test_what_does_not_exist_is_answered_with_what_does(dataset):
-    with pytest.raises(DatasetError, match=r"has no episode 2; episodes: 1, 4$"):
+    with pytest.raises(DatasetError, match=r"has no attempt of episode 2; episodes that have: 1, 4$"):
         write_explanation(dataset, dataset / "picture.png", 2, None)
     with pytest.raises(DatasetError, match=r"has no attempt 3 of episode 1; attempts: 0 to 2$"):
         write_explanation(dataset, dataset / "picture.png", 1, 3)
@@ -338,7 +338,7 @@ def test_the_command(dataset, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--episode", "2"], "attempts.jsonl has no episode 2; episodes: 1, 4"),
+        (["--episode", "2"], "attempts.jsonl has no attempt of episode 2; episodes that have: 1, 4"),
         (["--episode", "1", "--attempt", "-1"], "attempts.jsonl has no attempt -1 of episode 1; attempts: 0 to 2"),
         (["--episode", "1", "--out", "a.txt"], "a.txt is no picture file; its name must end in .png, .jpg, .jpeg"),
         ([], 'Command "explain" parameter --episode requires an argument.'),
