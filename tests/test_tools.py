@@ -276,7 +276,7 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
     for name, value in (("LEAST_REPEATS", 1), ("BURST", 1), ("STREAM_BATCHES", 1), ("WRITE_VIEWS", 3), ("BAKE_SPEED", 10.0)):
         monkeypatch.setattr(bench, name, value)
     file = tmp_path / "bench.json"
-    assert bench.main(["--worlds", "1", "--resolution", "32x18", "--seconds", "0", "--json", str(file), *FEW, *GLANCE]) == 0
+    assert bench.main(["--worlds", "1", "--resolution", "32x18", "--seconds", "0", "--json", str(file), *FEW, *GLANCE, *DASH]) == 0
     rows = json.loads(file.read_text())["rows"]
     assert {row["part"] for row in rows} == {"setup", *bench.PARTS}
     assert all(row["value"] >= 0.0 for row in rows)
