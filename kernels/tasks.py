@@ -54,7 +54,6 @@ def begin_picking_kernel(
     yaw_out: wp.array[float],
     overflow_out: wp.array[int],
     removed_out: wp.array2d[int],
-    held_out: wp.array2d[int],
     tilt_out: wp.array[float],
 ):
     """Worlds that do not act have no task and a straight gripper; those that begin to act in a mode of picking LOOK."""
@@ -74,6 +73,18 @@ def begin_picking_kernel(
     tilt_out[world * layout.coords + 3] = 0.0
     for instance in range(layout.instances):
         removed_out[world, instance] = 0
+
+
+@wp.kernel
+def forget_seals_kernel(
+    # State:
+    phase: wp.array[int],
+    # Out:
+    held_out: wp.array2d[int],
+):
+    """Nothing hangs on the cup of a world that does not act: not even where the last episode broke off in a lift."""
+    world, instance = wp.tid()
+    if phase[world] != ACT:
         held_out[world, instance] = 0
 
 

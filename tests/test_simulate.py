@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections import defaultdict
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 from synpick_warp.kernels import phases
 from synpick_warp.outcome import Ending
 from synpick_warp.scenes import build
-from synpick_warp.stages import act, arrange
+from synpick_warp.stages import arrange
 from synpick_warp.stages.constants import GRIPPER_HOME
 from synpick_warp.stages.simulate import Simulation
 from tests.reference.small_worlds import ANGLE, BOX, CUBE, catalog, report, run_ticks, settings

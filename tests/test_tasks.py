@@ -39,7 +39,7 @@ def made(device, worlds: int = 1, **pick) -> KernelWorlds:
 
 
 def begin(worlds: KernelWorlds) -> None:
-    act.begin_picking(worlds.scene, worlds.state, worlds.attempts, worlds.seals, worlds.sighting, worlds.plan, worlds.physics)
+    act.begin_picking(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.plan, worlds.physics)
 
 
 def end(worlds: KernelWorlds) -> None:
@@ -61,13 +61,21 @@ def test_who_begins_to_pick_looks(device):
     worlds = made(device, worlds=4)
     worlds.set(worlds.state.phase, [phases.ACT, phases.ACT, phases.ACT, phases.SETTLE])
     worlds.set(worlds.state.mode, [phases.PICK, phases.TARGET, phases.MOVE, phases.PICK])
-    for array in (worlds.attempts.failures, worlds.attempts.removed, worlds.seals.held, worlds.plan.yaw, worlds.sighting.overflow):
+    for array in (worlds.attempts.failures, worlds.attempts.removed, worlds.plan.yaw, worlds.sighting.overflow):
         worlds.set(array, 2)
     begin(worlds)
     assert worlds.attempts.task.numpy().tolist() == [phases.LOOK, phases.LOOK, phases.NO_TASK, phases.NO_TASK]
     assert worlds.attempts.attempt.numpy().tolist() == [-1] * 4
-    for array in (worlds.attempts.failures, worlds.attempts.removed, worlds.seals.held, worlds.plan.yaw, worlds.sighting.overflow):
+    for array in (worlds.attempts.failures, worlds.attempts.removed, worlds.plan.yaw, worlds.sighting.overflow):
         assert not array.numpy().any()
+
+
+def test_nothing_hangs_where_nobody_acts(device):
+    worlds = made(device, worlds=2)
+    worlds.set(worlds.state.phase, [phases.ACT, phases.SETTLE])
+    worlds.set(worlds.seals.held, 1)
+    act.forget_seals(worlds.state, worlds.seals)
+    assert worlds.seals.held.numpy().tolist() == [[1, 1, 1], [0, 0, 0]]
 
 
 def test_who_acts_already_keeps_its_task(device):

@@ -25,7 +25,7 @@ def begin_moving(scene: SceneData, state: WorldState, physics: Physics, seed: in
 
 
 def begin_picking(
-    scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, sighting: Sighting, plan: Plan, physics: Physics
+    scene: SceneData, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, physics: Physics
 ) -> None:
     """Where a world begins to pick, let it look; forget the outcomes of the last tick."""
     wp.launch(
@@ -33,9 +33,14 @@ def begin_picking(
         dim=state.phase.shape[0],
         inputs=[scene.layout, state.phase, state.mode, state.frame],
         outputs=[attempts.task, attempts.steps, attempts.attempt, attempts.outcome, attempts.failures, plan.target, plan.yaw,
-                 sighting.overflow, attempts.removed, seals.held, physics.control.joint_target_q],
+                 sighting.overflow, attempts.removed, physics.control.joint_target_q],
         device=state.phase.device,
     )
+
+
+def forget_seals(state: WorldState, seals: SealState) -> None:
+    """Before a world's objects fall, let go of what hung on its cup."""
+    wp.launch(tasks.forget_seals_kernel, dim=seals.held.shape, inputs=[state.phase], outputs=[seals.held], device=state.phase.device)
 
 
 def set_fingers(scene: SceneData, state: WorldState, physics: Physics) -> None:
