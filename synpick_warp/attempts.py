@@ -14,8 +14,8 @@ from synpick_warp.outcome import Ending, Outcome
 from synpick_warp.stages.stream import TickReport
 
 MODE_NAMES = {int(phases.MOVE): "move", int(phases.PICK): "pick", int(phases.TARGET): "target"}
-DIGITS = 6
-"""Significant digits of the numbers in a record; more would be noise of single precision."""
+DIGITS, PLACES = 6, 6
+"""Significant digits and decimal places of the numbers in a record; more would be noise of single precision."""
 LOAD_PLACES = 4
 """Decimal places of a load: a tenth of a millinewton."""
 
@@ -276,7 +276,7 @@ def _instances(bits: int) -> tuple[int, ...]:
 
 def _tidy(value: float) -> float:
     """A number with the digits that are kept; never -0."""
-    return float(f"{value:.{DIGITS}g}") + 0.0
+    return round(float(f"{value:.{DIGITS}g}"), PLACES) + 0.0
 
 
 def _tidy_vector(values: np.ndarray) -> Vector:

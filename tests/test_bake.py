@@ -6,6 +6,7 @@ import hashlib
 import json
 import subprocess
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -17,8 +18,9 @@ from synpick_warp.bake import run_bake
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop import BopExporter
-from synpick_warp.outcome import Ending
+from synpick_warp.outcome import Ending, Outcome
 from synpick_warp.progress import SilentProgress
+from tests.reference.sights import SHORT
 from tests.reference.small_worlds import QUICK, catalog, settings
 
 EPISODES, CAMERAS = 3, 3
@@ -33,6 +35,7 @@ TINY = {
     "physics.iterations": 6,
     "move.speed": 4.0,
 }
+PICKING = SHORT | {"arrangement__max_objects": 2, "bake__episodes": 2, "pick__failures": 1, "sight__resolution": [160, 90]}
 
 
 def tiny(**overrides: object):
@@ -134,6 +137,9 @@ def test_the_list_of_episodes_is_right(baked):
     for row, known in zip(rows, baked.summary.episodes, strict=True):
         assert (row["redraw"], row["frames"]) == (known.redraw, known.frames)
         assert row["seconds"] == pytest.approx((row["frames"] - 1) * tick, abs=1e-6)
+        assert (row["mode"], row["attempts"], row["picked"]) == ("move", 0, 0)
+        assert row["objects"] == row["left"] + row["lost"] > 0
+    assert not (baked.out / "attempts.jsonl").exists()
 
 
 def test_the_settings_are_kept_and_can_be_used_again(baked):
@@ -197,6 +203,49 @@ def test_an_instance_keeps_its_object_through_the_episode(baked):
     for scene in baked.scenes():
         objects = {tuple(record["obj_id"] for record in records) for records in truth(scene, "scene_gt").values()}
         assert len(objects) == 1
+
+
+# ---- picking ----
+
+
+@pytest.fixture(scope="module")
+def picked(tmp_path_factory) -> Baked:
+    return Baked(tmp_path_factory.mktemp("picked") / "set", **PICKING)
+
+
+def records(baked: Baked, name: str) -> list[dict]:
+    return [json.loads(line) for line in (baked.out / f"{name}.jsonl").read_text().splitlines()]
+
+
+def test_attempts_are_listed_by_episode_and_number(picked):
+    attempts, episodes = records(picked, "attempts"), records(picked, "episodes")
+    expected = [(row["episode"], number) for row in episodes for number in range(row["attempts"])]
+    assert [(row["episode"], row["attempt"]) for row in attempts] == expected
+    assert {row["mode"] for row in episodes} == {"pick"}
+    assert {row["ending"] for row in episodes} <= {"emptied", "gave_up"}
+    for row in episodes:
+        own = [attempt for attempt in attempts if attempt["episode"] == row["episode"]]
+        assert row["picked"] == sum(len(attempt["picked"]) for attempt in own)
+        assert row["picked"] + row["lost"] + row["left"] == row["objects"] > 0
+        assert [attempt["frame"] for attempt in own] == [0, *(attempt["end_frame"] for attempt in own[:-1])]
+        assert own[-1]["end_frame"] == row["frames"] - 1
+    assert sum(row["picked"] for row in episodes) > 0
+    assert picked.summary.outcomes == Counter(Outcome[row["outcome"].upper()] for row in attempts)
+
+
+def test_what_was_picked_is_in_the_truth_until_then(picked):
+    for attempt in records(picked, "attempts"):
+        scene = truth(picked.scenes()[CAMERAS * attempt["episode"]], "scene_gt")
+        there = [{row["instance_id"]: row["obj_id"] for row in scene[attempt[name]]} for name in ("frame", "end_frame")]
+        assert there[0] == {seen["instance"]: seen["object_id"] for seen in attempt["sight"]["instances"]}
+        assert set(there[0]) - set(there[1]) >= set(attempt["picked"])
+        if attempt["target"] is not None:
+            assert there[0][attempt["target"]] == attempt["object_id"]
+
+
+def test_attempts_are_the_same_in_any_number_of_worlds(picked, tmp_path):
+    other = Baked(tmp_path / "other", **PICKING | {"bake__worlds": 1, "sight__views": 1})
+    assert {name for name, _ in other.files().items() ^ picked.files().items()} == {"config.toml"}
 
 
 # ---- when something fails ----

@@ -1,0 +1,368 @@
+"""Records of attempts from scripted ticks: each attempt once, with what was seen before it and what came of it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from synpick_warp.attempts import AttemptLog, AttemptRecord, EpisodeRecord, InstanceSight, SightRecord, may_pick
+from synpick_warp.explain_record import read_attempts
+from synpick_warp.kernels import phases
+from synpick_warp.outcome import Ending, Outcome
+from tests.reference.scripted_worlds import Ticks, World, bits, play, report
+from tests.reference.small_worlds import settings
+
+ROOM = 4
+OBJECT_IDS = np.array([3, 8, 21], np.int32)
+CONFIG = settings(bake__mode="mixed", arrangement__max_objects=ROOM, sight__resolution=[64, 48], suction__tolerated_misses=1)
+RAYS = CONFIG.suction.rays
+
+
+def new_world(device) -> World:
+    return World(CONFIG, device)
+
+
+def run(*scripts: tuple[World, Ticks]) -> dict[tuple[int, int], EpisodeRecord]:
+    return play(dict(scripts), AttemptLog(CONFIG, OBJECT_IDS))
+
+
+# ---- one record, number by number ----
+
+
+def see_a_pair(world: World) -> None:
+    """Instances 1 and 3 are in the scene, 3 on top of 1, with numbers that need rounding; 0 and 2 have what an earlier pile left."""
+    seen, plan = world.sighting, world.plan
+    for arrays in (seen, plan):
+        for array in vars(arrays).values():
+            array[:] = 7
+    seen.visible[0, [1, 3]] = 120, 0
+    seen.share[0, [1, 3]] = 1.0 / 3.0, 0.0
+    seen.pole[0, [1, 3]] = (10.0, 20.0), (-1.0, -1.0)
+    seen.centroid[0, [1, 3]] = (12.3456789, 21.0), (-1.0, -1.0)
+    seen.middle[0, [1, 3]] = (11.17283945, 20.5), (-1.0, -1.0)
+    seen.distances[0, [1, 3]] = (5.0, 4.4721359, -0.0), (0.0, 0.0, 0.0)
+    seen.suction[0, [1, 3]] = (11, 21), (-1, -1)
+    seen.depth[0, [1, 3]] = 1.98765432, 0.0
+    seen.votes[0][np.ix_([1, 3], [1, 3])] = [[0.0, 12.3], [0.1, 0.0]]
+    seen.above[0, [1, 3]] = bits(3), 0
+    seen.all_above[0, [1, 3]] = bits(0, 3), 0
+    plan.target[0] = 1
+    plan.point[0] = 0.1, -0.2, 0.0345678912
+    plan.normal[0] = -3.0e-9, 0.6, 0.8
+    plan.yaw[0], plan.tilt[0] = -1.23456789, 0.0
+
+
+PAIR = SightRecord(
+    (64, 48),
+    (
+        InstanceSight(1, 21, 120, 0.333333, (10.0, 20.0), (12.3457, 21.0), (11.1728, 20.5), (5.0, 4.47214, 0.0), (11, 21), 1.98765,
+                      (3,), (0, 3)),
+        InstanceSight(3, 3, 0, 0.0, (-1.0, -1.0), (-1.0, -1.0), (-1.0, -1.0), (0.0, 0.0, 0.0), (-1, -1), 0.0, (), ()),
+    ),
+    ((1, 3, 12.3), (3, 1, 0.1)),
+)  # fmt: skip
+
+
+def pick_one(world: World) -> Ticks:
+    """Settle for two ticks; one attempt on instance 1, which comes away with 3 behind it; the tote is empty."""
+    for _ in range(2):
+        world.settle(7, 2, phases.TARGET, [-1, 2, -1, 0])
+        yield
+    world.first_frame()
+    see_a_pair(world)
+    yield
+    yield from world.attempt(
+        0, [0.0, 5.00004, 4.99996, 3.5], outcome=Outcome.TARGET_PICKED, hits=RAYS - 1, caught=bits(1, 3), held=bits(1, 3),
+        entry=[-1] * ROOM,
+    )  # fmt: skip
+    world.over(Ending.EMPTIED)
+    yield
+
+
+@pytest.fixture(scope="module")
+def picked(device) -> EpisodeRecord:
+    world = new_world(device)
+    found = run((world, pick_one(world)))
+    # Two ticks of settling, the look, three on the way and three of lifting come before.
+    assert list(found) == [(9, 7)]
+    return found[9, 7]
+
+
+def test_a_record_says_all_that_was_seen_and_done(picked):
+    (attempt,) = picked.attempts
+    assert attempt == AttemptRecord(
+        episode=7, attempt=0, mode="target", frame=0, end_frame=7, outcome=Outcome.TARGET_PICKED, target=1, object_id=21,
+        point=(0.1, -0.2, 0.034568), normal=(0.0, 0.6, 0.8), yaw=-1.23457, tilt=0.0, rays=RAYS, hits=RAYS - 1, good_seal=True,
+        caught=(1, 3), picked=(1, 3), load=(0.0, 5.0, 5.0, 3.5), sight=PAIR,
+    )  # fmt: skip
+    assert (picked.mode, picked.objects, picked.picked, picked.lost, picked.left) == ("target", 2, 2, 0, 0)
+
+
+def test_a_line_is_json_with_the_keys_of_the_format(picked):
+    line = picked.attempts[0].line()
+    assert line.endswith("}\n")
+    assert line.count("\n") == 1
+    record = json.loads(line)
+    assert list(record) == [
+        "episode", "attempt", "mode", "frame", "end_frame", "outcome", "sentence", "target", "object_id", "point", "normal", "yaw", "tilt",
+        "rays", "hits", "good_seal", "caught", "picked", "load", "sight",
+    ]  # fmt: skip
+    assert (record["outcome"], record["sentence"]) == ("target_picked", Outcome.TARGET_PICKED.sentence)
+    assert (record["point"], record["caught"], record["load"]) == ([0.1, -0.2, 0.034568], [1, 3], [0.0, 5.0, 5.0, 3.5])
+    assert record["good_seal"] is True
+    assert "-0.0," not in line
+    sight = record["sight"]
+    assert (sight["resolution"], sight["votes"]) == ([64, 48], [[1, 3, 12.3], [3, 1, 0.1]])
+    assert sight["instances"][0] == {
+        "instance": 1, "object_id": 21, "visible": 120, "share": 0.333333, "pole": [10.0, 20.0], "centroid": [12.3457, 21.0],
+        "middle": [11.1728, 20.5], "distances": [5.0, 4.47214, 0.0], "suction": [11, 21], "depth": 1.98765, "above": [3],
+        "all_above": [0, 3],
+    }  # fmt: skip
+
+
+def test_explain_reads_what_is_written(picked, tmp_path):
+    (attempt,) = picked.attempts
+    (tmp_path / "attempts.jsonl").write_text(attempt.line())
+    (read,) = read_attempts(tmp_path, 7, None)
+    for name in ("mode", "frame", "end_frame", "target", "tilt", "rays", "hits", "good_seal", "caught", "picked", "load"):
+        assert getattr(read, name) == getattr(attempt, name), name
+    assert (read.number, read.sentence, read.resolution) == (0, attempt.outcome.sentence, (64, 48))
+    assert [one.instance for one in read.seen] == [1], "3 was not visible"
+    assert read.seen[0].distances == attempt.sight.instances[0].distances
+    assert read.votes == {(1, 3): 12.3, (3, 1): 0.1}
+
+
+def test_what_is_not_finite_does_not_become_json(device):
+    world = new_world(device)
+
+    def script() -> Ticks:
+        world.settle(0, 0, phases.PICK, [0, 1, 2, 0])
+        world.first_frame()
+        world.look(0)
+        world.plan.tilt[0] = np.nan
+        yield
+        yield from world.attempt(0, [1.0], outcome=Outcome.DROPPED)
+        world.over(Ending.GAVE_UP)
+        yield
+
+    (record,) = run((world, script())).values()
+    with pytest.raises(ValueError, match="JSON"):
+        record.attempts[0].line()
+
+
+# ---- two worlds, every outcome ----
+
+
+def every_outcome(world: World) -> Ticks:
+    """Five attempts; one object is picked with the target, another alone, one is lost on the way, one is left."""
+    world.settle(5, 0, phases.PICK, [2, 0, 1, 1])
+    yield
+    world.first_frame()
+    world.look(1)
+    yield
+    yield from world.attempt(
+        0, [0.0, 9.0, 8.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, caught=bits(0, 1), held=bits(1), entry=[2, -1, 1, 1]
+    )
+    world.look(0)
+    yield
+    yield from world.attempt(1, [0.0, 3.0], outcome=Outcome.DROPPED, hits=RAYS - 2, caught=bits(0), held=0)
+    world.look(0)
+    yield
+    yield from world.attempt(
+        2, [0.0, 2.0, 1.0, 1.0], outcome=Outcome.OTHER_PICKED, hits=1, caught=bits(0, 2), held=bits(2), entry=[2, -1, -1, 1]
+    )
+    world.look(3)
+    yield
+    # Instance 3 falls beside the tote in the meantime.
+    world.entry[0, 3] = -1
+    yield from world.attempt(3, [0.0, 0.0], outcome=Outcome.NOTHING_CAUGHT, hits=0, caught=0, held=0)
+    world.look(-1)
+    yield
+    # The columns still tell of the attempt before.
+    world.now(hits=RAYS, caught=bits(0))
+    world.nothing_seen(4)
+    world.over(Ending.GAVE_UP)
+    yield
+
+
+def redrawn(world: World) -> Ticks:
+    """An arrangement that fails in the middle of its second attempt; then one of the same episode that moves on; then another episode."""
+    world.settle(6, 0, phases.PICK, [0, 1, -1, -1])
+    yield
+    world.first_frame()
+    world.look(0)
+    yield
+    yield from world.attempt(0, [0.0, 6.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, caught=1, held=1, entry=[-1, 1, -1, -1])
+    world.look(1)
+    yield
+    world.frame(task=phases.APPROACH, attempt=1)
+    world.over(Ending.SOLVER_OVERFLOW)
+    yield
+    world.settle(6, 1, phases.PICK, [1, 1, 1, -1])
+    yield
+    world.first_frame()
+    world.look(2)
+    yield
+    yield from world.attempt(0, [0.0, 4.0], outcome=Outcome.DROPPED, hits=RAYS, caught=bits(2), held=0)
+    world.over(Ending.GAVE_UP)
+    yield
+    world.settle(9, 19, phases.TARGET, [0, -1, -1, -1])
+    world.over(Ending.UNSETTLED)
+    yield
+
+
+def stir(world: World) -> Ticks:
+    """A world that moves; an object is thrown out."""
+    world.settle(8, 0, phases.MOVE, [0, 1, 2, 0])
+    yield
+    world.first_frame()
+    yield
+    for entry in ([0, 1, 2, 0], [0, -1, 2, 0], [0, -1, 2, 0]):
+        world.frame(entry=entry, load=0.0)
+        yield
+    world.frame()
+    world.over(Ending.FINISHED)
+    yield
+
+
+@pytest.fixture(scope="module")
+def mixed(device) -> dict[tuple[int, int], EpisodeRecord]:
+    scripts = (every_outcome, redrawn, stir)
+    return run(*((world, make(world)) for world, make in ((new_world(device), make) for make in scripts)))
+
+
+def by_number(found: dict[tuple[int, int], EpisodeRecord]) -> dict[int, EpisodeRecord]:
+    """The last record of every episode."""
+    return {episode: record for (_, episode), record in found.items()}
+
+
+def test_every_attempt_has_its_outcome_once(mixed):
+    attempts = by_number(mixed)[5].attempts
+    assert [(one.attempt, one.outcome) for one in attempts] == list(enumerate((
+        Outcome.TARGET_PICKED, Outcome.DROPPED, Outcome.OTHER_PICKED, Outcome.NOTHING_CAUGHT, Outcome.NOTHING_SEEN,
+    )))  # fmt: skip
+    # An attempt begins in the frame in which the one before ended.
+    assert [one.frame for one in attempts] == [0, 6, 11, 18, 23]
+    assert [one.end_frame for one in attempts] == [6, 11, 18, 23, 24]
+    assert [one.load for one in attempts] == [(0.0, 9.0, 8.0), (0.0, 3.0), (0.0, 2.0, 1.0, 1.0), (0.0, 0.0), ()]
+    assert {(one.episode, one.mode, one.rays) for one in attempts} == {(5, "pick", RAYS)}
+
+
+def test_caught_and_picked_are_the_attempts_own(mixed):
+    attempts = by_number(mixed)[5].attempts
+    assert [one.caught for one in attempts] == [(0, 1), (0,), (0, 2), (), ()]
+    assert [one.picked for one in attempts] == [(1,), (), (2,), (), ()]
+    assert [one.hits for one in attempts] == [RAYS, RAYS - 2, 1, 0, 0]
+    assert [one.good_seal for one in attempts] == [True, False, False, False, False]
+    assert [(one.target, one.object_id) for one in attempts] == [(1, 3), (0, 21), (0, 21), (3, 8), (None, None)]
+
+
+def test_an_attempt_keeps_what_its_own_look_saw(mixed):
+    """Each look of the script adds 1 to all numbers; in the tick in which an attempt ends they are already those of the next."""
+    attempts = by_number(mixed)[5].attempts
+    assert [one.point for one in attempts] == [(number,) * 3 for number in (1.0, 2.0, 3.0, 4.0)] + [None]
+    assert [one.tilt for one in attempts] == [1.0, 2.0, 3.0, 4.0, None]
+    assert [one.sight.instances[0].share for one in attempts] == [1.0, 2.0, 3.0, 4.0, 5.0]
+    present = [[seen.instance for seen in one.sight.instances] for one in attempts]
+    assert present == [[0, 1, 2, 3], [0, 2, 3], [0, 2, 3], [0, 3], [0]]
+    assert attempts[0].sight.instances[0].object_id == 21
+
+
+def test_a_look_that_found_nothing_has_no_grasp(mixed):
+    record = json.loads(by_number(mixed)[5].attempts[-1].line())
+    assert all(record[key] is None for key in ("target", "object_id", "point", "normal", "yaw", "tilt"))
+    assert (record["hits"], record["good_seal"], record["caught"], record["picked"], record["load"]) == (0, False, [], [], [])
+
+
+def test_objects_are_accounted_for(mixed):
+    found = by_number(mixed)
+    counts = {number: (one.mode, one.objects, len(one.attempts), one.picked, one.lost, one.left) for number, one in found.items()}
+    assert counts == {
+        5: ("pick", 4, 5, 2, 1, 1),
+        6: ("pick", 3, 1, 0, 0, 3),
+        8: ("move", 4, 0, 0, 1, 3),
+        9: ("target", 0, 0, 0, 0, 0),
+    }
+
+
+def test_an_arrangement_that_is_drawn_again_leaves_no_attempt(mixed):
+    first, second = (record for (_, episode), record in mixed.items() if episode == 6)
+    assert first == EpisodeRecord("pick")
+    (attempt,) = second.attempts
+    assert (attempt.attempt, attempt.frame, attempt.target, attempt.outcome) == (0, 0, 2, Outcome.DROPPED)
+
+
+def test_the_last_of_32_instances_is_a_bit_like_the_others(device):
+    world = new_world(device)
+
+    def script() -> Ticks:
+        world.settle(0, 0, phases.PICK, [0, 1, 2, 0])
+        world.first_frame()
+        world.look(0)
+        yield
+        yield from world.attempt(0, [0.0], outcome=Outcome.OTHER_PICKED, hits=1, caught=bits(0, 31), held=bits(31))
+        world.over(Ending.GAVE_UP)
+        yield
+
+    (record,) = run((world, script())).values()
+    assert (record.attempts[0].caught, record.attempts[0].picked) == ((0, 31), (31,))
+
+
+def test_missing_reports_are_noticed(device):
+    world, log = new_world(device), AttemptLog(CONFIG, OBJECT_IDS)
+    world.settle(3, 0, phases.PICK, [0, 1, 2, 0])
+    world.first_frame()
+    world.look(0)
+    log.see(report([world]))
+    world.frame(task=phases.LOOK, attempt=1, outcome=Outcome.DROPPED)
+    with pytest.raises(ValueError, match="attempt 1 of episode 3 ends"):
+        log.see(report([world]))
+
+
+FAILED = (Outcome.DROPPED, Outcome.NOTHING_CAUGHT, Outcome.NOTHING_SEEN)
+TRY = st.tuples(st.sampled_from(FAILED), st.lists(st.integers(0, 40).map(float), min_size=1, max_size=4))
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.lists(TRY, min_size=1, max_size=4)), min_size=1, max_size=3))
+def test_worlds_do_not_disturb_each_other(device, plans):
+    """Any attempts, in worlds that begin at different times."""
+    expected = {}
+
+    def script(world: World, episode: int, delay: int, tries: list[tuple[Outcome, list[float]]]) -> Ticks:
+        for _ in range(1 + delay):
+            world.settle(episode, 0, phases.PICK, [0, 1, -1, -1])
+            yield
+        world.first_frame()
+        frame, known = 0, []
+        for number, (outcome, loads) in enumerate(tries):
+            seen = outcome is not Outcome.NOTHING_SEEN
+            world.look(0 if seen else -1)
+            yield
+            if seen:
+                yield from world.attempt(number, loads, outcome=outcome, held=0)
+            else:
+                world.nothing_seen(number)
+            last = frame + (3 + len(loads) if seen else 1)
+            known.append((number, outcome, frame, last, tuple(loads) if seen else ()))
+            frame = last
+        expected[episode] = known
+        world.over(Ending.GAVE_UP)
+        yield
+
+    made = [new_world(device) for _ in plans]
+    found = run(*((world, script(world, episode, *plan)) for episode, (world, plan) in enumerate(zip(made, plans, strict=True))))
+    records = {episode: [(a.attempt, a.outcome, a.frame, a.end_frame, a.load) for a in one.attempts] for (_, episode), one in found.items()}
+    assert records == expected
+
+
+@pytest.mark.parametrize(
+    ("mode", "mix", "expected"),
+    [("pick", [0, 0, 1], True), ("target", [0, 0, 1], True), ("move", [1, 1, 1], False), ("mixed", [0, 0, 1], False),
+     ("mixed", [0, 2, 1], True)],
+)  # fmt: skip
+def test_which_bakes_may_pick(mode, mix, expected):
+    assert may_pick(settings(bake__mode=mode, bake__mix=mix)) is expected
