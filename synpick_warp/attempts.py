@@ -89,7 +89,7 @@ class AttemptRecord:
     hits: int
     """Rays that hit an object when the suction was switched on."""
     good_seal: bool
-    """Whether no more rays missed than settings tolerate, so that the seals were strong."""
+    """Whether no more rays missed than settings tolerate, which is never all of them, so that the seals were strong."""
     caught: tuple[int, ...]
     """Instances that the rays hit."""
     picked: tuple[int, ...]
@@ -138,8 +138,7 @@ class EpisodeRecord:
 class _Running:
     """An arrangement that is being acted on."""
 
-    address: tuple[int, int]
-    """Episode and redraw."""
+    episode: int
     objects: int
     attempts: list[AttemptRecord] = field(default_factory=list)
     begun: dict[str, Any] | None = None
@@ -174,32 +173,32 @@ class AttemptLog:
         ended = {}
         phase = report.column("phase")
         for world in np.flatnonzero((phase == phases.ACT) | (phase == phases.OVER)).tolist():
-            running = self._follow(report, world)
-            if phase[world] != phases.OVER:
-                continue
-            del self._running[world]
-            row = EpisodeRecord(MODE_NAMES[_number(report, "mode", world)])
-            if Ending(_number(report, "ending", world)).delivers:
-                row = EpisodeRecord(row.mode, running.objects, int((report.entry[world] >= 0).sum()), tuple(running.attempts))
-            ended[running.address[0]] = row
+            running = self._running.get(world)
+            if running is None:
+                running = self._running[world] = _Running(_number(report, "episode", world), int((report.entry[world] >= 0).sum()))
+            self._follow(running, report, world)
+            if phase[world] == phases.OVER:
+                ended[running.episode] = self._hand_over(report, world)
+            elif _number(report, "task", world) == phases.LOOK:
+                running.load = []
+                running.begun = self._begin(running.episode, report, world)
         return ended
 
-    def _follow(self, report: TickReport, world: int) -> _Running:
-        """What the tick adds to a world that acts, or whose episode is over."""
-        address = (_number(report, "episode", world), _number(report, "redraw", world))
-        running = self._running.get(world)
-        if running is None or running.address != address:
-            running = self._running[world] = _Running(address, int((report.entry[world] >= 0).sum()))
-        task, outcome = _number(report, "task", world), Outcome(_number(report, "outcome", world))
+    def _follow(self, running: _Running, report: TickReport, world: int) -> None:
+        """What the tick adds to the running attempt."""
+        outcome = Outcome(_number(report, "outcome", world))
         lifted = outcome not in (Outcome.NONE, Outcome.NOTHING_SEEN)
-        if task == phases.LIFT or lifted:
+        if lifted or _number(report, "task", world) == phases.LIFT:
             running.load.append(round(float(report.measure("load")[world]), LOAD_PLACES))
         if outcome is not Outcome.NONE:
             self._end(running, report, world, outcome)
-        if task == phases.LOOK and _number(report, "phase", world) == phases.ACT:
-            running.load = []
-            running.begun = self._begin(address[0], report, world)
-        return running
+
+    def _hand_over(self, report: TickReport, world: int) -> EpisodeRecord:
+        """The world's episode is over: what it did; nothing if it delivers nothing."""
+        running, mode = self._running.pop(world), MODE_NAMES[_number(report, "mode", world)]
+        if not Ending(_number(report, "ending", world)).delivers:
+            return EpisodeRecord(mode)
+        return EpisodeRecord(mode, running.objects, int((report.entry[world] >= 0).sum()), tuple(running.attempts))
 
     def _begin(self, episode: int, report: TickReport, world: int) -> dict[str, Any]:
         """What is known of an attempt when its world has been looked at."""
@@ -221,7 +220,7 @@ class AttemptLog:
     def _end(self, running: _Running, report: TickReport, world: int, outcome: Outcome) -> None:
         begun, number = running.begun, _number(report, "attempt", world)
         if begun is None or begun["attempt"] != number:
-            raise ValueError(f"attempt {number} of episode {running.address[0]} ends, but none that is followed has that number")
+            raise ValueError(f"attempt {number} of episode {running.episode} ends, but none that is followed has that number")
         seen = outcome is not Outcome.NOTHING_SEEN
         hits = _number(report, "hits", world) if seen else 0
         running.attempts.append(AttemptRecord(
@@ -230,9 +229,9 @@ class AttemptLog:
             outcome=outcome,
             rays=self.rays,
             hits=hits,
-            good_seal=hits > 0 and self.rays - hits <= self.tolerated_misses,
+            good_seal=self.rays - hits <= self.tolerated_misses,
             caught=_instances(_number(report, "caught", world)) if seen else (),
-            picked=_instances(_number(report, "held", world)) if outcome.succeeded else (),
+            picked=_instances(_number(report, "held", world)),
             load=tuple(running.load),
         ))  # fmt: skip
         running.begun = None

@@ -312,6 +312,24 @@ def test_the_last_of_32_instances_is_a_bit_like_the_others(device):
     assert (record.attempts[0].caught, record.attempts[0].picked) == ((0, 31), (31,))
 
 
+@pytest.mark.parametrize(("hits", "tolerated", "good"), [(RAYS, 0, True), (RAYS - 1, 0, False), (RAYS - 2, 2, True), (0, RAYS - 1, False)])
+def test_a_good_seal(device, hits, tolerated, good):
+    world = new_world(device)
+
+    def script() -> Ticks:
+        world.settle(0, 0, phases.PICK, [0, 1, 2, 0])
+        world.first_frame()
+        world.look(0)
+        yield
+        yield from world.attempt(0, [0.0], outcome=Outcome.DROPPED, hits=hits, held=0)
+        world.over(Ending.GAVE_UP)
+        yield
+
+    log = AttemptLog(settings(suction__tolerated_misses=tolerated), OBJECT_IDS)
+    (record,) = play({world: script()}, log).values()
+    assert record.attempts[0].good_seal is good
+
+
 def test_missing_reports_are_noticed(device):
     world, log = new_world(device), AttemptLog(CONFIG, OBJECT_IDS)
     world.settle(3, 0, phases.PICK, [0, 1, 2, 0])
