@@ -246,7 +246,7 @@ class Sight:
     deep_weight: float = setting(0.1, "", "That weight.", low=0.0, high=1.0)
     min_votes: float = setting(5.0, "", "Votes that make an edge of the clutter graph.", above=0.0)
     reach: float = setting(
-        1.2, "", "A neighbour whose contour reaches farther from the suction point than this many of its diagonals has no vote.", above=0.0
+        1.2, "", "A neighbour gets no vote where its contour reaches farther from the compared pixel than this many diagonals.", above=0.0
     )
     exact_cycle: int = setting(10, "", "Cycles of at most so many objects are broken at least cost; larger ones greedily.", low=2, high=12)
     normal_window: int = setting(10, "px", "The normal is averaged so far to each side of the suction point.", low=0, high=256)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from tests.reference import planning
 from tests.reference.planning import Looks, paint, paint_shapes
@@ -69,14 +71,92 @@ def test_neighbours_lower_than_the_suction_point_weigh_little(device):
         assert made.votes()[0, 0, 1] == pytest.approx(40 * weight)
 
 
-def test_a_small_thing_far_from_the_suction_point_does_not_vote(device):
-    """Farthest corner of the neighbour (100, 69) from the suction point; f = 100 px, its depth 1.8 m."""
-    picture = paint([(20, 20, 49, 59, LOW), (50, 10, 100, 69, HIGH)])
-    suction = looks(device, picture).found["suction"][0, 0]
-    farthest = max(np.hypot(*(np.array(corner) - suction)) for corner in ((50, 10), (100, 10), (50, 69), (100, 69)))
-    just = farthest * HIGH / (1.2 * planning.FOCAL)
-    assert looks(device, picture, diagonal=just * 1.001).votes()[0, 0, 1] == 40
-    assert looks(device, picture, diagonal=just * 0.999).votes()[0, 0, 1] == 0
+# ---- reach ----
+
+
+def reaching(pixels: float, depth: float = HIGH) -> float:
+    """Diagonal [m] of what may reach so many pixels, its suction point having that depth."""
+    return pixels * depth / (planning.SIGHT["reach"] * planning.FOCAL)
+
+
+def test_a_contour_votes_where_all_of_the_neighbour_is_in_reach(device):
+    """A bar of columns 5 to 115, rows 50 to 60, compared from row 52: x votes if (115 - x)² + 8² and (x - 5)² + 8² are at most 70²."""
+    picture = paint([(10, 20, 110, 49, LOW), (5, 50, 115, 60, HIGH)])
+    assert looks(device, picture).votes()[0, 0, 1] == 101
+    columns = np.arange(10, 111)
+    expected = (np.hypot(np.maximum(columns - 5, 115 - columns), 8) <= 70).sum()
+    assert expected == 29
+    assert looks(device, picture, diagonal=reaching(70)).votes()[0, 0, 1] == expected
+
+
+def test_a_neighbour_too_long_for_its_diagonal_has_no_vote(device):
+    """From the middle of the bar its ends are 55 pixels away, 8 rows down."""
+    picture = paint([(5, 20, 115, 49, LOW), (5, 50, 115, 60, HIGH)])
+    farthest = np.hypot(55, 8)
+    assert looks(device, picture, diagonal=reaching(farthest * 1.001)).votes()[0, 0, 1] == 1
+    assert looks(device, picture, diagonal=reaching(farthest * 0.999)).votes()[0, 0, 1] == 0
+
+
+def test_a_small_thing_at_the_end_of_a_long_one_votes(device):
+    """Its diagonal is the one that it shows; from the long one's suction point it is out of reach."""
+    shown = float(np.hypot(15, 40))
+    made = looks(device, paint([(10, 30, 95, 50, LOW), (85, 20, 100, 60, HIGH)]), diagonal=shown * HIGH / planning.FOCAL)
+    column, row = made.found["suction"][0, 0]
+    assert np.hypot(100 - column, max(row - 20, 60 - row)) > planning.SIGHT["reach"] * shown
+    assert made.votes()[0, 0, 1] == 21
+
+
+def test_piles_of_true_masks_keep_every_vote(device):
+    """Turned rectangles with the diagonals that they have, many of them out of reach of a suction point."""
+    numbers = np.random.default_rng(7)
+    far = votes = 0
+    for _ in range(8):
+        sides, turns = numbers.uniform(12, 60, (8, 2)), numbers.uniform(0, np.pi, 8)
+        depths, middles = 1.8 + 0.02 * numbers.permutation(8), numbers.uniform((30, 25), (90, 65), (8, 2))
+        square = np.array([(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)])
+        turn = np.stack([[np.cos(turns), -np.sin(turns)], [np.sin(turns), np.cos(turns)]]).transpose(2, 0, 1)
+        corners = ((square * sides[:, None]) @ turn.transpose(0, 2, 1) + middles[:, None]).round()
+        diagonal = np.linalg.norm(sides, axis=1) * depths / planning.FOCAL
+        made = looks(device, paint_shapes([(c, (0.0, 0.0, z)) for c, z in zip(corners, depths, strict=True)]), instances=8,
+                     diagonal=diagonal)
+        found = made.votes()[0]
+        np.testing.assert_allclose(found, planning.votes(made, np.inf)[0], atol=1e-4)
+        for i, j in np.argwhere(found >= planning.SIGHT["min_votes"]):
+            line = made.found["contour"][0, j, : made.found["contour_length"][0, j]]
+            farthest = np.linalg.norm(line - made.found["suction"][0, i], axis=1).max()
+            far, votes = far + (farthest > planning.SIGHT["reach"] * np.linalg.norm(sides[j])), votes + 1
+    assert votes > 60
+    assert far > 5
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    points=st.lists(st.tuples(st.integers(0, 119), st.integers(0, 89)), min_size=1, max_size=300),
+    column=st.integers(10, 110),
+    more=st.sampled_from((-0.5, 0.5)),
+)
+def test_votes_in_reach_are_the_twins_whatever_the_contour(device, points, column, more):
+    """The reach is just below or above what one of the compared pixels needs: a box alone cannot tell."""
+    made = looks(device, paint([(10, 20, 110, 49, LOW), (5, 50, 115, 60, HIGH)]))
+    line = np.array(points)
+    square = ((line - (column, 52)) ** 2).sum(axis=1).max()
+    diagonal = reaching(np.sqrt(max(square + more, 0.0)))
+    made.found["contour"][0, 1, : len(line)], made.found["contour_length"][0, 1] = line, len(line)
+    made.look.contour.assign(made.found["contour"])
+    made.look.contour_length.assign(made.found["contour_length"])
+    made.worlds.scene.catalog.diagonal.fill_(diagonal)
+    assert made.votes()[0, 0, 1] == planning.votes(made, diagonal)[0, 0, 1]
+
+
+def test_a_contour_without_points_is_in_reach(device):
+    """What had no room for its contour keeps its votes."""
+    made = looks(device, paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)]), diagonal=1e-3)
+    assert made.votes()[0, 0, 1] == 0
+    made.look.contour_length.assign([[160, 0, 0, 0, 0]])
+    assert made.votes()[0, 0, 1] == 40
+
+
+# ---- which views ----
 
 
 def test_unused_views_write_nothing(device):
@@ -112,7 +192,7 @@ def test_votes_are_the_twins(device):
     made = looks(device, *pictures, instances=6, diagonal=0.9)
     expected = planning.votes(made, 0.9)
     np.testing.assert_allclose(made.votes(), expected, atol=1e-4)
-    # The draw has full votes, deep votes and neighbours out of reach.
+    # The draw has full votes, deep votes and votes out of reach.
     assert (expected > 5).sum() > 30
     assert (expected % 1 > 0).sum() > 5
     assert (planning.votes(made, 10.0) != expected).sum() > 5

@@ -11,7 +11,7 @@ from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.acyclic import Cycles, order_clutter_kernel
 from synpick_warp.kernels.choice import choose_target_kernel
-from synpick_warp.kernels.clutter import CONTOUR_LANES, count_votes_kernel, weigh_votes_kernel
+from synpick_warp.kernels.clutter import CONTOUR_LANES, NOWHERE, bound_contours_kernel, count_votes_kernel, weigh_votes_kernel
 from synpick_warp.kernels.grasp import frame_grasp_kernel, smooth_normal_kernel
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.render import filled
@@ -40,6 +40,10 @@ class VoteArrays:
 
     count: wp.array = device_array("view", "instance", "instance", "kind", dtype=wp.int32)
     """Full and deep votes."""
+    extent: wp.array = device_array("view", "instance", dtype=wp.vec4i, unit="px")
+    """How far a contour extends to the left, up, right and down: greatest -column, -row, column, row."""
+    reach: wp.array = device_array("view", "instance", dtype=wp.float32, unit="px")
+    """No point of its contour may be farther from where an instance gets a vote."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +75,7 @@ class Planner:
         self.views, instances = seen.look.largest.shape
         sizes = plan_sizes(config, instances, self.views)
         self.device = device
-        self.count = allocate(VoteArrays, sizes, device).count
+        self.voting = allocate(VoteArrays, sizes, device)
         self.arrays = allocate(CycleArrays, sizes, device)
         self.cycles = filled(Cycles, self.arrays)
 
@@ -89,27 +93,36 @@ class Planner:
             plan: Written; a world in which nothing is visible gets the target -1 and keeps the rest.
             seed: Of all draws.
         """
+        self.bound_contours(scene, seen, state, sighting)
         self.count_votes(scene, seen, sighting)
-        self.weigh_votes(scene, seen, state, sighting)
+        self.weigh_votes(scene, seen, sighting)
         self.order_clutter(scene, seen, sighting)
         self.choose_target(scene, seen, state, attempts, sighting, plan, seed)
         self.smooth_normal(scene, seen, sighting, plan)
         self.frame_grasp(scene, seen, sighting, plan)
 
+    def bound_contours(self, scene: SceneData, seen: Seen, state: WorldState, sighting: Sighting) -> None:
+        """Box of every contour, and how far it may reach from where its instance gets a vote."""
+        look, (views, instances) = seen.look, seen.look.largest.shape
+        self.voting.extent.fill_(int(NOWHERE))
+        inputs = [scene.catalog, seen.cameras, scene.sight, state.entry, look.world, look.camera, look.contour, look.contour_length]
+        inputs += [sighting.depth]
+        dim = (views, instances, int(CONTOUR_LANES))
+        wp.launch(bound_contours_kernel, dim=dim, inputs=inputs, outputs=[self.voting.extent, self.voting.reach], device=self.device)
+
     def count_votes(self, scene: SceneData, seen: Seen, sighting: Sighting) -> None:
         """Votes of every contour, by kind."""
         look, (views, instances) = seen.look, seen.look.largest.shape
-        self.count.zero_()
+        self.voting.count.zero_()
         inputs = [seen.grid, scene.sight, seen.hits, look.world, look.component, look.largest, look.contour, look.contour_length]
-        inputs += [sighting.depth]
+        inputs += [sighting.depth, self.voting.extent, self.voting.reach]
         dim = (views, instances, int(CONTOUR_LANES))
-        wp.launch(count_votes_kernel, dim=dim, inputs=inputs, outputs=[self.count], device=self.device)
+        wp.launch(count_votes_kernel, dim=dim, inputs=inputs, outputs=[self.voting.count], device=self.device)
 
-    def weigh_votes(self, scene: SceneData, seen: Seen, state: WorldState, sighting: Sighting) -> None:
-        """Votes by weight, of neighbours in reach."""
-        look, (views, instances) = seen.look, seen.look.largest.shape
-        inputs = [scene.catalog, seen.cameras, scene.sight, state.entry, look.world, look.camera, look.contour]
-        inputs += [look.contour_length, sighting.suction, sighting.depth, self.count]
+    def weigh_votes(self, scene: SceneData, seen: Seen, sighting: Sighting) -> None:
+        """Votes by weight."""
+        views, instances = seen.look.largest.shape
+        inputs = [scene.sight, seen.look.world, self.voting.count]
         dim = (views, instances, instances)
         wp.launch(weigh_votes_kernel, dim=dim, inputs=inputs, outputs=[sighting.votes], device=self.device)
 

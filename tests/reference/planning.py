@@ -49,7 +49,7 @@ class Looks:
     """One view a world: what looking would have found in the images, and a planner for it."""
 
     def __init__(self, device: Any, ids: list[np.ndarray], depths: list[np.ndarray], instances: int, sight: dict | None = None,
-                 diagonal: float = 10.0) -> None:
+                 diagonal: float | np.ndarray = 10.0) -> None:
         ids, depths = np.stack(ids), np.stack(depths)
         self.views, height, width = ids.shape
         self.worlds = kernel_worlds.KernelWorlds(
@@ -76,8 +76,9 @@ class Looks:
         self.planner = Planner(Config(sight=Sight(exact_cycle=self.scene.sight.exact_cycle)), self.seen, device)
 
     def votes(self) -> np.ndarray:
+        self.planner.bound_contours(self.scene, self.seen, self.worlds.state, self.sighting)
         self.planner.count_votes(self.scene, self.seen, self.sighting)
-        self.planner.weigh_votes(self.scene, self.seen, self.worlds.state, self.sighting)
+        self.planner.weigh_votes(self.scene, self.seen, self.sighting)
         return self.sighting.votes.numpy()
 
     def graph(self, votes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -127,9 +128,11 @@ def look_at(ids: np.ndarray, depths: np.ndarray, instances: int) -> dict[str, np
     return found
 
 
-def votes(looks: Looks, diagonal: float) -> np.ndarray:
-    """Votes (V, I, I), from the rule."""
+def votes(looks: Looks, diagonal: float | np.ndarray) -> np.ndarray:
+    """Votes (V, I, I), from the rule; diagonals of all instances or of each (I,) [m]."""
     rule, found = {**SIGHT}, looks.found
+    with np.errstate(divide="ignore"):
+        reach = rule["reach"] * np.asarray(diagonal) * FOCAL / found["depth"]
     codes, depths = looks.hits.code.numpy().astype(int) - 1, looks.hits.depth.numpy()
     made = np.zeros(looks.sighting.votes.shape)
     for view, i in np.argwhere(found["contour_length"] > 0):
@@ -145,13 +148,11 @@ def votes(looks: Looks, diagonal: float) -> np.ndarray:
             j = codes[view, b[1], b[0]]
             nearer = depths[view, b[1], b[0]] < depths[view, a[1], a[0]]
             if found["component"][view, a[1], a[0]] == found["largest"][view, i] and j not in (-1, i) and nearer:
+                other = found["contour"][view, j, : found["contour_length"][view, j]]
+                if np.linalg.norm(other - b, axis=1).max() > reach[view, j]:
+                    continue
                 deep = depths[view, b[1], b[0]] > found["depth"][view, i] + np.float32(rule["deep_distance"])
                 made[view, i, j] += rule["deep_weight"] if deep else 1.0
-        for j in np.flatnonzero(made[view, i]):
-            other = found["contour"][view, j, : found["contour_length"][view, j]]
-            farthest = np.linalg.norm(other - found["suction"][view, i], axis=1).max()
-            if farthest > rule["reach"] * diagonal * FOCAL / found["depth"][view, j]:
-                made[view, i, j] = 0.0
     return made
 
 
