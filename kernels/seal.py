@@ -7,6 +7,9 @@ from synpick_warp.kernels.suction import CUP, tip_pose
 
 wp.set_module_options({"enable_backward": False})
 
+# A contact that is not to act is this far from touching [m]; stages.physics makes the solver skip contacts far nearer than that.
+APART = wp.constant(1.0)
+
 
 @wp.struct
 class Response:
@@ -235,19 +238,22 @@ def ignore_held_contacts_kernel(
     contact_count: wp.array[int],
     slot: wp.array2d[int],
     held: wp.array2d[int],
-    shape0_inout: wp.array[int],
-    shape1_inout: wp.array[int],
+    shape0: wp.array[int],
+    shape1: wp.array[int],
+    # Out:
+    margin_out: wp.array[float],
 ):
-    """Take the shapes, both -1, from contacts of a cup with what hangs on it: a contact in which nothing can respond makes no row.
+    """Pull contacts of a cup with what hangs on it so far apart that the solver makes no rows for them: they would fight the seal.
 
-    Such a contact would fight the seal. The collision pipeline writes all shapes anew each time, and has by then kept what it
-    matches the next contacts with.
+    The collision pipeline writes all margins anew each time, and has by then kept what it matches the next contacts with. Taking the
+    shapes away instead would make one pair of bodies of all such contacts of all worlds, and the solver's time grows with a pair's
+    square.
     """
     contact = wp.tid()
-    if contact >= contact_count[0] or shape0_inout[contact] < 0 or shape1_inout[contact] < 0:
+    if contact >= contact_count[0] or shape0[contact] < 0 or shape1[contact] < 0:
         return
-    a = shape_body[shape0_inout[contact]]
-    b = shape_body[shape1_inout[contact]]
+    a = shape_body[shape0[contact]]
+    b = shape_body[shape1[contact]]
     if a < 0 or b < 0:
         return
     cup = a
@@ -258,5 +264,4 @@ def ignore_held_contacts_kernel(
     if cup % layout.bodies != CUP:
         return
     if hangs(layout, cup // layout.bodies, other, slot, held):
-        shape0_inout[contact] = -1
-        shape1_inout[contact] = -1
+        margin_out[contact] = -APART

@@ -76,6 +76,7 @@ class Suction:
             dim=contacts.rigid_contact_max,
             inputs=[scene.layout, physics.model.shape_body, contacts.rigid_contact_count, state.slot, seals.held,
                     contacts.rigid_contact_shape0, contacts.rigid_contact_shape1],
+            outputs=[contacts.rigid_contact_margin0],
             device=state.phase.device,
         )
 

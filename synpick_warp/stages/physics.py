@@ -13,6 +13,8 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import joints, rest
 from synpick_warp.scenes import build
 
+# Contacts with a larger gap make no rows [m]: none has that the pipeline finds, only those that a hook has pulled apart.
+CONTACT_GAP = 0.1
 # A joint limit's row is made when the joint comes this near to it [rad].
 JOINT_LIMIT_GAP = 0.2
 
@@ -39,6 +41,7 @@ class Physics:
             self.model,
             iterations=physics.iterations,
             contact_warmstart=True,
+            contact_gap_gate=CONTACT_GAP,
             articulation_constraint_max=physics.gripper_rows_per_world,
             enable_joint_limits=True,
             joint_limit_activation_gap=JOINT_LIMIT_GAP,
