@@ -76,8 +76,6 @@ def test_the_released_generator_differs_in_exactly_this():
     assert {key: (paper[key], value) for key, value in released.items() if value != paper[key]} == {
         "move.damping": (60.0, 1.0),
         "pick.failures": (3, 4),
-        "target.forgive": (False, True),
-        "target.random_after_failure": (False, True),
         "suction.tolerated_misses": (0, 2),
         "suction.poor_force": (2.0, 0.2),
         "bop.coco": (True, False),
