@@ -24,7 +24,7 @@ from synpick_warp.exporters.files import output_error, write_whole
 from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.kernels import phases
-from synpick_warp.outcome import Ending, Outcome
+from synpick_warp.outcome import ATTEMPTS_FILE, Ending, Outcome
 from synpick_warp.progress import Progress
 from synpick_warp.scenes import build
 from synpick_warp.scenes.cameras import make_cameras
@@ -47,8 +47,6 @@ CONFIG_FILE = "config.toml"
 """The resolved settings, in the data set."""
 EPISODES_FILE = "episodes.jsonl"
 """How every episode ended, in the data set."""
-ATTEMPTS_FILE = "attempts.jsonl"
-"""Every attempt to pick, in the data set, by episode and number; a bake that only moves has none."""
 
 
 class EpisodeRow(NamedTuple):
@@ -221,8 +219,10 @@ class _Meter:
         done = [row for row in summary.episodes if row.ending.delivers]
         left = None
         if done and elapsed > 0.0:
-            total = self.config.bake.episodes * self.cameras * sum(row.frames for row in done) / len(done)
-            left = max(0.0, total / summary.views - 1.0) * elapsed
+            # Short episodes end first: those that run may already be longer than the mean of those that ended.
+            frames = max(sum(row.frames for row in done) / len(done), summary.views / self.cameras / (len(done) + active))
+            share = summary.views / (self.config.bake.episodes * self.cameras * frames)
+            left = (1.0 / share - 1.0) * elapsed if share < 1.0 else None
         self.progress.update(
             episodes_done=len(summary.episodes), episodes=self.config.bake.episodes, worlds_active=active, views=summary.views,
             views_per_s=summary.views / elapsed if elapsed > 0.0 else 0.0, seconds_left=left,

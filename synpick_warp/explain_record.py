@@ -11,8 +11,8 @@ from typing import Any
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DatasetError
+from synpick_warp.outcome import ATTEMPTS_FILE
 
-ATTEMPTS_FILE = "attempts.jsonl"
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
 CANDIDATES = ("pole", "centroid", "middle")
 """Where a suction point may lie, in the order of `SeenObject.distances`."""

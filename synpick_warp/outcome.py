@@ -5,6 +5,9 @@ from __future__ import annotations
 import enum
 from typing import Self
 
+ATTEMPTS_FILE = "attempts.jsonl"
+"""Every attempt to pick, in the data set, by episode and number; a bake that only moves has none."""
+
 
 class _Coded(enum.IntEnum):
     """An enum that is declared by its sentences; as a number, a member is its place in that order."""
