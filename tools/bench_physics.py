@@ -240,8 +240,8 @@ def _looks(simulation: Simulation, least: float) -> Iterator[Row]:
     )
 
     def look_at_batch() -> None:
-        looker._list_lookers()
-        looker._look_at_batch(snapshot)
+        looker.list_lookers()
+        looker.look_at_batch(snapshot)
 
     seconds_per_call(look_at_batch, simulation.device, 0.0)
     watch, calls = Stopwatch(simulation.device), 0

@@ -52,9 +52,7 @@ class Suction:
             device=device,
         )
 
-    def hold_objects(
-        self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics, current: newton.State
-    ) -> None:
+    def hold_objects(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
         """Before a step: pull what hangs on the cups to the tip, and break seals that bear too much.
 
         After the gripper's forces have been written: the reactions are added to them.

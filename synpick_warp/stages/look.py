@@ -50,8 +50,8 @@ class Looker:
             return
         if not self._warm:
             # Once eagerly, whether anybody looks or not: it loads the kernels.
-            self._list_lookers()
-            self._look_at_batch(snapshot)
+            self.list_lookers()
+            self.look_at_batch(snapshot)
             self._warm = True
         if id(snapshot) not in self._graphs:
             with wp.ScopedCapture(device=self.device) as capture:
@@ -60,10 +60,11 @@ class Looker:
         wp.capture_launch(self._graphs[id(snapshot)])
 
     def _look(self, snapshot: Snapshot) -> None:
-        self._list_lookers()
-        wp.capture_while(self._left, self._look_at_batch, snapshot=snapshot)
+        self.list_lookers()
+        wp.capture_while(self._left, self.look_at_batch, snapshot=snapshot)
 
-    def _list_lookers(self) -> None:
+    def list_lookers(self) -> None:
+        """List the worlds that look, and begin with the first."""
         wp.launch(
             lookers.list_lookers_kernel,
             dim=1,
@@ -72,7 +73,8 @@ class Looker:
             device=self.device,
         )
 
-    def _look_at_batch(self, snapshot: Snapshot) -> None:
+    def look_at_batch(self, snapshot: Snapshot) -> None:
+        """Look at the next of the worlds listed, as many as there are views, and plan their attempts."""
         look = self.sight.look
         views = look.world.shape[0]
         wp.launch(

@@ -109,7 +109,7 @@ class Simulation:
         """Forces before a step."""
         act.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current)
         if self.suction is not None:
-            self.suction.hold_objects(self.scene, self.state, self.attempts, self.seals, self.physics, current)
+            self.suction.hold_objects(self.scene, self.state, self.seals, self.physics, current)
 
     def _let_go_of_contacts(self) -> None:
         """After contacts were found."""

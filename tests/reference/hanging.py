@@ -98,7 +98,7 @@ class Hanging:
         if self.carried:
             force[:, :3] = (pick.stiffness * (offset - step * velocity) - pick.damping * velocity) / gain
             force[:, 2] += self.gripper_mass * self.config.physics.gravity
-        self.suction.hold_objects(self.scene, self.state, self.attempts, self.seals, self.physics, current)
+        self.suction.hold_objects(self.scene, self.state, self.seals, self.physics, current)
 
     def ignore(self) -> None:
         """Contacts of cups with what they hold."""
