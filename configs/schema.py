@@ -286,6 +286,9 @@ class Render:
 
     turn_lights: bool = setting(True, "", "Turn each episode's light map by a random angle about the vertical.")
     exposure: float = setting(1.0, "", "Factor on the automatic exposure.", above=0.0)
+    exposure_spread: float = setting(
+        0.3, "stops", "Each episode's exposure is off by up to so much, evenly: cameras step by a third of a stop.", low=0.0, high=5.0
+    )
     shadow_rays: int = setting(1, "", "Shadow rays a pixel towards the map's main light; 0: none.", low=0, high=64)
     ambient_rays: int = setting(1, "", "Rays a pixel that find how much of the sky is hidden; 0: none.", low=0, high=64)
     color_samples: int = setting(1, "", "Colour samples a pixel; depth and masks always have one.", low=1, high=64)

@@ -180,6 +180,7 @@ def develop_kernel(
     lights: Lights,
     # State:
     light: wp.array[int],
+    light_exposure: wp.array[float],
     # In:
     view_world: wp.array[int],
     radiance: wp.array3d[wp.vec3],
@@ -187,12 +188,13 @@ def develop_kernel(
     # Out:
     color_out: wp.array3d[wp.vec3ub],
 ):
-    """Radiance to sRGB bytes: exposure, tone curve, transfer curve."""
+    """Radiance to sRGB bytes: exposure (the map's factor times 2 to the episode's stops), tone curve, transfer curve."""
     pixel = tile_pixel(grid, wp.tid() + first)
     view = pixel[0]
     row = pixel[1]
     column = pixel[2]
     if row >= grid.height or column >= grid.width:
         return
-    value = lights.exposure[light[view_world[view]]] * radiance[view, row, column]
+    world = view_world[view]
+    value = lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world]) * radiance[view, row, column]
     color_out[view, row, column] = wp.vec3ub(display_value(value[0]), display_value(value[1]), display_value(value[2]))

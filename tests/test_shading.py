@@ -80,6 +80,15 @@ def test_exposure_does_not_depend_on_the_maps_scale_but_on_the_setting(device):
     assert (more.astype(int) - dim)[0, 24, 32].min() > 10
 
 
+def test_a_stop_doubles_the_light_before_the_tone_curve(device):
+    # Linear albedo 0.1 shows 0.125 and the gloss; twice that is still below the shoulder.
+    grey = matt((float(linear_to_srgb(0.1)),) * 3)
+    plain, more = (shown(grey, device, light_exposure=stops).color[0, 24, 32] / 255.0 for stops in (0.0, 1.0))
+    np.testing.assert_allclose(srgb_to_linear(more), 2.0 * srgb_to_linear(plain), rtol=0.02)
+    same = shown(grey, device, light_exposure=0.5, config=with_render(exposure=2.0**-0.5)).color[0, 24, 32] / 255.0
+    np.testing.assert_allclose(same, plain, atol=1.01 / 255.0)
+
+
 def test_a_grey_sheet_has_the_brightness_worked_out_by_hand(device):
     # Linear albedo 0.2 under an even map: 0.2 x 1.25 of white, below the shoulder of the tone curve, plus the gloss.
     value = shown(matt((float(linear_to_srgb(0.2)),) * 3), device, config=with_render(ambient_rays=0)).color[0, 24, 32]

@@ -187,7 +187,7 @@ class Renderer:
     def develop(self, snapshot: Snapshot, view_world: wp.array, count: int, out: ViewBuffers) -> None:
         """Radiance to bytes."""
         scene = self.scene
-        inputs = [scene.grid, scene.lights, snapshot.light, view_world, self.picture.radiance]
+        inputs = [scene.grid, scene.lights, snapshot.light, snapshot.light_exposure, view_world, self.picture.radiance]
         self._launch(develop_kernel, count, inputs, [out.color])
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
