@@ -1,14 +1,15 @@
 """How a surface scatters light: metallic-roughness with a GGX lobe, what that lobe scatters several times, and a diffuse lobe below it.
 
 With μ the cosine to the normal, F₀ the reflectance at normal incidence, E(μ) the single-scattering albedo of the lobe for F = 1 and
-E_g(μ) that of all gloss, their cosine-weighted means written Ē:
+E_d(μ) that of all gloss of a dielectric, their cosine-weighted means written Ē:
 
     f = D F G₂ / (4 μ_i μ_o)                                        gloss, single scattering (Walter et al., 2007; Heitz, 2014)
       + F_m (1 - E(μ_i)) (1 - E(μ_o)) / (π (1 - Ē))                 gloss, multiple scattering (Kulla and Conty, 2017)
-      + (1 - metallic) base (1 - E_g(μ_i)) (1 - E_g(μ_o)) / (π (1 - Ē_g))     diffuse: what the gloss lets through (Kelemen, 2001)
+      + (1 - metallic) base (1 - E_d(μ_i)) (1 - E_d(μ_o)) / (π (1 - Ē_d))     diffuse: what the gloss lets through (Kelemen, 2001)
 
-Each part is reciprocal, and together they reflect all light if base colour is white. F is Schlick's, so that the albedo is linear
-in F₀: ∫ D F G₂ / (4 μ_o) dω = F₀ a(μ) + b(μ), E = a + b. A table holds a and b.
+This is the mixture, by `metallic`, of a metal and a dielectric, as glTF has it. Each part is reciprocal, and a white base colour
+reflects all light. F is Schlick's, so that the albedo is linear in F₀: ∫ D F G₂ / (4 μ_o) dω = F₀ a(μ) + b(μ), E = a + b. A table
+holds a and b.
 """
 
 import warp as wp
@@ -59,6 +60,8 @@ class Brdf:
     """(1 - metallic) times base colour."""
     multiple: wp.vec3
     """F_m: what is left of light that the lobe scatters more than once."""
+    coat_multiple: float
+    """F_m of a dielectric."""
     albedo: wp.vec2
     """The table's entry for the outgoing direction."""
     mean: wp.vec2
@@ -91,10 +94,19 @@ def gloss_mean(gloss: Gloss, roughness: float) -> wp.vec2:
 
 
 @wp.func
-def glossy_share(brdf: Brdf, albedo: wp.vec2) -> wp.vec3:
-    """E_g: what all gloss reflects, single and multiple scattering, where the table says `albedo`."""
-    one = wp.vec3(1.0, 1.0, 1.0)
-    return albedo[0] * brdf.reflectance + albedo[1] * one + (1.0 - albedo[0] - albedo[1]) * brdf.multiple
+def multiple_share(kept: float, reflectance: float) -> float:
+    """F_m for the table's mean albedo `kept`: light meets the facets k > 1 times with chance ∝ (1 - Ē)^(k - 1), and F̄ stays each time.
+
+    Schlick's term averages to F̄ = F₀ + (1 - F₀) / 21. The sum begins at the second time, hence the square (Hill, 2018).
+    """
+    average = (20.0 * reflectance + 1.0) / 21.0
+    return average * average * kept / (1.0 - (1.0 - kept) * average)
+
+
+@wp.func
+def coat_share(brdf: Brdf, albedo: wp.vec2) -> float:
+    """E_d: what all gloss of a dielectric reflects where the table says `albedo`."""
+    return albedo[0] * DIELECTRIC + albedo[1] + (1.0 - albedo[0] - albedo[1]) * brdf.coat_multiple
 
 
 @wp.func
@@ -115,7 +127,6 @@ def facing(normal: wp.vec3, outgoing: wp.vec3) -> wp.vec3:
 @wp.func
 def brdf_at(gloss: Gloss, base: wp.vec3, metallic: float, roughness: float, normal: wp.vec3, outgoing: wp.vec3) -> Brdf:
     """A surface of linear base colour `base`, seen from `outgoing`; `normal` points to the same side."""
-    one = wp.vec3(1.0, 1.0, 1.0)
     made = Brdf()
     made.normal = facing(normal, outgoing)
     made.tangent = around(made.normal, wp.vec3(1.0, 0.0, 0.0))
@@ -127,13 +138,13 @@ def brdf_at(gloss: Gloss, base: wp.vec3, metallic: float, roughness: float, norm
     made.diffuse = (1.0 - metallic) * base
     made.albedo = gloss_albedo(gloss, roughness, wp.dot(made.normal, outgoing))
     made.mean = gloss_mean(gloss, roughness)
-    # Schlick's term averages to F₀ + (1 - F₀) / 21; light that left once at the first try is not counted, hence the square.
-    average = (20.0 / 21.0) * made.reflectance + (1.0 / 21.0) * one
     kept = made.mean[0] + made.mean[1]
-    made.multiple = wp.cw_div(kept * wp.cw_mul(average, average), one - (1.0 - kept) * average)
-    single = mean_of(made.albedo[0] * made.reflectance + made.albedo[1] * one)
-    gloss_all = glossy_share(made, made.albedo)
-    rest = mean_of(gloss_all) - single + mean_of(wp.cw_mul(made.diffuse, one - gloss_all))
+    made.coat_multiple = multiple_share(kept, DIELECTRIC)
+    metal = wp.vec3(multiple_share(kept, base[0]), multiple_share(kept, base[1]), multiple_share(kept, base[2]))
+    made.multiple = wp.lerp(wp.vec3(made.coat_multiple, made.coat_multiple, made.coat_multiple), metal, metallic)
+    single = made.albedo[0] * mean_of(made.reflectance) + made.albedo[1]
+    rest = (1.0 - made.albedo[0] - made.albedo[1]) * mean_of(made.multiple)
+    rest += (1.0 - coat_share(made, made.albedo)) * mean_of(made.diffuse)
     made.gloss_share = 1.0
     if rest > 0.0:
         made.gloss_share = wp.clamp(single / (single + rest), LEAST_SHARE, 1.0 - LEAST_SHARE)
@@ -196,10 +207,8 @@ def evaluate(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> wp.vec3:
 
     albedo = gloss_albedo(gloss, brdf.roughness, i[2])
     lost = (1.0 - albedo[0] - albedo[1]) * (1.0 - brdf.albedo[0] - brdf.albedo[1]) / wp.max(1.0 - brdf.mean[0] - brdf.mean[1], 1.0e-6)
-    through = wp.cw_mul(one - glossy_share(brdf, albedo), one - glossy_share(brdf, brdf.albedo))
-    closed = one - glossy_share(brdf, brdf.mean)
-    through = wp.cw_div(through, wp.vec3(wp.max(closed[0], 1.0e-6), wp.max(closed[1], 1.0e-6), wp.max(closed[2], 1.0e-6)))
-    return single + (i[2] / wp.PI) * (lost * brdf.multiple + wp.cw_mul(brdf.diffuse, through))
+    through = (1.0 - coat_share(brdf, albedo)) * (1.0 - coat_share(brdf, brdf.albedo)) / (1.0 - coat_share(brdf, brdf.mean))
+    return single + (i[2] / wp.PI) * (lost * brdf.multiple + through * brdf.diffuse)
 
 
 @wp.func
