@@ -15,7 +15,7 @@ from synpick_warp.outcome import Ending
 from synpick_warp.scenes import build
 from synpick_warp.stages import arrange
 from synpick_warp.stages.constants import make_scene_data
-from tests.reference import arrangement, draws, small_worlds
+from tests.reference import arrangement, small_worlds
 from tests.reference.kernel_worlds import KernelWorlds
 
 WORLDS = 24
@@ -228,49 +228,6 @@ def test_worlds_at_work_keep_their_objects(device, phase):
         assert (worlds.state.variant.numpy().reshape(WORLDS, -1)[:, 2:] == -1).all()
         assert (joints.numpy() == 0.5).all()
         assert not worlds.state.restarted.numpy().any()
-
-
-def test_lights_are_even_and_turn(device):
-    worlds = made(device, worlds=2000)
-    worlds.begin(phases.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
-    counts = np.bincount(worlds.state.light.numpy(), minlength=5)
-    assert counts.min() > 330
-    assert len(counts) == 5
-    keys = [draws.stream_key(SEED, episode, 0, draws.LIGHT) for episode in range(2000)]
-    np.testing.assert_allclose(worlds.state.light_turn.numpy(), [2 * np.pi * draws.uniform(key, 1) for key in keys], rtol=1e-6)
-
-
-def test_exposures_are_even_within_their_spread_and_the_episodes_own(device):
-    """Half a stop either way: mean 0 and deviation 0.5 / √3, within four standard errors; other worlds draw the same."""
-    worlds = made(device, worlds=2000)
-    worlds.begin(phases.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
-    drawn = worlds.state.light_exposure.numpy()
-    assert np.abs(drawn).max() <= 0.5
-    assert drawn.mean() == pytest.approx(0.0, abs=4 * 0.5 / np.sqrt(3 * 2000))
-    np.testing.assert_allclose(np.quantile(drawn, (0.05, 0.25, 0.5, 0.75, 0.95)), (-0.45, -0.25, 0.0, 0.25, 0.45), atol=0.05)
-    keys = [draws.stream_key(SEED, episode, 0, draws.LIGHT) for episode in range(2000)]
-    np.testing.assert_allclose(drawn, [draws.uniform(key, 2) - 0.5 for key in keys], atol=1e-6)
-    few = made(device, worlds=3)
-    few.begin(phases.START, np.array([1999, 7, 300]))
-    arrange.draw_objects(few.scene, few.state, SEED)
-    np.testing.assert_array_equal(few.state.light_exposure.numpy(), drawn[[1999, 7, 300]])
-    wide = made(device, worlds=2000, drop={"exposure_spread": 2.0})
-    wide.begin(phases.START)
-    arrange.draw_objects(wide.scene, wide.state, SEED)
-    np.testing.assert_allclose(wide.state.light_exposure.numpy(), 4.0 * drawn, rtol=1e-6)
-    np.testing.assert_array_equal(wide.state.light_turn.numpy(), worlds.state.light_turn.numpy())
-
-
-@pytest.mark.parametrize("setting", ["turn_lights", "exposure_spread"])
-def test_what_is_not_to_be_drawn_is_zero(device, setting):
-    worlds = made(device, drop={setting: 0})
-    worlds.begin(phases.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
-    drawn = {"turn_lights": worlds.state.light_turn, "exposure_spread": worlds.state.light_exposure}
-    for name, array in drawn.items():
-        assert (array.numpy() == 0.0).all() == (name == setting)
 
 
 @given(sizes=catalogs(), spread=st.floats(0.0, 1.0), clearance=st.floats(0.0, 0.05), episode=st.integers(0, 2**30))
