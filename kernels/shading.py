@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from synpick_warp.kernels.brdf import DIELECTRIC, MIN_ALPHA
 from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, tile_pixel
 from synpick_warp.kernels.environment import Lights, background_radiance, diffuse_irradiance, reflected_radiance, turned
 from synpick_warp.kernels.hits import NOTHING, TABLE, Bodies, Hits, Meshes, body_of
@@ -12,10 +13,6 @@ wp.set_module_options({"enable_backward": False})
 
 INTERREFLECTION = wp.constant(0.15)
 """What hides the sky shines itself, with about this share of the sky's light: an albedo of 0.3 that sees half of it."""
-DIELECTRIC = wp.constant(0.04)
-"""Reflectance of plastics and paper at normal incidence."""
-MIN_ALPHA = wp.constant(0.01)
-"""Smallest squared roughness; smoother surfaces would mirror the main light as a point that no pixel meets."""
 LINEAR_PART = wp.constant(0.6)
 """The tone curve leaves values below this untouched, so that colours keep their ratio."""
 
