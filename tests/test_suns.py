@@ -200,11 +200,24 @@ def test_a_sun_over_an_even_map_is_as_wide_as_the_sun():
 def test_a_disc_gives_its_irradiance_and_stays_above_the_horizon(z, azimuth, spread):
     across = np.sqrt(1.0 - z * z)
     direction = np.array([across * np.cos(azimuth), across * np.sin(azimuth), z])
-    disc = sun_disc(ROWS, direction, SUN.irradiance, spread)
+    disc = sun_disc(np.zeros((ROWS, 2 * ROWS), bool), direction, SUN.irradiance, spread)
     np.testing.assert_allclose(facing(disc, direction), SUN.irradiance)
     assert not disc[ROWS // 2 :].any()
     towards = map_directions(ROWS)[0][disc[..., 0] > 0.0] @ direction
     assert towards.min() > np.cos(max(np.arctan(spread), np.pi / ROWS)) - 1e-9
+
+
+def test_hills_hide_their_part_of_the_disc():
+    """The half of the map on the +y side is dark: all light comes from the other, and as much as before."""
+    direction = np.array([0.8, 0.0, 0.6])
+    bright = map_directions(ROWS)[0][..., 1] < 0.0
+    disc = sun_disc(bright, direction, SUN.irradiance, 0.2)
+    np.testing.assert_allclose(facing(disc, direction), SUN.irradiance)
+    assert not disc[~bright].any()
+    whole = sun_disc(np.ones_like(bright), direction, SUN.irradiance, 0.2)
+    assert (disc[..., 0] > 0.0).sum() == (whole[..., 0] > 0.0).sum() / 2
+    # A sun wholly behind them is believed all the same.
+    np.testing.assert_allclose(sun_disc(np.zeros_like(bright), direction, SUN.irradiance, 0.2), whole)
 
 
 def test_maps_without_a_sun_are_as_before():

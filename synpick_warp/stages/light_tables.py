@@ -133,18 +133,20 @@ def replace_sun(radiance: np.ndarray, sun: Sun) -> tuple[np.ndarray, np.ndarray,
     return rest, sun.direction, gain * sun.irradiance, max(spread, float(SUN_SPREAD))
 
 
-def sun_disc(rows: int, direction: np.ndarray, irradiance: np.ndarray, spread: float) -> np.ndarray:
+def sun_disc(bright: np.ndarray, direction: np.ndarray, irradiance: np.ndarray, spread: float) -> np.ndarray:
     """A map (rows, 2 rows, 3), black but for a disc above the horizon that gives this irradiance to what faces its middle.
 
     Args:
-        rows: Rows of the map.
+        bright: Where the map is bright (rows, 2 rows) bool; of a disc that meets such places the rest is left out, being hidden by hills.
         direction: Unit vector (3) to the disc's middle, above the horizon.
         irradiance: (3).
         spread: Tangent of its angular radius; it has at least one texel.
     """
-    directions, solid = map_directions(rows)
+    directions, solid = map_directions(len(bright))
     cosine = np.where(directions[..., 2] > 0.0, directions @ direction, -1.0)
     inside = cosine >= min(1.0 / np.sqrt(1.0 + spread**2), cosine.max())
+    if (inside & bright).any():
+        inside &= bright
     return inside[..., None] * irradiance / (cosine * solid)[inside].sum()
 
 
@@ -187,7 +189,8 @@ def light_table(light: LightMap, ground: np.ndarray | None) -> LightTable:
     upward = np.maximum(directions[..., 2], 0.0) * solid
     if replaced is not None:
         fine, direction, irradiance, spread = replaced
-        background = split_main_light(background, direction)[0] + sun_disc(BACKGROUND_ROWS, direction, irradiance, spread)
+        sky = split_main_light(background, direction)[0]
+        background = sky + sun_disc((sky < background).any(axis=2), direction, irradiance, spread)
     upward_irradiance = (fine * upward[..., None]).sum(axis=(0, 1))
     if replaced is not None:
         upward_irradiance += replaced[1][2] * replaced[2]
