@@ -35,8 +35,6 @@ BOTH = wp.constant(0)
 BY_LIGHT = wp.constant(1)
 BY_SURFACE = wp.constant(2)
 """How directions to the light are drawn. One way alone has the same mean and more noise: it serves to check the other."""
-ROULETTE_BOUNCE = wp.constant(2)
-"""From this scattering on, dim paths end early."""
 MOST_LUCK = wp.constant(0.95)
 """Largest chance of a path to go on, so that all end."""
 DIMENSIONS = wp.constant(3)
@@ -65,6 +63,8 @@ class PathRules:
     """Paths a pixel."""
     bounces: int
     """Most surfaces at which a path scatters."""
+    roulette: int
+    """From this scattering on, the first being 0, dim paths end early, and those that go on count for them."""
     strategy: int
     """BOTH, BY_LIGHT or BY_SURFACE."""
     seed: wp.uint64
@@ -213,7 +213,7 @@ def path_radiance(
             break
         through = wp.cw_mul(through, evaluate(scene.gloss, vertex.brdf, direction) / drawn_density)
         luck = wp.min(wp.max(through), MOST_LUCK)
-        if bounce >= ROULETTE_BOUNCE:
+        if bounce >= rules.roulette:
             if choice[1] >= luck:
                 break
             through = through / luck

@@ -67,6 +67,20 @@ def test_white_things_that_light_each_other_vanish_too(device):
     assert few.mean() < 0.98
 
 
+def test_roulette_ends_paths_but_takes_no_light(device, monkeypatch):
+    grey = surface((float(linear_to_srgb(0.5)),) * 3)
+    walls = [(box(0.02, 0.3, 0.2), grey, (x, 0.0, 0.1, *UPRIGHT)) for x in (0.03, -0.03)]
+    view = camera(8, 24, 200.0, (0.0, 0.0, 2.0))
+    pictures = []
+    for roulette in (0, 2, 100):
+        monkeypatch.setattr(reference, "ROULETTE", roulette)
+        radiance = shown(device, (sheet(0.3, 0.3), grey), *walls, config=settings(1024, 16), view=view).radiance
+        # Between the walls, where light comes by several reflections.
+        pictures.append(radiance[0, 4:20, 3:5].mean())
+    np.testing.assert_allclose(pictures, pictures[-1], rtol=0.02)
+    assert pictures[-1] < 0.3
+
+
 @pytest.mark.parametrize("cosine", [1.0, 0.6, 0.25])
 def test_a_plane_under_a_lamp_has_the_irradiance_worked_out_by_hand(device, cosine):
     # A disc of angular radius a and radiance L that is wholly above the horizon: E = π L sin² a cos θ.

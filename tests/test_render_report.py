@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FEW = (
     "--device", "cpu", "--set", "arrangement.volume=1e-3", "--set", "arrangement.max_objects=1",
     "--set", "physics.substeps=1", "--set", "physics.steps_per_tick=10", "--set", "settle.min_time=0.1", "--set", "settle.rest_ticks=2",
-)
+)  # fmt: skip
 """One object, and as few steps as bring it to rest."""
 
 

@@ -18,6 +18,8 @@ from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.light_tables import LUMINANCE, map_directions
 from synpick_warp.stages.render_scene import RenderScene
 
+ROULETTE = 2
+"""Scatterings before dim paths may end early: the first ones carry most of the light."""
 MEAN_STEPS = 4096
 """Steps of the integral over the table of albedos, which is smooth between nodes."""
 
@@ -101,6 +103,7 @@ class ReferencePicture:
         self.rules = PathRules()
         self.rules.samples = config.render.samples
         self.rules.bounces = config.render.bounces
+        self.rules.roulette = ROULETTE
         self.rules.strategy = int(BOTH)
         self.rules.seed = config.bake.seed
         self.rules.instances = instances
