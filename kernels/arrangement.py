@@ -183,14 +183,19 @@ def draw_lights_kernel(
     # Out:
     light_out: wp.array[int],
     light_turn_out: wp.array[float],
+    light_exposure_out: wp.array[float],
 ):
-    """Draw the light map of worlds that start an episode, and its turn about the vertical."""
+    """Draw the light map of worlds that start an episode, its turn about the vertical and its exposure.
+
+    With the numbers u_i of the stream (seed, episode, redraw, LIGHT): turn = 2π u_1, exposure = s (2 u_2 - 1) stops for a spread s.
+    """
     world = wp.tid()
     if phase[world] != START:
         return
     key = stream_key(seed, address[world][0], address[world][1], LIGHT)
     light_out[world] = uniform_index(key, 0, drop.lights)
     light_turn_out[world] = TAU * uniform(key, 1) * float(drop.turn_lights)
+    light_exposure_out[world] = drop.exposure_spread * (2.0 * uniform(key, 2) - 1.0)
 
 
 @wp.func

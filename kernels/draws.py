@@ -16,6 +16,7 @@ CORNERS = wp.constant(4)
 LIGHT = wp.constant(5)
 MODE = wp.constant(6)
 TARGETS = wp.constant(7)
+PATHS = wp.constant(8)
 
 # γ and the two multipliers of SplitMix64.
 GAMMA = wp.constant(wp.uint64(0x9E3779B97F4A7C15))

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from synpick_warp.kernels.brdf import DIELECTRIC, MIN_ALPHA
 from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, tile_pixel
 from synpick_warp.kernels.environment import Lights, background_radiance, diffuse_irradiance, reflected_radiance, turned
 from synpick_warp.kernels.hits import NOTHING, TABLE, Bodies, Hits, Meshes, body_of
@@ -12,10 +13,6 @@ wp.set_module_options({"enable_backward": False})
 
 INTERREFLECTION = wp.constant(0.15)
 """What hides the sky shines itself, with about this share of the sky's light: an albedo of 0.3 that sees half of it."""
-DIELECTRIC = wp.constant(0.04)
-"""Reflectance of plastics and paper at normal incidence."""
-MIN_ALPHA = wp.constant(0.01)
-"""Smallest squared roughness; smoother surfaces would mirror the main light as a point that no pixel meets."""
 LINEAR_PART = wp.constant(0.6)
 """The tone curve leaves values below this untouched, so that colours keep their ratio."""
 
@@ -180,6 +177,7 @@ def develop_kernel(
     lights: Lights,
     # State:
     light: wp.array[int],
+    light_exposure: wp.array[float],
     # In:
     view_world: wp.array[int],
     radiance: wp.array3d[wp.vec3],
@@ -187,12 +185,13 @@ def develop_kernel(
     # Out:
     color_out: wp.array3d[wp.vec3ub],
 ):
-    """Radiance to sRGB bytes: exposure, tone curve, transfer curve."""
+    """Radiance to sRGB bytes: exposure (the map's factor times 2 to the episode's stops), tone curve, transfer curve."""
     pixel = tile_pixel(grid, wp.tid() + first)
     view = pixel[0]
     row = pixel[1]
     column = pixel[2]
     if row >= grid.height or column >= grid.width:
         return
-    value = lights.exposure[light[view_world[view]]] * radiance[view, row, column]
+    world = view_world[view]
+    value = lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world]) * radiance[view, row, column]
     color_out[view, row, column] = wp.vec3ub(display_value(value[0]), display_value(value[1]), display_value(value[2]))

@@ -55,6 +55,7 @@ class DropData:
     gripper_home: wp.vec3
     lights: int
     turn_lights: int
+    exposure_spread: float
 
 
 @wp.struct

@@ -48,8 +48,9 @@ def as_color(channels: np.ndarray) -> tuple[float, float, float]:
 def rgb8(image: Image.Image) -> np.ndarray:
     """Any kind of picture as (H, W, 3) uint8.
 
-    Grey becomes three equal channels, 16 bits are rounded to 8, palettes and CMYK are resolved. Alpha is dropped: objects are opaque,
-    and the colour under transparent texels is the padding that texture bakers leave for filtering.
+    Grey becomes three equal channels, palettes and CMYK are resolved. Grey of 16 bits is rounded to 8, of colours of 16 bits the upper 8
+    are kept. Alpha is dropped: objects are opaque, and the colour under transparent texels is the padding that texture bakers leave for
+    filtering.
     """
     if image.mode == "F":
         grey = np.clip(np.asarray(image), 0.0, 1.0) * 255.0

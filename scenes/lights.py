@@ -9,17 +9,26 @@ import cv2
 import numpy as np
 
 from synpick_warp.errors import LightError
-from synpick_warp.scenes.shapes import LightMap
-from synpick_warp.scenes.skies import skies
+from synpick_warp.scenes.appearance import srgb_to_linear
+from synpick_warp.scenes.shapes import LightMap, Sun
+from synpick_warp.scenes.skies import directions, skies
 
 MAX_HEIGHT = 512
 """Maps with more rows are reduced to this many: half the map's 0.35° is finer than any shading here resolves."""
+SUN_ROWS = 64
+"""Rows of the map in which a set's sun is looked for; 2.8° a texel gather the glow about a clipped sun."""
+SUN_ANGLE = 10.0
+"""A set's sun is believed if the map is bright within this angle of it [°]; hand-set ones miss by some degrees."""
+SUN_BRIGHTNESS = 0.5
+"""Bright is what has this share of the brightest place: maps of few bits have many brightest places, rooms several lamps."""
+MAX_SUN_GAIN = 1e6
+"""Largest SUNmulti; no sun outshines its sky by more."""
 
 
 def load_lights(folder: str) -> tuple[LightMap, ...]:
     """All light maps of a folder and its direct subfolders, sorted by name.
 
-    A folder that holds an .ibl file is an sIBL set (hdrlabs.com/sibl): its reflection map counts and its other maps do not.
+    A folder that holds an .ibl file is an sIBL set (hdrlabs.com/sibl): its reflection map and its sun count, its other maps do not.
     In other folders every .hdr file is a map. A picture's middle column becomes azimuth 0 (+x), and what lies right of
     it for someone who stands inside lies at negative azimuth.
 
@@ -56,14 +65,17 @@ def _read_place(place: Path) -> list[LightMap]:
 
 
 def _read_set(path: Path) -> LightMap:
-    """The reflection map of an sIBL set, times its REFmulti. Set files are INI; notes in them begin with two dashes."""
+    """The reflection map of an sIBL set, times its REFmulti, and its sun. Set files are INI; notes in them begin with two dashes.
+
+    The reflection map serves for everything, diffuse light and background as well: the environment map is a blurred copy of it.
+    """
     parser = configparser.ConfigParser(interpolation=None, strict=False, comment_prefixes=("#", ";", "--", "//"))
     try:
         parser.read_string(path.read_text(encoding="utf-8-sig", errors="replace"))
     except configparser.Error as error:
         raise LightError(f"{path} is no sIBL set file: {str(error).splitlines()[0]}; it must be INI text") from error
     # The format spells it "Enviroment".
-    for section, key in (("Enviroment", "EVfile"), ("Reflection", "REFfile")):
+    for section, key in (("Background", "BGfile"), ("Enviroment", "EVfile"), ("Reflection", "REFfile")):
         file = _text(parser, section, key)
         if file and not (path.parent / file).is_file():
             raise LightError(f"{path} names {key} = {file}, which is not beside it; add the file")
@@ -77,7 +89,59 @@ def _read_set(path: Path) -> LightMap:
     image = _read_image(picture, gamma=_number(parser, path, "REFgamma", 1.0))
     with np.errstate(over="ignore"):  # what becomes infinite is refused with the rest
         image = image * np.float32(gain)
-    return LightMap(path.stem, _finish(image, picture))
+    sun = _read_sun(parser, path)
+    radiance = _finish(image, picture)
+    return LightMap(path.stem, radiance, sun if sun is not None and _shines(radiance, sun.direction) else None)
+
+
+def _read_sun(parser: configparser.ConfigParser, path: Path) -> Sun | None:
+    """The section Sun of an sIBL set; None without a place, without light, or below the horizon.
+
+    SUNu grows to the right and SUNv downward over the picture, both from 0 to 1, so that SUNv = 0 is the zenith. SUNcolor is
+    sRGB in 0..255. Renderers' directional lights show a white diffuse surface that faces them as SUNmulti times this colour,
+    linear: the irradiance is π times that, in the units of the map after REFmulti.
+    """
+    u, v = (_sun_numbers(parser, path, key, 1, 1.0) for key in ("SUNu", "SUNv"))
+    color = _sun_numbers(parser, path, "SUNcolor", 3, 255.0)
+    gain = _sun_numbers(parser, path, "SUNmulti", 1, MAX_SUN_GAIN)
+    if (u is None) != (v is None):
+        raise LightError(f"{path} has {'SUNv' if u is None else 'SUNu'} alone; a sun needs SUNu and SUNv, or neither")
+    if u is None or v is None:
+        return None
+    azimuth, polar = (0.5 - u[0]) * 2 * np.pi, v[0] * np.pi
+    direction = np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+    linear = np.ones(3) if color is None else srgb_to_linear(color / 255.0)
+    irradiance = np.pi * (1.0 if gain is None else gain[0]) * linear
+    return Sun(direction, irradiance) if v[0] < 0.5 and irradiance.any() else None
+
+
+def _sun_numbers(parser: configparser.ConfigParser, path: Path, key: str, count: int, high: float) -> np.ndarray | None:
+    """The numbers (count) of a key of the section Sun, each in 0..high; None if it is not there."""
+    text = _text(parser, "Sun", key)
+    if not text:
+        return None
+    try:
+        values = np.array([float(word) for word in text.split(",")])
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != count or not ((values >= 0.0) & (values <= high)).all():
+        wanted = "a number" if count == 1 else f"{count} numbers, with commas between them,"
+        raise LightError(f"{path} has {key} = {text}; it must be {wanted} from 0 to {high:g}")
+    return values
+
+
+def _shines(radiance: np.ndarray, direction: np.ndarray) -> bool:
+    """Whether a map is bright near a direction.
+
+    Where it is not, the set's sun is left out and the map's own brightest place counts: shadows must agree with what shiny
+    things mirror, and some sets count v upward.
+    """
+    height = min(radiance.shape[0], SUN_ROWS)
+    bright = cv2.resize(radiance, (2 * height, height), interpolation=cv2.INTER_AREA).sum(axis=2)
+    cosine = directions(height) @ direction
+    # In coarse maps even the nearest texel may lie farther away than the angle.
+    near = cosine >= min(np.cos(np.radians(SUN_ANGLE)), cosine.max())
+    return bool(bright[near].max() >= SUN_BRIGHTNESS * bright.max())
 
 
 def _text(parser: configparser.ConfigParser, section: str, key: str) -> str:

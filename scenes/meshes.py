@@ -27,6 +27,8 @@ _GREY = (0.7, 0.7, 0.7)
 _GLTF_FACTOR = 1.0
 # Meshes that reach farther cannot be meant, and lose their shape in 32-bit numbers [m].
 _FARTHEST = 1e4
+# Texture coordinates that reach farther cannot be meant: 32-bit numbers have a thousandth of the image left between them.
+_FARTHEST_UV = 1e4
 # BOP's names first, then those of Blender and MeshLab.
 _UV_COLUMNS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 
@@ -135,6 +137,8 @@ def _checked(part: _Part, path: Path) -> _Part:
     if not len(faces):
         raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
     used, index = np.unique(faces, return_inverse=True)
+    if part.uv is not None and not (np.abs(part.uv[used]) <= _FARTHEST_UV).all():
+        raise CatalogError(f"{path}: texture coordinates that are not finite or beyond {_FARTHEST_UV:g}; repair the mesh")
     if len(used) == len(part.vertices):
         return replace(part, faces=faces)
     rows = {name: None if (data := getattr(part, name)) is None else data[used] for name in ("normals", "uv", "colors")}
@@ -263,7 +267,9 @@ def _read_scene(path: Path) -> list[_Part]:
             transform, name = scene.graph[node]
             mesh = scene.geometry[name]
             if isinstance(mesh, trimesh.Trimesh):
-                parts.append(_placed(_scene_part(mesh, textures, linear_colors=path.suffix.lower() == ".glb"), np.asarray(transform)))
+                parts.append(_placed(_scene_part(mesh, textures, path), np.asarray(transform)))
+    except CatalogError:
+        raise
     except Exception as error:  # the readers raise nearly anything on damaged files
         raise CatalogError(f"{path}: not readable as {path.suffix[1:].upper()} ({error or type(error).__name__})") from error
     if not parts:
@@ -279,23 +285,22 @@ def _placed(part: _Part, transform: np.ndarray) -> _Part:
     return replace(part, vertices=vertices, faces=faces, normals=normals)
 
 
-def _scene_part(mesh: trimesh.Trimesh, textures: dict[int, np.ndarray], *, linear_colors: bool) -> _Part:
+def _scene_part(mesh: trimesh.Trimesh, textures: dict[int, np.ndarray], path: Path) -> _Part:
     """One of the reader's meshes. `textures` holds the pictures converted so far, by identity, so that parts share them."""
     # Asking for vertex_normals would compute them with visible seams; the cache has them if they came from the file.
     normals = mesh._cache.cache.get("vertex_normals")
     visual, uv, colors, finish = mesh.visual, None, None, Finish(_GREY, None, None, None)
     if isinstance(visual, TextureVisuals):
         finish, picture = _scene_finish(visual.material)
-        uv = visual.uv
-        if picture is not None and uv is not None and len(uv) == len(mesh.vertices):
-            texture = textures.setdefault(id(picture), rgb8(picture))
-            finish = replace(finish, texture=texture)
-        else:
-            uv = None
+        if picture is not None:
+            uv = visual.uv
+            if uv is None or len(uv) != len(mesh.vertices):
+                raise CatalogError(f"{path}: has a texture, but vertices without texture coordinates; unwrap it or remove the texture")
+            finish = replace(finish, texture=textures.setdefault(id(picture), rgb8(picture)))
     elif isinstance(visual, ColorVisuals) and visual.kind is not None:
         # glTF 2.0 keeps vertex colours in linear light; OBJ has no rule, and files are written from sRGB pictures.
         colors = np.asarray(visual.vertex_colors)[:, :3]
-        if linear_colors:
+        if path.suffix.lower() == ".glb":
             colors = np.rint(linear_to_srgb(colors / 255.0) * 255.0).astype(np.uint8)
     return _Part(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64), normals, uv, colors, finish)
 

@@ -113,12 +113,24 @@ class Fixture:
 
 
 @dataclass(frozen=True, eq=False)
+class Sun:
+    """A directional light that a set of light maps names."""
+
+    direction: np.ndarray
+    """Unit vector (3) float64 towards it, in the map's frame."""
+    irradiance: np.ndarray
+    """Linear RGB (3) float64 on a surface that faces it, in the map's units; not black."""
+
+
+@dataclass(frozen=True, eq=False)
 class LightMap:
     """An equirectangular environment. Row 0 looks up (+z); azimuth atan2(y, x) lies at column share u = azimuth / 2π + 0.5."""
 
     name: str
     radiance: np.ndarray
     """Linear RGB (H, 2H, 3) float32, finite, not negative."""
+    sun: Sun | None = None
+    """Stands for the bright place that the map has there, which cameras clip."""
 
 
 @dataclass(frozen=True, eq=False)

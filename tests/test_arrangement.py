@@ -15,7 +15,7 @@ from synpick_warp.outcome import Ending
 from synpick_warp.scenes import build
 from synpick_warp.stages import arrange
 from synpick_warp.stages.constants import make_scene_data
-from tests.reference import arrangement, draws, small_worlds
+from tests.reference import arrangement, small_worlds
 from tests.reference.kernel_worlds import KernelWorlds
 
 WORLDS = 24
@@ -228,21 +228,6 @@ def test_worlds_at_work_keep_their_objects(device, phase):
         assert (worlds.state.variant.numpy().reshape(WORLDS, -1)[:, 2:] == -1).all()
         assert (joints.numpy() == 0.5).all()
         assert not worlds.state.restarted.numpy().any()
-
-
-def test_lights_are_even_and_turn(device):
-    worlds = made(device, worlds=2000)
-    worlds.begin(phases.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
-    counts = np.bincount(worlds.state.light.numpy(), minlength=5)
-    assert counts.min() > 330
-    assert len(counts) == 5
-    keys = [draws.stream_key(SEED, episode, 0, draws.LIGHT) for episode in range(2000)]
-    np.testing.assert_allclose(worlds.state.light_turn.numpy(), [2 * np.pi * draws.uniform(key, 1) for key in keys], rtol=1e-6)
-    still = made(device, drop={"turn_lights": 0})
-    still.begin(phases.START)
-    arrange.draw_objects(still.scene, still.state, SEED)
-    assert (still.state.light_turn.numpy() == 0.0).all()
 
 
 @given(sizes=catalogs(), spread=st.floats(0.0, 1.0), clearance=st.floats(0.0, 0.05), episode=st.integers(0, 2**30))

@@ -24,7 +24,7 @@ REFmulti = {multi}
 REFgamma = {gamma}
 [Sun]
 SUNcolor = 255,255,245
-"""
+{sun}"""
 
 
 def picture(height=8, value=0.5):
@@ -35,11 +35,11 @@ def save(path, image):
     assert cv2.imwrite(str(path), np.ascontiguousarray(image[..., ::-1]))
 
 
-def make_set(folder, multi="2.0", gamma="2.2", image=None):
+def make_set(folder, multi="2.0", gamma="2.2", image=None, sun=""):
     folder.mkdir()
     save(folder / "env.hdr", picture(4))
     save(folder / "ref.hdr", picture() if image is None else image)
-    (folder / "room.ibl").write_text(IBL.format(multi=multi, gamma=gamma))
+    (folder / "room.ibl").write_text(IBL.format(multi=multi, gamma=gamma, sun=sun))
     return folder
 
 
@@ -207,10 +207,12 @@ def test_a_black_map(tmp_path):
     refused(tmp_path, "a.hdr", "black")
 
 
-@pytest.mark.parametrize("file", ["ref.hdr", "env.hdr"])
+@pytest.mark.parametrize("file", ["back.jpg", "ref.hdr", "env.hdr"])
 def test_a_set_without_one_of_its_files(tmp_path, file):
     folder = make_set(tmp_path / "set")
-    (folder / file).unlink()
+    if file == "back.jpg":
+        (folder / "room.ibl").write_text(f"[Background]\nBGfile = {file}\n" + (folder / "room.ibl").read_text())
+    (folder / file).unlink(missing_ok=True)
     refused(tmp_path, "room.ibl", file)
 
 

@@ -51,6 +51,21 @@ def test_a_texture_finer_than_the_pixels_is_averaged_in_linear_light(device):
     np.testing.assert_allclose(picture.radiance[middle], plain.radiance[middle], rtol=0.01)
 
 
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (5, 3)])
+def test_textures_of_any_size_are_shown(device, size):
+    # Red from left to right, as far as there are columns; green throughout.
+    texture = np.zeros((*size, 3), np.uint8)
+    texture[..., 0], texture[..., 1] = np.linspace(40, 200, size[1]), 120
+    shown_rows = shown(matt(texture=texture), device).radiance[0, 12:36, 14:50]
+    plain = shown(matt(color=(0.0, 120 / 255, 0.0)), device).radiance[0, 24, 32]
+    np.testing.assert_allclose(shown_rows[..., 1], plain[1], rtol=1e-3)
+    assert (np.ptp(shown_rows[..., 0], axis=0) < 1e-3).all()
+    assert (np.ptp(shown_rows[..., 0]) > 0.1) == (size[1] > 1)
+    finest = mip_levels(texture)
+    assert finest[0].shape[:2] == size
+    assert finest[-1].shape[:2] == (1, 1)
+
+
 def test_mip_levels_keep_the_mean_and_take_odd_sizes():
     texture = np.random.default_rng(0).integers(0, 256, (37, 50, 3), dtype=np.uint8)
     levels = mip_levels(texture)
@@ -78,6 +93,15 @@ def test_exposure_does_not_depend_on_the_maps_scale_but_on_the_setting(device):
     assert np.abs(dim.astype(int) - bright).max() <= 1
     more = shown(GREY, device, config=with_render(exposure=1.5)).color
     assert (more.astype(int) - dim)[0, 24, 32].min() > 10
+
+
+def test_a_stop_doubles_the_light_before_the_tone_curve(device):
+    # Linear albedo 0.1 shows 0.125 and the gloss; twice that is still below the shoulder.
+    grey = matt((float(linear_to_srgb(0.1)),) * 3)
+    plain, more = (shown(grey, device, light_exposure=stops).color[0, 24, 32] / 255.0 for stops in (0.0, 1.0))
+    np.testing.assert_allclose(srgb_to_linear(more), 2.0 * srgb_to_linear(plain), rtol=0.02)
+    same = shown(grey, device, light_exposure=0.5, config=with_render(exposure=2.0**-0.5)).color[0, 24, 32] / 255.0
+    np.testing.assert_allclose(same, plain, atol=1.01 / 255.0)
 
 
 def test_a_grey_sheet_has_the_brightness_worked_out_by_hand(device):

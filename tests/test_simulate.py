@@ -34,10 +34,12 @@ def track(device, worlds: int, disturb=None, episodes: int = EPISODES) -> dict[t
         simulation.tick(record)
         seen, snapshot = report(record), record.snapshot
         fixtures, light, turn = snapshot.fixture_pose.numpy(), snapshot.light.numpy(), snapshot.light_turn.numpy()
+        exposure = snapshot.light_exposure.numpy()
         for world in range(worlds):
             address = (int(seen.column("episode")[world]), int(seen.column("redraw")[world]))
             full = seen.entry[world] >= 0
-            parts = (seen.status[world], seen.entry[world], seen.pose[world][full], fixtures[world], light[world], turn[world])
+            parts = (seen.status[world], seen.entry[world], seen.pose[world][full], fixtures[world], light[world], turn[world],
+                     exposure[world])
             ticks[address].append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
         if (seen.column("phase") == phases.IDLE).all():
             return ticks

@@ -34,6 +34,8 @@ class Snapshot:
     """Index of the episode's light map."""
     light_turn: wp.array = device_array("world", dtype=wp.float32, unit="rad")
     """The light map is turned counter-clockwise about +z by this angle."""
+    light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="stops")
+    """How much longer than the automatic exposure the episode's pictures are exposed."""
 
 
 @dataclass(frozen=True, eq=False)

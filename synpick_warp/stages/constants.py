@@ -111,6 +111,7 @@ def _drop_data(config: Config, lights: int) -> structs.DropData:
     data.gripper_home = wp.vec3(*GRIPPER_HOME)
     data.lights = lights
     data.turn_lights = int(config.render.turn_lights)
+    data.exposure_spread = config.render.exposure_spread
     return data
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.kernels.environment import REFLECTION_LEVELS
-from synpick_warp.scenes.shapes import LightMap
+from synpick_warp.scenes.shapes import LightMap, Sun
 
 ANALYSIS_ROWS = 128
 """Rows of the map that is analysed; 1.4° a texel tells lamps apart."""
@@ -22,6 +22,8 @@ MAIN_LIGHT_CONTRAST = 4.0
 """Radiance counts as part of the main light as far as it exceeds the map's mean by this factor."""
 MAIN_LIGHT_MIN_HEIGHT = 0.15
 """Lowest z of the direction to a main light: lower ones light no pile in a tote."""
+SUN_SPREAD = np.tan(np.radians(0.267))
+"""Tangent of the sun's angular radius: the least that a set's sun has."""
 WHITE_VALUE = 1.25
 """Display value, linear, of a white diffuse surface that faces up and sees the whole sky."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -35,7 +37,7 @@ class LightTable:
     """One light map, ready for `kernels.environment.Lights`."""
 
     background: np.ndarray
-    """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32."""
+    """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: all light of the map, with a set's sun as a disc."""
     reflection: np.ndarray
     """(levels, REFLECTION_ROWS, 2 REFLECTION_ROWS, 3) float32."""
     irradiance: np.ndarray
@@ -84,11 +86,12 @@ def harmonics(directions: np.ndarray) -> np.ndarray:
     )
 
 
-def split_main_light(radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def split_main_light(radiance: np.ndarray, place: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Part a map into its brightest place above the horizon and the rest.
 
     Args:
         radiance: (rows, 2 rows, 3).
+        place: Unit direction (3) to look about instead of the brightest place's.
 
     Returns:
         The rest of the map, unit direction to the main light, its irradiance on a surface that faces it (3; zero if nothing stands
@@ -98,7 +101,7 @@ def split_main_light(radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     bright = radiance @ LUMINANCE
     threshold = MAIN_LIGHT_CONTRAST * (bright * solid).sum() / (4.0 * np.pi)
     smooth = np.where(directions[..., 2] > MAIN_LIGHT_MIN_HEIGHT, cv2.GaussianBlur(bright, (0, 0), 1.5), -1.0)
-    peak = directions[np.unravel_index(np.argmax(smooth), smooth.shape)]
+    peak = directions[np.unravel_index(np.argmax(smooth), smooth.shape)] if place is None else place
     near = (directions @ peak > np.cos(MAIN_LIGHT_RADIUS)) & (directions[..., 2] > 0.0) & (bright > threshold)
     share = np.where(near, 1.0 - threshold / np.maximum(bright, 1e-12), 0.0)
     weight = share * bright * solid
@@ -110,6 +113,41 @@ def split_main_light(radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
     # The mean squared sine over a disc is half the squared sine of its radius.
     sine = np.sqrt(np.clip(2.0 * (weight * (1.0 - (directions @ direction) ** 2)).sum() / weight.sum(), 0.0, 0.25))
     return radiance * (1.0 - share)[..., None], direction, irradiance, float(sine / np.sqrt(1.0 - sine**2))
+
+
+def replace_sun(radiance: np.ndarray, sun: Sun) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Take the bright place out of a map for which a set's sun stands, so that no light counts twice.
+
+    The sun has the set's direction and colour, and the set's luminance or that of what it replaces, whichever is more: a clipped
+    map lacks light, one that holds its sun whole knows better than a number set by eye. It is as wide as what it replaces.
+
+    Args:
+        radiance: (rows, 2 rows, 3).
+        sun: The set's sun.
+
+    Returns:
+        As `split_main_light` does.
+    """
+    rest, _, taken, spread = split_main_light(radiance, sun.direction)
+    gain = max(1.0, float(taken @ LUMINANCE) / float(sun.irradiance @ LUMINANCE))
+    return rest, sun.direction, gain * sun.irradiance, max(spread, float(SUN_SPREAD))
+
+
+def sun_disc(bright: np.ndarray, direction: np.ndarray, irradiance: np.ndarray, spread: float) -> np.ndarray:
+    """A map (rows, 2 rows, 3), black but for a disc above the horizon that gives this irradiance to what faces its middle.
+
+    Args:
+        bright: Where the map is bright (rows, 2 rows) bool; of a disc that meets such places the rest is left out, being hidden by hills.
+        direction: Unit vector (3) to the disc's middle, above the horizon.
+        irradiance: (3).
+        spread: Tangent of its angular radius; it has at least one texel.
+    """
+    directions, solid = map_directions(len(bright))
+    cosine = np.where(directions[..., 2] > 0.0, directions @ direction, -1.0)
+    inside = cosine >= min(1.0 / np.sqrt(1.0 + spread**2), cosine.max())
+    if (inside & bright).any():
+        inside &= bright
+    return inside[..., None] * irradiance / (cosine * solid)[inside].sum()
 
 
 def blurred_reflections(radiance: np.ndarray) -> np.ndarray:
@@ -145,17 +183,24 @@ def light_table(light: LightMap, ground: np.ndarray | None) -> LightTable:
         light: The map.
         ground: Linear albedo (3) of the table, which takes the place of the map below the horizon; None: no table.
     """
-    fine = resized(light.radiance, ANALYSIS_ROWS)
+    fine, background = resized(light.radiance, ANALYSIS_ROWS), resized(light.radiance, BACKGROUND_ROWS)
+    replaced = None if light.sun is None else replace_sun(fine, light.sun)
     directions, solid = map_directions(ANALYSIS_ROWS)
     upward = np.maximum(directions[..., 2], 0.0) * solid
+    if replaced is not None:
+        fine, direction, irradiance, spread = replaced
+        sky = split_main_light(background, direction)[0]
+        background = sky + sun_disc((sky < background).any(axis=2), direction, irradiance, spread)
     upward_irradiance = (fine * upward[..., None]).sum(axis=(0, 1))
+    if replaced is not None:
+        upward_irradiance += replaced[1][2] * replaced[2]
     if ground is not None:
         fine = np.where(directions[..., 2:] < 0.0, ground * upward_irradiance / np.pi, fine)
-    rest, direction, irradiance, spread = split_main_light(fine)
+    rest, direction, irradiance, spread = split_main_light(fine) if replaced is None else (fine, *replaced[1:])
     coefficients = np.einsum("ijk,ijc->kc", harmonics(directions) * solid[..., None], rest) * COSINE_LOBE[:, None]
     white = max(float(upward_irradiance @ LUMINANCE) / np.pi, 1e-9)
     return LightTable(
-        background=resized(light.radiance, BACKGROUND_ROWS).astype(np.float32),
+        background=background.astype(np.float32),
         reflection=blurred_reflections(resized(rest, REFLECTION_ROWS)).astype(np.float32),
         irradiance=coefficients.astype(np.float32),
         main_direction=direction.astype(np.float32),

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import REFERENCE, Config
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
 from synpick_warp.kernels.hits import Bodies, Hits, prepare_bodies_kernel, trace_hits_kernel, trace_sample_kernel
 from synpick_warp.kernels.occlusion import OcclusionRays, Sample, filter_occlusion_kernel, occlude_kernel
@@ -16,6 +16,7 @@ from synpick_warp.kernels.shading import develop_kernel, shade_kernel
 from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels
+from synpick_warp.stages.reference import ReferencePicture
 from synpick_warp.stages.render_scene import RenderScene
 
 AMBIENT_REACH = 0.3
@@ -113,6 +114,7 @@ class Renderer:
         self.rays.ambient = config.render.ambient_rays
         self.rays.ambient_reach = AMBIENT_REACH
         self.samples = color_samples(config.render.color_samples)
+        self.reference = ReferencePicture(config, scene, instances) if config.render.mode == REFERENCE else None
 
     def render(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
         """Render and annotate the first `count` views.
@@ -134,14 +136,21 @@ class Renderer:
         self.prepare_bodies(snapshot, view_world, view_camera, count)
         self.trace_hits(view_camera, count, out)
         # Layers made from `hits` belong here: further colour samples replace them.
+        if self.reference is None:
+            self.shade_samples(snapshot, view_world, view_camera, count)
+        else:
+            self.reference.trace_paths(snapshot, self.bodies, view_world, view_camera, count, self.picture.radiance)
+        self.develop(snapshot, view_world, count, out)
+        annotate(self.scene, self.bodies, view_camera, count, out)
+
+    def shade_samples(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int) -> None:
+        """Radiance of the fast picture: all colour samples."""
         for sample in self.samples:
             if len(self.samples) > 1:
                 self.trace_sample(view_camera, count, sample)
             self.occlude(snapshot, view_world, view_camera, count, sample)
             self.filter_occlusion(view_camera, count, sample)
             self.shade(snapshot, view_world, view_camera, count, sample)
-        self.develop(snapshot, view_world, count, out)
-        annotate(self.scene, self.bodies, view_camera, count, out)
 
     def prepare_bodies(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int) -> None:
         """Place every body before every view's camera."""
@@ -187,7 +196,7 @@ class Renderer:
     def develop(self, snapshot: Snapshot, view_world: wp.array, count: int, out: ViewBuffers) -> None:
         """Radiance to bytes."""
         scene = self.scene
-        inputs = [scene.grid, scene.lights, snapshot.light, view_world, self.picture.radiance]
+        inputs = [scene.grid, scene.lights, snapshot.light, snapshot.light_exposure, view_world, self.picture.radiance]
         self._launch(develop_kernel, count, inputs, [out.color])
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:

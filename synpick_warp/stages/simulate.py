@@ -138,6 +138,7 @@ class Simulation:
         )
         wp.copy(snapshot.light, state.light)
         wp.copy(snapshot.light_turn, state.light_turn)
+        wp.copy(snapshot.light_exposure, state.light_exposure)
 
 
 def _copy(target: Sighting | Plan, source: Sighting | Plan) -> None:

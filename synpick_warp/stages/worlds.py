@@ -66,6 +66,8 @@ class WorldState:
     """Light map of the episode."""
     light_turn: wp.array = device_array("world", dtype=wp.float32, unit="rad")
     """Its turn about +z."""
+    light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="stops")
+    """Exposure against the automatic one."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,7 +49,8 @@ class KernelWorlds:
         self.bodies, self.coords, self.dofs = GRIPPER_BODIES + self.slots, GRIPPER_DOFS + 7 * self.slots, GRIPPER_DOFS + 6 * self.slots
         drop = {"volume": 1.0, "move_repeats": 1, "pick_repeats": 1, "clearance": 0.01, "spread": 0.5,
                 "rim_length": 0.5, "rim_width": 0.3, "rim_height": 0.2,
-                "gravity": 9.81, "gripper_home": wp.vec3(3.0, 0.0, 1.0), "lights": 5, "turn_lights": 1, **self.drop}
+                "gravity": 9.81, "gripper_home": wp.vec3(3.0, 0.0, 1.0), "lights": 5, "turn_lights": 1, "exposure_spread": 0.5,
+                **self.drop}
         settle = {"min_ticks": 3, "max_ticks": 100, "rest_ticks": 2, "stuck_ticks": 2, "late_ticks": 50, "rest_shift": 1e-4,
                   "last_shift": 1e-3, "stuck_depth": 0.01, "max_redrops": 8, **self.settle}
         move = {"waypoints": 8, "corner": wp.vec3(0.2, 0.1, 0.02), "start_height": 0.3, "tip": 0.05, "mass": 2.0, "gravity": 9.81,

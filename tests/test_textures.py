@@ -1,0 +1,103 @@
+"""Textures as users bring them: any depth, channels and size; meshes that are not unwrapped, or badly."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.appearance import read_texture
+from synpick_warp.scenes.meshes import read_mesh
+
+CORNERS = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
+UNWRAPPED_OBJ = "mtllib a.mtl\n" + "".join(f"v {corner}\n" for corner in CORNERS) + "usemtl skin\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+
+
+def ply(rows, *, textured: bool) -> str:
+    """A tetrahedron of the first four of these vertices; `textured`: rows have texture_u and texture_v, and t.png is named."""
+    names = ["x", "y", "z", *(("texture_u", "texture_v") if textured else ())]
+    lines = ["ply", "format ascii 1.0", *(["comment TextureFile t.png"] if textured else []), f"element vertex {len(rows)}"]
+    lines += [f"property float {name}" for name in names]
+    lines += ["element face 4", "property list uchar int vertex_indices", "end_header", *rows]
+    return "\n".join([*lines, "3 0 2 1", "3 0 1 3", "3 0 3 2", "3 1 2 3"]) + "\n"
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (37, 50)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_pictures_of_any_depth_channels_and_size(tmp_path, channels, size, dtype):
+    """Each pixel to the byte above its value or the one below; with alpha 0, the colour is still there."""
+    largest = np.iinfo(dtype).max
+    pixels = np.random.default_rng(0).integers(0, largest + 1, (*size, channels)).astype(dtype)
+    if channels == 4:
+        pixels[..., 3] = 0
+    assert cv2.imwrite(str(tmp_path / "t.png"), pixels)
+    texture = read_texture(tmp_path / "t.png", "a.ply")
+    assert texture.shape == (*size, 3)
+    assert texture.dtype == np.uint8
+    expected = pixels[..., 2::-1] if channels > 1 else np.repeat(pixels, 3, axis=2)
+    assert np.abs(texture - expected / largest * 255.0).max() <= (0 if dtype == np.uint8 else 1)
+
+
+def without_coordinates(file: Path) -> None:
+    """Take the texture coordinates of a GLB's meshes away."""
+    data = file.read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    header = json.loads(data[20 : 20 + length])
+    for mesh in header["meshes"]:
+        for primitive in mesh["primitives"]:
+            del primitive["attributes"]["TEXCOORD_0"]
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I", len(text)) + data[16:20] + text + data[20 + length :]
+    file.write_bytes(data[:8] + struct.pack("<I", 12 + len(chunks)) + chunks)
+
+
+def test_a_texture_on_a_mesh_that_is_not_unwrapped_is_refused(tmp_path):
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    skin = Image.new("RGB", (8, 8), (200, 10, 10))
+    box.visual = TextureVisuals(uv=np.zeros((8, 2)), material=PBRMaterial(baseColorTexture=skin))
+    file = tmp_path / "a.glb"
+    file.write_bytes(trimesh.Scene([box]).export(file_type="glb"))
+    without_coordinates(file)
+    (tmp_path / "a.obj").write_text(UNWRAPPED_OBJ)
+    (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
+    skin.save(tmp_path / "skin.png")
+    for path in (file, tmp_path / "a.obj"):
+        with pytest.raises(CatalogError, match="without texture coordinates; unwrap it") as caught:
+            read_mesh(path, 1.0)
+        assert str(caught.value).startswith(f"{path}: ")
+        assert str(caught.value).count(str(path)) == 1
+
+
+def test_a_mesh_without_texture_needs_no_coordinates(tmp_path):
+    (tmp_path / "a.obj").write_text(UNWRAPPED_OBJ)
+    (tmp_path / "a.mtl").write_text("newmtl skin\nKd 0.2 0.4 0.6\n")
+    (tmp_path / "a.ply").write_text(ply(CORNERS, textured=False))
+    for name, color in (("a.obj", (0.2, 0.4, 0.6)), ("a.ply", (0.7, 0.7, 0.7))):
+        mesh, finish = read_mesh(tmp_path / name, 1.0)
+        assert finish.texture is None
+        assert finish.color == pytest.approx(color, abs=0.003)
+        assert mesh.uv.shape == (len(mesh.vertices), 2)
+        assert not mesh.uv.any()
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-1e30", "10001"])
+def test_texture_coordinates_that_cannot_be_meant(tmp_path, value):
+    Image.new("RGB", (4, 2)).save(tmp_path / "t.png")
+    rows = [f"{corner} 0.5 0.5" for corner in CORNERS]
+    (tmp_path / "a.ply").write_text(ply([*rows[:3], f"{CORNERS[3]} {value} 0.5"], textured=True))
+    with pytest.raises(CatalogError, match="not finite or beyond 10000; repair the mesh"):
+        read_mesh(tmp_path / "a.ply", 1.0)
+    # A vertex that no triangle uses may have any.
+    (tmp_path / "a.ply").write_text(ply([*rows, f"9 9 9 {value} 0.5"], textured=True))
+    assert len(read_mesh(tmp_path / "a.ply", 1.0)[0].vertices) == 4
