@@ -291,7 +291,7 @@ class Render:
     """Light and picture."""
 
     mode: str = setting(
-        FAST, "", "fast: few rays and a filter; reference: path tracing, which is slow. Depth, masks and boxes are the same.", choices=SHADINGS
+        FAST, "", "fast: few rays and a filter; reference: path tracing, slow. Depth, masks and boxes are the same.", choices=SHADINGS
     )
     samples: int = setting(64, "", "Paths a pixel with mode reference; powers of two are spread most evenly.", low=1, high=65536)
     bounces: int = setting(4, "", "Most surfaces that a path meets with mode reference; 1: direct light alone.", low=1, high=64)
