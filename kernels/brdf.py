@@ -110,6 +110,13 @@ def coat_share(brdf: Brdf, albedo: wp.vec2) -> float:
 
 
 @wp.func
+def even_gloss(brdf: Brdf) -> wp.vec3:
+    """Share of even light from everywhere that the gloss reflects to where it is seen from, however often it scatters it."""
+    once = brdf.albedo[0] * brdf.reflectance + wp.vec3(brdf.albedo[1], brdf.albedo[1], brdf.albedo[1])
+    return once + (1.0 - brdf.albedo[0] - brdf.albedo[1]) * brdf.multiple
+
+
+@wp.func
 def mean_of(color: wp.vec3) -> float:
     return (color[0] + color[1] + color[2]) / 3.0
 

@@ -7,7 +7,7 @@ w_l = p_l² / (p_l² + p_s²). Nothing in the scene glows but the map.
 
 import warp as wp
 
-from synpick_warp.kernels.brdf import Brdf, Gloss, brdf_at, density, evaluate, scatter
+from synpick_warp.kernels.brdf import Brdf, brdf_at, density, evaluate, scatter
 from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, tile_pixel
 from synpick_warp.kernels.draws import PATHS, mix, stream_key
 from synpick_warp.kernels.environment import Lights, background_radiance, turned
@@ -52,7 +52,6 @@ class PathScene:
     surfaces: Surfaces
     lights: Lights
     chances: Chances
-    gloss: Gloss
 
 
 @wp.struct
@@ -138,7 +137,7 @@ def vertex_at(
     made.face_normal = surface.face_normal
     metallic = scene.surfaces.metallic[surface.row]
     roughness = scene.surfaces.roughness[surface.row]
-    made.brdf = brdf_at(scene.gloss, base_color(scene.surfaces, surface), metallic, roughness, surface.normal, outgoing)
+    made.brdf = brdf_at(scene.surfaces.gloss, base_color(scene.surfaces, surface), metallic, roughness, surface.normal, outgoing)
     return made
 
 
@@ -164,7 +163,7 @@ def direct_light(scene: PathScene, bodies: Bodies, rules: PathRules, place: Plac
     nothing = wp.vec3(0.0, 0.0, 0.0)
     if drawn.density <= 0.0 or wp.dot(direction, vertex.face_normal) <= 0.0:
         return nothing
-    reflected = evaluate(scene.gloss, vertex.brdf, direction)
+    reflected = evaluate(scene.surfaces.gloss, vertex.brdf, direction)
     weight = heuristic(rules.strategy, BY_LIGHT, drawn.density, density(vertex.brdf, direction)) / drawn.density
     if weight * wp.max(reflected) <= 0.0:
         return nothing
@@ -211,7 +210,7 @@ def path_radiance(
         drawn_density = density(vertex.brdf, direction)
         if drawn_density <= 0.0 or wp.dot(direction, vertex.face_normal) <= 0.0:
             break
-        through = wp.cw_mul(through, evaluate(scene.gloss, vertex.brdf, direction) / drawn_density)
+        through = wp.cw_mul(through, evaluate(scene.surfaces.gloss, vertex.brdf, direction) / drawn_density)
         luck = wp.min(wp.max(through), MOST_LUCK)
         if bounce >= rules.roulette:
             if choice[1] >= luck:

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.brdf import DIELECTRIC, MIN_ALPHA
+from synpick_warp.kernels.brdf import MIN_ALPHA, brdf_at, coat_share, evaluate, even_gloss
 from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, tile_pixel
 from synpick_warp.kernels.environment import Lights, background_radiance, diffuse_irradiance, reflected_radiance, turned
 from synpick_warp.kernels.hits import NOTHING, TABLE, Bodies, Hits, Meshes, body_of
@@ -27,31 +27,6 @@ def ambient_share(visible: float, albedo: float) -> float:
 
 
 @wp.func
-def highlight(normal: wp.vec3, to_camera: wp.vec3, to_light: wp.vec3, alpha: float, reflectance: wp.vec3) -> wp.vec3:
-    """GGX with Smith's correlated masking and Schlick's Fresnel term (Walter et al., 2007; Heitz, 2014), without the cosine."""
-    half_way = wp.normalize(to_camera + to_light)
-    n_l = wp.max(wp.dot(normal, to_light), 1.0e-4)
-    n_v = wp.max(wp.dot(normal, to_camera), 1.0e-4)
-    n_h = wp.dot(normal, half_way)
-    a2 = alpha * alpha
-    spread = n_h * n_h * (a2 - 1.0) + 1.0
-    distribution = a2 / (wp.PI * spread * spread)
-    masking = 0.5 / (n_l * wp.sqrt(n_v * n_v * (1.0 - a2) + a2) + n_v * wp.sqrt(n_l * n_l * (1.0 - a2) + a2))
-    grazing = wp.pow(1.0 - wp.clamp(wp.dot(to_camera, half_way), 0.0, 1.0), 5.0)
-    return distribution * masking * (reflectance + grazing * (wp.vec3(1.0, 1.0, 1.0) - reflectance))
-
-
-@wp.func
-def mean_reflectance(reflectance: wp.vec3, roughness: float, n_v: float) -> wp.vec3:
-    """Share of an even environment that a rough surface reflects (Karis, 2014, fitted to GGX)."""
-    x = 1.0 - roughness
-    a004 = wp.min(x * x, wp.pow(2.0, -9.28 * n_v)) * x + 0.0425 - 0.0275 * roughness
-    scale = -1.04 * a004 + 1.04 - 0.572 * roughness
-    bias = 1.04 * a004 - 0.04 + 0.022 * roughness
-    return scale * reflectance + bias * wp.vec3(1.0, 1.0, 1.0)
-
-
-@wp.func
 def lit_surface(
     surfaces: Surfaces,
     surface: Surface,
@@ -62,37 +37,34 @@ def lit_surface(
     lit: float,
     ambient: float,
 ) -> wp.vec3:
-    """Radiance that a surface sends to the camera: main light and environment, diffuse and glossy."""
-    albedo = base_color(surfaces, surface)
-    metallic = surfaces.metallic[surface.row]
-    roughness = surfaces.roughness[surface.row]
-    reflectance = wp.lerp(wp.vec3(DIELECTRIC, DIELECTRIC, DIELECTRIC), albedo, metallic)
-    diffuse = (1.0 - metallic) / wp.PI * albedo
-    normal = surface.normal
-    n_v = wp.clamp(wp.dot(normal, to_camera), 1.0e-4, 1.0)
+    """Radiance that a surface sends to the camera: main light and environment, by the law of `kernels.brdf`.
 
-    sky = diffuse_irradiance(lights, light, turned(normal, -turn))
+    What the law says of even light from everywhere is applied to the environment: diffuse to its irradiance, gloss to what the
+    surface mirrors, blurred.
+    """
+    base = base_color(surfaces, surface)
+    roughness = surfaces.roughness[surface.row]
+    brdf = brdf_at(surfaces.gloss, base, surfaces.metallic[surface.row], roughness, surface.normal, to_camera)
+    n_v = wp.dot(brdf.normal, to_camera)
+
+    sky = diffuse_irradiance(lights, light, turned(brdf.normal, -turn))
     open_share = ambient + INTERREFLECTION * (1.0 - ambient)
     arriving = wp.vec3(
-        sky[0] * ambient_share(open_share, albedo[0]),
-        sky[1] * ambient_share(open_share, albedo[1]),
-        sky[2] * ambient_share(open_share, albedo[2]),
+        sky[0] * ambient_share(open_share, base[0]),
+        sky[1] * ambient_share(open_share, base[1]),
+        sky[2] * ambient_share(open_share, base[2]),
     )
-    mirrored = 2.0 * wp.dot(normal, to_camera) * normal - to_camera
+    mirrored = 2.0 * n_v * brdf.normal - to_camera
     # Glossy occlusion from diffuse occlusion (Lagarde and de Rousiers, 2014).
     glossy = wp.clamp(wp.pow(n_v + open_share, wp.pow(2.0, -16.0 * roughness - 1.0)) - 1.0 + open_share, 0.0, 1.0)
-    result = wp.cw_mul(diffuse, arriving) + glossy * wp.cw_mul(
-        mean_reflectance(reflectance, roughness, n_v), reflected_radiance(lights, light, turned(mirrored, -turn), roughness)
-    )
+    result = ((1.0 - coat_share(brdf, brdf.albedo)) / wp.PI) * wp.cw_mul(brdf.diffuse, arriving)
+    result += glossy * wp.cw_mul(even_gloss(brdf), reflected_radiance(lights, light, turned(mirrored, -turn), roughness))
 
-    to_light = turned(lights.main_direction[light], turn)
-    n_l = wp.dot(normal, to_light)
-    if n_l > 0.0 and lit > 0.0:
+    if lit > 0.0:
         # The light's disc widens the highlight.
-        alpha = wp.clamp(roughness * roughness + 0.5 * lights.main_spread[light], MIN_ALPHA, 1.0)
-        result += (lit * n_l) * wp.cw_mul(
-            diffuse + highlight(normal, to_camera, to_light, alpha, reflectance), lights.main_irradiance[light]
-        )
+        brdf.alpha = wp.clamp(roughness * roughness + 0.5 * lights.main_spread[light], MIN_ALPHA, 1.0)
+        to_light = turned(lights.main_direction[light], turn)
+        result += lit * wp.cw_mul(evaluate(surfaces.gloss, brdf, to_light), lights.main_irradiance[light])
     return result
 
 

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from synpick_warp.kernels.brdf import Gloss
 from synpick_warp.kernels.hits import Bodies, Meshes
 
 wp.set_module_options({"enable_backward": False})
@@ -33,6 +34,8 @@ class Surfaces:
     """sRGB."""
     linear: wp.array[float]
     """The linear value of each of the 256 sRGB values."""
+    gloss: Gloss
+    """What glossy lobes reflect, of any surface."""
 
 
 @wp.struct

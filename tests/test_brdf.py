@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.stages.reference import measure_gloss
+from synpick_warp.stages.gloss import measure_gloss
 from tests.reference.brdf_probe import evaluated, scatter_kernel, toward
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)

@@ -9,7 +9,6 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels.brdf import GLOSS_COLUMNS, GLOSS_ROWS, Gloss, measure_gloss_kernel
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
 from synpick_warp.kernels.paths import BOTH, PathRules, PathScene, trace_paths_kernel
 from synpick_warp.kernels.sampling import Chances
@@ -20,8 +19,6 @@ from synpick_warp.stages.render_scene import RenderScene
 
 ROULETTE = 2
 """Scatterings before dim paths may end early: the first ones carry most of the light."""
-MEAN_STEPS = 4096
-"""Steps of the integral over the table of albedos, which is smooth between nodes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,20 +64,6 @@ def build_chances(background: np.ndarray, device: wp.Device) -> Any:
     return chances
 
 
-def measure_gloss(device: wp.Device) -> Any:
-    """The struct `Gloss`: albedos of the glossy lobe, measured by its own sampling."""
-    gloss = Gloss()
-    gloss.albedo = wp.empty((int(GLOSS_ROWS), int(GLOSS_COLUMNS)), dtype=wp.vec2, device=device)
-    wp.launch(measure_gloss_kernel, dim=gloss.albedo.shape, outputs=[gloss.albedo], device=device)
-    # With t the root of μ, 2 ∫ a μ dμ = 4 ∫ a t³ dt, of what the kernels interpolate.
-    albedo = gloss.albedo.numpy().astype(np.float64)
-    root = (np.arange(MEAN_STEPS) + 0.5) / MEAN_STEPS
-    nodes = np.arange(albedo.shape[1]) / (albedo.shape[1] - 1)
-    mean = [[4.0 * np.mean(np.interp(root, nodes, part) * root**3) for part in row.T] for row in albedo]
-    gloss.mean = wp.array(mean, dtype=wp.vec2, device=device)
-    return gloss
-
-
 class ReferencePicture:
     """Renders linear radiance by path tracing. Owns its tables; `trace_paths` only launches."""
 
@@ -99,7 +82,6 @@ class ReferencePicture:
         self.paths.surfaces = scene.surfaces
         self.paths.lights = scene.lights
         self.paths.chances = build_chances(scene.lights.background.numpy(), scene.device)
-        self.paths.gloss = measure_gloss(scene.device)
         self.rules = PathRules()
         self.rules.samples = config.render.samples
         self.rules.bounces = config.render.bounces

@@ -16,6 +16,7 @@ from synpick_warp.kernels.hits import Meshes, Table
 from synpick_warp.kernels.surfaces import Surfaces
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.shapes import Camera, Catalog, Fixture, LightMap, Material, TriangleMesh
+from synpick_warp.stages.gloss import measure_gloss
 from synpick_warp.stages.light_tables import light_table
 
 TABLE_ROUGHNESS = 0.8
@@ -117,6 +118,7 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     surfaces.first_texel = wp.array(first_texel, dtype=wp.int32, device=device)
     surfaces.texture_levels = wp.array([len(chain) for chain in chains], dtype=wp.int32, device=device)
     surfaces.texel = wp.array(np.concatenate(texels) if texels else np.zeros((1, 3), np.uint8), dtype=wp.vec3ub, device=device)
+    surfaces.gloss = measure_gloss(device)
     surfaces.linear = wp.array(srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=device)
     return surfaces
 
