@@ -24,6 +24,12 @@ MIN_ALPHA = wp.constant(0.01)
 """Smallest squared roughness; smoother surfaces would mirror a lamp as a point that no pixel meets."""
 MIN_COSINE = wp.constant(1.0e-4)
 """Cosines are kept off zero by this much before something is divided by them."""
+LEAST_FACING = wp.constant(0.01)
+"""Interpolated normals are bent until this is their cosine to the side from which they are seen."""
+LEAST_RISE = wp.constant(1.0e-7)
+"""Facets point up by at least this much, so that their normal has a direction."""
+LEAST_LOST = wp.constant(1.0e-6)
+"""A mirror scatters nothing twice; what it would is divided by no less than this."""
 GLOSS_ROWS = wp.constant(32)
 """Roughness in the table of albedos: i / (GLOSS_ROWS - 1)."""
 GLOSS_COLUMNS = wp.constant(32)
@@ -124,11 +130,10 @@ def mean_of(color: wp.vec3) -> float:
 @wp.func
 def facing(normal: wp.vec3, outgoing: wp.vec3) -> wp.vec3:
     """`normal`, bent towards `outgoing` as far as it takes to see its front: interpolated normals turn away at silhouettes."""
-    least = 0.01
     cosine = wp.dot(normal, outgoing)
-    if cosine >= least:
+    if cosine >= LEAST_FACING:
         return normal
-    return wp.normalize(normal + (least - cosine) * outgoing)
+    return wp.normalize(normal + (LEAST_FACING - cosine) * outgoing)
 
 
 @wp.func
@@ -196,7 +201,7 @@ def visible_facet(outgoing: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
     z = (1.0 - u[1]) * (1.0 + seen[2]) - seen[2]
     radius = wp.sqrt(wp.clamp(1.0 - z * z, 0.0, 1.0))
     h = wp.vec3(radius * wp.cos(angle), radius * wp.sin(angle), z) + seen
-    return wp.normalize(wp.vec3(alpha * h[0], alpha * h[1], wp.max(h[2], 1.0e-7)))
+    return wp.normalize(wp.vec3(alpha * h[0], alpha * h[1], wp.max(h[2], LEAST_RISE)))
 
 
 @wp.func
@@ -213,7 +218,7 @@ def evaluate(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> wp.vec3:
     single = facets(half_way, brdf.alpha) * masking / (4.0 * wp.max(o[2], MIN_COSINE)) * fresnel
 
     albedo = gloss_albedo(gloss, brdf.roughness, i[2])
-    lost = (1.0 - albedo[0] - albedo[1]) * (1.0 - brdf.albedo[0] - brdf.albedo[1]) / wp.max(1.0 - brdf.mean[0] - brdf.mean[1], 1.0e-6)
+    lost = (1.0 - albedo[0] - albedo[1]) * (1.0 - brdf.albedo[0] - brdf.albedo[1]) / wp.max(1.0 - brdf.mean[0] - brdf.mean[1], LEAST_LOST)
     through = (1.0 - coat_share(brdf, albedo)) * (1.0 - coat_share(brdf, brdf.albedo)) / (1.0 - coat_share(brdf, brdf.mean))
     return single + (i[2] / wp.PI) * (lost * brdf.multiple + through * brdf.diffuse)
 

@@ -5,7 +5,7 @@ import warp as wp
 from synpick_warp.kernels.draws import CORNERS, stream_key, uniform_index
 from synpick_warp.kernels.impedance import impedance_force
 from synpick_warp.kernels.phases import ACT, APPROACH, DESCEND, LIFT, MOVE
-from synpick_warp.kernels.structs import LayoutData, MoveData, PickData
+from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, PickData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -75,7 +75,7 @@ def place_gripper(layout: LayoutData, world: int, position: wp.vec3, tilt: float
     """Put a world's gripper somewhere, at rest."""
     for axis in range(3):
         joint_q[world * layout.coords + axis] = position[axis]
-    joint_q[world * layout.coords + 3] = tilt
+    joint_q[world * layout.coords + TILT] = tilt
     for axis in range(layout.gripper_dofs):
         joint_qd[world * layout.dofs + axis] = 0.0
 
@@ -183,4 +183,4 @@ def drive_gripper_kernel(
     joint_f_out[qd] = force[0]
     joint_f_out[qd + 1] = force[1]
     joint_f_out[qd + 2] = force[2] + move.mass * move.gravity
-    joint_f_out[qd + 3] = 0.0
+    joint_f_out[qd + TILT] = 0.0

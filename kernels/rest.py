@@ -14,8 +14,8 @@ wp.set_module_options({"enable_backward": False})
 
 # An object whose origin is lower than this has left the tote through its floor or beside it [m].
 BELOW_FLOOR = wp.constant(-0.01)
-# Guide walls that do not stand are this much higher, above whatever falls [m].
-GUIDES_AWAY = wp.constant(1000.0)
+# Collision shapes that are to touch nothing are this much higher, above whatever falls [m].
+SHAPES_AWAY = wp.constant(1000.0)
 
 
 @wp.kernel
@@ -195,6 +195,18 @@ def flag_lost_pairs_kernel(
         overflow_out[world] = True
 
 
+@wp.func
+def shape_place(collides: bool) -> wp.transform:
+    """Where on its body, or in its world, a collision shape is: in place, or far above, where it touches nothing.
+
+    Moved, not switched off: Newton's all-pairs broad phase reads a shape's collision flag when it is made, and never again.
+    """
+    height = SHAPES_AWAY
+    if collides:
+        height = 0.0
+    return wp.transform(wp.vec3(0.0, 0.0, height), wp.quat_identity())
+
+
 @wp.kernel
 def set_guides_kernel(
     # Scene:
@@ -205,12 +217,6 @@ def set_guides_kernel(
     # Out:
     shape_transform_out: wp.array[wp.transform],
 ):
-    """Put the guide walls of each world in place, or far above.
-
-    Moved, not switched off: Newton's all-pairs broad phase reads a shape's collision flag when it is made, and never again.
-    """
+    """Put the guide walls of each world in place, or far above."""
     world, guide = wp.tid()
-    height = GUIDES_AWAY
-    if progress[world][3] == 1:
-        height = 0.0
-    shape_transform_out[world * layout.shapes + guide_shapes[guide]] = wp.transform(wp.vec3(0.0, 0.0, height), wp.quat_identity())
+    shape_transform_out[world * layout.shapes + guide_shapes[guide]] = shape_place(progress[world][3] == 1)

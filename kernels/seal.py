@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.structs import LayoutData, SuctionData
+from synpick_warp.kernels.structs import TILT, LayoutData, SuctionData
 from synpick_warp.kernels.suction import CUP, tip_pose
 
 wp.set_module_options({"enable_backward": False})
@@ -156,7 +156,7 @@ def apply_wrench(wrench: Wrench, arm: wp.vec3, lever: wp.vec3, hinge: wp.vec3, j
         joint_f[first + axis] = wrench.force[axis]
         joint_f[first + 3 + axis] = torque[axis]
         joint_f[gripper + axis] = joint_f[gripper + axis] - wrench.force[axis]
-    joint_f[gripper + 3] = joint_f[gripper + 3] - wp.dot(hinge, wrench.torque + wp.cross(lever, wrench.force))
+    joint_f[gripper + TILT] = joint_f[gripper + TILT] - wp.dot(hinge, wrench.torque + wp.cross(lever, wrench.force))
 
 
 @wp.kernel

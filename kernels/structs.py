@@ -5,6 +5,10 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 
+# The cup's tilt among the gripper's coordinates and degrees of freedom: x, y, z, tilt.
+TILT = wp.constant(3)
+
+
 @wp.struct
 class LayoutData:
     """Where a world's things lie in the model's arrays; see scenes.build.Layout."""

@@ -20,8 +20,8 @@ from synpick_warp.kernels.phases import (
     PRESS,
     TARGET,
 )
-from synpick_warp.kernels.rest import is_outside
-from synpick_warp.kernels.structs import DropData, LayoutData, MoveData, PickData, SettleData
+from synpick_warp.kernels.rest import is_outside, shape_place
+from synpick_warp.kernels.structs import TILT, DropData, LayoutData, MoveData, PickData, SettleData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,8 +32,6 @@ LOST = wp.constant(2)
 PARKED_PITCH = wp.constant(5.0)
 # A goal so near to its target has arrived [m]; two kernels may round the target differently.
 ARRIVED = wp.constant(1.0e-4)
-# A collision shape that is to touch nothing is this much higher [m].
-AWAY = wp.constant(1000.0)
 
 
 @wp.kernel
@@ -70,7 +68,7 @@ def begin_picking_kernel(
     target_out[world] = -1
     yaw_out[world] = 0.0
     overflow_out[world] = 0
-    tilt_out[world * layout.coords + 3] = 0.0
+    tilt_out[world * layout.coords + TILT] = 0.0
     for instance in range(layout.instances):
         removed_out[world, instance] = 0
 
@@ -225,7 +223,7 @@ def end_attempts_kernel(
             removed_out[world, instance] = PICKED
         held_out[world, instance] = 0
     place_gripper(layout, world, drop.gripper_home, 0.0, joint_q_out, joint_qd_out)
-    tilt_out[world * layout.coords + 3] = 0.0
+    tilt_out[world * layout.coords + TILT] = 0.0
 
 
 @wp.kernel
@@ -303,7 +301,7 @@ def place_grippers_kernel(
     goal = point[world] + move.tip * normal[world] + wp.vec3(0.0, 0.0, pick.appear_height)
     goal_out[world] = goal
     place_gripper(layout, world, goal, tilt[world], joint_q_out, joint_qd_out)
-    tilt_out[world * layout.coords + 3] = tilt[world]
+    tilt_out[world * layout.coords + TILT] = tilt[world]
 
 
 @wp.kernel
@@ -315,9 +313,6 @@ def set_fingers_kernel(
     # Out:
     shape_transform_out: wp.array[wp.transform],
 ):
-    """The finger collides when moving, where the gripper is one rigid body, and not when picking. As guide walls, it is moved away."""
+    """The finger collides when moving, where the gripper is one rigid body, and not when picking."""
     world = wp.tid()
-    height = AWAY
-    if mode[world] == MOVE:
-        height = 0.0
-    shape_transform_out[world * layout.shapes + layout.finger_shape] = wp.transform(wp.vec3(0.0, 0.0, height), wp.quat_identity())
+    shape_transform_out[world * layout.shapes + layout.finger_shape] = shape_place(mode[world] == MOVE)

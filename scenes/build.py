@@ -13,7 +13,8 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import MIXED, MODES, Config
+from synpick_warp.configs.modes import mode_weights
+from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.gripper import cup_collider, finger_collider
 from synpick_warp.scenes.shapes import Catalog, CatalogEntry, ConvexPiece
@@ -110,9 +111,8 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
 
 def repeats_that_occur(config: Config) -> set[bool]:
     """Whether an object may come several times in a tote, for all modes that episodes can have."""
-    weights = config.bake.mix if config.bake.mode == MIXED else [float(config.bake.mode == mode) for mode in MODES]
-    rules = (config.pick.repeats, config.pick.repeats, config.move.repeats)
-    return {repeats for weight, repeats in zip(weights, rules, strict=True) if weight > 0.0}
+    rules = {"pick": config.pick.repeats, "target": config.pick.repeats, "move": config.move.repeats}
+    return {rules[mode] for mode, weight in mode_weights(config).items() if weight > 0.0}
 
 
 def _draw_trials(volume: np.ndarray, budget: float, room: int, repeats: bool) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.configs.schema import MIXED, Config
+from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import phases
 from synpick_warp.outcome import Ending, Outcome
 from synpick_warp.stages.stream import TickReport
@@ -20,13 +20,6 @@ LOAD_PLACES = 4
 """Decimal places of a load: a tenth of a millinewton."""
 
 Vector = tuple[float, ...]
-
-
-def may_pick(config: Config) -> bool:
-    """Whether a bake can have episodes that pick."""
-    if config.bake.mode == MIXED:
-        return sum(config.bake.mix[:2]) > 0.0
-    return config.bake.mode != MODE_NAMES[int(phases.MOVE)]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import memory_table
-from synpick_warp.attempts import AttemptLog, EpisodeRecord, may_pick
+from synpick_warp.attempts import AttemptLog, EpisodeRecord
+from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.device import pick_device

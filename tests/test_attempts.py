@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.attempts import AttemptLog, AttemptRecord, EpisodeRecord, InstanceSight, SightRecord, may_pick
+from synpick_warp.attempts import AttemptLog, AttemptRecord, EpisodeRecord, InstanceSight, SightRecord
+from synpick_warp.configs.modes import may_pick
 from synpick_warp.explain_record import read_attempts
 from synpick_warp.kernels import phases
 from synpick_warp.outcome import Ending, Outcome

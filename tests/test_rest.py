@@ -220,7 +220,7 @@ def test_guides_stand_or_are_far_above_everything(device):
     others = np.delete(poses, GUIDES, axis=1)
     assert (others == [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0]).all()
     assert (poses[0, list(GUIDES)] == [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]).all()
-    assert (poses[1, list(GUIDES)] == [0.0, 0.0, rest.GUIDES_AWAY, 0.0, 0.0, 0.0, 1.0]).all()
+    assert (poses[1, list(GUIDES)] == [0.0, 0.0, rest.SHAPES_AWAY, 0.0, 0.0, 0.0, 1.0]).all()
     worlds.set(worlds.state.progress, [0, 0, 0, 1])
     arrange.set_guides(worlds.scene, worlds.state, worlds.physics)
     poses = worlds.physics.model.shape_transform.numpy().reshape(2, SHAPES, 7)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import MIXED, MODES, Config
+from synpick_warp.configs.modes import mode_weights
+from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import structs
 from synpick_warp.scenes import build
 from synpick_warp.scenes.shapes import Catalog, CatalogEntry
@@ -90,8 +91,8 @@ def _extents(entry: CatalogEntry) -> np.ndarray:
 
 
 def _mode_data(config: Config) -> structs.ModeData:
-    mode = config.bake.mode
-    pick, target, move = config.bake.mix if mode == MIXED else (float(mode == name) for name in MODES)
+    weights = mode_weights(config)
+    pick, target, move = weights["pick"], weights["target"], weights["move"]
     data = structs.ModeData()
     data.pick_share = pick / (pick + target + move)
     data.pick_or_target_share = (pick + target) / (pick + target + move)

@@ -8,6 +8,7 @@ import newton
 import warp as wp
 
 from synpick_warp.arrays import allocate
+from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import pack
 from synpick_warp.scenes.build import build_model
@@ -67,7 +68,7 @@ class Simulation:
         self.records = tuple(self._make_record(sizes) for _ in range(RECORDS))
         self.suction: Suction | None = None
         self.looker: Looker | None = None
-        if self.scene.mode.pick_or_target_share > 0.0:
+        if may_pick(config):
             if render_scene is None:
                 raise ValueError("episodes that pick need a render_scene to look at")
             self.suction = Suction(config, catalog, render_scene, device)
@@ -102,8 +103,8 @@ class Simulation:
         if self.looker is not None:
             self.looker.look(record.snapshot)
             act.begin_attempts(scene, state, self.attempts, self.plan, physics)
-        _copy(record.sighting, self.sighting)
-        _copy(record.plan, self.plan)
+            _copy(record.sighting, self.sighting)
+            _copy(record.plan, self.plan)
 
     def _drive(self, current: newton.State) -> None:
         """Forces before a step."""

@@ -1,0 +1,18 @@
+"""Which modes the episodes of a bake can have."""
+
+from __future__ import annotations
+
+from synpick_warp.configs.schema import MIXED, MODES, Config
+
+
+def mode_weights(config: Config) -> dict[str, float]:
+    """How often each of MODES is drawn, in proportion; 0: never."""
+    if config.bake.mode == MIXED:
+        return dict(zip(MODES, config.bake.mix, strict=True))
+    return {mode: float(mode == config.bake.mode) for mode in MODES}
+
+
+def may_pick(config: Config) -> bool:
+    """Whether a bake can have episodes that pick."""
+    weights = mode_weights(config)
+    return weights["pick"] > 0.0 or weights["target"] > 0.0
