@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 
 from synpick_warp.configs.check import shown
-from synpick_warp.configs.schema import MIXED, Config
+from synpick_warp.configs.schema import FORMATS, MIXED, Config
 
 DEPTH_COUNTS = 65535
 """Largest value of a 16-bit depth image."""
@@ -34,6 +34,8 @@ def complaints(config: Config) -> Iterator[Complaint]:
 def _mix(config: Config) -> Iterator[Complaint]:
     if config.bake.mode == MIXED and not any(config.bake.mix):
         yield "bake.mix", "at least one weight above 0, with the mode mixed"
+    if not config.bake.formats:
+        yield "bake.formats", f"at least one of {', '.join(FORMATS)}"
 
 
 def _tote(config: Config) -> Iterator[Complaint]:

@@ -39,6 +39,10 @@ SHADINGS = (FAST, REFERENCE)
 """How colour is made."""
 
 
+FORMATS = ("bop", "shards", "usd", "zarr")
+"""What a bake can write."""
+
+
 @dataclass(frozen=True)
 class Bake:
     """What to make, and where."""
@@ -54,6 +58,9 @@ class Bake:
     device: str = setting("auto", "", "cpu, cuda:N, or auto: the first GPU if there is one.")
     models: str = setting("", "", "Folder of BOP models, or of OBJ/GLB/PLY meshes; empty: the embedded objects.")
     lights: str = setting("", "", "Folder of .hdr maps and sIBL sets; empty: the embedded skies.")
+    formats: tuple[str, ...] = setting(
+        ("bop",), "", "bop: BOP, a folder a scene; shards: BOP as webdataset; usd: one scene an episode; zarr: physics.", choices=FORMATS
+    )
     writers: int = setting(0, "", "Processes that write files; 0: one a processor core.", low=0, high=1024)
 
 

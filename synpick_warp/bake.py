@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -20,9 +21,10 @@ from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.device import pick_device
-from synpick_warp.exporters.bop import BopExporter, view_bytes
-from synpick_warp.exporters.files import output_error, write_whole
+from synpick_warp.exporters.base import DataSet
+from synpick_warp.exporters.files import PARTIAL, output_error, prepare_output, write_whole
 from synpick_warp.exporters.pool import WriterPool
+from synpick_warp.exporters.registry import Exporters, exporter_kinds, join, slot_bytes
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.kernels import phases
 from synpick_warp.outcome import ATTEMPTS_FILE, Ending, Outcome
@@ -32,7 +34,7 @@ from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.shapes import Camera, Catalog
+from synpick_warp.scenes.shapes import Camera, Catalog, LightMap
 from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
@@ -41,7 +43,7 @@ from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays, Ren
 from synpick_warp.stages.render_scene import build_render_scene
 from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.simulate import RECORDS, Simulation
-from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, view_sizes
+from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, tick_batch, view_sizes
 from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 
 CONFIG_FILE = "config.toml"
@@ -97,6 +99,7 @@ class Factory:
 
     catalog: Catalog
     cameras: tuple[Camera, ...]
+    lights: tuple[LightMap, ...]
     simulation: Simulation
     stream: FrameStream
     log: AttemptLog
@@ -119,7 +122,8 @@ def build_factory(config: Config, progress: Progress) -> Factory:
     simulation = Simulation(config, catalog, len(lights), device, render_scene=scene)
     renderer = Renderer(config, scene, config.arrangement.max_objects, view_sizes(config, device)["view"])
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
-    return Factory(catalog, cameras, simulation, FrameStream(config, renderer, object_ids, device), AttemptLog(config, object_ids))
+    stream = FrameStream(config, renderer, object_ids, device)
+    return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config, object_ids))
 
 
 def run_bake(config: Config, out: Path, progress: Progress) -> BakeSummary:
@@ -135,26 +139,36 @@ def run_bake(config: Config, out: Path, progress: Progress) -> BakeSummary:
     """
     factory = build_factory(config, progress)
     writers = config.bake.writers or len(os.sched_getaffinity(0))
-    with WriterPool(writers, view_bytes(factory.cameras[0])) as pool:
-        exporter = BopExporter(out, config, factory.catalog, factory.cameras, config.bake.episodes, pool)
+    kinds = exporter_kinds(config.bake.formats)
+    prepare_output(out)
+    (out / PARTIAL).mkdir(parents=True)
+    with WriterPool(writers, slot_bytes(kinds, config)) as pool:
+        exporter = Exporters(kinds, DataSet(out, config, factory.catalog, factory.cameras, factory.lights, pool))
         try:
+            exporter.write_constants()
             summary = BakeSummary()
             started = time.perf_counter()
             _run(config, factory, exporter, summary, progress)
             progress.stage("finishing files")
+            pool.wait()
             exporter.close()
+            join(kinds, out, config, pool)
             _write_records(config, out, summary)
             summary.wall_seconds = time.perf_counter() - started
         except BaseException:
+            pool.abort()
             exporter.abort()
             raise
+        finally:
+            shutil.rmtree(out / PARTIAL, ignore_errors=True)
     return summary
 
 
-def _run(config: Config, factory: Factory, exporter: BopExporter, summary: BakeSummary, progress: Progress) -> None:
+def _run(config: Config, factory: Factory, exporter: Exporters, summary: BakeSummary, progress: Progress) -> None:
     """Tick until no episode is left. The device already works on the next tick while the host reads and renders this one."""
     simulation = factory.simulation
     readers = [TickReader(record) for record in simulation.records]
+    tick = config.physics.step * config.physics.steps_per_tick
     meter = _Meter(config, summary, progress)
     progress.stage("compiling kernels, dropping objects")
     simulation.tick(simulation.records[0])
@@ -165,12 +179,13 @@ def _run(config: Config, factory: Factory, exporter: BopExporter, summary: BakeS
         simulation.tick(simulation.records[following])
         readers[following].start()
         report = readers[current].wait()
+        exporter.tick(tick_batch(report, factory.log.object_ids, tick))
         for batch in factory.stream.render(simulation.records[current].snapshot, report):
             exporter.write(batch)
             summary.views += len(batch)
         records = factory.log.see(report)
         for end in _ends(report):
-            exporter.end(end)
+            exporter.end(end, lambda: None)
             _count(config, summary, end, records[end.episode], progress)
         phase = report.column("phase")
         meter.show(int(np.isin(phase, (phases.SETTLE, phases.ACT)).sum()))

@@ -1,8 +1,10 @@
-"""The one thing that stages hand to exporters: a batch of views with their images and ground truth, on the host."""
+"""What stages hand to exporters, on the host: views with their images and ground truth, ticks of the worlds, ends of episodes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -51,9 +53,45 @@ class FrameBatch:
         return len(self.episode)
 
 
+@dataclass(frozen=True, eq=False)
+class TickBatch:
+    """One frame of each of the `W` worlds that have one in a tick. Arrays are valid until the next tick; exporters copy what they keep.
+
+    `I` is the room for instances of a world, as in `FrameBatch`, `S` the number of steps in a tick.
+    """
+
+    episode: np.ndarray
+    """Episode number (W) int32."""
+    frame: np.ndarray
+    """Number of the frame in its episode, from 0, (W) int32."""
+    time: np.ndarray
+    """Simulated time since the episode's first frame [s] (W) float64."""
+    object_id: np.ndarray
+    """obj_id of each instance; -1: no such instance in the scene (W, I) int32."""
+    pose: np.ndarray
+    """Object to world: x, y, z [m], quaternion x, y, z, w (W, I, 7) float32."""
+    fixture_pose: np.ndarray
+    """The same of tote, finger and cup (W, 3, 7) float32."""
+    fixture_visible: np.ndarray
+    """0: not in the picture (W, 3) int32."""
+    light: np.ndarray
+    """Index of the episode's light map (W) int32."""
+    light_turn: np.ndarray
+    """The light map is turned counter-clockwise about +z by this angle [rad] (W) float32."""
+    light_exposure: np.ndarray
+    """How much longer than the automatic exposure the episode's pictures are exposed [stops] (W) float32."""
+    tick: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Further arrays (W, ...) of the tick; empty unless an exporter records physics."""
+    steps: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Arrays (W, S, ...) of the steps that led to the frame; empty unless an exporter records physics."""
+
+    def __len__(self) -> int:
+        return len(self.episode)
+
+
 @dataclass(frozen=True)
 class EpisodeEnd:
-    """An episode is over. Exporters finish its scenes, or drop them if the ending delivers nothing."""
+    """An episode is over. Exporters finish its files, or drop them if the ending delivers nothing."""
 
     episode: int
     redraw: int
@@ -61,3 +99,7 @@ class EpisodeEnd:
     frames: int
     ending: int
     """Code of an `Ending`."""
+    row: Mapping[str, Any] = field(default_factory=dict)
+    """What the data set's list of episodes says of it; empty if the episode will be drawn again."""
+    attempts: tuple[str, ...] = ()
+    """Its lines of the data set's list of attempts: JSON, each with its end."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import re
@@ -16,12 +15,11 @@ import pytest
 import trimesh
 
 from synpick_warp.errors import CatalogError, OutputError
-from synpick_warp.exporters.bop import BopExporter, view_bytes
+from synpick_warp.exporters.bop import BopExporter
 from synpick_warp.exporters.bop_models import encode_model, write_models
-from synpick_warp.exporters.files import PARTIAL, prepare_output
-from synpick_warp.exporters.pool import WriterPool
-from synpick_warp.outcome import Ending
+from synpick_warp.exporters.files import prepare_output
 from synpick_warp.scenes.shapes import Catalog
+from tests.exporter_contract import ExporterContract, digests, export, exporter_data_set, exporting, feed, finish
 from tests.reference.box_views import OBJECT_IDS, SIZES, batches, cameras, catalog, config, ends, poses
 from tests.test_rle import decode
 
@@ -29,30 +27,14 @@ EPISODES = (0, 2)
 FRAMES = 3
 LENSES = cameras()
 VIEW = next(batches(1, (0,), 1, LENSES))
-VIEW_BYTES = view_bytes(LENSES[0])
 
 
-def export(out: Path, processes: int = 2, episodes: tuple[int, ...] = EPISODES, **bop: object) -> Path:
-    with WriterPool(processes, VIEW_BYTES) as pool:
-        exporter = BopExporter(out, config(**bop), catalog(), LENSES, len(episodes), pool)
-        feed(exporter, episodes)
-        exporter.close()
-    return out
-
-
-def feed(exporter: BopExporter, episodes: tuple[int, ...], frames: int = FRAMES, ending: Ending = Ending.FINISHED) -> None:
-    for batch in batches(4, episodes, frames, LENSES):
-        exporter.write(batch)
-    for end in ends(episodes, frames, ending):
-        exporter.end(end)
+def make(out: Path, processes: int = 2, episodes: tuple[int, ...] = EPISODES, **bop: object) -> Path:
+    return export(BopExporter, out, config(**bop), episodes, processes)
 
 
 def load(path: Path) -> object:
     return json.loads(path.read_text())
-
-
-def digests(folder: Path) -> dict[str, str]:
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
 
 
 def rows():
@@ -63,7 +45,7 @@ def rows():
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Path:
-    return export(tmp_path_factory.mktemp("bop") / "not" / "there" / "yet")
+    return make(tmp_path_factory.mktemp("bop") / "not" / "there" / "yet")
 
 
 @pytest.fixture(scope="module")
@@ -212,56 +194,31 @@ def test_models_are_plain_ply_in_millimetres(dataset, folder):
 
 def test_the_same_frames_give_the_same_bytes_whatever_the_number_of_processes(dataset, tmp_path):
     for processes in (0, 2):
-        assert digests(export(tmp_path / str(processes), processes)) == digests(dataset)
+        assert digests(make(tmp_path / str(processes), processes)) == digests(dataset)
 
 
 def test_png_colour_without_masks_and_coco(tmp_path):
-    out = export(tmp_path / "set", episodes=(0,), split="test", color_format="png", masks=False, coco=False)
+    out = make(tmp_path / "set", episodes=(0,), split="test", color_format="png", masks=False, coco=False)
     batch = VIEW
     np.testing.assert_array_equal(cv2.imread(str(out / "test/000000/rgb/000000.png"))[..., ::-1], batch.color[0])
     names = {path.name for path in (out / "test/000000").iterdir()}
     assert names == {"rgb", "depth", "scene_camera.json", "scene_gt.json", "scene_gt_info.json"}
 
 
-def test_an_attempt_that_failed_leaves_nothing_and_comes_again(tmp_path, dataset):
-    with WriterPool(2, VIEW_BYTES) as pool:
-        exporter = BopExporter(tmp_path / "set", config(), catalog(), LENSES, len(EPISODES), pool)
-        feed(exporter, EPISODES, frames=2, ending=Ending.NOT_FINITE)
-        for end in ends((2,), 0, Ending.UNSETTLED, redraw=1):
-            exporter.end(end)
-        feed(exporter, EPISODES)
-        exporter.close()
-    assert digests(tmp_path / "set") == digests(dataset)
-
-
 def test_an_episode_that_never_ended_is_left_out(tmp_path):
-    with WriterPool(2, VIEW_BYTES) as pool:
-        exporter = BopExporter(tmp_path / "set", config(), catalog(), LENSES, 2, pool)
+    with exporting(BopExporter, tmp_path / "set", config()) as exporter:
+        exporter.write_constants()
         for batch in batches(5, (1,), 2, LENSES):
             exporter.write(batch)
-        exporter.close()
+        finish(exporter)
     assert list((tmp_path / "set/train_pbr").iterdir()) == []
     assert load(tmp_path / "set/test_targets_bop19.json") == load(tmp_path / "set/test_targets_bop24.json") == []
-    assert not (tmp_path / "set" / PARTIAL).exists()
-
-
-def test_whole_scenes_survive_an_abort_and_parts_do_not(tmp_path):
-    pool = WriterPool(2, VIEW_BYTES)
-    exporter = BopExporter(tmp_path, config(), catalog(), LENSES, 2, pool)
-    feed(exporter, (0,))
-    pool.wait()
-    for batch in batches(5, (1,), 2, LENSES):
-        exporter.write(batch)
-    exporter.abort()
-    assert sorted(path.name for path in (tmp_path / "train_pbr").iterdir()) == ["000000", "000001", "000002"]
-    assert not (tmp_path / PARTIAL).exists()
-    with pytest.raises(OutputError):
-        exporter.close()
 
 
 def lose_a_writer(out: Path) -> None:
-    with WriterPool(2, VIEW_BYTES) as pool:
-        exporter = BopExporter(out, config(), catalog(), LENSES, 2, pool)
+    with exporting(BopExporter, out, config()) as exporter:
+        exporter.write_constants()
+        pool = exporter_data_set(exporter).pool
         feed(exporter, (0,))
         pool.wait()
         os.kill(pool._workers[0].process.pid, signal.SIGKILL)
@@ -276,25 +233,18 @@ def test_a_killed_writer_is_reported_and_whole_scenes_stay(tmp_path):
 
 
 def lose_a_frame(out: Path) -> None:
-    with WriterPool(2, VIEW_BYTES) as pool:
-        exporter = BopExporter(out, config(), catalog(), LENSES, 2, pool)
+    with exporting(BopExporter, out, config()) as exporter:
+        exporter.write_constants()
         for batch in batches(5, (0,), 3, LENSES):
             exporter.write(batch)
-        exporter.end(ends((0,), 4)[0])
-        exporter.close()
+        exporter.end(ends((0,), 4)[0], lambda: None)
+        finish(exporter)
 
 
 def test_a_missing_frame_is_no_whole_scene(tmp_path):
     with pytest.raises(OutputError, match="has 3 of 4 frames"):
         lose_a_frame(tmp_path)
     assert list((tmp_path / "train_pbr").iterdir()) == []
-
-
-def test_an_abort_before_the_first_whole_scene_leaves_nothing(tmp_path):
-    exporter = BopExporter(tmp_path, config(), catalog(), LENSES, 2, WriterPool(2, VIEW_BYTES))
-    exporter.write(VIEW)
-    exporter.abort()
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture
@@ -309,7 +259,7 @@ def small_disk(tmp_path):
 
 def test_a_full_disk_ends_the_bake_with_one_line(small_disk):
     with pytest.raises(OutputError, match=r"cannot write .*: No space left on device") as caught:
-        export(small_disk, episodes=tuple(range(20)), color_format="png")
+        make(small_disk, episodes=tuple(range(20)), color_format="png")
     assert "\n" not in str(caught.value)
     for scene in (small_disk / "train_pbr").iterdir():
         assert len(list((scene / "rgb").iterdir())) == len(load(scene / "scene_gt.json")) == FRAMES
@@ -327,8 +277,6 @@ def test_output_folders_that_cannot_be_used(tmp_path):
     for bad in (tmp_path / "file" / "below", Path("/dev/null/x")):
         with pytest.raises(OutputError, match="cannot write"):
             prepare_output(bad)
-    with WriterPool(0, VIEW_BYTES) as pool, pytest.raises(OutputError, match="is not empty"):
-        BopExporter(tmp_path / "full", config(), catalog(), LENSES, 1, pool)
     assert digests(tmp_path) == before
 
 
@@ -359,3 +307,7 @@ def test_bop_models_are_copied_byte_for_byte(tmp_path):
     assert (tmp_path / "models/obj_000003.ply").read_bytes() == model
     assert (tmp_path / "models/label.png").read_bytes() == b"any bytes"
     assert load(tmp_path / "models/models_info.json") == {"3": info}
+
+
+class TestContract(ExporterContract):
+    kind = BopExporter

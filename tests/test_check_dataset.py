@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from synpick_warp.exporters.bop import BopExporter, view_bytes
-from synpick_warp.exporters.pool import WriterPool
-from tests.reference.box_views import batches, cameras, catalog, config, ends
+from synpick_warp.exporters.bop import BopExporter
+from tests.exporter_contract import export
+from tests.reference.box_views import cameras, config
 
 TOOL = Path(__file__).resolve().parent.parent / "tools" / "check_dataset.py"
 LENSES = cameras(240, 180)
@@ -37,13 +37,7 @@ TOOLS = load_tool()
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("check") / "set"
-    with WriterPool(0, view_bytes(LENSES[0])) as pool:
-        exporter = BopExporter(out, config(), catalog(), LENSES, 1, pool)
-        for batch in batches(6, (0,), 2, LENSES):
-            exporter.write(batch)
-        exporter.end(ends((0,), 2)[0])
-        exporter.close()
-    return out
+    return export(BopExporter, out, config(), (0,), 0, 2, LENSES)
 
 
 @pytest.fixture

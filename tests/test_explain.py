@@ -20,11 +20,11 @@ from synpick_warp.explain import object_names, to_color_image, write_explanation
 from synpick_warp.explain_graph import RED
 from synpick_warp.explain_panels import draw_load, fitted, ticks, wrapped
 from synpick_warp.explain_record import choice_words, labels, seal_words
-from synpick_warp.exporters.bop import BopExporter, view_bytes
-from synpick_warp.exporters.pool import WriterPool
+from synpick_warp.exporters.bop import BopExporter
 from synpick_warp.preview import FONT, instance_color
+from tests.exporter_contract import export
 from tests.reference.attempt_records import attempt, nothing_seen, record, seen, seen_object
-from tests.reference.box_views import batches, cameras, catalog, config, ends
+from tests.reference.box_views import config
 
 EPISODES = (0, 1)
 TOP, LEFT = explain.MARGIN + explain.HEAD, explain.MARGIN
@@ -33,13 +33,7 @@ NAMES = {1: "tin", 2: "box", 3: "mug"}
 
 
 def bake(out: Path, **bop: object) -> Path:
-    with WriterPool(0, view_bytes(cameras()[0])) as pool:
-        exporter = BopExporter(out, config(**bop), catalog(), cameras(), len(EPISODES), pool)
-        for batch in batches(6, EPISODES, 2, cameras()):
-            exporter.write(batch)
-        for end in ends(EPISODES, 2):
-            exporter.end(end)
-        exporter.close()
+    export(BopExporter, out, config(**bop), EPISODES, 0, 2)
     (out / "config.toml").write_text(config_to_toml(config(**bop)))
     return out
 

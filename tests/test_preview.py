@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from synpick_warp.errors import DatasetError, OutputError
-from synpick_warp.exporters.bop import BopExporter, view_bytes
-from synpick_warp.exporters.pool import WriterPool
+from synpick_warp.exporters.bop import BopExporter
 from synpick_warp.preview import find_scenes, sample, write_contact_sheet
-from tests.reference.box_views import batches, cameras, catalog, config, ends
+from tests.exporter_contract import export
+from tests.reference.box_views import config
 
 FRAMES = 5
 EPISODES = (0, 1)
@@ -23,14 +23,7 @@ EPISODES = (0, 1)
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("preview") / "set"
-    with WriterPool(0, view_bytes(cameras()[0])) as pool:
-        exporter = BopExporter(out, config(), catalog(), cameras(), 2, pool)
-        for batch in batches(6, EPISODES, FRAMES, cameras()):
-            exporter.write(batch)
-        for end in ends(EPISODES, FRAMES):
-            exporter.end(end)
-        exporter.close()
-    return out
+    return export(BopExporter, out, config(), EPISODES, 0, FRAMES)
 
 
 @pytest.fixture
@@ -78,12 +71,7 @@ def test_instances_and_boxes_are_drawn_where_they_are(dataset, tmp_path):
 
 
 def test_a_set_without_masks_and_with_png_colour(tmp_path):
-    with WriterPool(0, view_bytes(cameras()[0])) as pool:
-        exporter = BopExporter(tmp_path / "set", config(masks=False, color_format="png"), catalog(), cameras(), 1, pool)
-        for batch in batches(6, (0,), 1, cameras()):
-            exporter.write(batch)
-        exporter.end(ends((0,), 1)[0])
-        exporter.close()
+    export(BopExporter, tmp_path / "set", config(masks=False, color_format="png"), (0,), 0, 1)
     assert write_contact_sheet(tmp_path / "set", tmp_path / "sheet.jpg", 2).is_file()
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
+import os
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,19 +12,19 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.bop_models import CAMERA_FILE, MODEL_FOLDERS, NOTES_FILE, write_constants
+from synpick_warp.exporters.base import DataSet, view_bytes
+from synpick_warp.exporters.bop_models import write_constants
 from synpick_warp.exporters.bop_scene import SceneSettings, drop_scenes, finish_episode, make_scene
 from synpick_warp.exporters.bop_view import MILLIMETERS, ViewSettings, ViewTruth, write_view
-from synpick_warp.exporters.files import PARTIAL, output_error, prepare_output
-from synpick_warp.exporters.pool import WriterPool, shared_bytes
+from synpick_warp.exporters.files import PARTIAL, output_error
+from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.exporters.targets import BOP19, BOP24, join_targets, write_scene_targets
-from synpick_warp.frames import EpisodeEnd, FrameBatch
+from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.outcome import Ending
-from synpick_warp.scenes.shapes import Camera, Catalog
+from synpick_warp.scenes.shapes import Camera
 
-_PIXEL_BYTES = (3, 2, 1, 4)
-"""Of `FrameBatch`'s color, depth, instance and amodal."""
-
+_FOLDER = "bop"
+"""In `PARTIAL`."""
 
 @dataclass(eq=False)
 class _Episode:
@@ -34,6 +35,8 @@ class _Episode:
     pending: int = 0
     """Views that are not on the disk yet."""
     end: EpisodeEnd | None = None
+    whole: Callable[[], None] | None = None
+    """Comes with the end."""
 
 
 class BopExporter:
@@ -42,33 +45,52 @@ class BopExporter:
     A scene grows in a hidden folder, and moves to its place when it is whole: if the bake is killed, whole scenes stay.
     """
 
-    def __init__(self, out: Path, config: Config, catalog: Catalog, cameras: tuple[Camera, ...], episodes: int, pool: WriterPool) -> None:
-        """
-        Args:
-            episodes: How many the bake is to make; named in dataset_info.md.
-            pool: The exporter does not close it, but ends it in `abort`.
+    records = False
 
-        Raises:
-            OutputError: The folder exists and is not empty, or cannot be written.
-        """
-        prepare_output(out)
+    def __init__(self, data_set: DataSet) -> None:
+        """See `Exporter`."""
+        out, config = data_set.out, data_set.config
+        self._data_set = data_set
         self._out = out
         self._config = config.bop
-        self._cameras = cameras
-        self._pool = pool
+        self._cameras = data_set.cameras
+        self._pool = data_set.pool
         self._split = out / config.bop.split
         self._suffix = f".{config.bop.color_format}"
-        self._object_ids = tuple(entry.obj_id for entry in catalog.entries)
-        self._views = tuple(self._view_settings(camera) for camera in cameras)
+        self._object_ids = tuple(entry.obj_id for entry in data_set.catalog.entries)
+        self._views = tuple(self._view_settings(camera) for camera in data_set.cameras)
         self._episodes: dict[int, _Episode] = {}
         self._begun = 0
+
+    @staticmethod
+    def slot_bytes(config: Config) -> int:
+        """See `Exporter`."""
+        return view_bytes(config)
+
+    @staticmethod
+    def join(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+        """See `Exporter`: the targets of an evaluation."""
+        parts = out / PARTIAL / _FOLDER / "targets"
         try:
-            self._split.mkdir(parents=True)
-            (out / PARTIAL).mkdir()
-            write_constants(out, config, catalog, cameras, episodes)
+            parts.parent.mkdir(exist_ok=True)
+            shutil.rmtree(parts, ignore_errors=True)
+            for name in (parts, parts / BOP19, parts / BOP24):
+                name.mkdir()
+            for scene in sorted((out / config.bop.split).iterdir()):
+                pool.submit(write_scene_targets, (), (scene, parts, config.bop.target_visibility), path=scene)
+            pool.wait()
+            join_targets(parts, out)
         except OSError as error:
-            self._remove_all()
             raise output_error(out, error) from error
+        return [Path(BOP19), Path(BOP24)]
+
+    def write_constants(self) -> list[Path]:
+        """See `Exporter`: models, camera and notes."""
+        try:
+            self._split.mkdir(exist_ok=True)
+            return write_constants(self._out, self._data_set.config, self._data_set.catalog, self._cameras)
+        except OSError as error:
+            raise output_error(self._out, error) from error
 
     def write(self, batch: FrameBatch) -> None:
         """See `Exporter`."""
@@ -85,56 +107,43 @@ class BopExporter:
                 done=partial(self._view_done, number, episode),
             )
 
-    def end(self, end: EpisodeEnd) -> None:
+    def tick(self, batch: TickBatch) -> None:
+        """See `Exporter`: what BOP has of a tick comes with its views."""
+
+    def end(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
         """See `Exporter`."""
         episode = self._episodes.pop(end.episode, None)
-        if episode is not None:
-            episode.end = end
+        if episode is None:
+            whole()
+        else:
+            episode.end, episode.whole = end, whole
             self._finish_if_whole(end.episode, episode)
         self._pool.poll()
 
+    def files(self, episode: int) -> list[Path]:
+        """See `Exporter`: the folders of the scenes."""
+        places = (self._place(episode, camera) for camera in range(len(self._cameras)))
+        return [place.relative_to(self._out) for place in places if os.path.lexists(place)]
+
     def close(self) -> None:
         """See `Exporter`."""
-        self._pool.wait()
         self._episodes.clear()
-        parts = self._out / PARTIAL / "targets"
-        try:
-            for scene in sorted(self._split.iterdir()):
-                self._pool.submit(write_scene_targets, (), (scene, parts, self._config.target_visibility), path=scene)
-            self._pool.wait()
-            join_targets(parts, self._out)
-            shutil.rmtree(self._out / PARTIAL)
-        except OSError as error:
-            raise output_error(self._out, error) from error
 
     def abort(self) -> None:
-        """See `Exporter`. Without any whole scene, nothing stays at all."""
-        self._pool.abort()
+        """See `Exporter`."""
         self._episodes.clear()
-        shutil.rmtree(self._out / PARTIAL, ignore_errors=True)
-        with contextlib.suppress(OSError):
-            self._split.rmdir()
-            self._remove_all()
-
-    def _remove_all(self) -> None:
-        """Remove what the exporter made, but no whole scene."""
-        for name in (PARTIAL, *MODEL_FOLDERS):
-            shutil.rmtree(self._out / name, ignore_errors=True)
-        for name in (CAMERA_FILE, NOTES_FILE, BOP19, BOP24):
-            (self._out / name).unlink(missing_ok=True)
-        with contextlib.suppress(OSError):
-            self._split.rmdir()
 
     def _begin(self, number: int) -> _Episode:
         # A number of its own for every arrangement: the last one's folders may not be removed yet.
         self._begun += 1
         names = (f"{self._place(number, camera).name}-{self._begun}" for camera in range(len(self._cameras)))
-        episode = _Episode(tuple(self._out / PARTIAL / name for name in names))
-        for scene in episode.scenes:
-            try:
+        episode = _Episode(tuple(self._out / PARTIAL / _FOLDER / name for name in names))
+        try:
+            (self._out / PARTIAL / _FOLDER).mkdir(exist_ok=True)
+            for scene in episode.scenes:
                 make_scene(scene, self._config.masks)
-            except OSError as error:
-                raise output_error(scene, error) from error
+        except OSError as error:
+            raise output_error(episode.scenes[0], error) from error
         self._episodes[number] = episode
         return episode
 
@@ -146,7 +155,7 @@ class BopExporter:
         if episode.end is None or episode.pending:
             return
         if not Ending(episode.end.ending).delivers:
-            self._pool.submit(drop_scenes, (), (episode.scenes,), path=episode.scenes[0])
+            self._pool.submit(drop_scenes, (), (episode.scenes,), path=episode.scenes[0], done=episode.whole)
             return
         places = tuple(self._place(number, camera) for camera in range(len(self._cameras)))
         settings = SceneSettings(
@@ -158,7 +167,8 @@ class BopExporter:
             coco=self._config.coco,
             object_ids=self._object_ids,
         )
-        self._pool.submit(finish_episode, (), (tuple(zip(episode.scenes, places, strict=True)), settings), path=places[0])
+        scenes = tuple(zip(episode.scenes, places, strict=True))
+        self._pool.submit(finish_episode, (), (scenes, settings), path=places[0], done=episode.whole)
 
     def _place(self, episode: int, camera: int) -> Path:
         return self._split / f"{len(self._cameras) * episode + camera:06d}"
@@ -171,11 +181,6 @@ class BopExporter:
             "depth_scale": self._config.depth_scale,
         }
         return ViewSettings(self._suffix, self._config.jpeg_quality, self._config.masks, self._config.coco, record)
-
-
-def view_bytes(camera: Camera) -> int:
-    """Room that a view's images take in the pool's shared memory [B]."""
-    return shared_bytes(camera.height * camera.width * size for size in _PIXEL_BYTES)
 
 
 def _truth(batch: FrameBatch, view: int) -> ViewTruth:

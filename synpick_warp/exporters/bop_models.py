@@ -22,17 +22,20 @@ _TEXTURE_COMMENT = b"comment TextureFile "
 _HEADER_END = b"end_header"
 
 
-def write_constants(out: Path, config: Config, catalog: Catalog, cameras: tuple[Camera, ...], episodes: int) -> None:
-    """Write models/, models_eval/, camera.json and dataset_info.md.
+def write_constants(out: Path, config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> list[Path]:
+    """Write models/, models_eval/, camera.json and dataset_info.md in place of what is there, and name them.
 
     Raises:
         CatalogError: A model file lacks its texture file.
         OSError: A file cannot be written.
     """
     for name in MODEL_FOLDERS:
+        if (out / name).exists():
+            shutil.rmtree(out / name)
         write_models(out / name, catalog)
     _write_json(out / CAMERA_FILE, _camera_record(cameras[0], config.bop.depth_scale))
-    (out / NOTES_FILE).write_text(_notes(config, catalog, cameras, episodes), encoding="utf-8", newline="\n")
+    (out / NOTES_FILE).write_text(_notes(config, catalog, cameras), encoding="utf-8", newline="\n")
+    return [Path(name) for name in (*MODEL_FOLDERS, CAMERA_FILE, NOTES_FILE)]
 
 
 def write_models(folder: Path, catalog: Catalog) -> None:
@@ -155,13 +158,13 @@ def _write_json(path: Path, content: object) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
 
 
-def _notes(config: Config, catalog: Catalog, cameras: tuple[Camera, ...], episodes: int) -> str:
+def _notes(config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
     camera, count = cameras[0], len(cameras)
     period = config.physics.step * config.physics.steps_per_tick
     objects = "\n".join(f"| {entry.obj_id} | {entry.name} | {entry.mass:g} |" for entry in catalog.entries)
     return f"""# A SynPick data set
 
-Made by synpick-warp (mode {config.bake.mode}, seed {config.bake.seed}, {episodes} episodes, {count} cameras), in the format of the
+Made by synpick-warp (mode {config.bake.mode}, seed {config.bake.seed}, {count} cameras), in the format of the
 BOP challenge (scenewise). Camera c of episode k is scene {count} · k + c of `{config.bop.split}/`. Frames are {period:g} s apart.
 
 - Lengths are in millimetres. A depth image's count times `depth_scale` ({config.bop.depth_scale:g}) is the planar depth, along the

@@ -37,8 +37,9 @@ class SceneSettings:
 
 def make_scene(scene: Path, masks: bool) -> None:
     """Make the folders of a scene that is not whole yet."""
+    scene.mkdir()
     for name in (RECORDS, "rgb", "depth", *(("mask", "mask_visib") if masks else ())):
-        (scene / name).mkdir(parents=True)
+        (scene / name).mkdir()
 
 
 def finish_episode(scenes: tuple[tuple[Path, Path], ...], settings: SceneSettings) -> None:

@@ -12,7 +12,7 @@ BOP19, BOP24 = "test_targets_bop19.json", "test_targets_bop24.json"
 
 
 def write_scene_targets(scene: Path, folder: Path, visibility: float) -> None:
-    """Write a scene's targets, one a line, into `folder/<file name>/<scene name>`.
+    """Write a scene's targets, one a line, to `folder/<file name>/<scene name>`; the folders are there.
 
     BOP19: for each image and object, how many instances are visible by at least the share `visibility`. BOP24: each image.
     """
@@ -28,13 +28,12 @@ def write_scene_targets(scene: Path, folder: Path, visibility: float) -> None:
         localize += [{**place, "inst_count": count, "obj_id": obj_id, "scene_id": scene_id} for obj_id, count in sorted(seen.items())]
         detect.append({**place, "scene_id": scene_id})
     for name, targets in ((BOP19, localize), (BOP24, detect)):
-        (folder / name).mkdir(parents=True, exist_ok=True)
         (folder / name / scene.name).write_text("".join(json.dumps(target) + "\n" for target in targets), encoding="ascii")
 
 
 def join_targets(folder: Path, out: Path) -> None:
     """Join what `write_scene_targets` left into the data set's two files."""
     for name in (BOP19, BOP24):
-        parts = sorted((folder / name).iterdir(), key=lambda path: int(path.name)) if (folder / name).is_dir() else []
+        parts = sorted((folder / name).iterdir(), key=lambda path: int(path.name))
         lines = [line for part in parts for line in part.read_bytes().splitlines()]
         write_whole(out / name, b"[\n" + b",\n".join(lines) + b"\n]\n")

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +11,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config
-from synpick_warp.frames import FrameBatch
+from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.render import Renderer
 from synpick_warp.stages.simulate import TickRecord
@@ -21,6 +21,8 @@ from synpick_warp.stages.worlds import MEASURE_COLUMNS, STATUS_COLUMNS
 BATCH_BYTES = 256 << 20
 # Colour, depth, instance id and amodal bits of one pixel.
 PIXEL_BYTES = 3 + 2 + 1 + 4
+# What a report has of a snapshot, besides objects and their poses.
+_SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_turn", "light_exposure")
 # Batches in flight: one is rendered while another is copied and a third is read.
 RING = 3
 
@@ -66,6 +68,12 @@ class TickReport:
     """Arrays named and shaped as those of `Sighting`; vectors have their components as a last dimension. After the tick's look."""
     plan: SimpleNamespace
     """The same of `Plan`."""
+    snapshot: SimpleNamespace = field(default_factory=SimpleNamespace)
+    """The same of `Snapshot`, but for those of its arrays that are above."""
+    tick: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Further arrays (world, ...) for `TickBatch.tick`, if somebody records physics."""
+    steps: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """The same (world, step, ...) for `TickBatch.steps`."""
 
     def column(self, name: str) -> np.ndarray:
         """One column of the status table (world) int32."""
@@ -108,9 +116,10 @@ class TickReader:
     """Brings to the host what a tick left, but for its pictures: some kilobytes a world."""
 
     def __init__(self, record: TickRecord) -> None:
+        first = [record.status.table, record.status.measures, record.snapshot.entry, record.snapshot.pose]
         self.parts = [(part, [item.name for item in fields(part)]) for part in (record.sighting, record.plan)]
-        arrays = [record.status.table, record.status.measures, record.snapshot.entry, record.snapshot.pose]
-        self.copy = HostCopy(arrays + [getattr(part, name) for part, names in self.parts for name in names])
+        self.parts.append((record.snapshot, list(_SNAPSHOT)))
+        self.copy = HostCopy(first + [getattr(part, name) for part, names in self.parts for name in names])
 
     def start(self) -> None:
         """Begin to copy what the tick left."""
@@ -121,6 +130,28 @@ class TickReader:
         arrays = iter([array.copy() for array in self.copy.wait()])
         first = [next(arrays) for _ in range(4)]
         return TickReport(*first, *(SimpleNamespace(**{name: next(arrays) for name in names}) for _, names in self.parts))
+
+
+def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> TickBatch:
+    """The frames of a tick, world by world; none: an empty batch.
+
+    Args:
+        report: What the host knows of the tick.
+        object_ids: obj_id of each catalog entry (entry) int32.
+        tick_time: Time between two frames [s].
+    """
+    live = np.flatnonzero(report.column("live"))
+    frame = report.column("frame")[live]
+    return TickBatch(
+        episode=report.column("episode")[live],
+        frame=frame,
+        time=frame * tick_time,
+        object_id=np.append(object_ids, -1).astype(np.int32)[report.entry[live]],
+        pose=report.pose[live],
+        tick={name: values[live] for name, values in report.tick.items()},
+        steps={name: values[live] for name, values in report.steps.items()},
+        **{name: getattr(report.snapshot, name)[live] for name in _SNAPSHOT},
+    )
 
 
 class FrameStream:

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import trimesh
 
-from synpick_warp.configs.schema import Bop, Config
-from synpick_warp.frames import FINGER, TABLE, EpisodeEnd, FrameBatch
+from synpick_warp.configs.schema import Bop, Cameras, Config
+from synpick_warp.frames import FINGER, TABLE, EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.outcome import Ending
 from synpick_warp.scenes.shapes import Camera, Catalog, CatalogEntry, Material, TriangleMesh
 
@@ -22,7 +22,8 @@ FOCAL = 3.0
 
 
 def config(**bop: object) -> Config:
-    return Config(bop=Bop(**bop))
+    lens = cameras()[0]
+    return Config(bop=Bop(**bop), cameras=Cameras(resolution=(lens.width, lens.height)))
 
 
 def catalog() -> Catalog:
@@ -85,6 +86,32 @@ def batches(
     for start in range(0, len(order), views):
         rows = [_view(episode, frame, camera, lenses[camera], depth_scale) for episode, frame, camera in order[start : start + views]]
         yield FrameBatch(**{name: np.stack([row[name] for row in rows]) for name in rows[0]})
+
+
+def ticks(worlds: int, episodes: tuple[int, ...], frames: int) -> Iterator[TickBatch]:
+    """Every frame of the episodes, at most `worlds` side by side."""
+    order = [(episode, frame) for frame in range(frames) for episode in episodes]
+    for start in range(0, len(order), worlds):
+        rows = [_tick(episode, frame) for episode, frame in order[start : start + worlds]]
+        yield TickBatch(**{name: np.stack([row[name] for row in rows]) for name in rows[0]})
+
+
+def _tick(episode: int, frame: int) -> dict[str, np.ndarray]:
+    fixtures = np.zeros((3, 7), np.float32)
+    fixtures[:, 6] = 1.0
+    fixtures[1:, :3] = [[0.1 - 0.02 * frame, 0.05, 0.2], [0.1 - 0.02 * frame, 0.05, 0.05]]
+    return {
+        "episode": np.int32(episode),
+        "frame": np.int32(frame),
+        "time": np.float64(frame / 15),
+        "object_id": OBJECT_IDS if frame < 2 else np.where(np.arange(ROOM) == 3, -1, OBJECT_IDS).astype(np.int32),
+        "pose": poses(episode, frame),
+        "fixture_pose": fixtures,
+        "fixture_visible": np.array([1, frame > 0, frame > 0], np.int32),
+        "light": np.int32(0),
+        "light_turn": np.float32(0.5 * episode),
+        "light_exposure": np.float32(0.25),
+    }
 
 
 def ends(episodes: tuple[int, ...], frames: int, ending: Ending = Ending.FINISHED, redraw: int = 0) -> list[EpisodeEnd]:

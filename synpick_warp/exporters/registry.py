@@ -1,0 +1,97 @@
+"""Exporters by the names of their formats, and all that a bake writes with at once."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.errors import ConfigError
+from synpick_warp.exporters.base import DataSet, Exporter
+from synpick_warp.exporters.pool import WriterPool
+from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+
+EXPORTERS = {
+    "bop": ("bop", "BopExporter"),
+    "shards": ("shards", "ShardsExporter"),
+    "usd": ("usd", "UsdExporter"),
+    "zarr": ("trajectory", "TrajectoryExporter"),
+}
+"""Format -> (module in this package, class in it). Modules are imported when their format is asked for."""
+
+
+def exporter_kinds(names: Iterable[str]) -> tuple[type[Exporter], ...]:
+    """The classes that write these formats, each once, in the order of EXPORTERS.
+
+    Raises:
+        ConfigError: A format's module, or a package that it needs, is not installed.
+    """
+    asked = set(names)
+    return tuple(_kind(name) for name in EXPORTERS if name in asked)
+
+
+def _kind(name: str) -> type[Exporter]:
+    module, kind = EXPORTERS[name]
+    try:
+        return getattr(importlib.import_module(f"{__package__}.{module}"), kind)
+    except ImportError as error:
+        raise ConfigError(f"bake.formats names {name}, but its writer cannot be loaded: {error}; name other formats") from None
+
+
+class Exporters:
+    """All exporters of a bake as one; see `Exporter`."""
+
+    def __init__(self, kinds: Iterable[type[Exporter]], data_set: DataSet) -> None:
+        self._all = tuple(kind(data_set) for kind in kinds)
+        self.records = any(exporter.records for exporter in self._all)
+
+    def write_constants(self) -> list[Path]:
+        """See `Exporter`."""
+        return [path for exporter in self._all for path in exporter.write_constants()]
+
+    def write(self, batch: FrameBatch) -> None:
+        """See `Exporter`."""
+        for exporter in self._all:
+            exporter.write(batch)
+
+    def tick(self, batch: TickBatch) -> None:
+        """See `Exporter`."""
+        for exporter in self._all:
+            exporter.tick(batch)
+
+    def end(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
+        """See `Exporter`; `whole` is called when the last exporter is done with the episode."""
+        left = [len(self._all)]
+
+        def count() -> None:
+            left[0] -= 1
+            if left[0] == 0:
+                whole()
+
+        for exporter in self._all:
+            exporter.end(end, count)
+
+    def files(self, episode: int) -> list[Path]:
+        """See `Exporter`."""
+        return sorted(path for exporter in self._all for path in exporter.files(episode))
+
+    def close(self) -> None:
+        """See `Exporter`."""
+        for exporter in self._all:
+            exporter.close()
+
+    def abort(self) -> None:
+        """See `Exporter`."""
+        for exporter in self._all:
+            exporter.abort()
+
+
+def slot_bytes(kinds: Iterable[type[Exporter]], config: Config) -> int:
+    """Most room that the images of any task take in the pool's shared memory [B]."""
+    return max(kind.slot_bytes(config) for kind in kinds)
+
+
+def join(kinds: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    """Have every format's lists that span episodes written; returns these files, relative to the data set."""
+    return sorted(path for kind in kinds for path in kind.join(out, config, pool))
