@@ -16,12 +16,10 @@ import warp as wp
 from synpick_warp.configs.modes import mode_weights
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
-from synpick_warp.scenes.gripper import cup_collider, finger_collider
+from synpick_warp.scenes.gripper import cup_collider, finger_collider, rod_inertia
 from synpick_warp.scenes.shapes import Catalog, CatalogEntry, ConvexPiece
-from synpick_warp.scenes.tote import guide_walls, tote_colliders
+from synpick_warp.scenes.tote import TABLE_SIZE, guide_walls, tote_colliders
 
-# Half size and thickness [m] of the table on which the tote stands; large enough for whatever leaves the tote.
-TABLE_SIZE = (10.0, 10.0, 0.1)
 # Mass [kg] and inertia [kg·m²] of an empty slot; its weight is cancelled, so that only their being positive matters.
 EMPTY_MASS = 0.1
 EMPTY_INERTIA = 1e-3
@@ -174,9 +172,9 @@ def _add_gripper(world: newton.ModelBuilder, config: Config, shape: newton.Model
     gripper = config.gripper
     dof = newton.ModelBuilder.JointDofConfig
     free = {"limit_lower": -np.inf, "limit_upper": np.inf, "armature": 0.0}
-    finger = world.add_link(mass=gripper.finger_mass, inertia=wp.mat33(np.diag(_rod_inertia(gripper.finger_mass, gripper.finger_length))),
+    finger = world.add_link(mass=gripper.finger_mass, inertia=wp.mat33(np.diag(rod_inertia(gripper.finger_mass, gripper.finger_length))),
                             com=wp.vec3(0.0, 0.0, gripper.finger_length / 2), lock_inertia=True, label="finger")
-    cup = world.add_link(mass=gripper.cup_mass, inertia=wp.mat33(np.diag(_rod_inertia(gripper.cup_mass, gripper.cup_length))),
+    cup = world.add_link(mass=gripper.cup_mass, inertia=wp.mat33(np.diag(rod_inertia(gripper.cup_mass, gripper.cup_length))),
                          com=wp.vec3(0.0, 0.0, -gripper.cup_length / 2), lock_inertia=True, label="cup")
     axes = [dof(axis=axis, **free) for axis in (newton.Axis.X, newton.Axis.Y, newton.Axis.Z)]
     slide = world.add_joint_d6(-1, finger, linear_axes=axes)
@@ -188,13 +186,6 @@ def _add_gripper(world: newton.ModelBuilder, config: Config, shape: newton.Model
     cup_shape = world.add_shape_convex_hull(cup, mesh=_hull(cup_collider(gripper)), cfg=shape)
     world.add_shape_collision_filter_pair(finger_shape, cup_shape)
     return finger_shape, cup_shape
-
-
-def _rod_inertia(mass: float, length: float) -> tuple[float, float, float]:
-    """Principal inertia [kg·m²] of a rod along z as thick as a quarter of its length."""
-    radius = length / 8
-    across = mass * (length**2 + 3 * radius**2) / 12
-    return across, across, mass * radius**2 / 2
 
 
 def _add_slots(

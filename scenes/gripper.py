@@ -75,5 +75,12 @@ def cup_collider(gripper: Gripper) -> ConvexPiece:
     return limited_hull(points, len(points))
 
 
+def rod_inertia(mass: float, length: float) -> tuple[float, float, float]:
+    """Principal inertia [kg·m²] of a rod along z as thick as a quarter of its length: that of finger and cup."""
+    radius = length / 8
+    across = mass * (length**2 + 3 * radius**2) / 12
+    return across, across, mass * radius**2 / 2
+
+
 def _finger_radii(gripper: Gripper) -> tuple[float, float]:
     return min(FINGER_TIP, gripper.finger_width) / 2, gripper.finger_width / 2

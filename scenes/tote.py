@@ -26,6 +26,8 @@ MIN_WALL = 0.02
 """Least thickness of the walls' collision shapes at the rim [m], for the same reason."""
 GUIDE_THICKNESS = 0.1
 """Thickness of the guide walls [m]."""
+TABLE_SIZE = (10.0, 10.0, 0.1)
+"""Half size and half thickness of the table on which the tote stands [m]; large enough for whatever leaves the tote."""
 
 
 def rim_height(tote: Tote) -> float:

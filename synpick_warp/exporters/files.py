@@ -11,24 +11,28 @@ from synpick_warp.errors import OutputError
 
 PARTIAL = ".partial"
 """Folder in the data set for what is not whole yet: on the same file system, so that a rename moves it into place."""
+MANIFEST_FILE = "manifest.json"
+"""By which a folder is known as a data set."""
+_ALLOWED = "--out takes a new or an empty folder"
 
 
 def prepare_output(out: Path) -> None:
     """Make sure that a data set can be written to a folder, and leave nothing behind.
 
     Raises:
-        OutputError: The folder exists and is not empty, or cannot be made or written.
+        OutputError: The folder holds something else than a data set, or cannot be made or written.
     """
     made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     try:
         out.mkdir(parents=True, exist_ok=True)
-        if any(out.iterdir()):
-            raise OutputError(f"{out} is not empty; --out takes a new or an empty folder")
+        # Hidden names are what a bake leaves that was killed before its first file was whole.
+        if not (out / MANIFEST_FILE).exists() and any(not path.name.startswith(".") for path in out.iterdir()):
+            raise OutputError(f"{out} is not empty; {_ALLOWED}, or a data set to go on with")
         probe = out / f".{uuid.uuid4().hex}"
         probe.write_bytes(b"\0")
         probe.unlink()
     except FileExistsError:
-        raise OutputError(f"{out} is a file; --out takes a new or an empty folder") from None
+        raise OutputError(f"{out} is a file; {_ALLOWED}") from None
     except OSError as error:
         raise output_error(out, error) from error
     finally:
@@ -46,8 +50,13 @@ def output_error(path: Path | str, error: OSError) -> OutputError:
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file so that it is there entirely or not at all, even after a power cut."""
     beside = path.with_name(f".{path.name}.new")
-    write_flushed(beside, data)
-    beside.replace(path)
+    try:
+        write_flushed(beside, data)
+        beside.replace(path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            beside.unlink()
+        raise
     flush_folder(path.parent)
 
 
@@ -56,6 +65,12 @@ def write_flushed(path: Path, data: bytes) -> None:
     with path.open("wb") as file:
         file.write(data)
         file.flush()
+        os.fsync(file.fileno())
+
+
+def flush_file(path: Path) -> None:
+    """Write through to the disk what somebody else wrote into a file."""
+    with path.open("rb") as file:
         os.fsync(file.fileno())
 
 

@@ -29,7 +29,7 @@ _ALIGNMENT = 64
 """Images begin at a multiple of a cache line [B]."""
 _END_TIMEOUT = 10.0
 """How long a process may take to end when it has nothing left to do [s]."""
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
+_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1", "PXR_WORK_THREAD_LIMIT": "1"}
 """The processes are the parallelism: no threads within them."""
 
 
@@ -61,11 +61,12 @@ class WriterPool:
     shared memory has no name, so there is nothing to leak however the bake ends.
     """
 
-    def __init__(self, processes: int, slot_bytes: int) -> None:
+    def __init__(self, processes: int, slot_bytes: int, held: int | None = None) -> None:
         """
         Args:
             processes: How many processes; 0: tasks run in this one.
             slot_bytes: Most room that the images of one task take, see `shared_bytes` [B].
+            held: A file handle that the processes hold open until they end, such as one with a lock.
 
         Raises:
             OutputError: There is no memory or no process to be had.
@@ -84,7 +85,7 @@ class WriterPool:
             raise OutputError(f"no shared memory for {processes} writer processes: {error}; set bake.writers lower") from error
         try:
             for _ in range(processes):
-                self._workers.append(_start(handle))
+                self._workers.append(_start(handle, () if held is None else (held,)))
         except OSError as error:
             self.abort()
             raise OutputError(f"cannot start {processes} writer processes: {error}; set bake.writers lower") from error
@@ -274,7 +275,7 @@ def _shared_memory(size: int) -> tuple[int, mmap.mmap]:
     return handle, mmap.mmap(handle, size)
 
 
-def _start(memory: int) -> _Worker:
+def _start(memory: int, held: tuple[int, ...]) -> _Worker:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
@@ -282,7 +283,7 @@ def _start(memory: int) -> _Worker:
             (sys.executable, "-P", "-c", "from synpick_warp.exporters.worker import main; main()", str(theirs.fileno()), str(memory)),
             stdin=subprocess.DEVNULL,
             env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": paths},
-            pass_fds=(theirs.fileno(), memory),
+            pass_fds=(theirs.fileno(), memory, *held),
             process_group=0,  # A terminal's Ctrl-C goes to the bake alone, even before the process can ignore it.
         )
         return _Worker(process, Connection(ours.detach()))
