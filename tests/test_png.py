@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zlib
 
 import cv2
@@ -10,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from PIL import Image
 
 from synpick_warp.exporters.png import encode_mask_png, encode_png
-from synpick_warp.exporters.rle import Crop
+from synpick_warp.exporters.rle import find_edges
 
 SIDE = st.integers(1, 40)
 GREY = st.tuples(SIDE, SIDE)
@@ -55,14 +57,22 @@ def test_known_bytes():
 
 
 @given(st.data())
-def test_a_cropped_mask_is_written_at_its_place(data):
+def test_a_mask_is_written_at_its_place(data):
     height, width = data.draw(GREY)
     top, left = data.draw(st.integers(0, height)), data.draw(st.integers(0, width))
     rows, columns = data.draw(st.integers(0, height - top)), data.draw(st.integers(0, width - left))
-    crop = Crop(data.draw(hnp.arrays(bool, (rows, columns))), top, left)
+    mask = data.draw(hnp.arrays(bool, (rows, columns)))
     full = np.zeros((height, width), np.uint8)
-    full[top : top + rows, left : left + columns] = np.where(crop.mask, 255, 0)
-    np.testing.assert_array_equal(read(encode_mask_png(crop, height, width)), full)
+    full[top : top + rows, left : left + columns] = np.where(mask, 255, 0)
+    runs = find_edges(mask.view(np.uint8), top, left).runs_of(1)
+    stream = encode_mask_png(runs, height, width)
+    np.testing.assert_array_equal(read(stream), full)
+    # OpenCV reads on where a checksum is wrong.
+    length = int.from_bytes(stream[33:37])
+    assert len(zlib.decompress(stream[41 : 41 + length])) == height * (1 + width)
+    with Image.open(io.BytesIO(stream)) as image:
+        image.load()
+        np.testing.assert_array_equal(np.asarray(image), full)
 
 
 @pytest.mark.parametrize(

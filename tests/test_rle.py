@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from pycocotools import mask as coco
 
-from synpick_warp.exporters.rle import Crop, amodal_crop, run_lengths, visible_crop
+from synpick_warp.exporters.rle import Runs, find_edges
 
 SIDE = st.integers(1, 12)
-EDGE = st.integers(-15, 25)
 
 
 def decode(counts: list[int], height: int, width: int) -> np.ndarray:
@@ -20,10 +20,29 @@ def decode(counts: list[int], height: int, width: int) -> np.ndarray:
     return values.reshape(width, height).T
 
 
-def placed(crop: Crop, height: int, width: int) -> np.ndarray:
+def painted(runs: Runs, height: int, width: int) -> np.ndarray:
     full = np.zeros((height, width), bool)
-    full[crop.top : crop.top + crop.mask.shape[0], crop.left : crop.left + crop.mask.shape[1]] = crop.mask
+    for column, first, past in zip(runs.column, runs.first, runs.past, strict=True):
+        assert not full[first:past, column].any()
+        full[first:past, column] = True
     return full
+
+
+def cut(image: np.ndarray, data: st.DataObject) -> tuple[np.ndarray, int, int, int, int]:
+    """A part, with its first row and column, and height and width of a picture that holds it."""
+    rows, columns = image.shape
+    height, width = rows + data.draw(st.integers(0, 3)), columns + data.draw(st.integers(0, 3))
+    return image, data.draw(st.integers(0, height - rows)), data.draw(st.integers(0, width - columns)), height, width
+
+
+def placed(part: np.ndarray, top: int, left: int, height: int, width: int) -> np.ndarray:
+    full = np.zeros((height, width), part.dtype)
+    full[top : top + part.shape[0], left : left + part.shape[1]] = part
+    return full
+
+
+def of_mask(mask: object) -> Runs:
+    return find_edges(np.array(mask, np.uint8)).runs_of(1)
 
 
 @pytest.mark.parametrize(
@@ -37,47 +56,50 @@ def placed(crop: Crop, height: int, width: int) -> np.ndarray:
     ],
 )
 def test_known_run_lengths(mask, counts):
-    assert run_lengths(Crop(np.array(mask, bool), 0, 0), *np.shape(mask)) == counts
+    assert of_mask(mask).counts(*np.shape(mask)).tolist() == counts
 
 
-def test_a_crop_without_pixels_has_no_runs():
-    crop = Crop(np.zeros((0, 3), bool), 2, 1)
-    assert run_lengths(crop, 4, 5) == [20]
-    assert crop.box() is None
-    assert crop.count == 0
+@pytest.mark.parametrize("shape", [(0, 3), (3, 0), (0, 0), (2, 3)])
+def test_a_part_without_pixels_has_no_runs(shape):
+    runs = find_edges(np.zeros(shape, np.uint32), 2, 1).runs_with(31)
+    assert runs.counts(4, 5).tolist() == [20]
+    assert runs.box() is None
+    assert runs.count == 0
 
 
-@given(st.data())
-def test_run_lengths_decode_to_the_mask(data):
-    mask = data.draw(hnp.arrays(bool, st.tuples(SIDE, SIDE)))
-    rows, columns = mask.shape
-    height, width = rows + data.draw(st.integers(0, 3)), columns + data.draw(st.integers(0, 3))
-    crop = Crop(mask, data.draw(st.integers(0, height - rows)), data.draw(st.integers(0, width - columns)))
-    counts = run_lengths(crop, height, width)
+@given(hnp.arrays(np.uint8, st.tuples(SIDE, SIDE), elements=st.integers(0, 3)), st.integers(1, 4), st.data())
+def test_values_become_runs_and_run_lengths(image, value, data):
+    part, top, left, height, width = cut(image, data)
+    expected = placed(part, top, left, height, width) == value
+    runs = find_edges(part, top, left).runs_of(value)
+    np.testing.assert_array_equal(painted(runs, height, width), expected)
+    counts = runs.counts(height, width).tolist()
     assert sum(counts) == height * width
     assert all(counts[1:])
-    assert all(type(count) is int for count in counts)
-    np.testing.assert_array_equal(decode(counts, height, width), placed(crop, height, width))
+    np.testing.assert_array_equal(decode(counts, height, width), expected)
+    assert runs.count == expected.sum()
+    ys, xs = np.nonzero(expected)
+    assert runs.box() == ((xs.min(), ys.min(), xs.max(), ys.max()) if expected.any() else None)
 
 
-@given(hnp.arrays(np.uint32, st.tuples(SIDE, SIDE), elements=st.sampled_from([0, 1, 5, 2**31, 2**32 - 1])), st.sampled_from([0, 2, 31]))
-def test_amodal_bits_become_masks(bits, instance):
-    height, width = bits.shape
-    whole = amodal_crop(bits, instance, np.array([-3, -2, width + 4, height], np.int32))
-    np.testing.assert_array_equal(placed(whole, height, width), (bits >> np.uint32(instance)) & 1 == 1)
+@given(
+    hnp.arrays(np.uint32, st.tuples(SIDE, SIDE), elements=st.sampled_from([0, 1, 5, 2**31, 2**32 - 1])),
+    st.sampled_from([0, 2, 31]),
+    st.data(),
+)
+def test_bits_become_runs(bits, instance, data):
+    part, top, left, height, width = cut(bits, data)
+    expected = placed((bits >> np.uint32(instance)) & 1 == 1, top, left, height, width)
+    np.testing.assert_array_equal(painted(find_edges(part, top, left).runs_with(instance), height, width), expected)
 
 
-@given(hnp.arrays(np.uint8, st.tuples(SIDE, SIDE), elements=st.integers(0, 3)), st.tuples(EDGE, EDGE, EDGE, EDGE))
-def test_a_crop_holds_what_lies_in_its_box(instances, box):
-    height, width = instances.shape
-    rows, columns = np.mgrid[:height, :width]
-    inside = (columns >= box[0]) & (rows >= box[1]) & (columns <= box[2]) & (rows <= box[3])
-    crop = visible_crop(instances, 1, np.array(box, np.int32))
-    expected = (instances == 2) & inside
-    np.testing.assert_array_equal(placed(crop, height, width), expected)
-    assert crop.count == expected.sum()
-    if expected.any():
-        ys, xs = np.nonzero(expected)
-        assert crop.box() == (xs.min(), ys.min(), xs.max(), ys.max())
-    else:
-        assert crop.box() is None
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
+@given(hnp.arrays(bool, st.tuples(SIDE, SIDE)))
+def test_pycocotools_reads_and_makes_the_same_run_lengths(mask):
+    height, width = mask.shape
+    runs = of_mask(mask)
+    record = {"counts": runs.counts(height, width).tolist(), "size": [height, width]}
+    theirs = coco.frPyObjects(record, height, width)
+    np.testing.assert_array_equal(coco.decode(theirs), mask)
+    assert coco.encode(np.asfortranarray(mask, np.uint8)) == theirs
+    assert coco.area(theirs) == runs.count

@@ -5,16 +5,20 @@ Runs in writer processes, so it imports neither Warp nor Newton. Millimetres exi
 
 from __future__ import annotations
 
-import json
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import orjson
 
+from synpick_warp.exporters.folder import Buffer, open_folder
 from synpick_warp.exporters.png import encode_mask_png, encode_png
-from synpick_warp.exporters.rle import Crop, amodal_crop, run_lengths, visible_crop
+from synpick_warp.exporters.rle import Runs, find_edges
+from synpick_warp.frames import FrameBatch
+from synpick_warp.scenes.shapes import Camera
 
 RECORDS = "records"
 """Folder of views' records, in a scene that is not whole yet."""
@@ -57,6 +61,58 @@ class ViewTruth:
     """(N, 3)"""
     boxes: np.ndarray
     """(N, 2, 4)"""
+    top: int
+    """Row of the picture with which the images `instance` and `amodal` of the view's task begin: they hold what all boxes hold."""
+    left: int
+    """Column of the picture with which they begin."""
+
+
+@dataclass(frozen=True, eq=False)
+class Masks:
+    """Of one instance."""
+
+    whole: Runs
+    """Its silhouette, hidden or not, inside the picture."""
+    seen: Runs
+    """Its visible part."""
+
+
+def camera_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
+    """A camera's entry in scene_camera.json."""
+    return {
+        "cam_K": camera.matrix.ravel().tolist(),
+        "cam_R_w2c": camera.rotation.ravel().tolist(),
+        "cam_t_w2c": (MILLIMETERS * camera.translation).tolist(),
+        "depth_scale": depth_scale,
+    }
+
+
+def view_task(batch: FrameBatch, view: int) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
+    """What a task on one view needs: images color, depth, instance, amodal, the last two cut to where objects are; and the truth."""
+    present = np.flatnonzero(batch.object_id[view] >= 0)
+    boxes = batch.boxes[view][present]
+    height, width = batch.depth.shape[1:]
+    shown = boxes[:, _WHOLE][boxes[:, _WHOLE, 2] >= boxes[:, _WHOLE, 0]]
+    left, top = (min(max(int(shown[:, edge].min(initial=size)), 0), size) for edge, size in ((0, width), (1, height)))
+    right, bottom = (min(1 + int(shown[:, edge].max(initial=-1)), size) for edge, size in ((2, width), (3, height)))
+    part = slice(top, max(top, bottom)), slice(left, max(left, right))
+    truth = ViewTruth(
+        frame=int(batch.frame[view]),
+        instance_id=present,
+        object_id=batch.object_id[view][present],
+        pose=batch.pose[view][present],
+        pixels=batch.pixels[view][present],
+        boxes=boxes,
+        top=top,
+        left=left,
+    )
+    return (batch.color[view], batch.depth[view], batch.instance[view][part], batch.amodal[view][part]), truth
+
+
+def view_masks(instance: np.ndarray, amodal: np.ndarray, truth: ViewTruth) -> list[Masks]:
+    """Masks of all instances, in their order. One pass over each image finds all edges; every instance picks its own."""
+    seen, whole = (find_edges(image, truth.top, truth.left) for image in (instance, amodal))
+    return [Masks(whole.runs_with(number), seen.runs_of(1 + number)) for number in truth.instance_id.tolist()]
 
 
 def write_view(
@@ -67,31 +123,42 @@ def write_view(
     Lines: scene_camera, scene_gt, scene_gt_info, then one COCO annotation each, without its id.
     """
     name = f"{truth.frame:06d}"
-    (scene / "rgb" / f"{name}{settings.color_suffix}").write_bytes(_encode_color(color, settings))
-    (scene / "depth" / f"{name}.png").write_bytes(encode_png(depth))
     height, width = depth.shape
-    infos, annotations = [], []
-    for index, instance_id in enumerate(truth.instance_id.tolist()):
-        whole = amodal_crop(amodal, instance_id, truth.boxes[index, _WHOLE])
-        seen = visible_crop(instance, instance_id, truth.boxes[index, _SEEN])
+    with open_folder(scene) as folder:
+        folder.write(f"rgb/{name}{settings.color_suffix}", encode_color(color, settings))
+        folder.write(f"depth/{name}.png", encode_png(depth))
+        masks = view_masks(instance, amodal, truth) if settings.masks or settings.coco else []
         if settings.masks:
-            (scene / "mask" / f"{name}_{index:06d}.png").write_bytes(encode_mask_png(whole, height, width))
-            (scene / "mask_visib" / f"{name}_{index:06d}.png").write_bytes(encode_mask_png(seen, height, width))
-        info = info_record(truth.pixels[index], truth.boxes[index])
-        infos.append(info)
-        if settings.coco and (annotation := coco_record(truth.frame, int(truth.object_id[index]), info, whole, seen, height, width)):
-            annotations.append(annotation)
-    lines = (settings.camera, gt_records(truth, settings.camera), infos, *annotations)
-    (scene / RECORDS / name).write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="ascii")
+            for index, mask in enumerate(masks):
+                whole, seen = encode_masks(mask, height, width)
+                folder.write(f"mask/{name}_{index:06d}.png", whole)
+                folder.write(f"mask_visib/{name}_{index:06d}.png", seen)
+        infos = info_records(truth)
+        lines = [settings.camera, gt_records(truth, settings.camera), infos]
+        if settings.coco:
+            lines += coco_records(truth, infos, masks, height, width)
+        folder.write(f"{RECORDS}/{name}", b"".join(to_json(line) + b"\n" for line in lines))
 
 
-def _encode_color(color: np.ndarray, settings: ViewSettings) -> bytes:
+def encode_color(color: np.ndarray, settings: ViewSettings) -> Buffer:
+    """A picture (H, W, 3) uint8, red first, in the format that the settings name."""
     if settings.color_suffix == ".png":
         return encode_png(color)
     done, data = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality))
     if not done:
         raise ValueError(f"OpenCV cannot encode a picture of shape {color.shape} as JPEG")
-    return data.tobytes()
+    return data.data
+
+
+def encode_masks(masks: Masks, height: int, width: int) -> tuple[bytes, bytes]:
+    """PNG files of an instance's two masks. Often nothing hides it: then both are the same."""
+    whole = encode_mask_png(masks.whole, height, width)
+    return whole, whole if masks.whole.count == masks.seen.count else encode_mask_png(masks.seen, height, width)
+
+
+def to_json(record: object) -> bytes:
+    """A record in one line of JSON; arrays become lists."""
+    return orjson.dumps(record, option=orjson.OPT_SERIALIZE_NUMPY)
 
 
 def gt_records(truth: ViewTruth, camera: dict[str, Any]) -> list[dict[str, Any]]:
@@ -123,9 +190,13 @@ def rotation_matrices(quaternion: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def info_record(pixels: np.ndarray, boxes: np.ndarray) -> dict[str, Any]:
-    """An instance's entry in scene_gt_info.json. Boxes may exceed the image; a box of one pixel has width and height 0."""
-    whole, valid, visible = (int(pixels[column]) for column in (_ALL, _VALID, _VISIBLE))
+def info_records(truth: ViewTruth) -> list[dict[str, Any]]:
+    """The view's entry in scene_gt_info.json. Boxes may exceed the image; a box of one pixel has width and height 0."""
+    return [_info_record(pixels, boxes) for pixels, boxes in zip(truth.pixels.tolist(), truth.boxes.tolist(), strict=True)]
+
+
+def _info_record(pixels: list[int], boxes: list[list[int]]) -> dict[str, Any]:
+    whole, valid, visible = (pixels[column] for column in (_ALL, _VALID, _VISIBLE))
     return {
         "bbox_obj": _extent(boxes[_WHOLE]) if visible else NO_BOX,
         "bbox_visib": _extent(boxes[_SEEN]) if visible else NO_BOX,
@@ -136,28 +207,31 @@ def info_record(pixels: np.ndarray, boxes: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _extent(box: np.ndarray) -> list[int]:
-    x_min, y_min, x_max, y_max = box.tolist()
+def _extent(box: list[int]) -> list[int]:
+    x_min, y_min, x_max, y_max = box
     return [x_min, y_min, x_max - x_min, y_max - y_min]
 
 
-def coco_record(
-    frame: int, object_id: int, info: dict[str, Any], whole: Crop, seen: Crop, height: int, width: int
-) -> dict[str, Any] | None:
-    """An instance's annotation, without id: amodal box clipped to the image, visible mask; None if there is nothing to see."""
-    box = whole.box()
-    area = seen.count
-    if box is None or not area:
-        return None
-    x_min, y_min, x_max, y_max = box
-    return {
-        "image_id": frame,
-        "category_id": object_id,
-        "iscrowd": 0,
-        "area": area,
-        "bbox": [x_min, y_min, x_max - x_min + 1, y_max - y_min + 1],
-        "segmentation": {"counts": run_lengths(seen, height, width), "size": [height, width]},
-        "width": width,
-        "height": height,
-        "ignore": info["visib_fract"] < IGNORE_VISIBILITY,
-    }
+def coco_records(truth: ViewTruth, infos: list[dict[str, Any]], masks: list[Masks], height: int, width: int) -> Iterator[dict[str, Any]]:
+    """Annotations of the instances that are visible, without ids: amodal box clipped to the image, visible mask."""
+    for object_id, info, mask in zip(truth.object_id.tolist(), infos, masks, strict=True):
+        box = mask.whole.box()
+        area = mask.seen.count
+        if box is not None and area:
+            x_min, y_min, x_max, y_max = box
+            yield {
+                "image_id": truth.frame,
+                "category_id": object_id,
+                "iscrowd": 0,
+                "area": area,
+                "bbox": [x_min, y_min, x_max - x_min + 1, y_max - y_min + 1],
+                "segmentation": run_length_record(mask.seen, height, width),
+                "width": width,
+                "height": height,
+                "ignore": info["visib_fract"] < IGNORE_VISIBILITY,
+            }
+
+
+def run_length_record(runs: Runs, height: int, width: int) -> dict[str, Any]:
+    """A mask as COCO's uncompressed run lengths, in which BOP has them as well."""
+    return {"counts": runs.counts(height, width), "size": [height, width]}

@@ -1,4 +1,4 @@
-"""Masks cut out of a view's images, and their run lengths: never by way of a file that is read again."""
+"""Masks cut out of a view's images as runs down their columns: what COCO's run lengths and mask files are made of."""
 
 from __future__ import annotations
 
@@ -8,64 +8,85 @@ import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
-class Crop:
-    """The part of a mask that can be True, and where it lies in the full image."""
+class Runs:
+    """The True pixels of a mask: runs down single columns, in order of columns, then rows; between two there is a gap or a column's end."""
 
-    mask: np.ndarray
-    """(h, w) bool; may have no pixels."""
-    top: int
-    """Row of the crop's first row in the full image."""
-    left: int
-    """Column of the crop's first column in the full image."""
+    column: np.ndarray
+    """(N) int64."""
+    first: np.ndarray
+    """Row of a run's first pixel (N) int64."""
+    past: np.ndarray
+    """Row after a run's last pixel (N) int64."""
 
     @property
     def count(self) -> int:
         """How many pixels are True."""
-        return int(np.count_nonzero(self.mask))
+        return int(self.past.sum() - self.first.sum())
 
     def box(self) -> tuple[int, int, int, int] | None:
         """x_min, y_min, x_max, y_max of the True pixels, inclusive; None: there are none."""
-        rows = np.flatnonzero(self.mask.any(axis=1))
-        if not rows.size:
+        if not self.column.size:
             return None
-        columns = np.flatnonzero(self.mask.any(axis=0))
-        return self.left + int(columns[0]), self.top + int(rows[0]), self.left + int(columns[-1]), self.top + int(rows[-1])
+        return int(self.column[0]), int(self.first.min()), int(self.column[-1]), int(self.past.max()) - 1
+
+    def counts(self, height: int, width: int) -> np.ndarray:
+        """COCO's uncompressed run lengths: down all columns, False first, in turn (M) int64; they sum to height · width."""
+        edges = np.empty(2 * self.column.size + 2, np.int64)
+        edges[0], edges[-1] = 0, height * width
+        foot = self.column * height
+        np.add(foot, self.first, out=edges[1:-1:2])
+        np.add(foot, self.past, out=edges[2:-1:2])
+        # A run that ends at a column's foot may go on at the head of the next.
+        apart = edges[3:-1:2] != edges[2:-2:2]
+        if not apart.all():
+            edges = np.concatenate((edges[:2], np.stack((edges[2:-2:2], edges[3:-1:2]), axis=1)[apart].ravel(), edges[-2:]))
+        counts = np.diff(edges)
+        return counts if counts[-1] else counts[:-1]
 
 
-def amodal_crop(amodal: np.ndarray, instance: int, box: np.ndarray) -> Crop:
-    """The mask of an instance, hidden or not, from the bits (H, W) uint32 inside a box (4) that may exceed the image."""
-    part, top, left = _cut(amodal, box)
-    return Crop((part & np.uint32(1 << instance)) != 0, top, left)
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Where an image's values change down its columns, in order of columns, then rows. Above and below the image, values are 0."""
+
+    column: np.ndarray
+    """(N) int64."""
+    row: np.ndarray
+    """Row of the pixel below the edge (N) int64."""
+    above: np.ndarray
+    """Value of the pixel above the edge (N)."""
+    below: np.ndarray
+    """Value of the pixel below the edge (N)."""
+
+    def runs_of(self, value: int) -> Runs:
+        """Pixels with a value other than 0."""
+        number = self.above.dtype.type(value)
+        return self._runs((self.above == number) | (self.below == number))
+
+    def runs_with(self, bit: int) -> Runs:
+        """Pixels with a bit set; 0 is the lowest."""
+        return self._runs((self.above ^ self.below) & self.above.dtype.type(1 << bit) != 0)
+
+    def _runs(self, chosen: np.ndarray) -> Runs:
+        """A pixel's value differs from both neighbours': of the chosen edges, each second is an end."""
+        index = np.flatnonzero(chosen)
+        row = self.row[index]
+        return Runs(self.column[index[::2]], row[::2], row[1::2])
 
 
-def visible_crop(instances: np.ndarray, instance: int, box: np.ndarray) -> Crop:
-    """The mask of an instance's visible part from the instance image (H, W) uint8 inside a box (4)."""
-    part, top, left = _cut(instances, box)
-    return Crop(part == np.uint8(1 + instance), top, left)
-
-
-def _cut(image: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, int, int]:
-    height, width = image.shape
-    x_min, y_min, x_max, y_max = (int(value) for value in box)
-    left, top = min(max(x_min, 0), width), min(max(y_min, 0), height)
-    return image[top : max(min(y_max + 1, height), top), left : max(min(x_max + 1, width), left)], top, left
-
-
-def run_lengths(crop: Crop, height: int, width: int) -> list[int]:
-    """COCO's uncompressed run lengths of the full mask: down the columns, False first, in turn; they sum to height · width."""
-    rows, columns = crop.mask.shape
-    # One column of the mask after the other, each with a False at its foot, so that no run goes on into the next.
-    line = np.zeros(columns * (rows + 1) + 1, bool)
-    line[1:].reshape(columns, rows + 1)[:, :rows] = crop.mask.T
-    column, row = np.divmod(np.flatnonzero(line[1:] != line[:-1]), rows + 1)
-    changes = (crop.left + column) * height + crop.top + row
-    if not changes.size:
-        return [height * width]
-    # If the crop is as high as the image, a run may go on after all.
-    apart = changes[2::2] != changes[1:-1:2]
-    edges = np.empty(2 * np.count_nonzero(apart) + 4, np.int64)
-    edges[0], edges[-1] = 0, height * width
-    edges[1:-1:2] = changes[::2][np.append(True, apart)]
-    edges[2:-1:2] = changes[1::2][np.append(apart, True)]
-    counts = np.diff(edges)
-    return (counts if counts[-1] else counts[:-1]).tolist()
+def find_edges(image: np.ndarray, top: int = 0, left: int = 0) -> Edges:
+    """The edges of an image that is 0 outside of a part (h, w), whose first pixel is at row `top` and column `left`."""
+    rows, columns = image.shape
+    if not image.size:
+        nothing = np.zeros(0, np.int64)
+        return Edges(nothing, nothing, nothing.astype(image.dtype), nothing.astype(image.dtype))
+    changes = np.empty((rows + 1, columns), bool)
+    np.not_equal(image[0], 0, out=changes[0])
+    np.not_equal(image[1:], image[:-1], out=changes[1:-1])
+    np.not_equal(image[-1], 0, out=changes[-1])
+    # Edges are few: to find them row by row and to sort them is faster than to transpose the image.
+    row, column = np.divmod(np.flatnonzero(changes), columns)
+    column, row = np.divmod(np.sort(column * (rows + 1) + row), rows + 1)
+    above, below = image[row - 1, column], image[np.minimum(row, rows - 1), column]
+    above[row == 0] = 0
+    below[row == rows] = 0
+    return Edges(left + column, top + row, above, below)
