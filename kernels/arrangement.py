@@ -33,7 +33,7 @@ DROP_NUMBERS = wp.constant(5)
 def take_episodes_kernel(
     # Scene:
     worlds: int,
-    episodes: int,
+    episodes: wp.array[int],
     tries: int,
     # State:
     address_inout: wp.array[wp.vec2i],
@@ -41,7 +41,7 @@ def take_episodes_kernel(
     ending_inout: wp.array[int],
     next_episode_inout: wp.array[int],
 ):
-    """Worlds whose episode is over take the next number; an episode that delivered nothing is drawn again where it was.
+    """Worlds whose episode is over take the next of `episodes`; an episode that delivered nothing is drawn again where it was.
 
     One thread walks over the worlds, so that numbers go to worlds in order.
     """
@@ -55,8 +55,8 @@ def take_episodes_kernel(
             address_inout[world] = wp.vec2i(episode, redraw + 1)
             phase_inout[world] = START
         elif phase == OVER or phase == EMPTY:
-            if following < episodes:
-                address_inout[world] = wp.vec2i(following, 0)
+            if following < episodes.shape[0]:
+                address_inout[world] = wp.vec2i(episodes[following], 0)
                 phase_inout[world] = START
                 following += 1
             else:

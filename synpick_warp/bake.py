@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
-import shutil
 import time
-from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import warp as wp
@@ -19,15 +16,17 @@ from synpick_warp.arrays import memory_table
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.write import config_to_toml
 from synpick_warp.device import pick_device
-from synpick_warp.exporters.base import DataSet
-from synpick_warp.exporters.files import PARTIAL, output_error, prepare_output, write_whole
+from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_redrawn
+from synpick_warp.errors import OutputError
+from synpick_warp.exporters.base import DataSet, Exporter
 from synpick_warp.exporters.pool import WriterPool
-from synpick_warp.exporters.registry import Exporters, exporter_kinds, join, slot_bytes
+from synpick_warp.exporters.registry import Exporters, exporter_kinds, slot_bytes
 from synpick_warp.frames import EpisodeEnd
+from synpick_warp.interrupt import StopRequest
 from synpick_warp.kernels import phases
-from synpick_warp.outcome import ATTEMPTS_FILE, Ending, Outcome
+from synpick_warp.manifest import digest_inputs, episode_place, read_record
+from synpick_warp.output import Output, complete
 from synpick_warp.progress import Progress
 from synpick_warp.scenes import build
 from synpick_warp.scenes.cameras import make_cameras
@@ -46,52 +45,6 @@ from synpick_warp.stages.simulate import RECORDS, Simulation
 from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, tick_batch, view_sizes
 from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 
-CONFIG_FILE = "config.toml"
-"""The resolved settings, in the data set."""
-EPISODES_FILE = "episodes.jsonl"
-"""How every episode ended, in the data set."""
-
-
-class EpisodeRow(NamedTuple):
-    """One line of the summary."""
-
-    episode: int
-    redraw: int
-    """How often the episode was drawn again before."""
-    ending: Ending
-    frames: int
-    seconds: float
-    """Simulated time from the first frame to the last [s]."""
-    mode: str
-    """What follows is 0 if the episode delivered nothing."""
-    objects: int
-    """At the first frame."""
-    attempts: int
-    picked: int
-    """Objects."""
-    lost: int
-    """Objects that left the scene otherwise."""
-    left: int
-    """Objects at the last frame."""
-
-
-@dataclass
-class BakeSummary:
-    """What a bake made."""
-
-    episodes: list[EpisodeRow] = field(default_factory=list)
-    views: int = 0
-    wall_seconds: float = 0.0
-    """From the first tick to the last file [s]."""
-    redraws: int = 0
-    """Arrangements that ended in a way that delivers nothing, and were drawn again."""
-    redrawn: dict[Ending, int] = field(default_factory=dict)
-    """The same, by ending."""
-    outcomes: Counter[Outcome] = field(default_factory=Counter)
-    """Attempts, by outcome."""
-    attempts: dict[int, tuple[str, ...]] = field(default_factory=dict)
-    """Lines of ATTEMPTS_FILE, by episode."""
-
 
 @dataclass(frozen=True, eq=False)
 class Factory:
@@ -105,8 +58,13 @@ class Factory:
     log: AttemptLog
 
 
-def build_factory(config: Config, progress: Progress) -> Factory:
+def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | None = None) -> Factory:
     """Load what the settings name and put it on the device.
+
+    Args:
+        config: All settings.
+        progress: Told what happens.
+        episodes: Numbers of the episodes to simulate; None: from 0, as many as are set.
 
     Raises:
         SynpickError: Device, models, lights, tote or cameras cannot be used.
@@ -119,110 +77,132 @@ def build_factory(config: Config, progress: Progress) -> Factory:
     lights = load_lights(config.bake.lights)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     scene = build_render_scene(config, catalog, fixtures, cameras, lights, device)
-    simulation = Simulation(config, catalog, len(lights), device, render_scene=scene)
+    simulation = Simulation(config, catalog, len(lights), device, scene, episodes)
     renderer = Renderer(config, scene, config.arrangement.max_objects, view_sizes(config, device)["view"])
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     stream = FrameStream(config, renderer, object_ids, device)
     return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config, object_ids))
 
 
-def run_bake(config: Config, out: Path, progress: Progress) -> BakeSummary:
-    """Simulate, render and write a data set.
+def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, int] = (0, 1)) -> BakeSummary:
+    """Simulate, render and write a data set, or what is left of one.
 
     Args:
         config: All settings.
-        out: Folder of the data set: new, or empty.
+        out: Folder of the data set: new, empty, or of a bake with the same settings that did not come to its end.
         progress: Told what happens.
+        shard: (i, n): only episodes whose number leaves i when divided by n.
 
     Raises:
-        SynpickError: Something a user can mend; no half-written scene stays.
+        SynpickError: Something a user can mend; whole episodes stay, and the same bake goes on with them.
     """
-    factory = build_factory(config, progress)
-    writers = config.bake.writers or len(os.sched_getaffinity(0))
     kinds = exporter_kinds(config.bake.formats)
-    prepare_output(out)
-    (out / PARTIAL).mkdir(parents=True)
-    with WriterPool(writers, slot_bytes(kinds, config)) as pool:
-        exporter = Exporters(kinds, DataSet(out, config, factory.catalog, factory.cameras, factory.lights, pool))
+    with Output(out, config, range(shard[0], config.bake.episodes, shard[1])) as output:
+        summary = BakeSummary(len(output.episodes))
+        for episode in output.before:
+            summary.take_record(read_record(out, episode_place(episode)) or {})
+        if output.is_finished():
+            progress.note("the data set is finished: nothing is left to do")
+            return summary
+        if output.before:
+            progress.note(f"{len(output.before)} of {len(output.episodes)} episodes are whole; going on with the others")
         try:
-            exporter.write_constants()
-            summary = BakeSummary()
-            started = time.perf_counter()
-            _run(config, factory, exporter, summary, progress)
-            progress.stage("finishing files")
-            pool.wait()
-            exporter.close()
-            join(kinds, out, config, pool)
-            _write_records(config, out, summary)
-            summary.wall_seconds = time.perf_counter() - started
-        except BaseException:
-            pool.abort()
-            exporter.abort()
-            raise
+            _fill(config, output, kinds, summary, progress)
+        except OutputError as error:
+            if out.exists():
+                raise
+            raise OutputError(f"{out} was removed while the bake wrote to it") from error
         finally:
-            shutil.rmtree(out / PARTIAL, ignore_errors=True)
+            output.close()
     return summary
 
 
-def _run(config: Config, factory: Factory, exporter: Exporters, summary: BakeSummary, progress: Progress) -> None:
-    """Tick until no episode is left. The device already works on the next tick while the host reads and renders this one."""
-    simulation = factory.simulation
-    readers = [TickReader(record) for record in simulation.records]
-    tick = config.physics.step * config.physics.steps_per_tick
-    meter = _Meter(config, summary, progress)
-    progress.stage("compiling kernels, dropping objects")
-    simulation.tick(simulation.records[0])
-    readers[0].start()
-    current = 0
-    while True:
-        following = (current + 1) % RECORDS
-        simulation.tick(simulation.records[following])
-        readers[following].start()
-        report = readers[current].wait()
-        exporter.tick(tick_batch(report, factory.log.object_ids, tick))
-        for batch in factory.stream.render(simulation.records[current].snapshot, report):
-            exporter.write(batch)
-            summary.views += len(batch)
-        records = factory.log.see(report)
-        for end in _ends(report):
-            exporter.end(end, lambda: None)
-            _count(config, summary, end, records[end.episode], progress)
-        phase = report.column("phase")
-        meter.show(int(np.isin(phase, (phases.SETTLE, phases.ACT)).sum()))
-        if (phase == phases.IDLE).all():
-            return
-        current = following
+def _fill(config: Config, output: Output, kinds: tuple[type[Exporter], ...], summary: BakeSummary, progress: Progress) -> None:
+    """Make the episodes that are left, and the lists."""
+    factory = build_factory(config, progress, output.left) if output.left else None
+    writers = config.bake.writers or len(os.sched_getaffinity(0))
+    with WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
+        started = time.perf_counter()
+        if factory is not None:
+            exporters = Exporters(kinds, DataSet(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
+            try:
+                output.begin(exporters, digest_inputs(factory.catalog, factory.lights), pool)
+                _Run(config, factory, exporters, partial(output.record, exporters, pool), summary, progress).run()
+                pool.wait()
+                exporters.close()
+            except BaseException:
+                pool.abort()
+                exporters.abort()
+                raise
+        if not summary.stopped:
+            progress.stage("finishing files")
+            complete(output.out, config, kinds, pool)
+        summary.wall_seconds = time.perf_counter() - started
 
 
-def _ends(report: TickReport) -> Iterator[EpisodeEnd]:
-    for world in np.flatnonzero(report.column("phase") == phases.OVER):
-        episode, redraw, frame, ending = (int(report.column(name)[world]) for name in ("episode", "redraw", "frame", "ending"))
-        yield EpisodeEnd(episode, redraw, frame + 1, ending)
+class _Run:
+    """The ticks of a bake."""
 
+    def __init__(
+        self, config: Config, factory: Factory, exporters: Exporters, whole: Callable[[EpisodeEnd], None], summary: BakeSummary,
+        progress: Progress,
+    ) -> None:  # fmt: skip
+        self.config, self.factory, self.exporters = config, factory, exporters
+        self.whole, self.summary, self.progress = whole, summary, progress
+        self.meter = _Meter(config, summary, progress)
 
-def _count(config: Config, summary: BakeSummary, end: EpisodeEnd, record: EpisodeRecord, progress: Progress) -> None:
-    """Enter an episode's end into the summary."""
-    ending = Ending(end.ending)
-    if not ending.delivers and end.redraw + 1 < config.settle.tries:
-        summary.redraws += 1
-        summary.redrawn[ending] = summary.redrawn.get(ending, 0) + 1
-        progress.note(f"episode {end.episode}, arrangement {end.redraw + 1}: {ending.sentence}")
-        return
-    tick = config.physics.step * config.physics.steps_per_tick
-    summary.episodes.append(EpisodeRow(
-        end.episode, end.redraw, ending, end.frames, max(0, end.frames - 1) * tick,
-        record.mode, record.objects, len(record.attempts), record.picked, record.lost, record.left,
-    ))  # fmt: skip
-    summary.episodes.sort()
-    summary.outcomes.update(attempt.outcome for attempt in record.attempts)
-    summary.attempts[end.episode] = tuple(attempt.line() for attempt in record.attempts)
+    def run(self) -> None:
+        """Tick until no episode is left or somebody asks to stop. The device works on the next tick while the host reads this one."""
+        simulation = self.factory.simulation
+        readers = [TickReader(record) for record in simulation.records]
+        self.progress.stage("compiling kernels, dropping objects")
+        with StopRequest() as stop:
+            simulation.tick(simulation.records[0])
+            readers[0].start()
+            current = 0
+            while not stop.number:
+                following = (current + 1) % RECORDS
+                simulation.tick(simulation.records[following])
+                readers[following].start()
+                report = readers[current].wait()
+                self._hand_over(report, simulation.records[current].snapshot)
+                phase = report.column("phase")
+                self.meter.show(int(np.isin(phase, (phases.SETTLE, phases.ACT)).sum()))
+                if (phase == phases.IDLE).all():
+                    return
+                current = following
+        self.summary.stopped = stop.number
+
+    def _hand_over(self, report: TickReport, snapshot: Snapshot) -> None:
+        """A tick's frames and ends to the exporters."""
+        physics = self.config.physics
+        batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
+        if len(batch):
+            self.exporters.tick(batch)
+        for views in self.factory.stream.render(snapshot, report):
+            self.exporters.write(views)
+            self.summary.views += len(views)
+        records = self.factory.log.see(report)
+        for world in np.flatnonzero(report.column("phase") == phases.OVER).tolist():
+            self._end(report, world, records[int(report.column("episode")[world])])
+
+    def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
+        row = episode_row(self.config, report, world, record)
+        end = episode_end(self.config, row, record)
+        if is_redrawn(self.config, row):
+            self.summary.take_redraw(row.ending)
+            self.progress.note(f"episode {row.episode}, arrangement {row.redraw + 1}: {row.ending.sentence}")
+            self.exporters.end(end, lambda: None)
+        else:
+            self.summary.take_episode(row, record)
+            self.exporters.end(end, partial(self.whole, end))
 
 
 class _Meter:
     """Rates and remaining time for whoever watches."""
 
     def __init__(self, config: Config, summary: BakeSummary, progress: Progress) -> None:
-        self.config, self.summary, self.progress = config, summary, progress
+        self.summary, self.progress = summary, progress
         self.started: float | None = None
         self.cameras = len(config.cameras.positions)
 
@@ -234,32 +214,16 @@ class _Meter:
         elapsed = now - self.started if self.started is not None else 0.0
         done = [row for row in summary.episodes if row.ending.delivers]
         left = None
-        if done and elapsed > 0.0:
+        if len(summary.episodes) > summary.resumed and elapsed > 0.0 and done and summary.views:
             # Short episodes end first: those that run may already be longer than the mean of those that ended.
-            frames = max(sum(row.frames for row in done) / len(done), summary.views / self.cameras / (len(done) + active))
-            share = summary.views / (self.config.bake.episodes * self.cameras * frames)
+            running = summary.views / self.cameras / (len(summary.episodes) - summary.resumed + active)
+            frames = max(sum(row.frames for row in done) / len(done), running)
+            share = summary.views / ((summary.total - summary.resumed) * self.cameras * frames)
             left = (1.0 / share - 1.0) * elapsed if share < 1.0 else None
         self.progress.update(
-            episodes_done=len(summary.episodes), episodes=self.config.bake.episodes, worlds_active=active, views=summary.views,
+            episodes_done=len(summary.episodes), episodes=summary.total, worlds_active=active, views=summary.views,
             views_per_s=summary.views / elapsed if elapsed > 0.0 else 0.0, seconds_left=left,
         )
-
-
-def _write_records(config: Config, out: Path, summary: BakeSummary) -> None:
-    """The settings, how every episode ended, and every attempt. Nothing in them depends on the machine or the time."""
-    rows = [
-        {"episode": row.episode, "redraw": row.redraw, "ending": row.ending.name.lower(), "sentence": row.ending.sentence,
-         "frames": row.frames, "seconds": round(row.seconds, 6), "mode": row.mode, "objects": row.objects, "attempts": row.attempts,
-         "picked": row.picked, "lost": row.lost, "left": row.left}
-        for row in summary.episodes
-    ]
-    try:
-        write_whole(out / CONFIG_FILE, config_to_toml(config).encode())
-        if may_pick(config):
-            write_whole(out / ATTEMPTS_FILE, "".join(line for row in summary.episodes for line in summary.attempts[row.episode]).encode())
-        write_whole(out / EPISODES_FILE, "".join(json.dumps(row) + "\n" for row in rows).encode())
-    except OSError as error:
-        raise output_error(out, error) from error
 
 
 def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int]]:

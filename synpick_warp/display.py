@@ -17,7 +17,7 @@ from rich.table import Table
 from synpick_warp.progress import Progress
 
 if TYPE_CHECKING:
-    from synpick_warp.bake import BakeSummary, EpisodeRow
+    from synpick_warp.episodes import BakeSummary, EpisodeRow
     from synpick_warp.outcome import Outcome
 
 PLAIN_WIDTH = 120

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -315,8 +316,16 @@ def take(device, phase, ending, address, following: int, *, episodes: int, tries
     state = worlds.state
     for array, values in ((state.phase, phase), (state.ending, ending), (state.address, address), (state.next_episode, following)):
         worlds.set(array, values)
-    arrange.take_episodes(state, episodes, tries)
+    arrange.take_episodes(state, wp.array(np.arange(episodes), dtype=wp.int32, device=device), tries)
     return state.phase.numpy().tolist(), state.ending.numpy().tolist(), state.address.numpy().tolist(), int(state.next_episode.numpy()[0])
+
+
+def test_numbers_are_those_of_the_list(device):
+    worlds = made(device, worlds=3)
+    worlds.begin(phases.EMPTY, -1)
+    arrange.take_episodes(worlds.state, wp.array([7, 2], dtype=wp.int32, device=device), 1)
+    assert worlds.state.address.numpy().tolist() == [[7, 0], [2, 0], [-1, 0]]
+    assert worlds.state.phase.numpy().tolist() == [phases.START, phases.START, phases.IDLE]
 
 
 def test_empty_worlds_take_numbers_in_order(device):
@@ -347,8 +356,9 @@ def test_every_episode_ends_once(worlds, episodes, tries, seed, device):
     state = made_worlds.state
     made_worlds.begin(phases.EMPTY, -1)
     started, ended = [], []
+    listed = wp.array(np.arange(episodes), dtype=wp.int32, device=device)
     for _ in range(8 * episodes * tries):
-        arrange.take_episodes(state, episodes, tries)
+        arrange.take_episodes(state, listed, tries)
         phase, ending, address = state.phase.numpy(), state.ending.numpy(), state.address.numpy()
         started += [tuple(address[world]) for world in np.flatnonzero(phase == phases.START)]
         for world in np.flatnonzero(phase != phases.IDLE):

@@ -11,8 +11,8 @@ from synpick_warp.stages.sight import Sighting
 from synpick_warp.stages.worlds import AttemptState, WorldState
 
 
-def take_episodes(state: WorldState, episodes: int, tries: int) -> None:
-    """Give worlds whose episode is over the next episode number, or their own again if it delivered nothing."""
+def take_episodes(state: WorldState, episodes: wp.array, tries: int) -> None:
+    """Give worlds whose episode is over the next of the numbers `episodes`, or their own again if it delivered nothing."""
     wp.launch(
         arrangement.take_episodes_kernel,
         dim=1,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import newton
+import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate
@@ -40,7 +42,15 @@ class TickRecord:
 class Simulation:
     """N worlds that take episodes by number until none is left."""
 
-    def __init__(self, config: Config, catalog: Catalog, lights: int, device: wp.Device, render_scene: RenderScene | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        catalog: Catalog,
+        lights: int,
+        device: wp.Device,
+        render_scene: RenderScene | None = None,
+        episodes: Sequence[int] | None = None,
+    ) -> None:
         """Build the model and allocate all state.
 
         Args:
@@ -49,6 +59,7 @@ class Simulation:
             lights: How many light maps there are to draw from.
             device: Where everything lies.
             render_scene: What the gripper's side sees; not needed if all episodes move.
+            episodes: Numbers of the episodes to simulate, in order; None: from 0, as many as are set.
 
         Raises:
             ValueError: There is nothing to see, but episodes that pick.
@@ -59,6 +70,8 @@ class Simulation:
         self.layout = built.layout
         self.physics = Physics(config, built)
         self.scene: SceneData = make_scene_data(config, catalog, built, lights, device)
+        numbers = range(config.bake.episodes) if episodes is None else episodes
+        self.episodes = wp.array(np.asarray(numbers, np.int32), dtype=wp.int32, device=device)
         sizes = world_sizes(config, built.layout.bodies_per_world)
         self.state = allocate(WorldState, sizes, device)
         self.attempts = allocate(AttemptState, sizes, device)
@@ -80,7 +93,7 @@ class Simulation:
     def tick(self, record: TickRecord) -> None:
         """Hand out episodes, simulate one tick, judge, record what came of it in one of `records`, and look where one must choose."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
-        arrange.take_episodes(state, self.config.bake.episodes, self.config.settle.tries)
+        arrange.take_episodes(state, self.episodes, self.config.settle.tries)
         arrange.draw_objects(scene, state, seed)
         arrange.drop_objects(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)

@@ -35,7 +35,7 @@ class WorldState:
     mode: wp.array = device_array("world", dtype=wp.int32)
     """A mode of `kernels.phases`."""
     next_episode: wp.array = device_array("one", dtype=wp.int32)
-    """The first episode number that no world has taken."""
+    """How many of the bake's episode numbers worlds have taken."""
     progress: wp.array = device_array("world", dtype=wp.vec4i, unit="ticks")
     """Ticks since the drop, ticks at rest, re-drops, whether the guide walls stand."""
     entry: wp.array = device_array("world", "instance", dtype=wp.int32)
