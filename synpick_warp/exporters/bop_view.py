@@ -50,6 +50,8 @@ class ViewSettings:
 class ViewTruth:
     """Ground truth of a view: its row of `FrameBatch`, of instances that exist."""
 
+    scene: int
+    """Number of the scene."""
     frame: int
     instance_id: np.ndarray
     """(N)"""
@@ -87,7 +89,7 @@ def camera_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
     }
 
 
-def view_task(batch: FrameBatch, view: int) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
+def view_task(batch: FrameBatch, view: int, scene: int) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
     """What a task on one view needs: images color, depth, instance, amodal, the last two cut to where objects are; and the truth."""
     present = np.flatnonzero(batch.object_id[view] >= 0)
     boxes = batch.boxes[view][present]
@@ -97,6 +99,7 @@ def view_task(batch: FrameBatch, view: int) -> tuple[tuple[np.ndarray, ...], Vie
     right, bottom = (min(1 + int(shown[:, edge].max(initial=-1)), size) for edge, size in ((2, width), (3, height)))
     part = slice(top, max(top, bottom)), slice(left, max(left, right))
     truth = ViewTruth(
+        scene=scene,
         frame=int(batch.frame[view]),
         instance_id=present,
         object_id=batch.object_id[view][present],

@@ -98,7 +98,7 @@ class SceneExporter(ABC):
             episode = self._episodes.get(number) or self._begin(number)
             scene = episode.scenes[camera]
             episode.pending += 1
-            images, truth = view_task(batch, view)
+            images, truth = view_task(batch, view, self.scene_number(number, camera))
             self._pool.submit(
                 type(self).write_view,
                 images,

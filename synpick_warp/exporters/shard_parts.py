@@ -1,0 +1,130 @@
+"""Scenes as tar files: a view's records and pictures as tar entries, and views put together into whole shards.
+
+Runs in writer processes, so it imports neither Warp nor Newton.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tarfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from synpick_warp.errors import OutputError
+from synpick_warp.exporters.bop_view import (
+    ViewSettings,
+    ViewTruth,
+    encode_color,
+    gt_records,
+    info_records,
+    run_length_record,
+    to_json,
+    view_masks,
+)
+from synpick_warp.exporters.files import flush_folder
+from synpick_warp.exporters.folder import Buffer, open_folder
+from synpick_warp.exporters.png import encode_png
+from synpick_warp.exporters.rle import Runs
+
+MOST_VIEWS = 1000
+"""Of a shard, as the toolkit has them (convert_imagewise_to_webdataset.py)."""
+FURTHER = 1_000_000
+"""The shards of a scene are numbered scene, scene + this, scene + twice this, ...; scenes have six digits."""
+_END = bytes(2 * tarfile.BLOCKSIZE)
+"""How a tar file ends (POSIX.1-1988, section 10.1.1)."""
+_COPY_BYTES = 1 << 20
+"""Copied at once [B]."""
+
+
+def shard_name(scene: int, part: int) -> str:
+    """File of the views `MOST_VIEWS · part` and following of a scene."""
+    return f"shard-{scene + FURTHER * part:06d}.tar"
+
+
+def write_shard_view(
+    color: np.ndarray, depth: np.ndarray, instance: np.ndarray, amodal: np.ndarray, scene: Path, settings: ViewSettings, truth: ViewTruth
+) -> None:
+    """Write all of a view as tar entries, without a tar file's end, to a file in a scene's folder that is named as the frame."""
+    height, width = depth.shape
+    entries: list[tuple[str, Buffer]] = [
+        (f"rgb{settings.color_suffix}", encode_color(color, settings)),
+        ("depth.png", encode_png(depth)),
+        ("camera.json", to_json(settings.camera)),
+        ("gt.json", to_json(gt_records(truth, settings.camera))),
+        ("gt_info.json", to_json(info_records(truth))),
+    ]
+    if settings.masks:
+        masks = view_masks(instance, amodal, truth)
+        entries.append(("mask.json", _mask_json((mask.whole for mask in masks), height, width)))
+        entries.append(("mask_visib.json", _mask_json((mask.seen for mask in masks), height, width)))
+    key = f"{truth.scene:06d}_{truth.frame:06d}"
+    with open_folder(scene) as folder:
+        folder.write(str(truth.frame), b"".join(part for name, data in entries for part in _tar_entry(f"{key}.{name}", data)))
+
+
+def _mask_json(masks: Iterable[Runs], height: int, width: int) -> bytes:
+    return to_json({str(index): run_length_record(runs, height, width) for index, runs in enumerate(masks)})
+
+
+def _tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
+    """Nothing of the machine or the time: no owner, and the first second of 1970."""
+    info = tarfile.TarInfo(name)
+    info.size = len(data)
+    return info.tobuf(tarfile.USTAR_FORMAT), data, bytes(-len(data) % tarfile.BLOCKSIZE)
+
+
+def finish_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int) -> None:
+    """Make an episode's shards of its views, and move them to their places: hidden folders and scene numbers.
+
+    Shards are on the disk before the move.
+    """
+    whole: list[tuple[Path, Path]] = []
+    for scene, number in scenes:
+        names = sorted(int(path.name) for path in scene.iterdir())
+        if names != list(range(frames)):
+            raise OutputError(f"{scene} has {len(names)} of {frames} frames; this is an error of synpick-warp, please report it")
+        for part, begin in enumerate(range(0, frames, MOST_VIEWS)):
+            shard = scene / shard_name(number, part)
+            _join(shard, [scene / str(frame) for frame in names[begin : begin + MOST_VIEWS]])
+            whole.append((shard, split / shard.name))
+    for shard, place in whole:
+        shard.rename(place)
+    flush_folder(split)
+    for scene, _ in scenes:
+        shutil.rmtree(scene)
+
+
+def _join(shard: Path, views: list[Path]) -> None:
+    """Join views' entries to a tar file; each view's file goes at once, so that little room is taken twice."""
+    with shard.open("wb", buffering=0) as target:
+        for view in views:
+            with view.open("rb", buffering=0) as source:
+                shutil.copyfileobj(source, target, _COPY_BYTES)
+            view.unlink()
+        target.write(_END)
+        os.fsync(target.fileno())
+
+
+def shards_of(scene: int, split: Path) -> Iterator[Path]:
+    """The shards of a scene that are there, in order."""
+    part = 0
+    while os.path.lexists(path := split / shard_name(scene, part)):
+        yield path
+        part += 1
+
+
+def list_keys(shard: Path, folder: Path) -> None:
+    """Write the keys of a shard's views and its number, as lines of a JSON object, into a folder, to a file of the same name."""
+    with tarfile.open(shard, "r:") as file:
+        keys = dict.fromkeys(name.partition(".")[0] for name in file.getnames())
+    lines = (f"{json.dumps(key)}: {shard_number(shard)}\n" for key in keys)
+    (folder / shard.name).write_text("".join(lines), encoding="ascii")
+
+
+def shard_number(shard: Path) -> int:
+    """The number in a shard's name."""
+    return int(shard.stem.removeprefix("shard-"))
