@@ -26,6 +26,11 @@ EXIT_INTERRUPTED = 130
 """128 + SIGINT, as shells have it."""
 EXIT_PIPE = 141
 """128 + SIGPIPE: whoever read the output has left."""
+EXIT_SIGNAL = 128
+"""Added to a signal's number, as shells have it."""
+SHOWN = 10
+"""Most numbers that a message lists."""
+_SHARD = re.compile(r"(\d{1,9})/(\d{1,9})")
 _RESOLUTION = re.compile(r"(\d{1,9})[xX](\d{1,9})")
 
 app = App(
@@ -66,7 +71,7 @@ DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
 @app.command
 def bake(
     *,
-    out: Annotated[Path, Parameter(help="Folder of the data set: new, or empty.")],
+    out: Annotated[Path, Parameter(help="Folder of the data set: new, empty, or one that a bake with the same settings began.")],
     config: ConfigOption = None,
     worlds: WorldsOption = None,
     episodes: Annotated[int | None, Parameter(help=_help("bake.episodes"))] = None,
@@ -77,12 +82,14 @@ def bake(
     lights: Annotated[str | None, Parameter(help=_help("bake.lights"))] = None,
     resolution: ResolutionOption = None,
     writers: Annotated[int | None, Parameter(help=_help("bake.writers"))] = None,
+    formats: Annotated[str | None, Parameter(help=_help("bake.formats", " Joined by commas."))] = None,
+    shard: Annotated[str | None, Parameter(help="i/n: only episodes whose number leaves i when divided by n; join with merge.")] = None,
     set_: SetOption = None,
 ) -> int:
-    """Simulate, render and write a BOP data set.
+    """Simulate, render and write a data set. Stopped or killed, the same command goes on with the episodes that are left.
 
-    Options win over the file, the file over the preset. Exit code: 0, all episodes were delivered; 1, some were given up;
-    2, a mistake in the options, in a file or in a folder; 130, interrupted.
+    Options win over the file, the file over the preset. Ctrl-C stops after the tick, twice at once. Exit code: 0, all episodes
+    were delivered; 1, some were given up; 2, a mistake in the options, in a file or in a folder; 130 and 143, interrupted.
     """
     given = {
         "bake.worlds": worlds,
@@ -93,8 +100,44 @@ def bake(
         "bake.models": models,
         "bake.lights": lights,
         "bake.writers": writers,
+        "bake.formats": None if formats is None else [name.strip() for name in formats.split(",")],
     }
-    return _bake(_resolve(config, given, resolution, set_), out)
+    resolved = _resolve(config, given, resolution, set_)
+    return _bake(resolved, out, parse_shard(shard, resolved.bake.episodes) if shard is not None else (0, 1))
+
+
+@app.command
+def verify(folder: Annotated[Path, Parameter(name="DIR", help="A data set.")], /) -> int:
+    """Check every file of a data set against the checksum noted when it was written. Exit code: 1, a file is wrong or missing, which is
+    named, or the bake did not come to its end."""
+    from synpick_warp.verify import verify as check
+
+    verdict = check(folder)
+    if verdict.problem:
+        print(verdict.problem)
+        return EXIT_INCOMPLETE
+    print(f"{verdict.files:,} files of {verdict.episodes:,} episodes are as they were written")
+    if not verdict.finished:
+        print("the data set is not finished: the bake that made it can go on")
+    return 0 if verdict.finished else EXIT_INCOMPLETE
+
+
+@app.command
+def merge(
+    *parts: Annotated[Path, Parameter(name="PARTS", help="Data sets made with --shard.")],
+    out: Annotated[Path, Parameter(help="Folder of the joined data set: new, or empty.")],
+) -> int:
+    """Join the parts of a data set; files are linked, not copied, where the file system can. Exit code: 1, some episodes are in no part."""
+    from synpick_warp.merge import merge as join
+
+    if not parts:
+        raise ConfigError("merge joins data sets, and none is named; name the folders that `bake --shard` made")
+    merged = join(parts, out)
+    print(f"data set: {out}, {merged.episodes:,} episodes")
+    if merged.missing:
+        shown = ", ".join(map(str, merged.missing[:SHOWN])) + (", ..." if len(merged.missing) > SHOWN else "")
+        print(f"{len(merged.missing):,} are in no part: {shown}; `bake --out {out}` with the same settings makes them")
+    return EXIT_INCOMPLETE if merged.missing else 0
 
 
 @app.command
@@ -196,6 +239,20 @@ def parse_resolution(text: str) -> list[int]:
     return [int(match[1]), int(match[2])]
 
 
+def parse_shard(text: str, episodes: int) -> tuple[int, int]:
+    """Share and number of shares from "0/4".
+
+    Raises:
+        ConfigError: The text is something else, or the share would have no episode.
+    """
+    match = _SHARD.fullmatch(text)
+    if match is None or not int(match[1]) < int(match[2]):
+        raise ConfigError(f'--shard is "{text}"; allowed: i/n with i from 0 to n - 1, such as 0/4')
+    if int(match[1]) >= episodes:
+        raise ConfigError(f"--shard {text} has none of {episodes} episodes; use fewer shards")
+    return int(match[1]), int(match[2])
+
+
 def _resolve(config: str | None, given: dict[str, object], resolution: str | None, assignments: list[str] | None) -> Config:
     """Settings from file and options. Options of their own win over --set."""
     overrides = dict(parse_assignment(text) for text in assignments or [])
@@ -205,7 +262,7 @@ def _resolve(config: str | None, given: dict[str, object], resolution: str | Non
     return load_config(config, overrides)
 
 
-def _bake(config: Config, out: Path) -> int:
+def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:
     """Check everything that can be checked cheaply, then bake."""
     from synpick_warp.device import pick_device
     from synpick_warp.display import make_console, make_progress, print_summary
@@ -222,7 +279,11 @@ def _bake(config: Config, out: Path) -> int:
 
     console = make_console()
     with make_progress(console) as progress:
-        summary = run_bake(config, out, progress)
+        summary = run_bake(config, out, progress, shard)
     print_summary(console, summary, out)
+    if summary.stopped:
+        left = f"{len(summary.episodes)} of {summary.total} episodes are whole"
+        print(f"{NAME}: interrupted: {left}; the same command goes on with the others", file=sys.stderr)
+        return EXIT_SIGNAL + summary.stopped
     delivered = sum(1 for row in summary.episodes if row[2].delivers)
-    return 0 if delivered == config.bake.episodes else EXIT_INCOMPLETE
+    return 0 if delivered == summary.total else EXIT_INCOMPLETE

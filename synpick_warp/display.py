@@ -116,8 +116,9 @@ def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
     if len(rows) > LISTED:
         console.print(f"and {len(rows) - LISTED} more that delivered nothing", markup=False)
     rate = summary.views / summary.wall_seconds if summary.wall_seconds > 0.0 else 0.0
+    before = f" ({summary.resumed:,} of them before)" if summary.resumed else ""
     console.print(
-        f"{len(summary.episodes) - len(failed)} of {len(summary.episodes)} episodes and {summary.views:,} views"
+        f"{len(summary.episodes) - len(failed)} of {summary.total} episodes{before} and {summary.views:,} views"
         f" in {_duration(summary.wall_seconds)} ({rate:.1f} views/s); arrangements drawn again: {summary.redraws}",
         markup=False,
         soft_wrap=True,

@@ -72,6 +72,7 @@ class Output:
         self.out, self.config, self.episodes = out, config, list(episodes)
         self._manifest = make_manifest(config)
         prepare_output(out)
+        self._made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
         try:
             out.mkdir(parents=True, exist_ok=True)
             self.lock = lock_folder(out)
@@ -143,11 +144,21 @@ class Output:
             (self.out / PARTIAL).mkdir()
             if not seems_whole(self.out, CONSTANTS):
                 self._remove_record(CONSTANTS)
-                paths = exporters.write_constants()
+                paths = self._write_constants(exporters)
                 pool.submit(write_record, (), (self.out, CONSTANTS, paths, {}), path=self.out / CONSTANTS)
                 pool.wait()
         except OSError as error:
             raise output_error(self.out, error) from error
+
+    def _write_constants(self, exporters: Exporters) -> list[Path]:
+        before = set(os.listdir(self.out))
+        try:
+            return exporters.write_constants()
+        except BaseException:
+            with contextlib.suppress(OSError):
+                for name in set(os.listdir(self.out)) - before:
+                    _remove(self.out / name)
+            raise
 
     def _remove_files(self, place: Path) -> None:
         """Remove a record and its files."""
@@ -170,12 +181,14 @@ class Output:
         """Remove what is not whole, after success or after an error. Of a data set without a whole episode nothing stays."""
         shutil.rmtree(self.out / PARTIAL, ignore_errors=True)
         with contextlib.suppress(OSError, DatasetError):
-            if read_record(self.out, CONSTANTS) and not recorded_episodes(self.out):
+            if not recorded_episodes(self.out):
                 self._remove_files(CONSTANTS)
-                shutil.rmtree(self.out / RECORDS)
-                _remove_empty_folders(self.out)
+                shutil.rmtree(self.out / RECORDS, ignore_errors=True)
                 for name in (CONFIG_FILE, MANIFEST_FILE):
                     (self.out / name).unlink(missing_ok=True)
+                _remove_empty_folders(self.out)
+                for folder in self._made:
+                    folder.rmdir()
 
 
 def complete(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:

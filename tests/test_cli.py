@@ -31,7 +31,7 @@ needs_bake = pytest.mark.skipif(importlib.util.find_spec("synpick_warp.bake") is
 
 
 class Row(NamedTuple):
-    """Stands for bake.EpisodeRow."""
+    """Stands for episodes.EpisodeRow."""
 
     episode: int
     redraw: int
@@ -48,13 +48,19 @@ class Row(NamedTuple):
 
 @dataclass
 class Summary:
-    """Stands for bake.BakeSummary."""
+    """Stands for episodes.BakeSummary."""
 
     episodes: list[Row]
     views: int = 0
     wall_seconds: float = 0.0
     redraws: int = 0
     outcomes: Counter[Outcome] = field(default_factory=Counter)
+    resumed: int = 0
+    stopped: int = 0
+
+    @property
+    def total(self) -> int:
+        return len(self.episodes)
 
 
 def finished(number: int) -> Summary:
@@ -68,8 +74,8 @@ def bakes(monkeypatch):
     module = types.ModuleType("synpick_warp.bake")
     calls = []
 
-    def run_bake(config, out, progress):
-        calls.append((config, out))
+    def run_bake(config, out, progress, shard):
+        calls.append((config, out, shard))
         progress.stage("building worlds")
         progress.update(episodes_done=0, episodes=2, worlds_active=2, views=0, views_per_s=0.0, seconds_left=None)
         progress.note("a note")
@@ -99,8 +105,8 @@ def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
     given = {"config": "smoke", "worlds": 3, "episodes": 4, "seed": 7, "device": "cpu", "resolution": "64x48", "writers": 1, "mode": "move"}
     arguments = [f"--{name}={value}" for name, value in given.items()]
     assert main(["bake", "--out", str(out), *arguments, "--set", "move.speed=0.2", "--set", "bake.seed=1"]) == 0
-    [(config, folder)] = bakes.calls
-    assert folder == out
+    [(config, folder, shard)] = bakes.calls
+    assert (folder, shard) == (out, (0, 1))
     expected = {"bake.worlds": 3, "bake.episodes": 4, "bake.seed": 7, "bake.device": "cpu", "bake.writers": 1}
     assert config == load_config("smoke", expected | {"cameras.resolution": [64, 48], "move.speed": 0.2})
     printed = capsys.readouterr().out
@@ -169,10 +175,37 @@ def test_incomplete_command_lines(capsys, arguments):
     mistake(capsys, *arguments)
 
 
+def test_formats_and_share_are_passed_on(tmp_path, bakes):
+    assert main(["bake", "--device=cpu", f"--out={tmp_path}", "--formats=zarr, bop", "--shard=1/3"]) == 0
+    [(config, _, shard)] = bakes.calls
+    assert config.bake.formats == ("zarr", "bop")
+    assert shard == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("--formats=bop,obj", 'bake.formats is ["bop", "obj"] on the command line; allowed: bop, shards, usd, zarr'),
+        ("--shard=3", '--shard is "3"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
+        ("--shard=4/4", '--shard is "4/4"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
+        ("--shard=4/8", "--shard 4/8 has none of 4 episodes; use fewer shards"),
+    ],
+)
+def test_formats_and_shares_that_are_not_there(tmp_path, bakes, capsys, option, said):
+    assert mistake(capsys, "bake", "--device=cpu", f"--out={tmp_path}", option) == said
+
+
+def test_a_stopped_bake_says_how_to_go_on(tmp_path, bakes, capsys):
+    bakes.result = finished(4)
+    bakes.result.stopped = 2
+    assert main(["bake", "--device=cpu", f"--out={tmp_path}"]) == 130
+    assert capsys.readouterr().err.endswith("interrupted: 4 of 4 episodes are whole; the same command goes on with the others\n")
+
+
 def test_output_folder_that_is_not_empty(tmp_path, bakes, capsys):
     (tmp_path / "mine.txt").write_text("precious")
     said = mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path))
-    assert said == f"{tmp_path} is not empty; --out takes a new or an empty folder"
+    assert said == f"{tmp_path} is not empty; --out takes a new or an empty folder, or a data set to go on with"
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     assert not bakes.calls
 
@@ -233,7 +266,7 @@ def test_help_says_how_modes_are_mixed(capsys):
 @pytest.mark.parametrize("mode", ["pick", "target", "move", "mixed"])
 def test_every_mode_is_passed_on(tmp_path, bakes, mode):
     assert main(["bake", "--out", str(tmp_path), "--device", "cpu", "--mode", mode, "--set", "bake.mix=[1, 2, 0]"]) == 0
-    [(config, _)] = bakes.calls
+    [(config, *_)] = bakes.calls
     assert (config.bake.mode, config.bake.mix) == (mode, (1.0, 2.0, 0.0))
 
 
