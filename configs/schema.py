@@ -329,6 +329,16 @@ class Bop:
 
 
 @dataclass(frozen=True)
+class Trajectory:
+    """The zarr store of physics."""
+
+    steps: bool = setting(True, "", "Write what happens in every step; without it, in every tick alone.")
+    chunk_ticks: int = setting(16, "ticks", "What is compressed, and read, at once.", low=1, high=4096)
+    shard_chunks: int = setting(64, "chunks", "Chunks in a file.", low=1, high=4096)
+    level: int = setting(3, "", "Level of zstd.", low=1, high=22)
+
+
+@dataclass(frozen=True)
 class Config:
     """All settings of a bake."""
 
@@ -347,4 +357,5 @@ class Config:
     suction: Suction = field(default_factory=Suction)
     render: Render = field(default_factory=Render)
     bop: Bop = field(default_factory=Bop)
+    trajectory: Trajectory = field(default_factory=Trajectory)
     object_rows: tuple[ObjectRow, ...] = ()

@@ -38,6 +38,7 @@ from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
 from synpick_warp.stages.plan import CycleArrays, VoteArrays, plan_sizes
+from synpick_warp.stages.record import record_kinds, record_sizes
 from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays, Renderer
 from synpick_warp.stages.render_scene import build_render_scene
 from synpick_warp.stages.sight import Plan, Sighting
@@ -58,13 +59,16 @@ class Factory:
     log: AttemptLog
 
 
-def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | None = None) -> Factory:
+def build_factory(
+    config: Config, progress: Progress, episodes: Sequence[int] | None = None, records_physics: bool = False
+) -> Factory:
     """Load what the settings name and put it on the device.
 
     Args:
         config: All settings.
         progress: Told what happens.
         episodes: Numbers of the episodes to simulate; None: from 0, as many as are set.
+        records_physics: Whether ticks come with their physics.
 
     Raises:
         SynpickError: Device, models, lights, tote or cameras cannot be used.
@@ -77,7 +81,7 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
     lights = load_lights(config.bake.lights)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     scene = build_render_scene(config, catalog, fixtures, cameras, lights, device)
-    simulation = Simulation(config, catalog, len(lights), device, scene, episodes)
+    simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     renderer = Renderer(config, scene, config.arrangement.max_objects, view_sizes(config, device)["view"])
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     stream = FrameStream(config, renderer, object_ids, device)
@@ -119,7 +123,8 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
 
 def _fill(config: Config, output: Output, kinds: tuple[type[Exporter], ...], summary: BakeSummary, progress: Progress) -> None:
     """Make the episodes that are left, and the lists."""
-    factory = build_factory(config, progress, output.left) if output.left else None
+    records = any(kind.records for kind in kinds)
+    factory = build_factory(config, progress, output.left, records) if output.left else None
     writers = config.bake.writers or len(os.sched_getaffinity(0))
     with WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
         started = time.perf_counter()
@@ -241,6 +246,8 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     groups += [(kind, worlds, 1 + RECORDS) for kind in (Sighting, Plan)]
     groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
     groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
+    if any(kind.records for kind in exporter_kinds(config.bake.formats)):
+        groups += [(kind, record_sizes(config, worlds), 1 + RECORDS) for kind in record_kinds(config)]
     if may_pick(config):
         looks = count_views(config, room, device)
         groups += [(kind, sight_sizes(config, room, looks), 1) for kind in SCRATCH]

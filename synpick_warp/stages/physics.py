@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import newton
 import numpy as np
@@ -17,6 +17,19 @@ from synpick_warp.scenes import build
 CONTACT_GAP = 0.1
 # A joint limit's row is made when the joint comes this near to it [rad].
 JOINT_LIMIT_GAP = 0.2
+
+
+class Watcher(Protocol):
+    """Sees every step. On a GPU it is recorded once, as the hooks of `Physics.tick`."""
+
+    def begin_step(self) -> None:
+        """Before a step."""
+
+    def after_solve(self, contact_f: wp.array) -> None:
+        """After each solver step of it; `contact_f` is each contact's force on its first shape (contact) spatial vector [N]."""
+
+    def end_step(self, step: int, current: newton.State) -> None:
+        """After it; `step` is its number in the tick, `current` the state at its end."""
 
 
 class Physics:
@@ -52,6 +65,7 @@ class Physics:
         self._other = self.model.state()
         self.control = self.model.control()
         self._graph: wp.Graph | None = None
+        self._seen = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
         fingers = np.arange(worlds) * built.layout.bodies_per_world
         self._finger_joint = wp.array(np.argsort(self.model.joint_child.numpy())[fingers], dtype=wp.int32, device=self.device)
 
@@ -89,23 +103,26 @@ class Physics:
         """Body poses from joint coordinates, after these were written."""
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
-    def tick(self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None) -> None:
+    def tick(
+        self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
+    ) -> None:
         """Advance all worlds by one tick.
 
-        Both hooks are recorded once on a GPU, so they must launch the same kernels on the same arrays every time.
+        Hooks and watcher are recorded once on a GPU, so they must launch the same kernels on the same arrays every time.
 
         Args:
             before_step: Launches what sets the control's forces from a state; runs before each step.
             after_collide: Launches what edits `contacts` before the solver sees them.
+            watcher: Launches what writes down the steps.
         """
         if not self.device.is_cuda:
-            self._run_steps(before_step, after_collide)
+            self._run_steps(before_step, after_collide, watcher)
             return
         if self._graph is None:
             # The first tick runs eagerly: it loads the kernels and allocates what Newton allocates late.
-            self._run_steps(before_step, after_collide)
+            self._run_steps(before_step, after_collide, watcher)
             with wp.ScopedCapture(device=self.device) as capture:
-                self._run_steps(before_step, after_collide)
+                self._run_steps(before_step, after_collide, watcher)
             self._graph = capture.graph
             return
         wp.capture_launch(self._graph)
@@ -120,18 +137,26 @@ class Physics:
             device=self.device,
         )
 
-    def _run_steps(self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None) -> None:
+    def _run_steps(
+        self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None, watcher: Watcher | None
+    ) -> None:
         current, following = self.state, self._other
-        physics = self.config.physics
-        for _ in range(physics.steps_per_tick):
+        physics, seen = self.config.physics, self._seen if watcher is not None else None
+        for step in range(physics.steps_per_tick):
+            if watcher is not None:
+                watcher.begin_step()
             before_step(current)
             for _ in range(physics.substeps):
                 self.pipeline.collide(current, self.contacts)
                 self.flag_lost_pairs()
                 if after_collide is not None:
                     after_collide()
-                self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps)
+                self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps, observables=seen)
                 current, following = following, current
+                if watcher is not None:
+                    watcher.after_solve(self._seen.contact_f)
+            if watcher is not None:
+                watcher.end_step(step, current)
         if current is not self.state:
             self.state.assign(current)
 

@@ -21,6 +21,7 @@ from synpick_warp.stages.constants import SceneData, make_scene_data
 from synpick_warp.stages.hold import Suction
 from synpick_warp.stages.look import Looker
 from synpick_warp.stages.physics import Physics
+from synpick_warp.stages.record import PhysicsRecord, Recorder
 from synpick_warp.stages.render_scene import RenderScene
 from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
@@ -37,6 +38,8 @@ class TickRecord:
     status: WorldStatus
     sighting: Sighting
     plan: Plan
+    physics: PhysicsRecord | None = None
+    """None: nobody asked for it."""
 
 
 class Simulation:
@@ -50,6 +53,7 @@ class Simulation:
         device: wp.Device,
         render_scene: RenderScene | None = None,
         episodes: Sequence[int] | None = None,
+        records_physics: bool = False,
     ) -> None:
         """Build the model and allocate all state.
 
@@ -60,6 +64,7 @@ class Simulation:
             device: Where everything lies.
             render_scene: What the gripper's side sees; not needed if all episodes move.
             episodes: Numbers of the episodes to simulate, in order; None: from 0, as many as are set.
+            records_physics: Whether records have `physics`.
 
         Raises:
             ValueError: There is nothing to see, but episodes that pick.
@@ -78,6 +83,9 @@ class Simulation:
         self.seals = allocate(SealState, sizes, device)
         self.sighting = allocate(Sighting, sizes, device)
         self.plan = allocate(Plan, sizes, device)
+        self.recorder: Recorder | None = None
+        if records_physics:
+            self.recorder = Recorder(config, self.scene, self.state, self.attempts, self.seals, self.physics, sizes)
         self.records = tuple(self._make_record(sizes) for _ in range(RECORDS))
         self.suction: Suction | None = None
         self.looker: Looker | None = None
@@ -88,7 +96,8 @@ class Simulation:
             self.looker = Looker(config, render_scene, self.scene, self.state, self.attempts, self.sighting, self.plan)
 
     def _make_record(self, sizes: dict[str, int]) -> TickRecord:
-        return TickRecord(*(allocate(kind, sizes, self.device) for kind in (Snapshot, WorldStatus, Sighting, Plan)))
+        physics = self.recorder.new_record() if self.recorder is not None else None
+        return TickRecord(*(allocate(kind, sizes, self.device) for kind in (Snapshot, WorldStatus, Sighting, Plan)), physics=physics)
 
     def tick(self, record: TickRecord) -> None:
         """Hand out episodes, simulate one tick, judge, record what came of it in one of `records`, and look where one must choose."""
@@ -100,7 +109,9 @@ class Simulation:
         act.set_fingers(scene, state, physics)
         act.forget_seals(state, self.seals)
         self.seals.peak.zero_()
-        physics.tick(self._drive, self._let_go_of_contacts)
+        if self.recorder is not None:
+            self.recorder.keep_drops()
+        physics.tick(self._drive, self._let_go_of_contacts, self.recorder)
         arrange.judge_settling(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
         act.begin_moving(scene, state, physics, seed)
@@ -113,6 +124,8 @@ class Simulation:
         physics.refresh_poses()
         arrange.judge_episodes(scene, state, self.attempts, self.sighting, physics)
         self._take_snapshot(record)
+        if self.recorder is not None and record.physics is not None:
+            self.recorder.take(record.physics)
         if self.looker is not None:
             self.looker.look(record.snapshot)
             act.begin_attempts(scene, state, self.attempts, self.plan, physics)
@@ -122,6 +135,8 @@ class Simulation:
     def _drive(self, current: newton.State) -> None:
         """Forces before a step."""
         act.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current)
+        if self.recorder is not None:
+            self.recorder.keep_force()
         if self.suction is not None:
             self.suction.hold_objects(self.scene, self.state, self.seals, self.physics, current)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +13,7 @@ from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.record import host_record, record_arrays, tick_measures
 from synpick_warp.stages.render import Renderer
 from synpick_warp.stages.simulate import TickRecord
 from synpick_warp.stages.worlds import MEASURE_COLUMNS, STATUS_COLUMNS
@@ -119,17 +120,25 @@ class TickReader:
         first = [record.status.table, record.status.measures, record.snapshot.entry, record.snapshot.pose]
         self.parts = [(part, [item.name for item in fields(part)]) for part in (record.sighting, record.plan)]
         self.parts.append((record.snapshot, list(_SNAPSHOT)))
-        self.copy = HostCopy(first + [getattr(part, name) for part, names in self.parts for name in names])
+        self.physics = record_arrays(record.physics) if record.physics is not None else []
+        self.copy = HostCopy(first + [getattr(part, name) for part, names in self.parts for name in names] + self.physics)
 
     def start(self) -> None:
         """Begin to copy what the tick left."""
         self.copy.start(None)
 
     def wait(self) -> TickReport:
-        """The tick's report; its arrays are its own."""
-        arrays = iter([array.copy() for array in self.copy.wait()])
+        """The tick's report; its arrays are its own, but for `tick` and `steps`: these are valid until the record is used again."""
+        copied = self.copy.wait()
+        last = len(copied) - len(self.physics)
+        arrays = iter([array.copy() for array in copied[:last]])
         first = [next(arrays) for _ in range(4)]
-        return TickReport(*first, *(SimpleNamespace(**{name: next(arrays) for name in names}) for _, names in self.parts))
+        report = TickReport(*first, *(SimpleNamespace(**{name: next(arrays) for name in names}) for _, names in self.parts))
+        if not self.physics:
+            return report
+        tick, steps = host_record(copied[last:], report.entry.shape[1])
+        columns = dict(zip(STATUS_COLUMNS, report.status.T, strict=True)) | dict(zip(MEASURE_COLUMNS, report.measures.T, strict=True))
+        return replace(report, tick=tick | tick_measures(columns, report.entry.shape[1]), steps=steps)
 
 
 def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> TickBatch:

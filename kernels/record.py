@@ -1,0 +1,199 @@
+"""What physics does in every step, written down for trajectories."""
+
+import warp as wp
+
+from synpick_warp.kernels.phases import ACT, APPROACH, MOVE, NO_TASK, SETTLE
+from synpick_warp.kernels.structs import LayoutData
+
+wp.set_module_options({"enable_backward": False})
+
+# Counts of a newton in sums of contact forces: integers, so that no order of threads changes a sum. A count is 1 µN, the largest sum
+# 9e12 N.
+COUNTS = wp.constant(1048576.0)
+# Columns of these sums: the vector's x, y and z, then the sizes.
+SIZE = wp.constant(3)
+
+
+@wp.func
+def body_of(layout: LayoutData, world: int, place: int, entry: wp.array2d[int], slot: wp.array2d[int]) -> int:
+    """Index of the body in a place of a record: of an instance, or after these of the finger and the cup; -1: no such instance."""
+    if place >= layout.instances:
+        return world * layout.bodies + place - layout.instances
+    if entry[world, place] < 0:
+        return -1
+    return world * layout.bodies + layout.gripper_bodies + slot[world, place]
+
+
+@wp.func
+def add_force(body: int, force: wp.vec3, total: wp.array2d[wp.int64]):
+    """Add a contact's force [N] to a body's sums."""
+    for axis in range(3):
+        wp.atomic_add(total, body, axis, wp.int64(wp.rint(force[axis] * COUNTS)))
+    wp.atomic_add(total, body, SIZE, wp.int64(wp.rint(wp.length(force) * COUNTS)))
+
+
+@wp.kernel
+def sum_contacts_kernel(
+    # Scene:
+    shape_body: wp.array[int],
+    # State:
+    contact_count: wp.array[int],
+    shape0: wp.array[int],
+    shape1: wp.array[int],
+    # In:
+    contact_force: wp.array[wp.spatial_vector],
+    # Out:
+    total_inout: wp.array2d[wp.int64],
+):
+    """Add the force of each contact, which is that on its first shape, to the sums of the one body and its opposite to the other's."""
+    contact = wp.tid()
+    if contact >= contact_count[0]:
+        return
+    force = wp.spatial_top(contact_force[contact])
+    if not wp.isfinite(force):
+        return
+    for side in range(2):
+        shape = shape0[contact]
+        if side == 1:
+            shape = shape1[contact]
+            force = -force
+        if shape >= 0 and shape_body[shape] >= 0:
+            add_force(shape_body[shape], force, total_inout)
+
+
+@wp.kernel
+def keep_force_kernel(
+    # Scene:
+    layout: LayoutData,
+    weight: float,
+    # State:
+    joint_f: wp.array[float],
+    # Out:
+    force_out: wp.array[wp.vec3],
+):
+    """The force that draws the gripper to its goal, before the seals add theirs: what acts on it but for the weight it bears."""
+    world = wp.tid()
+    first = world * layout.dofs
+    force_out[world] = wp.vec3(joint_f[first], joint_f[first + 1], joint_f[first + 2] - weight)
+
+
+@wp.kernel
+def record_motion_kernel(
+    # Scene:
+    layout: LayoutData,
+    step: int,
+    # State:
+    entry: wp.array2d[int],
+    slot: wp.array2d[int],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    # Out:
+    pose_out: wp.array3d[wp.transform],
+    velocity_out: wp.array3d[wp.vec3],
+    spin_out: wp.array3d[wp.vec3],
+):
+    """Where objects, finger and cup are at the end of a step, and how they move; NaN for an instance that is not in the scene."""
+    world, place = wp.tid()
+    body = body_of(layout, world, place, entry, slot)
+    if body < 0:
+        nothing = wp.vec3(wp.nan, wp.nan, wp.nan)
+        pose_out[world, step, place] = wp.transform(nothing, wp.quat(wp.nan, wp.nan, wp.nan, wp.nan))
+        velocity_out[world, step, place] = nothing
+        spin_out[world, step, place] = nothing
+        return
+    pose_out[world, step, place] = body_q[body]
+    velocity_out[world, step, place] = wp.spatial_top(body_qd[body])
+    spin_out[world, step, place] = wp.spatial_bottom(body_qd[body])
+
+
+@wp.kernel
+def record_forces_kernel(
+    # Scene:
+    layout: LayoutData,
+    step: int,
+    share: float,
+    # State:
+    entry: wp.array2d[int],
+    slot: wp.array2d[int],
+    held: wp.array2d[int],
+    load: wp.array2d[float],
+    # In:
+    total: wp.array2d[wp.int64],
+    # Out:
+    contact_force_out: wp.array3d[wp.vec3],
+    contact_load_out: wp.array3d[float],
+    seal_load_out: wp.array3d[float],
+    held_out: wp.array3d[wp.uint8],
+):
+    """What acted on objects, finger and cup in a step; NaN for an instance that is not in the scene.
+
+    Contact forces are a mean over the step's solver steps, whose forces were summed: `share` is 1 / their number.
+    """
+    world, place = wp.tid()
+    body = body_of(layout, world, place, entry, slot)
+    force = wp.vec3(wp.nan, wp.nan, wp.nan)
+    size = float(wp.nan)
+    if body >= 0:
+        scale = share / COUNTS
+        force = wp.vec3(scale * float(total[body, 0]), scale * float(total[body, 1]), scale * float(total[body, 2]))
+        size = scale * float(total[body, SIZE])
+    contact_force_out[world, step, place] = force
+    contact_load_out[world, step, place] = size
+    if place < layout.instances:
+        bears = float(wp.nan)
+        hangs = int(0)
+        if body >= 0:
+            bears = 0.0
+            if held[world, place] != 0:
+                bears = load[world, place]
+                hangs = 1
+        seal_load_out[world, step, place] = bears
+        held_out[world, step, place] = wp.uint8(hangs)
+
+
+@wp.kernel
+def record_gripper_kernel(
+    # Scene:
+    step: int,
+    # State:
+    phase: wp.array[int],
+    mode: wp.array[int],
+    task: wp.array[int],
+    goal: wp.array[wp.vec3],
+    # In:
+    force: wp.array[wp.vec3],
+    # Out:
+    goal_out: wp.array2d[wp.vec3],
+    force_out: wp.array2d[wp.vec3],
+    task_out: wp.array2d[wp.int8],
+):
+    """What the gripper did in a step: its task, its goal, which is NaN where it has none, and the force towards it."""
+    world = wp.tid()
+    doing = int(NO_TASK)
+    if phase[world] == ACT:
+        doing = task[world]
+    place = wp.vec3(wp.nan, wp.nan, wp.nan)
+    if phase[world] == ACT and (mode[world] == MOVE or doing >= APPROACH):
+        place = goal[world]
+    goal_out[world, step] = place
+    force_out[world, step] = force[world]
+    task_out[world, step] = wp.int8(doing)
+
+
+@wp.kernel
+def keep_drops_kernel(
+    # Scene:
+    layout: LayoutData,
+    # State:
+    phase: wp.array[int],
+    progress: wp.array[wp.vec4i],
+    entry: wp.array2d[int],
+    slot: wp.array2d[int],
+    body_q: wp.array[wp.transform],
+    # Out:
+    drop_out: wp.array2d[wp.transform],
+):
+    """Where a world's objects begin to fall: their poses before its first tick."""
+    world, instance = wp.tid()
+    if phase[world] == SETTLE and progress[world][0] == 0 and entry[world, instance] >= 0:
+        drop_out[world, instance] = body_q[world * layout.bodies + layout.gripper_bodies + slot[world, instance]]
