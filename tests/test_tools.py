@@ -48,8 +48,8 @@ def load_tool(name: str):
 
 
 # In the order in which they import each other.
-rest_report, pick_tally, pick_report, bench_physics, bench = map(
-    load_tool, ("rest_report", "pick_tally", "pick_report", "bench_physics", "bench")
+rest_report, pick_tally, pick_report, bench_physics, bench_write, bench = map(
+    load_tool, ("rest_report", "pick_tally", "pick_report", "bench_physics", "bench_write", "bench")
 )
 
 
@@ -273,15 +273,18 @@ def test_when_time_is_up_the_report_is_of_what_has_ended(tmp_path, capsys):
 def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys):
     for name in ("FALL_TICKS", "SETTLE_TICKS", "STIR_TICKS", "LEAD_TICKS", "PICK_TICKS", "LEAST_REPEATS", "BURST"):
         monkeypatch.setattr(bench_physics, name, 1)
-    for name, value in (("LEAST_REPEATS", 1), ("BURST", 1), ("STREAM_BATCHES", 1), ("WRITE_VIEWS", 3), ("BAKE_SPEED", 10.0)):
+    for name, value in (("BURST", 1), ("STREAM_BATCHES", 1), ("WRITE_VIEWS", 3), ("BAKE_SPEED", 10.0)):
         monkeypatch.setattr(bench, name, value)
+    monkeypatch.setattr(bench_write, "COPIES", 1)
     file = tmp_path / "bench.json"
-    assert bench.main(["--worlds", "1", "--resolution", "32x18", "--seconds", "0", "--json", str(file), *FEW, *GLANCE, *DASH]) == 0
+    small = ("--worlds", "1", "--resolution", "32x18", "--seconds", "0", "--set", 'bake.formats=["bop", "shards"]')
+    assert bench.main([*small, "--json", str(file), *FEW, *GLANCE, *DASH]) == 0
     rows = json.loads(file.read_text())["rows"]
     assert {row["part"] for row in rows} == {"setup", *bench.PARTS}
     assert all(row["value"] >= 0.0 for row in rows)
     printed = capsys.readouterr().out
-    for name in ("views, all stages", "picking, steps alone", "looks and plans: share of the time with rendering"):
+    share = "looks and plans: share of the time with rendering"
+    for name in ("views, all stages", "picking, steps alone", share, "bop: views, 1 process", "shards: views, 1 process"):
         assert name in printed
 
 

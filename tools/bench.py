@@ -15,7 +15,6 @@ import dataclasses
 import functools
 import itertools
 import json
-import os
 import resource
 import sys
 import tempfile
@@ -26,7 +25,8 @@ from unittest import mock
 
 import numpy as np
 import warp as wp
-from bench_physics import BURST, LEAST_REPEATS, Row, measure_simulation, seconds_per_call
+from bench_physics import BURST, Row, measure_simulation, seconds_per_call
+from bench_write import measure_writing
 from rich.console import Console
 
 from synpick_warp.bake import Factory, build_factory, run_bake
@@ -36,10 +36,8 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.doctor import GIB, describe_machine
 from synpick_warp.errors import SynpickError
-from synpick_warp.exporters.bop import BopExporter, view_bytes
-from synpick_warp.exporters.files import PARTIAL
 from synpick_warp.exporters.pool import WriterPool
-from synpick_warp.frames import FrameBatch
+from synpick_warp.exporters.registry import Exporters, exporter_kinds
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.simulate import Simulation
@@ -57,8 +55,8 @@ BAKE_METHODS = (
     (TickReader, "wait", "wait for ticks"),
     (FrameStream, "_launch", "launch views"),
     (FrameStream, "_collect", "wait for views"),
-    (BopExporter, "write", "hand views to writers"),
-    (BopExporter, "close", "wait for writers, finish files"),
+    (Exporters, "write", "hand views to writers"),
+    (WriterPool, "wait", "wait for writers, finish files"),
 )
 """Where the main process of a bake spends its time; on the CPU, launching is computing."""
 
@@ -131,7 +129,8 @@ def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Ro
     """All numbers of the parts, as they come. `least` is the time a measurement is repeated [s]."""
     if {"physics", "sight", "render", "write"} & set(parts):
         started = time.perf_counter()
-        factory = build_factory(config, SilentProgress())
+        records = "write" in parts and any(kind.records for kind in exporter_kinds(config.bake.formats))
+        factory = build_factory(config, SilentProgress(), records_physics=records)
         wp.synchronize_device(factory.simulation.device)
         yield Row("setup", "load and build", time.perf_counter() - started, "s")
         values: dict[str, float] = {}
@@ -140,7 +139,8 @@ def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Ro
             yield row
         yield from _share_of_a_bake(config, values)
         if "write" in parts:
-            yield from _write(config, factory, least)
+            worlds = min(factory.simulation.layout.worlds, -(-WRITE_VIEWS // len(factory.cameras)))
+            yield from measure_writing(config, factory, _all_live(factory.simulation, worlds), least)
         yield _memory(factory.simulation.device)
     if "bake" in parts:
         yield from _bake(config)
@@ -225,37 +225,6 @@ def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], objec
     if len(samples) == 1:
         del stages["trace colour samples"]
     return stages
-
-
-def _write(config: Config, factory: Factory, least: float) -> Iterator[Row]:
-    """Views a second that go through the exporter and its processes, by number of processes."""
-    simulation, cameras = factory.simulation, len(factory.cameras)
-    worlds = min(simulation.layout.worlds, -(-WRITE_VIEWS // cameras))
-    ring = next(factory.stream.render(simulation.records[0].snapshot, _all_live(simulation, worlds)))
-    batch = FrameBatch(**{item.name: np.array(getattr(ring, item.name)[:WRITE_VIEWS]) for item in dataclasses.fields(ring)})
-    cores = len(os.sched_getaffinity(0))
-    size = 0.0
-    for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
-        rate, size = _write_rate(config, factory, batch, processes, least)
-        yield Row("write", f"views, {processes} process{'es' if processes > 1 else ''}", rate, "1/s")
-    yield Row("write", "files of a view", 1e-6 * size, "MB")
-
-
-def _write_rate(config: Config, factory: Factory, batch: FrameBatch, processes: int, least: float) -> tuple[float, float]:
-    """Views a second that so many processes write, and the size of a view's files [B]."""
-    with tempfile.TemporaryDirectory() as folder, WriterPool(processes, view_bytes(factory.cameras[0])) as pool:
-        exporter = BopExporter(Path(folder) / "out", config, factory.catalog, factory.cameras, config.bake.episodes, pool)
-        exporter.write(batch)
-        pool.wait()
-        written, started = 0, time.perf_counter()
-        while written < LEAST_REPEATS * len(batch) or time.perf_counter() - started < least:
-            written += len(batch)
-            exporter.write(dataclasses.replace(batch, frame=np.full(len(batch), written)))
-        pool.wait()
-        seconds = time.perf_counter() - started
-        size = sum(path.stat().st_size for path in (Path(folder) / "out" / PARTIAL).rglob("*.*"))
-        exporter.abort()
-    return written / seconds, size / (written + len(batch))
 
 
 class _StageTimes(SilentProgress):
