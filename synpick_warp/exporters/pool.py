@@ -29,7 +29,7 @@ _ALIGNMENT = 64
 """Images begin at a multiple of a cache line [B]."""
 _END_TIMEOUT = 10.0
 """How long a process may take to end when it has nothing left to do [s]."""
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1", "PXR_WORK_THREAD_LIMIT": "1"}
+_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 """The processes are the parallelism: no threads within them."""
 
 

@@ -56,9 +56,12 @@ def write_episode(spool: Path, instances: int, place: Path, facts: EpisodeFacts,
         facts: What the file says of the episode.
         settings: What all episodes share.
     """
+    from pxr import Work
+
     from synpick_warp.exporters.usd_parts import save_layer
     from synpick_warp.exporters.usd_stage import episode_layer
 
+    Work.SetConcurrencyLimit(1)  # type: ignore[attr-defined]  # The processes are the parallelism.
     ticks = read_ticks(spool, instances)
     if ticks["frame"].tolist() != list(range(facts.frames)):
         raise OutputError(f"{place} has {len(ticks)} of {facts.frames} frames; this is an error of synpick-warp, please report it")
