@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +12,9 @@ import numpy as np
 import pytest
 from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdSemantics, UsdShade, UsdUtils
 
+from synpick_warp.errors import OutputError
 from synpick_warp.exporters.usd import UsdExporter
+from synpick_warp.exporters.usd_parts import new_asset, save_layer
 from synpick_warp.scenes.appearance import srgb_to_linear
 from tests.exporter_contract import ExporterContract, digests
 from tests.reference import small_worlds, usd_sets
@@ -39,6 +43,37 @@ def folder(tmp_path_factory, config) -> Path:
 def layers(folder: Path) -> list[Path]:
     """Every file that USD reads."""
     return sorted(folder.rglob("*.usdc"))
+
+
+def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
+    stage = new_asset("thing", "thing")
+    with pytest.raises(FileNotFoundError, match="No such file"):
+        save_layer(stage.GetRootLayer(), tmp_path / "gone" / "thing.usdc")
+    assert not (tmp_path / "gone").exists()
+    (tmp_path / "taken.usdc").mkdir()
+    with pytest.raises(OutputError, match=r"cannot write .*taken\.usdc: "):
+        save_layer(stage.GetRootLayer(), tmp_path / "taken.usdc")
+
+
+LIMITED = """
+import resource, signal, sys
+from pathlib import Path
+from synpick_warp.errors import OutputError
+from synpick_warp.exporters.usd_parts import new_asset, save_layer
+stage = new_asset("thing", "thing")
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+try:
+    save_layer(stage.GetRootLayer(), Path(sys.argv[1]))
+except OutputError as error:
+    sys.exit(str(error))
+"""
+
+
+def test_a_file_that_is_cut_short_is_an_error(tmp_path):
+    """In a process of its own, since the limit holds for all that one writes."""
+    done = subprocess.run((sys.executable, "-c", LIMITED, str(tmp_path / "thing.usdc")), capture_output=True, text=True)
+    assert done.stderr == f"cannot write {tmp_path / 'thing.usdc'}: File too large; free space or rights there\n"
 
 
 def test_an_episode_is_a_file_and_assets_are_shared(folder):

@@ -8,10 +8,13 @@ Stages are in metres, z up, like everything here. Imports pxr, so it is imported
 
 from __future__ import annotations
 
+import errno
+import os
+import re
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdShade, Vt
+from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdShade, Vt
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.files import write_flushed
@@ -23,6 +26,7 @@ TEXTURES = "textures"
 """Folder in the asset library."""
 CLASS = "class"
 """Taxonomy of the labels that say what kind of thing something is."""
+_SYSTEM_REASON = re.compile(r"writing file: ([^']+)'")
 
 
 def object_asset(obj_id: int) -> str:
@@ -52,12 +56,17 @@ def save_layer(layer: Sdf.Layer, path: Path) -> None:
     """Write a layer as a file of its own.
 
     Raises:
-        OutputError: It cannot be written; USD does not hand on the system's error.
+        FileNotFoundError: There is no such folder; USD would make it.
+        OutputError: It cannot be written; USD hands on the system's error as text.
     """
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
     try:
         written = layer.Export(str(path))
-    except Exception as error:  # Tf.ErrorException, which no module exports under a name of its own
-        raise OutputError(f"cannot write {path}: {' '.join(str(error).split())}") from error
+    except Tf.ErrorException as error:
+        text = " ".join(str(error).split())
+        reason = _SYSTEM_REASON.search(text)
+        raise OutputError(f"cannot write {path}: {reason[1] if reason else text}; free space or rights there") from error
     if not written:
         raise OutputError(f"cannot write {path}: USD does not say why")
 
