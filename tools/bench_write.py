@@ -1,4 +1,4 @@
-"""What tools/bench.py measures of the writers: views a second from the hand-over to whole episodes, by format and number of processes."""
+"""What tools/bench.py measures of the writers: views a second by format and number of processes, and what the end of a scene takes."""
 
 from __future__ import annotations
 
@@ -61,18 +61,30 @@ def measure_writing(config: Config, factory: Factory, report: TickReport, least:
     cores = len(os.sched_getaffinity(0))
     for name in config.bake.formats:
         (kind,) = exporter_kinds((name,))
-        files = size = 0.0
+        written = _Written(0.0, 0.0, 0.0, 0.0)
         for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
-            rate, files, size = _rate(kind, config, factory, _Given(views, frames), processes, least)
-            yield Row("write", f"{name}: views, {processes} process{'es' if processes > 1 else ''}", rate, "1/s")
-        yield Row("write", f"{name}: files of a view", files, "")
-        yield Row("write", f"{name}: files of a view", 1e-6 * size, "MB")
+            written = _write(kind, config, factory, _Given(views, frames), processes, least)
+            yield Row("write", f"{name}: views, {processes} process{'es' if processes > 1 else ''}", written.rate, "1/s")
+        yield Row("write", f"{name}: a camera's part of an episode, to finish", 1e3 * written.finish, "ms")
+        yield Row("write", f"{name}: files of a view", written.files, "")
+        yield Row("write", f"{name}: files of a view", 1e-6 * written.size, "MB")
 
 
-def _rate(
-    kind: type[Exporter], config: Config, factory: Factory, given: _Given, processes: int, least: float
-) -> tuple[float, float, float]:
-    """Views a second that so many processes write, and how many files a view has, of how much in all [B]."""
+@dataclass(frozen=True)
+class _Written:
+    """What a number of processes did with a format."""
+
+    rate: float
+    """Views written [1/s]."""
+    finish: float
+    """Time from the last view to whole episodes, divided by episodes and cameras [s]."""
+    files: float
+    """Files of a view, in whole episodes."""
+    size: float
+    """Their size [B]."""
+
+
+def _write(kind: type[Exporter], config: Config, factory: Factory, given: _Given, processes: int, least: float) -> _Written:
     with tempfile.TemporaryDirectory() as folder, WriterPool(processes, kind.slot_bytes(config)) as pool:
         out = Path(folder)
         (out / PARTIAL).mkdir()
@@ -88,13 +100,16 @@ def _rate(
                 exporter.tick(frames)
                 exporter.write(views)
             frame += 1
-        for episode in given.episodes():
-            exporter.end(EpisodeEnd(episode, 0, frame, int(Ending.FINISHED)), lambda: None)
         pool.wait()
         seconds = time.perf_counter() - started
-        places = [out / path for episode in given.episodes() for path in exporter.files(episode)]
+        episodes = given.episodes()
+        for episode in episodes:
+            exporter.end(EpisodeEnd(episode, 0, frame, int(Ending.FINISHED)), lambda: None)
+        pool.wait()
+        finish = (time.perf_counter() - started - seconds) / (len(episodes) * len(factory.cameras))
+        places = [out / path for episode in episodes for path in exporter.files(episode)]
         files = [path for place in places for path in ([place] if place.is_file() else place.rglob("*")) if path.is_file()]
         size = sum(path.stat().st_size for path in files)
         exporter.close()
     count = frame * COPIES * len(given.views)
-    return count / seconds, len(files) / count, size / count
+    return _Written(count / seconds, finish, len(files) / count, size / count)
