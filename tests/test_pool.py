@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.errors import OutputError
+from synpick_warp.exporters import pool as pool_module
 from synpick_warp.exporters.pool import QUEUE, WriterPool, shared_bytes
 
 SIZE = 1 << 16
@@ -99,6 +100,20 @@ def test_several_images_of_different_types_share_a_slot(tmp_path):
     with np.load(tmp_path / "all.npz") as file:
         for image, back in zip(images, file.values(), strict=True):
             assert back.dtype == image.dtype
+            np.testing.assert_array_equal(back, image)
+
+
+def test_threads_copy_the_parts_of_large_images(tmp_path, monkeypatch):
+    monkeypatch.setattr(pool_module, "PROCESSES_PER_COPIER", 1)
+    draw = np.random.default_rng(0)
+    images = (draw.integers(0, 256, (700, 900, 6), np.uint8)[::2, 3:-3], np.zeros((0, 4)), np.arange(5), draw.integers(0, 9, (3, 1 << 20)))
+    kept = [image.copy() for image in images]
+    with WriterPool(2, shared_bytes(image.nbytes for image in images)) as pool:
+        pool.submit(save_all, images, (tmp_path / "all.npz",), path=tmp_path)
+        for image in images:
+            image[...] = 0
+    with np.load(tmp_path / "all.npz") as file:
+        for image, back in zip(kept, file.values(), strict=True):
             np.testing.assert_array_equal(back, image)
 
 

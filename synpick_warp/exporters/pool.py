@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -25,6 +26,10 @@ from synpick_warp.exporters.worker import Failure, SharedImage, Task, run
 
 QUEUE = 4
 """Tasks that a process has at hand, with the one it runs: enough to bridge the time in which the bake makes the next batch."""
+PROCESSES_PER_COPIER = 4
+"""So many processes for a thread that copies images into shared memory: one core alone cannot copy as fast as many cores write."""
+_COPY_BYTES = 1 << 20
+"""What a thread copies at once, about [B]."""
 _ALIGNMENT = 64
 """Images begin at a multiple of a cache line [B]."""
 _END_TIMEOUT = 10.0
@@ -79,6 +84,8 @@ class WriterPool:
         self._failure: OutputError | None = None
         self._ended = False
         self._hearing = False
+        self._copiers = ThreadPoolExecutor(max(1, processes // PROCESSES_PER_COPIER))
+        self._copies_here = processes < 2 * PROCESSES_PER_COPIER
         try:
             handle, self._memory = _shared_memory(slots * self._slot_bytes)
         except OSError as error:
@@ -158,6 +165,7 @@ class WriterPool:
             worker.link.close()
         self._workers.clear()
         self._waiting.clear()
+        self._copiers.shutdown()
         with contextlib.suppress(BufferError):
             self._memory.close()
 
@@ -176,12 +184,16 @@ class WriterPool:
         if (size := shared_bytes(image.nbytes for image in images)) > self._slot_bytes:
             raise ValueError(f"images of {size} bytes exceed the {self._slot_bytes} that the pool was made for")
         offset = slot * self._slot_bytes
-        shared = []
+        shared: list[SharedImage] = []
+        parts: list[tuple[np.ndarray, np.ndarray]] = []
         for image in images:
             place = SharedImage(offset, image.shape, image.dtype.str)
-            np.copyto(place.of(self._memory), image)
             shared.append(place)
             offset += shared_bytes((image.nbytes,))
+            count = 1 if self._copies_here else max(1, image.nbytes // _COPY_BYTES)
+            parts += zip(np.array_split(place.of(self._memory), count), np.array_split(image, count), strict=True)
+        for _ in (map if self._copies_here else self._copiers.map)(_copy, parts):
+            pass
         return tuple(shared)
 
     def _collect(self, timeout: float | None) -> None:
@@ -262,6 +274,11 @@ def _describe(failure: Failure, path: Path) -> OutputError:
         return OutputError(f"cannot write {path}: {failure.error}")
     code, reason, name = failure.system
     return output_error(path, OSError(code, reason, name or str(path)))
+
+
+def _copy(part: tuple[np.ndarray, np.ndarray]) -> None:
+    """Copy to the first array from the second; other threads may run meanwhile."""
+    np.copyto(*part)
 
 
 def _shared_memory(size: int) -> tuple[int, mmap.mmap]:
