@@ -32,6 +32,6 @@ def render_scene(config: Config, objects: Catalog, device: Any) -> RenderScene:
     return build_render_scene(config, objects, fixtures, make_cameras(config.cameras), load_lights("")[:LIGHTS], device)
 
 
-def picking(config: Config, objects: Catalog, device: Any) -> Simulation:
-    """Worlds that can see."""
-    return Simulation(config, objects, LIGHTS, device, render_scene(config, objects, device))
+def picking(config: Config, objects: Catalog, device: Any, **other: Any) -> Simulation:
+    """Worlds that can see; `other` goes to the simulation."""
+    return Simulation(config, objects, LIGHTS, device, render_scene(config, objects, device), **other)
