@@ -18,12 +18,12 @@ def checksum(path: Path) -> str:
 
 
 def files_below(out: Path, paths: Sequence[Path]) -> list[Path]:
-    """Every file that these files and folders are or hold, relative to the data set, sorted by name."""
+    """Every file that these files and folders are or hold, once, relative to the data set, sorted by name."""
     found: list[Path] = []
     for path in paths:
         place = out / path
         found += [one.relative_to(out) for one in _files(place)] if place.is_dir() else [path]
-    return sorted(found, key=str)
+    return sorted(set(found), key=str)
 
 
 def _files(folder: Path) -> Iterator[Path]:

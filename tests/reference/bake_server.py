@@ -19,6 +19,7 @@ TINY = {
     "bake.worlds": 2,
     "bake.episodes": 4,
     "bake.writers": 1,
+    "bake.formats": ["bop", "shards", "usd", "zarr"],
     "cameras.resolution": [48, 27],
     "physics.step": 8e-3,
     "physics.steps_per_tick": 8,
@@ -121,13 +122,17 @@ def _prepare(request: dict) -> None:
 
     if "alone" in request:
         # Files are written by this process, too.
-        bake.WriterPool = lambda processes, slot_bytes, held: WriterPool(0, slot_bytes, held)
+        def alone(_: int, slot_bytes: int, held: int) -> WriterPool:
+            pool = WriterPool(0, slot_bytes, held)
+            if "most_bytes" in request:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (request["most_bytes"],) * 2)
+            return pool
+
+        bake.WriterPool = alone
     if "kill_at" in request:
         _kill_at(request["kill_at"], request["out"])
     if "count" in request:
         _count(Path(request["count"]), request["out"])
-    if "most_bytes" in request:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (request["most_bytes"],) * 2)
 
 
 def _kill_at(number: int, out: str) -> None:
