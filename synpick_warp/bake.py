@@ -36,6 +36,7 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.shapes import Camera, Catalog, LightMap
 from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
+from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch, edge_sizes
 from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
 from synpick_warp.stages.plan import CycleArrays, VoteArrays, plan_sizes
 from synpick_warp.stages.record import record_kinds, record_sizes
@@ -245,6 +246,7 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     groups = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState)]
     groups += [(kind, worlds, 1 + RECORDS) for kind in (Sighting, Plan)]
     groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
+    groups += [(EdgeBuffers, edge_sizes(views), ring), (EdgeScratch, edge_sizes(views), 1)]
     groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
     if any(kind.records for kind in exporter_kinds(config.bake.formats)):
         groups += [(kind, record_sizes(config, worlds), 1 + RECORDS) for kind in record_kinds(config)]

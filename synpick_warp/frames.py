@@ -48,6 +48,10 @@ class FrameBatch:
     """px_count_all, px_count_valid, px_count_visib (B, I, 3) int32."""
     boxes: np.ndarray
     """bbox_obj and bbox_visib as x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty (B, I, 2, 4) int32."""
+    edge_count: np.ndarray | None = None
+    """How many edges down their columns `instance` and `amodal` have (B, 2) int32; more than E: they are not all in `edges`."""
+    edges: np.ndarray | None = None
+    """These edges: column · (H + 1) + row of the pixel below, value above, value below, by the first (B, 2, 3, E) uint32."""
 
     def __len__(self) -> int:
         return len(self.episode)

@@ -11,6 +11,7 @@ from synpick_warp.arrays import allocate, device_array, memory_table
 from synpick_warp.bake import describe_arrays
 from synpick_warp.device import pick_device
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch
 from synpick_warp.stages.perceive import SightScratch, count_views
 from synpick_warp.stages.plan import CycleArrays, VoteArrays
 from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays
@@ -18,10 +19,11 @@ from synpick_warp.stages.sight import LookArrays, Plan, Sighting
 from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus
 from tests.reference.small_worlds import settings
 
-NAMES = "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset"
+NAMES = "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset part"
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
     WorldState, AttemptState, SealState, Sighting, Plan, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays, PictureArrays,
+    EdgeBuffers, EdgeScratch,
 ]  # fmt: skip
 LOOKING = [LookArrays, SightScratch, VoteArrays, CycleArrays]
 DECLARED = MOVING + LOOKING

@@ -52,10 +52,12 @@ class _Given:
 
 def measure_writing(config: Config, factory: Factory, report: TickReport, least: float) -> Iterator[Row]:
     """Rates of each format alone. `report` says which worlds are in the views; `least` is the time a measurement takes at least [s]."""
-    names = [item.name for item in dataclasses.fields(FrameBatch)]
     snapshot = factory.simulation.records[0].snapshot
-    kept = [{name: np.array(getattr(batch, name)) for name in names} for batch in factory.stream.render(snapshot, report)]
-    views = FrameBatch(**{name: np.concatenate([batch[name] for batch in kept]) for name in names})
+    kept = [
+        {name: array.copy() for name, array in vars(batch).items() if array is not None}
+        for batch in factory.stream.render(snapshot, report)
+    ]
+    views = FrameBatch(**{name: np.concatenate([batch[name] for batch in kept]) for name in kept[0]})
     frames = tick_batch(report, factory.log.object_ids, config.physics.step * config.physics.steps_per_tick)
     yield Row("write", "objects in a view", float((views.object_id >= 0).sum(axis=1).mean()), "")
     cores = len(os.sched_getaffinity(0))

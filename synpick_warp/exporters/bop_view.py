@@ -16,7 +16,7 @@ import orjson
 
 from synpick_warp.exporters.folder import Buffer, open_folder
 from synpick_warp.exporters.png import encode_mask_png, encode_png
-from synpick_warp.exporters.rle import Runs, find_edges
+from synpick_warp.exporters.rle import Runs, find_edges, listed_edges
 from synpick_warp.frames import FrameBatch
 from synpick_warp.scenes.shapes import Camera
 
@@ -63,8 +63,10 @@ class ViewTruth:
     """(N, 3)"""
     boxes: np.ndarray
     """(N, 2, 4)"""
+    listed: bool
+    """The last two arrays of the view's task are lists of edges, not images."""
     top: int
-    """Row of the picture with which the images `instance` and `amodal` of the view's task begin: they hold what all boxes hold."""
+    """Row of the picture with which these images begin."""
     left: int
     """Column of the picture with which they begin."""
 
@@ -90,14 +92,14 @@ def camera_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
 
 
 def view_task(batch: FrameBatch, view: int, scene: int) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
-    """What a task on one view needs: images color, depth, instance, amodal, the last two cut to where objects are; and the truth."""
+    """What a task on one view needs: color, depth, two arrays that hold where masks begin and end, and the truth.
+
+    The two are the lists of edges of the images instance and amodal, or else the images themselves, cut to where objects are.
+    """
     present = np.flatnonzero(batch.object_id[view] >= 0)
     boxes = batch.boxes[view][present]
-    height, width = batch.depth.shape[1:]
-    shown = boxes[:, _WHOLE][boxes[:, _WHOLE, 2] >= boxes[:, _WHOLE, 0]]
-    left, top = (min(max(int(shown[:, edge].min(initial=size)), 0), size) for edge, size in ((0, width), (1, height)))
-    right, bottom = (min(1 + int(shown[:, edge].max(initial=-1)), size) for edge, size in ((2, width), (3, height)))
-    part = slice(top, max(top, bottom)), slice(left, max(left, right))
+    edges = _edges(batch, view)
+    rows, columns = (slice(0, 0), slice(0, 0)) if edges else _shown(boxes, *batch.depth.shape[1:])
     truth = ViewTruth(
         scene=scene,
         frame=int(batch.frame[view]),
@@ -106,22 +108,41 @@ def view_task(batch: FrameBatch, view: int, scene: int) -> tuple[tuple[np.ndarra
         pose=batch.pose[view][present],
         pixels=batch.pixels[view][present],
         boxes=boxes,
-        top=top,
-        left=left,
+        listed=bool(edges),
+        top=rows.start,
+        left=columns.start,
     )
-    return (batch.color[view], batch.depth[view], batch.instance[view][part], batch.amodal[view][part]), truth
+    masks = edges or tuple(image[view, rows, columns] for image in (batch.instance, batch.amodal))
+    return (batch.color[view], batch.depth[view], *masks), truth
 
 
-def view_masks(instance: np.ndarray, amodal: np.ndarray, truth: ViewTruth) -> list[Masks]:
-    """Masks of all instances, in their order. One pass over each image finds all edges; every instance picks its own."""
-    seen, whole = (find_edges(image, truth.top, truth.left) for image in (instance, amodal))
+def _edges(batch: FrameBatch, view: int) -> tuple[np.ndarray, ...]:
+    """Lists of the edges of instance and amodal, if they are there, whole, and not larger than the images."""
+    if batch.edges is None or batch.edge_count is None or (batch.edge_count[view] > batch.edges.shape[-1]).any():
+        return ()
+    lists = tuple(edges[:, :count] for edges, count in zip(batch.edges[view], batch.edge_count[view].tolist(), strict=True))
+    images = batch.instance[view], batch.amodal[view]
+    return lists if all(edges.nbytes <= image.nbytes for edges, image in zip(lists, images, strict=True)) else ()
+
+
+def _shown(boxes: np.ndarray, height: int, width: int) -> tuple[slice, slice]:
+    """Rows and columns of the picture that hold what all boxes (N, 2, 4) hold of it."""
+    whole = boxes[:, _WHOLE][boxes[:, _WHOLE, 2] >= boxes[:, _WHOLE, 0]]
+    left, top = (min(max(int(whole[:, edge].min(initial=size)), 0), size) for edge, size in ((0, width), (1, height)))
+    right, bottom = (min(1 + int(whole[:, edge].max(initial=-1)), size) for edge, size in ((2, width), (3, height)))
+    return slice(top, max(top, bottom)), slice(left, max(left, right))
+
+
+def view_masks(first: np.ndarray, second: np.ndarray, truth: ViewTruth, height: int) -> list[Masks]:
+    """Masks of all instances, in their order, from the last two arrays of `view_task`. Every instance picks its own of all edges."""
+    seen, whole = (listed_edges(array, height) if truth.listed else find_edges(array, truth.top, truth.left) for array in (first, second))
     return [Masks(whole.runs_with(number), seen.runs_of(1 + number)) for number in truth.instance_id.tolist()]
 
 
 def write_view(
-    color: np.ndarray, depth: np.ndarray, instance: np.ndarray, amodal: np.ndarray, scene: Path, settings: ViewSettings, truth: ViewTruth
+    color: np.ndarray, depth: np.ndarray, first: np.ndarray, second: np.ndarray, scene: Path, settings: ViewSettings, truth: ViewTruth
 ) -> None:
-    """Write a view's pictures into the folders of a scene, and its records, one a line, into `RECORDS`.
+    """Write what `view_task` gave: pictures into the folders of a scene, and records, one a line, into `RECORDS`.
 
     Lines: scene_camera, scene_gt, scene_gt_info, then one COCO annotation each, without its id.
     """
@@ -130,7 +151,7 @@ def write_view(
     with open_folder(scene) as folder:
         folder.write(f"rgb/{name}{settings.color_suffix}", encode_color(color, settings))
         folder.write(f"depth/{name}.png", encode_png(depth))
-        masks = view_masks(instance, amodal, truth) if settings.masks or settings.coco else []
+        masks = view_masks(first, second, truth, height) if settings.masks or settings.coco else []
         if settings.masks:
             for index, mask in enumerate(masks):
                 whole, seen = encode_masks(mask, height, width)

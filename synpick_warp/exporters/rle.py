@@ -73,6 +73,12 @@ class Edges:
         return Runs(self.column[index[::2]], row[::2], row[1::2])
 
 
+def listed_edges(edges: np.ndarray, height: int) -> Edges:
+    """The edges that a device listed, (3, N) as in `FrameBatch.edges`, of images so high."""
+    column, row = np.divmod(edges[0].astype(np.int64), height + 1)
+    return Edges(column, row, edges[1], edges[2])
+
+
 def find_edges(image: np.ndarray, top: int = 0, left: int = 0) -> Edges:
     """The edges of an image that is 0 outside of a part (h, w), whose first pixel is at row `top` and column `left`."""
     rows, columns = image.shape

@@ -42,7 +42,7 @@ class SceneExporter(ABC):
     hidden: ClassVar[str]
     """Folder in `PARTIAL`."""
     write_view: ClassVar[Callable[..., None]]
-    """Task that writes a view: color, depth, instance, amodal, hidden folder of the scene, `ViewSettings`, `ViewTruth`."""
+    """Task that writes a view: the arrays of `view_task`, hidden folder of the scene, `ViewSettings`, `ViewTruth`."""
 
     def __init__(self, data_set: DataSet) -> None:
         """See `Exporter`."""

@@ -46,7 +46,7 @@ def shard_name(scene: int, part: int) -> str:
 
 
 def write_shard_view(
-    color: np.ndarray, depth: np.ndarray, instance: np.ndarray, amodal: np.ndarray, scene: Path, settings: ViewSettings, truth: ViewTruth
+    color: np.ndarray, depth: np.ndarray, first: np.ndarray, second: np.ndarray, scene: Path, settings: ViewSettings, truth: ViewTruth
 ) -> None:
     """Write all of a view as tar entries, without a tar file's end, to a file in a scene's folder that is named as the frame."""
     height, width = depth.shape
@@ -58,7 +58,7 @@ def write_shard_view(
         ("gt_info.json", to_json(info_records(truth))),
     ]
     if settings.masks:
-        masks = view_masks(instance, amodal, truth)
+        masks = view_masks(first, second, truth, height)
         entries.append(("mask.json", _mask_json((mask.whole for mask in masks), height, width)))
         entries.append(("mask_visib.json", _mask_json((mask.seen for mask in masks), height, width)))
     key = f"{truth.scene:06d}_{truth.frame:06d}"

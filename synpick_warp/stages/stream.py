@@ -13,6 +13,7 @@ from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch, edge_sizes, list_edges
 from synpick_warp.stages.record import host_record, record_arrays, tick_measures
 from synpick_warp.stages.render import Renderer
 from synpick_warp.stages.simulate import TickRecord
@@ -184,7 +185,11 @@ class FrameStream:
         self.device = device
         self.copy_stream = wp.Stream(device) if device.is_cuda else None
         self.buffers = [allocate(ViewBuffers, sizes, device) for _ in range(RING if device.is_cuda else 1)]
-        self.copies = [HostCopy([getattr(buffers, item.name) for item in fields(buffers)]) for buffers in self.buffers]
+        self.edges = [allocate(EdgeBuffers, edge_sizes(sizes), device) for _ in self.buffers]
+        self.edge_scratch = allocate(EdgeScratch, edge_sizes(sizes), device)
+        self.copied = [item.name for kind in (ViewBuffers, EdgeBuffers) for item in fields(kind)]
+        pairs = zip(self.buffers, self.edges, strict=True)
+        self.copies = [HostCopy([getattr(part, item.name) for part in pair for item in fields(part)]) for pair in pairs]
         self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.buffers]
 
     def render(self, snapshot: Snapshot, report: TickReport) -> Iterator[FrameBatch]:
@@ -212,14 +217,13 @@ class FrameStream:
         padded[:, : len(world)] = world, camera
         views.assign(padded)
         self.renderer.render(snapshot, views[0], views[1], len(world), self.buffers[slot])
+        list_edges(self.edge_scratch, len(world), self.buffers[slot], self.edges[slot])
         self.copies[slot].start(self.copy_stream)
 
     def _collect(self, waiting: tuple[int, slice], world: np.ndarray, camera: np.ndarray, report: TickReport) -> FrameBatch:
         slot, part = waiting
         count = part.stop - part.start
-        images = {
-            item.name: array[:count] for item, array in zip(fields(self.buffers[slot]), self.copies[slot].wait(), strict=True)
-        }
+        images = {name: array[:count] for name, array in zip(self.copied, self.copies[slot].wait(), strict=True)}
         worlds = world[part]
         frame = report.column("frame")[worlds]
         return FrameBatch(
