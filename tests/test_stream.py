@@ -11,6 +11,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import allocate
+from synpick_warp.exporters.rle import find_edges, listed_edges
 from synpick_warp.kernels import pack, phases
 from synpick_warp.stages import stream, worlds
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
@@ -206,3 +207,15 @@ def test_on_the_processor_a_host_copy_is_the_array_itself(device):
     (seen,) = copy.wait()
     array.fill_(3.0)
     assert seen.tolist() == [3.0] * 4
+
+
+def test_edges_are_those_of_the_batchs_own_images(device):
+    batches, _ = rendered(device, [1, 1, 0, 1, 1], 5)
+    assert sum(made["length"] for made in batches) == 12
+    for made in batches:
+        for view in range(made["length"]):
+            for kind, image in enumerate((made["instance"][view], made["amodal"][view])):
+                edges = listed_edges(made["edges"][view, kind, :, : made["edge_count"][view, kind]], len(image))
+                assert len(edges.column) == 2 * image.shape[1]
+                for name, values in vars(find_edges(image)).items():
+                    np.testing.assert_array_equal(getattr(edges, name), values)

@@ -11,7 +11,7 @@ from synpick_warp.kernels.edges import count_edges_kernel, list_edges_kernel
 from synpick_warp.stages.buffers import ViewBuffers
 
 EDGES_PER_COLUMN = 24
-"""Room for edges, as a mean over the columns of an image: five times what a full tote has."""
+"""Room for edges, as a mean over the columns of an image: three times what a tote of 14 objects has."""
 KINDS, PARTS = 2, 3
 """Images; numbers of an edge."""
 
