@@ -43,7 +43,7 @@ FREE = (
 )
 """Settings in which a bake may differ from the one that it goes on with: no episode depends on them. Objects and lights are compared by
 what is in them, not by the name of their folder. A device of another kind computes the same episodes to its own last bits."""
-PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "usd-core", "zarr")
+PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
 """Whose versions files depend on."""
 
 

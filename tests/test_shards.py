@@ -17,8 +17,9 @@ from webdataset import tariterators
 
 from synpick_warp.exporters import shard_parts
 from synpick_warp.exporters.bop import BopExporter
+from synpick_warp.exporters.registry import Exporters
 from synpick_warp.exporters.shards import ShardsExporter
-from tests.exporter_contract import ExporterContract, digests, export, exporting, finish
+from tests.exporter_contract import ExporterContract, digests, export, exporter_data_set, exporting, finish
 from tests.reference.box_views import batches, cameras, config, ends
 
 EPISODES = (0, 2)
@@ -185,3 +186,9 @@ def test_an_empty_data_set_has_an_empty_list(tmp_path):
         assert finish(exporter) == [Path("train_pbr_web/key_to_shard.json")]
     assert json.loads((tmp_path / "train_pbr_web/key_to_shard.json").read_text()) == {}
     assert set(digests(tmp_path / "train_pbr_web")) == {"key_to_shard.json"}
+
+
+def test_constants_that_bop_has_as_well_are_named_once(tmp_path):
+    with exporting(ShardsExporter, tmp_path, config()) as exporter:
+        constants = Exporters((BopExporter, ShardsExporter), exporter_data_set(exporter)).write_constants()
+    assert sorted(map(str, constants)) == ["camera.json", "dataset_info.md", "models", "models_eval"]

@@ -47,8 +47,8 @@ class Exporters:
         self.records = any(exporter.records for exporter in self._all)
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`."""
-        return [path for exporter in self._all for path in exporter.write_constants()]
+        """See `Exporter`; formats may share constants, which then are the same."""
+        return list(dict.fromkeys(path for exporter in self._all for path in exporter.write_constants()))
 
     def write(self, batch: FrameBatch) -> None:
         """See `Exporter`."""
