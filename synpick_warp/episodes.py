@@ -41,13 +41,14 @@ class EpisodeRow(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """As the data set's list of episodes has it."""
-        ending = {"ending": self.ending.name.lower(), "sentence": self.ending.sentence}
-        return {**self._asdict(), "ending": ending["ending"], "sentence": ending["sentence"], "seconds": round(self.seconds, PLACES)}
+        row = {**self._asdict(), "ending": self.ending.name.lower(), "seconds": round(self.seconds, PLACES)}
+        return {**row, "sentence": self.ending.sentence}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> EpisodeRow:
         """From the data set's list of episodes."""
-        return cls(**{name: Ending[row[name].upper()] if name == "ending" else row[name] for name in cls._fields})
+        values: dict[str, Any] = {name: row[name] for name in cls._fields}
+        return cls(**values | {"ending": Ending[row["ending"].upper()]})
 
 
 @dataclass

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +18,7 @@ from synpick_warp.stages import stream, worlds
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.simulate import TickRecord
-from synpick_warp.stages.stream import FrameStream, HostCopy, TickReader, TickReport, view_sizes, views_per_batch
+from synpick_warp.stages.stream import FrameStream, HostCopy, TickReader, TickReport, tick_batch, view_sizes, views_per_batch
 from tests.reference.small_worlds import settings
 
 WORLDS, ROOM = 5, 3
@@ -109,6 +110,32 @@ def test_what_a_batch_says_of_its_views(device):
     ]
     assert made["color"].shape == (6, 6, 8, 3)
     assert made["boxes"].shape == (6, ROOM, 2, 4)
+
+
+def test_what_a_tick_says_of_its_live_worlds():
+    known = report_of([0, 1, 0, 0, 1])
+    numbers = np.arange(WORLDS, dtype=np.float32)
+    fixtures = np.arange(WORLDS * 21, dtype=np.float32).reshape(WORLDS, 3, 7)
+    known = dataclasses.replace(
+        known,
+        snapshot=SimpleNamespace(
+            fixture_pose=fixtures, fixture_visible=np.arange(15).reshape(WORLDS, 3), light=numbers, light_turn=numbers / 2,
+            light_exposure=-numbers,
+        ),
+        tick={"speed": numbers[:, None]},
+        steps={"force": np.repeat(numbers[:, None], 4, axis=1)},
+    )  # fmt: skip
+    batch = tick_batch(known, OBJECT_IDS, 0.25)
+    live = [1, 4]
+    assert len(batch) == 2
+    assert (batch.episode.tolist(), batch.frame.tolist(), batch.time.tolist()) == ([21, 24], [2, 8], [0.5, 2.0])
+    np.testing.assert_array_equal(batch.pose, known.pose[live])
+    np.testing.assert_array_equal(batch.object_id, np.where(known.entry >= 0, OBJECT_IDS[known.entry], -1)[live])
+    np.testing.assert_array_equal(batch.fixture_pose, fixtures[live])
+    assert batch.fixture_visible.tolist() == [[3, 4, 5], [12, 13, 14]]
+    assert (batch.light.tolist(), batch.light_turn.tolist(), batch.light_exposure.tolist()) == ([1, 4], [0.5, 2.0], [-1, -4])
+    assert batch.tick["speed"].tolist() == [[1.0], [4.0]]
+    assert batch.steps["force"].tolist() == [[1.0] * 4, [4.0] * 4]
 
 
 def test_a_tick_that_is_stopped_early_leaves_nothing_behind(device):

@@ -142,12 +142,13 @@ def compare_bytes(name: str, first: bytes, second: bytes) -> Difference | None:
     """Content of two files of a name."""
     suffix = PurePosixPath(name).suffix
     if suffix in IMAGES:
-        images = (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) for data in (first, second))
-        return compare_arrays(*images, names=("row", "column", "channel"))
+        one, other = (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) for data in (first, second))
+        return compare_arrays(one, other, names=("row", "column", "channel"))
     if suffix == ".json":
         return _from_pairs(compare_values(json.loads(first), json.loads(second)))
     if suffix == ".jsonl":
-        return _from_pairs(compare_values(*([json.loads(line) for line in data.splitlines()] for data in (first, second))))
+        lines, others = ([json.loads(line) for line in data.splitlines()] for data in (first, second))
+        return _from_pairs(compare_values(lines, others))
     if suffix == ".toml":
         pairs = compare_values(tomllib.loads(first.decode()), tomllib.loads(second.decode()))
         return _from_pairs(pair for pair in pairs if pair[0].lstrip(".") not in FREE)
@@ -214,8 +215,8 @@ def compare_zarr(first: Path, second: Path) -> Difference | None:
     """Two arrays on disk."""
     import zarr
 
-    arrays = (np.asarray(zarr.open_array(folder, mode="r")[...]) for folder in (first, second))
-    return compare_arrays(*arrays)
+    one, other = (np.asarray(zarr.open_array(folder, mode="r")[...]) for folder in (first, second))
+    return compare_arrays(one, other)
 
 
 def compare_tars(first: Path, second: Path) -> Difference | None:
