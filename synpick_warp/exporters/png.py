@@ -21,6 +21,8 @@ _GREY, _RGB = 0, 2
 _KINDS = (((), "uint8"), ((), "uint16"), ((3,), "uint8"))
 _ZLIB = b"\x78\x01"
 """How a zlib stream begins (RFC 1950, section 2.2): deflate, window of 32 kB, fastest compression."""
+_LAST = b"\x03\x00"
+"""An empty block with fixed codes, the last of its stream (RFC 1951, section 3.2.6)."""
 _LEVEL = 1
 """ISA-L's level: on depth images, 0 makes files a third larger in the same time, 3 takes twice as long and gains nothing."""
 
@@ -55,7 +57,7 @@ def encode_mask_png(runs: Runs, height: int, width: int) -> bytes:
     begins = runs.first * stride + 1 + runs.column
     ends = (runs.past * stride + 1 + runs.column)[ended]
     if not begins.size:
-        return _assemble(width, height, 8, _GREY, _ZLIB + _zeros(height * stride, True) + _checksum(height * stride, 0, 0))
+        return _assemble(width, height, 8, _GREY, _ZLIB + _zeros(height, stride) + _LAST + _checksum(height * stride, 0, 0))
     top, bottom = int(runs.first.min()), int(runs.past.max())
     rows = min(bottom + 1, height) - top
     canvas = _canvas(height, width)
@@ -66,8 +68,8 @@ def encode_mask_png(runs: Runs, height: int, width: int) -> bytes:
     canvas[begins_here] = canvas[ends_here] = 0
     total = _UP * rows + 255 * begins.size + ends.size
     moment = _UP * stride * (rows * top + rows * (rows - 1) // 2) + 255 * int(begins.sum()) + int(ends.sum())
-    above, below = _zeros(top * stride, False), _zeros((height - top - rows) * stride, True)
-    return _assemble(width, height, 8, _GREY, b"".join((_ZLIB, above, middle, below, _checksum(height * stride, total, moment))))
+    above, below = _zeros(top, stride), _zeros(height - top - rows, stride)
+    return _assemble(width, height, 8, _GREY, b"".join((_ZLIB, above, middle, below, _LAST, _checksum(height * stride, total, moment))))
 
 
 @functools.cache
@@ -78,11 +80,15 @@ def _canvas(height: int, width: int) -> np.ndarray:
     return canvas.ravel()
 
 
+def _zeros(rows: int, stride: int) -> bytes:
+    """Raw deflate of so many rows of zero bytes, from a byte's beginning to a byte's end."""
+    return b"".join(_zero_rows(1 << bit, stride) for bit in range(rows.bit_length()) if rows >> bit & 1)
+
+
 @functools.cache
-def _zeros(count: int, last: bool) -> bytes:
-    """Raw deflate of so many zero bytes, from a byte's beginning to a byte's end; `last`: nothing follows in the stream."""
+def _zero_rows(rows: int, stride: int) -> bytes:
     squeezer = isal_zlib.compressobj(_LEVEL, isal_zlib.DEFLATED, -isal_zlib.MAX_WBITS)
-    return squeezer.compress(bytes(count)) + squeezer.flush(isal_zlib.Z_FINISH if last else isal_zlib.Z_FULL_FLUSH)
+    return squeezer.compress(bytes(rows * stride)) + squeezer.flush(isal_zlib.Z_FULL_FLUSH)
 
 
 def _checksum(count: int, total: int, moment: int) -> bytes:
