@@ -223,3 +223,15 @@ def test_names_of_codes_are_those_of_kernels_and_outcomes():
     for names in (tables.PHASES, tables.MODES, tasks):
         assert [int(getattr(phases, name.upper())) for name in names] == list(range(len(names)))
     assert list(tables.OUTCOMES) == [outcome.name.lower() for outcome in Outcome]
+
+
+def test_an_episode_without_instances_has_empty_axes(tmp_path):
+    (batch,) = ticks((0,), 1)
+    batch.object_id.fill(-1)
+    with exporting(TrajectoryExporter, tmp_path, config(), processes=0) as exporter:
+        exporter.write_constants()
+        exporter.tick(batch)
+        exporter.end(box_views.ends((0,), 1)[0], lambda: None)
+    episode = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000", mode="r")
+    assert episode["steps/pose"].shape == (STEP_COUNT, 0, 7)
+    assert episode["steps/goal"].shape == (STEP_COUNT, 3)

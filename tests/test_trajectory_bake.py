@@ -103,3 +103,11 @@ def test_what_is_opened_is_what_was_baked(out, mixed):
         assert episode.steps["time"].shape == (16 * row["frames"],)
         kinds = episode.arrangement["object_id"][:]
         np.testing.assert_allclose(episode.arrangement["mass"][:], [data.objects[kind - 1].mass for kind in kinds])
+
+
+def test_the_table_of_memory_counts_what_is_recorded(mixed):
+    """What a tick is written into, and two records; none for formats that ask for none."""
+    rows = [row for row in bake.describe_arrays(mixed) if row[0] == "StepArrays.pose"]
+    assert rows == [("StepArrays.pose", (1, 16, 4), "m", 16 * 4 * 28)] * 3
+    without = replace(mixed, bake=replace(mixed.bake, formats=("bop",)))
+    assert not any(row[0].startswith("StepArrays") for row in bake.describe_arrays(without))
