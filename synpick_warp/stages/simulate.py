@@ -111,7 +111,7 @@ class Simulation:
         self.seals.peak.zero_()
         if self.recorder is not None:
             self.recorder.keep_drops()
-        physics.tick(self._drive, self._let_go_of_contacts, self.recorder)
+        physics.tick(self._drive, self._let_go_of_contacts, self.recorder if self.config.trajectory.steps else None)
         arrange.judge_settling(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
         act.begin_moving(scene, state, physics, seed)
