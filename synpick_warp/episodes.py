@@ -14,7 +14,7 @@ from synpick_warp.outcome import Ending, Outcome
 from synpick_warp.stages.stream import TickReport
 
 PLACES = 6
-"""Decimal places of a time in the list."""
+"""Decimal places of a time [s]; more would be noise."""
 
 
 class EpisodeRow(NamedTuple):
@@ -41,7 +41,7 @@ class EpisodeRow(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """As the data set's list of episodes has it."""
-        row = {**self._asdict(), "ending": self.ending.name.lower(), "seconds": round(self.seconds, PLACES)}
+        row = {**self._asdict(), "ending": self.ending.name.lower()}
         return {**row, "sentence": self.ending.sentence}
 
     @classmethod
@@ -96,7 +96,7 @@ def episode_row(config: Config, report: TickReport, world: int, record: EpisodeR
     episode, redraw, frame, ending = (int(report.column(name)[world]) for name in ("episode", "redraw", "frame", "ending"))
     tick = config.physics.step * config.physics.steps_per_tick
     return EpisodeRow(
-        episode, redraw, Ending(ending), frame + 1, max(0, frame) * tick,
+        episode, redraw, Ending(ending), frame + 1, round(max(0, frame) * tick, PLACES),
         record.mode, record.objects, len(record.attempts), record.picked, record.lost, record.left,
     )  # fmt: skip
 

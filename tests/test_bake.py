@@ -248,6 +248,15 @@ def test_attempts_are_the_same_in_any_number_of_worlds(picked, tmp_path):
     assert {name for name, _ in other.files().items() ^ picked.files().items()} == {"config.toml"}
 
 
+def test_a_bake_that_grows_lists_the_attempts_of_both(picked, tmp_path):
+    """The first episode's attempts come from its record: by the second bake nobody remembers them."""
+    Baked(tmp_path / "set", **PICKING | {"bake__episodes": 1, "bake__worlds": 1})
+    grown = Baked(tmp_path / "set", **PICKING)
+    assert (grown.summary.resumed, grown.summary.episodes) == (1, picked.summary.episodes)
+    assert grown.summary.outcomes == picked.summary.outcomes
+    assert grown.files() == picked.files()
+
+
 # ---- when something fails ----
 
 
