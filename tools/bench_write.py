@@ -25,6 +25,8 @@ from synpick_warp.stages.stream import TickReport, tick_batch
 
 COPIES = 8
 """Of their episodes, so that files spread over as many folders as those of many worlds do."""
+MOST_FRAMES = 600
+"""Of an episode, as long as those of picking are; formats without pictures write them in no time."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +65,12 @@ def measure_writing(config: Config, factory: Factory, report: TickReport, least:
     cores = len(os.sched_getaffinity(0))
     for name in config.bake.formats:
         (kind,) = exporter_kinds((name,))
-        written = _Written(0.0, 0.0, 0.0, 0.0)
+        written = _Written(0.0, 0.0, 0, 0.0, 0.0, 0.0)
         for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
             written = _write(kind, config, factory, _Given(views, frames), processes, least)
             yield Row("write", f"{name}: views, {processes} process{'es' if processes > 1 else ''}", written.rate, "1/s")
-        yield Row("write", f"{name}: a camera's part of an episode, to finish", 1e3 * written.finish, "ms")
+        yield Row("write", f"{name}: an episode, to finish", 1e3 * written.finish, "ms")
+        yield Row("write", f"{name}: views, with the end of episodes of {written.frames} frames", written.whole_rate, "1/s")
         yield Row("write", f"{name}: files of a view", written.files, "")
         yield Row("write", f"{name}: files of a view", 1e-6 * written.size, "MB")
 
@@ -79,7 +82,11 @@ class _Written:
     rate: float
     """Views written [1/s]."""
     finish: float
-    """Time from the last view to whole episodes, divided by episodes and cameras [s]."""
+    """Time from the last view to whole episodes, divided by their number [s]."""
+    frames: int
+    """Of an episode."""
+    whole_rate: float
+    """Views from the first to whole episodes [1/s]."""
     files: float
     """Files of a view, in whole episodes."""
     size: float
@@ -96,7 +103,7 @@ def _write(kind: type[Exporter], config: Config, factory: Factory, given: _Given
             exporter.write(batch)
         pool.wait()
         frame, started = 0, time.perf_counter()
-        while frame == 0 or time.perf_counter() - started < least:
+        while frame == 0 or (frame < MOST_FRAMES and time.perf_counter() - started < least):
             for copy in range(COPIES):
                 views, frames = given.of(copy, frame)
                 exporter.tick(frames)
@@ -108,10 +115,10 @@ def _write(kind: type[Exporter], config: Config, factory: Factory, given: _Given
         for episode in episodes:
             exporter.end(EpisodeEnd(episode, 0, frame, int(Ending.FINISHED)), lambda: None)
         pool.wait()
-        finish = (time.perf_counter() - started - seconds) / (len(episodes) * len(factory.cameras))
+        finish = time.perf_counter() - started - seconds
         places = [out / path for episode in episodes for path in exporter.files(episode)]
         files = [path for place in places for path in ([place] if place.is_file() else place.rglob("*")) if path.is_file()]
         size = sum(path.stat().st_size for path in files)
         exporter.close()
     count = frame * COPIES * len(given.views)
-    return _Written(count / seconds, finish, len(files) / count, size / count)
+    return _Written(count / seconds, finish / len(episodes), frame, count / (seconds + finish), len(files) / count, size / count)
