@@ -3,69 +3,30 @@
 from __future__ import annotations
 
 import importlib.util
-import io
 import os
 import subprocess
 import sys
 import tomllib
 import types
-from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 import trimesh
 import warp as wp
-from rich.console import Console
 
 from synpick_warp import __version__
 from synpick_warp.cli import main
 from synpick_warp.configs.load import load_config
-from synpick_warp.display import LiveProgress, PlainProgress, print_summary
+from synpick_warp.episodes import BakeSummary, EpisodeRow
 from synpick_warp.errors import OutputError
-from synpick_warp.outcome import Ending, Outcome
-from synpick_warp.progress import Progress, SilentProgress
+from synpick_warp.outcome import Ending
 
 needs_bake = pytest.mark.skipif(importlib.util.find_spec("synpick_warp.bake") is None, reason="there is no bake yet")
 
 
-class Row(NamedTuple):
-    """Stands for episodes.EpisodeRow."""
-
-    episode: int
-    redraw: int
-    ending: Ending
-    frames: int
-    seconds: float
-    mode: str = "move"
-    objects: int = 9
-    attempts: int = 0
-    picked: int = 0
-    lost: int = 0
-    left: int = 9
-
-
-@dataclass
-class Summary:
-    """Stands for episodes.BakeSummary."""
-
-    episodes: list[Row]
-    views: int = 0
-    wall_seconds: float = 0.0
-    redraws: int = 0
-    outcomes: Counter[Outcome] = field(default_factory=Counter)
-    resumed: int = 0
-    stopped: int = 0
-
-    @property
-    def total(self) -> int:
-        return len(self.episodes)
-
-
-def finished(number: int) -> Summary:
-    rows = [Row(episode, 0, Ending.FINISHED, 10, 1.0) for episode in range(number)]
-    return Summary(rows, views=30 * number, wall_seconds=2.0, redraws=1)
+def finished(number: int) -> BakeSummary:
+    rows = [EpisodeRow(episode, 0, Ending.FINISHED, 10, 1.0, "move", 9, 0, 0, 0, 9) for episode in range(number)]
+    return BakeSummary(number, rows, views=30 * number, wall_seconds=2.0, redraws=1)
 
 
 @pytest.fixture
@@ -116,8 +77,8 @@ def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
 
 
 def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, capsys):
-    rows = [Row(0, 0, Ending.FINISHED, 10, 1.0), Row(1, 19, Ending.UNSETTLED, 0, 99.0)]
-    bakes.result = Summary(rows, views=30, wall_seconds=1.0, redraws=19)
+    bakes.result = finished(2)
+    bakes.result.episodes[1] = bakes.result.episodes[1]._replace(redraw=19, ending=Ending.UNSETTLED, frames=0)
     assert main(["bake", "--out", str(tmp_path / "a"), "--device", "cpu", "--episodes", "2"]) == 1
     assert "did not come to rest" in capsys.readouterr().out
 
@@ -298,70 +259,6 @@ def test_a_reader_that_leaves_is_no_fault():
     result = subprocess.run([*COMMAND, "config"], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
     os.close(writer)
     assert (result.returncode, result.stderr) == (141, "")
-
-
-def printed(summary: Summary) -> str:
-    console = Console(file=io.StringIO(), width=120)
-    print_summary(console, summary, Path("data"))  # type: ignore[arg-type]
-    return console.file.getvalue()  # type: ignore[attr-defined]
-
-
-def test_a_short_bake_lists_every_episode():
-    rows = [Row(0, 0, Ending.FINISHED, 120, 61.0), Row(1, 2, Ending.FINISHED, 119, 3661.0)]
-    text = printed(Summary(rows, views=717, wall_seconds=10.0))
-    assert "1:01 " in text
-    assert "1:01:01" in text
-    assert text.count(Ending.FINISHED.sentence) == 2
-    assert "attempts" not in text
-    assert "picked" not in text
-
-
-def test_a_bake_that_picked_tells_of_attempts():
-    rows = [
-        Row(0, 0, Ending.EMPTIED, 573, 38.2, "pick", 9, 10, 9, 0, 0),
-        Row(1, 0, Ending.GAVE_UP, 90, 6.0, "target", 8, 4, 2, 1, 5),
-        Row(2, 0, Ending.FINISHED, 416, 27.7),
-    ]
-    outcomes = Counter({Outcome.DROPPED: 3, Outcome.TARGET_PICKED: 10, Outcome.OTHER_PICKED: 1})
-    text = printed(Summary(rows, views=3000, wall_seconds=10.0, outcomes=outcomes))
-    lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines()]
-    assert [line[-3:] for line in lines if line and line[0] in "012"][:2] == [["10", "9 of 9", "0"], ["4", "2 of 8", "1"]]
-    assert {line[1] for line in lines if line and line[1]} == {"pick", "target", "move"}
-    expected = "14 attempts: target picked 10 (71%), dropped 3 (21%), other picked 1 (7%); 11 of 17 objects picked, 1 lost otherwise"
-    assert expected in text.splitlines()
-
-
-def test_a_long_bake_lists_counts_and_failures():
-    rows = [Row(episode, 0, Ending.NOT_FINITE if episode % 4 == 0 else Ending.FINISHED, 5, 1.0) for episode in range(100)]
-    text = printed(Summary(rows, views=1500, wall_seconds=10.0))
-    assert text.count(Ending.FINISHED.sentence) == 1
-    assert text.count(Ending.NOT_FINITE.sentence) == 1 + 20
-    assert "and 5 more that delivered nothing" in text
-    assert "75 of 100 episodes" in text
-
-
-@pytest.mark.parametrize("kind", [LiveProgress, PlainProgress])
-def test_progress_displays(kind):
-    console = Console(file=io.StringIO(), width=120, highlight=False, force_terminal=kind is LiveProgress)
-    progress: Progress = kind(console)
-    with progress:
-        progress.stage("baking [bold]")
-        for done in range(50):
-            progress.update(episodes_done=done, episodes=50, worlds_active=4, views=done, views_per_s=3.0, seconds_left=90.0)
-        progress.note("note [x]")
-    text = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "note [x]" in text
-    assert "1:30 left" in text
-    if kind is PlainProgress:
-        lines = ["baking [bold]", "episodes 0/50 · worlds 4 · views 0 · 3.0 views/s · 1:30 left", "note [x]"]
-        assert text.splitlines() == [f"   0:00  {line}" for line in lines]
-
-
-def test_silence():
-    with SilentProgress() as progress:
-        progress.stage("a")
-        progress.update(episodes_done=0, episodes=1, worlds_active=1, views=0, views_per_s=0.0, seconds_left=None)
-        progress.note("b")
 
 
 PLY_HEAD = "ply\nformat ascii 1.0\n{comment}element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
