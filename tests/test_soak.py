@@ -7,12 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-TICKS = 200
-"""A short soak; `python -m tests.reference.soak` makes 10,000."""
+TICKS = 100
+"""A short soak; `python -m tests.reference.soak` makes 10,000. One writer, so that it has done all kinds of work by half time."""
 
 
 def test_memory_and_open_files_stay_as_they_are():
-    command = [sys.executable, "-m", "tests.reference.soak", "--ticks", str(TICKS)]
+    command = [sys.executable, "-m", "tests.reference.soak", "--ticks", str(TICKS), "--writers", "1"]
     done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=True)
     found = json.loads(done.stdout)
     late = slice(len(found["memory"]) // 2, None)

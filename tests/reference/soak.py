@@ -38,7 +38,6 @@ FRAMES = 25
 SEEN = 8
 """Frames that come again and again."""
 SAMPLES = 50
-WRITERS = 2
 KEPT = 4
 """Episodes whose files stay, so that no disk fills."""
 
@@ -57,7 +56,7 @@ def renamed(batch: Any, episodes: np.ndarray, frame: int) -> Any:
     return dataclasses.replace(batch, episode=number, frame=np.full(len(number), frame, np.int32))
 
 
-def given(lenses: tuple) -> list[tuple[FrameBatch, TickBatch]]:
+def frames_of(lenses: tuple) -> list[tuple[FrameBatch, TickBatch]]:
     """Views and ticks of SEEN frames."""
     worlds = tuple(range(WORLDS))
     views = list(box_views.batches(WORLDS * len(lenses), worlds, SEEN, lenses))
@@ -80,13 +79,13 @@ def sample(pool: WriterPool) -> tuple[int, int]:
     return memory, files
 
 
-def soak(ticks: int, out: Path) -> tuple[list[int], list[int]]:
+def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
     """Samples of memory and of open files."""
     config, lenses = settings()
     kinds = exporter_kinds(config.bake.formats)
-    frames = given(lenses)
+    frames = frames_of(lenses)
     memory, files = [], []
-    with Output(out, config, ()) as output, WriterPool(WRITERS, slot_bytes(kinds, config), output.lock) as pool:
+    with Output(out, config, ()) as output, WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
         exporters = Exporters(kinds, DataSet(out, config, box_views.catalog(), lenses, skies(), pool))
         output.begin(exporters, {}, pool)
         for tick in range(ticks):
@@ -120,9 +119,10 @@ def main() -> None:
     """See above."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--ticks", type=int, default=10_000)
-    count = parser.parse_args().ticks
+    parser.add_argument("--writers", type=int, default=2)
+    given = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        memory, files = soak(count, Path(folder) / "set")
+        memory, files = soak(given.ticks, given.writers, Path(folder) / "set")
     late = memory[len(memory) // 5 :]
     print(json.dumps({"memory": memory, "files": files, "growth": max(late) / min(late) - 1.0}))
 
