@@ -107,7 +107,7 @@ class Output:
         whole = {number for number in recorded if seems_whole(self.out, episode_place(number))}
         self.before = sorted(whole.intersection(self.episodes))
         self.left = sorted(set(self.episodes) - whole)
-        self._strays = sorted(set(range(max(episodes, _episodes_of(out)))) - whole)
+        self._strays = sorted(set(range(max(episodes, _episodes_of(out)))) - whole) if self._known else []
 
     def is_finished(self) -> bool:
         """Whether nothing is left to do."""

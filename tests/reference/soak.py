@@ -46,7 +46,7 @@ def settings() -> tuple[Config, tuple]:
     """Small pictures, all formats, and the cameras."""
     lenses = box_views.cameras(48, 36)
     config = trajectories.config(chunk_ticks=8, shard_chunks=4)
-    bake = dataclasses.replace(config.bake, formats=FORMATS, episodes=1_000_000)
+    bake = dataclasses.replace(config.bake, formats=FORMATS, episodes=1)
     return dataclasses.replace(config, bake=bake, cameras=dataclasses.replace(config.cameras, resolution=(48, 36))), lenses
 
 
