@@ -19,13 +19,14 @@ from synpick_warp import output
 from synpick_warp.cli import main
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.files import PARTIAL
-from synpick_warp.manifest import recorded_episodes
+from synpick_warp.manifest import CONSTANTS, episode_place, read_checksums, recorded_episodes
 from synpick_warp.merge import merge
 from synpick_warp.verify import verify
 from tests.reference.bake_server import TINY, BakeServer
 
 KILLS = 20
 EPISODES = TINY["bake.episodes"]
+PAGE = os.sysconf("SC_PAGE_SIZE")
 FILES_OF_THE_MANIFEST = 2 + 2 * (EPISODES + 2)
 """Settings, manifest and records have no checksum of their own."""
 
@@ -238,11 +239,16 @@ def goes_on_after(server: BakeServer, out: Path, log: Path, expected: dict[str, 
 
 
 @pytest.fixture
-def small_disk(tmp_path) -> Iterator[Path]:
-    """A file system with room for some episodes."""
+def small_disk(whole, tmp_path) -> Iterator[Path]:
+    """A file system with room for half of the episodes, and a little more."""
     folder = tmp_path / "disk"
     folder.mkdir()
-    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=3500k", "tmpfs", folder], capture_output=True).returncode:
+    constants, episodes = (
+        sum(-(-(whole / name).stat().st_size // PAGE) * PAGE for place in places for name in read_checksums(whole, place))
+        for places in ([CONSTANTS], [episode_place(number) for number in range(EPISODES)])
+    )
+    size = f"size={(constants + 0.6 * episodes) / 1024:.0f}k"
+    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", folder], capture_output=True).returncode:
         pytest.skip("mounting needs root")
     yield folder
     subprocess.run(["umount", folder], check=True)
