@@ -48,7 +48,8 @@ class EpisodeRow(NamedTuple):
     def from_json(cls, row: Mapping[str, Any]) -> EpisodeRow:
         """From the data set's list of episodes."""
         values: dict[str, Any] = {name: row[name] for name in cls._fields}
-        return cls(**values | {"ending": Ending[row["ending"].upper()]})
+        values["ending"] = Ending[row["ending"].upper()]
+        return cls(**values)
 
 
 @dataclass

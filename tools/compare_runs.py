@@ -143,6 +143,8 @@ def compare_bytes(name: str, first: bytes, second: bytes) -> Difference | None:
     suffix = PurePosixPath(name).suffix
     if suffix in IMAGES:
         one, other = (cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) for data in (first, second))
+        if one is None or other is None:
+            return Difference("no image")
         return compare_arrays(one, other, names=("row", "column", "channel"))
     if suffix == ".json":
         return _from_pairs(compare_values(json.loads(first), json.loads(second)))
@@ -240,7 +242,8 @@ def compare_usd(first: Path, second: Path) -> Difference | None:
     """Two layers, as text."""
     from pxr import Sdf
 
-    texts = [Sdf.Layer.OpenAsAnonymous(str(path)).ExportToString().splitlines() for path in (first, second)]
+    layers = (Sdf.Layer.OpenAsAnonymous(str(path)) for path in (first, second))  # type: ignore[attr-defined]
+    texts = [layer.ExportToString().splitlines() for layer in layers]
     for number, (one, other) in enumerate(zip(*texts, strict=False), start=1):
         if one != other:
             return Difference(f"line {number} as text: {one.strip()} and {other.strip()}")
