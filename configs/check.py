@@ -45,7 +45,8 @@ def checked(key: str, value: object, item: dataclasses.Field[Any], kind: Any, so
     except _MismatchError:
         raise ConfigError(f"{key} is {shown(value)} {source}; allowed: {describe_kind(kind)}{_unit(item)}") from None
     if not all(_inside(leaf, item) for leaf in _leaves(result)):
-        hint = did_you_mean(str(value), item.metadata["choices"])
+        wrong = next(leaf for leaf in _leaves(result) if not _inside(leaf, item))
+        hint = did_you_mean(str(wrong), item.metadata["choices"])
         raise ConfigError(f"{key} is {shown(value)} {source}; allowed: {allowed(item, kind)}{_unit(item)}{hint}")
     return result
 

@@ -27,6 +27,7 @@ def complaints(config: Config) -> Iterator[Complaint]:
     yield from _times(config)
     yield from _pick(config)
     yield from _suction(config)
+    yield from _render(config)
     yield from _bop(config)
     yield from _object_rows(config)
 
@@ -91,6 +92,12 @@ def _suction(config: Config) -> Iterator[Complaint]:
         yield "suction.tolerated_misses", f"less than suction.rays, {suction.rays}: a ray must hit"
     if suction.poor_force > suction.good_force:
         yield "suction.poor_force", f"at most suction.good_force, {suction.good_force:g} [N]"
+
+
+def _render(config: Config) -> Iterator[Complaint]:
+    layers = config.render.layers
+    if len(set(layers)) < len(layers):
+        yield "render.layers", f"each layer once: {shown(list(dict.fromkeys(layers)))}"
 
 
 def _bop(config: Config) -> Iterator[Complaint]:

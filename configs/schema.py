@@ -37,6 +37,8 @@ FAST = "fast"
 REFERENCE = "reference"
 SHADINGS = (FAST, REFERENCE)
 """How colour is made."""
+LAYERS = ("normals", "albedo", "nocs", "classes", "flow", "scene_flow")
+"""What a picture can have besides colour, depth and instances; `synpick_warp.layers` says what each is."""
 
 
 @dataclass(frozen=True)
@@ -305,6 +307,7 @@ class Render:
     color_samples: int = setting(1, "", "Colour samples a pixel; depth and masks always have one.", low=1, high=64)
     table: bool = setting(True, "", "A table under the tote; without it the light map shows.")
     table_color: tuple[float, float, float] = setting((0.45, 0.45, 0.44), "sRGB", "Base colour of the table.", low=0.0, high=1.0)
+    layers: tuple[str, ...] = setting((), "", "What each view has besides colour, depth and masks: a list of these.", choices=LAYERS)
     views_per_batch: int = setting(0, "", "Views rendered and copied at once; 0: chosen by device and resolution.", low=0)
 
 

@@ -14,8 +14,9 @@ from synpick_warp.kernels.hits import Bodies, Hits, prepare_bodies_kernel, trace
 from synpick_warp.kernels.occlusion import OcclusionRays, Sample, filter_occlusion_kernel, occlude_kernel
 from synpick_warp.kernels.shading import develop_kernel, shade_kernel
 from synpick_warp.stages.annotate import annotate
-from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels
+from synpick_warp.stages.layers import LayerPainter
 from synpick_warp.stages.reference import ReferencePicture
 from synpick_warp.stages.render_scene import RenderScene
 
@@ -115,8 +116,17 @@ class Renderer:
         self.rays.ambient_reach = AMBIENT_REACH
         self.samples = color_samples(config.render.color_samples)
         self.reference = ReferencePicture(config, scene, instances) if config.render.mode == REFERENCE else None
+        self.layers = LayerPainter(config, scene, instances, views)
 
-    def render(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
+    def render(
+        self,
+        snapshot: Snapshot,
+        view_world: wp.array,
+        view_camera: wp.array,
+        count: int,
+        out: ViewBuffers,
+        layers: LayerBuffers | None = None,
+    ) -> None:
         """Render and annotate the first `count` views.
 
         Args:
@@ -125,6 +135,7 @@ class Renderer:
             view_camera: Camera of each view (B) int32.
             count: Views in use, known on the host.
             out: Written.
+            layers: Written, if given.
 
         Raises:
             ValueError: More views than there is scratch for.
@@ -135,7 +146,9 @@ class Renderer:
             return
         self.prepare_bodies(snapshot, view_world, view_camera, count)
         self.trace_hits(view_camera, count, out)
-        # Layers made from `hits` belong here: further colour samples replace them.
+        if layers is not None:
+            # Here, because further colour samples replace the hits.
+            self.layers.draw(snapshot, self.bodies, self.hits, view_world, view_camera, count, layers)
         if self.reference is None:
             self.shade_samples(snapshot, view_world, view_camera, count)
         else:

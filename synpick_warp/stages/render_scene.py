@@ -33,6 +33,8 @@ class RenderScene:
     lights: Any
     table: Any
     grid: Any
+    obj_id: wp.array
+    """Of each catalog entry (entry) int32."""
     camera_count: int
     device: wp.Device
     keep: tuple[wp.Mesh, ...]
@@ -192,6 +194,7 @@ def build_render_scene(
         lights=build_lights(lights, ground, config.render.exposure, device),
         table=table,
         grid=build_grid(cameras[0].width, cameras[0].height),
+        obj_id=wp.array([entry.obj_id for entry in catalog.entries], dtype=wp.int32, device=device),
         camera_count=len(cameras),
         device=device,
         keep=keep,
