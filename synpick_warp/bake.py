@@ -34,7 +34,8 @@ from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.shapes import Camera, Catalog
 from synpick_warp.scenes.tote import tote_fixture
-from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import FIXTURES, LastFrame, LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.layers import MOVING, MotionArrays
 from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
 from synpick_warp.stages.plan import CycleArrays, VoteArrays, plan_sizes
 from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays, Renderer
@@ -258,12 +259,15 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     views = view_sizes(config, device)
     views["body"] = room + len(FIXTURES)
     ring = RING if device.is_cuda else 1
-    groups = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState)]
+    groups = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState, LastFrame)]
     groups += [(kind, worlds, 1 + RECORDS) for kind in (Sighting, Plan)]
     groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
     groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
+    if MOVING.intersection(config.render.layers):
+        groups += [(MotionArrays, views, 1)]
     if may_pick(config):
         looks = count_views(config, room, device)
         groups += [(kind, sight_sizes(config, room, looks), 1) for kind in SCRATCH]
         groups += [(kind, plan_sizes(config, room, looks), 1) for kind in (VoteArrays, CycleArrays)]
-    return [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
+    rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
+    return rows + ring * memory_table(LayerBuffers, views, config.render.layers)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -46,6 +46,8 @@ class FrameBatch:
     """px_count_all, px_count_valid, px_count_visib (B, I, 3) int32."""
     boxes: np.ndarray
     """bbox_obj and bbox_visib as x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty (B, I, 2, 4) int32."""
+    layers: dict[str, np.ndarray] = field(default_factory=dict)
+    """The layers that the settings name (B, H, W[, C]); see `synpick_warp.layers`."""
 
     def __len__(self) -> int:
         return len(self.episode)

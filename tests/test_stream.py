@@ -11,6 +11,8 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import allocate
+from synpick_warp.configs.schema import LAYERS
+from synpick_warp.frames import FrameBatch
 from synpick_warp.kernels import pack, phases
 from synpick_warp.stages import stream, worlds
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
@@ -29,11 +31,10 @@ class FakeRenderer:
 
     calls: list[tuple[Any, list[int], list[int], int]]
 
-    def render(self, snapshot, view_world, view_camera, count, out) -> None:
+    def render(self, snapshot, view_world, view_camera, count, out, layers) -> None:
         world, camera = view_world.numpy(), view_camera.numpy()
         self.calls.append((snapshot, world.tolist(), camera.tolist(), count))
-        for name in vars(out):
-            array = getattr(out, name)
+        for array in (*vars(out).values(), *(array for array in vars(layers).values() if array is not None)):
             values = array.numpy()
             shape = (count,) + (1,) * (values.ndim - 1)
             values[:count] = (10 * world[:count] + camera[:count] + 1).reshape(shape)
@@ -56,11 +57,15 @@ def report_of(live: list[int]) -> TickReport:
     return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace())
 
 
-def rendered(device, live: list[int], batch: int) -> tuple[list[dict[str, np.ndarray]], FakeRenderer]:
+def rendered(device, live: list[int], batch: int, **overrides: object) -> tuple[list[dict[str, Any]], FakeRenderer]:
     renderer = FakeRenderer([])
-    frames = FrameStream(config_of(render__views_per_batch=batch), renderer, OBJECT_IDS, device)
-    batches = frames.render("snapshot", report_of(live))
-    return [{name: np.array(value) for name, value in vars(made).items()} | {"length": len(made)} for made in batches], renderer
+    frames = FrameStream(config_of(render__views_per_batch=batch, **overrides), renderer, OBJECT_IDS, device)
+    return [copied(made) for made in frames.render("snapshot", report_of(live))], renderer
+
+
+def copied(batch: FrameBatch) -> dict[str, Any]:
+    arrays = {name: np.array(value) for name, value in vars(batch).items() if name != "layers"}
+    return arrays | {"layers": {name: value.copy() for name, value in batch.layers.items()}, "length": len(batch)}
 
 
 @pytest.mark.parametrize("live", [[1, 1, 1, 1, 1], [0, 1, 0, 1, 1], [0, 0, 0, 0, 1]])
@@ -81,6 +86,30 @@ def test_live_views_come_world_by_world_and_camera_by_camera(device, live, batch
         for name in ("color", "depth", "instance", "amodal", "pixels", "boxes"):
             assert len(made[name]) == count
             assert (made[name].reshape(count, -1) == code[:, None]).all(), name
+
+
+def test_layers_come_if_they_are_asked_for_each_with_its_views(device):
+    (made,), _ = rendered(device, [0, 1, 0, 0, 1], 100)
+    assert made["layers"] == {}
+    batches, _ = rendered(device, [0, 1, 0, 0, 1], 4, render__layers=["scene_flow", "normals", "classes", "albedo"])
+    code = iter([11, 12, 13, 41, 42, 43])
+    for made in batches:
+        layers = made["layers"]
+        # The order is that of the declaration, whatever that of the setting.
+        assert list(layers) == [name for name in LAYERS if name in layers] == ["normals", "albedo", "classes", "scene_flow"]
+        assert [layers[name].dtype.name for name in layers] == ["float32", "uint8", "uint16", "float32"]
+        assert [layers[name].shape[1:] for name in layers] == [(6, 8, 3), (6, 8, 3), (6, 8), (6, 8, 3)]
+        for view in range(made["length"]):
+            expected = next(code)
+            assert all((array[view] == expected).all() for array in layers.values())
+
+
+def test_layers_make_batches_smaller():
+    gpu = SimpleNamespace(is_cuda=True)
+    large = {"bake__worlds": 1000, "cameras__resolution": [1920, 1080]}
+    count = views_per_batch(settings(**large, render__layers=list(LAYERS)), gpu)
+    pixel = stream.PIXEL_BYTES + 12 + 3 + 12 + 2 + 8 + 12
+    assert count * 1920 * 1080 * pixel <= stream.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
 
 
 def test_no_live_world_gives_no_batch(device):

@@ -9,10 +9,10 @@ from types import SimpleNamespace
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate
+from synpick_warp.arrays import allocate, memory_table
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch
-from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render import Renderer
 from synpick_warp.stages.simulate import TickRecord
 from synpick_warp.stages.worlds import MEASURE_COLUMNS, STATUS_COLUMNS
@@ -33,11 +33,13 @@ def views_per_batch(config: Config, device: wp.Device) -> int:
     if not device.is_cuda:
         return views
     width, height = config.cameras.resolution
-    return max(1, min(BATCH_BYTES // (width * height * PIXEL_BYTES), views * config.bake.worlds))
+    one = {"view": 1, "row": height, "column": width}
+    layers = sum(size for *_, size in memory_table(LayerBuffers, one, config.render.layers))
+    return max(1, min(BATCH_BYTES // (width * height * PIXEL_BYTES + layers), views * config.bake.worlds))
 
 
 def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
-    """Extents of the dimensions that `ViewBuffers` names."""
+    """Extents of the dimensions that `ViewBuffers` and `LayerBuffers` name."""
     width, height = config.cameras.resolution
     return {
         "view": views_per_batch(config, device),
@@ -143,8 +145,15 @@ class FrameStream:
         self.batch = sizes["view"]
         self.device = device
         self.copy_stream = wp.Stream(device) if device.is_cuda else None
-        self.buffers = [allocate(ViewBuffers, sizes, device) for _ in range(RING if device.is_cuda else 1)]
-        self.copies = [HostCopy([getattr(buffers, item.name) for item in fields(buffers)]) for buffers in self.buffers]
+        self.images = [item.name for item in fields(ViewBuffers)]
+        self.layers = [item.name for item in fields(LayerBuffers) if item.name in config.render.layers]
+        ring = range(RING if device.is_cuda else 1)
+        self.buffers = [allocate(ViewBuffers, sizes, device) for _ in ring]
+        self.layer_buffers = [allocate(LayerBuffers, sizes, device, self.layers) for _ in ring]
+        self.copies = [
+            HostCopy([getattr(images, name) for name in self.images] + [getattr(layers, name) for name in self.layers])
+            for images, layers in zip(self.buffers, self.layer_buffers, strict=True)
+        ]
         self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.buffers]
 
     def render(self, snapshot: Snapshot, report: TickReport) -> Iterator[FrameBatch]:
@@ -171,15 +180,13 @@ class FrameStream:
         padded = np.zeros((2, self.batch), dtype=np.int32)
         padded[:, : len(world)] = world, camera
         views.assign(padded)
-        self.renderer.render(snapshot, views[0], views[1], len(world), self.buffers[slot])
+        self.renderer.render(snapshot, views[0], views[1], len(world), self.buffers[slot], self.layer_buffers[slot])
         self.copies[slot].start(self.copy_stream)
 
     def _collect(self, waiting: tuple[int, slice], world: np.ndarray, camera: np.ndarray, report: TickReport) -> FrameBatch:
         slot, part = waiting
         count = part.stop - part.start
-        images = {
-            item.name: array[:count] for item, array in zip(fields(self.buffers[slot]), self.copies[slot].wait(), strict=True)
-        }
+        arrays = {name: array[:count] for name, array in zip(self.images + self.layers, self.copies[slot].wait(), strict=True)}
         worlds = world[part]
         frame = report.column("frame")[worlds]
         return FrameBatch(
@@ -189,5 +196,6 @@ class FrameStream:
             time=frame * self.tick_time,
             object_id=self.object_ids[report.entry[worlds]],
             pose=report.pose[worlds],
-            **images,
+            **{name: arrays[name] for name in self.images},
+            layers={name: arrays[name] for name in self.layers},
         )
