@@ -10,9 +10,10 @@ import warp as wp
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import REFERENCE, Config
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
+from synpick_warp.kernels.develop import develop_kernel
 from synpick_warp.kernels.hits import Bodies, Hits, prepare_bodies_kernel, trace_hits_kernel, trace_sample_kernel
 from synpick_warp.kernels.occlusion import OcclusionRays, Sample, filter_occlusion_kernel, occlude_kernel
-from synpick_warp.kernels.shading import develop_kernel, shade_kernel
+from synpick_warp.kernels.shading import shade_kernel
 from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels
