@@ -13,7 +13,7 @@ import numpy as np
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.bop_models import CAMERA_FILE, MODEL_FOLDERS, NOTES_FILE, write_constants
 from synpick_warp.exporters.bop_scene import SceneSettings, drop_scenes, finish_episode, make_scene
-from synpick_warp.exporters.bop_view import MILLIMETERS, ViewSettings, ViewTruth, write_view
+from synpick_warp.exporters.bop_view import MILLIMETERS, ViewSettings, ViewTruth, write_layer, write_view
 from synpick_warp.exporters.files import PARTIAL, output_error, prepare_output
 from synpick_warp.exporters.pool import WriterPool, shared_bytes
 from synpick_warp.exporters.targets import BOP19, BOP24, join_targets, write_scene_targets
@@ -23,6 +23,8 @@ from synpick_warp.scenes.shapes import Camera, Catalog
 
 _PIXEL_BYTES = (3, 2, 1, 4)
 """Of `FrameBatch`'s color, depth, instance and amodal."""
+_LAYER_BYTES = 12
+"""Of a pixel of the largest layer."""
 
 
 @dataclass(eq=False)
@@ -32,7 +34,7 @@ class _Episode:
     scenes: tuple[Path, ...]
     """Hidden folder of each camera's scene."""
     pending: int = 0
-    """Views that are not on the disk yet."""
+    """Views and layers of views that are not on the disk yet."""
     end: EpisodeEnd | None = None
 
 
@@ -54,6 +56,7 @@ class BopExporter:
         prepare_output(out)
         self._out = out
         self._config = config.bop
+        self._layers = config.render.layers
         self._cameras = cameras
         self._pool = pool
         self._split = out / config.bop.split
@@ -82,8 +85,17 @@ class BopExporter:
                 (batch.color[view], batch.depth[view], batch.instance[view], batch.amodal[view]),
                 (scene, self._views[camera], _truth(batch, view)),
                 path=self._place(number, camera),
-                done=partial(self._view_done, number, episode),
+                done=partial(self._part_done, number, episode),
             )
+            for name in self._layers:
+                episode.pending += 1
+                self._pool.submit(
+                    write_layer,
+                    (batch.layers[name][view],),
+                    (scene, name, int(batch.frame[view])),
+                    path=self._place(number, camera),
+                    done=partial(self._part_done, number, episode),
+                )
 
     def end(self, end: EpisodeEnd) -> None:
         """See `Exporter`."""
@@ -132,13 +144,13 @@ class BopExporter:
         episode = _Episode(tuple(self._out / PARTIAL / name for name in names))
         for scene in episode.scenes:
             try:
-                make_scene(scene, self._config.masks)
+                make_scene(scene, self._config.masks, self._layers)
             except OSError as error:
                 raise output_error(scene, error) from error
         self._episodes[number] = episode
         return episode
 
-    def _view_done(self, number: int, episode: _Episode) -> None:
+    def _part_done(self, number: int, episode: _Episode) -> None:
         episode.pending -= 1
         self._finish_if_whole(number, episode)
 
@@ -174,8 +186,9 @@ class BopExporter:
 
 
 def view_bytes(camera: Camera) -> int:
-    """Room that a view's images take in the pool's shared memory [B]."""
-    return shared_bytes(camera.height * camera.width * size for size in _PIXEL_BYTES)
+    """Room that a view's images, or one of its layers, take at most in the pool's shared memory [B]."""
+    pixels = camera.height * camera.width
+    return max(shared_bytes(pixels * size for size in _PIXEL_BYTES), shared_bytes((pixels * _LAYER_BYTES,)))
 
 
 def _truth(batch: FrameBatch, view: int) -> ViewTruth:

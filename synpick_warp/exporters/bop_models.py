@@ -13,6 +13,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop_view import MILLIMETERS
 from synpick_warp.exporters.png import encode_png
+from synpick_warp.layers import layer_notes
 from synpick_warp.scenes.shapes import Camera, Catalog, CatalogEntry, Material
 
 CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
@@ -173,7 +174,7 @@ BOP challenge (scenewise). Camera c of episode k is scene {count} · k + c of `{
   in an image's list.
 - `mask_visib` is exact: what the ray through the pixel's centre meets first. The masks of an image do not overlap.
 - `px_count_all` and `bbox_obj` count what lies outside of the picture too, up to one picture's size beyond each border.
-- `models_eval/` equals `models/`.
+{layer_notes(config.render.layers)}- `models_eval/` equals `models/`.
 - The toolkit has no place for new data sets: add this one's name to `dataset_params.py` (im_size {(camera.width, camera.height)}).
 
 | obj_id | name | mass [kg] |

@@ -15,6 +15,7 @@ import numpy as np
 
 from synpick_warp.exporters.png import encode_mask_png, encode_png
 from synpick_warp.exporters.rle import Crop, amodal_crop, run_lengths, visible_crop
+from synpick_warp.layers import encode_layer, layer_path
 
 RECORDS = "records"
 """Folder of views' records, in a scene that is not whole yet."""
@@ -83,6 +84,11 @@ def write_view(
             annotations.append(annotation)
     lines = (settings.camera, gt_records(truth, settings.camera), infos, *annotations)
     (scene / RECORDS / name).write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="ascii")
+
+
+def write_layer(values: np.ndarray, scene: Path, name: str, frame: int) -> None:
+    """Write a view's layer into the folder of that name."""
+    layer_path(scene, name, frame).write_bytes(encode_png(encode_layer(name, values)))
 
 
 def _encode_color(color: np.ndarray, settings: ViewSettings) -> bytes:

@@ -17,7 +17,7 @@ _NONE, _UP = 0, 2
 """Filter types of the PNG specification, section 9.2: the bytes as they are; minus the byte above."""
 _GREY, _RGB = 0, 2
 """Colour types of the PNG specification, table 11.1."""
-_KINDS = (((), "uint8"), ((), "uint16"), ((3,), "uint8"))
+_KINDS = (((), "uint8"), ((), "uint16"), ((3,), "uint8"), ((3,), "uint16"))
 _LEVEL = 1
 """ISA-L's level: on depth images, 0 makes files a third larger in the same time, 3 takes twice as long and gains nothing."""
 
@@ -26,7 +26,7 @@ def encode_png(image: np.ndarray) -> bytes:
     """An image as a PNG file.
 
     Args:
-        image: Grey (H, W) uint8 or uint16, or colour (H, W, 3) uint8, red first.
+        image: Grey (H, W) or colour (H, W, 3), red first; uint8 or uint16.
     """
     if (image.shape[2:], image.dtype.name) not in _KINDS or not image.size:
         raise ValueError(f"no PNG for an image of shape {image.shape} and type {image.dtype}")

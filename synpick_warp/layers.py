@@ -1,0 +1,159 @@
+"""Layers as files: how their numbers are kept in PNG images, and how to get them back.
+
+    flow = read_layer(Path("DATA/train_pbr/000003"), "flow", 17)      # (H, W, 2) float32 [px], NaN: unknown
+
+Axes are the camera's: x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from synpick_warp.errors import DatasetError
+
+_ZERO = 32768
+"""Code of 0 in a signed layer; codes are 16 bits."""
+_LAST = 65535
+_NORMAL_STEPS = 32767
+"""Steps from 0 to 1 of a normal's component."""
+_FLOW_STEPS = 64
+"""Steps of a pixel, as in KITTI's flow images; they reach 512 px."""
+_SCENE_FLOW_STEP = 2e-5
+"""One step of scene flow [m]; 16 bits reach 0.655 m, in a tick of 1/15 s a speed of 9.8 m/s."""
+
+
+@dataclass(frozen=True)
+class _Layer:
+    encode: Callable[[np.ndarray], np.ndarray]
+    decode: Callable[[np.ndarray], np.ndarray]
+    channels: tuple[int, ...]
+    """Of the image."""
+    dtype: str
+    """Of the image."""
+    meaning: str
+    """For the notes of a data set."""
+
+
+def encode_layer(name: str, values: np.ndarray) -> np.ndarray:
+    """The image of a layer: what `FrameBatch.layers` has of one view, as integers (H, W[, 3])."""
+    return _LAYERS[name].encode(values)
+
+
+def decode_layer(name: str, image: np.ndarray) -> np.ndarray:
+    """Undo `encode_layer`, up to rounding.
+
+    Returns:
+        normals: (H, W, 3) float32, unit vectors; zero: no surface.
+        albedo: (H, W, 3) uint8, sRGB, red first.
+        nocs: (H, W, 3) float32 from 0 to 1; zero: no instance.
+        classes: (H, W) uint16, obj_id; 0: no instance.
+        flow: (H, W, 2) float32 [px], columns and rows; NaN: unknown.
+        scene_flow: (H, W, 3) float32 [m]; NaN: unknown.
+    """
+    return _LAYERS[name].decode(image)
+
+
+def read_layer(scene: Path, name: str, frame: int) -> np.ndarray:
+    """A layer of one image of a BOP scene, as `decode_layer` gives it.
+
+    Raises:
+        DatasetError: There is no such layer or file, or the file is no image of this layer.
+    """
+    if name not in _LAYERS:
+        raise DatasetError(f"there is no layer {name}; layers: {', '.join(_LAYERS)}")
+    layer = _LAYERS[name]
+    path = layer_path(scene, name, frame)
+    if not path.is_file():
+        raise DatasetError(f"there is no {path}; bake with render.layers naming {name}")
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
+    if image is None or image.dtype.name != layer.dtype or image.shape[2:] != layer.channels:
+        raise DatasetError(f"{path} is no image of the layer {name}; bake the data set again")
+    return layer.decode(image[..., ::-1] if layer.channels else image)
+
+
+def layer_path(scene: Path, name: str, frame: int) -> Path:
+    """Where an image's layer lies."""
+    return scene / name / f"{frame:06d}.png"
+
+
+def layer_notes(names: tuple[str, ...]) -> str:
+    """What a user of these layers must know, one line each, as Markdown."""
+    return "".join(f"- `{name}/`: {layer.meaning}\n" for name, layer in _LAYERS.items() if name in names)
+
+
+def _same(values: np.ndarray) -> np.ndarray:
+    return values
+
+
+def _encode_normals(values: np.ndarray) -> np.ndarray:
+    code = np.rint(_NORMAL_STEPS * values) + _ZERO
+    return np.where(values.any(axis=-1, keepdims=True), code, 0).astype(np.uint16)
+
+
+def _decode_normals(image: np.ndarray) -> np.ndarray:
+    values = (image.astype(np.float32) - _ZERO) / _NORMAL_STEPS
+    return np.where(image.any(axis=-1, keepdims=True), values, np.float32(0.0))
+
+
+def _encode_nocs(values: np.ndarray) -> np.ndarray:
+    return np.rint(np.clip(_LAST * values, 0, _LAST)).astype(np.uint16)
+
+
+def _decode_nocs(image: np.ndarray) -> np.ndarray:
+    return image.astype(np.float32) / _LAST
+
+
+def _encode_flow(values: np.ndarray) -> np.ndarray:
+    code = np.rint(_FLOW_STEPS * values.astype(np.float64)) + _ZERO
+    # Comparisons with NaN are False.
+    valid = ((code >= 0) & (code <= _LAST)).all(axis=-1, keepdims=True)
+    return np.concatenate((np.where(valid, code, 0), valid), axis=-1).astype(np.uint16)
+
+
+def _decode_flow(image: np.ndarray) -> np.ndarray:
+    values = (image[..., :2].astype(np.float32) - _ZERO) / _FLOW_STEPS
+    return np.where(image[..., 2:] > 0, values, np.float32(np.nan))
+
+
+def _encode_scene_flow(values: np.ndarray) -> np.ndarray:
+    code = np.rint(values.astype(np.float64) / _SCENE_FLOW_STEP) + _ZERO
+    valid = ((code >= 1) & (code <= _LAST)).all(axis=-1, keepdims=True)
+    return np.where(valid, code, 0).astype(np.uint16)
+
+
+def _decode_scene_flow(image: np.ndarray) -> np.ndarray:
+    values = (_SCENE_FLOW_STEP * (image.astype(np.float64) - _ZERO)).astype(np.float32)
+    return np.where(image.any(axis=-1, keepdims=True), values, np.float32(np.nan))
+
+
+_LAYERS = {
+    "normals": _Layer(
+        _encode_normals, _decode_normals, (3,), "uint16",
+        f"unit normals towards the camera, in its axes; red, green and blue are {_ZERO} + {_NORMAL_STEPS} times x, y and z; 0, 0, 0: no "
+        "surface. They are interpolated between vertices, as those of the picture.",
+    ),
+    "albedo": _Layer(_same, _same, (3,), "uint8", "base colour without light, sRGB; black where no surface is."),
+    "nocs": _Layer(
+        _encode_nocs, _decode_nocs, (3,), "uint16",
+        f"where on its object the pixel lies: {_LAST} times ((p - c) / d + 0.5), with p in the model's axes, c = min + size / 2 and "
+        "d = |size| from models_info.json; so p = c + d (value - 0.5). 0, 0, 0: no instance.",
+    ),
+    "classes": _Layer(_same, _same, (), "uint16", "obj_id; 0: no instance."),
+    "flow": _Layer(
+        _encode_flow, _decode_flow, (3,), "uint16",
+        "optical flow to the image before this one, in KITTI's format: the pixel's surface point was then (red - "
+        f"{_ZERO}) / {_FLOW_STEPS} columns to the right and (green - {_ZERO}) / {_FLOW_STEPS} rows down, hidden or not. Blue 0: unknown: "
+        f"no surface, the scene's first image, what was not in the scene then, or {_ZERO // _FLOW_STEPS} pixels and more.",
+    ),
+    "scene_flow": _Layer(
+        _encode_scene_flow, _decode_scene_flow, (3,), "uint16",
+        f"the same as displacement in the camera's axes: red, green and blue minus {_ZERO}, times {1e3 * _SCENE_FLOW_STEP:g} mm; 0, 0, 0: "
+        f"unknown, or {_ZERO * _SCENE_FLOW_STEP:.3f} m and more.",
+    ),
+}  # fmt: skip
+"""Keys are `configs.schema.LAYERS`, in that order."""
