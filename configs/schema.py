@@ -7,30 +7,14 @@ number comes from. "Released" means the generator that the paper's authors publi
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+
+from synpick_warp.configs.fields import setting
+from synpick_warp.configs.sensors import SHOULDER, TONES, DepthSensor, Effects
 
 MODES = ("pick", "target", "move")
 """What the gripper does in an episode."""
 MIXED = "mixed"
 """Every episode draws its mode."""
-
-
-def setting(
-    default: Any,
-    unit: str,
-    doc: str,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    above: float | None = None,
-    choices: tuple[str, ...] = (),
-) -> Any:
-    """A dataclass field that knows its unit, its meaning and what values it takes.
-
-    `low` and `high` include their end; `above` excludes it. For tuples the bounds hold for each element.
-    """
-    metadata = {"unit": unit, "doc": doc, "low": low, "high": high, "above": above, "choices": choices}
-    return field(default=default, metadata=metadata)
 
 
 FAST = "fast"
@@ -305,6 +289,10 @@ class Render:
     shadow_rays: int = setting(1, "", "Shadow rays a pixel towards the map's main light; 0: none.", low=0, high=64)
     ambient_rays: int = setting(1, "", "Rays a pixel that find how much of the sky is hidden; 0: none.", low=0, high=64)
     color_samples: int = setting(1, "", "Colour samples a pixel; depth and masks always have one.", low=1, high=64)
+    tone: str = setting(
+        SHOULDER, "", "shoulder: linear up to 0.6, highlights compressed; linear: cut off at 1; filmic: ACES' curve, middle grey kept.",
+        choices=TONES,
+    )
     table: bool = setting(True, "", "A table under the tote; without it the light map shows.")
     table_color: tuple[float, float, float] = setting((0.45, 0.45, 0.44), "sRGB", "Base colour of the table.", low=0.0, high=1.0)
     layers: tuple[str, ...] = setting((), "", "What each view has besides colour, depth and masks: a list of these.", choices=LAYERS)
@@ -342,5 +330,7 @@ class Config:
     sight: Sight = field(default_factory=Sight)
     suction: Suction = field(default_factory=Suction)
     render: Render = field(default_factory=Render)
+    effects: Effects = field(default_factory=Effects)
+    depth_sensor: DepthSensor = field(default_factory=DepthSensor)
     bop: Bop = field(default_factory=Bop)
     object_rows: tuple[ObjectRow, ...] = ()
