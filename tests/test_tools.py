@@ -48,8 +48,8 @@ def load_tool(name: str):
 
 
 # In the order in which they import each other.
-rest_report, pick_tally, pick_report, bench_physics, bench = map(
-    load_tool, ("rest_report", "pick_tally", "pick_report", "bench_physics", "bench")
+rest_report, pick_tally, pick_report, bench_physics, bench_sensor, bench = map(
+    load_tool, ("rest_report", "pick_tally", "pick_report", "bench_physics", "bench_sensor", "bench")
 )
 
 
@@ -273,6 +273,7 @@ def test_when_time_is_up_the_report_is_of_what_has_ended(tmp_path, capsys):
 def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys):
     for name in ("FALL_TICKS", "SETTLE_TICKS", "STIR_TICKS", "LEAD_TICKS", "PICK_TICKS", "LEAST_REPEATS", "BURST"):
         monkeypatch.setattr(bench_physics, name, 1)
+    monkeypatch.setattr(bench_sensor, "BURST", 1)
     for name, value in (("LEAST_REPEATS", 1), ("BURST", 1), ("STREAM_BATCHES", 1), ("WRITE_VIEWS", 3), ("BAKE_SPEED", 10.0)):
         monkeypatch.setattr(bench, name, value)
     file = tmp_path / "bench.json"
@@ -281,7 +282,8 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
     assert {row["part"] for row in rows} == {"setup", *bench.PARTS}
     assert all(row["value"] >= 0.0 for row in rows)
     printed = capsys.readouterr().out
-    for name in ("views, all stages", "picking, steps alone", "looks and plans: share of the time with rendering"):
+    sights = ("views, all stages", "picking, steps alone", "looks and plans: share of the time with rendering")
+    for name in (*sights, "SensorCamera's time over ours"):
         assert name in printed
 
 

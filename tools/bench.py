@@ -2,7 +2,7 @@
 
 Everything is warmed up first; numbers are medians of repeated, synchronised measurements. Physics, sight and rendering use the same
 worlds, which pick; with `--set bake.mode=move` they are stirred. Writing gets views of them over and over. Files go to the system's
-temporary folder (TMPDIR) and are removed.
+temporary folder (TMPDIR) and are removed. The part sensor renders the same views by Newton's SensorCamera, too.
 
     python tools/bench.py --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
 """
@@ -27,6 +27,7 @@ from unittest import mock
 import numpy as np
 import warp as wp
 from bench_physics import BURST, LEAST_REPEATS, Row, measure_simulation, seconds_per_call
+from bench_sensor import measure_sensor
 from rich.console import Console
 
 from synpick_warp.bake import Factory, build_factory, run_bake
@@ -45,7 +46,7 @@ from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.simulate import Simulation
 from synpick_warp.stages.stream import STATUS_COLUMNS, FrameStream, TickReader, TickReport
 
-PARTS = ("physics", "sight", "render", "write", "bake")
+PARTS = ("physics", "sight", "render", "sensor", "write", "bake")
 STREAM_BATCHES = 12
 """Batches that are rendered and copied in a row."""
 WRITE_VIEWS = 12
@@ -129,7 +130,7 @@ def _config(options: argparse.Namespace) -> Config:
 
 def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Row]:
     """All numbers of the parts, as they come. `least` is the time a measurement is repeated [s]."""
-    if {"physics", "sight", "render", "write"} & set(parts):
+    if set(parts) - {"bake"}:
         started = time.perf_counter()
         factory = build_factory(config, SilentProgress())
         wp.synchronize_device(factory.simulation.device)
@@ -151,6 +152,8 @@ def _worlds(config: Config, factory: Factory, least: float, parts: tuple[str, ..
     yield from measure_simulation(factory, least, parts)
     if "render" in parts:
         yield from _render(config, factory, least)
+    if "sensor" in parts:
+        yield from measure_sensor(config, factory, least)
 
 
 def _share_of_a_bake(config: Config, values: dict[str, float]) -> Iterator[Row]:
@@ -232,7 +235,9 @@ def _write(config: Config, factory: Factory, least: float) -> Iterator[Row]:
     simulation, cameras = factory.simulation, len(factory.cameras)
     worlds = min(simulation.layout.worlds, -(-WRITE_VIEWS // cameras))
     ring = next(factory.stream.render(simulation.records[0].snapshot, _all_live(simulation, worlds)))
-    batch = FrameBatch(**{item.name: np.array(getattr(ring, item.name)[:WRITE_VIEWS]) for item in dataclasses.fields(ring)})
+    arrays = {item.name: getattr(ring, item.name) for item in dataclasses.fields(ring)}
+    layers = {name: np.array(layer[:WRITE_VIEWS]) for name, layer in arrays.pop("layers").items()}
+    batch = FrameBatch(**{name: np.array(array[:WRITE_VIEWS]) for name, array in arrays.items()}, layers=layers)
     cores = len(os.sched_getaffinity(0))
     size = 0.0
     for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
