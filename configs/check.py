@@ -55,7 +55,7 @@ def allowed(item: dataclasses.Field[Any], kind: Any) -> str:
     """The range or the choices of a setting in words, or its type if every value of the type will do."""
     rules = item.metadata
     if rules["choices"]:
-        return ", ".join(rules["choices"])
+        return ("any of " if typing.get_origin(kind) is tuple else "") + ", ".join(rules["choices"])
     words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
     if not words:
         return describe_kind(kind)
