@@ -35,6 +35,7 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.shapes import Camera, Catalog
 from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.stages.buffers import FIXTURES, LastFrame, LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.develop import SpreadArrays, has_spread
 from synpick_warp.stages.layers import MOVING, MotionArrays
 from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
 from synpick_warp.stages.plan import CycleArrays, VoteArrays, plan_sizes
@@ -42,7 +43,7 @@ from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays, Ren
 from synpick_warp.stages.render_scene import build_render_scene
 from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.simulate import RECORDS, Simulation
-from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, view_sizes
+from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, name_lights, view_sizes
 from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 
 CONFIG_FILE = "config.toml"
@@ -120,7 +121,9 @@ def build_factory(config: Config, progress: Progress) -> Factory:
     simulation = Simulation(config, catalog, len(lights), device, render_scene=scene)
     renderer = Renderer(config, scene, config.arrangement.max_objects, view_sizes(config, device)["view"])
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
-    return Factory(catalog, cameras, simulation, FrameStream(config, renderer, object_ids, device), AttemptLog(config, object_ids))
+    table = name_lights([light.name for light in lights], scene.lights)
+    stream = FrameStream(config, renderer, object_ids, table, device)
+    return Factory(catalog, cameras, simulation, stream, AttemptLog(config, object_ids))
 
 
 def run_bake(config: Config, out: Path, progress: Progress) -> BakeSummary:
@@ -265,6 +268,8 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
     if MOVING.intersection(config.render.layers):
         groups += [(MotionArrays, views, 1)]
+    if has_spread(config):
+        groups += [(SpreadArrays, views, 1)]
     if may_pick(config):
         looks = count_views(config, room, device)
         groups += [(kind, sight_sizes(config, room, looks), 1) for kind in SCRATCH]

@@ -12,17 +12,18 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.frames import FrameBatch
+from synpick_warp.frames import EFFECTS, FrameBatch
 from synpick_warp.kernels import pack, phases
 from synpick_warp.stages import stream, worlds
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.simulate import TickRecord
-from synpick_warp.stages.stream import FrameStream, HostCopy, TickReader, TickReport, view_sizes, views_per_batch
+from synpick_warp.stages.stream import FrameStream, HostCopy, LightTable, TickReader, TickReport, view_sizes, views_per_batch
 from tests.reference.small_worlds import settings
 
 WORLDS, ROOM = 5, 3
 OBJECT_IDS = np.array([4, 7, 11], np.int32)
+LIGHTS = LightTable(np.array(["lamp", "even"]), np.array([[0.6, 0.0, 0.8], [0.0, 0.0, 0.0]], np.float32))
 
 
 @dataclass
@@ -54,12 +55,13 @@ def report_of(live: list[int]) -> TickReport:
     entry = ((number[:, None] + np.arange(ROOM)) % 4 - 1).astype(np.int32)
     pose = np.arange(WORLDS * ROOM * 7, dtype=np.float32).reshape(WORLDS, ROOM, 7)
     measures = np.zeros((WORLDS, len(worlds.MEASURE_COLUMNS)), np.float32)
-    return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace())
+    light = SimpleNamespace(light=number % 2, light_turn=0.5 * number.astype(np.float32), light_exposure=0.1 * number.astype(np.float32))
+    return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace(), light)
 
 
 def rendered(device, live: list[int], batch: int, **overrides: object) -> tuple[list[dict[str, Any]], FakeRenderer]:
     renderer = FakeRenderer([])
-    frames = FrameStream(config_of(render__views_per_batch=batch, **overrides), renderer, OBJECT_IDS, device)
+    frames = FrameStream(config_of(render__views_per_batch=batch, **overrides), renderer, OBJECT_IDS, LIGHTS, device)
     return [copied(made) for made in frames.render("snapshot", report_of(live))], renderer
 
 
@@ -83,7 +85,7 @@ def test_live_views_come_world_by_world_and_camera_by_camera(device, live, batch
         # What pads the batch must be worlds and cameras that exist.
         assert world[count:] == camera[count:] == [0] * (batch - count)
         code = 10 * (made["episode"] - 20) + made["camera"] + 1
-        for name in ("color", "depth", "instance", "amodal", "pixels", "boxes"):
+        for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "effects"):
             assert len(made[name]) == count
             assert (made[name].reshape(count, -1) == code[:, None]).all(), name
 
@@ -135,13 +137,19 @@ def test_what_a_batch_says_of_its_views(device):
     assert [made[name].dtype.name for name in ("time", "pose", "color", "depth", "instance", "amodal")] == [
         "float64", "float32", "uint8", "uint16", "uint8", "uint32"
     ]
+    assert made["light_name"].tolist() == ["even"] * 3 + ["lamp"] * 3
+    np.testing.assert_allclose(made["light_turn"], 0.5 * world)
+    np.testing.assert_allclose(made["light_exposure"], 0.1 * world, rtol=1e-6)
+    np.testing.assert_allclose(made["light_direction"][3], [0.6 * np.cos(2.0), 0.6 * np.sin(2.0), 0.8], rtol=1e-6)
+    assert not made["light_direction"][:3].any()
+    assert made["effects"].shape == (6, len(EFFECTS))
     assert made["color"].shape == (6, 6, 8, 3)
     assert made["boxes"].shape == (6, ROOM, 2, 4)
 
 
 def test_a_tick_that_is_stopped_early_leaves_nothing_behind(device):
     """Whoever stops reading a tick's batches gets the next tick's from its first."""
-    frames = FrameStream(config_of(render__views_per_batch=2), FakeRenderer([]), OBJECT_IDS, device)
+    frames = FrameStream(config_of(render__views_per_batch=2), FakeRenderer([]), OBJECT_IDS, LIGHTS, device)
     next(frames.render("first", report_of([1] * WORLDS)))
     batches = frames.render("second", report_of([0, 0, 1, 0, 0]))
     assert [int(episode) for made in batches for episode in made.episode] == [22, 22, 22]

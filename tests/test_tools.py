@@ -139,7 +139,7 @@ def tick_report(*worlds: dict) -> TickReport:
         for instance, moved in values.get("poses", {}).items():
             pose[world, instance] = moved
     measures = np.array([[values.get("load", 0.0)] for values in worlds], np.float32)
-    return TickReport(status, measures, entry, pose.astype(np.float32), SimpleNamespace(), SimpleNamespace())
+    return TickReport(status, measures, entry, pose.astype(np.float32), *(SimpleNamespace() for _ in range(3)))
 
 
 def tallied(*ticks: TickReport, modes=("pick",)):

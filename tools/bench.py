@@ -221,7 +221,7 @@ def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], objec
         "occlude": lambda: [renderer.occlude(snapshot, world, camera, count, sample) for sample in samples],
         "filter occlusion": lambda: [renderer.filter_occlusion(camera, count, sample) for sample in samples],
         "shade": lambda: [renderer.shade(snapshot, world, camera, count, sample) for sample in samples],
-        "develop": lambda: renderer.develop(snapshot, world, count, out),
+        "develop": lambda: renderer.develop(snapshot, world, camera, count, out),
         "annotate": lambda: annotate(renderer.scene, renderer.bodies, camera, count, out),
         "all": lambda: renderer.render(snapshot, world, camera, count, out),
     }

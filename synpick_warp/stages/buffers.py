@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from synpick_warp.arrays import device_array
+from synpick_warp.kernels.effects import Strengths
 
 FIXTURES = ("tote", "finger", "cup")
 """What `Snapshot.fixture_pose` holds, in order."""
@@ -73,6 +74,8 @@ class ViewBuffers:
     """px_count_all, px_count_valid, px_count_visib."""
     boxes: wp.array = device_array("view", "instance", "box", "edge", dtype=wp.int32, unit="px")
     """bbox_obj and bbox_visib: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty."""
+    effects: wp.array = device_array("view", dtype=Strengths)
+    """Strengths of the camera's effects, in the order of `frames.EFFECTS`; zero: off."""
 
 
 @dataclass(frozen=True, eq=False)

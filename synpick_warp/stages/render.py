@@ -10,12 +10,12 @@ import warp as wp
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import REFERENCE, Config
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
-from synpick_warp.kernels.develop import develop_kernel
 from synpick_warp.kernels.hits import Bodies, Hits, prepare_bodies_kernel, trace_hits_kernel, trace_sample_kernel
 from synpick_warp.kernels.occlusion import OcclusionRays, Sample, filter_occlusion_kernel, occlude_kernel
 from synpick_warp.kernels.shading import shade_kernel
 from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.develop import Developer
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.layers import LayerPainter
 from synpick_warp.stages.reference import ReferencePicture
@@ -118,6 +118,7 @@ class Renderer:
         self.samples = color_samples(config.render.color_samples)
         self.reference = ReferencePicture(config, scene, instances) if config.render.mode == REFERENCE else None
         self.layers = LayerPainter(config, scene, instances, views)
+        self.developer = Developer(config, scene, views)
 
     def render(
         self,
@@ -154,7 +155,7 @@ class Renderer:
             self.shade_samples(snapshot, view_world, view_camera, count)
         else:
             self.reference.trace_paths(snapshot, self.bodies, view_world, view_camera, count, self.picture.radiance)
-        self.develop(snapshot, view_world, count, out)
+        self.develop(snapshot, view_world, view_camera, count, out)
         annotate(self.scene, self.bodies, view_camera, count, out)
 
     def shade_samples(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int) -> None:
@@ -207,11 +208,9 @@ class Renderer:
         inputs += [self.bodies, self.hits, self.picture.smoothed, view_world, view_camera, self.instances, sample]
         self._launch(shade_kernel, count, inputs, [self.picture.radiance])
 
-    def develop(self, snapshot: Snapshot, view_world: wp.array, count: int, out: ViewBuffers) -> None:
+    def develop(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
         """Radiance to bytes."""
-        scene = self.scene
-        inputs = [scene.grid, scene.lights, snapshot.light, snapshot.light_exposure, view_world, self.picture.radiance]
-        self._launch(develop_kernel, count, inputs, [out.color])
+        self.developer.develop(snapshot, view_world, view_camera, count, self.picture.radiance, out)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         pixels = count * self.scene.grid.tiles * int(TILE_PIXELS)

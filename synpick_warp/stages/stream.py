@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -68,6 +69,8 @@ class TickReport:
     """Arrays named and shaped as those of `Sighting`; vectors have their components as a last dimension. After the tick's look."""
     plan: SimpleNamespace
     """The same of `Plan`."""
+    light: SimpleNamespace
+    """The arrays `light`, `light_turn` and `light_exposure` of `Snapshot`."""
 
     def column(self, name: str) -> np.ndarray:
         """One column of the status table (world) int32."""
@@ -76,6 +79,28 @@ class TickReport:
     def measure(self, name: str) -> np.ndarray:
         """One column of the table of measures (world) float32."""
         return self.measures[:, MEASURE_COLUMNS.index(name)]
+
+
+@dataclass(frozen=True, eq=False)
+class LightTable:
+    """What is told of each light map."""
+
+    name: np.ndarray
+    """(light) str."""
+    direction: np.ndarray
+    """Unit vector towards the main light of the map that is not turned (light, 3) float32; zero: none."""
+
+    def directions(self, light: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """The same in the world (..., 3) float32, of maps `light` (...) that are turned by `turn` (...) [rad]."""
+        x, y, z = np.moveaxis(self.direction[light].astype(np.float64), -1, 0)
+        c, s = np.cos(turn), np.sin(turn)
+        return np.stack([c * x - s * y, s * x + c * y, z], axis=-1).astype(np.float32)
+
+
+def name_lights(names: list[str], lights: Any) -> LightTable:
+    """The table of light maps, from their names and the struct `Lights`."""
+    shines = lights.main_irradiance.numpy().max(axis=1, keepdims=True) > 0.0
+    return LightTable(np.array(names), np.where(shines, lights.main_direction.numpy(), 0.0).astype(np.float32))
 
 
 class HostCopy:
@@ -111,6 +136,7 @@ class TickReader:
 
     def __init__(self, record: TickRecord) -> None:
         self.parts = [(part, [item.name for item in fields(part)]) for part in (record.sighting, record.plan)]
+        self.parts.append((record.snapshot, ["light", "light_turn", "light_exposure"]))
         arrays = [record.status.table, record.status.measures, record.snapshot.entry, record.snapshot.pose]
         self.copy = HostCopy(arrays + [getattr(part, name) for part, names in self.parts for name in names])
 
@@ -128,17 +154,19 @@ class TickReader:
 class FrameStream:
     """Renders the live worlds of a snapshot and yields FrameBatches, each while the next is rendered."""
 
-    def __init__(self, config: Config, renderer: Renderer, object_ids: np.ndarray, device: wp.Device) -> None:
+    def __init__(self, config: Config, renderer: Renderer, object_ids: np.ndarray, lights: LightTable, device: wp.Device) -> None:
         """Allocate the ring of batches.
 
         Args:
             config: Settings.
             renderer: Renders and annotates.
             object_ids: obj_id of each catalog entry (entry) int32.
+            lights: What is told of the light maps.
             device: Where rendering happens.
         """
         self.renderer = renderer
         self.object_ids = np.append(object_ids, -1).astype(np.int32)
+        self.lights = lights
         self.cameras = len(config.cameras.positions)
         self.tick_time = config.physics.step * config.physics.steps_per_tick
         sizes = view_sizes(config, device)
@@ -189,6 +217,7 @@ class FrameStream:
         arrays = {name: array[:count] for name, array in zip(self.images + self.layers, self.copies[slot].wait(), strict=True)}
         worlds = world[part]
         frame = report.column("frame")[worlds]
+        light, turn = report.light.light[worlds], report.light.light_turn[worlds]
         return FrameBatch(
             episode=report.column("episode")[worlds],
             camera=camera[part],
@@ -196,6 +225,10 @@ class FrameStream:
             time=frame * self.tick_time,
             object_id=self.object_ids[report.entry[worlds]],
             pose=report.pose[worlds],
+            light_name=self.lights.name[light],
+            light_turn=turn,
+            light_exposure=report.light.light_exposure[worlds],
+            light_direction=self.lights.directions(light, turn),
             **{name: arrays[name] for name in self.images},
             layers={name: arrays[name] for name in self.layers},
         )
