@@ -7,6 +7,7 @@ Axes are the camera's: x right, y down, z forward.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,14 +91,29 @@ def _same(values: np.ndarray) -> np.ndarray:
     return values
 
 
+def _some(image: np.ndarray) -> np.ndarray:
+    """Pixels of which a channel is not 0 (H, W, 1) bool; much faster than NumPy's `any` over so few."""
+    return (image[..., 0:1] != 0) | (image[..., 1:2] != 0) | (image[..., 2:3] != 0)
+
+
+def _coded(values: np.ndarray, scale: float, least: int) -> tuple[np.ndarray, np.ndarray]:
+    """Codes of signed numbers (H, W, C) uint16, 0 in pixels that have a number without code, and which have none such (H, W, 1) bool."""
+    # float32 holds codes of 16 bits to 1/256 of a step.
+    code = np.rint(np.float32(scale) * values + np.float32(_ZERO))
+    # Comparisons with NaN are False.
+    fits = (code >= least) & (code <= _LAST)
+    valid = functools.reduce(np.logical_and, (fits[..., channel : channel + 1] for channel in range(fits.shape[-1])))
+    code[~valid[..., 0]] = 0.0
+    return code.astype(np.uint16), valid
+
+
 def _encode_normals(values: np.ndarray) -> np.ndarray:
-    code = np.rint(_NORMAL_STEPS * values) + _ZERO
-    return np.where(values.any(axis=-1, keepdims=True), code, 0).astype(np.uint16)
+    return _coded(values, _NORMAL_STEPS, 1)[0] * _some(values)
 
 
 def _decode_normals(image: np.ndarray) -> np.ndarray:
     values = (image.astype(np.float32) - _ZERO) / _NORMAL_STEPS
-    return np.where(image.any(axis=-1, keepdims=True), values, np.float32(0.0))
+    return np.where(_some(image), values, np.float32(0.0))
 
 
 def _encode_nocs(values: np.ndarray) -> np.ndarray:
@@ -109,10 +125,7 @@ def _decode_nocs(image: np.ndarray) -> np.ndarray:
 
 
 def _encode_flow(values: np.ndarray) -> np.ndarray:
-    code = np.rint(_FLOW_STEPS * values.astype(np.float64)) + _ZERO
-    # Comparisons with NaN are False.
-    valid = ((code >= 0) & (code <= _LAST)).all(axis=-1, keepdims=True)
-    return np.concatenate((np.where(valid, code, 0), valid), axis=-1).astype(np.uint16)
+    return np.concatenate(_coded(values, _FLOW_STEPS, 0), axis=-1, dtype=np.uint16)
 
 
 def _decode_flow(image: np.ndarray) -> np.ndarray:
@@ -121,14 +134,12 @@ def _decode_flow(image: np.ndarray) -> np.ndarray:
 
 
 def _encode_scene_flow(values: np.ndarray) -> np.ndarray:
-    code = np.rint(values.astype(np.float64) / _SCENE_FLOW_STEP) + _ZERO
-    valid = ((code >= 1) & (code <= _LAST)).all(axis=-1, keepdims=True)
-    return np.where(valid, code, 0).astype(np.uint16)
+    return _coded(values, 1.0 / _SCENE_FLOW_STEP, 1)[0]
 
 
 def _decode_scene_flow(image: np.ndarray) -> np.ndarray:
-    values = (_SCENE_FLOW_STEP * (image.astype(np.float64) - _ZERO)).astype(np.float32)
-    return np.where(image.any(axis=-1, keepdims=True), values, np.float32(np.nan))
+    values = np.float32(_SCENE_FLOW_STEP) * (image.astype(np.float32) - _ZERO)
+    return np.where(_some(image), values, np.float32(np.nan))
 
 
 _LAYERS = {
