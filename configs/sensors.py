@@ -60,6 +60,22 @@ class Effects:
     jpeg_quality: tuple[int, int] = setting((0, 0), "", "Least and largest JPEG quality; 0, 0: bop.jpeg_quality.", low=0, high=100)
 
 
+def strength_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
+    """Least and largest strength of every effect, in the order of `frames.EFFECTS`; 0, 0: off."""
+    exposure, balance = effects.exposure_jitter, effects.white_balance_jitter
+    return {
+        "exposure": (-exposure, exposure),
+        "red": (-balance, balance),
+        "blue": (-balance, balance),
+        "vignette": effects.vignette,
+        "chromatic_aberration": effects.chromatic_aberration,
+        "blur": effects.blur,
+        "shot_noise": effects.shot_noise,
+        "read_noise": effects.read_noise,
+        "jpeg_quality": effects.jpeg_quality,
+    }
+
+
 @dataclass(frozen=True)
 class DepthSensor:
     """A depth camera that finds disparities between the camera and a projector beside it, for the layer depth_sensor.

@@ -7,22 +7,28 @@ import shutil
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.sensors import strength_ranges
 from synpick_warp.exporters.bop_models import CAMERA_FILE, MODEL_FOLDERS, NOTES_FILE, write_constants
 from synpick_warp.exporters.bop_scene import SceneSettings, drop_scenes, finish_episode, make_scene
 from synpick_warp.exporters.bop_view import MILLIMETERS, ViewSettings, ViewTruth, write_layer, write_view
 from synpick_warp.exporters.files import PARTIAL, output_error, prepare_output
 from synpick_warp.exporters.pool import WriterPool, shared_bytes
 from synpick_warp.exporters.targets import BOP19, BOP24, join_targets, write_scene_targets
-from synpick_warp.frames import EpisodeEnd, FrameBatch
+from synpick_warp.frames import EFFECTS, EpisodeEnd, FrameBatch
 from synpick_warp.outcome import Ending
 from synpick_warp.scenes.shapes import Camera, Catalog
 
 _PIXEL_BYTES = (3, 2, 1, 4)
 """Of `FrameBatch`'s color, depth, instance and amodal."""
+_DIGITS = 6
+"""Decimal places of what is told of light and camera."""
+JPEG_QUALITY = "jpeg_quality"
+"""The one of EFFECTS that is the writer's to make."""
 _LAYER_BYTES = 12
 """Of a pixel of the largest layer."""
 
@@ -61,6 +67,7 @@ class BopExporter:
         self._pool = pool
         self._split = out / config.bop.split
         self._suffix = f".{config.bop.color_format}"
+        self._effects = tuple(name for name, strengths in strength_ranges(config.effects).items() if any(strengths))
         self._object_ids = tuple(entry.obj_id for entry in catalog.entries)
         self._views = tuple(self._view_settings(camera) for camera in cameras)
         self._episodes: dict[int, _Episode] = {}
@@ -83,7 +90,7 @@ class BopExporter:
             self._pool.submit(
                 write_view,
                 (batch.color[view], batch.depth[view], batch.instance[view], batch.amodal[view]),
-                (scene, self._views[camera], _truth(batch, view)),
+                (scene, self._views[camera], self._truth(batch, view)),
                 path=self._place(number, camera),
                 done=partial(self._part_done, number, episode),
             )
@@ -182,7 +189,21 @@ class BopExporter:
             "cam_t_w2c": (MILLIMETERS * camera.translation).tolist(),
             "depth_scale": self._config.depth_scale,
         }
-        return ViewSettings(self._suffix, self._config.jpeg_quality, self._config.masks, self._config.coco, record)
+        return ViewSettings(self._suffix, self._config.masks, self._config.coco, record)
+
+    def _truth(self, batch: FrameBatch, view: int) -> ViewTruth:
+        strengths = dict(zip(EFFECTS, batch.effects[view].tolist(), strict=True))
+        present = np.flatnonzero(batch.object_id[view] >= 0)
+        return ViewTruth(
+            frame=int(batch.frame[view]),
+            jpeg_quality=round(strengths[JPEG_QUALITY]) if JPEG_QUALITY in self._effects else self._config.jpeg_quality,
+            circumstances=_circumstances(batch, view, {name: strengths[name] for name in self._effects}),
+            instance_id=present,
+            object_id=batch.object_id[view][present],
+            pose=batch.pose[view][present],
+            pixels=batch.pixels[view][present],
+            boxes=batch.boxes[view][present],
+        )
 
 
 def view_bytes(camera: Camera) -> int:
@@ -191,13 +212,13 @@ def view_bytes(camera: Camera) -> int:
     return max(shared_bytes(pixels * size for size in _PIXEL_BYTES), shared_bytes((pixels * _LAYER_BYTES,)))
 
 
-def _truth(batch: FrameBatch, view: int) -> ViewTruth:
-    present = np.flatnonzero(batch.object_id[view] >= 0)
-    return ViewTruth(
-        frame=int(batch.frame[view]),
-        instance_id=present,
-        object_id=batch.object_id[view][present],
-        pose=batch.pose[view][present],
-        pixels=batch.pixels[view][present],
-        boxes=batch.boxes[view][present],
-    )
+def _circumstances(batch: FrameBatch, view: int, effects: dict[str, float]) -> dict[str, Any]:
+    """A view's light, and what its camera did to colour if that is anything, for scene_camera.json."""
+    direction = batch.light_direction[view]
+    light = {
+        "map": str(batch.light_name[view]),
+        "turn": round(float(batch.light_turn[view]), _DIGITS),
+        "exposure": round(float(batch.light_exposure[view]), _DIGITS),
+        "direction": [round(part, _DIGITS) for part in direction.tolist()] if direction.any() else None,
+    }
+    return {"light": light} | ({"effects": {name: round(value, _DIGITS) for name, value in effects.items()}} if effects else {})

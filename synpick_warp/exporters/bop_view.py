@@ -36,7 +36,6 @@ class ViewSettings:
     """What all views of a camera share."""
 
     color_suffix: str
-    jpeg_quality: int
     masks: bool
     coco: bool
     camera: dict[str, Any]
@@ -48,6 +47,9 @@ class ViewTruth:
     """Ground truth of a view: its row of `FrameBatch`, of instances that exist."""
 
     frame: int
+    jpeg_quality: int
+    circumstances: dict[str, Any]
+    """What the view adds to its record in scene_camera.json."""
     instance_id: np.ndarray
     """(N)"""
     object_id: np.ndarray
@@ -68,7 +70,7 @@ def write_view(
     Lines: scene_camera, scene_gt, scene_gt_info, then one COCO annotation each, without its id.
     """
     name = f"{truth.frame:06d}"
-    (scene / "rgb" / f"{name}{settings.color_suffix}").write_bytes(_encode_color(color, settings))
+    (scene / "rgb" / f"{name}{settings.color_suffix}").write_bytes(_encode_color(color, settings, truth.jpeg_quality))
     (scene / "depth" / f"{name}.png").write_bytes(encode_png(depth))
     height, width = depth.shape
     infos, annotations = [], []
@@ -82,7 +84,7 @@ def write_view(
         infos.append(info)
         if settings.coco and (annotation := coco_record(truth.frame, int(truth.object_id[index]), info, whole, seen, height, width)):
             annotations.append(annotation)
-    lines = (settings.camera, gt_records(truth, settings.camera), infos, *annotations)
+    lines = (settings.camera | truth.circumstances, gt_records(truth, settings.camera), infos, *annotations)
     (scene / RECORDS / name).write_text("".join(json.dumps(line) + "\n" for line in lines), encoding="ascii")
 
 
@@ -91,10 +93,10 @@ def write_layer(values: np.ndarray, scene: Path, name: str, frame: int) -> None:
     layer_path(scene, name, frame).write_bytes(encode_png(encode_layer(name, values)))
 
 
-def _encode_color(color: np.ndarray, settings: ViewSettings) -> bytes:
+def _encode_color(color: np.ndarray, settings: ViewSettings, jpeg_quality: int) -> bytes:
     if settings.color_suffix == ".png":
         return encode_png(color)
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality))
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality))
     if not done:
         raise ValueError(f"OpenCV cannot encode a picture of shape {color.shape} as JPEG")
     return data.tobytes()

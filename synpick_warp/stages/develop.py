@@ -9,16 +9,13 @@ import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import TONES
-from synpick_warp.frames import EFFECTS
+from synpick_warp.configs.sensors import TONES, strength_ranges
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
 from synpick_warp.kernels.develop import DevelopRules, develop_effects_kernel, develop_kernel, spread_rows_kernel
 from synpick_warp.kernels.effects import EffectRules, Strengths, draw_effects_kernel
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render_scene import RenderScene
-
-Strength = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,17 +26,9 @@ class SpreadArrays:
     """After vignette, and after blur and chromatic aberration along the rows."""
 
 
-def strength_ranges(config: Config) -> dict[str, Strength]:
-    """Least and largest strength of every effect, by the names of `EFFECTS`; 0, 0: off."""
-    effects = config.effects
-    exposure, balance = effects.exposure_jitter, effects.white_balance_jitter
-    ranges: dict[str, Strength] = {"exposure": (-exposure, exposure), "red": (-balance, balance), "blue": (-balance, balance)}
-    return {name: ranges.get(name) or getattr(effects, name) for name in EFFECTS}
-
-
 def has_effects(config: Config) -> bool:
     """Whether the settings ask for any effect."""
-    return any(any(strengths) for strengths in strength_ranges(config).values())
+    return any(any(strengths) for strengths in strength_ranges(config.effects).values())
 
 
 def has_spread(config: Config) -> bool:
@@ -49,7 +38,7 @@ def has_spread(config: Config) -> bool:
 
 def effect_rules(config: Config) -> Any:
     """The struct `EffectRules`."""
-    low, high = zip(*strength_ranges(config).values(), strict=True)
+    low, high = zip(*strength_ranges(config.effects).values(), strict=True)
     rules = EffectRules()
     rules.seed = config.bake.seed
     rules.low, rules.high = Strengths(*low), Strengths(*high)
