@@ -21,7 +21,7 @@ FAST = "fast"
 REFERENCE = "reference"
 SHADINGS = (FAST, REFERENCE)
 """How colour is made."""
-LAYERS = ("normals", "albedo", "nocs", "classes", "flow", "scene_flow")
+LAYERS = ("normals", "albedo", "nocs", "classes", "flow", "scene_flow", "depth_sensor")
 """What a picture can have besides colour, depth and instances; `synpick_warp.layers` says what each is."""
 
 

@@ -55,6 +55,7 @@ def decode_layer(name: str, image: np.ndarray) -> np.ndarray:
         classes: (H, W) uint16, obj_id; 0: no instance.
         flow: (H, W, 2) float32 [px], columns and rows; NaN: unknown.
         scene_flow: (H, W, 3) float32 [m]; NaN: unknown.
+        depth_sensor: (H, W) uint16, counts of the depth scale; 0: hole.
     """
     return _LAYERS[name].decode(image)
 
@@ -165,6 +166,10 @@ _LAYERS = {
         _encode_scene_flow, _decode_scene_flow, (3,), "uint16",
         f"the same as displacement in the camera's axes: red, green and blue minus {_ZERO}, times {1e3 * _SCENE_FLOW_STEP:g} mm; 0, 0, 0: "
         f"unknown, or {_ZERO * _SCENE_FLOW_STEP:.3f} m and more.",
+    ),
+    "depth_sensor": _Layer(
+        _same, _same, (), "uint16",
+        "what a depth camera might measure (`depth_sensor` in config.toml): noise, steps and holes, which are 0; counts as in `depth/`.",
     ),
 }  # fmt: skip
 """Keys are `configs.schema.LAYERS`, in that order."""

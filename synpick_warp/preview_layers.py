@@ -13,6 +13,8 @@ from synpick_warp.layers import read_layer
 
 _MOTION_RANGE = 99.0
 """Percentile of a picture's motions that gets full colour."""
+_DEPTH_RANGE = (1.0, 99.0)
+"""Percentiles of a picture's depths that get the first and the last colour."""
 _GOLDEN = 0.6180339887498949
 """(√5 - 1) / 2: its multiples modulo 1 are evenly spread, however many are taken."""
 _GREY = 64
@@ -66,6 +68,17 @@ def _draw_scene_flow(values: np.ndarray) -> tuple[str, Image]:
     return f"scene flow: x, y, z as red, green, blue, up to {1e3 * full:.1f} mm", _with_unknown(colors, size)
 
 
+def _draw_depth_sensor(values: np.ndarray) -> tuple[str, Image]:
+    """As the picture of depth; holes are black."""
+    known = values[values > 0]
+    low, high = np.percentile(known, _DEPTH_RANGE) if known.size else (0.0, 1.0)
+    nearness = np.clip((high - values) / max(high - low, 1e-9), 0.0, 1.0)
+    colors = cv2.applyColorMap(np.rint(255.0 * nearness).astype(np.uint8), cv2.COLORMAP_TURBO)
+    holes = values == 0
+    colors[holes] = 0
+    return f"depth sensor: {100.0 * holes.mean():.1f} % holes, black", colors
+
+
 def _full(size: np.ndarray) -> float:
     """The motion that gets full colour; 1 where nothing is known to move."""
     known = size[np.isfinite(size) & (size > 0.0)]
@@ -94,4 +107,5 @@ _DRAW: dict[str, Callable[[np.ndarray], tuple[str, Image]]] = {
     "classes": _draw_classes,
     "flow": _draw_flow,
     "scene_flow": _draw_scene_flow,
+    "depth_sensor": _draw_depth_sensor,
 }

@@ -88,6 +88,7 @@ VALUES = {
     "classes": np.array([[0, 1, 21], [65535, 300, 0]], np.uint16),
     "flow": np.array([[(1.25, -3.5)] * 3, [(np.nan, np.nan)] * 3], np.float32),
     "scene_flow": np.array([[(0.002, -0.1, 0.05)] * 3, [(np.nan, np.nan, np.nan)] * 3], np.float32),
+    "depth_sensor": np.array([[0, 18000, 65535], [1, 17999, 18001]], np.uint16),
 }
 
 

@@ -268,6 +268,7 @@ def test_worlds_and_cameras_do_not_mix(device):
     for world, follows in enumerate((1, 0, 1)):
         for number, view in enumerate(views):
             alone = draw(ToyScene([entry(shape)], [now[world]], (view,), table=True), device, Before([then[world]], [follows]))
-            for name in LAYERS:
+            # Cameras are told apart by the depth sensor's noise.
+            for name in set(LAYERS) - {"depth_sensor"}:
                 np.testing.assert_array_equal(together[name][2 * world + number], alone[name][0])
     assert np.isnan(together["flow"][2:4]).all()

@@ -110,7 +110,7 @@ def test_layers_make_batches_smaller():
     gpu = SimpleNamespace(is_cuda=True)
     large = {"bake__worlds": 1000, "cameras__resolution": [1920, 1080]}
     count = views_per_batch(settings(**large, render__layers=list(LAYERS)), gpu)
-    pixel = stream.PIXEL_BYTES + 12 + 3 + 12 + 2 + 8 + 12
+    pixel = stream.PIXEL_BYTES + 12 + 3 + 12 + 2 + 8 + 12 + 2
     assert count * 1920 * 1080 * pixel <= stream.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
 
 

@@ -192,7 +192,7 @@ class BopExporter:
         return ViewSettings(self._suffix, self._config.masks, self._config.coco, record)
 
     def _truth(self, batch: FrameBatch, view: int) -> ViewTruth:
-        strengths = dict(zip(EFFECTS, batch.effects[view].tolist(), strict=True))
+        strengths: dict[str, float] = dict(zip(EFFECTS, batch.effects[view].tolist(), strict=True))
         present = np.flatnonzero(batch.object_id[view] >= 0)
         return ViewTruth(
             frame=int(batch.frame[view]),

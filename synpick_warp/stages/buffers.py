@@ -94,3 +94,5 @@ class LayerBuffers:
     """From the pixel to where its surface point was in the frame before: columns, rows; NaN: unknown."""
     scene_flow: wp.array = device_array("view", "row", "column", dtype=wp.vec3, unit="m")
     """From the pixel's surface point to where it was in the frame before, in the camera's axes; NaN: unknown."""
+    depth_sensor: wp.array = device_array("view", "row", "column", dtype=wp.uint16, unit="depth_scale")
+    """Planar depth as a depth camera measures it; 0: hole."""

@@ -11,6 +11,7 @@ from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
+from synpick_warp.kernels.depth_sensor import draw_depth_sensor_kernel
 from synpick_warp.kernels.layers import (
     Motions,
     draw_albedo_kernel,
@@ -22,6 +23,7 @@ from synpick_warp.kernels.layers import (
     prepare_motions_kernel,
 )
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
+from synpick_warp.stages.depth_sensor import sensor_rules
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render_scene import RenderScene
 
@@ -65,6 +67,7 @@ class LayerPainter:
                 raise CatalogError(
                     f"object {wrong[0]} has no place in the layer classes, which holds 1 to {MOST_CLASS}; renumber the model"
                 )
+        self.sensor = sensor_rules(config)
         self.motions = None
         if MOVING.intersection(self.names):
             self.motions = Motions()
@@ -103,6 +106,10 @@ class LayerPainter:
             self._launch(draw_nocs_kernel, count, [scene.meshes, scene.grid, bodies, hits, self.instances], out.nocs)
         if "classes" in names:
             self._launch(draw_classes_kernel, count, [scene.grid, scene.obj_id, bodies, hits, self.instances], out.classes)
+        if "depth_sensor" in names:
+            inputs = [scene.meshes, scene.surfaces, scene.cameras, scene.grid, snapshot.episode, snapshot.frame, self.sensor, bodies, hits]
+            inputs += [view_world, view_camera, self.instances]
+            self._launch(draw_depth_sensor_kernel, count, inputs, out.depth_sensor)
         if self.motions is None:
             return
         self.prepare_motions(snapshot, view_world, view_camera, count)
