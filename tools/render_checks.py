@@ -150,8 +150,8 @@ def _lamp(cosine: float) -> LightMap:
 def _bare_studio(
     config: Config, mesh: TriangleMesh, kinds: list[tuple[float, float]], cameras: tuple[Camera, ...], light: LightMap, device: Any
 ) -> Studio:
-    """A studio for a white mesh, one catalog entry for each (metallic, roughness), with nothing around and hidden sky not looked for."""
-    config = replace(config, render=replace(config.render, table=False, ambient_rays=0))
+    """A studio for a white mesh, one catalog entry for each (metallic, roughness), with nothing around."""
+    config = replace(config, render=replace(config.render, table=False))
     white = [Material((1.0, 1.0, 1.0), None, metallic, roughness) for metallic, roughness in kinds]
     # Volume, radius, mass and diameter do not show.
     entries = tuple(
