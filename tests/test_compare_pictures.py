@@ -116,3 +116,10 @@ def test_without_a_gpu_it_says_so(capsys):
 def test_devices_that_are_no_two_devices(capsys, devices):
     assert tool.main(["--devices", devices]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_what_exceeds_its_tolerance_is_an_exit_code_of_its_own(monkeypatch, capsys):
+    a = np.zeros((1, 2, 5), np.uint8)
+    monkeypatch.setattr(tool, "compare_devices", lambda *_: [tool.compare(FAST, "instance", a, a + 1)])
+    assert tool.main(["--devices", "cpu,cpu"]) == 1
+    assert "VIOLATED" in capsys.readouterr().out

@@ -221,7 +221,8 @@ def render_views(config: Config, scene: Any, snapshot: Snapshot) -> dict[str, np
 
 
 def _print(console: Console, differences: list[Difference], title: str) -> None:
-    table = Table("mode", "output", "differ %", "mean", "largest", "unit", "tolerance", "beyond %", "most %", "", title=title)
+    table = Table("mode", "output", "differ %", "mean", "largest", "unit", "tolerance", "beyond %", "most %", title=title)
+    table.add_column("", min_width=len("VIOLATED"), no_wrap=True)
     for row in differences:
         tolerance = row.tolerance
         same = "equal" if tolerance.apart is None else f"{tolerance.apart:g}"
