@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from synpick_warp import frames
 from synpick_warp.scenes.shapes import Catalog, Fixture
-from tests.reference.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, render, snapshot
+from tests.reference.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, render, sheet, snapshot
 
 FOLDER = Path(__file__).resolve().parent.parent / "tools"
 OBLIQUE = np.array([[1.0, 0.0, 0.0], [0.0, -0.6, -0.8], [0.0, 0.8, -0.6]])
@@ -87,3 +88,11 @@ def test_surfaces_are_compared_in_the_camera():
     }
     straight, apart = (row.value for row in bench_sensor.surface_agreement(cameras, normal, albedo, layers))
     assert (straight, apart) == (50.0, 1.0)
+
+
+def test_textures_with_the_same_border_stay_apart():
+    black = np.zeros((1024, 1024, 3), np.uint8)
+    framed = black.copy()
+    framed[:, 1:] = 200
+    first, second = (bench_sensor._newton_mesh(sheet(1.0, 1.0), replace(GREY, texture=texture)) for texture in (black, framed))
+    assert first.texture_hash != second.texture_hash

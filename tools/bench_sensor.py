@@ -139,11 +139,17 @@ def _build_model(
     return builder.finalize(device=device), codes
 
 
+class _Mesh(newton.Mesh):
+    """A mesh with a texture of its own: Newton tells textures apart by a thousand of their bytes, which may all lie on a black border."""
+
+    @property
+    def texture_hash(self) -> int:
+        return id(self.texture)
+
+
 def _newton_mesh(mesh: TriangleMesh, material: Material) -> newton.Mesh:
     uvs = None if material.texture is None else mesh.uv
-    return newton.Mesh(
-        mesh.vertices, mesh.faces.reshape(-1), normals=mesh.normals, uvs=uvs, texture=material.texture, compute_inertia=False
-    )
+    return _Mesh(mesh.vertices, mesh.faces.reshape(-1), normals=mesh.normals, uvs=uvs, texture=material.texture, compute_inertia=False)
 
 
 def _add_body(builder: newton.ModelBuilder, mesh: newton.Mesh, material: Material, pose: np.ndarray, shape: Any) -> None:
