@@ -137,8 +137,8 @@ def test_whole_numbers_do_for_floats():
         ("cameras.resolution", [640], "cameras.resolution is [640] on the command line; allowed: 2 whole numbers in a list [px]"),
         ("cameras.ups", [[1, 2]], "cameras.ups is [[1, 2]] on the command line; allowed: a list of lists of 3 numbers"),
         ("render.layers", ["flow", "normal"],
-         'render.layers is ["flow", "normal"] on the command line; allowed: any of normals, albedo, nocs, classes, flow, scene_flow; '
-         "did you mean normals?"),
+         'render.layers is ["flow", "normal"] on the command line; allowed: any of normals, albedo, nocs, classes, flow, scene_flow, '
+         "depth_sensor; did you mean normals?"),
         ("render.layers", "flow", 'render.layers is "flow" on the command line; allowed: a list of strings'),
         ("tote.color", [0.5, 0.5, 1.5], "tote.color is [0.5, 0.5, 1.5] on the command line; allowed: each at least 0, at most 1 [sRGB]"),
     ],

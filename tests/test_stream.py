@@ -16,10 +16,12 @@ from synpick_warp.frames import EFFECTS, FrameBatch
 from synpick_warp.kernels import pack, phases
 from synpick_warp.stages import stream, worlds
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.render_scene import build_lights
 from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.simulate import TickRecord
-from synpick_warp.stages.stream import FrameStream, HostCopy, LightTable, TickReader, TickReport, view_sizes, views_per_batch
+from synpick_warp.stages.stream import FrameStream, HostCopy, LightTable, TickReader, TickReport, name_lights, view_sizes, views_per_batch
 from tests.reference.small_worlds import settings
+from tests.reference.toy_scene import even_light, sun
 
 WORLDS, ROOM = 5, 3
 OBJECT_IDS = np.array([4, 7, 11], np.int32)
@@ -175,6 +177,18 @@ def test_view_sizes_are_those_of_the_buffers(device):
     assert buffers.pixels.shape == (3, ROOM, 3)
     pixel = sum(wp.types.type_size_in_bytes(getattr(buffers, name).dtype) for name in ("color", "depth", "instance", "amodal"))
     assert pixel == stream.PIXEL_BYTES
+
+
+def test_main_lights_are_told_in_the_world_and_maps_without_any_as_zero(device):
+    maps = (sun((1.0, 0.0, 1.0)), even_light())
+    table = name_lights([light.name for light in maps], build_lights(maps, None, 1.0, device))
+    assert table.name.tolist() == ["sun", "even"]
+    assert not table.direction[1].any()
+    # Counter-clockwise by a quarter, what stood over +x stands over +y: as far off as a texel of the map is wide.
+    turned = table.directions(np.array([0, 0, 1]), np.array([0.0, np.pi / 2, 1.0]))
+    np.testing.assert_allclose(turned, [[0.5**0.5, 0.0, 0.5**0.5], [0.0, 0.5**0.5, 0.5**0.5], [0.0, 0.0, 0.0]], atol=0.03)
+    np.testing.assert_allclose(np.linalg.norm(turned[:2], axis=1), 1.0, rtol=1e-6)
+    assert turned.dtype == np.float32
 
 
 # ---- from the device ----
