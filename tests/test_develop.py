@@ -26,7 +26,7 @@ from synpick_warp.kernels.environment import Lights
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.stages.develop import Developer
 from synpick_warp.stages.render_scene import build_cameras, build_grid
-from tests.reference.toy_scene import camera
+from tests.reference.toy_scene import UPRIGHT, ToyScene, box, camera, entry, render
 
 WIDTH, HEIGHT = 72, 40
 LENS = camera(WIDTH, HEIGHT, 60.0, (0.0, 0.0, 2.0))
@@ -291,6 +291,16 @@ def test_a_view_follows_from_its_address_alone():
     fixed = config_of(read_noise=(0.1, 0.1))
     pictures, _ = developed(even(0.5), fixed, at)
     assert len({picture.tobytes() for picture in (*pictures, developed(even(0.5), config_of(seed=8, read_noise=(0.1, 0.1)), ONE)[0])}) == 5
+
+
+def test_effects_change_colour_alone(device):
+    toy = ToyScene([entry(box(0.3, 0.2, 0.1))], [[(0, (0.02, 0.0, 0.0, *UPRIGHT))]] * 2, (LENS,), table=True)
+    plain = render(toy, device)
+    toy.config = config_of("shoulder", **ALL)
+    changed = render(toy, device)
+    assert (changed.color != plain.color).any(axis=(1, 2, 3)).all()
+    for name in ("depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance"):
+        np.testing.assert_array_equal(getattr(changed, name), getattr(plain, name))
 
 
 def test_strengths_fill_their_ranges_evenly():
