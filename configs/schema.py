@@ -277,18 +277,19 @@ class Render:
     """Light and picture."""
 
     mode: str = setting(
-        FAST, "", "fast: few rays and a filter; reference: path tracing, slow. Depth, masks and boxes are the same.", choices=SHADINGS
+        FAST, "", "fast: few paths and a filter; reference: many paths, slow. Depth, masks and boxes are the same.", choices=SHADINGS
     )
     samples: int = setting(64, "", "Paths a pixel with mode reference; powers of two are spread most evenly.", low=1, high=65536)
-    bounces: int = setting(4, "", "Most surfaces that a path meets with mode reference; 1: direct light alone.", low=1, high=64)
+    bounces: int = setting(4, "", "Most surfaces that a path meets; 1: direct light alone.", low=1, high=64)
     turn_lights: bool = setting(True, "", "Turn each episode's light map by a random angle about the vertical.")
     exposure: float = setting(1.0, "", "Factor on the automatic exposure.", above=0.0)
     exposure_spread: float = setting(
         0.3, "stops", "Each episode's exposure is off by up to so much, evenly: cameras step by a third of a stop.", low=0.0, high=5.0
     )
-    shadow_rays: int = setting(1, "", "Shadow rays a pixel towards the map's main light; 0: none.", low=0, high=64)
-    ambient_rays: int = setting(1, "", "Rays a pixel that find how much of the sky is hidden; 0: none.", low=0, high=64)
-    color_samples: int = setting(1, "", "Colour samples a pixel; depth and masks always have one.", low=1, high=64)
+    cell: int = setting(
+        0, "px", "With mode fast: paths start from the middles of cells so wide; 0: as many px as make 480 cells across.", low=0, high=64
+    )
+    cell_paths: int = setting(2, "", "With mode fast: paths a cell; powers of two are spread most evenly.", low=1, high=1024)
     tone: str = setting(
         SHOULDER, "", "shoulder: linear up to 0.6, highlights compressed; linear: cut off at 1; filmic: ACES' curve, middle grey kept.",
         choices=TONES,

@@ -18,7 +18,7 @@ from synpick_warp.kernels.effects import (
 )
 from synpick_warp.kernels.environment import Lights
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 # Tone curves; a test keeps them in step with configs.sensors.TONES.
 SHOULDER = wp.constant(0)

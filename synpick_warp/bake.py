@@ -17,7 +17,7 @@ import warp as wp
 from synpick_warp.arrays import memory_table
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.configs.modes import may_pick
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.device import pick_device
 from synpick_warp.exporters.bop import BopExporter, view_bytes
@@ -34,12 +34,14 @@ from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.shapes import Camera, Catalog
 from synpick_warp.scenes.tote import tote_fixture
-from synpick_warp.stages.buffers import FIXTURES, LastFrame, LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.bodies import BodyArrays, HitArrays, body_sizes
+from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.develop import SpreadArrays, has_spread
+from synpick_warp.stages.fast import FAST_SCRATCH, cell_sizes
 from synpick_warp.stages.layers import MOVING, MotionArrays
 from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
 from synpick_warp.stages.plan import CycleArrays, VoteArrays, plan_sizes
-from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays, Renderer
+from synpick_warp.stages.render import PictureArrays, Renderer
 from synpick_warp.stages.render_scene import build_render_scene
 from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.simulate import RECORDS, Simulation
@@ -260,7 +262,7 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     room = config.arrangement.max_objects
     worlds = world_sizes(config, build.GRIPPER_BODIES + 2 * room)
     views = view_sizes(config, device)
-    views["body"] = room + len(FIXTURES)
+    views |= body_sizes(room, *config.cameras.resolution)
     ring = RING if device.is_cuda else 1
     groups = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState, LastFrame)]
     groups += [(kind, worlds, 1 + RECORDS) for kind in (Sighting, Plan)]
@@ -275,4 +277,7 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
         groups += [(kind, sight_sizes(config, room, looks), 1) for kind in SCRATCH]
         groups += [(kind, plan_sizes(config, room, looks), 1) for kind in (VoteArrays, CycleArrays)]
     rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
+    if config.render.mode == FAST:
+        cells = views | cell_sizes(config)
+        rows += [row for kind, copies in FAST_SCRATCH for row in memory_table(kind, cells) for _ in range(copies)]
     return rows + ring * memory_table(LayerBuffers, views, config.render.layers)

@@ -14,7 +14,9 @@ from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewB
 from synpick_warp.stages.layers import MotionArrays
 from synpick_warp.stages.perceive import SightScratch, count_views
 from synpick_warp.stages.plan import CycleArrays, VoteArrays
-from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays
+from synpick_warp.stages.bodies import BodyArrays, HitArrays
+from synpick_warp.stages.fast import GatheredArrays, ShadowArrays
+from synpick_warp.stages.render import PictureArrays
 from synpick_warp.stages.sight import LookArrays, Plan, Sighting
 from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus
 from tests.reference.small_worlds import settings

@@ -43,6 +43,7 @@ from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.frames import FrameBatch
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.annotate import annotate
+from synpick_warp.stages.fast import FastPicture
 from synpick_warp.stages.simulate import Simulation
 from synpick_warp.stages.stream import STATUS_COLUMNS, FrameStream, TickReader, TickReport
 
@@ -211,23 +212,28 @@ def _render(config: Config, factory: Factory, least: float) -> Iterator[Row]:
 def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], object]]:
     """Launches of each stage of a batch of `count` views, by name, in order; "all" is all of them."""
     simulation, renderer, out = factory.simulation, factory.stream.renderer, factory.stream.buffers[0]
-    cameras, snapshot, samples = len(factory.cameras), simulation.records[0].snapshot, renderer.samples
+    cameras, snapshot, shading = len(factory.cameras), simulation.records[0].snapshot, renderer.shading
+    bodies, hits, radiance = renderer.bodies, renderer.hits, renderer.picture.radiance
     view = np.arange(count, dtype=np.int32)
     world, camera = (wp.array(values, dtype=wp.int32, device=simulation.device) for values in (view // cameras, view % cameras))
     stages: dict[str, Callable[[], object]] = {
         "prepare bodies": lambda: renderer.prepare_bodies(snapshot, world, camera, count),
         "trace hits": lambda: renderer.trace_hits(camera, count, out),
-        "trace colour samples": lambda: [renderer.trace_sample(camera, count, sample) for sample in samples],
-        "occlude": lambda: [renderer.occlude(snapshot, world, camera, count, sample) for sample in samples],
-        "filter occlusion": lambda: [renderer.filter_occlusion(camera, count, sample) for sample in samples],
-        "shade": lambda: [renderer.shade(snapshot, world, camera, count, sample) for sample in samples],
+    }
+    if isinstance(shading, FastPicture):
+        stages |= {
+            "gather light": lambda: shading.gather(snapshot, bodies, hits, world, camera, count),
+            "filter light": lambda: shading.filter(camera, count),
+            "shadows of the main light": lambda: shading.cast_shadows(snapshot, bodies, hits, world, camera, count),
+            "shade": lambda: shading.light(snapshot, bodies, hits, world, camera, count, radiance),
+        }
+    else:
+        stages["trace paths"] = lambda: shading.shade(snapshot, bodies, hits, world, camera, count, radiance)
+    return stages | {
         "develop": lambda: renderer.develop(snapshot, world, camera, count, out),
         "annotate": lambda: annotate(renderer.scene, renderer.bodies, camera, count, out),
         "all": lambda: renderer.render(snapshot, world, camera, count, out),
     }
-    if len(samples) == 1:
-        del stages["trace colour samples"]
-    return stages
 
 
 def _write(config: Config, factory: Factory, least: float) -> Iterator[Row]:

@@ -19,7 +19,7 @@ from synpick_warp.stages.simulate import TickRecord
 from synpick_warp.stages.worlds import MEASURE_COLUMNS, STATUS_COLUMNS
 
 # Bytes of one batch's images on a GPU: large enough to fill it, small enough that several batches are in flight.
-BATCH_BYTES = 256 << 20
+BATCH_BYTES = 512 << 20
 # Colour, depth, instance id and amodal bits of one pixel.
 PIXEL_BYTES = 3 + 2 + 1 + 4
 # Batches in flight: one is rendered while another is copied and a third is read.
