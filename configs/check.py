@@ -45,7 +45,8 @@ def checked(key: str, value: object, item: dataclasses.Field[Any], kind: Any, so
     except _MismatchError:
         raise ConfigError(f"{key} is {shown(value)} {source}; allowed: {describe_kind(kind)}{_unit(item)}") from None
     if not all(_inside(leaf, item) for leaf in _leaves(result)):
-        hint = did_you_mean(str(value), item.metadata["choices"])
+        wrong = next(leaf for leaf in _leaves(result) if not _inside(leaf, item))
+        hint = did_you_mean(str(wrong), item.metadata["choices"])
         raise ConfigError(f"{key} is {shown(value)} {source}; allowed: {allowed(item, kind)}{_unit(item)}{hint}")
     return result
 
@@ -54,7 +55,7 @@ def allowed(item: dataclasses.Field[Any], kind: Any) -> str:
     """The range or the choices of a setting in words, or its type if every value of the type will do."""
     rules = item.metadata
     if rules["choices"]:
-        return ", ".join(rules["choices"])
+        return ("any of " if typing.get_origin(kind) is tuple else "") + ", ".join(rules["choices"])
     words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
     if not words:
         return describe_kind(kind)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import re
 from collections.abc import Iterator
@@ -27,6 +28,8 @@ def complaints(config: Config) -> Iterator[Complaint]:
     yield from _times(config)
     yield from _pick(config)
     yield from _suction(config)
+    yield from _render(config)
+    yield from _sensors(config)
     yield from _bop(config)
     yield from _object_rows(config)
 
@@ -93,6 +96,25 @@ def _suction(config: Config) -> Iterator[Complaint]:
         yield "suction.tolerated_misses", f"less than suction.rays, {suction.rays}: a ray must hit"
     if suction.poor_force > suction.good_force:
         yield "suction.poor_force", f"at most suction.good_force, {suction.good_force:g} [N]"
+
+
+def _render(config: Config) -> Iterator[Complaint]:
+    layers = config.render.layers
+    if len(set(layers)) < len(layers):
+        yield "render.layers", f"each layer once: {shown(list(dict.fromkeys(layers)))}"
+
+
+def _sensors(config: Config) -> Iterator[Complaint]:
+    for section in ("effects", "depth_sensor"):
+        for item in dataclasses.fields(getattr(config, section)):
+            value = getattr(getattr(config, section), item.name)
+            if isinstance(value, tuple) and value[0] > value[1]:
+                yield f"{section}.{item.name}", f"the lesser first: {shown([value[1], value[0]])}"
+    least, most = config.effects.jpeg_quality
+    if most and not least:
+        yield "effects.jpeg_quality", f"from 1 to 100, or 0, 0: {shown([1, most])}"
+    if most and config.bop.color_format != "jpg":
+        yield "effects.jpeg_quality", f"0, 0 with bop.color_format {config.bop.color_format}"
 
 
 def _bop(config: Config) -> Iterator[Complaint]:

@@ -55,7 +55,7 @@ def preset_names() -> list[str]:
 
 
 def parse_assignment(text: str) -> tuple[str, object]:
-    """Split "section.key=value" into key and value; the value is TOML, and for strings the quotes may be left out.
+    """Split "section.key=value" into key and value; the value is TOML, and for strings and lists of strings the quotes may be left out.
 
     Raises:
         ConfigError: There is no "=", or no such setting.
@@ -69,7 +69,9 @@ def parse_assignment(text: str) -> tuple[str, object]:
     try:
         value: object = tomllib.loads(f"value = {written}")["value"]
     except tomllib.TOMLDecodeError:
-        value = written
+        # A shell takes the quotes out of ["a","b"].
+        words = written.strip().removeprefix("[").removesuffix("]").split(",")
+        value = [word.strip() for word in words] if kind == tuple[str, ...] else written
     return key, written if kind is str and not isinstance(value, str) else value
 
 

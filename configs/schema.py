@@ -7,7 +7,9 @@ number comes from. "Released" means the generator that the paper's authors publi
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+
+from synpick_warp.configs.fields import setting
+from synpick_warp.configs.sensors import SHOULDER, TONES, DepthSensor, Effects
 
 MODES = ("pick", "target", "move")
 """What the gripper does in an episode."""
@@ -15,28 +17,12 @@ MIXED = "mixed"
 """Every episode draws its mode."""
 
 
-def setting(
-    default: Any,
-    unit: str,
-    doc: str,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    above: float | None = None,
-    choices: tuple[str, ...] = (),
-) -> Any:
-    """A dataclass field that knows its unit, its meaning and what values it takes.
-
-    `low` and `high` include their end; `above` excludes it. For tuples the bounds hold for each element.
-    """
-    metadata = {"unit": unit, "doc": doc, "low": low, "high": high, "above": above, "choices": choices}
-    return field(default=default, metadata=metadata)
-
-
 FAST = "fast"
 REFERENCE = "reference"
 SHADINGS = (FAST, REFERENCE)
 """How colour is made."""
+LAYERS = ("normals", "albedo", "nocs", "classes", "flow", "scene_flow", "depth_sensor")
+"""What a picture can have besides colour, depth and instances; `synpick_warp.layers` says what each is."""
 
 
 FORMATS = ("bop", "shards", "usd", "zarr")
@@ -298,20 +284,26 @@ class Render:
     """Light and picture."""
 
     mode: str = setting(
-        FAST, "", "fast: few rays and a filter; reference: path tracing, slow. Depth, masks and boxes are the same.", choices=SHADINGS
+        FAST, "", "fast: few paths and a filter; reference: many paths, slow. Depth, masks and boxes are the same.", choices=SHADINGS
     )
     samples: int = setting(64, "", "Paths a pixel with mode reference; powers of two are spread most evenly.", low=1, high=65536)
-    bounces: int = setting(4, "", "Most surfaces that a path meets with mode reference; 1: direct light alone.", low=1, high=64)
+    bounces: int = setting(4, "", "Most surfaces that a path meets; 1: direct light alone.", low=1, high=64)
     turn_lights: bool = setting(True, "", "Turn each episode's light map by a random angle about the vertical.")
     exposure: float = setting(1.0, "", "Factor on the automatic exposure.", above=0.0)
     exposure_spread: float = setting(
         0.3, "stops", "Each episode's exposure is off by up to so much, evenly: cameras step by a third of a stop.", low=0.0, high=5.0
     )
-    shadow_rays: int = setting(1, "", "Shadow rays a pixel towards the map's main light; 0: none.", low=0, high=64)
-    ambient_rays: int = setting(1, "", "Rays a pixel that find how much of the sky is hidden; 0: none.", low=0, high=64)
-    color_samples: int = setting(1, "", "Colour samples a pixel; depth and masks always have one.", low=1, high=64)
+    cell: int = setting(
+        0, "px", "With mode fast: paths start from the middles of cells so wide; 0: as many px as make 480 cells across.", low=0, high=64
+    )
+    cell_paths: int = setting(2, "", "With mode fast: paths a cell; powers of two are spread most evenly.", low=1, high=1024)
+    tone: str = setting(
+        SHOULDER, "", "shoulder: linear up to 0.6, highlights compressed; linear: cut off at 1; filmic: ACES' curve, middle grey kept.",
+        choices=TONES,
+    )
     table: bool = setting(True, "", "A table under the tote; without it the light map shows.")
     table_color: tuple[float, float, float] = setting((0.45, 0.45, 0.44), "sRGB", "Base colour of the table.", low=0.0, high=1.0)
+    layers: tuple[str, ...] = setting((), "", "What each view has besides colour, depth and masks: a list of these.", choices=LAYERS)
     views_per_batch: int = setting(0, "", "Views rendered and copied at once; 0: chosen by device and resolution.", low=0)
 
 
@@ -356,6 +348,8 @@ class Config:
     sight: Sight = field(default_factory=Sight)
     suction: Suction = field(default_factory=Suction)
     render: Render = field(default_factory=Render)
+    effects: Effects = field(default_factory=Effects)
+    depth_sensor: DepthSensor = field(default_factory=DepthSensor)
     bop: Bop = field(default_factory=Bop)
     trajectory: Trajectory = field(default_factory=Trajectory)
     object_rows: tuple[ObjectRow, ...] = ()

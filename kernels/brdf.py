@@ -14,7 +14,7 @@ holds a and b.
 
 import warp as wp
 
-from synpick_warp.kernels.occlusion import around, sobol_point
+from synpick_warp.kernels.sampling import around, sobol_point
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,7 +36,7 @@ GLOSS_COLUMNS = wp.constant(32)
 """Roots of cosines in the table: j / (GLOSS_COLUMNS - 1); the albedo changes fastest at grazing angles."""
 GLOSS_SAMPLES = wp.constant(4096)
 """Directions that find one entry of the table, to about 1e-4."""
-LEAST_SHARE = wp.constant(0.1)
+LEAST_SHARE = wp.constant(0.25)
 """No lobe that scatters anything is chosen more seldom than this."""
 
 
@@ -204,13 +204,22 @@ def visible_facet(outgoing: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
     return wp.normalize(wp.vec3(alpha * h[0], alpha * h[1], wp.max(h[2], LEAST_RISE)))
 
 
+@wp.struct
+class Reflection:
+    """f times the cosine to where light comes from, in two parts: diffuse color times `diffuse`, plus `gloss` [1/sr]."""
+
+    diffuse: float
+    gloss: wp.vec3
+
+
 @wp.func
-def evaluate(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> wp.vec3:
-    """f times the cosine to `incoming`, from where light comes; 0 below the surface [1/sr]."""
+def evaluate_parts(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> Reflection:
+    """How much of the light from `incoming` a surface reflects; none below the surface."""
+    made = Reflection()
     i = to_local(brdf, incoming)
     o = to_local(brdf, brdf.outgoing)
     if i[2] <= 0.0 or o[2] <= 0.0:
-        return wp.vec3(0.0, 0.0, 0.0)
+        return made
     one = wp.vec3(1.0, 1.0, 1.0)
     half_way = wp.normalize(i + o)
     fresnel = brdf.reflectance + schlick(wp.dot(o, half_way)) * (one - brdf.reflectance)
@@ -220,7 +229,16 @@ def evaluate(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> wp.vec3:
     albedo = gloss_albedo(gloss, brdf.roughness, i[2])
     lost = (1.0 - albedo[0] - albedo[1]) * (1.0 - brdf.albedo[0] - brdf.albedo[1]) / wp.max(1.0 - brdf.mean[0] - brdf.mean[1], LEAST_LOST)
     through = (1.0 - coat_share(brdf, albedo)) * (1.0 - coat_share(brdf, brdf.albedo)) / (1.0 - coat_share(brdf, brdf.mean))
-    return single + (i[2] / wp.PI) * (lost * brdf.multiple + through * brdf.diffuse)
+    made.gloss = single + (i[2] / wp.PI * lost) * brdf.multiple
+    made.diffuse = i[2] / wp.PI * through
+    return made
+
+
+@wp.func
+def evaluate(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> wp.vec3:
+    """f times the cosine to `incoming`, from where light comes; 0 below the surface [1/sr]."""
+    parts = evaluate_parts(gloss, brdf, incoming)
+    return parts.gloss + parts.diffuse * brdf.diffuse
 
 
 @wp.func

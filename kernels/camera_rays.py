@@ -56,6 +56,12 @@ def tile_pixel(grid: ImageGrid, index: int) -> wp.vec3i:
 
 
 @wp.func
+def tile_of(grid: ImageGrid, row: int, column: int) -> int:
+    """Number of the tile that holds a pixel."""
+    return (row // TILE_HEIGHT) * grid.tile_columns + column // TILE_WIDTH
+
+
+@wp.func
 def camera_ray(intrinsics: wp.vec4, row: int, column: int, offset: wp.vec2) -> wp.vec3:
     """Direction ((x - cx) / fx, (y - cy) / fy, 1) in the camera's axes, so that a multiple of it is planar depth.
 
@@ -64,6 +70,12 @@ def camera_ray(intrinsics: wp.vec4, row: int, column: int, offset: wp.vec2) -> w
     x = float(column) + PIXEL_CENTER + offset[0]
     y = float(row) + PIXEL_CENTER + offset[1]
     return wp.vec3((x - intrinsics[2]) / intrinsics[0], (y - intrinsics[3]) / intrinsics[1], 1.0)
+
+
+@wp.func
+def hit_position(cameras: Cameras, camera: int, ray: wp.vec3, depth: float) -> wp.vec3:
+    """Where a camera ray reaches a planar depth, in the world [m]."""
+    return wp.vec3(cameras.center[camera]) + cameras.to_world[camera] * (depth * ray)
 
 
 @wp.func

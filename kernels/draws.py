@@ -17,6 +17,9 @@ LIGHT = wp.constant(5)
 MODE = wp.constant(6)
 TARGETS = wp.constant(7)
 PATHS = wp.constant(8)
+EFFECTS = wp.constant(9)
+COLOR_NOISE = wp.constant(10)
+DEPTH_NOISE = wp.constant(11)
 
 # γ and the two multipliers of SplitMix64.
 GAMMA = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
@@ -45,6 +48,20 @@ def stream_key(seed: wp.uint64, episode: int, redraw: int, purpose: int) -> wp.u
 
 
 @wp.func
+def view_key(seed: wp.uint64, episode: int, frame: int, camera: int, purpose: int) -> wp.uint64:
+    """Key of a view's stream: pictures do not depend on how often an arrangement was drawn again."""
+    key = stream_key(seed, episode, 0, purpose)
+    key = mix((key ^ wp.uint64(frame)) + GAMMA)
+    return mix((key ^ wp.uint64(camera)) + GAMMA)
+
+
+@wp.func
+def pixel_key(key: wp.uint64, pixel: int) -> wp.uint64:
+    """Key of a pixel's stream, from its view's."""
+    return mix((key ^ wp.uint64(pixel)) + GAMMA)
+
+
+@wp.func
 def uniform(key: wp.uint64, index: int) -> float:
     """Number `index` of a stream, in [0, 1)."""
     bits = mix(key + (wp.uint64(index) + wp.uint64(1)) * GAMMA)
@@ -55,6 +72,14 @@ def uniform(key: wp.uint64, index: int) -> float:
 def uniform_index(key: wp.uint64, index: int, count: int) -> int:
     """Number `index` of a stream as an integer in [0, count)."""
     return wp.min(int(uniform(key, index) * float(count)), count - 1)
+
+
+@wp.func
+def normal_pair(key: wp.uint64, index: int) -> wp.vec2:
+    """Two independent standard normal numbers, from numbers `index` and `index` + 1 (Box and Muller, 1958)."""
+    radius = wp.sqrt(-2.0 * wp.log(1.0 - uniform(key, index)))
+    angle = TAU * uniform(key, index + 1)
+    return wp.vec2(radius * wp.cos(angle), radius * wp.sin(angle))
 
 
 @wp.func

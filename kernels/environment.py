@@ -4,7 +4,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-REFLECTION_LEVELS = wp.constant(5)
+REFLECTION_LEVELS = wp.constant(10)
 """Reflections are blurred for roughness 1/5, 2/5, ... 1."""
 
 
@@ -12,8 +12,10 @@ REFLECTION_LEVELS = wp.constant(5)
 class Lights:
     """Constant, one row a light map. Directions are the map's; a world turns them about +z."""
 
+    maps: int
     background: wp.array3d[wp.vec3]
-    """Radiance (map, row, column); row 0 looks up, column u = azimuth / 2π + 0.5."""
+    """Radiance (map, row, column), first of all maps whole, then of all without their main light; row 0 looks up, column
+    u = azimuth / 2π + 0.5."""
     reflection: wp.array4d[wp.vec3]
     """Radiance without the main light, blurred for growing roughness (map, level, row, column)."""
     irradiance: wp.array2d[wp.vec3]
@@ -44,45 +46,62 @@ def map_position(direction: wp.vec3, rows: int, columns: int) -> wp.vec2:
     return wp.vec2(v * float(rows) - 0.5, u * float(columns) - 0.5)
 
 
+@wp.struct
+class Corners:
+    """Where a bilinear look-up reads, and how far it lies from the upper left of the four texels."""
+
+    upper: int
+    lower: int
+    west: int
+    east: int
+    down: float
+    right: float
+
+
 @wp.func
-def background_radiance(lights: Lights, light: int, direction: wp.vec3) -> wp.vec3:
-    """Radiance from a unit direction in the map's frame, bilinear."""
-    rows = lights.background.shape[1]
-    columns = lights.background.shape[2]
+def map_corners(direction: wp.vec3, rows: int, columns: int) -> Corners:
+    """The texels about a unit direction in an equirectangular map, whose left edge continues its right one."""
     at = map_position(direction, rows, columns)
     row = int(wp.floor(at[0]))
     column = int(wp.floor(at[1]))
-    down = at[0] - float(row)
-    right = at[1] - float(column)
-    upper = wp.clamp(row, 0, rows - 1)
-    lower = wp.clamp(row + 1, 0, rows - 1)
-    west = (column + columns) % columns
-    east = (column + 1) % columns
-    return wp.lerp(
-        wp.lerp(lights.background[light, upper, west], lights.background[light, upper, east], right),
-        wp.lerp(lights.background[light, lower, west], lights.background[light, lower, east], right),
-        down,
+    made = Corners()
+    made.down = at[0] - float(row)
+    made.right = at[1] - float(column)
+    made.upper = wp.clamp(row, 0, rows - 1)
+    made.lower = wp.clamp(row + 1, 0, rows - 1)
+    made.west = (column + columns) % columns
+    made.east = (column + 1) % columns
+    return made
+
+
+@wp.func
+def bilinear(at: Corners, upper_west: wp.vec3, upper_east: wp.vec3, lower_west: wp.vec3, lower_east: wp.vec3) -> wp.vec3:
+    return wp.lerp(wp.lerp(upper_west, upper_east, at.right), wp.lerp(lower_west, lower_east, at.right), at.down)
+
+
+@wp.func
+def background_radiance(lights: Lights, light: int, direction: wp.vec3) -> wp.vec3:
+    """Radiance from a unit direction in the map's frame, bilinear."""
+    at = map_corners(direction, lights.background.shape[1], lights.background.shape[2])
+    return bilinear(
+        at,
+        lights.background[light, at.upper, at.west],
+        lights.background[light, at.upper, at.east],
+        lights.background[light, at.lower, at.west],
+        lights.background[light, at.lower, at.east],
     )
 
 
 @wp.func
 def reflection_texel(lights: Lights, light: int, level: int, direction: wp.vec3) -> wp.vec3:
     """One level of the blurred reflections from a unit direction in the map's frame, bilinear."""
-    rows = lights.reflection.shape[2]
-    columns = lights.reflection.shape[3]
-    at = map_position(direction, rows, columns)
-    row = int(wp.floor(at[0]))
-    column = int(wp.floor(at[1]))
-    down = at[0] - float(row)
-    right = at[1] - float(column)
-    upper = wp.clamp(row, 0, rows - 1)
-    lower = wp.clamp(row + 1, 0, rows - 1)
-    west = (column + columns) % columns
-    east = (column + 1) % columns
-    return wp.lerp(
-        wp.lerp(lights.reflection[light, level, upper, west], lights.reflection[light, level, upper, east], right),
-        wp.lerp(lights.reflection[light, level, lower, west], lights.reflection[light, level, lower, east], right),
-        down,
+    at = map_corners(direction, lights.reflection.shape[2], lights.reflection.shape[3])
+    return bilinear(
+        at,
+        lights.reflection[light, level, at.upper, at.west],
+        lights.reflection[light, level, at.upper, at.east],
+        lights.reflection[light, level, at.lower, at.west],
+        lights.reflection[light, level, at.lower, at.east],
     )
 
 

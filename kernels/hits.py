@@ -1,17 +1,21 @@
-"""What every pixel's ray hits: bodies prepared for a view, primary hits with amodal bits, and occlusion queries."""
+"""What every pixel's ray hits: primary hits with amodal bits, and occlusion queries."""
 
 import warp as wp
 
-from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, projected_box, tile_pixel
+from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, tile_of, tile_pixel
 
 wp.set_module_options({"enable_backward": False})
 
+RAY_REGISTERS = 64
+"""Most registers of a thread that casts rays: with more, too few threads are in flight to hide how long a tree's nodes take to come."""
 NOTHING = wp.constant(0)
 TABLE = wp.constant(252)
 FIRST_FIXTURE = wp.constant(253)
 """Codes of `frames`: 0 nothing, 1 + instance_id, 252 table, 253 tote, 254 finger, 255 cup."""
 FAR = wp.constant(1.0e30)
 """Stands for no hit yet [m]."""
+RAY_OFFSET = wp.constant(2.0e-4)
+"""Secondary rays start this far off the surface [m], so that they do not hit it again."""
 MAX_COUNTS = wp.constant(65535.0)
 """Largest depth that fits into 16 bits."""
 
@@ -60,6 +64,12 @@ class Bodies:
     """Origin of the body in the world [m]."""
     sphere: wp.array2d[wp.vec4]
     """Bounding sphere in the world: centre [m], squared radius [m²]; a negative square: not there."""
+    order: wp.array2d[int]
+    """The bodies that are there, by `near`: rays that meet the nearest first seldom have to look at the rest."""
+    present: wp.array[int]
+    """How many these are, one a view."""
+    candidates: wp.array2d[wp.uint64]
+    """Of a view's tile: bit k is set if rays of its pixels may meet body order[k]."""
 
 
 @wp.struct
@@ -94,90 +104,10 @@ def body_of(code: int, instances: int) -> int:
     return code - 1
 
 
-@wp.kernel
-def aim_views_kernel(
-    # In:
-    view_world: wp.array[int],
-    # Out:
-    view_camera_out: wp.array[int],
-):
-    """Views of a world look through camera 0, views of none (-1) through none (-1)."""
-    view = wp.tid()
-    view_camera_out[view] = 0
-    if view_world[view] < 0:
-        view_camera_out[view] = -1
-
-
-@wp.kernel
-def prepare_bodies_kernel(
-    # Scene:
-    meshes: Meshes,
-    cameras: Cameras,
-    grid: ImageGrid,
-    # State:
-    entry: wp.array2d[int],
-    pose: wp.array2d[wp.transformf],
-    fixture_pose: wp.array2d[wp.transformf],
-    fixture_visible: wp.array2d[int],
-    # In:
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
-    instances: int,
-    # Out:
-    bodies_out: Bodies,
-):
-    """Place bodies of a view's world (-1: none) before the view's camera: x_camera = R (x_world - c), in float64, stored in float32."""
-    view, body = wp.tid()
-    world = view_world[view]
-    camera = view_camera[view]
-    mesh = int(-1)
-    placed = wp.transform_identity(dtype=float)
-    if world < 0:
-        mesh = -1
-    elif body < instances:
-        mesh = entry[world, body]
-        placed = pose[world, body]
-    elif fixture_visible[world, body - instances] != 0:
-        mesh = meshes.entries + body - instances
-        placed = fixture_pose[world, body - instances]
-    bodies_out.mesh[view, body] = mesh
-    if mesh < 0:
-        bodies_out.box[view, body] = wp.vec4i(0, 0, -1, -1)
-        bodies_out.sphere[view, body] = wp.vec4(0.0, 0.0, 0.0, -1.0)
-        return
-
-    p = wp.transform_get_translation(placed)
-    q = wp.transform_get_rotation(placed)
-    position = wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
-    turn = wp.quat_to_matrix(wp.normalize(wp.quatd(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))))
-    to_camera = cameras.rotation[camera] * turn
-    origin = cameras.rotation[camera] * (position - cameras.center[camera])
-
-    c = meshes.center[mesh]
-    center = wp.vec3d(wp.float64(c[0]), wp.float64(c[1]), wp.float64(c[2]))
-    radius = meshes.radius[mesh]
-    near = wp.max(float((to_camera * center + origin)[2]) - radius, 0.0)
-    start = wp.transpose(to_camera) * (wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(near)) - origin)
-    sphere = turn * center + position
-
-    bodies_out.turn[view, body] = wp.mat33(wp.transpose(to_camera))
-    bodies_out.start[view, body] = wp.vec3(start)
-    bodies_out.near[view, body] = near
-    bodies_out.box[view, body] = projected_box(meshes.lower[mesh], meshes.upper[mesh], to_camera, origin, cameras.intrinsics[camera], grid)
-    bodies_out.world_turn[view, body] = wp.mat33(wp.transpose(turn))
-    bodies_out.position[view, body] = p
-    bodies_out.sphere[view, body] = wp.vec4(float(sphere[0]), float(sphere[1]), float(sphere[2]), radius * radius)
-
-
 @wp.func
 def body_ray_start(bodies: Bodies, view: int, body: int, ray: wp.vec3) -> wp.vec3:
     """Where a camera ray passes the body's near depth, in the body's frame [m]."""
     return bodies.start[view, body] + bodies.near[view, body] * (bodies.turn[view, body] * wp.vec3(ray[0], ray[1], 0.0))
-
-
-@wp.func
-def in_box(box: wp.vec4i, row: int, column: int) -> bool:
-    return column >= box[0] and column <= box[2] and row >= box[1] and row <= box[3]
 
 
 @wp.func
@@ -193,18 +123,20 @@ def trace_camera_ray(
     meshes: Meshes,
     bodies: Bodies,
     view: int,
-    row: int,
-    column: int,
+    tile: int,
     ray: wp.vec3,
     instances: int,
     amodal: bool,
 ) -> Hit:
-    """Nearest hit among the bodies whose box holds the pixel; with `amodal`, hidden instances are tested as well and get their bit."""
+    """Nearest hit among the tile's candidates; with `amodal`, hidden instances are tested as well and get their bit."""
     best = Hit()
     best.code = NOTHING
     best.depth = FAR
-    for body in range(instances + 3):
-        if in_box(bodies.box[view, body], row, column):
+    candidates = bodies.candidates[view, tile]
+    number = int(0)
+    while candidates != wp.uint64(0):
+        if (candidates & wp.uint64(1)) != wp.uint64(0):
+            body = bodies.order[view, number]
             near = bodies.near[view, body]
             if near < best.depth:
                 # Amodal bits need to know of hits behind the nearest one too; fixtures have no bit.
@@ -231,6 +163,8 @@ def trace_camera_ray(
             elif amodal and body < instances:
                 if hits_body(meshes, bodies, view, body, ray):
                     best.amodal = best.amodal | (wp.uint32(1) << wp.uint32(body))
+        candidates = candidates >> wp.uint64(1)
+        number += 1
     return best
 
 
@@ -257,7 +191,18 @@ def store_hit(hits: Hits, view: int, row: int, column: int, hit: Hit):
     hits.depth[view, row, column] = hit.depth
 
 
-@wp.kernel
+@wp.func
+def read_hit(hits: Hits, view: int, row: int, column: int) -> Hit:
+    """The hit of a pixel, without its amodal bits."""
+    hit = Hit()
+    hit.code = int(hits.code[view, row, column])
+    hit.triangle = hits.triangle[view, row, column]
+    hit.barycentric = hits.barycentric[view, row, column]
+    hit.depth = hits.depth[view, row, column]
+    return hit
+
+
+@wp.kernel(cuda_max_registers=RAY_REGISTERS)
 def trace_hits_kernel(
     # Scene:
     meshes: Meshes,
@@ -289,7 +234,7 @@ def trace_hits_kernel(
         return
     camera = view_camera[view]
     ray = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
-    hit = trace_camera_ray(meshes, bodies, view, row, column, ray, instances, True)
+    hit = trace_camera_ray(meshes, bodies, view, tile_of(grid, row, column), ray, instances, True)
     hit = hit_table(table, cameras, camera, ray, hit)
 
     store_hit(hits_out, view, row, column, hit)
@@ -301,7 +246,7 @@ def trace_hits_kernel(
     depth_out[view, row, column] = wp.uint16(counts)
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=RAY_REGISTERS)
 def trace_sample_kernel(
     # Scene:
     meshes: Meshes,
@@ -328,7 +273,7 @@ def trace_sample_kernel(
     if camera < 0:
         return
     ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
-    hit = trace_camera_ray(meshes, bodies, view, row, column, ray, instances, False)
+    hit = trace_camera_ray(meshes, bodies, view, tile_of(grid, row, column), ray, instances, False)
     store_hit(hits_out, view, row, column, hit_table(table, cameras, camera, ray, hit))
 
 
@@ -338,7 +283,6 @@ def is_blocked(
     table: Table,
     bodies: Bodies,
     view: int,
-    instances: int,
     origin: wp.vec3,
     direction: wp.vec3,
     reach: float,
@@ -347,11 +291,11 @@ def is_blocked(
     if table.visible != 0 and direction[2] < 0.0:
         if origin[2] + reach * direction[2] < table.height:
             return True
-    for body in range(instances + 3):
+    for number in range(bodies.present[view]):
+        body = bodies.order[view, number]
         sphere = bodies.sphere[view, body]
         offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
-        along = wp.clamp(wp.dot(offset, direction), 0.0, reach)
-        closest = offset - along * direction
+        closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, reach) * direction
         if wp.dot(closest, closest) < sphere[3]:
             turn = bodies.world_turn[view, body]
             if wp.mesh_query_ray_anyhit(

@@ -72,6 +72,58 @@ def take_snapshot_kernel(
         fixture_visible_out[world, 1 + link] = gripper
 
 
+@wp.struct
+class FramePoses:
+    """What a frame must tell the next one: parts of a snapshot."""
+
+    live: wp.array[int]
+    episode: wp.array[int]
+    frame: wp.array[int]
+    entry: wp.array2d[int]
+    pose: wp.array2d[wp.transform]
+    """Object to world [m]."""
+    fixture_pose: wp.array2d[wp.transform]
+    """Fixture to world [m]."""
+    fixture_visible: wp.array2d[int]
+
+
+@wp.kernel
+def link_frames_kernel(
+    # In:
+    now: FramePoses,
+    # Out:
+    last_inout: FramePoses,
+    follows_out: wp.array[int],
+    entry_out: wp.array2d[int],
+    pose_out: wp.array2d[wp.transform],
+    fixture_pose_out: wp.array2d[wp.transform],
+    fixture_visible_out: wp.array2d[int],
+):
+    """Put the last tick's poses beside this one's, and keep these for the next.
+
+    A frame follows the last one if that was the frame before it in the same episode: an episode's first frame follows none.
+    """
+    world = wp.tid()
+    follows = int(0)
+    if now.live[world] != 0 and last_inout.live[world] != 0:
+        if now.episode[world] == last_inout.episode[world] and now.frame[world] == last_inout.frame[world] + 1:
+            follows = 1
+    follows_out[world] = follows
+    last_inout.live[world] = now.live[world]
+    last_inout.episode[world] = now.episode[world]
+    last_inout.frame[world] = now.frame[world]
+    for instance in range(now.entry.shape[1]):
+        entry_out[world, instance] = last_inout.entry[world, instance]
+        pose_out[world, instance] = last_inout.pose[world, instance]
+        last_inout.entry[world, instance] = now.entry[world, instance]
+        last_inout.pose[world, instance] = now.pose[world, instance]
+    for fixture in range(now.fixture_pose.shape[1]):
+        fixture_pose_out[world, fixture] = last_inout.fixture_pose[world, fixture]
+        fixture_visible_out[world, fixture] = last_inout.fixture_visible[world, fixture]
+        last_inout.fixture_pose[world, fixture] = now.fixture_pose[world, fixture]
+        last_inout.fixture_visible[world, fixture] = now.fixture_visible[world, fixture]
+
+
 @wp.kernel
 def pack_status_kernel(
     # State:

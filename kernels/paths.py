@@ -7,14 +7,15 @@ w_l = p_l² / (p_l² + p_s²). Nothing in the scene glows but the map.
 
 import warp as wp
 
-from synpick_warp.kernels.brdf import Brdf, brdf_at, density, evaluate, scatter
-from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, tile_pixel
+from synpick_warp.kernels.brdf import Brdf, Reflection, brdf_at, density, evaluate_parts, scatter
+from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, hit_position, tile_of, tile_pixel
 from synpick_warp.kernels.draws import PATHS, mix, stream_key
 from synpick_warp.kernels.environment import Lights, background_radiance, turned
 from synpick_warp.kernels.hits import (
     FAR,
     FIRST_FIXTURE,
     NOTHING,
+    RAY_OFFSET,
     TABLE,
     Bodies,
     Hit,
@@ -25,8 +26,7 @@ from synpick_warp.kernels.hits import (
     is_blocked,
     trace_camera_ray,
 )
-from synpick_warp.kernels.occlusion import RAY_OFFSET, hit_position
-from synpick_warp.kernels.sampling import Chances, light_density, sample_light, scrambled_point
+from synpick_warp.kernels.sampling import Chances, LightSample, light_density, sample_light, scrambled_point
 from synpick_warp.kernels.surfaces import Surfaces, base_color, mesh_surface, table_surface
 
 wp.set_module_options({"enable_backward": False})
@@ -37,6 +37,8 @@ BY_SURFACE = wp.constant(2)
 """How directions to the light are drawn. One way alone has the same mean and more noise: it serves to check the other."""
 MOST_LUCK = wp.constant(0.95)
 """Largest chance of a path to go on, so that all end."""
+MOST_POINT = wp.constant(0.99999994)
+"""The largest float32 below 1."""
 DIMENSIONS = wp.constant(3)
 """Points in the unit square that a scattering takes: light, surface, and (lobe, roulette)."""
 SCATTERED_SPREAD = wp.constant(0.1)
@@ -66,6 +68,8 @@ class PathRules:
     """From this scattering on, the first being 0, dim paths end early, and those that go on count for them."""
     strategy: int
     """BOTH, BY_LIGHT or BY_SURFACE."""
+    least_roughness: float
+    """Surfaces that a path meets after the first are at least so rough: what shines through two mirrors is rare, bright and noisy."""
     seed: wp.uint64
     instances: int
 
@@ -75,9 +79,34 @@ class Place:
     """Where one pixel's paths are: the world's light, the view's bodies, the stream of random numbers."""
 
     view: int
+    first_light: int
+    """Map that lights the surface which the camera sees."""
     light: int
+    """Map that lights all others."""
     turn: float
     key: wp.uint64
+    shift: wp.vec2
+    """Moves all points in the unit square, each dimension its own way; beyond an edge they come in at the other."""
+
+
+@wp.struct
+class Reflected:
+    """Radiance that a surface sends to the camera: diffuse colour times `diffuse` + `between`, plus `gloss`."""
+
+    diffuse: wp.vec3
+    """From the map."""
+    between: wp.vec3
+    """From other surfaces."""
+    gloss: wp.vec3
+    """From both."""
+
+
+@wp.struct
+class Through:
+    """What the surfaces of a path leave of light at its end, in the two parts of the first one."""
+
+    diffuse: wp.vec3
+    gloss: wp.vec3
 
 
 @wp.struct
@@ -100,7 +129,8 @@ def nearest_hit(scene: PathScene, bodies: Bodies, view: int, instances: int, ori
     if scene.table.visible != 0 and direction[2] * height < 0.0:
         best.code = TABLE
         best.depth = -height / direction[2]
-    for body in range(instances + 3):
+    for number in range(bodies.present[view]):
+        body = bodies.order[view, number]
         sphere = bodies.sphere[view, body]
         offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
         closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, best.depth) * direction
@@ -121,7 +151,15 @@ def nearest_hit(scene: PathScene, bodies: Bodies, view: int, instances: int, ori
 
 @wp.func
 def vertex_at(
-    scene: PathScene, bodies: Bodies, view: int, instances: int, hit: Hit, position: wp.vec3, outgoing: wp.vec3, width: float
+    scene: PathScene,
+    bodies: Bodies,
+    view: int,
+    instances: int,
+    hit: Hit,
+    position: wp.vec3,
+    outgoing: wp.vec3,
+    width: float,
+    least_roughness: float,
 ) -> Vertex:
     """The surface at a hit; `width` [m] is the path's there, across it."""
     surface = table_surface(scene.meshes, outgoing)
@@ -136,7 +174,7 @@ def vertex_at(
     made.origin = at + RAY_OFFSET * surface.face_normal
     made.face_normal = surface.face_normal
     metallic = scene.surfaces.metallic[surface.row]
-    roughness = scene.surfaces.roughness[surface.row]
+    roughness = wp.max(scene.surfaces.roughness[surface.row], least_roughness)
     made.brdf = brdf_at(scene.surfaces.gloss, base_color(scene.surfaces, surface), metallic, roughness, surface.normal, outgoing)
     return made
 
@@ -153,72 +191,110 @@ def heuristic(strategy: int, own: int, density_own: float, density_other: float)
 
 
 @wp.func
-def direct_light(scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, vertex: Vertex, u: wp.vec2) -> wp.vec3:
-    """What the map sends straight to a surface and on along its path, by one direction drawn from the map, with its weight.
+def extended(through: Through, parts: Reflection, color: wp.vec3, bounce: int) -> Through:
+    """With one more surface, of diffuse colour `color`, at the path's end. The first keeps its parts apart; others add both of theirs."""
+    made = Through()
+    if bounce == 0:
+        made.diffuse = wp.vec3(parts.diffuse, parts.diffuse, parts.diffuse)
+        made.gloss = parts.gloss
+    else:
+        both = parts.gloss + parts.diffuse * color
+        made.diffuse = wp.cw_mul(through.diffuse, both)
+        made.gloss = wp.cw_mul(through.gloss, both)
+    return made
+
+
+@wp.func
+def lit(total: Reflected, through: Through, radiance: wp.vec3, bounce: int) -> Reflected:
+    """`total`, and light that arrives at the end of a path of `bounce` + 1 surfaces."""
+    made = total
+    made.gloss += wp.cw_mul(through.gloss, radiance)
+    if bounce == 0:
+        made.diffuse += wp.cw_mul(through.diffuse, radiance)
+    else:
+        made.between += wp.cw_mul(through.diffuse, radiance)
+    return made
+
+
+@wp.func
+def path_point(place: Place, number: int, dimension: int) -> wp.vec2:
+    """Point `number` of a dimension in [0, 1)², moved by the place's shift."""
+    point = scrambled_point(place.key, number, dimension)
+    x = point[0] + place.shift[0] * float(dimension)
+    y = point[1] + place.shift[1] * float(dimension)
+    return wp.vec2(wp.min(x - wp.floor(x), MOST_POINT), wp.min(y - wp.floor(y), MOST_POINT))
+
+
+@wp.func
+def direct_light(scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, light: int, vertex: Vertex, u: wp.vec2) -> LightSample:
+    """A direction in the world drawn from the map, and in `radiance` what comes from there, over its density and with its weight.
 
     Light that comes from behind the triangle is none, whatever the interpolated normal says.
     """
-    drawn = sample_light(scene.chances, place.light, u)
-    direction = turned(drawn.direction, place.turn)
-    nothing = wp.vec3(0.0, 0.0, 0.0)
-    if drawn.density <= 0.0 or wp.dot(direction, vertex.face_normal) <= 0.0:
-        return nothing
-    reflected = evaluate(scene.surfaces.gloss, vertex.brdf, direction)
-    weight = heuristic(rules.strategy, BY_LIGHT, drawn.density, density(vertex.brdf, direction)) / drawn.density
-    if weight * wp.max(reflected) <= 0.0:
-        return nothing
-    if is_blocked(scene.meshes, scene.table, bodies, place.view, rules.instances, vertex.origin, direction, FAR):
-        return nothing
-    return weight * wp.cw_mul(reflected, background_radiance(scene.lights, place.light, drawn.direction))
+    drawn = sample_light(scene.chances, light, u)
+    made = LightSample()
+    made.direction = turned(drawn.direction, place.turn)
+    if drawn.density <= 0.0 or wp.dot(made.direction, vertex.face_normal) <= 0.0:
+        return made
+    weight = heuristic(rules.strategy, BY_LIGHT, drawn.density, density(vertex.brdf, made.direction)) / drawn.density
+    if weight <= 0.0 or wp.dot(made.direction, vertex.brdf.normal) <= 0.0:
+        return made
+    if is_blocked(scene.meshes, scene.table, bodies, place.view, vertex.origin, made.direction, FAR):
+        return made
+    made.radiance = weight * background_radiance(scene.lights, light, drawn.direction)
+    return made
 
 
 @wp.func
-def escaped_light(scene: PathScene, rules: PathRules, place: Place, direction: wp.vec3, bounce: int, drawn_density: float) -> wp.vec3:
+def escaped_light(scene: PathScene, rules: PathRules, place: Place, light: int, direction: wp.vec3, drawn_density: float) -> wp.vec3:
     """What the map sends along a path that left the scene, weighted against drawing the same direction from the map."""
     local = turned(direction, -place.turn)
-    radiance = background_radiance(scene.lights, place.light, local)
-    if bounce == 0:
-        return radiance
-    return heuristic(rules.strategy, BY_SURFACE, drawn_density, light_density(scene.chances, place.light, local)) * radiance
+    radiance = background_radiance(scene.lights, light, local)
+    return heuristic(rules.strategy, BY_SURFACE, drawn_density, light_density(scene.chances, light, local)) * radiance
 
 
 @wp.func
-def path_radiance(
-    scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, number: int, first: Hit, start: wp.vec3, ray: wp.vec3, spread: float
-) -> wp.vec3:
-    """Radiance along one path, whose first hit lies at `start` in the direction `ray` from the camera; `spread` is its width there [m]."""
-    total = wp.vec3(0.0, 0.0, 0.0)
-    through = wp.vec3(1.0, 1.0, 1.0)
-    hit = first
-    position = start
-    direction = ray
+def reflected_light(
+    scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, number: int, first: Vertex, spread: float
+) -> Reflected:
+    """What the surface at the vertex `first` reflects of the light that path `number` finds; `spread` is the path's width there [m]."""
+    total = Reflected()
+    through = Through()
+    vertex = first
     width = float(spread)
-    drawn_density = float(0.0)
-    for bounce in range(rules.bounces + 1):
-        if hit.code == NOTHING:
-            total += wp.cw_mul(through, escaped_light(scene, rules, place, direction, bounce, drawn_density))
-            break
-        if bounce == rules.bounces:
-            break
-        vertex = vertex_at(scene, bodies, place.view, rules.instances, hit, position, -direction, width)
+    light = place.first_light
+    for bounce in range(rules.bounces):
         dimension = 1 + DIMENSIONS * bounce
-        light = direct_light(scene, bodies, rules, place, vertex, scrambled_point(place.key, number, dimension))
-        total += wp.cw_mul(through, light)
+        direct = direct_light(scene, bodies, rules, place, light, vertex, path_point(place, number, dimension))
+        if wp.max(direct.radiance) > 0.0:
+            parts = evaluate_parts(scene.surfaces.gloss, vertex.brdf, direct.direction)
+            total = lit(total, extended(through, parts, vertex.brdf.diffuse, bounce), direct.radiance, bounce)
 
-        choice = scrambled_point(place.key, number, dimension + 2)
-        direction = scatter(vertex.brdf, choice[0], scrambled_point(place.key, number, dimension + 1))
+        choice = path_point(place, number, dimension + 2)
+        direction = scatter(vertex.brdf, choice[0], path_point(place, number, dimension + 1))
         drawn_density = density(vertex.brdf, direction)
         if drawn_density <= 0.0 or wp.dot(direction, vertex.face_normal) <= 0.0:
             break
-        through = wp.cw_mul(through, evaluate(scene.surfaces.gloss, vertex.brdf, direction) / drawn_density)
-        luck = wp.min(wp.max(through), MOST_LUCK)
+        parts = evaluate_parts(scene.surfaces.gloss, vertex.brdf, direction)
+        through = extended(through, parts, vertex.brdf.diffuse, bounce)
+        through.diffuse = through.diffuse / drawn_density
+        through.gloss = through.gloss / drawn_density
         if bounce >= rules.roulette:
+            luck = wp.min(wp.max(wp.cw_mul(first.brdf.diffuse, through.diffuse) + through.gloss), MOST_LUCK)
             if choice[1] >= luck:
                 break
-            through = through / luck
+            through.diffuse = through.diffuse / luck
+            through.gloss = through.gloss / luck
         hit = nearest_hit(scene, bodies, place.view, rules.instances, vertex.origin, direction)
-        position = vertex.origin + hit.depth * direction
+        if hit.code == NOTHING:
+            total = lit(total, through, escaped_light(scene, rules, place, light, direction, drawn_density), bounce)
+            break
+        if bounce + 1 == rules.bounces:
+            break
         width += SCATTERED_SPREAD * vertex.brdf.roughness * hit.depth
+        position = vertex.origin + hit.depth * direction
+        vertex = vertex_at(scene, bodies, place.view, rules.instances, hit, position, -direction, width, rules.least_roughness)
+        light = place.light
     return total
 
 
@@ -255,6 +331,7 @@ def trace_paths_kernel(
     world = view_world[view]
     place = Place()
     place.view = view
+    place.first_light = light[world]
     place.light = light[world]
     place.turn = light_turn[world]
     address = (camera * grid.height + row) * grid.width + column
@@ -264,9 +341,15 @@ def trace_paths_kernel(
     for number in range(rules.samples):
         offset = scrambled_point(place.key, number, 0) - wp.vec2(0.5, 0.5)
         ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
-        hit = trace_camera_ray(scene.meshes, bodies, view, row, column, ray, rules.instances, False)
+        hit = trace_camera_ray(scene.meshes, bodies, view, tile_of(grid, row, column), ray, rules.instances, False)
         hit = hit_table(scene.table, cameras, camera, ray, hit)
-        start = hit_position(cameras, camera, ray, hit.depth)
         direction = wp.normalize(cameras.to_world[camera] * ray)
-        total += path_radiance(scene, bodies, rules, place, number, hit, start, direction, footprint * hit.depth)
+        if hit.code == NOTHING:
+            total += background_radiance(scene.lights, place.light, turned(direction, -place.turn))
+        else:
+            start = hit_position(cameras, camera, ray, hit.depth)
+            width = footprint * hit.depth
+            vertex = vertex_at(scene, bodies, view, rules.instances, hit, start, -direction, width, 0.0)
+            reflected = reflected_light(scene, bodies, rules, place, number, vertex, width)
+            total += wp.cw_mul(vertex.brdf.diffuse, reflected.diffuse + reflected.between) + reflected.gloss
     radiance_out[view, row, column] = total / float(rules.samples)

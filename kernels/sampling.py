@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.draws import UNIT, mix
+from synpick_warp.kernels.draws import GAMMA, UNIT, mix
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,6 +25,8 @@ class LightSample:
     """Unit, in the map's frame."""
     density: float
     """Probability per solid angle [1/sr]."""
+    radiance: wp.vec3
+    """What comes from there, as `kernels.paths` weights it."""
 
 
 @wp.func
@@ -47,25 +49,50 @@ def carried(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
 
 
 @wp.func
+def pascal(x: wp.uint32) -> wp.uint32:
+    """Bits times Pascal's matrix, modulo 2: with its bits reversed, number `x` of the second dimension of Sobol' (Ahmed, 2024)."""
+    y = x ^ (x >> wp.uint32(16))
+    y = y ^ ((y >> wp.uint32(8)) & wp.uint32(0x00FF00FF))
+    y = y ^ ((y >> wp.uint32(4)) & wp.uint32(0x0F0F0F0F))
+    y = y ^ ((y >> wp.uint32(2)) & wp.uint32(0x33333333))
+    return y ^ ((y >> wp.uint32(1)) & wp.uint32(0x55555555))
+
+
+@wp.func
+def sobol_point(index: int) -> wp.vec2:
+    """Point of the two-dimensional Sobol' sequence in (0, 1)²: aligned runs of 2^k points fill the unit square evenly (Sobol', 1967)."""
+    x = reversed_bits(wp.uint32(index)) >> wp.uint32(8)
+    y = reversed_bits(pascal(wp.uint32(index))) >> wp.uint32(8)
+    return wp.vec2((float(x) + 0.5) * UNIT, (float(y) + 0.5) * UNIT)
+
+
+@wp.func
+def around(axis: wp.vec3, local: wp.vec3) -> wp.vec3:
+    """`local`, carried from a frame with z up to one whose z is the unit vector `axis` (Duff et al., 2017)."""
+    side = float(1.0)
+    if axis[2] < 0.0:
+        side = float(-1.0)
+    a = -1.0 / (side + axis[2])
+    b = axis[0] * axis[1] * a
+    tangent = wp.vec3(1.0 + side * axis[0] * axis[0] * a, side * b, -side * axis[0])
+    bitangent = wp.vec3(b, side + axis[1] * axis[1] * a, -axis[1])
+    return local[0] * tangent + local[1] * bitangent + local[2] * axis
+
+
+@wp.func
 def scrambled_point(key: wp.uint64, index: int, dimension: int) -> wp.vec2:
     """Point `index` of the two-dimensional Sobol' sequence in [0, 1)², shuffled and Owen-scrambled anew for each (key, dimension).
 
     Any aligned run of 2^k indices fills the square evenly; points of different dimensions or keys are unrelated (Burley, 2020).
     """
-    low = mix(key ^ mix(wp.uint64(2 * dimension)))
-    high = mix(key ^ mix(wp.uint64(2 * dimension + 1)))
+    bits = mix(key + wp.uint64(dimension + 1) * GAMMA)
+    order = wp.uint32(bits)
+    across = wp.uint32(bits >> wp.uint64(32))
+    down = (across ^ (order << wp.uint32(15)) ^ (order >> wp.uint32(17))) * wp.uint32(0x31848BAB)
     # Carried on the reversed index, as for the points: a run of indices stays a run.
-    rest = reversed_bits(carried(reversed_bits(wp.uint32(index)), wp.uint32(low)))
-    x = reversed_bits(rest)
-    y = wp.uint32(0)
-    digit = wp.uint32(1) << wp.uint32(31)
-    while rest != wp.uint32(0):
-        if (rest & wp.uint32(1)) != wp.uint32(0):
-            y = y ^ digit
-        rest = rest >> wp.uint32(1)
-        digit = digit ^ (digit >> wp.uint32(1))
-    x = reversed_bits(carried(reversed_bits(x), wp.uint32(high)))
-    y = reversed_bits(carried(reversed_bits(y), wp.uint32(high >> wp.uint64(32))))
+    rest = reversed_bits(carried(reversed_bits(wp.uint32(index)), order))
+    x = reversed_bits(carried(rest, across))
+    y = reversed_bits(carried(pascal(rest), down))
     return wp.vec2(float(x >> wp.uint32(8)) * UNIT, float(y >> wp.uint32(8)) * UNIT)
 
 

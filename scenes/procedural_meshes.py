@@ -141,6 +141,23 @@ def cap(ring: np.ndarray, rect: Rect = NO_TEXTURE, *, below: bool = False) -> Pa
     return Patch(corners, np.array(rect[:2]) + share * (rect[2] - rect[0], rect[3] - rect[1]))
 
 
+def strips(ring: np.ndarray, *, below: bool = False) -> Patch:
+    """Closes a ring (n, 3) as `cap` does, by strips along x: their boxes overlap less than those of a fan, so that rays are faster.
+
+    The ring is its own mirror image in x, and its first point and the opposite one lie in the middle of sides along x, as
+    `rounded_rectangle` makes it.
+    """
+    half = len(ring) // 2
+    left, right = ring[: half + 1], ring[-np.arange(half + 1)]
+    corners = [(left[0], left[1], left[2]), (left[0], left[2], right[2]), (left[0], right[2], right[1])]
+    for k in range(2, half - 2):
+        corners += [(left[k], left[k + 1], right[k + 1]), (left[k], right[k + 1], right[k])]
+    end = half - 2
+    corners += [(left[end], left[end + 1], left[half]), (left[end], left[half], right[end]), (right[end], left[half], right[end + 1])]
+    made = np.array(corners)[:, ::-1] if below else np.array(corners)
+    return Patch(made, np.zeros((*made.shape[:2], 2)))
+
+
 def solid(rings: np.ndarray, rect: Rect = NO_TEXTURE) -> Patch:
     """A loft with both ends closed."""
     return join(cap(rings[0], rect, below=True), loft(rings, rect), cap(rings[-1], rect))

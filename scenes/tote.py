@@ -10,7 +10,7 @@ import numpy as np
 from synpick_warp.configs.schema import Tote
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.collision import limited_hull
-from synpick_warp.scenes.procedural_meshes import Patch, cap, join, loft, make_mesh, rounded_rectangle, solid
+from synpick_warp.scenes.procedural_meshes import Patch, join, loft, make_mesh, rounded_rectangle, solid, strips
 from synpick_warp.scenes.shapes import ConvexPiece, Fixture, Material
 
 CORNER_RADIUS = 0.02
@@ -53,7 +53,7 @@ def tote_fixture(tote: Tote) -> Fixture:
             *(_ring(tote, share * top, 0.0, share * top) for share in np.linspace(1.0, 0.0, 4)),
         ]
     )
-    shell = join(cap(rings[0], below=True), loft(rings), cap(rings[-1]))
+    shell = join(strips(rings[0], below=True), loft(rings), strips(rings[-1]))
     mesh = make_mesh(join(shell, *_ribs(tote)), centered=False)
     return Fixture(mesh, Material(tote.color, None, tote.metallic, tote.roughness))
 

@@ -15,7 +15,7 @@ import warp as wp
 from synpick_warp.arrays import memory_table
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.configs.modes import may_pick
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.device import pick_device
 from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_redrawn
 from synpick_warp.errors import OutputError
@@ -35,16 +35,20 @@ from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.shapes import Camera, Catalog, LightMap
 from synpick_warp.scenes.tote import tote_fixture
-from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
+from synpick_warp.stages.bodies import BodyArrays, HitArrays, body_sizes
+from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.develop import SpreadArrays, has_spread
 from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch, edge_sizes
+from synpick_warp.stages.fast import FAST_SCRATCH, cell_sizes
+from synpick_warp.stages.layers import MOVING, MotionArrays
 from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
 from synpick_warp.stages.plan import CycleArrays, VoteArrays, plan_sizes
 from synpick_warp.stages.record import record_kinds, record_sizes
-from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays, Renderer
+from synpick_warp.stages.render import PictureArrays, Renderer
 from synpick_warp.stages.render_scene import build_render_scene
 from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.simulate import RECORDS, Simulation
-from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, tick_batch, view_sizes
+from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, name_lights, tick_batch, view_sizes
 from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 
 
@@ -85,7 +89,8 @@ def build_factory(
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     renderer = Renderer(config, scene, config.arrangement.max_objects, view_sizes(config, device)["view"])
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
-    stream = FrameStream(config, renderer, object_ids, device)
+    table = name_lights([light.name for light in lights], scene.lights)
+    stream = FrameStream(config, renderer, object_ids, table, device)
     return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config, object_ids))
 
 
@@ -241,17 +246,25 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     room = config.arrangement.max_objects
     worlds = world_sizes(config, build.GRIPPER_BODIES + 2 * room)
     views = view_sizes(config, device)
-    views["body"] = room + len(FIXTURES)
+    views |= body_sizes(room, *config.cameras.resolution)
     ring = RING if device.is_cuda else 1
-    groups = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState)]
+    groups = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState, LastFrame)]
     groups += [(kind, worlds, 1 + RECORDS) for kind in (Sighting, Plan)]
     groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
     groups += [(EdgeBuffers, edge_sizes(views), ring), (EdgeScratch, edge_sizes(views), 1)]
     groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
     if any(kind.records for kind in exporter_kinds(config.bake.formats)):
         groups += [(kind, record_sizes(config, worlds), 1 + RECORDS) for kind in record_kinds(config)]
+    if MOVING.intersection(config.render.layers):
+        groups += [(MotionArrays, views, 1)]
+    if has_spread(config):
+        groups += [(SpreadArrays, views, 1)]
     if may_pick(config):
         looks = count_views(config, room, device)
         groups += [(kind, sight_sizes(config, room, looks), 1) for kind in SCRATCH]
         groups += [(kind, plan_sizes(config, room, looks), 1) for kind in (VoteArrays, CycleArrays)]
-    return [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
+    rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
+    if config.render.mode == FAST:
+        cells = views | cell_sizes(config)
+        rows += [row for kind, copies in FAST_SCRATCH for row in memory_table(kind, cells) for _ in range(copies)]
+    return rows + ring * memory_table(LayerBuffers, views, config.render.layers)

@@ -15,6 +15,9 @@ TOTE = 253
 FINGER = 254
 CUP = 255
 
+EFFECTS = ("exposure", "red", "blue", "vignette", "chromatic_aberration", "blur", "shot_noise", "read_noise", "jpeg_quality")
+"""Columns of FrameBatch.effects; the first three in stops, what the others mean says `configs.sensors.Effects`."""
+
 
 @dataclass(frozen=True, eq=False)
 class FrameBatch:
@@ -48,6 +51,18 @@ class FrameBatch:
     """px_count_all, px_count_valid, px_count_visib (B, I, 3) int32."""
     boxes: np.ndarray
     """bbox_obj and bbox_visib as x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty (B, I, 2, 4) int32."""
+    effects: np.ndarray
+    """Strengths of what the camera did to colour (B, EFFECTS) float32; zero: off."""
+    light_name: np.ndarray
+    """Name of the episode's light map (B) str."""
+    light_turn: np.ndarray
+    """The map is turned counter-clockwise about +z by this angle [rad] (B) float32."""
+    light_exposure: np.ndarray
+    """How much longer than the automatic exposure the episode's pictures are exposed [stops] (B) float32."""
+    light_direction: np.ndarray
+    """Unit vector towards the map's main light, the sun or a lamp, in the world; zero: none stands out (B, 3) float32."""
+    layers: dict[str, np.ndarray] = field(default_factory=dict)
+    """The layers that the settings name (B, H, W[, C]); see `synpick_warp.layers`."""
     edge_count: np.ndarray | None = None
     """How many edges down their columns `instance` and `amodal` have (B, 2) int32; more than E: they are not all in `edges`."""
     edges: np.ndarray | None = None

@@ -1,4 +1,4 @@
-"""A contact sheet of a BOP data set, from its files alone: colour, depth, instances and boxes of sampled views."""
+"""A contact sheet of a BOP data set, from its files alone: colour, depth, instances, boxes and layers of sampled views."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import colorsys
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.preview_layers import layer_pictures
 
 _PANEL_WIDTH = 480
 """Width of one picture on the sheet [px]."""
@@ -167,6 +169,7 @@ def _row(view: _View) -> Image:
         (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
         ("boxes: whole thin, visible thick; obj_id and visible share", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
     ]
+    panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layer_pictures(view.scene, view.frame)]
     scale = _PANEL_WIDTH / color.shape[1]
     return np.concatenate([_captioned(draw(scale), caption) for caption, draw in panels], axis=1)
 

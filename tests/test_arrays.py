@@ -10,11 +10,14 @@ import warp as wp
 from synpick_warp.arrays import allocate, device_array, memory_table
 from synpick_warp.bake import describe_arrays
 from synpick_warp.device import pick_device
-from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch
+from synpick_warp.stages.layers import MotionArrays
 from synpick_warp.stages.perceive import SightScratch, count_views
 from synpick_warp.stages.plan import CycleArrays, VoteArrays
-from synpick_warp.stages.render import BodyArrays, HitArrays, PictureArrays
+from synpick_warp.stages.bodies import BodyArrays, HitArrays
+from synpick_warp.stages.fast import GatheredArrays, ShadowArrays
+from synpick_warp.stages.render import PictureArrays
 from synpick_warp.stages.sight import LookArrays, Plan, Sighting
 from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus
 from tests.reference.small_worlds import settings
@@ -22,11 +25,12 @@ from tests.reference.small_worlds import settings
 NAMES = "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset part"
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
-    WorldState, AttemptState, SealState, Sighting, Plan, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays, PictureArrays,
-    EdgeBuffers, EdgeScratch,
+    WorldState, AttemptState, SealState, LastFrame, Sighting, Plan, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays,
+    PictureArrays, EdgeBuffers, EdgeScratch,
 ]  # fmt: skip
 LOOKING = [LookArrays, SightScratch, VoteArrays, CycleArrays]
-DECLARED = MOVING + LOOKING
+LAYERS = [LayerBuffers, MotionArrays]
+DECLARED = MOVING + LOOKING + LAYERS
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +88,7 @@ def test_a_bake_that_may_pick_has_the_arrays_of_looking_as_well(mode):
     room = config.arrangement.max_objects
     looks = count_views(config, room, pick_device("cpu"))
     rows = describe_arrays(config)
-    assert {name.split(".")[0] for name, *_ in rows} == {kind.__name__ for kind in DECLARED}
+    assert {name.split(".")[0] for name, *_ in rows} == {kind.__name__ for kind in MOVING + LOOKING}
     shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in LOOKING}}
     assert shapes["LookArrays.component"] == shapes["SightScratch.gap"] == (looks, 48, 64)
     assert shapes["VoteArrays.count"] == (looks, room, room, 2)
@@ -94,3 +98,18 @@ def test_a_bake_that_may_pick_has_the_arrays_of_looking_as_well(mode):
 def test_a_mixture_without_picking_has_none():
     config = settings(bake__mode="mixed", bake__mix=[0, 0, 1])
     assert {name.split(".")[0] for name, *_ in describe_arrays(config)} == {kind.__name__ for kind in MOVING}
+
+
+def test_fields_that_are_not_asked_for_are_neither_allocated_nor_counted(device):
+    made = allocate(Sample, {"world": 3, "cup": 2}, device, only=("pose",))
+    assert (made.gap, made.flag) == (None, None)
+    assert made.pose.shape == (3,)
+    assert memory_table(Sample, {"world": 3}, only=("pose",)) == [("Sample.pose", (3,), "", 84)]
+
+
+def test_layers_are_in_the_table_if_they_are_asked_for():
+    rows = {name: (shape, unit, size) for name, shape, unit, size in describe_arrays(settings(render__layers=["flow", "nocs"]))}
+    assert {name for name in rows if name.startswith("LayerBuffers")} == {"LayerBuffers.flow", "LayerBuffers.nocs"}
+    assert rows["LayerBuffers.flow"][1] == "px"
+    assert "MotionArrays.turn" in rows
+    assert not any(name.startswith("MotionArrays") for name, *_ in describe_arrays(settings(render__layers=["nocs"])))

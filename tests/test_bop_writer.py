@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from synpick_warp.configs.sensors import Effects
 from synpick_warp.errors import CatalogError, OutputError
 from synpick_warp.exporters.bop import BopExporter
 from synpick_warp.exporters.bop_models import encode_model, write_models
@@ -35,6 +37,11 @@ def make(out: Path, processes: int = 2, episodes: tuple[int, ...] = EPISODES, **
 
 def load(path: Path) -> object:
     return json.loads(path.read_text())
+
+
+def light_of(episode: int) -> dict[str, object]:
+    direction = [0.0, 0.6, 0.8] if episode else None
+    return {"map": f"map {episode}", "turn": 0.5 * episode, "exposure": -0.25, "direction": direction}
 
 
 def rows():
@@ -96,6 +103,7 @@ def test_camera_and_poses_are_in_millimetres_and_lead_from_model_to_camera(split
             "cam_R_w2c": lens.rotation.ravel().tolist(),
             "cam_t_w2c": (1000 * lens.translation).tolist(),
             "depth_scale": 0.1,
+            "light": light_of(int(scene) // 3),
         }
         truth = load(split / scene / "scene_gt.json")[str(frame)]
         assert [record["instance_id"] for record in truth] == [0, 2, 3]
@@ -195,6 +203,22 @@ def test_models_are_plain_ply_in_millimetres(dataset, folder):
 def test_the_same_frames_give_the_same_bytes_whatever_the_number_of_processes(dataset, tmp_path):
     for processes in (0, 2):
         assert digests(make(tmp_path / str(processes), processes)) == digests(dataset)
+
+
+def test_effects_that_are_on_are_told_and_a_views_jpeg_quality_is_its_own(tmp_path):
+    effects = Effects(exposure_jitter=1.0, blur=(0.0, 2.0), jpeg_quality=(5, 40))
+    export(BopExporter, tmp_path / "set", replace(config(), effects=effects), (0,), 0)
+    for scene in range(3):
+        folder = tmp_path / "set/train_pbr" / f"{scene:06d}"
+        for frame in range(FRAMES):
+            record = load(folder / "scene_camera.json")[str(frame)]
+            first = float(10 * scene + frame)
+            assert record["effects"] == {"exposure": first, "blur": first + 5, "jpeg_quality": first + 8}
+            assert record["light"] == light_of(0)
+            picture = next(batch.color[0] for batch, name, number in rows() if name == f"{scene:06d}" and number == frame)
+            quality = (cv2.IMWRITE_JPEG_QUALITY, int(first) + 8)
+            expected = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), quality)[1].tobytes()
+            assert (folder / "rgb" / f"{frame:06d}.jpg").read_bytes() == expected
 
 
 def test_png_colour_without_masks_and_coco(tmp_path):

@@ -136,6 +136,10 @@ def test_whole_numbers_do_for_floats():
         ("cameras.resolution", [0, 0], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
         ("cameras.resolution", [640], "cameras.resolution is [640] on the command line; allowed: 2 whole numbers in a list [px]"),
         ("cameras.ups", [[1, 2]], "cameras.ups is [[1, 2]] on the command line; allowed: a list of lists of 3 numbers"),
+        ("render.layers", ["flow", "normal"],
+         'render.layers is ["flow", "normal"] on the command line; allowed: any of normals, albedo, nocs, classes, flow, scene_flow, '
+         "depth_sensor; did you mean normals?"),
+        ("render.layers", "flow", 'render.layers is "flow" on the command line; allowed: a list of strings'),
         ("tote.color", [0.5, 0.5, 1.5], "tote.color is [0.5, 0.5, 1.5] on the command line; allowed: each at least 0, at most 1 [sRGB]"),
     ],
 )
@@ -219,6 +223,8 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
         ({"bop.split": "train"}, 'bop.color_format is "jpg" by default; allowed: png with the split train: '),
         ({"bop.color_format": "png"}, 'bop.color_format is "png" on the command line; allowed: jpg with the split train_pbr: '),
         ({"bop.split": "a/b"}, 'bop.split is "a/b" on the command line; allowed: train, val or test'),
+        ({"render.layers": ["flow", "nocs", "flow"]},
+         r'render.layers is \["flow", "nocs", "flow"\] on .*; allowed: each layer once: \["flow", "nocs"\]'),
         ({"bop.depth_scale": 0.01}, "bop.depth_scale is 0.01 on the command line; allowed: at least 0.03"),
     ],
 )
@@ -257,6 +263,10 @@ def test_object_ids_come_once(tmp_path):
         ("bop.split=5", "bop.split", "5"),
         ("render.table=false", "render.table", False),
         ("physics.step=fast", "physics.step", "fast"),
+        ('render.layers=["normals", "flow"]', "render.layers", ["normals", "flow"]),
+        ("render.layers=[normals,flow]", "render.layers", ["normals", "flow"]),
+        ("render.layers=normals, flow", "render.layers", ["normals", "flow"]),
+        ("render.layers=[]", "render.layers", []),
     ],
 )
 def test_assignments(text, key, value):
@@ -285,7 +295,8 @@ def values(item: dataclasses.Field, kind: object) -> st.SearchStrategy:
     """Values that a setting takes."""
     rules = item.metadata
     if rules["choices"]:
-        return st.sampled_from(rules["choices"])
+        one = st.sampled_from(rules["choices"])
+        return st.lists(one, unique=True).map(tuple) if kind == tuple[str, ...] else one
     if kind is float:
         low = rules["above"] if rules["above"] is not None else rules["low"]
         return st.floats(low, rules["high"], exclude_min=rules["above"] is not None, allow_nan=False, allow_infinity=False)
@@ -297,7 +308,7 @@ def values(item: dataclasses.Field, kind: object) -> st.SearchStrategy:
 def free_settings() -> dict[str, st.SearchStrategy]:
     known = {f"{section}.{name}": pair for section, kind in sections().items() for name, pair in settings_of(kind).items()}
     free = {key: pair for key, pair in known.items() if key not in COUPLED and key.split(".")[0] not in COUPLED_SECTIONS}
-    return {key: values(*pair) for key, pair in free.items() if pair[1] in (float, int, bool, str)}
+    return {key: values(*pair) for key, pair in free.items() if pair[1] in (float, int, bool, str, tuple[str, ...])}
 
 
 ROW = st.builds(ObjectRow, **{name: values(*pair) for name, pair in settings_of(ObjectRow).items()})

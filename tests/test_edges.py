@@ -10,7 +10,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.exporters.bop import BopExporter
-from synpick_warp.exporters.bop_view import view_masks, view_task
+from synpick_warp.exporters.bop_view import ViewSettings, view_masks, view_task
 from synpick_warp.exporters.rle import find_edges, listed_edges
 from synpick_warp.exporters.shards import ShardsExporter
 from synpick_warp.stages import edges as edges_module
@@ -20,6 +20,7 @@ from tests.exporter_contract import digests, exporting, finish
 from tests.reference.box_views import batches, cameras, config, ends
 
 LENSES = cameras()
+SETTINGS = ViewSettings(".jpg", 95, (), masks=True, coco=True, camera={})
 
 
 def listed(instance: np.ndarray, amodal: np.ndarray, device: wp.Device) -> tuple[np.ndarray, np.ndarray]:
@@ -76,10 +77,10 @@ def test_masks_are_the_same_from_lists_and_from_images(device):
     for batch in batches(4, (0, 2), 3, LENSES):
         lists = with_edges(batch, device)
         for view in range(len(batch)):
-            (*_, first, second), truth = view_task(lists, view, 0)
+            (*_, first, second), truth = view_task(lists, view, 0, SETTINGS)
             assert truth.listed
             assert first.nbytes < batch.instance[view].nbytes
-            (*_, instance, amodal), plain = view_task(batch, view, 0)
+            (*_, instance, amodal), plain = view_task(batch, view, 0, SETTINGS)
             height = batch.depth.shape[1]
             pairs = zip(view_masks(first, second, truth, height), view_masks(instance, amodal, plain, height), strict=True)
             for found, expected in pairs:
@@ -90,11 +91,11 @@ def test_masks_are_the_same_from_lists_and_from_images(device):
 
 def test_lists_that_overflowed_or_are_large_are_not_used(device):
     batch = with_edges(next(batches(1, (0,), 1, LENSES)), device)
-    assert view_task(batch, 0, 0)[1].listed
+    assert view_task(batch, 0, 0, SETTINGS)[1].listed
     short = dataclasses.replace(batch, edges=batch.edges[..., : batch.edge_count.max() - 1])
     noise = np.random.default_rng(0).integers(0, 256, batch.instance.shape).astype(np.uint8)
     for other in (short, with_edges(dataclasses.replace(batch, instance=noise), device)):
-        images, truth = view_task(other, 0, 0)
+        images, truth = view_task(other, 0, 0, SETTINGS)
         assert not truth.listed
         assert images[2].dtype == np.uint8
 

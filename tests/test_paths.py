@@ -15,7 +15,7 @@ from synpick_warp.scenes.shapes import LightMap, Material
 from synpick_warp.stages import reference
 from synpick_warp.stages.gloss import measure_gloss
 from synpick_warp.stages.light_tables import map_directions
-from synpick_warp.stages.reference import build_chances
+from synpick_warp.stages.chances import build_chances
 from tests.reference.brdf_probe import evaluated, light_kernel, point_kernel, toward
 from tests.reference.toy_scene import UPRIGHT, ToyScene, ball, box, camera, entry, even_light, render, sheet, sun
 

@@ -31,6 +31,7 @@ def read(data: bytes) -> np.ndarray:
         hnp.arrays(np.uint16, GREY),
         hnp.arrays(np.dtype(">u2"), GREY),
         hnp.arrays(np.uint8, st.tuples(SIDE, SIDE, st.just(3))),
+        hnp.arrays(np.uint16, st.tuples(SIDE, SIDE, st.just(3))),
     )
 )
 def test_pixels_come_back(image):
@@ -76,7 +77,7 @@ def test_a_mask_is_written_at_its_place(data):
 
 
 @pytest.mark.parametrize(
-    "image", [np.zeros((2, 2)), np.zeros((2, 2, 3), np.uint16), np.zeros((2, 2, 4), np.uint8), np.zeros((0, 3), np.uint8)]
+    "image", [np.zeros((2, 2)), np.zeros((2, 2, 2), np.uint16), np.zeros((2, 2, 4), np.uint8), np.zeros((0, 3), np.uint8)]
 )
 def test_other_images_are_refused(image):
     with pytest.raises(ValueError, match="no PNG for an image of shape"):

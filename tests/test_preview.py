@@ -12,9 +12,10 @@ import pytest
 
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop import BopExporter
+from synpick_warp.exporters.bop_view import write_layer
 from synpick_warp.preview import find_scenes, sample, write_contact_sheet
 from tests.exporter_contract import export
-from tests.reference.box_views import config
+from tests.reference.box_views import cameras, config
 
 FRAMES = 5
 EPISODES = (0, 1)
@@ -39,6 +40,38 @@ def test_a_row_a_view_and_four_pictures_a_row(dataset, tmp_path):
     scene, frame = sample(find_scenes(dataset), 4)[0]
     color = cv2.imread(str(scene / "rgb" / f"{frame:06d}.jpg"))
     np.testing.assert_array_equal(first[2::5, 2::5], color)
+
+
+def test_layers_get_columns_of_their_own(dataset, tmp_path):
+    shape = (cameras()[0].height, cameras()[0].width)
+    flow = np.full((*shape, 2), np.nan, np.float32)
+    flow[:, 10:20] = 4.0, 0.0
+    flow[:, 20:40] = 0.0, 0.0
+    values = {
+        "normals": np.broadcast_to(np.array([0, 0, -1], np.float32), (*shape, 3)),
+        "albedo": np.broadcast_to(np.array([200, 100, 50], np.uint8), (*shape, 3)),
+        "nocs": np.broadcast_to(np.array([1.0, 0.0, 0.2], np.float32), (*shape, 3)),
+        "classes": np.zeros(shape, np.uint16),
+        "flow": flow,
+        "scene_flow": np.full((*shape, 3), np.nan, np.float32),
+    }
+    for scene in find_scenes(dataset):
+        for name, layer in values.items():
+            (scene / name).mkdir()
+            for frame in range(FRAMES):
+                write_layer(layer, scene, name, frame)
+    sheet = cv2.imread(str(write_contact_sheet(dataset, tmp_path / "sheet.png", 1)))
+    assert sheet.shape[1] == 10 * (480 + 4)
+    panels = {name: sheet[20:380, 484 * (4 + i) : 484 * (4 + i) + 480] for i, name in enumerate(values)}
+    expected = {"normals": (255, 128, 128), "albedo": (50, 100, 200), "nocs": (51, 0, 255), "classes": (0, 0, 0)}
+    for name, color in (expected | {"scene_flow": (64, 64, 64)}).items():
+        assert (panels[name] == color).all(), name
+    # Flow to the right is red, none is black, unknown is grey.
+    scale = 480 // shape[1]
+    assert [panels["flow"][100, scale * column].tolist() for column in (5, 15, 30)] == [[64, 64, 64], [0, 0, 255], [0, 0, 0]]
+    (find_scenes(dataset)[0] / "flow" / "000002.png").unlink()
+    with pytest.raises(DatasetError, match=r"there is no .*flow/000002.png"):
+        write_contact_sheet(dataset, tmp_path / "sheet.png", 100)
 
 
 def test_views_are_spread_over_cameras_scenes_and_time(dataset):

@@ -12,17 +12,32 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import allocate
+from synpick_warp.configs.schema import LAYERS
 from synpick_warp.exporters.rle import find_edges, listed_edges
+from synpick_warp.frames import EFFECTS, FrameBatch
 from synpick_warp.kernels import pack, phases
 from synpick_warp.stages import stream, worlds
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.render_scene import build_lights
 from synpick_warp.stages.sight import Plan, Sighting
 from synpick_warp.stages.simulate import TickRecord
-from synpick_warp.stages.stream import FrameStream, HostCopy, TickReader, TickReport, tick_batch, view_sizes, views_per_batch
+from synpick_warp.stages.stream import (
+    FrameStream,
+    HostCopy,
+    LightTable,
+    TickReader,
+    TickReport,
+    name_lights,
+    tick_batch,
+    view_sizes,
+    views_per_batch,
+)
 from tests.reference.small_worlds import settings
+from tests.reference.toy_scene import even_light, sun
 
 WORLDS, ROOM = 5, 3
 OBJECT_IDS = np.array([4, 7, 11], np.int32)
+LIGHTS = LightTable(np.array(["lamp", "even"]), np.array([[0.6, 0.0, 0.8], [0.0, 0.0, 0.0]], np.float32))
 
 
 @dataclass
@@ -31,11 +46,10 @@ class FakeRenderer:
 
     calls: list[tuple[Any, list[int], list[int], int]]
 
-    def render(self, snapshot, view_world, view_camera, count, out) -> None:
+    def render(self, snapshot, view_world, view_camera, count, out, layers) -> None:
         world, camera = view_world.numpy(), view_camera.numpy()
         self.calls.append((snapshot, world.tolist(), camera.tolist(), count))
-        for name in vars(out):
-            array = getattr(out, name)
+        for array in (*vars(out).values(), *(array for array in vars(layers).values() if array is not None)):
             values = array.numpy()
             shape = (count,) + (1,) * (values.ndim - 1)
             values[:count] = (10 * world[:count] + camera[:count] + 1).reshape(shape)
@@ -55,14 +69,19 @@ def report_of(live: list[int]) -> TickReport:
     entry = ((number[:, None] + np.arange(ROOM)) % 4 - 1).astype(np.int32)
     pose = np.arange(WORLDS * ROOM * 7, dtype=np.float32).reshape(WORLDS, ROOM, 7)
     measures = np.zeros((WORLDS, len(worlds.MEASURE_COLUMNS)), np.float32)
-    return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace())
+    light = SimpleNamespace(light=number % 2, light_turn=0.5 * number.astype(np.float32), light_exposure=0.1 * number.astype(np.float32))
+    return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace(), light)
 
 
-def rendered(device, live: list[int], batch: int) -> tuple[list[dict[str, np.ndarray]], FakeRenderer]:
+def rendered(device, live: list[int], batch: int, **overrides: object) -> tuple[list[dict[str, Any]], FakeRenderer]:
     renderer = FakeRenderer([])
-    frames = FrameStream(config_of(render__views_per_batch=batch), renderer, OBJECT_IDS, device)
-    batches = frames.render("snapshot", report_of(live))
-    return [{name: np.array(value) for name, value in vars(made).items()} | {"length": len(made)} for made in batches], renderer
+    frames = FrameStream(config_of(render__views_per_batch=batch, **overrides), renderer, OBJECT_IDS, LIGHTS, device)
+    return [copied(made) for made in frames.render("snapshot", report_of(live))], renderer
+
+
+def copied(batch: FrameBatch) -> dict[str, Any]:
+    arrays = {name: np.array(value) for name, value in vars(batch).items() if name != "layers"}
+    return arrays | {"layers": {name: value.copy() for name, value in batch.layers.items()}, "length": len(batch)}
 
 
 @pytest.mark.parametrize("live", [[1, 1, 1, 1, 1], [0, 1, 0, 1, 1], [0, 0, 0, 0, 1]])
@@ -80,9 +99,33 @@ def test_live_views_come_world_by_world_and_camera_by_camera(device, live, batch
         # What pads the batch must be worlds and cameras that exist.
         assert world[count:] == camera[count:] == [0] * (batch - count)
         code = 10 * (made["episode"] - 20) + made["camera"] + 1
-        for name in ("color", "depth", "instance", "amodal", "pixels", "boxes"):
+        for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "effects"):
             assert len(made[name]) == count
             assert (made[name].reshape(count, -1) == code[:, None]).all(), name
+
+
+def test_layers_come_if_they_are_asked_for_each_with_its_views(device):
+    (made,), _ = rendered(device, [0, 1, 0, 0, 1], 100)
+    assert made["layers"] == {}
+    batches, _ = rendered(device, [0, 1, 0, 0, 1], 4, render__layers=["scene_flow", "normals", "classes", "albedo"])
+    code = iter([11, 12, 13, 41, 42, 43])
+    for made in batches:
+        layers = made["layers"]
+        # The order is that of the declaration, whatever that of the setting.
+        assert list(layers) == [name for name in LAYERS if name in layers] == ["normals", "albedo", "classes", "scene_flow"]
+        assert [layers[name].dtype.name for name in layers] == ["float32", "uint8", "uint16", "float32"]
+        assert [layers[name].shape[1:] for name in layers] == [(6, 8, 3), (6, 8, 3), (6, 8), (6, 8, 3)]
+        for view in range(made["length"]):
+            expected = next(code)
+            assert all((array[view] == expected).all() for array in layers.values())
+
+
+def test_layers_make_batches_smaller():
+    gpu = SimpleNamespace(is_cuda=True)
+    large = {"bake__worlds": 1000, "cameras__resolution": [1920, 1080]}
+    count = views_per_batch(settings(**large, render__layers=list(LAYERS)), gpu)
+    pixel = stream.PIXEL_BYTES + 12 + 3 + 12 + 2 + 8 + 12 + 2
+    assert count * 1920 * 1080 * pixel <= stream.BATCH_BYTES < (count + 1) * 1920 * 1080 * pixel
 
 
 def test_no_live_world_gives_no_batch(device):
@@ -108,6 +151,12 @@ def test_what_a_batch_says_of_its_views(device):
     assert [made[name].dtype.name for name in ("time", "pose", "color", "depth", "instance", "amodal")] == [
         "float64", "float32", "uint8", "uint16", "uint8", "uint32"
     ]
+    assert made["light_name"].tolist() == ["even"] * 3 + ["lamp"] * 3
+    np.testing.assert_allclose(made["light_turn"], 0.5 * world)
+    np.testing.assert_allclose(made["light_exposure"], 0.1 * world, rtol=1e-6)
+    np.testing.assert_allclose(made["light_direction"][3], [0.6 * np.cos(2.0), 0.6 * np.sin(2.0), 0.8], rtol=1e-6)
+    assert not made["light_direction"][:3].any()
+    assert made["effects"].shape == (6, len(EFFECTS))
     assert made["color"].shape == (6, 6, 8, 3)
     assert made["boxes"].shape == (6, ROOM, 2, 4)
 
@@ -140,7 +189,7 @@ def test_what_a_tick_says_of_its_live_worlds():
 
 def test_a_tick_that_is_stopped_early_leaves_nothing_behind(device):
     """Whoever stops reading a tick's batches gets the next tick's from its first."""
-    frames = FrameStream(config_of(render__views_per_batch=2), FakeRenderer([]), OBJECT_IDS, device)
+    frames = FrameStream(config_of(render__views_per_batch=2), FakeRenderer([]), OBJECT_IDS, LIGHTS, device)
     next(frames.render("first", report_of([1] * WORLDS)))
     batches = frames.render("second", report_of([0, 0, 1, 0, 0]))
     assert [int(episode) for made in batches for episode in made.episode] == [22, 22, 22]
@@ -166,6 +215,18 @@ def test_view_sizes_are_those_of_the_buffers(device):
     assert buffers.pixels.shape == (3, ROOM, 3)
     pixel = sum(wp.types.type_size_in_bytes(getattr(buffers, name).dtype) for name in ("color", "depth", "instance", "amodal"))
     assert pixel == stream.PIXEL_BYTES
+
+
+def test_main_lights_are_told_in_the_world_and_maps_without_any_as_zero(device):
+    maps = (sun((1.0, 0.0, 1.0)), even_light())
+    table = name_lights([light.name for light in maps], build_lights(maps, None, 1.0, device))
+    assert table.name.tolist() == ["sun", "even"]
+    assert not table.direction[1].any()
+    # Counter-clockwise by a quarter, what stood over +x stands over +y: as far off as a texel of the map is wide.
+    turned = table.directions(np.array([0, 0, 1]), np.array([0.0, np.pi / 2, 1.0]))
+    np.testing.assert_allclose(turned, [[0.5**0.5, 0.0, 0.5**0.5], [0.0, 0.5**0.5, 0.5**0.5], [0.0, 0.0, 0.0]], atol=0.03)
+    np.testing.assert_allclose(np.linalg.norm(turned[:2], axis=1), 1.0, rtol=1e-6)
+    assert turned.dtype == np.float32
 
 
 # ---- from the device ----

@@ -48,8 +48,8 @@ def load_tool(name: str):
 
 
 # In the order in which they import each other.
-rest_report, pick_tally, pick_report, bench_physics, bench_write, bench = map(
-    load_tool, ("rest_report", "pick_tally", "pick_report", "bench_physics", "bench_write", "bench")
+rest_report, pick_tally, pick_report, bench_physics, bench_sensor, bench_write, bench = map(
+    load_tool, ("rest_report", "pick_tally", "pick_report", "bench_physics", "bench_sensor", "bench_write", "bench")
 )
 
 
@@ -139,7 +139,7 @@ def tick_report(*worlds: dict) -> TickReport:
         for instance, moved in values.get("poses", {}).items():
             pose[world, instance] = moved
     measures = np.array([[values.get("load", 0.0)] for values in worlds], np.float32)
-    return TickReport(status, measures, entry, pose.astype(np.float32), SimpleNamespace(), SimpleNamespace())
+    return TickReport(status, measures, entry, pose.astype(np.float32), *(SimpleNamespace() for _ in range(3)))
 
 
 def tallied(*ticks: TickReport, modes=("pick",)):
@@ -273,6 +273,7 @@ def test_when_time_is_up_the_report_is_of_what_has_ended(tmp_path, capsys):
 def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys):
     for name in ("FALL_TICKS", "SETTLE_TICKS", "STIR_TICKS", "LEAD_TICKS", "PICK_TICKS", "LEAST_REPEATS", "BURST"):
         monkeypatch.setattr(bench_physics, name, 1)
+    monkeypatch.setattr(bench_sensor, "BURST", 1)
     for name, value in (("BURST", 1), ("STREAM_BATCHES", 1), ("WRITE_VIEWS", 3), ("BAKE_SPEED", 10.0)):
         monkeypatch.setattr(bench, name, value)
     monkeypatch.setattr(bench_write, "COPIES", 1)
@@ -283,8 +284,8 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
     assert {row["part"] for row in rows} == {"setup", *bench.PARTS}
     assert all(row["value"] >= 0.0 for row in rows)
     printed = capsys.readouterr().out
-    share = "looks and plans: share of the time with rendering"
-    for name in ("views, all stages", "picking, steps alone", share, "bop: views, 1 process", "shards: views, 1 process"):
+    sights = ("views, all stages", "picking, steps alone", "looks and plans: share of the time with rendering")
+    for name in (*sights, "bop: views, 1 process", "shards: views, 1 process", "SensorCamera's time over ours"):
         assert name in printed
 
 

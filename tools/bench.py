@@ -2,7 +2,7 @@
 
 Everything is warmed up first; numbers are medians of repeated, synchronised measurements. Physics, sight and rendering use the same
 worlds, which pick; with `--set bake.mode=move` they are stirred. Writing gets views of them over and over. Files go to the system's
-temporary folder (TMPDIR) and are removed.
+temporary folder (TMPDIR) and are removed. The part sensor renders the same views by Newton's SensorCamera, too.
 
     python tools/bench.py --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
 """
@@ -26,6 +26,7 @@ from unittest import mock
 import numpy as np
 import warp as wp
 from bench_physics import BURST, Row, measure_simulation, seconds_per_call
+from bench_sensor import measure_sensor
 from bench_write import measure_writing
 from rich.console import Console
 
@@ -40,10 +41,11 @@ from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.exporters.registry import Exporters, exporter_kinds
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.annotate import annotate
+from synpick_warp.stages.fast import FastPicture
 from synpick_warp.stages.simulate import Simulation
 from synpick_warp.stages.stream import STATUS_COLUMNS, FrameStream, TickReader, TickReport
 
-PARTS = ("physics", "sight", "render", "write", "bake")
+PARTS = ("physics", "sight", "render", "sensor", "write", "bake")
 STREAM_BATCHES = 12
 """Batches that are rendered and copied in a row."""
 WRITE_VIEWS = 12
@@ -127,7 +129,7 @@ def _config(options: argparse.Namespace) -> Config:
 
 def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Row]:
     """All numbers of the parts, as they come. `least` is the time a measurement is repeated [s]."""
-    if {"physics", "sight", "render", "write"} & set(parts):
+    if set(parts) - {"bake"}:
         started = time.perf_counter()
         records = "write" in parts and any(kind.records for kind in exporter_kinds(config.bake.formats))
         factory = build_factory(config, SilentProgress(), records_physics=records)
@@ -151,6 +153,8 @@ def _worlds(config: Config, factory: Factory, least: float, parts: tuple[str, ..
     yield from measure_simulation(factory, least, parts)
     if "render" in parts:
         yield from _render(config, factory, least)
+    if "sensor" in parts:
+        yield from measure_sensor(config, factory, least)
 
 
 def _share_of_a_bake(config: Config, values: dict[str, float]) -> Iterator[Row]:
@@ -208,23 +212,28 @@ def _render(config: Config, factory: Factory, least: float) -> Iterator[Row]:
 def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], object]]:
     """Launches of each stage of a batch of `count` views, by name, in order; "all" is all of them."""
     simulation, renderer, out = factory.simulation, factory.stream.renderer, factory.stream.buffers[0]
-    cameras, snapshot, samples = len(factory.cameras), simulation.records[0].snapshot, renderer.samples
+    cameras, snapshot, shading = len(factory.cameras), simulation.records[0].snapshot, renderer.shading
+    bodies, hits, radiance = renderer.bodies, renderer.hits, renderer.picture.radiance
     view = np.arange(count, dtype=np.int32)
     world, camera = (wp.array(values, dtype=wp.int32, device=simulation.device) for values in (view // cameras, view % cameras))
     stages: dict[str, Callable[[], object]] = {
         "prepare bodies": lambda: renderer.prepare_bodies(snapshot, world, camera, count),
         "trace hits": lambda: renderer.trace_hits(camera, count, out),
-        "trace colour samples": lambda: [renderer.trace_sample(camera, count, sample) for sample in samples],
-        "occlude": lambda: [renderer.occlude(snapshot, world, camera, count, sample) for sample in samples],
-        "filter occlusion": lambda: [renderer.filter_occlusion(camera, count, sample) for sample in samples],
-        "shade": lambda: [renderer.shade(snapshot, world, camera, count, sample) for sample in samples],
-        "develop": lambda: renderer.develop(snapshot, world, count, out),
+    }
+    if isinstance(shading, FastPicture):
+        stages |= {
+            "gather light": lambda: shading.gather(snapshot, bodies, hits, world, camera, count),
+            "filter light": lambda: shading.filter(camera, count),
+            "shadows of the main light": lambda: shading.cast_shadows(snapshot, bodies, hits, world, camera, count),
+            "shade": lambda: shading.light(snapshot, bodies, hits, world, camera, count, radiance),
+        }
+    else:
+        stages["trace paths"] = lambda: shading.shade(snapshot, bodies, hits, world, camera, count, radiance)
+    return stages | {
+        "develop": lambda: renderer.develop(snapshot, world, camera, count, out),
         "annotate": lambda: annotate(renderer.scene, renderer.bodies, camera, count, out),
         "all": lambda: renderer.render(snapshot, world, camera, count, out),
     }
-    if len(samples) == 1:
-        del stages["trace colour samples"]
-    return stages
 
 
 class _StageTimes(SilentProgress):

@@ -55,11 +55,10 @@ class _Given:
 def measure_writing(config: Config, factory: Factory, report: TickReport, least: float) -> Iterator[Row]:
     """Rates of each format alone. `report` says which worlds are in the views; `least` is the time a measurement takes at least [s]."""
     snapshot = factory.simulation.records[0].snapshot
-    kept = [
-        {name: array.copy() for name, array in vars(batch).items() if array is not None}
-        for batch in factory.stream.render(snapshot, report)
-    ]
-    views = FrameBatch(**{name: np.concatenate([batch[name] for batch in kept]) for name in kept[0]})
+    kept = [_copied(batch) for batch in factory.stream.render(snapshot, report)]
+    layers = {name: np.concatenate([batch.layers[name] for batch in kept]) for name in kept[0].layers}
+    names = [name for name, array in vars(kept[0]).items() if isinstance(array, np.ndarray)]
+    views = FrameBatch(**{name: np.concatenate([getattr(batch, name) for batch in kept]) for name in names}, layers=layers)
     frames = tick_batch(report, factory.log.object_ids, config.physics.step * config.physics.steps_per_tick)
     yield Row("write", "objects in a view", float((views.object_id >= 0).sum(axis=1).mean()), "")
     cores = len(os.sched_getaffinity(0))
@@ -73,6 +72,11 @@ def measure_writing(config: Config, factory: Factory, report: TickReport, least:
         yield Row("write", f"{name}: views, with the end of episodes of {written.frames} frames", written.whole_rate, "1/s")
         yield Row("write", f"{name}: files of a view", written.files, "")
         yield Row("write", f"{name}: files of a view", 1e-6 * written.size, "MB")
+
+
+def _copied(batch: FrameBatch) -> FrameBatch:
+    arrays = {name: array.copy() for name, array in vars(batch).items() if isinstance(array, np.ndarray)}
+    return dataclasses.replace(batch, **arrays, layers={name: array.copy() for name, array in batch.layers.items()})
 
 
 @dataclass(frozen=True)

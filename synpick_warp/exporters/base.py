@@ -14,6 +14,8 @@ from synpick_warp.scenes.shapes import Camera, Catalog, LightMap
 
 PIXEL_BYTES = (3, 2, 1, 4)
 """Of `FrameBatch`'s color, depth, instance and amodal."""
+LAYER_BYTES = 12
+"""Of a pixel of the largest layer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +111,7 @@ class Exporter(Protocol):
 
 
 def view_bytes(config: Config) -> int:
-    """Room that a view's images take in the pool's shared memory [B]."""
+    """Room that a view's images, or one of its layers, take at most in the pool's shared memory [B]."""
     width, height = config.cameras.resolution
-    return shared_bytes(height * width * size for size in PIXEL_BYTES)
+    layer = (height * width * LAYER_BYTES,) if config.render.layers else ()
+    return max(shared_bytes(height * width * size for size in PIXEL_BYTES), shared_bytes(layer))

@@ -11,7 +11,7 @@ from typing import Any
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import DataSet
 from synpick_warp.exporters.bop_scene import SceneSettings, finish_episode, make_scene
-from synpick_warp.exporters.bop_view import write_view
+from synpick_warp.exporters.bop_view import write_layer, write_view
 from synpick_warp.exporters.files import PARTIAL, output_error
 from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.exporters.scenes import SceneExporter
@@ -57,7 +57,10 @@ class BopExporter(SceneExporter):
         return [place.relative_to(self._out) for place in places if os.path.lexists(place)]
 
     def _make_scene(self, scene: Path) -> None:
-        make_scene(scene, self._config.masks)
+        make_scene(scene, self._config.masks, self._layers)
+
+    def _layer_task(self, scene: Path, number: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        return write_layer, (scene, name, frame)
 
     def _finish_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
         settings = SceneSettings(

@@ -13,6 +13,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop_view import MILLIMETERS
 from synpick_warp.exporters.png import encode_png
+from synpick_warp.layers import layer_notes
 from synpick_warp.scenes.shapes import Camera, Catalog, CatalogEntry, Material
 
 CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
@@ -172,11 +173,14 @@ BOP challenge (scenewise). Camera c of episode k is scene {count} · k + c of `{
 - Pictures have {camera.width} x {camera.height} pixels. The centre of pixel (row, column) is (column + 0.5, row + 0.5). Cameras have
   x right, y down, z forward.
 - `cam_R_w2c` and `cam_t_w2c` lead from the tote's frame (centre of its inner floor, z up) to the camera.
+- `light` in scene_camera.json tells of the episode's light: the map's name, its turn about the vertical [rad], the exposure [stops]
+  against the automatic one, and the direction to the sun or lamp that casts shadows, in the tote's frame; null: none stands out.
+  `effects`, if there, tells what the camera did to colour; `config.toml` has the ranges from which it was drawn.
 - `instance_id` in scene_gt.json is an object's number for the whole episode, the same for all cameras; a gt_id is but the place
   in an image's list.
 - `mask_visib` is exact: what the ray through the pixel's centre meets first. The masks of an image do not overlap.
 - `px_count_all` and `bbox_obj` count what lies outside of the picture too, up to one picture's size beyond each border.
-- `models_eval/` equals `models/`.
+{layer_notes(config.render.layers)}- `models_eval/` equals `models/`.
 - The toolkit has no place for new data sets: add this one's name to `dataset_params.py` (im_size {(camera.width, camera.height)}).
 
 | obj_id | name | mass [kg] |

@@ -35,10 +35,10 @@ class SceneSettings:
     """Every object that may come."""
 
 
-def make_scene(scene: Path, masks: bool) -> None:
+def make_scene(scene: Path, masks: bool, layers: tuple[str, ...]) -> None:
     """Make the folders of a scene that is not whole yet."""
     scene.mkdir()
-    for name in (RECORDS, "rgb", "depth", *(("mask", "mask_visib") if masks else ())):
+    for name in (RECORDS, "rgb", "depth", *(("mask", "mask_visib") if masks else ()), *layers):
         (scene / name).mkdir()
 
 

@@ -17,7 +17,8 @@ import orjson
 from synpick_warp.exporters.folder import Buffer, open_folder
 from synpick_warp.exporters.png import encode_mask_png, encode_png
 from synpick_warp.exporters.rle import Runs, find_edges, listed_edges
-from synpick_warp.frames import FrameBatch
+from synpick_warp.frames import EFFECTS, FrameBatch
+from synpick_warp.layers import encode_layer, layer_path
 from synpick_warp.scenes.shapes import Camera
 
 RECORDS = "records"
@@ -32,6 +33,10 @@ _ALL, _VALID, _VISIBLE = 0, 1, 2
 """Columns of `FrameBatch.pixels`."""
 _WHOLE, _SEEN = 0, 1
 """Rows of `FrameBatch.boxes`."""
+_DIGITS = 6
+"""Decimal places of what is told of light and camera."""
+JPEG_QUALITY = "jpeg_quality"
+"""The one of EFFECTS that is the writer's to make."""
 
 
 @dataclass(frozen=True)
@@ -40,10 +45,13 @@ class ViewSettings:
 
     color_suffix: str
     jpeg_quality: int
+    """Unless the view has its own, see `effects`."""
+    effects: tuple[str, ...]
+    """Those of EFFECTS that are on."""
     masks: bool
     coco: bool
     camera: dict[str, Any]
-    """The record in scene_camera.json."""
+    """What all views' records in scene_camera.json share."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +61,9 @@ class ViewTruth:
     scene: int
     """Number of the scene."""
     frame: int
+    jpeg_quality: int
+    circumstances: dict[str, Any]
+    """What the view adds to its record in scene_camera.json."""
     instance_id: np.ndarray
     """(N)"""
     object_id: np.ndarray
@@ -81,8 +92,8 @@ class Masks:
     """Its visible part."""
 
 
-def camera_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
-    """A camera's entry in scene_camera.json."""
+def shared_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
+    """What the entries of all views of a camera in scene_camera.json share."""
     return {
         "cam_K": camera.matrix.ravel().tolist(),
         "cam_R_w2c": camera.rotation.ravel().tolist(),
@@ -91,7 +102,7 @@ def camera_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
     }
 
 
-def view_task(batch: FrameBatch, view: int, scene: int) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
+def view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSettings) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
     """What a task on one view needs: color, depth, two arrays that hold where masks begin and end, and the truth.
 
     The two are the lists of edges of the images instance and amodal, or else the images themselves, cut to where objects are.
@@ -100,9 +111,12 @@ def view_task(batch: FrameBatch, view: int, scene: int) -> tuple[tuple[np.ndarra
     boxes = batch.boxes[view][present]
     edges = _edges(batch, view)
     rows, columns = (slice(0, 0), slice(0, 0)) if edges else _shown(boxes, *batch.depth.shape[1:])
+    strengths: dict[str, float] = dict(zip(EFFECTS, batch.effects[view].tolist(), strict=True))
     truth = ViewTruth(
         scene=scene,
         frame=int(batch.frame[view]),
+        jpeg_quality=round(strengths[JPEG_QUALITY]) if JPEG_QUALITY in settings.effects else settings.jpeg_quality,
+        circumstances=_circumstances(batch, view, {name: strengths[name] for name in settings.effects}),
         instance_id=present,
         object_id=batch.object_id[view][present],
         pose=batch.pose[view][present],
@@ -114,6 +128,18 @@ def view_task(batch: FrameBatch, view: int, scene: int) -> tuple[tuple[np.ndarra
     )
     masks = edges or tuple(image[view, rows, columns] for image in (batch.instance, batch.amodal))
     return (batch.color[view], batch.depth[view], *masks), truth
+
+
+def _circumstances(batch: FrameBatch, view: int, effects: dict[str, float]) -> dict[str, Any]:
+    """A view's light, and what its camera did to colour if that is anything, for scene_camera.json."""
+    direction = batch.light_direction[view]
+    light = {
+        "map": str(batch.light_name[view]),
+        "turn": round(float(batch.light_turn[view]), _DIGITS),
+        "exposure": round(float(batch.light_exposure[view]), _DIGITS),
+        "direction": [round(part, _DIGITS) for part in direction.tolist()] if direction.any() else None,
+    }
+    return {"light": light} | ({"effects": {name: round(value, _DIGITS) for name, value in effects.items()}} if effects else {})
 
 
 def _edges(batch: FrameBatch, view: int) -> tuple[np.ndarray, ...]:
@@ -149,7 +175,7 @@ def write_view(
     name = f"{truth.frame:06d}"
     height, width = depth.shape
     with open_folder(scene) as folder:
-        folder.write(f"rgb/{name}{settings.color_suffix}", encode_color(color, settings))
+        folder.write(f"rgb/{name}{settings.color_suffix}", encode_color(color, settings, truth.jpeg_quality))
         folder.write(f"depth/{name}.png", encode_png(depth))
         masks = view_masks(first, second, truth, height) if settings.masks or settings.coco else []
         if settings.masks:
@@ -158,17 +184,22 @@ def write_view(
                 folder.write(f"mask/{name}_{index:06d}.png", whole)
                 folder.write(f"mask_visib/{name}_{index:06d}.png", seen)
         infos = info_records(truth)
-        lines = [settings.camera, gt_records(truth, settings.camera), infos]
+        lines = [camera_record(truth, settings), gt_records(truth, settings.camera), infos]
         if settings.coco:
             lines += coco_records(truth, infos, masks, height, width)
         folder.write(f"{RECORDS}/{name}", b"".join(to_json(line) + b"\n" for line in lines))
 
 
-def encode_color(color: np.ndarray, settings: ViewSettings) -> Buffer:
+def write_layer(values: np.ndarray, scene: Path, name: str, frame: int) -> None:
+    """Write a view's layer into the folder of that name."""
+    layer_path(scene, name, frame).write_bytes(encode_png(encode_layer(name, values)))
+
+
+def encode_color(color: np.ndarray, settings: ViewSettings, jpeg_quality: int) -> Buffer:
     """A picture (H, W, 3) uint8, red first, in the format that the settings name."""
     if settings.color_suffix == ".png":
         return encode_png(color)
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality))
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality))
     if not done:
         raise ValueError(f"OpenCV cannot encode a picture of shape {color.shape} as JPEG")
     return data.data
@@ -183,6 +214,11 @@ def encode_masks(masks: Masks, height: int, width: int) -> tuple[bytes, bytes]:
 def to_json(record: object) -> bytes:
     """A record in one line of JSON; arrays become lists."""
     return orjson.dumps(record, option=orjson.OPT_SERIALIZE_NUMPY)
+
+
+def camera_record(truth: ViewTruth, settings: ViewSettings) -> dict[str, Any]:
+    """A view's entry in scene_camera.json."""
+    return settings.camera | truth.circumstances
 
 
 def gt_records(truth: ViewTruth, camera: dict[str, Any]) -> list[dict[str, Any]]:

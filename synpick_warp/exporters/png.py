@@ -18,7 +18,7 @@ _UP = 2
 """Filter type of the PNG specification, section 9.2: minus the byte above. 0: the bytes as they are."""
 _GREY, _RGB = 0, 2
 """Colour types of the PNG specification, table 11.1."""
-_KINDS = (((), "uint8"), ((), "uint16"), ((3,), "uint8"))
+_KINDS = (((), "uint8"), ((), "uint16"), ((3,), "uint8"), ((3,), "uint16"))
 _ZLIB = b"\x78\x01"
 """How a zlib stream begins (RFC 1950, section 2.2): deflate, window of 32 kB, fastest compression."""
 _LAST = b"\x03\x00"
@@ -31,7 +31,7 @@ def encode_png(image: np.ndarray) -> bytes:
     """An image as a PNG file.
 
     Args:
-        image: Grey (H, W) uint8 or uint16, or colour (H, W, 3) uint8, red first.
+        image: Grey (H, W) or colour (H, W, 3), red first; uint8 or uint16.
     """
     if (image.shape[2:], image.dtype.name) not in _KINDS or not image.size:
         raise ValueError(f"no PNG for an image of shape {image.shape} and type {image.dtype}")

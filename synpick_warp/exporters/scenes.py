@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.sensors import strength_ranges
 from synpick_warp.exporters.base import DataSet, view_bytes
 from synpick_warp.exporters.bop_models import write_constants
 from synpick_warp.exporters.bop_scene import drop_scenes
-from synpick_warp.exporters.bop_view import ViewSettings, camera_record, view_task
+from synpick_warp.exporters.bop_view import ViewSettings, shared_record, view_task
 from synpick_warp.exporters.files import PARTIAL, output_error
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.outcome import Ending
@@ -26,7 +27,7 @@ class _Episode:
     scenes: tuple[Path, ...]
     """Hidden folder of each camera's scene."""
     pending: int = 0
-    """Views that are not on the disk yet."""
+    """Views and layers of views that are not on the disk yet."""
     end: EpisodeEnd | None = None
     whole: Callable[[], None] | None = None
     """Comes with the end."""
@@ -54,10 +55,14 @@ class SceneExporter(ABC):
         self._pool = data_set.pool
         self._split = self._out / self.split(data_set.config)
         self._suffix = f".{config.color_format}"
+        self._layers = data_set.config.render.layers
+        effects = tuple(name for name, strengths in strength_ranges(data_set.config.effects).items() if any(strengths))
         self._views = tuple(
-            ViewSettings(self._suffix, config.jpeg_quality, config.masks, config.coco, camera_record(camera, config.depth_scale))
+            ViewSettings(
+                self._suffix, config.jpeg_quality, effects, config.masks, config.coco, shared_record(camera, config.depth_scale)
+            )
             for camera in data_set.cameras
-        )
+        )  # fmt: skip
         self._episodes: dict[int, _Episode] = {}
         self._begun = 0
 
@@ -69,6 +74,10 @@ class SceneExporter(ABC):
     @abstractmethod
     def _make_scene(self, scene: Path) -> None:
         """Make the hidden folder of a scene, and folders in it."""
+
+    @abstractmethod
+    def _layer_task(self, scene: Path, number: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        """The task, function and further arguments, that writes a view's layer: hidden folder of the scene, its number, layer, frame."""
 
     @abstractmethod
     def _finish_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
@@ -97,15 +106,16 @@ class SceneExporter(ABC):
             number, camera = int(batch.episode[view]), int(batch.camera[view])
             episode = self._episodes.get(number) or self._begin(number)
             scene = episode.scenes[camera]
-            episode.pending += 1
-            images, truth = view_task(batch, view, self.scene_number(number, camera))
-            self._pool.submit(
-                type(self).write_view,
-                images,
-                (scene, self._views[camera], truth),
-                path=self._split / scene.name,
-                done=partial(self._view_done, number, episode),
-            )
+            images, truth = view_task(batch, view, self.scene_number(number, camera), self._views[camera])
+            tasks = [(type(self).write_view, images, (scene, self._views[camera], truth))]
+            for name in self._layers:
+                function, arguments = self._layer_task(scene, truth.scene, name, truth.frame)
+                tasks.append((function, (batch.layers[name][view],), arguments))
+            episode.pending += len(tasks)
+            for function, arrays, arguments in tasks:
+                self._pool.submit(
+                    function, arrays, arguments, path=self._split / scene.name, done=partial(self._part_done, number, episode)
+                )  # fmt: skip
 
     def tick(self, batch: TickBatch) -> None:
         """See `Exporter`: what BOP has of a tick comes with its views."""
@@ -148,7 +158,7 @@ class SceneExporter(ABC):
         self._episodes[number] = episode
         return episode
 
-    def _view_done(self, number: int, episode: _Episode) -> None:
+    def _part_done(self, number: int, episode: _Episode) -> None:
         episode.pending -= 1
         self._finish_if_whole(number, episode)
 

@@ -18,6 +18,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop_view import (
     ViewSettings,
     ViewTruth,
+    camera_record,
     encode_color,
     gt_records,
     info_records,
@@ -29,6 +30,7 @@ from synpick_warp.exporters.files import flush_folder
 from synpick_warp.exporters.folder import Buffer, open_folder
 from synpick_warp.exporters.png import encode_png
 from synpick_warp.exporters.rle import Runs
+from synpick_warp.layers import encode_layer
 
 MOST_VIEWS = 1000
 """Of a shard, as the toolkit has them (convert_imagewise_to_webdataset.py)."""
@@ -51,9 +53,9 @@ def write_shard_view(
     """Write all of a view as tar entries, without a tar file's end, to a file in a scene's folder that is named as the frame."""
     height, width = depth.shape
     entries: list[tuple[str, Buffer]] = [
-        (f"rgb{settings.color_suffix}", encode_color(color, settings)),
+        (f"rgb{settings.color_suffix}", encode_color(color, settings, truth.jpeg_quality)),
         ("depth.png", encode_png(depth)),
-        ("camera.json", to_json(settings.camera)),
+        ("camera.json", to_json(camera_record(truth, settings))),
         ("gt.json", to_json(gt_records(truth, settings.camera))),
         ("gt_info.json", to_json(info_records(truth))),
     ]
@@ -61,9 +63,24 @@ def write_shard_view(
         masks = view_masks(first, second, truth, height)
         entries.append(("mask.json", _mask_json((mask.whole for mask in masks), height, width)))
         entries.append(("mask_visib.json", _mask_json((mask.seen for mask in masks), height, width)))
-    key = f"{truth.scene:06d}_{truth.frame:06d}"
+    key = _key(truth.scene, truth.frame)
     with open_folder(scene) as folder:
         folder.write(str(truth.frame), b"".join(part for name, data in entries for part in _tar_entry(f"{key}.{name}", data)))
+
+
+def write_shard_layer(values: np.ndarray, scene: Path, number: int, name: str, frame: int) -> None:
+    """Write a view's layer as a tar entry, without a tar file's end, to a file in a scene's folder; `number` is the scene's."""
+    entry = _tar_entry(f"{_key(number, frame)}.{name}.png", encode_png(encode_layer(name, values)))
+    with open_folder(scene) as folder:
+        folder.write(_layer_file(frame, name), b"".join(entry))
+
+
+def _key(scene: int, frame: int) -> str:
+    return f"{scene:06d}_{frame:06d}"
+
+
+def _layer_file(frame: int, name: str) -> str:
+    return f"{frame}.{name}"
 
 
 def _mask_json(masks: Iterable[Runs], height: int, width: int) -> bytes:
@@ -77,19 +94,20 @@ def _tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
     return info.tobuf(tarfile.USTAR_FORMAT), data, bytes(-len(data) % tarfile.BLOCKSIZE)
 
 
-def finish_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int) -> None:
-    """Make an episode's shards of its views, and move them to their places: hidden folders and scene numbers.
+def finish_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int, layers: tuple[str, ...]) -> None:
+    """Make an episode's shards of its views with their layers, and move them to their places: hidden folders and scene numbers.
 
     Shards are on the disk before the move.
     """
     whole: list[tuple[Path, Path]] = []
     for scene, number in scenes:
-        names = sorted(int(path.name) for path in scene.iterdir())
-        if names != list(range(frames)):
-            raise OutputError(f"{scene} has {len(names)} of {frames} frames; this is an error of synpick-warp, please report it")
+        views = [[str(frame), *(_layer_file(frame, name) for name in layers)] for frame in range(frames)]
+        names = {path.name for path in scene.iterdir()}
+        if names != {name for view in views for name in view}:
+            raise OutputError(f"{scene} does not have {frames} whole frames; this is an error of synpick-warp, please report it")
         for part, begin in enumerate(range(0, frames, MOST_VIEWS)):
             shard = scene / shard_name(number, part)
-            _join(shard, [scene / str(frame) for frame in names[begin : begin + MOST_VIEWS]])
+            _join(shard, [scene / name for view in views[begin : begin + MOST_VIEWS] for name in view])
             whole.append((shard, split / shard.name))
     for shard, place in whole:
         shard.rename(place)
@@ -98,13 +116,13 @@ def finish_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int
         shutil.rmtree(scene)
 
 
-def _join(shard: Path, views: list[Path]) -> None:
-    """Join views' entries to a tar file; each view's file goes at once, so that little room is taken twice."""
+def _join(shard: Path, pieces: list[Path]) -> None:
+    """Join files of entries to a tar file; each goes at once, so that little room is taken twice."""
     with shard.open("wb", buffering=0) as target:
-        for view in views:
-            with view.open("rb", buffering=0) as source:
+        for piece in pieces:
+            with piece.open("rb", buffering=0) as source:
                 shutil.copyfileobj(source, target, _COPY_BYTES)
-            view.unlink()
+            piece.unlink()
         target.write(_END)
         os.fsync(target.fileno())
 

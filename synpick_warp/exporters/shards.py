@@ -11,7 +11,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.files import PARTIAL, output_error, write_whole
 from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.exporters.scenes import SceneExporter
-from synpick_warp.exporters.shard_parts import finish_shards, list_keys, shard_number, shards_of, write_shard_view
+from synpick_warp.exporters.shard_parts import finish_shards, list_keys, shard_number, shards_of, write_shard_layer, write_shard_view
 
 KEYS_FILE = "key_to_shard.json"
 """In which shard a view is."""
@@ -56,5 +56,8 @@ class ShardsExporter(SceneExporter):
     def _make_scene(self, scene: Path) -> None:
         scene.mkdir()
 
+    def _layer_task(self, scene: Path, number: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        return write_shard_layer, (scene, number, name, frame)
+
     def _finish_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return finish_shards, (scenes, self._split, frames)
+        return finish_shards, (scenes, self._split, frames, self._layers)

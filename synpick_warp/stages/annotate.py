@@ -10,7 +10,7 @@ from synpick_warp.kernels.annotate import clear_annotation_kernel, close_boxes_k
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.render_scene import RenderScene
 
-GPU_THREADS = 256
+GPU_THREADS = 1024
 """Threads that share one instance's pixels: enough to hide the latency of their reads, few enough that atomics do not crowd."""
 
 

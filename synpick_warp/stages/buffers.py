@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from synpick_warp.arrays import device_array
+from synpick_warp.kernels.effects import Strengths
 
 FIXTURES = ("tote", "finger", "cup")
 """What `Snapshot.fixture_pose` holds, in order."""
@@ -36,6 +37,25 @@ class Snapshot:
     """The light map is turned counter-clockwise about +z by this angle."""
     light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="stops")
     """How much longer than the automatic exposure the episode's pictures are exposed."""
+    follows: wp.array = device_array("world", dtype=wp.int32)
+    """1: the arrays below hold the frame before this one, of the same episode; 0: there is none."""
+    last_entry: wp.array = device_array("world", "instance", dtype=wp.int32)
+    last_pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
+    last_fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
+    last_fixture_visible: wp.array = device_array("world", "fixture", dtype=wp.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class LastFrame:
+    """The part of every world's last snapshot that the next one repeats; fields as those of `Snapshot` and of the struct `FramePoses`."""
+
+    live: wp.array = device_array("world", dtype=wp.int32)
+    episode: wp.array = device_array("world", dtype=wp.int32)
+    frame: wp.array = device_array("world", dtype=wp.int32)
+    entry: wp.array = device_array("world", "instance", dtype=wp.int32)
+    pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
+    fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
+    fixture_visible: wp.array = device_array("world", "fixture", dtype=wp.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,3 +74,25 @@ class ViewBuffers:
     """px_count_all, px_count_valid, px_count_visib."""
     boxes: wp.array = device_array("view", "instance", "box", "edge", dtype=wp.int32, unit="px")
     """bbox_obj and bbox_visib: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty."""
+    effects: wp.array = device_array("view", dtype=Strengths)
+    """Strengths of the camera's effects, in the order of `frames.EFFECTS`; zero: off."""
+
+
+@dataclass(frozen=True, eq=False)
+class LayerBuffers:
+    """Layers of one batch of views, in the order of `configs.schema.LAYERS`; None: not asked for."""
+
+    normals: wp.array = device_array("view", "row", "column", dtype=wp.vec3)
+    """Unit normal of the surface in the camera's axes, towards the camera; zero: no surface."""
+    albedo: wp.array = device_array("view", "row", "column", dtype=wp.vec3ub)
+    """Base colour, sRGB, red first; zero: no surface."""
+    nocs: wp.array = device_array("view", "row", "column", dtype=wp.vec3)
+    """Place on the instance: (p - centre of its bounding box) / diagonal of that box + 0.5, in the model's axes; zero: no instance."""
+    classes: wp.array = device_array("view", "row", "column", dtype=wp.uint16)
+    """obj_id; 0: no instance."""
+    flow: wp.array = device_array("view", "row", "column", dtype=wp.vec2, unit="px")
+    """From the pixel to where its surface point was in the frame before: columns, rows; NaN: unknown."""
+    scene_flow: wp.array = device_array("view", "row", "column", dtype=wp.vec3, unit="m")
+    """From the pixel's surface point to where it was in the frame before, in the camera's axes; NaN: unknown."""
+    depth_sensor: wp.array = device_array("view", "row", "column", dtype=wp.uint16, unit="depth_scale")
+    """Planar depth as a depth camera measures it; 0: hole."""

@@ -10,16 +10,16 @@ import numpy as np
 from synpick_warp.kernels.environment import REFLECTION_LEVELS
 from synpick_warp.scenes.shapes import LightMap, Sun
 
-ANALYSIS_ROWS = 128
-"""Rows of the map that is analysed; 1.4° a texel tells lamps apart."""
 BACKGROUND_ROWS = 256
-"""Rows of the background, which is what a camera out of focus would see."""
-REFLECTION_ROWS = 32
+"""Rows of the background, which is what a camera out of focus would see; 0.7° a texel tells lamps apart."""
+REFLECTION_ROWS = 96
 """Rows of the blurred reflections: the sharpest lobe kept is wider than a texel of 5.6°."""
 MAIN_LIGHT_RADIUS = np.radians(15.0)
 """The main light gathers what is bright within this angle of the brightest place."""
 MAIN_LIGHT_CONTRAST = 4.0
 """Radiance counts as part of the main light as far as it exceeds the map's mean by this factor."""
+MAIN_LIGHT_SPREAD = np.tan(np.radians(4.0))
+"""Tangent of the largest angular radius of a main light: wider ones cast half-shadows that need no rays of their own."""
 MAIN_LIGHT_MIN_HEIGHT = 0.15
 """Lowest z of the direction to a main light: lower ones light no pile in a tote."""
 SUN_SPREAD = np.tan(np.radians(0.267))
@@ -38,6 +38,8 @@ class LightTable:
 
     background: np.ndarray
     """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: all light of the map, with a set's sun as a disc."""
+    rest: np.ndarray
+    """The same without the main light."""
     reflection: np.ndarray
     """(levels, REFLECTION_ROWS, 2 REFLECTION_ROWS, 3) float32."""
     irradiance: np.ndarray
@@ -183,25 +185,23 @@ def light_table(light: LightMap, ground: np.ndarray | None) -> LightTable:
         light: The map.
         ground: Linear albedo (3) of the table, which takes the place of the map below the horizon; None: no table.
     """
-    fine, background = resized(light.radiance, ANALYSIS_ROWS), resized(light.radiance, BACKGROUND_ROWS)
-    replaced = None if light.sun is None else replace_sun(fine, light.sun)
-    directions, solid = map_directions(ANALYSIS_ROWS)
+    background = resized(light.radiance, BACKGROUND_ROWS)
+    directions, solid = map_directions(BACKGROUND_ROWS)
+    rest, direction, irradiance, spread = split_main_light(background) if light.sun is None else replace_sun(background, light.sun)
+    if light.sun is not None:
+        background = rest + sun_disc((rest < background).any(axis=2), direction, irradiance, spread)
+    if spread > MAIN_LIGHT_SPREAD:
+        rest, irradiance = background, np.zeros(3)
     upward = np.maximum(directions[..., 2], 0.0) * solid
-    if replaced is not None:
-        fine, direction, irradiance, spread = replaced
-        sky = split_main_light(background, direction)[0]
-        background = sky + sun_disc((sky < background).any(axis=2), direction, irradiance, spread)
-    upward_irradiance = (fine * upward[..., None]).sum(axis=(0, 1))
-    if replaced is not None:
-        upward_irradiance += replaced[1][2] * replaced[2]
-    if ground is not None:
-        fine = np.where(directions[..., 2:] < 0.0, ground * upward_irradiance / np.pi, fine)
-    rest, direction, irradiance, spread = split_main_light(fine) if replaced is None else (fine, *replaced[1:])
-    coefficients = np.einsum("ijk,ijc->kc", harmonics(directions) * solid[..., None], rest) * COSINE_LOBE[:, None]
+    upward_irradiance = (background * upward[..., None]).sum(axis=(0, 1))
+    # What surfaces would see: the table hides the map below the horizon.
+    even = rest if ground is None else np.where(directions[..., 2:] < 0.0, ground * upward_irradiance / np.pi, rest)
+    coefficients = np.einsum("ijk,ijc->kc", harmonics(directions) * solid[..., None], even) * COSINE_LOBE[:, None]
     white = max(float(upward_irradiance @ LUMINANCE) / np.pi, 1e-9)
     return LightTable(
         background=background.astype(np.float32),
-        reflection=blurred_reflections(resized(rest, REFLECTION_ROWS)).astype(np.float32),
+        rest=rest.astype(np.float32),
+        reflection=blurred_reflections(resized(even, REFLECTION_ROWS)).astype(np.float32),
         irradiance=coefficients.astype(np.float32),
         main_direction=direction.astype(np.float32),
         main_irradiance=irradiance.astype(np.float32),

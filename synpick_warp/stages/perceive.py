@@ -10,13 +10,13 @@ import warp as wp
 from synpick_warp.arrays import allocate, device_array, memory_table
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
-from synpick_warp.kernels import components, contours, distance, hits, suction_points
+from synpick_warp.kernels import components, contours, distance, hits, placing, suction_points
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.stages.buffers import FIXTURES, Snapshot
+from synpick_warp.stages.bodies import BodyArrays, HitArrays, body_sizes, filled, place_bodies
+from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch_pixels
-from synpick_warp.stages.render import BodyArrays, HitArrays, filled
 from synpick_warp.stages.render_scene import RenderScene, build_cameras, build_grid
 from synpick_warp.stages.sight import LookArrays, Sighting
 
@@ -53,12 +53,11 @@ def sight_sizes(config: Config, instances: int, views: int) -> dict[str, int]:
     width, height = config.sight.resolution
     return {
         "view": views,
-        "body": instances + len(FIXTURES),
         "instance": instances,
         "row": height,
         "column": width,
         "point": config.sight.contour_points,
-    }
+    } | body_sizes(instances, width, height)
 
 
 def view_bytes(config: Config, instances: int) -> int:
@@ -121,11 +120,8 @@ class Sight:
     def trace(self, snapshot: Snapshot) -> None:
         """What each pixel shows, without finger and cup. Views that are not in use keep what they had."""
         scene, look = self.scene, self.look
-        wp.launch(hits.aim_views_kernel, dim=self.views, inputs=[look.world], outputs=[look.camera], device=scene.device)
-        inputs = [scene.meshes, self.cameras, self.grid, snapshot.entry, snapshot.pose, snapshot.fixture_pose]
-        inputs += [self.fixture_visible, look.world, look.camera, self.instances]
-        dim = (self.views, self.instances + len(FIXTURES))
-        wp.launch(hits.prepare_bodies_kernel, dim=dim, inputs=inputs, outputs=[self.bodies], device=scene.device)
+        wp.launch(placing.aim_views_kernel, dim=self.views, inputs=[look.world], outputs=[look.camera], device=scene.device)
+        place_bodies(scene, self.cameras, self.grid, snapshot, self.fixture_visible, look.world, look.camera, self.views, self.bodies)
         inputs = [scene.meshes, scene.table, self.cameras, self.grid, self.bodies, look.camera, self.instances, CENTER]
         self._launch_pixels(hits.trace_sample_kernel, inputs, [self.hits])
 

@@ -13,8 +13,8 @@ from synpick_warp.kernels.acyclic import Cycles, order_clutter_kernel
 from synpick_warp.kernels.choice import choose_target_kernel
 from synpick_warp.kernels.clutter import CONTOUR_LANES, NOWHERE, bound_contours_kernel, count_votes_kernel, weigh_votes_kernel
 from synpick_warp.kernels.grasp import frame_grasp_kernel, smooth_normal_kernel
+from synpick_warp.stages.bodies import filled
 from synpick_warp.stages.constants import SceneData
-from synpick_warp.stages.render import filled
 from synpick_warp.stages.render_scene import RenderScene
 from synpick_warp.stages.sight import LookArrays, Plan, Sighting
 from synpick_warp.stages.worlds import AttemptState, WorldState

@@ -13,9 +13,11 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.environment import Lights
 from synpick_warp.kernels.hits import Meshes, Table
+from synpick_warp.kernels.paths import PathScene
 from synpick_warp.kernels.surfaces import Surfaces
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.shapes import Camera, Catalog, Fixture, LightMap, Material, TriangleMesh
+from synpick_warp.stages.chances import build_chances
 from synpick_warp.stages.gloss import measure_gloss
 from synpick_warp.stages.light_tables import light_table
 
@@ -32,7 +34,11 @@ class RenderScene:
     cameras: Any
     lights: Any
     table: Any
+    paths: Any
+    """The struct `PathScene`: all that paths meet."""
     grid: Any
+    obj_id: wp.array
+    """Of each catalog entry (entry) int32."""
     camera_count: int
     device: wp.Device
     keep: tuple[wp.Mesh, ...]
@@ -150,7 +156,9 @@ def build_lights(maps: tuple[LightMap, ...], ground: np.ndarray | None, exposure
     """The struct `Lights`; `exposure` multiplies the automatic exposure, `ground` is the table's linear albedo."""
     tables = [light_table(light, ground) for light in maps]
     lights = Lights()
-    lights.background = wp.array(np.stack([t.background for t in tables]), dtype=wp.vec3, device=device)
+    lights.maps = len(tables)
+    backgrounds = np.stack([t.background for t in tables] + [t.rest for t in tables])
+    lights.background = wp.array(backgrounds, dtype=wp.vec3, device=device)
     lights.reflection = wp.array(np.stack([t.reflection for t in tables]), dtype=wp.vec3, device=device)
     lights.irradiance = wp.array(np.stack([t.irradiance for t in tables]), dtype=wp.vec3, device=device)
     lights.main_direction = wp.array(np.stack([t.main_direction for t in tables]), dtype=wp.vec3, device=device)
@@ -185,13 +193,21 @@ def build_render_scene(
     table = Table()
     table.visible, table.height = int(config.render.table), -config.tote.wall
     ground = srgb_to_linear(np.array(config.render.table_color)) if config.render.table else None
+    paths = PathScene()
+    paths.meshes = meshes
+    paths.table = table
+    paths.surfaces = build_surfaces(shapes, materials, device)
+    paths.lights = build_lights(lights, ground, config.render.exposure, device)
+    paths.chances = build_chances(paths.lights.background.numpy(), device, config.render.table)
     return RenderScene(
         meshes=meshes,
-        surfaces=build_surfaces(shapes, materials, device),
+        surfaces=paths.surfaces,
         cameras=build_cameras(cameras, device),
-        lights=build_lights(lights, ground, config.render.exposure, device),
+        lights=paths.lights,
         table=table,
+        paths=paths,
         grid=build_grid(cameras[0].width, cameras[0].height),
+        obj_id=wp.array([entry.obj_id for entry in catalog.entries], dtype=wp.int32, device=device),
         camera_count=len(cameras),
         device=device,
         keep=keep,

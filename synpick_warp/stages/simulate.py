@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import newton
 import numpy as np
@@ -16,7 +17,7 @@ from synpick_warp.kernels import pack
 from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.shapes import Catalog
 from synpick_warp.stages import act, arrange
-from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.buffers import LastFrame, Snapshot
 from synpick_warp.stages.constants import SceneData, make_scene_data
 from synpick_warp.stages.hold import Suction
 from synpick_warp.stages.look import Looker
@@ -83,6 +84,7 @@ class Simulation:
         self.seals = allocate(SealState, sizes, device)
         self.sighting = allocate(Sighting, sizes, device)
         self.plan = allocate(Plan, sizes, device)
+        self.last = allocate(LastFrame, sizes, device)
         self.recorder: Recorder | None = None
         if records_physics:
             self.recorder = Recorder(config, self.scene, self.state, self.attempts, self.seals, self.physics, sizes)
@@ -165,9 +167,20 @@ class Simulation:
             outputs=[status.table, status.measures],
             device=device,
         )
+        outputs = [_frame_poses(self.last), snapshot.follows, snapshot.last_entry, snapshot.last_pose, snapshot.last_fixture_pose]
+        outputs += [snapshot.last_fixture_visible]
+        wp.launch(pack.link_frames_kernel, dim=self.layout.worlds, inputs=[_frame_poses(snapshot)], outputs=outputs, device=device)
         wp.copy(snapshot.light, state.light)
         wp.copy(snapshot.light_turn, state.light_turn)
         wp.copy(snapshot.light_exposure, state.light_exposure)
+
+
+def _frame_poses(arrays: Snapshot | LastFrame) -> Any:
+    """The struct `FramePoses` of arrays of the same names."""
+    made = pack.FramePoses()
+    for item in fields(LastFrame):
+        setattr(made, item.name, getattr(arrays, item.name))
+    return made
 
 
 def _copy(target: Sighting | Plan, source: Sighting | Plan) -> None:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate
+from synpick_warp.arrays import allocate, memory_table
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch, TickBatch
-from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch, edge_sizes, list_edges
 from synpick_warp.stages.record import host_record, record_arrays, tick_measures
 from synpick_warp.stages.render import Renderer
@@ -20,7 +21,7 @@ from synpick_warp.stages.simulate import TickRecord
 from synpick_warp.stages.worlds import MEASURE_COLUMNS, STATUS_COLUMNS
 
 # Bytes of one batch's images on a GPU: large enough to fill it, small enough that several batches are in flight.
-BATCH_BYTES = 256 << 20
+BATCH_BYTES = 512 << 20
 # Colour, depth, instance id and amodal bits of one pixel.
 PIXEL_BYTES = 3 + 2 + 1 + 4
 # What a report has of a snapshot, besides objects and their poses.
@@ -37,11 +38,13 @@ def views_per_batch(config: Config, device: wp.Device) -> int:
     if not device.is_cuda:
         return views
     width, height = config.cameras.resolution
-    return max(1, min(BATCH_BYTES // (width * height * PIXEL_BYTES), views * config.bake.worlds))
+    one = {"view": 1, "row": height, "column": width}
+    layers = sum(size for *_, size in memory_table(LayerBuffers, one, config.render.layers))
+    return max(1, min(BATCH_BYTES // (width * height * PIXEL_BYTES + layers), views * config.bake.worlds))
 
 
 def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
-    """Extents of the dimensions that `ViewBuffers` names."""
+    """Extents of the dimensions that `ViewBuffers` and `LayerBuffers` name."""
     width, height = config.cameras.resolution
     return {
         "view": views_per_batch(config, device),
@@ -84,6 +87,28 @@ class TickReport:
     def measure(self, name: str) -> np.ndarray:
         """One column of the table of measures (world) float32."""
         return self.measures[:, MEASURE_COLUMNS.index(name)]
+
+
+@dataclass(frozen=True, eq=False)
+class LightTable:
+    """What is told of each light map."""
+
+    name: np.ndarray
+    """(light) str."""
+    direction: np.ndarray
+    """Unit vector towards the main light of the map that is not turned (light, 3) float32; zero: none."""
+
+    def directions(self, light: np.ndarray, turn: np.ndarray) -> np.ndarray:
+        """The same in the world (..., 3) float32, of maps `light` (...) that are turned by `turn` (...) [rad]."""
+        x, y, z = np.moveaxis(self.direction[light].astype(np.float64), -1, 0)
+        c, s = np.cos(turn), np.sin(turn)
+        return np.stack([c * x - s * y, s * x + c * y, z], axis=-1).astype(np.float32)
+
+
+def name_lights(names: list[str], lights: Any) -> LightTable:
+    """The table of light maps, from their names and the struct `Lights`."""
+    shines = lights.main_irradiance.numpy().max(axis=1, keepdims=True) > 0.0
+    return LightTable(np.array(names), np.where(shines, lights.main_direction.numpy(), 0.0).astype(np.float32))
 
 
 class HostCopy:
@@ -167,29 +192,39 @@ def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> 
 class FrameStream:
     """Renders the live worlds of a snapshot and yields FrameBatches, each while the next is rendered."""
 
-    def __init__(self, config: Config, renderer: Renderer, object_ids: np.ndarray, device: wp.Device) -> None:
+    def __init__(self, config: Config, renderer: Renderer, object_ids: np.ndarray, lights: LightTable, device: wp.Device) -> None:
         """Allocate the ring of batches.
 
         Args:
             config: Settings.
             renderer: Renders and annotates.
             object_ids: obj_id of each catalog entry (entry) int32.
+            lights: What is told of the light maps.
             device: Where rendering happens.
         """
         self.renderer = renderer
         self.object_ids = np.append(object_ids, -1).astype(np.int32)
+        self.lights = lights
         self.cameras = len(config.cameras.positions)
         self.tick_time = config.physics.step * config.physics.steps_per_tick
         sizes = view_sizes(config, device)
         self.batch = sizes["view"]
         self.device = device
         self.copy_stream = wp.Stream(device) if device.is_cuda else None
-        self.buffers = [allocate(ViewBuffers, sizes, device) for _ in range(RING if device.is_cuda else 1)]
-        self.edges = [allocate(EdgeBuffers, edge_sizes(sizes), device) for _ in self.buffers]
+        self.images = [item.name for kind in (ViewBuffers, EdgeBuffers) for item in fields(kind)]
+        self.layers = [item.name for item in fields(LayerBuffers) if item.name in config.render.layers]
+        ring = range(RING if device.is_cuda else 1)
+        self.buffers = [allocate(ViewBuffers, sizes, device) for _ in ring]
+        self.edges = [allocate(EdgeBuffers, edge_sizes(sizes), device) for _ in ring]
         self.edge_scratch = allocate(EdgeScratch, edge_sizes(sizes), device)
-        self.copied = [item.name for kind in (ViewBuffers, EdgeBuffers) for item in fields(kind)]
-        pairs = zip(self.buffers, self.edges, strict=True)
-        self.copies = [HostCopy([getattr(part, item.name) for part in pair for item in fields(part)]) for pair in pairs]
+        self.layer_buffers = [allocate(LayerBuffers, sizes, device, self.layers) for _ in ring]
+        self.copies = [
+            HostCopy(
+                [getattr(part, item.name) for part in (images, edges) for item in fields(part)]
+                + [getattr(layers, name) for name in self.layers]
+            )
+            for images, edges, layers in zip(self.buffers, self.edges, self.layer_buffers, strict=True)
+        ]
         self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.buffers]
 
     def render(self, snapshot: Snapshot, report: TickReport) -> Iterator[FrameBatch]:
@@ -216,16 +251,17 @@ class FrameStream:
         padded = np.zeros((2, self.batch), dtype=np.int32)
         padded[:, : len(world)] = world, camera
         views.assign(padded)
-        self.renderer.render(snapshot, views[0], views[1], len(world), self.buffers[slot])
+        self.renderer.render(snapshot, views[0], views[1], len(world), self.buffers[slot], self.layer_buffers[slot])
         list_edges(self.edge_scratch, len(world), self.buffers[slot], self.edges[slot])
         self.copies[slot].start(self.copy_stream)
 
     def _collect(self, waiting: tuple[int, slice], world: np.ndarray, camera: np.ndarray, report: TickReport) -> FrameBatch:
         slot, part = waiting
         count = part.stop - part.start
-        images = {name: array[:count] for name, array in zip(self.copied, self.copies[slot].wait(), strict=True)}
+        arrays = {name: array[:count] for name, array in zip(self.images + self.layers, self.copies[slot].wait(), strict=True)}
         worlds = world[part]
         frame = report.column("frame")[worlds]
+        light, turn = report.snapshot.light[worlds], report.snapshot.light_turn[worlds]
         return FrameBatch(
             episode=report.column("episode")[worlds],
             camera=camera[part],
@@ -233,5 +269,10 @@ class FrameStream:
             time=frame * self.tick_time,
             object_id=self.object_ids[report.entry[worlds]],
             pose=report.pose[worlds],
-            **images,
+            light_name=self.lights.name[light],
+            light_turn=turn,
+            light_exposure=report.snapshot.light_exposure[worlds],
+            light_direction=self.lights.directions(light, turn),
+            **{name: arrays[name] for name in self.images},
+            layers={name: arrays[name] for name in self.layers},
         )

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 
 from synpick_warp.configs.schema import Bop, Cameras, Config
-from synpick_warp.frames import FINGER, TABLE, EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.frames import EFFECTS, FINGER, TABLE, EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.outcome import Ending
 from synpick_warp.scenes.shapes import Camera, Catalog, CatalogEntry, Material, TriangleMesh
 
@@ -149,6 +149,11 @@ def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: flo
         "pose": pose,
         "pixels": pixels,
         "boxes": boxes,
+        "effects": np.arange(len(EFFECTS), dtype=np.float32) + np.float32(10 * index + frame),
+        "light_name": np.str_(f"map {episode}"),
+        "light_turn": np.float32(0.5 * episode),
+        "light_exposure": np.float32(-0.25),
+        "light_direction": np.array([0.0, 0.6, 0.8] if episode else [0.0, 0.0, 0.0], np.float32),
     }
 
 

@@ -110,7 +110,8 @@ def report(side_by_side: list[World]) -> TickReport:
         return SimpleNamespace(**{name: np.concatenate([arrays[name] for arrays in parts]) for name in parts[0]})
 
     status, measures, entry = (np.concatenate([getattr(world, name) for world in side_by_side]) for name in ("status", "measures", "entry"))
-    return TickReport(status, measures, entry, np.zeros((*entry.shape, 7), np.float32), stacked("sighting"), stacked("plan"))
+    pose = np.zeros((*entry.shape, 7), np.float32)
+    return TickReport(status, measures, entry, pose, stacked("sighting"), stacked("plan"), SimpleNamespace())
 
 
 def bits(*instances: int) -> int:

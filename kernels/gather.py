@@ -1,0 +1,126 @@
+"""The fast picture's light: few paths for each cell of pixels, and a filter that shares them among neighbours on the same surface.
+
+What a path finds is kept beside what the surface would reflect of the map if nothing stood in the way, which is known without any
+path. Their ratio changes slowly over a surface, even where it bends or its colour changes; so the ratio is what is filtered, and
+each pixel multiplies it by its own unhindered light (after Heitz, Hill and McGuire, 2018).
+"""
+
+import warp as wp
+
+from synpick_warp.kernels.camera_rays import Cameras, camera_ray, hit_position
+from synpick_warp.kernels.cells import CellGrid, Guide, cell_number, cell_pixel, spread_cell
+from synpick_warp.kernels.draws import PATHS, stream_key
+from synpick_warp.kernels.even_light import even_light
+from synpick_warp.kernels.hits import NOTHING, Bodies, Hits, read_hit
+from synpick_warp.kernels.paths import PathRules, PathScene, Place, Reflected, reflected_light, vertex_at
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+GATHER_REGISTERS = 56
+"""As `kernels.hits.RAY_REGISTERS`; with paths, a few less are better still."""
+PERIOD = wp.constant(16)
+"""Cells take their points from one sequence by their place in squares of PERIOD x PERIOD; aligned smaller squares hold aligned runs."""
+PHASES = wp.constant(1.0)
+"""Points of the first dimension move so far through their unit square along the picture's height and width: slowly within a window, which
+so keeps its points evenly spread, but enough for the picture's mean to be right."""
+
+
+@wp.struct
+class Gathered:
+    """Scratch, one a view and cell: light that its surface reflects; diffuse light without the surface's colour."""
+
+    diffuse: wp.array3d[wp.vec3]
+    """From the map, without its main light."""
+    gloss: wp.array3d[wp.vec3]
+    """From the map, without its main light, and from other surfaces."""
+    even_diffuse: wp.array3d[wp.vec3]
+    even_gloss: wp.array3d[wp.vec3]
+    """Both if nothing stood in the way."""
+    between: wp.array3d[wp.vec3]
+    """Diffuse light from other surfaces: it changes slowly, but few of the paths find much of it."""
+    variance: wp.array3d[wp.vec2]
+    """Of the ratios of `diffuse` and of `gloss` to even light, in luminance; of means, not of single paths."""
+
+
+@wp.func
+def limited(light: wp.vec3, most: wp.vec3) -> wp.vec3:
+    """`light`, made darker if it exceeds `most`, in the same colour."""
+    return light * wp.min(1.0, wp.max(most) / wp.max(wp.max(light), 1.0e-20))
+
+
+@wp.func
+def paths_place(
+    scene: PathScene, cells: CellGrid, rules: PathRules, view: int, row: int, column: int, episode: int, light: int, turn: float
+) -> Place:
+    """Where a cell's paths are. All of an episode's pictures take their points from one stream, so that what rests looks the same."""
+    place = Place()
+    place.view = view
+    place.light = light
+    place.first_light = light + scene.lights.maps
+    place.turn = turn
+    place.key = stream_key(rules.seed, episode, 0, PATHS)
+    place.shift = wp.vec2(PHASES * float(row) / float(cells.cells.height), PHASES * float(column) / float(cells.cells.width))
+    return place
+
+
+@wp.kernel(cuda_max_registers=GATHER_REGISTERS)
+def gather_kernel(
+    # Scene:
+    scene: PathScene,
+    cameras: Cameras,
+    cells: CellGrid,
+    # State:
+    episode: wp.array[int],
+    light: wp.array[int],
+    light_turn: wp.array[float],
+    # In:
+    bodies: Bodies,
+    hits: Hits,
+    view_world: wp.array[int],
+    view_camera: wp.array[int],
+    rules: PathRules,
+    most_share: float,
+    first: int,
+    # Out:
+    guide_out: Guide,
+    gathered_out: Gathered,
+):
+    """Mean of N paths from the pixel in each cell's middle, and the light that they would find if nothing stood in their way.
+
+    The main light is left out of the first surface's light: it casts sharp shadows, and is looked for at more pixels.
+    """
+    cell = spread_cell(cells, wp.tid() + first)
+    view = cell[0]
+    row = cell[1]
+    column = cell[2]
+    if row >= cells.cells.height or column >= cells.cells.width:
+        return
+    pixel = cell_pixel(cells, row, column)
+    hit = read_hit(hits, view, pixel[0], pixel[1])
+    guide_out.code[view, row, column] = wp.uint8(hit.code)
+    if hit.code == NOTHING:
+        return
+    camera = view_camera[view]
+    world = view_world[view]
+    ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
+    outgoing = -wp.normalize(cameras.to_world[camera] * ray)
+    position = hit_position(cameras, camera, ray, hit.depth)
+    width = float(cells.size) * hit.depth / cameras.intrinsics[camera][0]
+    vertex = vertex_at(scene, bodies, view, rules.instances, hit, position, outgoing, width, 0.0)
+
+    place = paths_place(scene, cells, rules, view, row, column, episode[world], light[world], light_turn[world])
+    even = even_light(scene.lights, place.light, place.turn, vertex.brdf)
+    number = cell_number(PERIOD, row, column) * rules.samples
+    sum = Reflected()
+    for sample in range(rules.samples):
+        reflected = reflected_light(scene, bodies, rules, place, number + sample, vertex, width)
+        sum.diffuse += limited(reflected.diffuse, most_share * even.diffuse)
+        sum.between += limited(reflected.between, most_share * even.diffuse)
+        sum.gloss += limited(reflected.gloss, most_share * even.gloss)
+    gathered_out.diffuse[view, row, column] = sum.diffuse / float(rules.samples)
+    gathered_out.between[view, row, column] = sum.between / float(rules.samples)
+    gathered_out.gloss[view, row, column] = sum.gloss / float(rules.samples)
+    gathered_out.even_diffuse[view, row, column] = even.diffuse
+    gathered_out.even_gloss[view, row, column] = even.gloss
+    guide_out.normal[view, row, column] = wp.transpose(cameras.to_world[camera]) * vertex.brdf.normal
+    guide_out.depth[view, row, column] = hit.depth

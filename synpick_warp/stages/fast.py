@@ -1,0 +1,196 @@
+"""The fast picture: few paths for each cell of pixels, a filter, and shading of each pixel by what was found around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from synpick_warp.arrays import allocate, device_array
+from synpick_warp.configs.schema import Config
+from synpick_warp.kernels.camera_rays import TILE_PIXELS
+from synpick_warp.kernels.cells import SPREAD, CellGrid, Guide
+from synpick_warp.kernels.gather import Gathered, gather_kernel
+from synpick_warp.kernels.shading import shade_kernel
+from synpick_warp.kernels.shadows import cast_shadow_rays_kernel, filter_shadows_kernel
+from synpick_warp.kernels.windows import Shares, choose_windows_kernel, soften_shares_kernel, sum_blocks_kernel
+from synpick_warp.stages.bodies import filled
+from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.launch import launch_pixels
+from synpick_warp.stages.reference import path_rules
+from synpick_warp.stages.render_scene import RenderScene, build_grid
+
+CELLS_ACROSS = 480
+"""Cells in a picture's width if the setting leaves their size open: 1.5 mm wide at the bottom of the tote."""
+SHADOW_WINDOW = 4
+"""Width of the window that shares shadow rays among cells: 16 rays find how much of a lamp is hidden."""
+LEAST_ROUGHNESS = 0.3
+"""Of surfaces that a path meets after the first (Kaplanyan and Dachsbacher, 2013): caustics are smeared, not sprinkled."""
+MOST_SHARE = 8.0
+"""A path counts with at most this many times the unhindered light, or single ones would show as patches."""
+ROULETTE = 1
+"""Scatterings before dim paths may end early: few paths are long, since many neighbours share them."""
+
+
+@dataclass(frozen=True, eq=False)
+class GuideArrays:
+    """Arrays of the struct `Guide`."""
+
+    normal: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
+    depth: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.float32, unit="m")
+    code: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class GatheredArrays:
+    """Arrays of the struct `Gathered`."""
+
+    diffuse: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
+    gloss: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
+    even_diffuse: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
+    even_gloss: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
+    between: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
+    variance: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec2)
+
+
+@dataclass(frozen=True, eq=False)
+class ShareArrays:
+    """Arrays of the struct `Shares`."""
+
+    diffuse: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
+    gloss: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
+    between: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
+
+
+@dataclass(frozen=True, eq=False)
+class ShadowArrays:
+    """How much of the main light reaches the middle of each cell."""
+
+    cast: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.float32)
+    """As the rays found it."""
+    smooth: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.float32)
+    """After the filter."""
+
+
+FAST_SCRATCH = ((GuideArrays, 1), (GatheredArrays, 2), (ShareArrays, 2), (ShadowArrays, 1))
+"""What `FastPicture` allocates, and how often."""
+
+
+def cell_size(config: Config) -> int:
+    """Width of a cell of the fast picture [px]."""
+    return config.render.cell or max(1, round(config.cameras.resolution[0] / CELLS_ACROSS))
+
+
+def cell_sizes(config: Config) -> dict[str, int]:
+    """Extents of the dimensions that the arrays here name."""
+    size = cell_size(config)
+    width, height = config.cameras.resolution
+    shadow = max(1, size // 2)
+    return {"cell_row": -(-height // size), "cell_column": -(-width // size),
+            "shadow_row": -(-height // shadow), "shadow_column": -(-width // shadow)}  # fmt: skip
+
+
+def cell_grid(image: Any, size: int, window: int) -> Any:
+    """The struct `CellGrid` of cells of `size` x `size` px, filtered over `window` x `window` cells."""
+    grid = CellGrid()
+    grid.size = size
+    grid.window = window
+    grid.image = image
+    grid.cells = build_grid(-(-image.width // size), -(-image.height // size))
+    return grid
+
+
+def spread_threads(cells: Any) -> int:
+    """Threads a view of kernels that find their cell by `spread_cell`."""
+    across, down = (-(-size // int(SPREAD)) for size in (cells.cells.width, cells.cells.height))
+    warp = int(TILE_PIXELS)
+    return int(SPREAD) ** 2 * -(-across * down // warp) * warp
+
+
+class FastPicture:
+    """Renders linear radiance by few paths and a filter. Owns its scratch; `shade` only launches."""
+
+    def __init__(self, config: Config, scene: RenderScene, instances: int, views: int) -> None:
+        """Allocate scratch.
+
+        Args:
+            config: All settings; `render.cell`, `cell_paths` and `bounces` count.
+            scene: Constant data.
+            instances: Room for instances of a world.
+            views: Most views of a batch.
+        """
+        size = cell_size(config)
+        sizes = {"view": views} | cell_sizes(config)
+        self.scene = scene
+        self.cells = cell_grid(scene.grid, size, 1)
+        self.shadow_cells = cell_grid(scene.grid, max(1, size // 2), SHADOW_WINDOW)
+        self.rules = path_rules(config, instances, config.render.cell_paths, ROULETTE)
+        self.rules.least_roughness = LEAST_ROUGHNESS
+        self.most_share = MOST_SHARE
+        self.guide = filled(Guide, allocate(GuideArrays, sizes, scene.device))
+        self.gathered, self.blocks = (filled(Gathered, allocate(GatheredArrays, sizes, scene.device)) for _ in range(2))
+        self.chosen, self.shares = (filled(Shares, allocate(ShareArrays, sizes, scene.device)) for _ in range(2))
+        self.shadows = allocate(ShadowArrays, sizes, scene.device)
+
+    def shade(
+        self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int, radiance: wp.array
+    ) -> None:
+        """Radiance of the first `count` views.
+
+        Args:
+            snapshot: The worlds.
+            bodies: The struct `Bodies`, prepared for these views.
+            hits: The struct `Hits` of these views.
+            view_world: World of each view (B) int32.
+            view_camera: Camera of each view (B) int32.
+            count: Views in use.
+            radiance: Written (B, row, column) vec3.
+        """
+        self.gather(snapshot, bodies, hits, view_world, view_camera, count)
+        self.filter(view_camera, count)
+        self.cast_shadows(snapshot, bodies, hits, view_world, view_camera, count)
+        self.light(snapshot, bodies, hits, view_world, view_camera, count, radiance)
+
+    def gather(self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int) -> None:
+        """Trace the cells' paths."""
+        scene = self.scene
+        inputs = [scene.paths, scene.cameras, self.cells, snapshot.episode, snapshot.light, snapshot.light_turn, bodies, hits]
+        inputs += [view_world, view_camera, self.rules, self.most_share]
+        launch_pixels(gather_kernel, count * spread_threads(self.cells), inputs, [self.guide, self.gathered], scene.device)
+
+    def filter(self, view_camera: wp.array, count: int) -> None:
+        """Share light among cells, over windows that are as wide as the light is even."""
+        shared = [self.scene.cameras, self.cells, self.guide]
+        self._launch(sum_blocks_kernel, self.cells.cells, count, [*shared, self.gathered, view_camera], [self.blocks])
+        self._launch(choose_windows_kernel, self.cells.cells, count, [*shared, self.blocks, view_camera], [self.chosen])
+        self._launch(soften_shares_kernel, self.cells.cells, count, [*shared, self.chosen, view_camera], [self.shares])
+
+    def cast_shadows(self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int) -> None:
+        """Visible shares of the main light."""
+        scene, cells, shadows = self.scene, self.shadow_cells, self.shadows
+        inputs = [scene.meshes, scene.table, scene.cameras, cells, scene.lights, snapshot.light, snapshot.light_turn, bodies, hits]
+        inputs += [view_world, view_camera, self.rules.instances]
+        self._launch(cast_shadow_rays_kernel, cells.cells, count, inputs, [shadows.cast])
+        inputs = [scene.meshes, scene.cameras, cells, scene.lights, snapshot.light, bodies, hits, shadows.cast]
+        inputs += [view_world, view_camera, self.rules.instances]
+        self._launch(filter_shadows_kernel, cells.cells, count, inputs, [shadows.smooth])
+
+    def light(
+        self,
+        snapshot: Snapshot,
+        bodies: Any,
+        hits: Any,
+        view_world: wp.array,
+        view_camera: wp.array,
+        count: int,
+        radiance: wp.array,
+    ) -> None:
+        """Radiance of each pixel from the light around it."""
+        scene = self.scene
+        inputs = [scene.paths, scene.cameras, self.cells, self.shadow_cells, snapshot.light, snapshot.light_turn, bodies, hits]
+        inputs += [self.guide, self.shares, self.shadows.smooth, view_world, view_camera, self.rules.instances]
+        self._launch(shade_kernel, scene.grid, count, inputs, [radiance])
+
+    def _launch(self, kernel: wp.Kernel, grid: Any, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+        launch_pixels(kernel, count * grid.tiles * int(TILE_PIXELS), inputs, outputs, self.scene.device)
