@@ -88,8 +88,8 @@ def feed(
 
 def wipe(batch: FrameBatch | TickBatch) -> None:
     """The buffers behind a batch are used for something else."""
-    for item in dataclasses.fields(batch):
-        value = getattr(batch, item.name)
+    layers = batch.layers.values() if isinstance(batch, FrameBatch) else ()
+    for value in (*vars(batch).values(), *layers):
         if isinstance(value, np.ndarray):
             value.fill(7)
 

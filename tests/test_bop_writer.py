@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import Effects
 from synpick_warp.errors import CatalogError, OutputError
 from synpick_warp.exporters.bop import BopExporter
@@ -335,3 +336,7 @@ def test_bop_models_are_copied_byte_for_byte(tmp_path):
 
 class TestContract(ExporterContract):
     kind = BopExporter
+
+    @classmethod
+    def config(cls) -> Config:
+        return config(("flow", "classes"))

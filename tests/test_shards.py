@@ -15,6 +15,7 @@ import pytest
 from pycocotools import mask as coco
 from webdataset import tariterators
 
+from synpick_warp.configs.schema import Config
 from synpick_warp.exporters import shard_parts
 from synpick_warp.exporters.bop import BopExporter
 from synpick_warp.exporters.registry import Exporters
@@ -26,6 +27,7 @@ EPISODES = (0, 2)
 FRAMES = 3
 SCENES = (0, 1, 2, 6, 7, 8)
 LENSES = cameras()
+LAYERS = ("flow", "classes")
 KINDS = ("rgb.jpg", "depth.png", "camera.json", "gt.json", "gt_info.json", "mask.json", "mask_visib.json")
 
 
@@ -33,6 +35,10 @@ class TestShardsContract(ExporterContract):
     """Shards are whole or not there."""
 
     kind = ShardsExporter
+
+    @classmethod
+    def config(cls) -> Config:
+        return config(LAYERS)
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +114,17 @@ def test_a_view_says_the_same_as_the_folders_of_bop(split, tmp_path):
                     x, y, width, height = coco.toBbox(compressed)
                     assert infos[int(index)]["bbox_visib"] == [x, y, width - 1, height - 1]
                     assert infos[int(index)]["px_count_visib"] == coco.area(compressed)
+
+
+def test_layers_lie_with_their_views_and_are_bops(tmp_path):
+    folders = export(BopExporter, tmp_path / "bop", config(LAYERS), (2,)) / "train_pbr"
+    views = samples(export(ShardsExporter, tmp_path / "shards", config(LAYERS), (2,)) / "train_pbr_web")
+    assert list(views) == [f"{scene:06d}_{frame:06d}" for scene in (6, 7, 8) for frame in range(FRAMES)]
+    for key, view in views.items():
+        scene, frame = key.split("_")
+        assert [name for name in view if not name.startswith("__")] == [*KINDS, "flow.png", "classes.png"]
+        for name in LAYERS:
+            assert view[f"{name}.png"] == (folders / scene / name / f"{frame}.png").read_bytes()
 
 
 def test_keys_lead_to_shards(split):

@@ -174,11 +174,11 @@ def test_films_are_36_mm_wide_and_products_know_the_resolution(stage):
         assert product.GetCameraRel().GetTargets() == [lens.GetPath()]
 
 
-def sunny(azimuth: float, polar: float, irradiance: float = 3.0) -> LightMap:
-    """A dim map with a bright place, and a sun that stands for it."""
+def sunny(azimuth: float, polar: float, irradiance: float = 3.0, sharpness: float = 3000.0, rows: int = ROWS) -> LightMap:
+    """A dim map with a bright place, and a sun that stands for it. A sharpness of 100 is too wide for a light of its own."""
     a, p = np.radians(azimuth), np.radians(polar)
     toward = np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
-    radiance = 0.2 + 30.0 * np.exp(400.0 * (directions(ROWS) @ toward - 1.0))[..., None] * np.array([1.0, 0.9, 0.7])
+    radiance = 0.2 + 30.0 * np.exp(sharpness * (directions(rows) @ toward - 1.0))[..., None] * np.array([1.0, 0.9, 0.7])
     return LightMap("sunny", radiance.astype(np.float32), Sun(toward, irradiance * np.array([1.0, 0.8, 0.5])))
 
 
@@ -223,6 +223,7 @@ def test_suns_shine_from_where_they_stand(rows, azimuth, polar):
     a, p = np.radians(azimuth) + usd_sets.TURN, np.radians(polar)
     np.testing.assert_allclose(found, -np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)]), atol=1e-6)
     assert sun.GetNormalizeAttr().Get()
+    assert np.radians(sun.GetAngleAttr().Get() / 2) == pytest.approx(np.arctan(part_sun(light)[2]), rel=1e-5)
     irradiance = np.array(sun.GetColorAttr().Get()) * sun.GetIntensityAttr().Get()
     made = stage_light(0, light, 1.0)
     np.testing.assert_allclose(irradiance, made.intensity * np.array(made.sun_irradiance), rtol=1e-5)
@@ -233,18 +234,42 @@ def test_maps_without_a_sun_have_none(stage):
 
 
 @pytest.mark.parametrize("irradiance", [0.01, 3.0, 100.0])
-def test_no_light_counts_twice(irradiance):
-    """The sun takes the bright place's light out of the map, and gives no less; what it outshines it adds."""
-    light = sunny(30.0, 50.0, irradiance)
-    rest, beam = part_sun(light)
-    taken = light_tables.split_main_light(light.radiance.astype(np.float64), light.sun.direction)
-    np.testing.assert_allclose(rest, taken[0], rtol=1e-6)
-    assert rest.max() < 0.1 * light.radiance.max()
-    weight = np.array([0.2126, 0.7152, 0.0722])
-    assert beam @ weight == pytest.approx(max(taken[2] @ weight, irradiance * np.array([1.0, 0.8, 0.5]) @ weight), rel=1e-6)
+@pytest.mark.parametrize("rows", [256, 512])
+@pytest.mark.parametrize("sharpness", [100.0, 3000.0])
+def test_no_light_counts_twice(irradiance, rows, sharpness):
+    """Map and sun are those of the pictures, whether the sun is a light of its own or a disc in its map."""
+    light = sunny(30.0, 50.0, irradiance, sharpness, rows)
+    rest, beam, spread = part_sun(light)
+    table = light_tables.light_table(light, None)
+    assert spread == pytest.approx(table.main_spread, rel=1e-4)
+    assert (spread > usd_lights.MOST_SPREAD) == (not beam.any()) == (sharpness == 100.0)
+    np.testing.assert_allclose(beam, table.main_irradiance, rtol=1e-5)
+    near = directions(256) @ light.sun.direction > np.cos(np.radians(15.0))
+    found, expected = light_tables.resized(rest, 256), table.rest
+    np.testing.assert_allclose(found[~near], expected[~near], rtol=1e-4)
+    solid = light_tables.map_directions(256)[1]
+    parts = [(image * solid[..., None])[near].sum(axis=0) for image in (found, expected)]
+    np.testing.assert_allclose(*parts, rtol=5e-3)
+    if beam.any():
+        np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
-@pytest.mark.parametrize("light", [*skies(), sunny(30.0, 50.0)], ids=lambda light: light.name)
+def test_the_rule_for_suns_is_that_of_the_pictures():
+    assert usd_lights.SUN_ROWS == light_tables.BACKGROUND_ROWS
+    assert np.radians(usd_lights.SUN_RADIUS) == light_tables.MAIN_LIGHT_RADIUS
+    assert usd_lights.SUN_CONTRAST == light_tables.MAIN_LIGHT_CONTRAST
+    assert [usd_lights.LEAST_SPREAD, usd_lights.MOST_SPREAD] == [light_tables.SUN_SPREAD, light_tables.MAIN_LIGHT_SPREAD]
+
+
+def test_wide_suns_are_in_the_map_alone(rows):
+    light = sunny(30.0, 50.0, sharpness=100.0)
+    stage = open_episode(rows, lights=(light, light))
+    assert not stage.GetPrimAtPath("/Episode/Lights/Sun")
+
+
+@pytest.mark.parametrize(
+    "light", [*skies(), sunny(30.0, 50.0), replace(sunny(30.0, 50.0, sharpness=100.0), name="wide")], ids=lambda light: light.name
+)
 def test_brightness_is_that_of_the_pictures(light):
     assert usd_lights.WHITE_VALUE == light_tables.WHITE_VALUE
     expected = light_tables.light_table(light, None).exposure

@@ -20,8 +20,6 @@ APERTURE = 0.36
 """Width of the cameras' film in tenths of a metre, USD's unit for lenses: 36 mm. Only its ratio to the focal length shows."""
 CLIPPING = (0.01, 100.0)
 """Nearest and farthest distance that viewers draw [m]."""
-SUN_ANGLE = 0.53
-"""Angular diameter of the sun [°]."""
 INSTANCE = "instance"
 """Taxonomy of the labels that tell the objects of an episode apart, and beginning of their prims' names."""
 ROOT = "/Episode"
@@ -184,7 +182,7 @@ def _add_light(stage: Usd.Stage, light: StageLight, turn: float, stops: float) -
         return
     sun = UsdLux.DistantLight.Define(stage, f"{ROOT}/Lights/Sun")
     most = max(light.sun_irradiance)
-    sun.CreateAngleAttr(SUN_ANGLE)
+    sun.CreateAngleAttr(light.sun_angle)
     # Normalised, the intensity is the irradiance of what faces the sun, whatever its angle.
     sun.CreateNormalizeAttr(True)
     sun.CreateIntensityAttr(light.intensity * most)

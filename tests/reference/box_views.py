@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import trimesh
 
-from synpick_warp.configs.schema import Bop, Cameras, Config
+from synpick_warp.configs.schema import Bop, Cameras, Config, Render
 from synpick_warp.frames import EFFECTS, FINGER, TABLE, EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.outcome import Ending
 from synpick_warp.scenes.shapes import Camera, Catalog, CatalogEntry, Material, TriangleMesh
@@ -21,9 +21,10 @@ FOCAL = 3.0
 """Focal length in picture widths."""
 
 
-def config(**bop: object) -> Config:
+def config(layers: tuple[str, ...] = (), **bop: object) -> Config:
+    """Layers may be those of `_layers`."""
     lens = cameras()[0]
-    return Config(bop=Bop(**bop), cameras=Cameras(resolution=(lens.width, lens.height)))
+    return Config(bop=Bop(**bop), cameras=Cameras(resolution=(lens.width, lens.height)), render=Render(layers=layers))
 
 
 def catalog() -> Catalog:
@@ -85,7 +86,18 @@ def batches(
     order = [(episode, frame, camera) for frame in range(frames) for episode in episodes for camera in range(len(lenses))]
     for start in range(0, len(order), views):
         rows = [_view(episode, frame, camera, lenses[camera], depth_scale) for episode, frame, camera in order[start : start + views]]
-        yield FrameBatch(**{name: np.stack([row[name] for row in rows]) for name in rows[0]})
+        layers = [_layers(row) for row in rows]
+        yield FrameBatch(
+            **{name: np.stack([row[name] for row in rows]) for name in rows[0]},
+            layers={name: np.stack([layer[name] for layer in layers]) for name in layers[0]},
+        )
+
+
+def _layers(view: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Layers that differ between views; no truth of the boxes."""
+    number = int(100 * view["episode"] + 10 * view["camera"] + view["frame"])
+    flow = np.stack([view["instance"] - np.float32(number), np.where(view["instance"] == TABLE, np.nan, 0.25)], axis=-1)
+    return {"classes": (view["instance"] + np.uint16(number)).astype(np.uint16), "flow": flow.astype(np.float32)}
 
 
 def ticks(worlds: int, episodes: tuple[int, ...], frames: int) -> Iterator[TickBatch]:
