@@ -14,6 +14,7 @@ from synpick_warp import bake
 from synpick_warp.bake import run_bake
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.layers import read_layer
+from synpick_warp.manifest import episode_place, read_checksums
 from synpick_warp.progress import SilentProgress
 from tests.reference.sights import SHORT
 from tests.reference.small_worlds import catalog, settings
@@ -196,6 +197,12 @@ def digests(split: Path) -> dict[str, str]:
 def test_worlds_writers_and_batches_change_no_layer(split, tmp_path):
     other = baked(tmp_path / "other", bake__worlds=2, bake__writers=2, render__views_per_batch=3)
     assert digests(other) == digests(split)
+
+
+def test_layers_have_checksums(split):
+    names = {name for episode in range(TINY["bake__episodes"]) for name in read_checksums(split.parent, episode_place(episode))}
+    assert names == {f"{split.name}/{name}" for name in digests(split)}
+    assert {Path(name).parts[2] for name in names} >= set(LAYERS)
 
 
 def test_layers_change_nothing_else(split, tmp_path):

@@ -31,7 +31,7 @@ def other(value: object) -> object:
     if isinstance(value, bool):
         return not value
     if isinstance(value, tuple):
-        return (other(value[0]), *value[1:])
+        return (other(value[0]), *value[1:]) if value else ("x",)
     return f"{value}x" if isinstance(value, str) else value + 1  # type: ignore[operator]
 
 
