@@ -77,15 +77,14 @@ FAST_SCRATCH = ((GuideArrays, 1), (GatheredArrays, 2), (ShareArrays, 2), (Shadow
 """What `FastPicture` allocates, and how often."""
 
 
-def cell_size(config: Config) -> int:
-    """Width of a cell of the fast picture [px]."""
-    return config.render.cell or max(1, round(config.cameras.resolution[0] / CELLS_ACROSS))
+def cell_size(config: Config, width: int) -> int:
+    """Width of a cell of a fast picture of this width [px]."""
+    return config.render.cell or max(1, round(width / CELLS_ACROSS))
 
 
-def cell_sizes(config: Config) -> dict[str, int]:
-    """Extents of the dimensions that the arrays here name."""
-    size = cell_size(config)
-    width, height = config.cameras.resolution
+def cell_sizes(config: Config, width: int, height: int) -> dict[str, int]:
+    """Extents of the dimensions that the arrays here name, for images of `width` x `height` px."""
+    size = cell_size(config, width)
     shadow = max(1, size // 2)
     return {"cell_row": -(-height // size), "cell_column": -(-width // size),
             "shadow_row": -(-height // shadow), "shadow_column": -(-width // shadow)}  # fmt: skip
@@ -120,8 +119,8 @@ class FastPicture:
             instances: Room for instances of a world.
             views: Most views of a batch.
         """
-        size = cell_size(config)
-        sizes = {"view": views} | cell_sizes(config)
+        size = cell_size(config, scene.width)
+        sizes = {"view": views} | cell_sizes(config, scene.width, scene.height)
         self.scene = scene
         self.cells = cell_grid(scene.grid, size, 1)
         self.shadow_cells = cell_grid(scene.grid, max(1, size // 2), SHADOW_WINDOW)
