@@ -10,7 +10,7 @@ import warp as wp
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
-from synpick_warp.kernels.cells import SPREAD, CellGrid, Guide
+from synpick_warp.kernels.cells import LANES_ACROSS, SPREAD, CellGrid, Guide
 from synpick_warp.kernels.gather import Gathered, gather_kernel
 from synpick_warp.kernels.shading import shade_kernel
 from synpick_warp.kernels.shadows import cast_shadow_rays_kernel, filter_shadows_kernel
@@ -102,9 +102,8 @@ def cell_grid(image: Any, size: int, window: int) -> Any:
 
 def spread_threads(cells: Any) -> int:
     """Threads a view of kernels that find their cell by `spread_cell`."""
-    across, down = (-(-size // int(SPREAD)) for size in (cells.cells.width, cells.cells.height))
-    warp = int(TILE_PIXELS)
-    return int(SPREAD) ** 2 * -(-across * down // warp) * warp
+    across, down = int(SPREAD) * int(LANES_ACROSS), int(SPREAD) * int(TILE_PIXELS) // int(LANES_ACROSS)
+    return -(-cells.cells.width // across) * -(-cells.cells.height // down) * across * down
 
 
 class FastPicture:
