@@ -6,8 +6,10 @@ from synpick_warp.kernels.camera_rays import TILE_PIXELS, ImageGrid
 
 wp.set_module_options({"enable_backward": False})
 
-SPREAD = wp.constant(8)
+SPREAD = wp.constant(4)
 """The threads of a warp take cells so far apart, by row and by column."""
+LANES_ACROSS = wp.constant(8)
+"""So many of a warp's threads take cells of one row."""
 SAME_SURFACE = wp.constant(1.0)
 """Cells count as one surface up to this distance from its tangent plane, in widths of a cell at their depth, times the stride."""
 LEAST_WEIGHT = wp.constant(1.0e-4)
@@ -67,10 +69,15 @@ def cell_place(cells: CellGrid, pixel: int) -> float:
 def spread_cell(cells: CellGrid, index: int) -> wp.vec3i:
     """(view, row, column) of a flat index. The threads of a warp take cells SPREAD apart, whose points are alike: their rays are nearly
     parallel, and visit the same nodes of a mesh's tree."""
-    across = (cells.cells.width + SPREAD - 1) // SPREAD
-    down = (cells.cells.height + SPREAD - 1) // SPREAD
-    alike = ((across * down + TILE_PIXELS - 1) // TILE_PIXELS) * TILE_PIXELS
-    number = index % alike
-    place = (index // alike) % (SPREAD * SPREAD)
-    view = index // (alike * SPREAD * SPREAD)
-    return wp.vec3i(view, (number // across) * SPREAD + place // SPREAD, (number % across) * SPREAD + place % SPREAD)
+    across = SPREAD * LANES_ACROSS
+    down = SPREAD * (TILE_PIXELS // LANES_ACROSS)
+    regions_across = (cells.cells.width + across - 1) // across
+    regions = regions_across * ((cells.cells.height + down - 1) // down)
+    lane = index % TILE_PIXELS
+    place = (index // TILE_PIXELS) % (SPREAD * SPREAD)
+    region = index // (TILE_PIXELS * SPREAD * SPREAD)
+    view = region // regions
+    region = region - view * regions
+    row = (region // regions_across) * down + (lane // LANES_ACROSS) * SPREAD + place // SPREAD
+    column = (region % regions_across) * across + (lane % LANES_ACROSS) * SPREAD + place % SPREAD
+    return wp.vec3i(view, row, column)

@@ -101,7 +101,11 @@ def filter_shadows_kernel(
         return
     pixel = cell_pixel(cells, row, column)
     code = hits.code[view, pixel[0], pixel[1]]
-    if wp.max(lights.main_irradiance[light[view_world[view]]]) <= 0.0 or int(code) == NOTHING:
+    if wp.max(lights.main_irradiance[light[view_world[view]]]) <= 0.0:
+        return
+    if int(code) == NOTHING:
+        # What is smaller than a cell may have no other about it.
+        lit_out[view, row, column] = 1.0
         return
     camera = view_camera[view]
     normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, hits, view, pixel[0], pixel[1], instances)

@@ -265,6 +265,6 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
         groups += [(kind, plan_sizes(config, room, looks), 1) for kind in (VoteArrays, CycleArrays)]
     rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
     if config.render.mode == FAST:
-        cells = views | cell_sizes(config)
+        cells = views | cell_sizes(config, *config.cameras.resolution)
         rows += [row for kind, copies in FAST_SCRATCH for row in memory_table(kind, cells) for _ in range(copies)]
     return rows + ring * memory_table(LayerBuffers, views, config.render.layers)

@@ -10,7 +10,7 @@ import warp as wp
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
-from synpick_warp.kernels.cells import SPREAD, CellGrid, Guide
+from synpick_warp.kernels.cells import LANES_ACROSS, SPREAD, CellGrid, Guide
 from synpick_warp.kernels.gather import Gathered, gather_kernel
 from synpick_warp.kernels.shading import shade_kernel
 from synpick_warp.kernels.shadows import cast_shadow_rays_kernel, filter_shadows_kernel
@@ -77,15 +77,14 @@ FAST_SCRATCH = ((GuideArrays, 1), (GatheredArrays, 2), (ShareArrays, 2), (Shadow
 """What `FastPicture` allocates, and how often."""
 
 
-def cell_size(config: Config) -> int:
-    """Width of a cell of the fast picture [px]."""
-    return config.render.cell or max(1, round(config.cameras.resolution[0] / CELLS_ACROSS))
+def cell_size(config: Config, width: int) -> int:
+    """Width of a cell of a fast picture of this width [px]."""
+    return config.render.cell or max(1, round(width / CELLS_ACROSS))
 
 
-def cell_sizes(config: Config) -> dict[str, int]:
-    """Extents of the dimensions that the arrays here name."""
-    size = cell_size(config)
-    width, height = config.cameras.resolution
+def cell_sizes(config: Config, width: int, height: int) -> dict[str, int]:
+    """Extents of the dimensions that the arrays here name, for images of `width` x `height` px."""
+    size = cell_size(config, width)
     shadow = max(1, size // 2)
     return {"cell_row": -(-height // size), "cell_column": -(-width // size),
             "shadow_row": -(-height // shadow), "shadow_column": -(-width // shadow)}  # fmt: skip
@@ -103,9 +102,8 @@ def cell_grid(image: Any, size: int, window: int) -> Any:
 
 def spread_threads(cells: Any) -> int:
     """Threads a view of kernels that find their cell by `spread_cell`."""
-    across, down = (-(-size // int(SPREAD)) for size in (cells.cells.width, cells.cells.height))
-    warp = int(TILE_PIXELS)
-    return int(SPREAD) ** 2 * -(-across * down // warp) * warp
+    across, down = int(SPREAD) * int(LANES_ACROSS), int(SPREAD) * int(TILE_PIXELS) // int(LANES_ACROSS)
+    return -(-cells.cells.width // across) * -(-cells.cells.height // down) * across * down
 
 
 class FastPicture:
@@ -120,8 +118,8 @@ class FastPicture:
             instances: Room for instances of a world.
             views: Most views of a batch.
         """
-        size = cell_size(config)
-        sizes = {"view": views} | cell_sizes(config)
+        size = cell_size(config, scene.width)
+        sizes = {"view": views} | cell_sizes(config, scene.width, scene.height)
         self.scene = scene
         self.cells = cell_grid(scene.grid, size, 1)
         self.shadow_cells = cell_grid(scene.grid, max(1, size // 2), SHADOW_WINDOW)
