@@ -146,7 +146,7 @@ def test_formats_and_share_are_passed_on(tmp_path, bakes):
 @pytest.mark.parametrize(
     ("option", "said"),
     [
-        ("--formats=bop,obj", 'bake.formats is ["bop", "obj"] on the command line; allowed: bop, shards, usd, zarr'),
+        ("--formats=bop,obj", 'bake.formats is ["bop", "obj"] on the command line; allowed: any of bop, shards, usd, zarr'),
         ("--shard=3", '--shard is "3"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
         ("--shard=4/4", '--shard is "4/4"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
         ("--shard=4/8", "--shard 4/8 has none of 4 episodes; use fewer shards"),

@@ -21,6 +21,8 @@ TINY = {
     "bake.writers": 1,
     "bake.formats": ["bop", "shards", "usd", "zarr"],
     "cameras.resolution": [48, 27],
+    "render.bounces": 1,
+    "render.cell_paths": 1,
     "render.layers": ["flow", "depth_sensor"],
     "effects.blur": [0.0, 1.0],
     "effects.shot_noise": [0.0, 0.1],
