@@ -10,23 +10,26 @@ import warp as wp
 from synpick_warp.arrays import allocate, device_array, memory_table
 from synpick_warp.bake import describe_arrays
 from synpick_warp.device import pick_device
+from synpick_warp.stages.bodies import BodyArrays, HitArrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch
+from synpick_warp.stages.fast import GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_sizes
 from synpick_warp.stages.layers import MotionArrays
 from synpick_warp.stages.perceive import SightScratch, count_views
 from synpick_warp.stages.plan import CycleArrays, VoteArrays
-from synpick_warp.stages.bodies import BodyArrays, HitArrays
-from synpick_warp.stages.fast import GatheredArrays, ShadowArrays
 from synpick_warp.stages.render import PictureArrays
 from synpick_warp.stages.sight import LookArrays, Plan, Sighting
 from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus
 from tests.reference.small_worlds import settings
 
-NAMES = "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset part"
+NAMES = (
+    "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset part tile "
+    "cell_row cell_column shadow_row shadow_column"
+)
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
     WorldState, AttemptState, SealState, LastFrame, Sighting, Plan, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays,
-    PictureArrays, EdgeBuffers, EdgeScratch,
+    PictureArrays, EdgeBuffers, EdgeScratch, GuideArrays, GatheredArrays, ShareArrays, ShadowArrays,
 ]  # fmt: skip
 LOOKING = [LookArrays, SightScratch, VoteArrays, CycleArrays]
 LAYERS = [LayerBuffers, MotionArrays]
@@ -80,6 +83,20 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
     by_name = {name: (shape, unit, size) for name, shape, unit, size in rows}
     assert by_name["Snapshot.pose"] == ((7, config.arrangement.max_objects), "m", 28 * 7 * config.arrangement.max_objects)
     assert by_name["ViewBuffers.color"] == ((3, 6, 8), "", 3 * 6 * 8 * 3)
+
+
+@pytest.mark.parametrize(
+    ("cell", "width", "shape"), [(0, 8, (6, 8, 6, 8)), (0, 1920, (2, 480, 3, 960)), (3, 8, (2, 3, 6, 8)), (64, 8, (1,) * 4)]
+)
+def test_cells_cover_the_image(cell, width, shape):
+    sizes = cell_sizes(settings(render__cell=cell), width, 6)
+    assert tuple(sizes[name] for name in ("cell_row", "cell_column", "shadow_row", "shadow_column")) == shape
+
+
+def test_the_reference_has_no_cells():
+    names = {name.split(".")[0] for name, *_ in describe_arrays(settings(render__mode="reference"))}
+    assert "PictureArrays" in names
+    assert not names & {"GuideArrays", "GatheredArrays", "ShareArrays", "ShadowArrays"}
 
 
 @pytest.mark.parametrize("mode", [{"bake__mode": "target"}, {"bake__mode": "mixed", "bake__mix": [1, 0, 3]}])

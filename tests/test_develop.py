@@ -295,6 +295,7 @@ def test_a_view_follows_from_its_address_alone():
 
 def test_effects_change_colour_alone(device):
     toy = ToyScene([entry(box(0.3, 0.2, 0.1))], [[(0, (0.02, 0.0, 0.0, *UPRIGHT))]] * 2, (LENS,), table=True)
+    toy.config = config_of("shoulder")
     plain = render(toy, device)
     toy.config = config_of("shoulder", **ALL)
     changed = render(toy, device)

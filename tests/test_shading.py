@@ -57,10 +57,13 @@ def test_textures_of_any_size_are_shown(device, size):
     texture = np.zeros((*size, 3), np.uint8)
     texture[..., 0], texture[..., 1] = np.linspace(40, 200, size[1]), 120
     shown_rows = shown(matt(texture=texture), device).radiance[0, 12:36, 14:50]
-    plain = shown(matt(color=(0.0, 120 / 255, 0.0)), device).radiance[0, 24, 32]
-    np.testing.assert_allclose(shown_rows[..., 1], plain[1], rtol=1e-3)
-    assert (np.ptp(shown_rows[..., 0], axis=0) < 1e-3).all()
-    assert (np.ptp(shown_rows[..., 0]) > 0.1) == (size[1] > 1)
+    # Light is gathered without the surface's colour: its noise is the same on both.
+    plain = shown(matt(color=(0.0, 120 / 255, 0.0)), device).radiance[0, 12:36, 14:50]
+    np.testing.assert_allclose(shown_rows[..., 1], plain[..., 1], rtol=1e-3)
+    # Both colours have the same noise, but for that of gloss: some per cent of the light, to some per cent.
+    share = shown_rows[..., 0] / shown_rows[..., 1]
+    assert (np.ptp(share, axis=0) < 5e-3).all()
+    assert (np.ptp(share) > 0.1) == (size[1] > 1)
     finest = mip_levels(texture)
     assert finest[0].shape[:2] == size
     assert finest[-1].shape[:2] == (1, 1)
@@ -77,15 +80,6 @@ def test_mip_levels_keep_the_mean_and_take_odd_sizes():
 def test_texture_density_is_texture_lengths_per_metre():
     np.testing.assert_allclose(uv_density(sheet(0.5, 0.5)), 2.0, rtol=1e-6)
     assert not uv_density(ball(0.1, 1)).any()
-
-
-def test_a_white_ball_in_an_even_room_nearly_vanishes(device):
-    # White, diffuse: it sends back what arrives. Four per cent of gloss come on top; the part-3 renderer shares them out.
-    picture = shown(matt(), device, mesh=ball(0.1, 4), lights=(even_light(2.0),), config=with_render(ambient_rays=0))
-    inside = picture.radiance[0][picture.instance[0] == 1]
-    np.testing.assert_allclose(picture.radiance[0, 0, 0], 2.0, rtol=1e-5)
-    assert inside.min() > 2.0 * 0.99
-    assert inside.max() < 2.0 * 1.07
 
 
 def test_exposure_does_not_depend_on_the_maps_scale_but_on_the_setting(device):
@@ -106,7 +100,7 @@ def test_a_stop_doubles_the_light_before_the_tone_curve(device):
 
 def test_a_grey_sheet_has_the_brightness_worked_out_by_hand(device):
     # Linear albedo 0.2 under an even map: 0.2 x 1.25 of white, below the shoulder of the tone curve, plus the gloss.
-    value = shown(matt((float(linear_to_srgb(0.2)),) * 3), device, config=with_render(ambient_rays=0)).color[0, 24, 32]
+    value = shown(matt((float(linear_to_srgb(0.2)),) * 3), device).color[0, 16:32, 22:42].mean(axis=(0, 1))
     assert (value >= np.rint(255 * linear_to_srgb(0.25)) - 1).all()
     assert (value <= np.rint(255 * linear_to_srgb(0.31))).all()
 
@@ -127,10 +121,11 @@ def test_a_map_without_light_makes_a_black_picture(device, black):
     assert np.isfinite(picture.radiance).all()
 
 
-def shadow_scene(direction, turn=0.0, **settings):
-    """A large sheet and a small one 0.1 m above its middle, under a sun."""
-    toy = ToyScene([entry(sheet(0.6, 0.4)), entry(sheet(0.04, 0.04))], [[(0, FLAT), (1, (0.0, 0.0, 0.1, *UPRIGHT))]], (VIEW,))
-    toy.lights, toy.light_turn, toy.config = (sun(direction),), turn, with_render(ambient_rays=0, **settings)
+def shadow_scene(direction, turn=0.0, hidden=True):
+    """A large sheet and, if anything is to be hidden, a small one 0.1 m above its middle, under a sun."""
+    above = [(1, (0.0, 0.0, 0.1, *UPRIGHT))] if hidden else []
+    toy = ToyScene([entry(sheet(0.6, 0.4)), entry(sheet(0.08, 0.08))], [[(0, FLAT), *above]], (VIEW,))
+    toy.lights, toy.light_turn, toy.config = (sun(direction),), turn, with_render(cell_paths=32)
     return toy
 
 
@@ -139,7 +134,7 @@ def test_the_shadow_falls_away_from_the_light(device):
     lit = render(shadow_scene((1.0, 0.0, 1.0)), device).radiance[0, :, :, 0]
     assert lit[24, 22] < 0.65 * lit[24, 42]
     np.testing.assert_allclose(lit[24, 42], lit[24, 50], rtol=0.02)
-    unshadowed = render(shadow_scene((1.0, 0.0, 1.0), shadow_rays=0), device).radiance[0, :, :, 0]
+    unshadowed = render(shadow_scene((1.0, 0.0, 1.0), hidden=False), device).radiance[0, :, :, 0]
     np.testing.assert_allclose(unshadowed[24, 22], lit[24, 42], rtol=0.02)
 
 
@@ -150,37 +145,20 @@ def test_turning_the_light_turns_the_shadow(device):
     np.testing.assert_allclose(lit[24, 22], lit[24, 42], rtol=0.02)
 
 
-def test_more_rays_change_little_but_the_noise(device):
-    few, many = (render(shadow_scene((1.0, 0.0, 1.0), shadow_rays=n), device).radiance[0, :, :, 0] for n in (1, 32))
-    assert np.abs(few - many).mean() < 0.02 * many.mean()
-
-
 def test_walls_darken_what_lies_between_them(device):
     walls = [(1, (x, 0.0, 0.05, *UPRIGHT)) for x in (0.03, -0.03)]
     toy = ToyScene([entry(sheet(0.6, 0.4)), entry(box(0.01, 0.2, 0.1))], [[(0, FLAT), *walls]], (VIEW,))
-    toy.config = with_render(ambient_rays=4)
     lit = render(toy, device).radiance[0, :, :, 0]
     assert lit[24, 32] < 0.8 * lit[24, 60]
 
 
-def test_an_open_plane_shows_no_pattern_of_rays(device):
-    # The filter's windows see all rays of a block, so that a plane beside a wall is smooth along the wall.
+def test_an_open_plane_shows_no_pattern_of_paths(device):
+    # Windows of many cells share their light, so that a plane beside a wall is smooth: what noise is left has no edges. Two steps of
+    # 255 are hardly seen.
     toy = ToyScene([entry(sheet(1.0, 1.0)), entry(box(0.01, 2.0, 0.2))], [[(0, FLAT), (1, (0.25, 0.0, 0.1, *UPRIGHT))]], (VIEW,))
+    toy.config = with_render(cell_paths=8)
     lit = render(toy, device).radiance[0, 8:40, 8:40, 0]
-    assert (np.ptp(lit, axis=0) < 0.02 * lit.mean()).all()
-
-
-def test_samples_smooth_edges_of_colour_alone(device):
-    turned = (0.0, 0.0, 0.0, 0.0, 0.0, np.sin(0.2), np.cos(0.2))
-    one, many = (
-        shown(matt((0.2, 0.2, 0.2)), device, mesh=sheet(0.2, 0.2), pose=turned, config=with_render(color_samples=count)) for count in (1, 8)
-    )
-    np.testing.assert_array_equal(one.depth, many.depth)
-    np.testing.assert_array_equal(one.amodal, many.amodal)
-    low, high = one.color[0, 24, 32, 0], one.color[0, 0, 0, 0]
-    between = [((image.color[0, :, :, 0] > low + 10) & (image.color[0, :, :, 0] < high - 10)).sum() for image in (one, many)]
-    assert between[0] == 0
-    assert between[1] > 40
+    assert np.abs(np.diff(lit, axis=0)).max() < 2.0 / 255.0
 
 
 def test_several_threads_render_what_one_does(device, monkeypatch):

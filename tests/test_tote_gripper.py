@@ -13,6 +13,7 @@ from synpick_warp.configs.schema import Gripper, Tote
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture
 from synpick_warp.scenes.meshes import merge_positions, signed_volume
+from synpick_warp.scenes.procedural_meshes import at_height, cap, join, loft, make_mesh, rounded_rectangle, strips
 from synpick_warp.scenes.tote import CORNER_RADIUS, FLOOR_DEPTH, MIN_WALL, guide_walls, rim_height, tote_colliders, tote_fixture
 from tests.reference.rays import edges_match, first_hit
 
@@ -198,3 +199,33 @@ def test_gripper_colliders_enclose_the_working_parts():
     assert finger.vertices[:, 2].min() == 0
     # The cup's underside is what presses: hull and picture end at the same height.
     assert felt((cup,), (0.018, 1e-3, -1.0), UP) == pytest.approx(1.0 - GRIPPER.cup_length, abs=1e-6)
+
+
+def areas(patch):
+    """Signed areas (n) of a flat patch's triangles, seen from above."""
+    a, b, c = np.moveaxis(np.asarray(patch.corners, dtype=np.float64)[..., :2], 1, 0)
+    return 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+
+
+@given(width=st.floats(0.1, 1.0), depth=st.floats(0.1, 1.0), share=st.floats(0.1, 0.9), segments=st.integers(2, 8), below=st.booleans())
+def test_strips_close_a_ring_as_a_fan_does(width, depth, share, segments, below):
+    # The rectangle without what its round corners lack.
+    radius = share * min(width, depth) / 2
+    ring = at_height(rounded_rectangle(width, depth, radius, segments), 0.3)
+    made, fan = (areas(close(ring, below=below)) for close in (strips, cap))
+    sign = -1.0 if below else 1.0
+    assert (sign * made > 0.0).all()
+    np.testing.assert_allclose(made.sum(), fan.sum(), rtol=1e-9)
+    round_corner = segments * np.sin(np.pi / 2 / segments) / 2 * radius**2
+    np.testing.assert_allclose(sign * made.sum(), width * depth - 4 * (radius**2 - round_corner), rtol=1e-9)
+
+
+@pytest.mark.parametrize("segments", [2, 3, 6])
+def test_a_solid_with_strips_at_its_ends_is_closed(segments):
+    ring = rounded_rectangle(0.6, 0.4, 0.05, segments)
+    rings = np.stack([at_height(ring, 0.0), at_height(ring, 0.2)])
+    mesh = make_mesh(join(strips(rings[0], below=True), loft(rings), strips(rings[1])), centered=False)
+    vertices, faces = merge_positions(mesh.vertices, mesh.faces)
+    assert edges_match(faces)
+    area = 0.6 * 0.4 - 4 * 0.05**2 * (1 - segments * np.sin(np.pi / 2 / segments) / 2)
+    assert signed_volume(vertices, faces) == pytest.approx(0.2 * area, rel=1e-5)

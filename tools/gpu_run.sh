@@ -1,33 +1,36 @@
 #!/usr/bin/env bash
-# What is measured on a machine with a GPU, in one go of less than 10 minutes: piles at rest, speeds, sequences of picking, a bake.
+# What is measured on a machine with a GPU, in one go of less than 10 minutes: piles at rest, speeds, pictures, sequences of picking,
+# a bake, what two devices render.
 #
 #     PYTHONPATH=... WARP_CACHE_PATH=... tools/gpu_run.sh RESULTS
 #
 # Run it in the project's root; RESULTS is a folder that gets the log, the numbers as JSON, of the bake a contact sheet, an explained
 # episode, settings, episodes and attempts, and, for the next run, the compiled kernels (unpack wpcache.txz to WARP_CACHE_PATH first:
 # cold kernels cost minutes). Each step gets its share of the time that is left, and ends with what it has: all four are a survey,
-# and numbers to quote come from runs of one or two, as STEPS="pick". Thus the README's large bake:
+# and numbers to quote come from runs of one or two, as STEPS="bench render". Thus the README's large bake:
 #     STEPS=bake BAKE_MODE=move BAKE_EPISODES=512 BAKE_WORLDS=512 BAKE_SETTINGS="move.rounds=1 move.speed=0.4" tools/gpu_run.sh RESULTS
 # The bake itself goes to the temporary folder and is removed; 512 short episodes at 640x360 are about 100,000 views, 2 million
 # files and 20 GB. Longer episodes, or full HD, fill a small disk.
 #
 # Environment:
-#     STEPS              "rest bench pick bake": what to do, in this order
+#     STEPS              "rest bench pick bake": what to do, in this order; also "render" and "devices"
 #     PYTHON             interpreter (python3)
 #     DATA               folder of data (.gpu/data): ycbv_models/, hdri/ and cache/ in it are used if they are there
 #     DEVICE             cuda:0
 #     ARRANGEMENTS       64: of piles at rest
 #     WORLDS             512: of speeds
-#     BENCH_PARTS        physics,sight,render,write
+#     BENCH_PARTS        physics,sight,render,write; also sensor
 #     BENCH_RESOLUTION   1920x1080
+#     RENDER_SCENES      10: piles whose fast picture is held against the reference; RENDER_SAMPLES 1024, RENDER_SIZE 960x540
 #     PICK_EPISODES      64: of each of the modes pick and target
 #     PICK_SETTINGS      none, such as "pick.failures=4"
 #     BAKE_MODE          mixed; or pick, target, move
 #     BAKE_WORLDS        64
 #     BAKE_EPISODES      64
 #     BAKE_RESOLUTION    640x360
+#     BAKE_FORMATS       bop; or any of bop,shards,usd,zarr
 #     BAKE_SETTINGS      "move.rounds=1 move.speed=0.4 pick.failures=1": short episodes
-#     REST_LIMIT BENCH_LIMIT PICK_LIMIT BAKE_LIMIT   most seconds of each step (its share of what is left)
+#     REST_LIMIT BENCH_LIMIT RENDER_LIMIT DEVICES_LIMIT PICK_LIMIT BAKE_LIMIT   most seconds of each step (its share of what is left)
 #     TOTAL_LIMIT        most seconds of all steps (490)
 #
 # DATA/cache is a cache folder as XDG has it, so that concave objects need not be decomposed on the GPU machine, which takes minutes.
@@ -41,11 +44,11 @@ if [ $# -ne 1 ]; then
     exit 2
 fi
 # Shares of the time; a step whose name is not here does not exist.
-declare -A shares=([rest]=60 [bench]=130 [pick]=210 [bake]=90)
+declare -A shares=([rest]=60 [bench]=130 [render]=200 [devices]=60 [pick]=210 [bake]=90)
 read -ra steps <<<"${STEPS:-rest bench pick bake}"
 for name in "${steps[@]}"; do
     if [ -z "${shares[$name]:-}" ]; then
-        echo "gpu_run: no such step: $name; steps: rest bench pick bake" >&2
+        echo "gpu_run: no such step: $name; steps: ${!shares[*]}" >&2
         exit 2
     fi
 done
@@ -114,6 +117,16 @@ measure_bench() {
         --json "$results/bench.json"
 }
 
+measure_render() {
+    step "pictures" "${RENDER_LIMIT:-$1}" "$python" tools/render_report.py --device "$device" "${models[@]}" "${lights[@]}" \
+        --scenes "${RENDER_SCENES:-10}" --samples "${RENDER_SAMPLES:-1024}" --size "${RENDER_SIZE:-960x540}" \
+        --sheet "$results/pictures.jpg" --json "$results/render.json"
+}
+
+measure_devices() {
+    step "two devices" "${DEVICES_LIMIT:-$1}" "$python" tools/compare_pictures.py --devices "cpu,$device" "${models[@]}" "${lights[@]}"
+}
+
 measure_pick() {
     settings_of "${PICK_SETTINGS:-}"
     step "picking" "${PICK_LIMIT:-$1}" "$python" tools/pick_report.py --device "$device" "${models[@]}" \
@@ -124,7 +137,7 @@ measure_bake() {
     local file
     settings_of "${BAKE_SETTINGS-move.rounds=1 move.speed=0.4 pick.failures=1}"
     step "bake" "${BAKE_LIMIT:-$1}" "${synpick[@]}" bake --mode "${BAKE_MODE:-mixed}" --device "$device" "${models[@]}" "${lights[@]}" \
-        --worlds "${BAKE_WORLDS:-64}" --episodes "${BAKE_EPISODES:-64}" --resolution "${BAKE_RESOLUTION:-640x360}" "${settings[@]}" \
+        --worlds "${BAKE_WORLDS:-64}" --episodes "${BAKE_EPISODES:-64}" --resolution "${BAKE_RESOLUTION:-640x360}" --formats "${BAKE_FORMATS:-bop}" "${settings[@]}" \
         --out "$bakes/set"
     for file in config.toml episodes.jsonl attempts.jsonl; do
         [ -f "$bakes/set/$file" ] && cp "$bakes/set/$file" "$results/"
