@@ -296,7 +296,8 @@ def values(item: dataclasses.Field, kind: object) -> st.SearchStrategy:
     rules = item.metadata
     if rules["choices"]:
         one = st.sampled_from(rules["choices"])
-        return st.lists(one, unique=True).map(tuple) if kind == tuple[str, ...] else one
+        least = 0 if item.default == () else 1
+        return st.lists(one, min_size=least, unique=True).map(tuple) if kind == tuple[str, ...] else one
     if kind is float:
         low = rules["above"] if rules["above"] is not None else rules["low"]
         return st.floats(low, rules["high"], exclude_min=rules["above"] is not None, allow_nan=False, allow_infinity=False)
