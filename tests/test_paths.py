@@ -13,7 +13,7 @@ from synpick_warp.kernels.paths import BY_LIGHT, BY_SURFACE
 from synpick_warp.scenes.appearance import linear_to_srgb
 from synpick_warp.scenes.shapes import LightMap, Material
 from synpick_warp.stages import reference
-from synpick_warp.stages.chances import build_chances
+from synpick_warp.stages.chances import build_chances, chance_table
 from synpick_warp.stages.gloss import measure_gloss
 from synpick_warp.stages.light_tables import map_directions
 from tests.reference.brdf_probe import evaluated, light_kernel, point_kernel, toward
@@ -174,6 +174,42 @@ def test_lamps_are_drawn_as_often_as_they_are_bright(device):
     _, solid = map_directions(rows)
     np.testing.assert_allclose(drawn.numpy(), (share / solid)[row, column], rtol=1e-3, atol=1e-6)
     assert (np.abs(found.numpy() - drawn.numpy()) <= 1e-4 * drawn.numpy()).mean() > 0.999
+
+
+@pytest.mark.parametrize("black", [False, True])
+@pytest.mark.parametrize("table", [False, True])
+def test_nothing_below_the_horizon_of_a_table_is_drawn(device, table, black):
+    rows = 16
+    radiance = np.random.default_rng(3).gamma(0.5, size=(rows, 2 * rows, 3)).astype(np.float32) * (not black)
+    made = chance_table(radiance, table)
+    assert (np.diff(made.row) >= 0.0).all()
+    assert (np.diff(made.column, axis=1) >= 0.0).all()
+    assert made.row[0] == 0.0
+    assert made.row[-1] == 1.0
+    assert (made.column[:, 0] == 0.0).all()
+    assert (made.column[:, -1] == 1.0).all()
+    share = np.diff(made.row)[:, None] * np.diff(made.column, axis=1)
+    assert share.sum() == pytest.approx(1.0, abs=1e-5)
+    # One row below the horizon is left: interpolation carries light across it.
+    assert (share[rows // 2 + 1 :].max() == 0.0) == table
+    # Light that counts is drawn, however little it is.
+    assert (share[: rows // 2 + 1] > 0.0).all()
+    # Low light counts less: LOW_SHARE of it at the horizon, and the more the higher.
+    if black:
+        density = share[:, 0] / map_directions(rows)[1][:, 0]
+        assert (np.diff(density[: rows // 2]) < 0.0).all()
+    count = 20_000
+    numbers = wp.array(np.random.default_rng(1).random((count, 2), dtype=np.float32), dtype=wp.vec2, device=device)
+    direction = wp.empty(count, dtype=wp.vec3, device=device)
+    drawn, found = (wp.empty(count, dtype=wp.float32, device=device) for _ in range(2))
+    wp.launch(light_kernel, count, [build_chances(radiance[None], device, table), numbers], [direction, drawn, found], device=device)
+    assert (drawn.numpy() > 0.0).all()
+    lowest = direction.numpy()[:, 2].min()
+    assert lowest >= -np.sin(np.pi / rows) - 1e-6 if table else lowest < -0.9
+    # The mean of 1 / density is the solid angle that can be drawn.
+    solid = map_directions(rows)[1][: rows // 2 + 1 if table else rows].sum()
+    inverse = 1.0 / drawn.numpy().astype(np.float64)
+    assert abs(inverse.mean() - solid) < 5.0 * inverse.std() / np.sqrt(count)
 
 
 def points(device, key: int, dimension: int, count: int = 256) -> np.ndarray:
