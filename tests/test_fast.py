@@ -213,3 +213,11 @@ def test_a_main_lights_shadow_edge_lies_where_geometry_says(device, turn):
     assert dark.max() < middle < bright.min()
     # The edge itself: as many pixels are darker than half as the square has.
     np.testing.assert_allclose((value[ground] < middle).sum(), (ground & (inside > 0.0)).sum(), rtol=0.12)
+
+
+def test_scratch_follows_the_scenes_image_whatever_the_setting_says(device):
+    config = replace(settings(cell=4), cameras=replace(Config().cameras, resolution=(8, 8)))
+    scene = build_render_scene(config, Catalog((entry(sheet(0.1, 0.1)),)), ToyScene([], [], ()).fixtures, (VIEW,), (EVEN,), device)
+    shading = Renderer(config, scene, 1, 2).shading
+    assert shading.guide.code.shape == shading.shares.gloss.shape == (2, 12, 16)
+    assert shading.shadows.smooth.shape == (2, 24, 32)
