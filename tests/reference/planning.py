@@ -13,8 +13,8 @@ from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config, Sight
 from synpick_warp.kernels.hits import Hits
 from synpick_warp.scenes.shapes import Camera
-from synpick_warp.stages.plan import Planner
 from synpick_warp.stages.bodies import HitArrays, filled
+from synpick_warp.stages.plan import Planner
 from synpick_warp.stages.render_scene import build_cameras, build_grid
 from synpick_warp.stages.sight import LookArrays, Plan, Sighting
 from synpick_warp.stages.worlds import AttemptState
