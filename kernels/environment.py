@@ -4,7 +4,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-REFLECTION_LEVELS = wp.constant(10)
+REFLECTION_LEVELS = wp.constant(5)
 """Reflections are blurred for roughness 1/5, 2/5, ... 1."""
 
 

@@ -280,7 +280,7 @@ class _Ours:
         renderer, scene = self.renderer, self.renderer.scene
         renderer.prepare_bodies(self.snapshot, self.world, self.camera, self.count)
         inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, renderer.bodies, self.camera, renderer.instances, wp.vec2(0.0, 0.0)]
-        launch_pixels(trace_sample_kernel, self.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [renderer.hits], scene.device)
+        launch_pixels(trace_sample_kernel, self.count * scene.grid.tiles * int(TILE_PIXELS), inputs, [renderer.hits], scene.device)  # pyright: ignore[reportArgumentType]
 
     def hits_and_layers(self) -> None:
         self.hits()

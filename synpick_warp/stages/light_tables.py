@@ -12,7 +12,7 @@ from synpick_warp.scenes.shapes import LightMap, Sun
 
 BACKGROUND_ROWS = 256
 """Rows of the background, which is what a camera out of focus would see; 0.7° a texel tells lamps apart."""
-REFLECTION_ROWS = 96
+REFLECTION_ROWS = 32
 """Rows of the blurred reflections: the sharpest lobe kept is wider than a texel of 5.6°."""
 MAIN_LIGHT_RADIUS = np.radians(15.0)
 """The main light gathers what is bright within this angle of the brightest place."""
