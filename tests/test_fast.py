@@ -11,10 +11,11 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.scenes.appearance import linear_to_srgb
+from synpick_warp.scenes.main_light import MAIN_LIGHT_SPREAD, map_directions
 from synpick_warp.scenes.shapes import Catalog, LightMap, Material
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.gloss import measure_gloss
-from synpick_warp.stages.light_tables import MAIN_LIGHT_SPREAD, light_table, map_directions
+from synpick_warp.stages.light_tables import light_table
 from synpick_warp.stages.render import Renderer
 from synpick_warp.stages.render_scene import build_render_scene
 from tests.reference.brdf_probe import evaluated, toward

@@ -11,11 +11,11 @@ import warp as wp
 from synpick_warp.configs.schema import REFERENCE, Config
 from synpick_warp.kernels.paths import BY_LIGHT, BY_SURFACE
 from synpick_warp.scenes.appearance import linear_to_srgb
+from synpick_warp.scenes.main_light import map_directions
 from synpick_warp.scenes.shapes import LightMap, Material
 from synpick_warp.stages import reference
 from synpick_warp.stages.chances import build_chances, chance_table
 from synpick_warp.stages.gloss import measure_gloss
-from synpick_warp.stages.light_tables import map_directions
 from tests.reference.brdf_probe import evaluated, light_kernel, point_kernel, toward
 from tests.reference.toy_scene import UPRIGHT, ToyScene, ball, box, camera, entry, even_light, render, sheet, sun
 

@@ -9,9 +9,10 @@ import pytest
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.main_light import map_directions, split_main_light
 from synpick_warp.scenes.shapes import Catalog, LightMap, Material
 from synpick_warp.stages import launch
-from synpick_warp.stages.light_tables import blurred_reflections, harmonics, light_table, map_directions, split_main_light
+from synpick_warp.stages.light_tables import blurred_reflections, harmonics, light_table
 from synpick_warp.stages.render import Renderer
 from synpick_warp.stages.render_scene import build_render_scene, mip_levels, uv_density
 from tests.reference.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, even_light, render, sheet, sun

@@ -11,22 +11,21 @@ from hypothesis import strategies as st
 from synpick_warp.errors import LightError
 from synpick_warp.scenes.appearance import srgb_to_linear
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.shapes import LightMap, Sun
-from synpick_warp.scenes.skies import directions
-from synpick_warp.stages.light_tables import (
+from synpick_warp.scenes.main_light import (
     BACKGROUND_ROWS,
     LUMINANCE,
     MAIN_LIGHT_SPREAD,
     SUN_SPREAD,
     WHITE_VALUE,
-    harmonics,
-    light_table,
     map_directions,
     replace_sun,
     resized,
     split_main_light,
     sun_disc,
-)  # fmt: skip
+)
+from synpick_warp.scenes.shapes import LightMap, Sun
+from synpick_warp.scenes.skies import directions
+from synpick_warp.stages.light_tables import harmonics, light_table
 from tests.reference import toy_scene
 
 ROWS = 64

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdRender, UsdSemantics
 
-from synpick_warp.exporters import usd_lights
 from synpick_warp.exporters.usd_episode import EpisodeFacts, EpisodeSettings
 from synpick_warp.exporters.usd_lights import part_sun, stage_light, write_light_maps
 from synpick_warp.exporters.usd_spool import TickSpool, read_ticks
 from synpick_warp.exporters.usd_stage import FIXTURES, episode_layer
+from synpick_warp.scenes import main_light
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.shapes import Camera, LightMap, Sun
 from synpick_warp.scenes.skies import directions, skies
@@ -242,23 +242,16 @@ def test_no_light_counts_twice(irradiance, rows, sharpness):
     rest, beam, spread = part_sun(light)
     table = light_tables.light_table(light, None)
     assert spread == pytest.approx(table.main_spread, rel=1e-4)
-    assert (spread > usd_lights.MOST_SPREAD) == (not beam.any()) == (sharpness == 100.0)
+    assert (spread > main_light.MAIN_LIGHT_SPREAD) == (not beam.any()) == (sharpness == 100.0)
     np.testing.assert_allclose(beam, table.main_irradiance, rtol=1e-5)
     near = directions(256) @ light.sun.direction > np.cos(np.radians(15.0))
-    found, expected = light_tables.resized(rest, 256), table.rest
+    found, expected = main_light.resized(rest, 256), table.rest
     np.testing.assert_allclose(found[~near], expected[~near], rtol=1e-4)
-    solid = light_tables.map_directions(256)[1]
+    solid = main_light.map_directions(256)[1]
     parts = [(image * solid[..., None])[near].sum(axis=0) for image in (found, expected)]
     np.testing.assert_allclose(*parts, rtol=5e-3)
     if beam.any():
         np.testing.assert_allclose(found, expected, rtol=1e-4)
-
-
-def test_the_rule_for_suns_is_that_of_the_pictures():
-    assert usd_lights.SUN_ROWS == light_tables.BACKGROUND_ROWS
-    assert np.radians(usd_lights.SUN_RADIUS) == light_tables.MAIN_LIGHT_RADIUS
-    assert usd_lights.SUN_CONTRAST == light_tables.MAIN_LIGHT_CONTRAST
-    assert [usd_lights.LEAST_SPREAD, usd_lights.MOST_SPREAD] == [light_tables.SUN_SPREAD, light_tables.MAIN_LIGHT_SPREAD]
 
 
 def test_wide_suns_are_in_the_map_alone(rows):
@@ -271,6 +264,5 @@ def test_wide_suns_are_in_the_map_alone(rows):
     "light", [*skies(), sunny(30.0, 50.0), replace(sunny(30.0, 50.0, sharpness=100.0), name="wide")], ids=lambda light: light.name
 )
 def test_brightness_is_that_of_the_pictures(light):
-    assert usd_lights.WHITE_VALUE == light_tables.WHITE_VALUE
     expected = light_tables.light_table(light, None).exposure
     assert stage_light(0, light, 1.5).intensity == pytest.approx(1.5 * expected, rel=0.03)

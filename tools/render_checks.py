@@ -14,10 +14,10 @@ from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
+from synpick_warp.scenes.main_light import map_directions
 from synpick_warp.scenes.shapes import Camera, Catalog, CatalogEntry, LightMap, Material, TriangleMesh
 from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
-from synpick_warp.stages.light_tables import map_directions
 from synpick_warp.stages.render import Renderer
 from synpick_warp.stages.render_scene import build_render_scene
 

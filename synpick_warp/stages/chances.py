@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.kernels.sampling import Chances
-from synpick_warp.stages.light_tables import LUMINANCE, map_directions
+from synpick_warp.scenes.main_light import LUMINANCE, map_directions
 
 LOW_SHARE = 0.15
 """How much light from the horizon counts; light from the zenith counts 1 more."""
