@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.camera_rays import PIXEL_CENTER, Cameras, ImageGrid, camera_ray, tile_pixel
+from synpick_warp.kernels.color import srgb_byte
 from synpick_warp.kernels.draws import COLOR_NOISE, view_key
 from synpick_warp.kernels.effects import (
     BLUR,
@@ -50,10 +51,7 @@ def display_value(linear: float, tone: int) -> wp.uint8:
         if x > LINEAR_PART:
             rest = 1.0 - LINEAR_PART
             x = LINEAR_PART + rest * (1.0 - wp.exp((LINEAR_PART - x) / rest))
-    encoded = 12.92 * x
-    if x > 0.0031308:
-        encoded = 1.055 * wp.pow(x, 1.0 / 2.4) - 0.055
-    return wp.uint8(wp.rint(255.0 * wp.clamp(encoded, 0.0, 1.0)))
+    return srgb_byte(x)
 
 
 @wp.kernel

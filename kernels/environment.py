@@ -8,6 +8,10 @@ REFLECTION_LEVELS = wp.constant(5)
 """Reflections are blurred for roughness 1/5, 2/5, ... 1."""
 
 
+FLAT_HARMONIC = wp.constant(0.282095)
+"""The real spherical harmonic of order 0: 1 / (2 √π)."""
+
+
 @wp.struct
 class Lights:
     """Constant, one row a light map. Directions are the map's; a world turns them about +z."""
@@ -127,7 +131,7 @@ def diffuse_irradiance(lights: Lights, light: int, normal: wp.vec3) -> wp.vec3:
     y = normal[1]
     z = normal[2]
     total = (
-        lights.irradiance[light, 0] * 0.282095
+        lights.irradiance[light, 0] * FLAT_HARMONIC
         + lights.irradiance[light, 1] * (0.488603 * y)
         + lights.irradiance[light, 2] * (0.488603 * z)
         + lights.irradiance[light, 3] * (0.488603 * x)

@@ -3,16 +3,12 @@
 import warp as wp
 
 from synpick_warp.kernels.brdf import Brdf, coat_share, even_gloss
-from synpick_warp.kernels.environment import Lights, diffuse_irradiance, reflected_radiance, turned
+from synpick_warp.kernels.environment import FLAT_HARMONIC, Lights, diffuse_irradiance, reflected_radiance, turned
 
 wp.set_module_options({"enable_backward": False})
 
 LEAST_EVEN = wp.constant(0.05)
 """Unhindered light counts as at least this share of the map's mean, so that ratios stay small."""
-LUMINANCE_RED = wp.constant(0.2126)
-LUMINANCE_GREEN = wp.constant(0.7152)
-LUMINANCE_BLUE = wp.constant(0.0722)
-"""Rec. 709."""
 
 
 @wp.struct
@@ -33,18 +29,13 @@ def brighter(value: wp.vec3, least: wp.vec3) -> wp.vec3:
 def even_light(lights: Lights, light: int, turn: float, brdf: Brdf) -> Light:
     """What a surface reflects of a map, without its main light, that nothing hides: diffuse by harmonics, gloss by blurred reflections."""
     made = Light()
-    mean = LEAST_EVEN * lights.irradiance[light, 0] * 0.282095
+    mean = LEAST_EVEN * lights.irradiance[light, 0] * FLAT_HARMONIC
     sky = brighter(diffuse_irradiance(lights, light, turned(brdf.normal, -turn)), mean)
     made.diffuse = ((1.0 - coat_share(brdf, brdf.albedo)) / wp.PI) * sky
     mirrored = 2.0 * wp.dot(brdf.normal, brdf.outgoing) * brdf.normal - brdf.outgoing
     seen = brighter(reflected_radiance(lights, light, turned(mirrored, -turn), brdf.roughness), mean / wp.PI)
     made.gloss = wp.cw_mul(even_gloss(brdf), seen)
     return made
-
-
-@wp.func
-def luminance(color: wp.vec3) -> float:
-    return LUMINANCE_RED * color[0] + LUMINANCE_GREEN * color[1] + LUMINANCE_BLUE * color[2]
 
 
 @wp.func

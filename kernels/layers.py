@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.camera_rays import NEAR_PLANE, Cameras, ImageGrid, camera_ray, tile_pixel
+from synpick_warp.kernels.color import srgb_byte
 from synpick_warp.kernels.hits import NOTHING, TABLE, Bodies, Hits, Meshes, body_of
 from synpick_warp.kernels.surfaces import Surface, Surfaces, base_color, mesh_surface, table_surface
 
@@ -138,15 +139,6 @@ def draw_normals_kernel(
         surface = hit_surface(meshes, surfaces, cameras, bodies, hits, view, row, column, camera, instances)
         normal = wp.transpose(cameras.to_world[camera]) * surface.normal
     normals_out[view, row, column] = normal
-
-
-@wp.func
-def srgb_byte(linear: float) -> wp.uint8:
-    """sRGB value of a linear one (IEC 61966-2-1)."""
-    encoded = 12.92 * linear
-    if linear > 0.0031308:
-        encoded = 1.055 * wp.pow(linear, 1.0 / 2.4) - 0.055
-    return wp.uint8(wp.rint(255.0 * wp.clamp(encoded, 0.0, 1.0)))
 
 
 @wp.kernel

@@ -4,7 +4,8 @@ import warp as wp
 
 from synpick_warp.kernels.camera_rays import Cameras, camera_ray, tile_pixel
 from synpick_warp.kernels.cells import LEAST_WEIGHT, SAME_SURFACE, CellGrid, Guide, cell_pixel, cell_place
-from synpick_warp.kernels.even_light import Light, luminance, ratio
+from synpick_warp.kernels.color import luminance
+from synpick_warp.kernels.even_light import Light, ratio
 from synpick_warp.kernels.gather import Gathered
 from synpick_warp.kernels.hits import NOTHING
 
@@ -14,6 +15,8 @@ BLOCK = wp.constant(4)
 """Cells across a block: the narrowest window of the filter."""
 BLOCKS = wp.constant(4)
 """Blocks across the widest window."""
+MIDDLE_BLOCKS = wp.constant(4.0)
+"""Blocks of the window between: 2 x 2."""
 BODY_WEIGHT = wp.constant(0.02)
 """Weight of a cell on the same body but another surface: it calms places that have few like them around."""
 CERTAIN = wp.constant(1.0)
@@ -225,8 +228,8 @@ def choose_windows_kernel(
     diffuse = ratio(wide.diffuse, wide.even_diffuse)
     gloss = ratio(wide.gloss, wide.even_gloss)
     if middle.weight > 0.0:
-        diffuse = narrowed(diffuse, ratio(middle.diffuse, middle.even_diffuse), 0.25 * variance[0])
-        gloss = narrowed(gloss, ratio(middle.gloss, middle.even_gloss), 0.25 * variance[1])
+        diffuse = narrowed(diffuse, ratio(middle.diffuse, middle.even_diffuse), variance[0] / MIDDLE_BLOCKS)
+        gloss = narrowed(gloss, ratio(middle.gloss, middle.even_gloss), variance[1] / MIDDLE_BLOCKS)
     shares_out.diffuse[view, row, column] = narrowed(diffuse, own_diffuse, variance[0])
     shares_out.gloss[view, row, column] = narrowed(gloss, own_gloss, variance[1])
     shares_out.between[view, row, column] = wide.between / wide.weight
