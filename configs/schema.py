@@ -178,6 +178,7 @@ class Physics:
     pairs_per_world: int = setting(1024, "", "Room for pairs of near shapes in a world.", low=16)
     rows_per_world: int = setting(1536, "", "Room for the objects' contact rows in a world.", low=48)
     gripper_rows_per_world: int = setting(256, "", "Room for the gripper's constraint rows in a world.", low=48)
+    deterministic: bool = setting(True, "", "On a GPU, rows of contacts have a fixed order, so that a bake can be repeated bit by bit.")
     guide_height: float = setting(8.0, "m", "Height of the walls that guide the drop and vanish afterwards.", above=0.0)
 
 
@@ -297,6 +298,7 @@ class Render:
         0, "px", "With mode fast: paths start from the middles of cells so wide; 0: as many px as make 480 cells across.", low=0, high=64
     )
     cell_paths: int = setting(2, "", "With mode fast: paths a cell; powers of two are spread most evenly.", low=1, high=1024)
+    antialias: bool = setting(True, "", "With mode fast: a pixel where surfaces meet mixes their colours; reference always does.")
     tone: str = setting(
         SHOULDER, "", "shoulder: linear up to 0.6, highlights compressed; linear: cut off at 1; filmic: ACES' curve, middle grey kept.",
         choices=TONES,

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from synpick_warp.kernels.antialias import Picture, pixel_radiance
 from synpick_warp.kernels.camera_rays import PIXEL_CENTER, Cameras, ImageGrid, camera_ray, tile_pixel
 from synpick_warp.kernels.color import srgb_byte
 from synpick_warp.kernels.draws import COLOR_NOISE, view_key
@@ -64,7 +65,7 @@ def develop_kernel(
     light_exposure: wp.array[float],
     # In:
     view_world: wp.array[int],
-    radiance: wp.array3d[wp.vec3],
+    picture: Picture,
     tone: int,
     first: int,
     # Out:
@@ -78,13 +79,13 @@ def develop_kernel(
     if row >= grid.height or column >= grid.width:
         return
     world = view_world[view]
-    value = lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world]) * radiance[view, row, column]
+    value = lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world]) * pixel_radiance(picture, view, row, column)
     color_out[view, row, column] = wp.vec3ub(display_value(value[0], tone), display_value(value[1], tone), display_value(value[2], tone))
 
 
 @wp.func
 def spread_value(
-    linear: wp.array3d[wp.vec3],
+    picture: Picture,
     strengths: Strengths,
     intrinsics: wp.vec4,
     grid: ImageGrid,
@@ -128,10 +129,10 @@ def spread_value(
         at = wp.clamp(low + offset, 0, size - 1)
         value = float(0.0)
         if along_row != 0:
-            value = linear[view, row, at][channel]
+            value = pixel_radiance(picture, view, row, at)[channel]
             value *= vignette_factor(loss, camera_ray(intrinsics, row, at, wp.vec2(0.0, 0.0)), slope)
         else:
-            value = linear[view, at, column][channel]
+            value = picture.radiance[view, at, column][channel]
         total += ((1.0 - share) * weight + share * before) * value
         weights += weight
         before = weight
@@ -146,7 +147,7 @@ def spread_rows_kernel(
     # In:
     effects: wp.array[Strengths],
     view_camera: wp.array[int],
-    radiance: wp.array3d[wp.vec3],
+    picture: Picture,
     first: int,
     # Out:
     spread_out: wp.array3d[wp.vec3],
@@ -161,7 +162,7 @@ def spread_rows_kernel(
     intrinsics = cameras.intrinsics[view_camera[view]]
     value = wp.vec3(0.0, 0.0, 0.0)
     for channel in range(3):
-        value[channel] = spread_value(radiance, effects[view], intrinsics, grid, view, row, column, channel, 1)
+        value[channel] = spread_value(picture, effects[view], intrinsics, grid, view, row, column, channel, 1)
     spread_out[view, row, column] = value
 
 
@@ -191,14 +192,15 @@ def develop_effects_kernel(
     effects: wp.array[Strengths],
     view_world: wp.array[int],
     view_camera: wp.array[int],
-    linear: wp.array3d[wp.vec3],
+    picture: Picture,
     first: int,
     # Out:
     color_out: wp.array3d[wp.vec3ub],
 ):
     """As `develop_kernel`, with all effects: lens (unless done), exposure and white balance, noise of the sensor, tone and transfer curve.
 
-    `linear` is radiance, or what `spread_rows_kernel` made of it. Noise is that of the stream (seed, episode, frame, camera, COLOR_NOISE).
+    If `spread_rows_kernel` made `picture.radiance`, its `mix` counts no more. Noise is that of the stream (seed, episode, frame, camera,
+    COLOR_NOISE).
     """
     pixel = tile_pixel(grid, wp.tid() + first)
     view = pixel[0]
@@ -210,10 +212,10 @@ def develop_effects_kernel(
     camera = view_camera[view]
     intrinsics = cameras.intrinsics[camera]
     strengths = effects[view]
-    value = linear[view, row, column]
+    value = pixel_radiance(picture, view, row, column)
     if rules.spread != 0:
         for channel in range(3):
-            value[channel] = spread_value(linear, strengths, intrinsics, grid, view, row, column, channel, 0)
+            value[channel] = spread_value(picture, strengths, intrinsics, grid, view, row, column, channel, 0)
     else:
         corner = corner_slope(intrinsics, grid.width, grid.height)
         value *= vignette_factor(strengths[VIGNETTE], camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)), corner)

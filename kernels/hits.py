@@ -119,23 +119,23 @@ def hits_body(meshes: Meshes, bodies: Bodies, view: int, body: int, ray: wp.vec3
 
 
 @wp.func
-def trace_camera_ray(
+def trace_candidates(
     meshes: Meshes,
     bodies: Bodies,
     view: int,
-    tile: int,
+    candidates: wp.uint64,
     ray: wp.vec3,
     instances: int,
     amodal: bool,
 ) -> Hit:
-    """Nearest hit among the tile's candidates; with `amodal`, hidden instances are tested as well and get their bit."""
+    """Nearest hit among these bodies, as in `Bodies.candidates`; with `amodal`, hidden instances are tested as well and get their bit."""
     best = Hit()
     best.code = NOTHING
     best.depth = FAR
-    candidates = bodies.candidates[view, tile]
+    left = candidates
     number = int(0)
-    while candidates != wp.uint64(0):
-        if (candidates & wp.uint64(1)) != wp.uint64(0):
+    while left != wp.uint64(0):
+        if (left & wp.uint64(1)) != wp.uint64(0):
             body = bodies.order[view, number]
             near = bodies.near[view, body]
             if near < best.depth:
@@ -163,9 +163,15 @@ def trace_camera_ray(
             elif amodal and body < instances:
                 if hits_body(meshes, bodies, view, body, ray):
                     best.amodal = best.amodal | (wp.uint32(1) << wp.uint32(body))
-        candidates = candidates >> wp.uint64(1)
+        left = left >> wp.uint64(1)
         number += 1
     return best
+
+
+@wp.func
+def trace_camera_ray(meshes: Meshes, bodies: Bodies, view: int, tile: int, ray: wp.vec3, instances: int, amodal: bool) -> Hit:
+    """Nearest hit among the tile's candidates; see `trace_candidates`."""
+    return trace_candidates(meshes, bodies, view, bodies.candidates[view, tile], ray, instances, amodal)
 
 
 @wp.func

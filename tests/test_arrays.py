@@ -13,7 +13,7 @@ from synpick_warp.device import pick_device
 from synpick_warp.stages.bodies import BodyArrays, HitArrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch
-from synpick_warp.stages.fast import GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_sizes
+from synpick_warp.stages.fast import EdgePixels, GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_sizes
 from synpick_warp.stages.layers import MotionArrays
 from synpick_warp.stages.perceive import SightScratch, count_views
 from synpick_warp.stages.plan import CycleArrays, VoteArrays
@@ -24,12 +24,12 @@ from tests.reference.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset part tile "
-    "cell_row cell_column shadow_row shadow_column"
+    "cell_row cell_column shadow_row shadow_column pixel"
 )
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
     WorldState, AttemptState, SealState, LastFrame, Sighting, Plan, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays,
-    PictureArrays, EdgeBuffers, EdgeScratch, GuideArrays, GatheredArrays, ShareArrays, ShadowArrays,
+    PictureArrays, EdgeBuffers, EdgeScratch, GuideArrays, GatheredArrays, ShareArrays, ShadowArrays, EdgePixels,
 ]  # fmt: skip
 LOOKING = [LookArrays, SightScratch, VoteArrays, CycleArrays]
 LAYERS = [LayerBuffers, MotionArrays]

@@ -21,6 +21,7 @@ from synpick_warp.errors import ConfigError
 from synpick_warp.frames import EFFECTS
 from synpick_warp.kernels import develop as develop_kernels
 from synpick_warp.kernels import effects as effect_kernels
+from synpick_warp.kernels.antialias import Picture
 from synpick_warp.kernels.effects import Strengths
 from synpick_warp.kernels.environment import Lights
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
@@ -72,8 +73,10 @@ def developed(radiance: np.ndarray, config: Config, at: Addresses = ONE, stops: 
     out = SimpleNamespace(
         color=wp.zeros((views, height, width), dtype=wp.vec3ub, device=device), effects=wp.zeros(views, dtype=Strengths, device=device)
     )
-    linear = wp.array(np.repeat(radiance[None] / GAIN, views, axis=0), dtype=wp.vec3, device=device)
-    Developer(config, scene, views).develop(world, numbers(list(range(views))), numbers(at.camera), views, linear, out)
+    picture = Picture()
+    picture.radiance = wp.array(np.repeat(radiance[None] / GAIN, views, axis=0), dtype=wp.vec3, device=device)
+    picture.mix = wp.zeros((views, height, width), dtype=wp.uint32, device=device)
+    Developer(config, scene, views).develop(world, numbers(list(range(views))), numbers(at.camera), views, picture, out)
     return out.color.numpy(), out.effects.numpy()
 
 

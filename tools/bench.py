@@ -213,7 +213,7 @@ def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], objec
     """Launches of each stage of a batch of `count` views, by name, in order; "all" is all of them."""
     simulation, renderer, out = factory.simulation, factory.stream.renderer, factory.stream.buffers[0]
     cameras, snapshot, shading = len(factory.cameras), simulation.records[0].snapshot, renderer.shading
-    bodies, hits, radiance = renderer.bodies, renderer.hits, renderer.picture.radiance
+    bodies, hits, picture = renderer.bodies, renderer.hits, renderer.picture
     view = np.arange(count, dtype=np.int32)
     world, camera = (wp.array(values, dtype=wp.int32, device=simulation.device) for values in (view // cameras, view % cameras))
     stages: dict[str, Callable[[], object]] = {
@@ -225,10 +225,11 @@ def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], objec
             "gather light": lambda: shading.gather(snapshot, bodies, hits, world, camera, count),
             "filter light": lambda: shading.filter(camera, count),
             "shadows of the main light": lambda: shading.cast_shadows(snapshot, bodies, hits, world, camera, count),
-            "shade": lambda: shading.light(snapshot, bodies, hits, world, camera, count, radiance),
+            "shade": lambda: shading.light(snapshot, bodies, hits, world, camera, count, picture.radiance),
+            "anti-alias": lambda: shading.smooth(bodies, hits, camera, count, picture.mix),
         }
     else:
-        stages["trace paths"] = lambda: shading.shade(snapshot, bodies, hits, world, camera, count, radiance)
+        stages["trace paths"] = lambda: shading.shade(snapshot, bodies, hits, world, camera, count, picture)
     return stages | {
         "develop": lambda: renderer.develop(snapshot, world, camera, count, out),
         "annotate": lambda: annotate(renderer.scene, renderer.bodies, camera, count, out),

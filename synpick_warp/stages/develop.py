@@ -10,6 +10,7 @@ import warp as wp
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import TONES, strength_ranges
+from synpick_warp.kernels.antialias import Picture
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
 from synpick_warp.kernels.develop import DevelopRules, develop_effects_kernel, develop_kernel, spread_rows_kernel
 from synpick_warp.kernels.effects import EffectRules, Strengths, draw_effects_kernel
@@ -23,7 +24,7 @@ class SpreadArrays:
     """Scratch of effects for which a pixel needs its neighbours."""
 
     radiance: wp.array = device_array("view", "row", "column", dtype=wp.vec3)
-    """After vignette, and after blur and chromatic aberration along the rows."""
+    """Of pixels as they show, after vignette, and after blur and chromatic aberration along the rows."""
 
 
 def has_effects(config: Config) -> bool:
@@ -68,7 +69,7 @@ class Developer:
             self.spread = allocate(SpreadArrays, sizes, scene.device).radiance
 
     def develop(
-        self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, radiance: wp.array, out: ViewBuffers
+        self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, picture: Any, out: ViewBuffers
     ) -> None:
         """Colour of the first `count` views.
 
@@ -77,22 +78,24 @@ class Developer:
             view_world: World of each view (B) int32.
             view_camera: Camera of each view (B) int32.
             count: Views in use.
-            radiance: Linear, before exposure (B, row, column) vec3.
+            picture: The struct `Picture`.
             out: `color` is written, and `effects` if there are any; else these stay zero.
         """
         scene = self.scene
         if self.effects is None:
-            inputs = [scene.grid, scene.lights, snapshot.light, snapshot.light_exposure, view_world, radiance, self.rules.tone]
+            inputs = [scene.grid, scene.lights, snapshot.light, snapshot.light_exposure, view_world, picture, self.rules.tone]
             self._launch(develop_kernel, count, inputs, out.color)
             return
         inputs = [snapshot.episode, snapshot.frame, self.effects, view_world, view_camera]
         wp.launch(draw_effects_kernel, dim=count, inputs=inputs, outputs=[out.effects], device=scene.device)
         if self.spread is not None:
-            inputs = [scene.cameras, scene.grid, out.effects, view_camera, radiance]
+            inputs = [scene.cameras, scene.grid, out.effects, view_camera, picture]
             self._launch(spread_rows_kernel, count, inputs, self.spread)
-            radiance = self.spread
+            spread = Picture()
+            spread.radiance, spread.mix = self.spread, picture.mix
+            picture = spread
         inputs = [scene.cameras, scene.grid, scene.lights, snapshot.episode, snapshot.frame, snapshot.light, snapshot.light_exposure]
-        inputs += [self.rules, out.effects, view_world, view_camera, radiance]
+        inputs += [self.rules, out.effects, view_world, view_camera, picture]
         self._launch(develop_effects_kernel, count, inputs, out.color)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:

@@ -9,6 +9,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import Config
+from synpick_warp.kernels.antialias import find_edges_kernel, mix_edges_kernel
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
 from synpick_warp.kernels.cells import LANES_ACROSS, SPREAD, CellGrid, Guide
 from synpick_warp.kernels.gather import Gathered, gather_kernel
@@ -17,7 +18,7 @@ from synpick_warp.kernels.shadows import cast_shadow_rays_kernel, filter_shadows
 from synpick_warp.kernels.windows import Shares, choose_windows_kernel, soften_shares_kernel, sum_blocks_kernel
 from synpick_warp.stages.bodies import filled
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.launch import launch_pixels
+from synpick_warp.stages.launch import BLOCK, launch_pixels
 from synpick_warp.stages.reference import path_rules
 from synpick_warp.stages.render_scene import RenderScene, build_grid
 
@@ -31,6 +32,8 @@ MOST_SHARE = 8.0
 """A path counts with at most this many times the unhindered light, or single ones would show as patches."""
 ROULETTE = 1
 """Scatterings before dim paths may end early: few paths are long, since many neighbours share them."""
+EDGE_THREADS = 1 << 14
+"""Threads that share the edges of a view: those of the few views of a batch fill a GPU."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +76,17 @@ class ShadowArrays:
     """After the filter."""
 
 
-FAST_SCRATCH = ((GuideArrays, 1), (GatheredArrays, 2), (ShareArrays, 2), (ShadowArrays, 1))
+@dataclass(frozen=True, eq=False)
+class EdgePixels:
+    """Pixels that anti-aliasing works on."""
+
+    place: wp.array = device_array("view", "pixel", dtype=wp.int32)
+    """Row times width plus column of each."""
+    number: wp.array = device_array("view", dtype=wp.int32)
+    """How many there are."""
+
+
+FAST_SCRATCH = ((GuideArrays, 1), (GatheredArrays, 2), (ShareArrays, 2), (ShadowArrays, 1), (EdgePixels, 1))
 """What `FastPicture` allocates, and how often."""
 
 
@@ -83,10 +96,10 @@ def cell_size(config: Config, width: int) -> int:
 
 
 def cell_sizes(config: Config, width: int, height: int) -> dict[str, int]:
-    """Extents of the dimensions that the arrays here name, for images of `width` x `height` px."""
+    """Extents of the dimensions that the arrays here name beside the view, for images of `width` x `height` px."""
     size = cell_size(config, width)
     shadow = max(1, size // 2)
-    return {"cell_row": -(-height // size), "cell_column": -(-width // size),
+    return {"pixel": width * height if config.render.antialias else 0, "cell_row": -(-height // size), "cell_column": -(-width // size),
             "shadow_row": -(-height // shadow), "shadow_column": -(-width // shadow)}  # fmt: skip
 
 
@@ -113,7 +126,7 @@ class FastPicture:
         """Allocate scratch.
 
         Args:
-            config: All settings; `render.cell`, `cell_paths` and `bounces` count.
+            config: All settings; `render.cell`, `cell_paths`, `bounces` and `antialias` count.
             scene: Constant data.
             instances: Room for instances of a world.
             views: Most views of a batch.
@@ -130,11 +143,13 @@ class FastPicture:
         self.gathered, self.blocks = (filled(Gathered, allocate(GatheredArrays, sizes, scene.device)) for _ in range(2))
         self.chosen, self.shares = (filled(Shares, allocate(ShareArrays, sizes, scene.device)) for _ in range(2))
         self.shadows = allocate(ShadowArrays, sizes, scene.device)
+        self.antialias = config.render.antialias
+        self.edges = allocate(EdgePixels, sizes, scene.device)
 
     def shade(
-        self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int, radiance: wp.array
+        self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int, picture: Any
     ) -> None:
-        """Radiance of the first `count` views.
+        """Pictures of the first `count` views.
 
         Args:
             snapshot: The worlds.
@@ -143,12 +158,14 @@ class FastPicture:
             view_world: World of each view (B) int32.
             view_camera: Camera of each view (B) int32.
             count: Views in use.
-            radiance: Written (B, row, column) vec3.
+            picture: The struct `Picture`; written.
         """
         self.gather(snapshot, bodies, hits, view_world, view_camera, count)
         self.filter(view_camera, count)
         self.cast_shadows(snapshot, bodies, hits, view_world, view_camera, count)
-        self.light(snapshot, bodies, hits, view_world, view_camera, count, radiance)
+        self.light(snapshot, bodies, hits, view_world, view_camera, count, picture.radiance)
+        if self.antialias:
+            self.smooth(bodies, hits, view_camera, count, picture.mix)
 
     def gather(self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int) -> None:
         """Trace the cells' paths."""
@@ -189,6 +206,19 @@ class FastPicture:
         inputs = [scene.paths, scene.cameras, self.cells, self.shadow_cells, snapshot.light, snapshot.light_turn, bodies, hits]
         inputs += [self.guide, self.shares, self.shadows.smooth, view_world, view_camera, self.rules.instances]
         self._launch(shade_kernel, scene.grid, count, inputs, [radiance])
+
+    def smooth(self, bodies: Any, hits: Any, view_camera: wp.array, count: int, mix: wp.array) -> None:
+        """Which pixels' radiance those on edges show."""
+        scene, edges = self.scene, self.edges
+        edges.number.zero_()
+        # Atomics of a launch on the CPU hold in one thread alone, so it is not cut into pieces.
+        pixels = count * scene.grid.tiles * int(TILE_PIXELS)
+        inputs = [scene.cameras, scene.grid, hits, view_camera]
+        outputs = [mix, edges.place, edges.number]
+        wp.launch(find_edges_kernel, dim=pixels, inputs=inputs, outputs=outputs, device=scene.device, block_dim=BLOCK)
+        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, bodies, hits, edges.place, edges.number, view_camera]
+        inputs += [self.rules.instances, EDGE_THREADS]
+        launch_pixels(mix_edges_kernel, count * EDGE_THREADS, inputs, [mix], scene.device)
 
     def _launch(self, kernel: wp.Kernel, grid: Any, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         launch_pixels(kernel, count * grid.tiles * int(TILE_PIXELS), inputs, outputs, self.scene.device)

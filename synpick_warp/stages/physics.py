@@ -46,6 +46,7 @@ class Physics:
         physics, worlds = config.physics, built.layout.worlds
         self.model.rigid_contact_max = physics.contacts_per_world * worlds
         self.pipeline = newton.CollisionPipeline(
+            # Matching contacts with those of the step before sorts them, so their order is the same every time.
             self.model, broad_phase="nxn", contact_matching="latest", rigid_contact_max=physics.contacts_per_world * worlds,
             shape_pairs_max=physics.pairs_per_world * worlds, verify_buffers=False,
         )
@@ -59,6 +60,7 @@ class Physics:
             enable_joint_limits=True,
             joint_limit_activation_gap=JOINT_LIMIT_GAP,
             warn_constraint_overflow=False,
+            deterministic=wp.DeterministicMode.RUN_TO_RUN if physics.deterministic else wp.DeterministicMode.NOT_GUARANTEED,
             **_sweep(physics.rows_per_world, built.layout.slots, self.device.is_cuda),
         )
         self.state = self.model.state()

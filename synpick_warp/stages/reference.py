@@ -43,9 +43,9 @@ class ReferencePicture:
         self.rules = path_rules(config, instances, config.render.samples, ROULETTE)
 
     def shade(
-        self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int, radiance: wp.array
+        self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int, picture: Any
     ) -> None:
-        """Radiance of the first `count` views.
+        """Pictures of the first `count` views.
 
         Args:
             snapshot: The worlds.
@@ -54,9 +54,9 @@ class ReferencePicture:
             view_world: World of each view (B) int32.
             view_camera: Camera of each view (B) int32.
             count: Views in use.
-            radiance: Written (B, row, column) vec3.
+            picture: The struct `Picture`; its `radiance` is written, which is that of whole pixels.
         """
         scene = self.scene
         inputs = [scene.paths, scene.cameras, scene.grid, snapshot.episode, snapshot.light, snapshot.light_turn]
         inputs += [bodies, view_world, view_camera, self.rules]
-        launch_pixels(trace_paths_kernel, count * scene.grid.tiles * int(TILE_PIXELS), inputs, [radiance], scene.device)
+        launch_pixels(trace_paths_kernel, count * scene.grid.tiles * int(TILE_PIXELS), inputs, [picture.radiance], scene.device)

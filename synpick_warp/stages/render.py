@@ -9,6 +9,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import REFERENCE, Config
+from synpick_warp.kernels.antialias import Picture
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
 from synpick_warp.kernels.hits import Bodies, Hits, trace_hits_kernel
 from synpick_warp.stages.annotate import annotate
@@ -24,10 +25,10 @@ from synpick_warp.stages.render_scene import RenderScene
 
 @dataclass(frozen=True, eq=False)
 class PictureArrays:
-    """What lies between hits and colour."""
+    """Arrays of the struct `Picture`: what lies between hits and colour."""
 
     radiance: wp.array = device_array("view", "row", "column", dtype=wp.vec3)
-    """Linear, before exposure."""
+    mix: wp.array = device_array("view", "row", "column", dtype=wp.uint32)
 
 
 class Renderer:
@@ -54,7 +55,7 @@ class Renderer:
         )
         self.bodies = filled(Bodies, self.arrays[0])
         self.hits = filled(Hits, self.arrays[1])
-        self.picture = self.arrays[2]
+        self.picture = filled(Picture, self.arrays[2])
         if config.render.mode == REFERENCE:
             self.shading: FastPicture | ReferencePicture = ReferencePicture(config, scene, instances)
         else:
@@ -91,9 +92,8 @@ class Renderer:
         self.prepare_bodies(snapshot, view_world, view_camera, count)
         self.trace_hits(view_camera, count, out)
         if layers is not None:
-            # Here, because further colour samples replace the hits.
             self.layers.draw(snapshot, self.bodies, self.hits, view_world, view_camera, count, layers)
-        self.shading.shade(snapshot, self.bodies, self.hits, view_world, view_camera, count, self.picture.radiance)
+        self.shading.shade(snapshot, self.bodies, self.hits, view_world, view_camera, count, self.picture)
         self.develop(snapshot, view_world, view_camera, count, out)
         annotate(self.scene, self.bodies, view_camera, count, out)
 
@@ -111,7 +111,7 @@ class Renderer:
 
     def develop(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
         """Radiance to bytes."""
-        self.developer.develop(snapshot, view_world, view_camera, count, self.picture.radiance, out)
+        self.developer.develop(snapshot, view_world, view_camera, count, self.picture, out)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         pixels = count * self.scene.grid.tiles * int(TILE_PIXELS)

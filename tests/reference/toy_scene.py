@@ -139,6 +139,8 @@ class Picture:
     exact_depth: np.ndarray
     """What the pixels' rays met, before rounding [m]."""
     radiance: np.ndarray
+    mix: np.ndarray
+    """Whose radiance a pixel shows (B, H, W) uint32."""
 
 
 def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
@@ -173,4 +175,5 @@ def render(toy: ToyScene, device: wp.Device) -> Picture:
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
     renderer.render(snapshot(toy, device), view_world, view_camera, views, out)
     images = {name: getattr(out, name).numpy() for name in ("color", "depth", "instance", "amodal", "pixels", "boxes")}
-    return Picture(**images, exact_depth=renderer.hits.depth.numpy(), radiance=renderer.picture.radiance.numpy())
+    shown = renderer.picture
+    return Picture(**images, exact_depth=renderer.hits.depth.numpy(), radiance=shown.radiance.numpy(), mix=shown.mix.numpy())

@@ -1,0 +1,158 @@
+"""Anti-aliasing of the fast picture: coverage known by geometry, and nothing changed but the colour of edges."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.frames import NOTHING
+from synpick_warp.kernels import antialias
+from synpick_warp.scenes.appearance import srgb_to_linear
+from synpick_warp.scenes.shapes import Material
+from tests.reference.toy_scene import UPRIGHT, Picture, ToyScene, box, camera, entry, even_light, render, sheet
+
+VIEW = camera(48, 40, 200.0, (0.0, 0.0, 2.0))
+SAMPLES = int(antialias.SAMPLES)
+OFFSETS = np.array(antialias.ROOKS, np.float64).reshape(SAMPLES, 2)
+"""x, y [px from the pixel's centre]."""
+EMPTY = entry(sheet(0.1, 0.1))
+
+
+def with_render(**settings) -> Config:
+    return replace(Config(), render=replace(Config().render, **settings))
+
+
+def turned(x: float, y: float, z: float, angle: float, axis: int = 2) -> tuple[float, ...]:
+    """A pose [m, rad]."""
+    quaternion = [0.0, 0.0, 0.0, np.cos(angle / 2)]
+    quaternion[axis] = np.sin(angle / 2)
+    return (x, y, z, *quaternion)
+
+
+def shown(device, *placed, view=VIEW, config=None, **more) -> Picture:
+    """Picture of (mesh, pose, colour)."""
+    entries = [entry(mesh, Material(color=color, texture=None, metallic=0.0, roughness=1.0)) for mesh, _, color in placed] or [EMPTY]
+    world = [(number, pose) for number, (_, pose, _) in enumerate(placed)]
+    return render(ToyScene(entries, [world], (view,), config=config or with_render(), **more), device)
+
+
+def sources(picture: Picture) -> np.ndarray:
+    """(row, column) of the pixel whose radiance each sample of each pixel shows (H, W, SAMPLES, 2)."""
+    mix = picture.mix[0]
+    number = (mix[..., None] >> (4 * np.arange(SAMPLES, dtype=np.uint32))) & 15
+    step = np.stack(np.divmod((number + 4) % 9, 3), axis=-1).astype(int) - 1
+    return np.stack(np.mgrid[: mix.shape[0], : mix.shape[1]], axis=-1)[:, :, None] + step
+
+
+def plate_places(view, pose, distance: float) -> np.ndarray:
+    """Where each sample of each pixel passes the plane z = 0 in the axes of a plate that lies there [m] (H, W, SAMPLES, 2)."""
+    rows, columns = np.mgrid[: view.height, : view.width]
+    x = (columns[..., None] + 0.5 + OFFSETS[:, 0] - view.matrix[0, 2]) / view.matrix[0, 0] * distance
+    y = -(rows[..., None] + 0.5 + OFFSETS[:, 1] - view.matrix[1, 2]) / view.matrix[1, 1] * distance
+    angle = 2.0 * np.arctan2(pose[5], pose[6])
+    x, y = x - pose[0], y - pose[1]
+    return np.stack([np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x], axis=-1)
+
+
+def test_samples_are_rooks_about_the_centre():
+    for axis in range(2):
+        assert sorted(OFFSETS[:, axis] * 16) == [-7, -5, -3, -1, 1, 3, 5, 7]
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.1, 0.4, np.pi / 4, 1.3])
+def test_pixels_on_a_plates_edge_mix_by_coverage(device, angle):
+    pose = turned(0.0123, -0.0071, 0.0, angle)
+    width, height = 0.21, 0.13
+    picture = shown(device, (sheet(width, height), pose, (0.9, 0.2, 0.2)))
+    inside = np.all(np.abs(plate_places(VIEW, pose, 2.0)) <= (width / 2, height / 2), axis=-1)
+    source = sources(picture)
+    taken = picture.instance[0][source[..., 0], source[..., 1]] == 1
+    edge = picture.mix[0] != 0
+    np.testing.assert_array_equal(taken[edge], inside[edge])
+    # What is no edge is covered wholly or not at all, but for the tips of corners.
+    partly = (inside.any(axis=-1) != inside.all(axis=-1)) & ~edge
+    assert partly.sum() <= 4
+    assert edge.sum() > 50
+
+
+def test_colour_of_an_edge_is_the_mean_of_what_it_shows(device):
+    picture = shown(
+        device, (sheet(0.21, 0.13), turned(0.0, 0.0, 0.0, 0.3), (0.5, 0.5, 0.5)), config=with_render(tone="linear", exposure=0.4)
+    )
+    source = sources(picture)
+    mixed = picture.radiance[0][source[..., 0], source[..., 1]].mean(axis=2)
+    edge = picture.mix[0] != 0
+    gain = srgb_to_linear(picture.color[0, 0, 0] / 255.0) / picture.radiance[0, 0, 0]
+    np.testing.assert_allclose(srgb_to_linear(picture.color[0][edge] / 255.0), gain * mixed[edge], atol=0.006)
+
+
+def test_a_plate_over_a_plate_is_told_by_depth_not_by_colour(device):
+    """Two plates of one body: its edge over itself is smoothed too."""
+    low, high = sheet(0.25, 0.2), sheet(0.1, 0.1)
+    both = replace(
+        low,
+        vertices=np.concatenate([low.vertices, high.vertices + np.array([0, 0, 0.3], np.float32)]),
+        faces=np.concatenate([low.faces, high.faces + 4]),
+        normals=np.concatenate([low.normals, high.normals]),
+        uv=np.concatenate([low.uv, high.uv]),
+    )
+    pose = turned(0.0, 0.0, 0.0, 0.3)
+    picture = shown(device, (both, pose, (0.9, 0.9, 0.9)))
+    inside = np.all(np.abs(plate_places(VIEW, pose, 1.7)) <= 0.05, axis=-1)
+    source = sources(picture)
+    upper = picture.exact_depth[0][source[..., 0], source[..., 1]] < 1.85
+    edge = picture.mix[0] != 0
+    np.testing.assert_array_equal(upper[edge], inside[edge])
+    assert (inside.any(axis=-1) & edge).sum() > 30
+
+
+def test_a_boxs_edge_mixes_its_two_sides(device):
+    """A box that turns an edge to the camera: left of it one side, right of it the other."""
+    picture = shown(device, (box(0.1, 0.3, 0.1), turned(0.003, 0.0, 0.0, np.pi / 4, axis=1), (0.9, 0.9, 0.9)))
+    ridge = VIEW.matrix[0, 2] + 0.003 / (2.0 - 0.1 / np.sqrt(2.0)) * VIEW.matrix[0, 0]
+    column = int(ridge)
+    source = sources(picture)[10:30, column]
+    assert (picture.mix[0, 10:30, column] != 0).all()
+    right = column + 0.5 + OFFSETS[:, 0] > ridge
+    centre_is_right = column + 0.5 > ridge
+    expected = np.where(right == centre_is_right, column, np.where(right, column + 1, column - 1))
+    np.testing.assert_array_equal(source[..., 1], np.broadcast_to(expected, source[..., 1].shape))
+
+
+def test_even_surfaces_and_the_background_have_no_edges(device):
+    tilted = turned(0.0, 0.0, 0.0, 1.2, axis=0)
+    assert not shown(device, (sheet(4.0, 9.0), tilted, (0.9, 0.9, 0.9))).mix.any()
+    empty = shown(device)
+    assert not empty.mix.any()
+    assert (empty.instance == NOTHING).all()
+    assert not shown(device, table=True).mix.any()
+
+
+def test_nothing_changes_but_the_colour_of_edges(device):
+    things = [
+        (box(0.1, 0.06, 0.08), turned(0.02, 0.0, 0.0, 0.5), (0.2, 0.4, 0.9)),
+        (sheet(0.3, 0.1), turned(-0.05, 0.0, -0.1, 1.0), (0.8, 0.8, 0.3)),
+    ]
+    smooth, rough = (shown(device, *things, config=with_render(antialias=on), table=True) for on in (True, False))
+    for name in ("depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance"):
+        np.testing.assert_array_equal(getattr(smooth, name), getattr(rough, name))
+    edge = smooth.mix[0] != 0
+    assert not rough.mix.any()
+    np.testing.assert_array_equal(smooth.color[0][~edge], rough.color[0][~edge])
+    assert (smooth.color[0][edge] != rough.color[0][edge]).any(axis=-1).mean() > 0.5
+
+
+def test_edges_come_nearer_to_the_reference(device):
+    things = [
+        (sheet(0.6, 0.5), (0.0, 0.0, 0.0, *UPRIGHT), (0.7, 0.7, 0.6)),
+        (box(0.12, 0.06, 0.08), turned(0.02, 0.01, 0.041, 0.5), (0.1, 0.2, 0.6)),
+        (box(0.05, 0.05, 0.05), turned(-0.07, 0.02, 0.026, 1.0), (0.8, 0.1, 0.1)),
+    ]
+    configs = (with_render(mode=FAST), with_render(mode=FAST, antialias=False), with_render(mode=REFERENCE, samples=256))
+    smooth, rough, reference = (shown(device, *things, config=config, lights=(even_light(),)) for config in configs)
+    edge = smooth.mix[0] != 0
+    errors = [np.square(picture.color[0].astype(float) - reference.color[0])[edge].mean() for picture in (smooth, rough)]
+    assert errors[0] < 0.3 * errors[1]
