@@ -30,8 +30,8 @@ class Surfaces:
     first_texel: wp.array2d[int]
     """Where each mip level starts (mesh, level)."""
     texture_levels: wp.array[int]
-    texel: wp.array[wp.vec3ub]
-    """sRGB."""
+    texel: wp.array[wp.uint32]
+    """sRGB, red in the lowest byte: one load brings all three."""
     linear: wp.array[float]
     """The linear value of each of the 256 sRGB values."""
     gloss: Gloss
@@ -109,8 +109,8 @@ def mesh_surface(
 
 @wp.func
 def texel_color(surfaces: Surfaces, index: int) -> wp.vec3:
-    texel = surfaces.texel[index]
-    return wp.vec3(surfaces.linear[int(texel[0])], surfaces.linear[int(texel[1])], surfaces.linear[int(texel[2])])
+    texel = int(surfaces.texel[index])
+    return wp.vec3(surfaces.linear[texel & 255], surfaces.linear[(texel >> 8) & 255], surfaces.linear[(texel >> 16) & 255])
 
 
 @wp.func

@@ -62,7 +62,7 @@ def test_a_gltf_material_reaches_the_renderer(tmp_path, device):
     # glTF's factor is linear, as are the renderer's colours.
     assert surfaces.color.numpy()[0] == pytest.approx((1.0, 128 / 255, 0.0), abs=2e-3)
     assert surfaces.texture_size.numpy()[0].tolist() == [5, 3]
-    assert surfaces.texel.numpy()[0].tolist() == [200, 100, 50]
+    assert surfaces.texel.numpy()[0] == 200 | 100 << 8 | 50 << 16
 
 
 def albedo(material: Material, rows: int, columns: int, device) -> np.ndarray:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from isal import isal_zlib
+
+from synpick_warp.exporters.deflate import deflate
 
 _MAGIC, _VERSION = 20000630, 2
 """First words of a file of one part with scan lines (openexr.com/en/latest/OpenEXRFileLayout.html)."""
@@ -16,8 +17,6 @@ _FLOAT = 2
 """Pixel type: 32-bit float."""
 _ZIP, _ROWS = 3, 16
 """Compression, and the rows that it packs together."""
-_LEVEL = 1
-"""ISA-L's level, as for PNG."""
 
 
 def encode_exr(image: np.ndarray) -> bytes:
@@ -62,6 +61,6 @@ def _block(row: int, lines: np.ndarray) -> bytes:
     steps = sorted_bytes.copy()
     steps[1:] -= sorted_bytes[:-1]
     steps[1:] += np.uint8(128)
-    packed = isal_zlib.compress(steps, _LEVEL)
+    packed = deflate(steps)
     data = packed if len(packed) < plain.size else plain.tobytes()
     return struct.pack("<2i", row, len(data)) + data

@@ -63,6 +63,12 @@ def mip_levels(texture: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
+def packed_colors(image: np.ndarray) -> np.ndarray:
+    """The colours of an image (H, W, 3) uint8, row by row, as `Surfaces.texel` holds them (H W) uint32."""
+    red, green, blue = image.reshape(-1, 3).T.astype(np.uint32)
+    return red | green << 8 | blue << 16
+
+
 def uv_density(mesh: TriangleMesh) -> np.ndarray:
     """Texture lengths per metre on each triangle (F) float32: the root of the ratio of areas, 0 for triangles without area."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
@@ -108,7 +114,7 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     for row, chain in enumerate(chains):
         for level, image in enumerate(chain):
             first_texel[row, level] = total
-            texels.append(image.reshape(-1, 3))
+            texels.append(packed_colors(image))
             total += len(texels[-1])
     sizes = [(chain[0].shape[1], chain[0].shape[0]) if chain else (0, 0) for chain in chains]
     surfaces = Surfaces()
@@ -123,7 +129,7 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     surfaces.texture_size = wp.array(sizes, dtype=wp.vec2i, device=device)
     surfaces.first_texel = wp.array(first_texel, dtype=wp.int32, device=device)
     surfaces.texture_levels = wp.array([len(chain) for chain in chains], dtype=wp.int32, device=device)
-    surfaces.texel = wp.array(np.concatenate(texels) if texels else np.zeros((1, 3), np.uint8), dtype=wp.vec3ub, device=device)
+    surfaces.texel = wp.array(np.concatenate(texels) if texels else np.zeros(1, np.uint32), dtype=wp.uint32, device=device)
     surfaces.gloss = measure_gloss(device)
     surfaces.linear = wp.array(srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=device)
     return surfaces
