@@ -26,8 +26,9 @@ wp.set_module_options({"enable_backward": False})
 SAMPLES = wp.constant(8)
 """Rays of a pixel on an edge."""
 ROOKS = wp.constant(wp.types.matrix(shape=(8, 2), dtype=float)(
-    1.0, -3.0, -1.0, 3.0, 5.0, 1.0, -3.0, -5.0, -5.0, 5.0, -7.0, -1.0, 3.0, 7.0, 7.0, -7.0,
-) / 16.0)  # fmt: skip
+    0.0625, -0.1875, -0.0625, 0.1875, 0.3125, 0.0625, -0.1875, -0.3125,
+    -0.3125, 0.3125, -0.4375, -0.0625, 0.1875, 0.4375, 0.4375, -0.4375,
+))  # fmt: skip
 """Where they pass [px from the pixel's centre]: no two in one of eight rows or columns (Direct3D's standard pattern of eight)."""
 BITS = wp.constant(4)
 """Of a sample in `Picture.mix`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 from dataclasses import replace
@@ -20,7 +21,10 @@ from synpick_warp.configs.sensors import Effects
 from synpick_warp.errors import CatalogError, OutputError
 from synpick_warp.exporters.bop import BopExporter
 from synpick_warp.exporters.bop_models import encode_model, write_models
+from synpick_warp.exporters.bop_scene import SceneSettings, finish_episode, make_scene
+from synpick_warp.exporters.bop_view import RECORDS, records_block
 from synpick_warp.exporters.files import prepare_output
+from synpick_warp.exporters.folder import open_folder
 from synpick_warp.scenes.shapes import Catalog
 from tests.exporter_contract import ExporterContract, digests, export, exporter_data_set, exporting, feed, finish
 from tests.reference.box_views import OBJECT_IDS, SIZES, batches, cameras, catalog, config, ends, poses
@@ -264,6 +268,29 @@ def lose_a_frame(out: Path) -> None:
             exporter.write(batch)
         exporter.end(ends((0,), 4)[0], lambda: None)
         finish(exporter)
+
+
+def test_records_come_in_any_order_and_each_frame_once(tmp_path):
+    settings = SceneSettings("train_pbr", 3, 4, 3, ".jpg", True, (5,))
+    for frames in ((2, 0, 1), (2, 0, 1, 0), (2, 0)):
+        scene, place = tmp_path / "hidden", tmp_path / "-".join(map(str, frames))
+        make_scene(scene, True, ())
+        with open_folder(scene) as folder:
+            for frame in frames:
+                annotations = [b'{"of": %d}' % frame] * frame
+                folder.append(RECORDS, records_block(frame, (b'{"view": %d}' % frame, b"[]", b"[1]", *annotations)))
+        if frames != (2, 0, 1):
+            with pytest.raises(OutputError, match=f"has {len(frames)} of 3 frames"):
+                finish_episode(((scene, place),), settings)
+            shutil.rmtree(scene)
+            continue
+        finish_episode(((scene, place),), settings)
+        assert load(place / "scene_camera.json") == {str(frame): {"view": frame} for frame in range(3)}
+        assert list(load(place / "scene_gt_info.json").items()) == [(str(frame), [1]) for frame in range(3)]
+        assert load(place / "scene_gt_coco.json")["annotations"] == [
+            {"id": number, "of": frame} for number, frame in ((1, 1), (2, 2), (3, 2))
+        ]
+        assert not (place / RECORDS).exists()
 
 
 def test_a_missing_frame_is_no_whole_scene(tmp_path):

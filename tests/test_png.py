@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
+from synpick_warp.exporters import png
 from synpick_warp.exporters.png import encode_mask_png, encode_png
 from synpick_warp.exporters.rle import find_edges
 
@@ -38,6 +39,14 @@ def test_pixels_come_back(image):
     back = read(encode_png(image))
     assert back.dtype == image.dtype.newbyteorder("=")
     np.testing.assert_array_equal(back, image)
+
+
+@pytest.mark.parametrize("strip_bytes", [0, 30, 45, 1 << 20])
+def test_strips_make_one_image(strip_bytes, monkeypatch):
+    monkeypatch.setattr(png, "_STRIP_BYTES", strip_bytes)
+    for shape, kind in (((7, 5), np.uint16), ((7, 5, 3), np.uint8), ((1, 1), np.uint8)):
+        image = np.random.default_rng(0).integers(0, np.iinfo(kind).max, shape, kind)
+        np.testing.assert_array_equal(read(encode_png(image)), image)
 
 
 def test_a_view_into_a_larger_array_is_written_like_a_copy():

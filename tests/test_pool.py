@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ import pytest
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters import pool as pool_module
-from synpick_warp.exporters.pool import QUEUE, WriterPool, shared_bytes
+from synpick_warp.exporters.pool import QUEUE, Order, WriterPool, shared_bytes
+from synpick_warp.exporters.worker import NICENESS
 
 SIZE = 1 << 16
 
@@ -41,6 +43,10 @@ def fill_the_disk(path: Path) -> None:
 
 def stumble(_: Path) -> None:
     raise ValueError("two\nlines")
+
+
+def stumble_on(_image: np.ndarray, path: Path) -> None:
+    stumble(path)
 
 
 def die(_: Path) -> None:
@@ -103,7 +109,7 @@ def test_several_images_of_different_types_share_a_slot(tmp_path):
             np.testing.assert_array_equal(back, image)
 
 
-def test_threads_copy_the_parts_of_large_images(tmp_path, monkeypatch):
+def test_threads_copy_large_images(tmp_path, monkeypatch):
     monkeypatch.setattr(pool_module, "PROCESSES_PER_COPIER", 1)
     draw = np.random.default_rng(0)
     images = (draw.integers(0, 256, (700, 900, 6), np.uint8)[::2, 3:-3], np.zeros((0, 4)), np.arange(5), draw.integers(0, 9, (3, 1 << 20)))
@@ -115,6 +121,43 @@ def test_threads_copy_the_parts_of_large_images(tmp_path, monkeypatch):
     with np.load(tmp_path / "all.npz") as file:
         for image, back in zip(kept, file.values(), strict=True):
             np.testing.assert_array_equal(back, image)
+
+
+def test_many_orders_are_taken_at_once_each_with_its_own_images(tmp_path, monkeypatch):
+    """More than there are slots, made one by one, while threads copy the images of those before."""
+    monkeypatch.setattr(pool_module, "PROCESSES_PER_COPIER", 1)
+    count, side = 5 * QUEUE, 700
+    ring = np.empty((count, side, side), np.uint8)
+    made, done = [], []
+
+    def orders(first: int) -> Iterator[Order]:
+        for value in range(first, first + count):
+            made.append(value)
+            ring[value - first] = value
+            yield Order(save, (ring[value - first],), (tmp_path / f"{value}.npy",), tmp_path, lambda value=value: done.append(value))
+
+    with WriterPool(2, side * side) as pool:
+        for first in (0, count):
+            pool.submit_all(orders(first))
+            ring[...] = 255
+    assert made == sorted(done) == list(range(2 * count))
+    for value in made:
+        np.testing.assert_array_equal(np.load(tmp_path / f"{value}.npy"), np.full((side, side), value))
+
+
+def test_a_failure_ends_the_orders(tmp_path):
+    made = []
+
+    def orders() -> Iterator[Order]:
+        while True:
+            made.append(None)
+            yield Order(stumble_on, (np.zeros(4),), (tmp_path,), tmp_path)
+
+    pool = WriterPool(2, SIZE)
+    with pytest.raises(OutputError, match="ValueError: two lines"):
+        pool.submit_all(orders())
+    assert len(made) <= 1 + 2 * QUEUE
+    pool.abort()
 
 
 def test_images_too_large_for_a_slot_are_refused(tmp_path):
@@ -224,9 +267,12 @@ def test_a_process_that_dies_while_it_waits_is_noticed(tmp_path):
 
 def test_processes_survive_ctrl_c_and_never_load_the_simulator(tmp_path):
     with WriterPool(1, SIZE) as pool:
-        assert os.getpgid(processes(pool)[0].pid) != os.getpgid(0)
+        (writer,) = pool.pids()
+        assert os.getpgid(writer) != os.getpgid(0)
         pool.submit(interrupt, (), (tmp_path / "modules",), path=tmp_path)
         pool.submit(note, (), (tmp_path / "after", "x"), path=tmp_path)
+        pool.wait()
+        assert os.getpriority(os.PRIO_PROCESS, writer) == min(19, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
     assert (tmp_path / "after").exists()
     assert not {"warp", "newton", "trimesh"} & set((tmp_path / "modules").read_text().split())
 

@@ -285,7 +285,8 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
     assert all(row["value"] >= 0.0 for row in rows)
     printed = capsys.readouterr().out
     sights = ("views, all stages", "picking, steps alone", "looks and plans: share of the time with rendering")
-    for name in (*sights, "bop: views, 1 process", "shards: views, 1 process", "SensorCamera's time over ours"):
+    writers = ("bop, 1 process: views", "bop, 1 process: CPU of a view, writers, kernel", "shards, 1 process: cores in use")
+    for name in (*sights, *writers, "SensorCamera's time over ours"):
         assert name in printed
 
 

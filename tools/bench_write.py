@@ -1,4 +1,4 @@
-"""What tools/bench.py measures of the writers: views a second by format and number of processes, and what the end of a scene takes."""
+"""What tools/bench.py measures of the writers: views a second and CPU time by format and number of processes, and the end of a scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from synpick_warp.bake import Factory
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import DataSet, Exporter
 from synpick_warp.exporters.files import PARTIAL
-from synpick_warp.exporters.pool import WriterPool
+from synpick_warp.exporters.pool import QUEUE, WriterPool
 from synpick_warp.exporters.registry import exporter_kinds
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.outcome import Ending
@@ -61,17 +61,28 @@ def measure_writing(config: Config, factory: Factory, report: TickReport, least:
     views = FrameBatch(**{name: np.concatenate([getattr(batch, name) for batch in kept]) for name in names}, layers=layers)
     frames = tick_batch(report, factory.log.object_ids, config.physics.step * config.physics.steps_per_tick)
     yield Row("write", "objects in a view", float((views.object_id >= 0).sum(axis=1).mean()), "")
+    # All files stay until the end: to make some soon after others were removed takes longer on some file systems.
+    with tempfile.TemporaryDirectory() as folder:
+        for name in config.bake.formats:
+            yield from _measure_format(name, config, factory, _Given(views, frames), least, Path(folder) / name)
+
+
+def _measure_format(name: str, config: Config, factory: Factory, given: _Given, least: float, folder: Path) -> Iterator[Row]:
+    """Numbers of a format by processes, and the end of episodes with all of them."""
+    (kind,) = exporter_kinds((name,))
     cores = len(os.sched_getaffinity(0))
-    for name in config.bake.formats:
-        (kind,) = exporter_kinds((name,))
-        written = _Written(0.0, 0.0, 0, 0.0, 0.0, 0.0)
-        for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
-            written = _write(kind, config, factory, _Given(views, frames), processes, least)
-            yield Row("write", f"{name}: views, {processes} process{'es' if processes > 1 else ''}", written.rate, "1/s")
-        yield Row("write", f"{name}: an episode, to finish", 1e3 * written.finish, "ms")
-        yield Row("write", f"{name}: views, with the end of episodes of {written.frames} frames", written.whole_rate, "1/s")
-        yield Row("write", f"{name}: files of a view", written.files, "")
-        yield Row("write", f"{name}: files of a view", 1e-6 * written.size, "MB")
+    written = _Written(0.0, {}, 0.0, 0, 0.0, 0.0, 0.0)
+    for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
+        written = _write(kind, config, factory, given, processes, least, folder / str(processes))
+        label = f"{name}, {processes} process{'es' if processes > 1 else ''}"
+        yield Row("write", f"{label}: views", written.rate, "1/s")
+        for part, seconds in written.cpu.items():
+            yield Row("write", f"{label}: CPU of a view, {part}", 1e3 * seconds, "ms")
+        yield Row("write", f"{label}: cores in use", written.rate * sum(written.cpu.values()), "")
+    yield Row("write", f"{name}: an episode, to finish", 1e3 * written.finish, "ms")
+    yield Row("write", f"{name}: views, with the end of episodes of {written.frames} frames", written.whole_rate, "1/s")
+    yield Row("write", f"{name}: files of a view", written.files, "")
+    yield Row("write", f"{name}: files of a view", 1e-6 * written.size, "MB")
 
 
 def _copied(batch: FrameBatch) -> FrameBatch:
@@ -85,6 +96,8 @@ class _Written:
 
     rate: float
     """Views written [1/s]."""
+    cpu: dict[str, float]
+    """CPU time of a view, by part [s]."""
     finish: float
     """Time from the last view to whole episodes, divided by their number [s]."""
     frames: int
@@ -97,16 +110,16 @@ class _Written:
     """Their size [B]."""
 
 
-def _write(kind: type[Exporter], config: Config, factory: Factory, given: _Given, processes: int, least: float) -> _Written:
-    with tempfile.TemporaryDirectory() as folder, WriterPool(processes, kind.slot_bytes(config)) as pool:
-        out = Path(folder)
-        (out / PARTIAL).mkdir()
+def _write(kind: type[Exporter], config: Config, factory: Factory, given: _Given, processes: int, least: float, out: Path) -> _Written:
+    """Write into a folder that is not there yet, for at least so long [s]."""
+    (out / PARTIAL).mkdir(parents=True)
+    with WriterPool(processes, kind.slot_bytes(config)) as pool:
         exporter = kind(DataSet(out, config, factory.catalog, factory.cameras, factory.lights, pool))
         exporter.write_constants()
-        for batch in (given.of(COPIES, 0)[0] for _ in range(-(-processes // len(given.views)))):
+        for batch in (given.of(COPIES, 0)[0] for _ in range(-(-processes * QUEUE // len(given.views)))):
             exporter.write(batch)
         pool.wait()
-        frame, started = 0, time.perf_counter()
+        cpu, frame, started = _cpu_seconds(pool), 0, time.perf_counter()
         while frame == 0 or (frame < MOST_FRAMES and time.perf_counter() - started < least):
             for copy in range(COPIES):
                 views, frames = given.of(copy, frame)
@@ -115,6 +128,8 @@ def _write(kind: type[Exporter], config: Config, factory: Factory, given: _Given
             frame += 1
         pool.wait()
         seconds = time.perf_counter() - started
+        # The clocks of a thread and of all are not read at once, so their difference may seem to shrink.
+        cpu = {part: max(0.0, spent - cpu[part]) for part, spent in _cpu_seconds(pool).items()}
         episodes = given.episodes()
         for episode in episodes:
             exporter.end(EpisodeEnd(episode, 0, frame, int(Ending.FINISHED)), lambda: None)
@@ -125,4 +140,15 @@ def _write(kind: type[Exporter], config: Config, factory: Factory, given: _Given
         size = sum(path.stat().st_size for path in files)
         exporter.close()
     count = frame * COPIES * len(given.views)
-    return _Written(count / seconds, finish / len(episodes), frame, count / (seconds + finish), len(files) / count, size / count)
+    cpu = {part: spent / count for part, spent in cpu.items()}
+    return _Written(count / seconds, cpu, finish / len(episodes), frame, count / (seconds + finish), len(files) / count, size / count)
+
+
+def _cpu_seconds(pool: WriterPool) -> dict[str, float]:
+    """What this process's thread that hands out views, its others, and the writers have spent, the last by mode [s]."""
+    # Of /proc/PID/stat, utime and stime (proc_pid_stat(5)); the name before may hold blanks.
+    texts = (Path(f"/proc/{pid}/stat").read_text() for pid in pool.pids())
+    ticks = np.array([[int(number) for number in text.rpartition(")")[2].split()[11:13]] for text in texts])
+    user, kernel = (ticks.sum(axis=0) / os.sysconf("SC_CLK_TCK")).tolist()
+    first = time.thread_time()
+    return {"main thread": first, "its other threads": time.process_time() - first, "writers, user": user, "writers, kernel": kernel}

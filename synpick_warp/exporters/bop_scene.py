@@ -5,12 +5,14 @@ Runs in writer processes, so it imports neither Warp nor Newton.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop_view import RECORDS
@@ -38,7 +40,7 @@ class SceneSettings:
 def make_scene(scene: Path, masks: bool, layers: tuple[str, ...]) -> None:
     """Make the folders of a scene that is not whole yet."""
     scene.mkdir()
-    for name in (RECORDS, "rgb", "depth", *(("mask", "mask_visib") if masks else ()), *layers):
+    for name in ("rgb", "depth", *(("mask", "mask_visib") if masks else ()), *layers):
         (scene / name).mkdir()
 
 
@@ -63,29 +65,55 @@ def drop_scenes(scenes: tuple[Path, ...]) -> None:
 
 
 def _finish_scene(scene: Path, settings: SceneSettings) -> None:
-    records = sorted((scene / RECORDS).iterdir(), key=lambda path: int(path.name))
-    if [int(path.name) for path in records] != list(range(settings.frames)):
-        raise OutputError(f"{scene} has {len(records)} of {settings.frames} frames; this is an error of synpick-warp, please report it")
-    names = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
-    for line, name in enumerate(names):
-        _write_lines(scene / name, _keyed(records, line))
-    if settings.coco:
-        _write_lines(scene / "scene_gt_coco.json", _coco(records, len(names), settings))
-    shutil.rmtree(scene / RECORDS)
+    with (scene / RECORDS).open("rb") as file:
+        records = _Records(file)
+        if records.frames != list(range(settings.frames)):
+            raise OutputError(
+                f"{scene} has {len(records.frames)} of {settings.frames} frames; this is an error of synpick-warp, please report it"
+            )
+        names = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
+        for record, name in enumerate(names):
+            _write_lines(scene / name, _keyed(records, record))
+        if settings.coco:
+            _write_lines(scene / "scene_gt_coco.json", _coco(records, len(names), settings))
+    (scene / RECORDS).unlink()
     for folder in (*(entry for entry in sorted(scene.iterdir()) if entry.is_dir()), scene):
         flush_folder(folder)
 
 
-def _keyed(records: list[Path], line: int) -> Iterator[str]:
+class _Records:
+    """A file of `records_block`s, read by frame and record: whole, they would fill the memory."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.frames: list[int] = []
+        """Of each block, sorted."""
+        self._places: dict[int, list[tuple[int, int]]] = {}
+        while head := file.readline():
+            frame, *sizes = map(int, head.split())
+            *begins, end = itertools.accumulate((size + 1 for size in sizes), initial=file.tell())
+            self._places[frame] = list(zip(begins, sizes, strict=True))
+            self.frames.append(frame)
+            file.seek(end)
+        self.frames.sort()
+
+    def texts(self, frame: int, begin: int, end: int | None) -> Iterator[str]:
+        """Records `begin` to `end`, exclusive, of a frame."""
+        for offset, size in self._places[frame][begin:end]:
+            self._file.seek(offset)
+            yield self._file.read(size).decode("ascii")
+
+
+def _keyed(records: _Records, record: int) -> Iterator[str]:
     """One entry a view: `"frame": record`."""
     yield "{\n"
-    for index, path in enumerate(records):
-        text = path.read_text(encoding="ascii").split("\n")[line]
-        yield ("" if index == 0 else ",\n") + f'  "{int(path.name)}": {text}'
+    for index, frame in enumerate(records.frames):
+        (text,) = records.texts(frame, record, record + 1)
+        yield ("" if index == 0 else ",\n") + f'  "{frame}": {text}'
     yield "\n}\n"
 
 
-def _coco(records: list[Path], first_line: int, settings: SceneSettings) -> Iterator[str]:
+def _coco(records: _Records, first: int, settings: SceneSettings) -> Iterator[str]:
     head = {
         "info": {
             "description": f"synpick_{settings.split}",
@@ -97,12 +125,12 @@ def _coco(records: list[Path], first_line: int, settings: SceneSettings) -> Iter
         },
         "licenses": [{"id": 1, "name": "as of the models", "url": ""}],
         "categories": [{"id": obj_id, "name": str(obj_id), "supercategory": "synpick"} for obj_id in settings.object_ids],
-        "images": [_coco_image(int(path.name), settings) for path in records],
+        "images": [_coco_image(frame, settings) for frame in records.frames],
     }
     yield json.dumps(head)[:-1] + ', "annotations": [\n'
     number = 0
-    for path in records:
-        for text in path.read_text(encoding="ascii").split("\n")[first_line:-1]:
+    for frame in records.frames:
+        for text in records.texts(frame, first, None):
             number += 1
             yield ("" if number == 1 else ",\n") + f'{{"id": {number}, {text[1:]}'
     yield "\n]}\n"

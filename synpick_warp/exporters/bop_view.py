@@ -5,7 +5,7 @@ Runs in writer processes, so it imports neither Warp nor Newton. Millimetres exi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,9 @@ from synpick_warp.layers import encode_layer, layer_path
 from synpick_warp.scenes.shapes import Camera
 
 RECORDS = "records"
-"""Folder of views' records, in a scene that is not whole yet."""
+"""File of views' records, in a scene that is not whole yet, in the order in which they came; see `records_block`. It is one file, not
+one a view, because ext4 without a journal walks over the inodes that were freed in the last minutes whenever it makes a file.
+"""
 MILLIMETERS = 1000.0
 """In a metre."""
 IGNORE_VISIBILITY = 0.1
@@ -168,7 +170,7 @@ def view_masks(first: np.ndarray, second: np.ndarray, truth: ViewTruth, height: 
 def write_view(
     color: np.ndarray, depth: np.ndarray, first: np.ndarray, second: np.ndarray, scene: Path, settings: ViewSettings, truth: ViewTruth
 ) -> None:
-    """Write what `view_task` gave: pictures into the folders of a scene, and records, one a line, into `RECORDS`.
+    """Write what `view_task` gave: pictures into the folders of a scene, and records into `RECORDS`.
 
     Lines: scene_camera, scene_gt, scene_gt_info, then one COCO annotation each, without its id.
     """
@@ -187,7 +189,13 @@ def write_view(
         lines = [camera_record(truth, settings), gt_records(truth, settings.camera), infos]
         if settings.coco:
             lines += coco_records(truth, infos, masks, height, width)
-        folder.write(f"{RECORDS}/{name}", b"".join(to_json(line) + b"\n" for line in lines))
+        folder.append(RECORDS, records_block(truth.frame, map(to_json, lines)))
+
+
+def records_block(frame: int, records: Iterable[bytes]) -> bytes:
+    """A view's records as `RECORDS` has them: a line with the frame and the length of each record [B], then the records, one a line."""
+    lines = tuple(records)
+    return b"\n".join((b" ".join(b"%d" % number for number in (frame, *map(len, lines))), *lines, b""))
 
 
 def write_layer(values: np.ndarray, scene: Path, name: str, frame: int) -> None:
@@ -226,17 +234,10 @@ def gt_records(truth: ViewTruth, camera: dict[str, Any]) -> list[dict[str, Any]]
     rotation = np.reshape(camera["cam_R_w2c"], (3, 3))
     translation = np.asarray(camera["cam_t_w2c"])
     pose = truth.pose.astype(np.float64)
-    model = rotation @ rotation_matrices(pose[:, 3:])
+    model = (rotation @ rotation_matrices(pose[:, 3:])).reshape(-1, 9)
     place = MILLIMETERS * pose[:, :3] @ rotation.T + translation
-    return [
-        {
-            "cam_R_m2c": model[index].ravel().tolist(),
-            "cam_t_m2c": place[index].tolist(),
-            "obj_id": int(truth.object_id[index]),
-            "instance_id": int(truth.instance_id[index]),
-        }
-        for index in range(len(truth.instance_id))
-    ]
+    rows = zip(*(array.tolist() for array in (model, place, truth.object_id, truth.instance_id)), strict=True)
+    return [dict(zip(("cam_R_m2c", "cam_t_m2c", "obj_id", "instance_id"), row, strict=True)) for row in rows]
 
 
 def rotation_matrices(quaternion: np.ndarray) -> np.ndarray:

@@ -26,10 +26,10 @@ class Deflater:
 
     def compress(self, data: bytes | np.ndarray) -> bytes:
         """Pack bytes, C-contiguous ones; the first call gets at least HEAD, or all there are."""
+        view = memoryview(data if isinstance(data, bytes) else data.data).cast("B")
         if self._begun:
-            return self._stream.compress(data)
+            return self._stream.compress(view)
         self._begun = True
-        view = memoryview(data).cast("B")
         head = self._stream.compress(view[:HEAD]) + self._stream.flush(isal_zlib.Z_SYNC_FLUSH)
         return head + self._stream.compress(view[HEAD:])
 

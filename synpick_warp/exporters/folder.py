@@ -9,7 +9,7 @@ from pathlib import Path
 
 Buffer = bytes | memoryview
 """Contiguous bytes."""
-_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
+_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC
 
 
 class Folder:
@@ -21,8 +21,15 @@ class Folder:
 
     def write(self, name: str, data: Buffer) -> None:
         """Write a file; `name` is relative to the folder, and folders in it exist."""
+        self._write(name, data, os.O_TRUNC)
+
+    def append(self, name: str, data: Buffer) -> None:
+        """Write to a file's end. Processes may do so at once: what each appends stays in one piece."""
+        self._write(name, data, os.O_APPEND)
+
+    def _write(self, name: str, data: Buffer, flag: int) -> None:
         try:
-            handle = os.open(name, _FLAGS, 0o666, dir_fd=self._handle)
+            handle = os.open(name, _FLAGS | flag, 0o666, dir_fd=self._handle)
             try:
                 rest = memoryview(data).cast("B")
                 while rest:

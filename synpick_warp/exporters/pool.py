@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
+import selectors
 import signal
 import socket
 import subprocess
@@ -12,9 +13,9 @@ import sys
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -28,8 +29,6 @@ QUEUE = 4
 """Tasks that a process has at hand, with the one it runs: enough to bridge the time in which the bake makes the next batch."""
 PROCESSES_PER_COPIER = 4
 """So many processes for a thread that copies images into shared memory: one core alone cannot copy as fast as many cores write."""
-_COPY_BYTES = 1 << 20
-"""What a thread copies at once, about [B]."""
 _ALIGNMENT = 64
 """Images begin at a multiple of a cache line [B]."""
 _END_TIMEOUT = 10.0
@@ -38,12 +37,30 @@ _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR
 """The processes are the parallelism: no threads within them."""
 
 
+@dataclass(frozen=True, eq=False)
+class Order:
+    """A task to be done: `function(*images, *arguments)` in a process."""
+
+    function: Callable[..., None]
+    """Stands at the top of a module that imports quickly."""
+    images: Sequence[np.ndarray]
+    """Copied into shared memory before the call that brings the order returns."""
+    arguments: tuple[Any, ...]
+    """Pickled; keep them small."""
+    path: Path
+    """What the task writes, for error messages."""
+    done: Callable[[], None] | None = None
+    """Called from a later call of the pool, in the caller's thread, once the task succeeded. It may submit tasks without images."""
+
+
 @dataclass(eq=False)
 class _Job:
     task: Task
     path: Path
     done: Callable[[], None] | None
     slot: int | None
+    copying: Future[None] | None
+    """A thread's copying of the images; None: they are there."""
 
 
 @dataclass(eq=False)
@@ -81,6 +98,7 @@ class WriterPool:
         self._free = list(range(slots))
         self._waiting: deque[_Job] = deque()
         self._workers: list[_Worker] = []
+        self._links = selectors.DefaultSelector()
         self._failure: OutputError | None = None
         self._ended = False
         self._hearing = False
@@ -92,7 +110,9 @@ class WriterPool:
             raise OutputError(f"no shared memory for {processes} writer processes: {error}; set bake.writers lower") from error
         try:
             for _ in range(processes):
-                self._workers.append(_start(handle, () if held is None else (held,)))
+                worker = _start(handle, () if held is None else (held,))
+                self._workers.append(worker)
+                self._links.register(worker.link, selectors.EVENT_READ, worker)
         except OSError as error:
             self.abort()
             raise OutputError(f"cannot start {processes} writer processes: {error}; set bake.writers lower") from error
@@ -108,26 +128,32 @@ class WriterPool:
         path: Path,
         done: Callable[[], None] | None = None,
     ) -> None:
-        """Have `function(*images, *arguments)` called in a process. Tasks with images wait until there is room for these.
+        """Have one `Order` done, which has these parts; see `submit_all`."""
+        self.submit_all((Order(function, images, arguments, path, done),))
 
-        Args:
-            function: Stands at the top of a module that imports quickly.
-            images: Copied into shared memory before this returns.
-            arguments: Pickled; keep them small.
-            path: What the task writes, for error messages.
-            done: Called from a later call of the pool, in the caller's thread, once the task succeeded. It may submit tasks without images.
+    def submit_all(self, orders: Iterable[Order]) -> None:
+        """Have tasks done, and return when all their images are copied. Tasks with images wait until there is room for these.
+
+        Threads copy the images of some orders while the next one is made, so give orders that take work to make by a generator.
 
         Raises:
-            OutputError: This or an earlier task failed, or a process died.
+            OutputError: One of these or an earlier task failed, or a process died.
         """
         self._check()
-        slot = None
-        if images:
-            while not self._free:
-                self._collect(None)
-            slot = self._free.pop()
-        self._waiting.append(_Job(Task(function, self._share(images, slot), arguments), path, done, slot))
+        jobs: list[_Job] = []
+        for order in orders:
+            slot = self._take_slot() if order.images else None
+            places, copying = self._share(order.images, slot)
+            jobs.append(_Job(Task(order.function, places, order.arguments), order.path, order.done, slot, copying))
+            self._waiting.append(jobs[-1])
+            self._collect(0.0)
+        for job in jobs:
+            _await_copy(job)
         self._collect(0.0)
+
+    def pids(self) -> tuple[int, ...]:
+        """Numbers of the processes."""
+        return tuple(worker.process.pid for worker in self._workers)
 
     def poll(self) -> None:
         """Hear from the processes without waiting. Raises like `submit`."""
@@ -165,6 +191,7 @@ class WriterPool:
             worker.link.close()
         self._workers.clear()
         self._waiting.clear()
+        self._links.close()
         self._copiers.shutdown()
         with contextlib.suppress(BufferError):
             self._memory.close()
@@ -178,30 +205,34 @@ class WriterPool:
         else:
             self.abort()
 
-    def _share(self, images: Sequence[np.ndarray], slot: int | None) -> tuple[SharedImage, ...]:
+    def _take_slot(self) -> int:
+        while not self._free:
+            self._collect(None)
+        return self._free.pop()
+
+    def _share(self, images: Sequence[np.ndarray], slot: int | None) -> tuple[tuple[SharedImage, ...], Future[None] | None]:
+        """Places of the images in a slot, and their copying if it goes on."""
         if slot is None:
-            return ()
+            return (), None
         if (size := shared_bytes(image.nbytes for image in images)) > self._slot_bytes:
             raise ValueError(f"images of {size} bytes exceed the {self._slot_bytes} that the pool was made for")
         offset = slot * self._slot_bytes
-        shared: list[SharedImage] = []
-        parts: list[tuple[np.ndarray, np.ndarray]] = []
+        places: list[SharedImage] = []
         for image in images:
-            place = SharedImage(offset, image.shape, image.dtype.str)
-            shared.append(place)
+            places.append(SharedImage(offset, image.shape, image.dtype.str))
             offset += shared_bytes((image.nbytes,))
-            count = 1 if self._copies_here else max(1, image.nbytes // _COPY_BYTES)
-            parts += zip(np.array_split(place.of(self._memory), count), np.array_split(image, count), strict=True)
-        for _ in (map if self._copies_here else self._copiers.map)(_copy, parts):
-            pass
-        return tuple(shared)
+        targets = [place.of(self._memory) for place in places]
+        if self._copies_here:
+            _copy(targets, images)
+            return tuple(places), None
+        return tuple(places), self._copiers.submit(_copy, targets, images)
 
     def _collect(self, timeout: float | None) -> None:
         """Hand out tasks and hear about finished ones; `None` waits for at least one."""
         if not self._workers:
             self._run_here()
             return
-        self._hand_out()
+        self._hand_out(waits=timeout is None)
         if self._hearing:
             # Called by a `done`: the caller below has yet to hear from the processes that it found ready, once each.
             return
@@ -210,12 +241,11 @@ class WriterPool:
             self._hear(timeout)
         finally:
             self._hearing = False
-        self._hand_out()
+        self._hand_out(waits=False)
 
     def _hear(self, timeout: float | None) -> None:
-        links = {worker.link: worker for worker in self._workers}
-        for link in wait(list(links), timeout):
-            worker = links[link]  # type: ignore[index]
+        for key, _ in self._links.select(timeout):
+            worker: _Worker = key.data
             try:
                 failure: Failure | None = worker.link.recv()
             except (EOFError, OSError):
@@ -223,12 +253,15 @@ class WriterPool:
             job = worker.jobs.popleft()
             self._finish(job, failure)
 
-    def _hand_out(self) -> None:
+    def _hand_out(self, waits: bool) -> None:
+        """Hand out tasks, in order, while a process has room for one; `waits`: even if images are still being copied."""
         while self._waiting:
             worker = min(self._workers, key=lambda candidate: len(candidate.jobs))
-            if len(worker.jobs) == QUEUE:
+            copying = self._waiting[0].copying
+            if len(worker.jobs) == QUEUE or not (waits or copying is None or copying.done()):
                 return
             job = self._waiting.popleft()
+            _await_copy(job)
             worker.jobs.append(job)
             try:
                 worker.link.send(job.task)
@@ -276,9 +309,15 @@ def _describe(failure: Failure, path: Path) -> OutputError:
     return output_error(path, OSError(code, reason, name or str(path)))
 
 
-def _copy(part: tuple[np.ndarray, np.ndarray]) -> None:
-    """Copy to the first array from the second; other threads may run meanwhile."""
-    np.copyto(*part)
+def _copy(targets: Sequence[np.ndarray], images: Sequence[np.ndarray]) -> None:
+    """Copy images; other threads may run meanwhile."""
+    for target, image in zip(targets, images, strict=True):
+        np.copyto(target, image)
+
+
+def _await_copy(job: _Job) -> None:
+    if job.copying is not None:
+        job.copying.result()
 
 
 def _shared_memory(size: int) -> tuple[int, mmap.mmap]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from synpick_warp.exporters.bop_models import write_constants
 from synpick_warp.exporters.bop_scene import drop_scenes
 from synpick_warp.exporters.bop_view import ViewSettings, shared_record, view_task
 from synpick_warp.exporters.files import PARTIAL, output_error
+from synpick_warp.exporters.pool import Order
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.outcome import Ending
 
@@ -102,6 +103,10 @@ class SceneExporter(ABC):
 
     def write(self, batch: FrameBatch) -> None:
         """See `Exporter`."""
+        self._pool.submit_all(self._orders(batch))
+
+    def _orders(self, batch: FrameBatch) -> Iterator[Order]:
+        """A task for each view, and for each of its layers."""
         for view in range(len(batch)):
             number, camera = int(batch.episode[view]), int(batch.camera[view])
             episode = self._episodes.get(number) or self._begin(number)
@@ -113,9 +118,7 @@ class SceneExporter(ABC):
                 tasks.append((function, (batch.layers[name][view],), arguments))
             episode.pending += len(tasks)
             for function, arrays, arguments in tasks:
-                self._pool.submit(
-                    function, arrays, arguments, path=self._split / scene.name, done=partial(self._part_done, number, episode)
-                )  # fmt: skip
+                yield Order(function, arrays, arguments, self._split / scene.name, partial(self._part_done, number, episode))
 
     def tick(self, batch: TickBatch) -> None:
         """See `Exporter`: what BOP has of a tick comes with its views."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import os
 import signal
 import sys
 import traceback
@@ -14,6 +15,9 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.errors import SynpickError
+
+NICENESS = 10
+"""Added to the processes' own (nice(2)): when they keep all cores busy, the bake, which feeds them and the GPU, goes first."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,7 @@ def run(task: Task, memory: mmap.mmap) -> Failure | None:
 def main() -> None:
     """Serve the tasks that come through file handle argv[1] on the memory of handle argv[2], until there is `None` or no bake."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the bake's to handle.
+    os.nice(NICENESS)
     link = Connection(int(sys.argv[1]))
     memory = mmap.mmap(int(sys.argv[2]), 0)
     try:
