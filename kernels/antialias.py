@@ -34,6 +34,8 @@ BITS = wp.constant(4)
 """Of a sample in `Picture.mix`."""
 AROUND = wp.constant(9)
 """Pixels of a square of 3 x 3."""
+SEGMENT_TILES = wp.constant(32)
+"""Tiles whose edges have a counter of their own: threads that count up the same number stand in line."""
 CREASE = wp.constant(1.5)
 """Slopes [m/m] of a body's surface beside a pixel that differ by more are an edge: by 2 do those of a box's edge that points here."""
 NEARNESS = wp.constant(0.1)
@@ -107,10 +109,11 @@ def find_edges_kernel(
     view_camera: wp.array[int],
     # Out:
     mix_out: wp.array3d[wp.uint32],
-    edge_out: wp.array2d[int],
-    edges_inout: wp.array[int],
+    edge_out: wp.array3d[int],
+    edges_inout: wp.array2d[int],
 ):
-    """List the pixels on edges of each view, in any order: their number and, in `edge_out`, row times width plus column."""
+    """List the pixels on edges in each segment of each view, in any order: their number and, in `edge_out`, row times width plus column.
+    Mixes are cleared."""
     pixel = tile_pixel(grid, wp.tid())
     view = pixel[0]
     row = pixel[1]
@@ -119,7 +122,8 @@ def find_edges_kernel(
         return
     mix_out[view, row, column] = wp.uint32(0)
     if is_edge(hits, grid, cameras.intrinsics[view_camera[view]], view, row, column):
-        edge_out[view, wp.atomic_add(edges_inout, view, 1)] = row * grid.width + column
+        segment = tile_of(grid, row, column) // SEGMENT_TILES
+        edge_out[view, segment, wp.atomic_add(edges_inout, view, segment, 1)] = row * grid.width + column
 
 
 @wp.func
@@ -166,8 +170,12 @@ def like_pixel(
 ) -> int:
     """Number of the pixel about (row, column) that shows best what a ray `offset` [px] off its centre hit: the same body, near the tangent
     plane there, close by. The pixel itself, if none shows that body."""
-    height = hit.depth * wp.dot(normal, camera_ray(intrinsics, row, column, offset))
-    width = hit.depth / intrinsics[0]
+    # n . ray is linear in the image.
+    facing = wp.dot(normal, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
+    down = normal[1] / intrinsics[1]
+    right = normal[0] / intrinsics[0]
+    height = hit.depth * (facing + offset[1] * down + offset[0] * right)
+    per_width = intrinsics[0] / hit.depth
     best = int(0)
     least = float(1.0e30)
     for number in range(AROUND):
@@ -176,10 +184,11 @@ def like_pixel(
         c = column + step[1]
         if r >= 0 and r < grid.height and c >= 0 and c < grid.width:
             if int(hits.code[view, r, c]) == hit.code:
-                apart = NEARNESS * wp.length(wp.vec2(float(step[1]), float(step[0])) - offset)
+                y = float(step[0])
+                x = float(step[1])
+                apart = NEARNESS * wp.length(wp.vec2(x - offset[0], y - offset[1]))
                 if hit.code != NOTHING:
-                    there = hits.depth[view, r, c] * wp.dot(normal, camera_ray(intrinsics, r, c, wp.vec2(0.0, 0.0)))
-                    apart += wp.abs(there - height) / width
+                    apart += wp.abs(hits.depth[view, r, c] * (facing + y * down + x * right) - height) * per_width
                 if apart < least:
                     least = apart
                     best = number
@@ -196,34 +205,36 @@ def mix_edges_kernel(
     # In:
     bodies: Bodies,
     hits: Hits,
-    edge: wp.array2d[int],
-    edges: wp.array[int],
+    edge: wp.array3d[int],
+    edges: wp.array2d[int],
     view_camera: wp.array[int],
     instances: int,
     threads: int,
     first: int,
     # Out:
-    mix_out: wp.array3d[wp.uint32],
+    mix_inout: wp.array3d[wp.uint32],
 ):
-    """Which pixels' radiance each pixel on an edge shows; a view's `threads` threads take them in turn, since the host knows no number."""
+    """Which pixels' radiance each pixel on an edge shows. The host knows no number of edges, so `threads` threads take the samples of a
+    segment in turn; neighbouring threads take one pixel's, whose rays meet the same bodies."""
     thread = wp.tid() + first
-    view = thread // threads
+    segments = edges.shape[1]
+    view = thread // (segments * threads)
+    segment = (thread // threads) % segments
     camera = view_camera[view]
     intrinsics = cameras.intrinsics[camera]
-    for number in range(thread % threads, edges[view], threads):
-        row = edge[view, number] // grid.width
-        column = edge[view, number] % grid.width
+    for number in range(thread % threads, SAMPLES * edges[view, segment], threads):
+        place = edge[view, segment, number // SAMPLES]
+        sample = number % SAMPLES
+        row = place // grid.width
+        column = place % grid.width
+        offset = wp.vec2(ROOKS[sample, 0], ROOKS[sample, 1])
+        ray = camera_ray(intrinsics, row, column, offset)
         seen = seen_bodies(hits, grid, view, row, column, instances)
         candidates = seen_candidates(bodies, view, tile_of(grid, row, column), seen)
-        mix = wp.uint32(0)
-        for sample in range(SAMPLES):
-            offset = wp.vec2(ROOKS[sample, 0], ROOKS[sample, 1])
-            ray = camera_ray(intrinsics, row, column, offset)
-            hit = trace_candidates(meshes, bodies, view, candidates, ray, instances, False)
-            hit = hit_table(table, cameras, camera, ray, hit)
-            normal = wp.vec3(0.0, 0.0, 0.0)
-            if hit.code != NOTHING:
-                normal = hit_normal(meshes, bodies, cameras, camera, view, hit, instances)
-            best = like_pixel(hits, grid, intrinsics, view, row, column, offset, hit, normal)
-            mix = mix | (wp.uint32(best) << wp.uint32(BITS * sample))
-        mix_out[view, row, column] = mix
+        hit = trace_candidates(meshes, bodies, view, candidates, ray, instances, False)
+        hit = hit_table(table, cameras, camera, ray, hit)
+        normal = wp.vec3(0.0, 0.0, 0.0)
+        if hit.code != NOTHING:
+            normal = hit_normal(meshes, bodies, cameras, camera, view, hit, instances)
+        best = like_pixel(hits, grid, intrinsics, view, row, column, offset, hit, normal)
+        wp.atomic_or(mix_inout, view, row, column, wp.uint32(best) << wp.uint32(BITS * sample))

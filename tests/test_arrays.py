@@ -24,7 +24,7 @@ from tests.reference.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset part tile "
-    "cell_row cell_column shadow_row shadow_column pixel"
+    "cell_row cell_column shadow_row shadow_column segment segment_pixel"
 )
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [

@@ -9,7 +9,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels.antialias import find_edges_kernel, mix_edges_kernel
+from synpick_warp.kernels.antialias import SAMPLES, SEGMENT_TILES, find_edges_kernel, mix_edges_kernel
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
 from synpick_warp.kernels.cells import LANES_ACROSS, SPREAD, CellGrid, Guide
 from synpick_warp.kernels.gather import Gathered, gather_kernel
@@ -32,8 +32,8 @@ MOST_SHARE = 8.0
 """A path counts with at most this many times the unhindered light, or single ones would show as patches."""
 ROULETTE = 1
 """Scatterings before dim paths may end early: few paths are long, since many neighbours share them."""
-EDGE_THREADS = 1 << 14
-"""Threads that share the edges of a view: those of the few views of a batch fill a GPU."""
+EDGE_THREADS = 128
+"""Threads that share the edges of a segment on a GPU: it has some hundred samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,9 +80,9 @@ class ShadowArrays:
 class EdgePixels:
     """Pixels that anti-aliasing works on."""
 
-    place: wp.array = device_array("view", "pixel", dtype=wp.int32)
-    """Row times width plus column of each."""
-    number: wp.array = device_array("view", dtype=wp.int32)
+    place: wp.array = device_array("view", "segment", "segment_pixel", dtype=wp.int32)
+    """Row times width plus column of each; a segment is a run of tiles."""
+    number: wp.array = device_array("view", "segment", dtype=wp.int32)
     """How many there are."""
 
 
@@ -99,8 +99,15 @@ def cell_sizes(config: Config, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions that the arrays here name beside the view, for images of `width` x `height` px."""
     size = cell_size(config, width)
     shadow = max(1, size // 2)
-    return {"pixel": width * height if config.render.antialias else 0, "cell_row": -(-height // size), "cell_column": -(-width // size),
-            "shadow_row": -(-height // shadow), "shadow_column": -(-width // shadow)}  # fmt: skip
+    segments = -(-build_grid(width, height).tiles // int(SEGMENT_TILES)) if config.render.antialias else 0
+    return {
+        "cell_row": -(-height // size),
+        "cell_column": -(-width // size),
+        "shadow_row": -(-height // shadow),
+        "shadow_column": -(-width // shadow),
+        "segment": segments,
+        "segment_pixel": int(SEGMENT_TILES) * int(TILE_PIXELS),
+    }
 
 
 def cell_grid(image: Any, size: int, window: int) -> Any:
@@ -217,8 +224,9 @@ class FastPicture:
         outputs = [mix, edges.place, edges.number]
         wp.launch(find_edges_kernel, dim=pixels, inputs=inputs, outputs=outputs, device=scene.device, block_dim=BLOCK)
         inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, bodies, hits, edges.place, edges.number, view_camera]
-        inputs += [self.rules.instances, EDGE_THREADS]
-        launch_pixels(mix_edges_kernel, count * EDGE_THREADS, inputs, [mix], scene.device)
+        threads = EDGE_THREADS if scene.device.is_cuda else int(SAMPLES)
+        inputs += [self.rules.instances, threads]
+        launch_pixels(mix_edges_kernel, count * edges.number.shape[1] * threads, inputs, [mix], scene.device)
 
     def _launch(self, kernel: wp.Kernel, grid: Any, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         launch_pixels(kernel, count * grid.tiles * int(TILE_PIXELS), inputs, outputs, self.scene.device)

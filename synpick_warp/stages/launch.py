@@ -9,6 +9,8 @@ from typing import Any
 
 import warp as wp
 
+from synpick_warp.kernels.camera_rays import TILE_PIXELS
+
 BLOCK = 128
 """Threads of a block: four tiles of 8 x 4 pixels."""
 CHUNKS = 8
@@ -28,11 +30,15 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(_cores(), thread_name_prefix="pixels")
 
 
+# Threads do not survive a fork: a child starts its own.
+os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
 def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:
-    """Launch a kernel over a flat range of pixels, each thread of which writes its own pixel alone; its last input is the range's begin.
+    """Launch a kernel over a flat range of pixels; its last input is the range's begin. No two tiles of threads write the same place.
 
     Warp runs a launch on the CPU in the calling thread and releases the interpreter's lock meanwhile; so pieces of the range run
-    side by side. Which thread takes which piece does not change the result.
+    side by side, whole tiles each. Which thread takes which piece does not change the result.
     """
     if device.is_cuda:
         wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=BLOCK)
@@ -42,7 +48,8 @@ def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: li
         return
     # Loading a module is not safe from several threads at once.
     kernel.module.load(device, 1)
-    size = max(CHUNK_PIXELS, -(-pixels // (CHUNKS * _cores())))
+    tiles = -(-pixels // (CHUNKS * _cores() * int(TILE_PIXELS)))
+    size = max(CHUNK_PIXELS, tiles * int(TILE_PIXELS))
 
     def launch_piece(first: int) -> None:
         wp.launch(kernel, dim=min(size, pixels - first), inputs=[*inputs, first], outputs=outputs, device=device)
