@@ -13,7 +13,7 @@
 # files and 20 GB. Longer episodes, or full HD, fill a small disk.
 #
 # Environment:
-#     STEPS              "rest bench pick bake": what to do, in this order; also "render" and "devices"
+#     STEPS              "rest bench pick bake": what to do, in this order; also "render", "devices" and "sameness"
 #     PYTHON             interpreter (python3)
 #     DATA               folder of data (.gpu/data): ycbv_models/, hdri/ and cache/ in it are used if they are there
 #     DEVICE             cuda:0
@@ -21,7 +21,11 @@
 #     WORLDS             512: of speeds
 #     BENCH_PARTS        physics,sight,render,write; also sensor
 #     BENCH_RESOLUTION   1920x1080
+#     BENCH_SETTINGS     none, such as "bake.mode=move bake.formats=[bop,shards,usd,zarr]"; writers write to TMPDIR
 #     RENDER_SCENES      10: piles whose fast picture is held against the reference; RENDER_SAMPLES 1024, RENDER_SIZE 960x540
+#     SAME_WORLDS        8,1,64,512: numbers of worlds in which the same episodes are simulated, and the first and the last of which bake
+#     SAME_EPISODES      8
+#     SAME_SETTINGS      "move.rounds=1 move.speed=0.6 pick.failures=1 arrangement.volume=1e-3 target.forgive=false": short episodes
 #     PICK_EPISODES      64: of each of the modes pick and target
 #     PICK_SETTINGS      none, such as "pick.failures=4"
 #     BAKE_MODE          mixed; or pick, target, move
@@ -30,7 +34,7 @@
 #     BAKE_RESOLUTION    640x360
 #     BAKE_FORMATS       bop; or any of bop,shards,usd,zarr
 #     BAKE_SETTINGS      "move.rounds=1 move.speed=0.4 pick.failures=1": short episodes
-#     REST_LIMIT BENCH_LIMIT RENDER_LIMIT DEVICES_LIMIT PICK_LIMIT BAKE_LIMIT   most seconds of each step (its share of what is left)
+#     REST_LIMIT BENCH_LIMIT RENDER_LIMIT DEVICES_LIMIT SAME_LIMIT PICK_LIMIT BAKE_LIMIT   most seconds of each step (its share of what is left)
 #     TOTAL_LIMIT        most seconds of all steps (490)
 #
 # DATA/cache is a cache folder as XDG has it, so that concave objects need not be decomposed on the GPU machine, which takes minutes.
@@ -44,7 +48,7 @@ if [ $# -ne 1 ]; then
     exit 2
 fi
 # Shares of the time; a step whose name is not here does not exist.
-declare -A shares=([rest]=60 [bench]=130 [render]=200 [devices]=60 [pick]=210 [bake]=90)
+declare -A shares=([rest]=60 [bench]=130 [render]=200 [devices]=60 [sameness]=200 [pick]=210 [bake]=90)
 read -ra steps <<<"${STEPS:-rest bench pick bake}"
 for name in "${steps[@]}"; do
     if [ -z "${shares[$name]:-}" ]; then
@@ -112,9 +116,10 @@ measure_rest() {
 }
 
 measure_bench() {
+    settings_of "${BENCH_SETTINGS:-}"
     step "speeds" "${BENCH_LIMIT:-$1}" "$python" tools/bench.py --device "$device" "${models[@]}" "${lights[@]}" \
         --worlds "${WORLDS:-512}" --resolution "${BENCH_RESOLUTION:-1920x1080}" --parts "${BENCH_PARTS:-physics,sight,render,write}" \
-        --json "$results/bench.json"
+        "${settings[@]}" --json "$results/bench.json"
 }
 
 measure_render() {
@@ -125,6 +130,21 @@ measure_render() {
 
 measure_devices() {
     step "two devices" "${DEVICES_LIMIT:-$1}" "$python" tools/compare_pictures.py --devices "cpu,$device" "${models[@]}" "${lights[@]}"
+}
+
+# Episodes in different numbers of worlds, then two bakes of them, in the first and the last number of worlds.
+measure_sameness() {
+    local worlds=${SAME_WORLDS:-8,1,64,512} number all=${SAME_LIMIT:-$1}
+    settings_of "${SAME_SETTINGS-move.rounds=1 move.speed=0.6 pick.failures=1 arrangement.volume=1e-3 target.forgive=false}"
+    for number in "${worlds%%,*}" "${worlds##*,}"; do
+        step "bake in $number worlds" "$((all / 4))" "${synpick[@]}" bake --mode mixed --device "$device" "${models[@]}" "${lights[@]}" \
+            --worlds "$number" --episodes "${SAME_EPISODES:-8}" --resolution 320x180 --formats bop,shards,usd,zarr "${settings[@]}" \
+            --set "render.layers=[normals,albedo,nocs,classes,flow,scene_flow,depth_sensor]" --out "$bakes/same-$number"
+    done
+    step "both bakes" 60 "$python" tools/compare_runs.py "$bakes/same-${worlds%%,*}" "$bakes/same-${worlds##*,}"
+    step "trajectories" 30 "$python" tools/check_trajectory.py "$bakes/same-${worlds%%,*}"
+    step "numbers of worlds" "$((all / 2))" "$python" tools/compare_worlds.py --device "$device" "${models[@]}" --worlds "$worlds" \
+        --episodes "${SAME_EPISODES:-8}" --set bake.mode=mixed "${settings[@]}" --json "$results/worlds.json"
 }
 
 measure_pick() {
