@@ -21,6 +21,17 @@ MAX_COUNTS = wp.constant(65535.0)
 
 
 @wp.struct
+class Room:
+    """A convex room in the tote's own frame that none of its triangles reaches into, open at the top: see `scenes.shapes.Hollow`."""
+
+    half: wp.vec3
+    """Negative: there is none."""
+    growth: wp.vec3
+    floor: float
+    top: float
+
+
+@wp.struct
 class Meshes:
     """Constant, one row a mesh: the catalog's entries, then tote, finger, cup."""
 
@@ -33,6 +44,8 @@ class Meshes:
     """Bounding sphere in the mesh's own frame [m]."""
     entries: int
     """Catalog entries; the mesh of fixture f is entries + f."""
+    room: Room
+    """The tote's."""
 
 
 @wp.struct
@@ -65,7 +78,7 @@ class Bodies:
     sphere: wp.array2d[wp.vec4]
     """Bounding sphere in the world: centre [m], squared radius [m²]; a negative square: not there."""
     order: wp.array2d[int]
-    """The bodies that are there, by `near`: rays that meet the nearest first seldom have to look at the rest."""
+    """The bodies that are there, by `near`, the tote last: rays that meet the nearest first seldom have to look at the rest."""
     present: wp.array[int]
     """How many these are, one a view."""
     candidates: wp.array2d[wp.uint64]
@@ -94,6 +107,37 @@ class Hit:
     barycentric: wp.vec2
     depth: float
     amodal: wp.uint32
+
+
+@wp.func
+def lies_in(room: Room, point: wp.vec3) -> bool:
+    """Whether a point at most as high as the top lies in a room."""
+    x = wp.abs(point[0])
+    y = wp.abs(point[1])
+    z = point[2]
+    return (
+        z >= room.floor
+        and x <= room.half[0] + z * room.growth[0]
+        and y <= room.half[1] + z * room.growth[1]
+        and x + y <= room.half[2] + z * room.growth[2]
+    )
+
+
+@wp.func
+def misses_tote(room: Room, start: wp.vec3, direction: wp.vec3, reach: float) -> bool:
+    """Whether it is plain that a ray meets no triangle of the tote before `reach`: what of it is no higher than the tote begins and ends in
+    the room, which is convex. Most rays to lights, and those that meet an object in the tote, are spared its tree thus."""
+    begin = float(0.0)
+    end = float(reach)
+    if direction[2] > 0.0:
+        end = wp.min(reach, (room.top - start[2]) / direction[2])
+    elif start[2] > room.top:
+        begin = FAR
+        if direction[2] < 0.0:
+            begin = (room.top - start[2]) / direction[2]
+    if begin >= end:
+        return room.half[0] > 0.0
+    return lies_in(room, start + begin * direction) and lies_in(room, start + end * direction)
 
 
 @wp.func
@@ -143,23 +187,21 @@ def trace_candidates(
                 reach = best.depth - near
                 if amodal and body < instances:
                     reach = FAR
-                query = wp.mesh_query_ray(
-                    meshes.id[bodies.mesh[view, body]],
-                    body_ray_start(bodies, view, body, ray),
-                    bodies.turn[view, body] * ray,
-                    reach,
-                )
-                if query.result:
-                    if body < instances:
-                        best.amodal = best.amodal | (wp.uint32(1) << wp.uint32(body))
-                    depth = near + query.t
-                    if depth < best.depth:
-                        best.depth = depth
-                        best.triangle = query.face
-                        best.barycentric = wp.vec2(query.u, query.v)
-                        best.code = body + 1
-                        if body >= instances:
-                            best.code = FIRST_FIXTURE + body - instances
+                start = body_ray_start(bodies, view, body, ray)
+                direction = bodies.turn[view, body] * ray
+                if body != instances or not misses_tote(meshes.room, start, direction, reach):
+                    query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, direction, reach)
+                    if query.result:
+                        if body < instances:
+                            best.amodal = best.amodal | (wp.uint32(1) << wp.uint32(body))
+                        depth = near + query.t
+                        if depth < best.depth:
+                            best.depth = depth
+                            best.triangle = query.face
+                            best.barycentric = wp.vec2(query.u, query.v)
+                            best.code = body + 1
+                            if body >= instances:
+                                best.code = FIRST_FIXTURE + body - instances
             elif amodal and body < instances:
                 if hits_body(meshes, bodies, view, body, ray):
                     best.amodal = best.amodal | (wp.uint32(1) << wp.uint32(body))
@@ -292,20 +334,24 @@ def is_blocked(
     origin: wp.vec3,
     direction: wp.vec3,
     reach: float,
+    instances: int,
 ) -> bool:
     """Whether anything lies within `reach` [m] of `origin` along the unit vector `direction`, all in the world."""
     if table.visible != 0 and direction[2] < 0.0:
         if origin[2] + reach * direction[2] < table.height:
             return True
-    for number in range(bodies.present[view]):
-        body = bodies.order[view, number]
+    present = bodies.present[view]
+    for number in range(present):
+        # The tote, which is last, first: low rays meet its walls.
+        body = bodies.order[view, present - 1 - number]
         sphere = bodies.sphere[view, body]
         offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
         closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, reach) * direction
         if wp.dot(closest, closest) < sphere[3]:
             turn = bodies.world_turn[view, body]
-            if wp.mesh_query_ray_anyhit(
-                meshes.id[bodies.mesh[view, body]], turn * (origin - bodies.position[view, body]), turn * direction, reach
-            ):
-                return True
+            start = turn * (origin - bodies.position[view, body])
+            local = turn * direction
+            if body != instances or not misses_tote(meshes.room, start, local, reach):
+                if wp.mesh_query_ray_anyhit(meshes.id[bodies.mesh[view, body]], start, local, reach):
+                    return True
     return False

@@ -24,6 +24,7 @@ from synpick_warp.kernels.hits import (
     body_of,
     hit_table,
     is_blocked,
+    misses_tote,
     trace_camera_ray,
 )
 from synpick_warp.kernels.sampling import Chances, LightSample, light_density, sample_light, scrambled_point
@@ -136,16 +137,17 @@ def nearest_hit(scene: PathScene, bodies: Bodies, view: int, instances: int, ori
         closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, best.depth) * direction
         if wp.dot(closest, closest) < sphere[3]:
             turn = bodies.world_turn[view, body]
-            query = wp.mesh_query_ray(
-                scene.meshes.id[bodies.mesh[view, body]], turn * (origin - bodies.position[view, body]), turn * direction, best.depth
-            )
-            if query.result:
-                best.depth = query.t
-                best.triangle = query.face
-                best.barycentric = wp.vec2(query.u, query.v)
-                best.code = body + 1
-                if body >= instances:
-                    best.code = FIRST_FIXTURE + body - instances
+            start = turn * (origin - bodies.position[view, body])
+            local = turn * direction
+            if body != instances or not misses_tote(scene.meshes.room, start, local, best.depth):
+                query = wp.mesh_query_ray(scene.meshes.id[bodies.mesh[view, body]], start, local, best.depth)
+                if query.result:
+                    best.depth = query.t
+                    best.triangle = query.face
+                    best.barycentric = wp.vec2(query.u, query.v)
+                    best.code = body + 1
+                    if body >= instances:
+                        best.code = FIRST_FIXTURE + body - instances
     return best
 
 
@@ -239,7 +241,7 @@ def direct_light(scene: PathScene, bodies: Bodies, rules: PathRules, place: Plac
     weight = heuristic(rules.strategy, BY_LIGHT, drawn.density, density(vertex.brdf, made.direction)) / drawn.density
     if weight <= 0.0 or wp.dot(made.direction, vertex.brdf.normal) <= 0.0:
         return made
-    if is_blocked(scene.meshes, scene.table, bodies, place.view, vertex.origin, made.direction, FAR):
+    if is_blocked(scene.meshes, scene.table, bodies, place.view, vertex.origin, made.direction, FAR, rules.instances):
         return made
     made.radiance = weight * background_radiance(scene.lights, light, drawn.direction)
     return made

@@ -7,6 +7,8 @@ from synpick_warp.kernels.hits import FAR, Bodies, Meshes, body_ray_start
 
 wp.set_module_options({"enable_backward": False})
 
+FIXTURES = wp.constant(3)
+"""Tote, finger and cup, in this order, come after a world's instances."""
 TILE_REACH = wp.constant(5.5)
 """Rays of a tile pass within this many pixels of the ray of its middle: half its diagonal, 4.5, and colour samples' offsets."""
 
@@ -86,22 +88,31 @@ def prepare_bodies_kernel(
     bodies_out.sphere[view, body] = wp.vec4(float(sphere[0]), float(sphere[1]), float(sphere[2]), radius * radius)
 
 
+@wp.func
+def rank_depth(bodies: Bodies, view: int, body: int) -> float:
+    """What bodies are ranked by [m]. A ray that has met an object in the tote seldom has to look at the tote, see `misses_tote`."""
+    if body == bodies.mesh.shape[1] - FIXTURES:
+        return FAR
+    return bodies.near[view, body]
+
+
 @wp.kernel
 def order_bodies_kernel(
     # Out:
     bodies_inout: Bodies,
 ):
-    """List a view's bodies that are there, the nearest first: a body's rank is the number of those before it."""
+    """List a view's bodies that are there, the nearest first and the tote last: a body's rank is the number of those before it."""
     view, body = wp.tid()
     bodies = bodies_inout.mesh.shape[1]
-    near = bodies_inout.near[view, body]
+    near = rank_depth(bodies_inout, view, body)
     there = bodies_inout.mesh[view, body] >= 0
     rank = int(0)
     total = int(0)
     for other in range(bodies):
         if bodies_inout.mesh[view, other] >= 0:
             total += 1
-            if bodies_inout.near[view, other] < near or (bodies_inout.near[view, other] == near and other < body):
+            other_near = rank_depth(bodies_inout, view, other)
+            if other_near < near or (other_near == near and other < body):
                 rank += 1
     if there:
         bodies_inout.order[view, rank] = body

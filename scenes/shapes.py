@@ -104,12 +104,29 @@ class Catalog:
         return len(self.entries)
 
 
+@dataclass(frozen=True)
+class Hollow:
+    """A convex room in a mesh's own frame that no triangle reaches into, open at the top: |x| <= half[0], |y| <= half[1] and |x| + |y| <=
+    half[2] at z = 0, each wider by its growth a metre up."""
+
+    half: tuple[float, float, float]
+    """[m]"""
+    growth: tuple[float, float, float]
+    """[m/m]"""
+    floor: float
+    """Least z [m]."""
+    top: float
+    """No vertex of the mesh is higher [m]."""
+
+
 @dataclass(frozen=True, eq=False)
 class Fixture:
     """A visible thing that is no object: tote, finger, cup."""
 
     mesh: TriangleMesh
     material: Material
+    hollow: Hollow | None = None
+    """The room in it, if it is a container."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,11 +12,11 @@ import warp as wp
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.environment import Lights
-from synpick_warp.kernels.hits import Meshes, Table
+from synpick_warp.kernels.hits import Meshes, Room, Table
 from synpick_warp.kernels.paths import PathScene
 from synpick_warp.kernels.surfaces import Surfaces
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
-from synpick_warp.scenes.shapes import Camera, Catalog, Fixture, LightMap, Material, TriangleMesh
+from synpick_warp.scenes.shapes import Camera, Catalog, Fixture, Hollow, LightMap, Material, TriangleMesh
 from synpick_warp.stages.chances import build_chances
 from synpick_warp.stages.gloss import measure_gloss
 from synpick_warp.stages.light_tables import light_table
@@ -79,8 +79,10 @@ def uv_density(mesh: TriangleMesh) -> np.ndarray:
     return np.sqrt(uv_area / np.where(area > 0.0, area, np.inf)).astype(np.float32)
 
 
-def build_meshes(shapes: list[TriangleMesh], entries: int, device: wp.Device) -> tuple[Any, tuple[wp.Mesh, ...]]:
-    """One `wp.Mesh` a shape, and the struct `Meshes` about them."""
+def build_meshes(
+    shapes: list[TriangleMesh], entries: int, device: wp.Device, hollow: Hollow | None = None
+) -> tuple[Any, tuple[wp.Mesh, ...]]:
+    """One `wp.Mesh` a shape, and the struct `Meshes` about them; `hollow` is the tote's."""
     keep = tuple(
         wp.Mesh(
             points=wp.array(shape.vertices, dtype=wp.vec3, device=device),
@@ -102,6 +104,11 @@ def build_meshes(shapes: list[TriangleMesh], entries: int, device: wp.Device) ->
     # One part in a million more, so that rounding never lets a sphere exclude its own mesh.
     meshes.radius = wp.array(np.array(radius) * (1.0 + 1e-6), dtype=wp.float32, device=device)
     meshes.entries = entries
+    meshes.room = Room()
+    meshes.room.half = wp.vec3(-1.0, -1.0, -1.0)
+    if hollow is not None:
+        meshes.room.half, meshes.room.growth = wp.vec3(*hollow.half), wp.vec3(*hollow.growth)
+        meshes.room.floor, meshes.room.top = hollow.floor, hollow.top
     return meshes, keep
 
 
@@ -195,7 +202,7 @@ def build_render_scene(
     shapes = [entry.mesh for entry in catalog.entries] + [fixture.mesh for fixture in fixtures]
     table_material = Material(color=config.render.table_color, texture=None, metallic=0.0, roughness=TABLE_ROUGHNESS)
     materials = [entry.material for entry in catalog.entries] + [fixture.material for fixture in fixtures] + [table_material]
-    meshes, keep = build_meshes(shapes, len(catalog), device)
+    meshes, keep = build_meshes(shapes, len(catalog), device, fixtures[0].hollow)
     table = Table()
     table.visible, table.height = int(config.render.table), -config.tote.wall
     ground = srgb_to_linear(np.array(config.render.table_color)) if config.render.table else None
