@@ -11,7 +11,7 @@ from synpick_warp.kernels.hits import NOTHING, RAY_REGISTERS, TABLE, Bodies, Hit
 from synpick_warp.kernels.paths import PathScene
 from synpick_warp.kernels.shadows import lit_share
 from synpick_warp.kernels.surfaces import base_color, mesh_surface, table_surface
-from synpick_warp.kernels.windows import Shares, gathered_share
+from synpick_warp.kernels.windows import Shares, gathered_share, pixel_plane
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -83,7 +83,8 @@ def shade_kernel(
     metallic = scene.surfaces.metallic[surface.row]
     brdf = brdf_at(scene.surfaces.gloss, color, metallic, scene.surfaces.roughness[surface.row], surface.normal, outgoing)
     normal = wp.transpose(cameras.to_world[camera]) * surface.face_normal
-    share = gathered_share(guide, shares, cells, intrinsics, view, row, column, code, depth, normal)
+    plane = pixel_plane(cells, intrinsics, row, column, code, depth, normal)
+    share = gathered_share(guide, shares, cells, intrinsics, view, row, column, plane)
     sun = float(0.0)
     if wp.max(scene.lights.main_irradiance[which]) > 0.0:
         if wp.dot(surface.face_normal, turned(scene.lights.main_direction[which], turn)) > 0.0:

@@ -17,6 +17,8 @@ BLOCKS = wp.constant(4)
 """Blocks across the widest window."""
 MIDDLE_BLOCKS = wp.constant(4.0)
 """Blocks of the window between: 2 x 2."""
+RING = wp.constant(1)
+"""How many cells farther a pixel looks for its surface if none of the four about it is on it."""
 BODY_WEIGHT = wp.constant(0.02)
 """Weight of a cell on the same body but another surface: it calms places that have few like them around."""
 CERTAIN = wp.constant(1.0)
@@ -279,47 +281,79 @@ def soften_shares_kernel(
 
 
 @wp.func
+def pixel_plane(cells: CellGrid, intrinsics: wp.vec4, row: int, column: int, code: int, depth: float, normal: wp.vec3) -> Plane:
+    """The tangent plane of what a pixel shows; `normal` is in the camera's axes. `down` and `right` are from pixel to pixel."""
+    made = Plane()
+    made.code = wp.uint8(code)
+    made.normal = normal
+    made.facing = wp.dot(normal, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
+    made.down = normal[1] / intrinsics[1]
+    made.right = normal[0] / intrinsics[0]
+    made.height = depth * made.facing
+    made.tolerance = SAME_SURFACE * float(cells.size) * depth / intrinsics[0]
+    return made
+
+
+@wp.func
+def cell_likeness(guide: Guide, cells: CellGrid, plane: Plane, view: int, row: int, column: int, r: int, c: int) -> float:
+    """1 if the cell (r, c) is on the surface that the pixel (row, column) shows, LEAST_WEIGHT if on another, 0 if on none."""
+    code = guide.code[view, r, c]
+    if int(code) == NOTHING:
+        return 0.0
+    pixel = cell_pixel(cells, r, c)
+    slope = plane.facing + float(pixel[0] - row) * plane.down + float(pixel[1] - column) * plane.right
+    if code != plane.code or wp.abs(guide.depth[view, r, c] * slope - plane.height) > plane.tolerance:
+        return LEAST_WEIGHT
+    return 1.0
+
+
+@wp.func
+def with_cell(light: Light, shares: Shares, view: int, row: int, column: int, weight: float) -> Light:
+    """`light` with the shares of one more cell."""
+    made = Light()
+    made.diffuse = light.diffuse + weight * shares.diffuse[view, row, column]
+    made.gloss = light.gloss + weight * shares.gloss[view, row, column]
+    made.between = light.between + weight * shares.between[view, row, column]
+    return made
+
+
+@wp.func
 def gathered_share(
-    guide: Guide,
-    shares: Shares,
-    cells: CellGrid,
-    intrinsics: wp.vec4,
-    view: int,
-    row: int,
-    column: int,
-    code: int,
-    depth: float,
-    normal: wp.vec3,
+    guide: Guide, shares: Shares, cells: CellGrid, intrinsics: wp.vec4, view: int, row: int, column: int, plane: Plane
 ) -> Light:
     """Shares of even light at a pixel, from the four cells about it; those on other surfaces count next to nothing.
 
-    `normal` is the surface's, in the camera's axes.
+    If all four are on other surfaces, those around them are looked at too: light changes less along a surface than from one to another.
+    `plane` is the pixel's.
     """
-    facing = wp.dot(normal, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
     y = cell_place(cells, row)
     x = cell_place(cells, column)
     top = int(wp.floor(y))
     left = int(wp.floor(x))
-    tolerance = SAME_SURFACE * float(cells.size) * depth / intrinsics[0]
     made = Light()
     total = float(0.0)
+    most = float(0.0)
     for i in range(2):
         r = wp.clamp(top + i, 0, cells.cells.height - 1)
         vertical = 1.0 - wp.abs(y - float(top + i))
         for j in range(2):
             c = wp.clamp(left + j, 0, cells.cells.width - 1)
-            other = int(guide.code[view, r, c])
-            if other != NOTHING:
-                weight = vertical * (1.0 - wp.abs(x - float(left + j))) + LEAST_WEIGHT
-                pixel = cell_pixel(cells, r, c)
-                slope = facing + float(pixel[0] - row) * normal[1] / intrinsics[1] + float(pixel[1] - column) * normal[0] / intrinsics[0]
-                apart = wp.abs(guide.depth[view, r, c] * slope - depth * facing)
-                if other != code or apart > tolerance:
-                    weight *= LEAST_WEIGHT
-                made.diffuse += weight * shares.diffuse[view, r, c]
-                made.gloss += weight * shares.gloss[view, r, c]
-                made.between += weight * shares.between[view, r, c]
+            like = cell_likeness(guide, cells, plane, view, row, column, r, c)
+            if like > 0.0:
+                weight = like * (vertical * (1.0 - wp.abs(x - float(left + j))) + LEAST_WEIGHT)
+                made = with_cell(made, shares, view, r, c, weight)
                 total += weight
+                most = wp.max(most, like)
+    if most < 1.0:
+        # Not unrolled: few pixels come here.
+        ring = int(RING)
+        for i in range(-ring, 2 + ring):
+            r = wp.clamp(top + i, 0, cells.cells.height - 1)
+            for j in range(-ring, 2 + ring):
+                c = wp.clamp(left + j, 0, cells.cells.width - 1)
+                if cell_likeness(guide, cells, plane, view, row, column, r, c) == 1.0:
+                    made = with_cell(made, shares, view, r, c, 1.0)
+                    total += 1.0
     if total <= 0.0:
         # Nothing but background around: as if nothing stood in the way.
         made.diffuse = wp.vec3(1.0, 1.0, 1.0)

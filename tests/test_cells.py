@@ -198,7 +198,7 @@ def test_no_body_that_a_tiles_rays_meet_is_left_out(device, seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_bodies_are_listed_the_nearest_first(device, seed):
+def test_bodies_are_listed_the_nearest_first_and_the_tote_last(device, seed):
     toy = pile(np.random.default_rng(seed), 9)
     toy.fixtures_visible = (1, 0, 1)
     _, renderer = traced(toy, device)
@@ -207,4 +207,6 @@ def test_bodies_are_listed_the_nearest_first(device, seed):
     there = np.flatnonzero(mesh >= 0)
     assert present == len(there) == 11
     assert set(order[:present]) == set(there)
-    np.testing.assert_array_equal(order[:present], there[np.argsort(near[there], kind="stable")])
+    tote = toy.room
+    others = there[there != tote]
+    np.testing.assert_array_equal(order[:present], [*others[np.argsort(near[others], kind="stable")], tote])

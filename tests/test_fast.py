@@ -222,3 +222,20 @@ def test_scratch_follows_the_scenes_image_whatever_the_setting_says(device):
     shading = Renderer(config, scene, 1, 2).shading
     assert shading.guide.code.shape == shading.shares.gloss.shape == (2, 12, 16)
     assert shading.shadows.smooth.shape == (2, 24, 32)
+
+
+def test_edges_of_a_dark_pit_do_not_take_the_light_of_its_rim(device):
+    """Pixels of a pit's floor next to its rim, none of whose four cells lies on the floor."""
+    rim = [
+        (sheet(*size), surface(HALF), (sign * x, sign * y, 0.4, *UPRIGHT))
+        for size, x, y in (((0.4, 0.8), 0.27, 0.0), ((0.14, 0.4), 0.0, 0.27))
+        for sign in (-1.0, 1.0)
+    ]
+    things = [(sheet(0.5, 0.5), surface(HALF), (0.0, 0.0, 0.0, *UPRIGHT)), *rim]
+    view = camera(64, 48, 300.0, (0.0, 0.0, 2.0))
+    fast, path = (
+        shown(device, *things, view=view, room=5, config=settings(mode, cell=5, cell_paths=16, samples=256)) for mode in (FAST, REFERENCE)
+    )
+    floor = fast.instance[0] == 1
+    bright = [np.quantile(picture.radiance[0][floor].mean(axis=-1), 0.98) for picture in (fast, path)]
+    assert bright[0] < 1.1 * bright[1]
