@@ -20,6 +20,7 @@ from synpick_warp.kernels.hits import (
     hit_table,
     trace_candidates,
 )
+from synpick_warp.kernels.tangent import off_plane, pixel_plane
 
 wp.set_module_options({"enable_backward": False})
 
@@ -170,12 +171,8 @@ def like_pixel(
 ) -> int:
     """Number of the pixel about (row, column) that shows best what a ray `offset` [px] off its centre hit: the same body, near the tangent
     plane there, close by. The pixel itself, if none shows that body."""
-    # n . ray is linear in the image.
-    facing = wp.dot(normal, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
-    down = normal[1] / intrinsics[1]
-    right = normal[0] / intrinsics[0]
-    height = hit.depth * (facing + offset[1] * down + offset[0] * right)
-    per_width = intrinsics[0] / hit.depth
+    plane = pixel_plane(intrinsics, row, column, wp.uint8(hit.code), hit.depth, normal)
+    plane.height = hit.depth * (plane.facing + offset[1] * plane.down + offset[0] * plane.right)
     best = int(0)
     least = float(1.0e30)
     for number in range(AROUND):
@@ -184,11 +181,9 @@ def like_pixel(
         c = column + step[1]
         if r >= 0 and r < grid.height and c >= 0 and c < grid.width:
             if int(hits.code[view, r, c]) == hit.code:
-                y = float(step[0])
-                x = float(step[1])
-                apart = NEARNESS * wp.length(wp.vec2(x - offset[0], y - offset[1]))
+                apart = NEARNESS * wp.length(wp.vec2(float(step[1]) - offset[0], float(step[0]) - offset[1]))
                 if hit.code != NOTHING:
-                    apart += wp.abs(hits.depth[view, r, c] * (facing + y * down + x * right) - height) * per_width
+                    apart += off_plane(plane, step[0], step[1], hits.depth[view, r, c]) / plane.width
                 if apart < least:
                     least = apart
                     best = number

@@ -11,7 +11,8 @@ from synpick_warp.kernels.hits import NOTHING, RAY_REGISTERS, TABLE, Bodies, Hit
 from synpick_warp.kernels.paths import PathScene
 from synpick_warp.kernels.shadows import lit_share
 from synpick_warp.kernels.surfaces import base_color, mesh_surface, table_surface
-from synpick_warp.kernels.windows import Shares, gathered_share, pixel_plane
+from synpick_warp.kernels.tangent import pixel_plane
+from synpick_warp.kernels.windows import Shares, gathered_share
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -83,10 +84,10 @@ def shade_kernel(
     metallic = scene.surfaces.metallic[surface.row]
     brdf = brdf_at(scene.surfaces.gloss, color, metallic, scene.surfaces.roughness[surface.row], surface.normal, outgoing)
     normal = wp.transpose(cameras.to_world[camera]) * surface.face_normal
-    plane = pixel_plane(cells, intrinsics, row, column, code, depth, normal)
-    share = gathered_share(guide, shares, cells, intrinsics, view, row, column, plane)
+    plane = pixel_plane(intrinsics, row, column, hits.code[view, row, column], depth, normal)
+    share = gathered_share(guide, shares, cells, view, row, column, plane)
     sun = float(0.0)
     if wp.max(scene.lights.main_irradiance[which]) > 0.0:
         if wp.dot(surface.face_normal, turned(scene.lights.main_direction[which], turn)) > 0.0:
-            sun = lit_share(hits, lit, shadow_cells, intrinsics, view, row, column, code, depth, normal)
+            sun = lit_share(hits, lit, shadow_cells, view, row, column, plane)
     radiance_out[view, row, column] = lit_surface(scene.surfaces.gloss, scene.lights, which, turn, brdf, share, sun)

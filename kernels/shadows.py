@@ -7,6 +7,7 @@ from synpick_warp.kernels.cells import LEAST_WEIGHT, SAME_SURFACE, CellGrid, cel
 from synpick_warp.kernels.environment import Lights, turned
 from synpick_warp.kernels.hits import FAR, NOTHING, RAY_OFFSET, RAY_REGISTERS, TABLE, Bodies, Hits, Meshes, Table, body_of, is_blocked
 from synpick_warp.kernels.sampling import around, sobol_point
+from synpick_warp.kernels.tangent import Plane, off_plane, pixel_plane
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -109,10 +110,8 @@ def filter_shadows_kernel(
         return
     camera = view_camera[view]
     normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, hits, view, pixel[0], pixel[1], instances)
-    intrinsics = cameras.intrinsics[camera]
-    depth = hits.depth[view, pixel[0], pixel[1]]
-    facing = wp.dot(normal, camera_ray(intrinsics, pixel[0], pixel[1], wp.vec2(0.0, 0.0)))
-    tolerance = SAME_SURFACE * float(cells.size) * depth / intrinsics[0]
+    plane = pixel_plane(cameras.intrinsics[camera], pixel[0], pixel[1], code, hits.depth[view, pixel[0], pixel[1]], normal)
+    tolerance = SAME_SURFACE * float(cells.size) * plane.width
     seen = float(0.0)
     total = float(0.0)
     for i in range(cells.window):
@@ -123,9 +122,7 @@ def filter_shadows_kernel(
                 if c >= 0 and c < cells.cells.width:
                     other = cell_pixel(cells, r, c)
                     if hits.code[view, other[0], other[1]] == code:
-                        slope = facing + float(other[0] - pixel[0]) * normal[1] / intrinsics[1]
-                        slope += float(other[1] - pixel[1]) * normal[0] / intrinsics[0]
-                        if wp.abs(hits.depth[view, other[0], other[1]] * slope - depth * facing) < tolerance:
+                        if off_plane(plane, other[0] - pixel[0], other[1] - pixel[1], hits.depth[view, other[0], other[1]]) < tolerance:
                             seen += lit[view, r, c]
                             total += 1.0
     if total > 0.0:
@@ -135,25 +132,13 @@ def filter_shadows_kernel(
 
 
 @wp.func
-def lit_share(
-    hits: Hits,
-    lit: wp.array3d[float],
-    cells: CellGrid,
-    intrinsics: wp.vec4,
-    view: int,
-    row: int,
-    column: int,
-    code: int,
-    depth: float,
-    normal: wp.vec3,
-) -> float:
-    """Share of the main light that reaches a pixel, from the four cells about it; `normal` is the surface's, in the camera's axes."""
-    facing = wp.dot(normal, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
+def lit_share(hits: Hits, lit: wp.array3d[float], cells: CellGrid, view: int, row: int, column: int, plane: Plane) -> float:
+    """Share of the main light that reaches a pixel, from the four cells about it; `plane` is the pixel's."""
     y = cell_place(cells, row)
     x = cell_place(cells, column)
     top = int(wp.floor(y))
     left = int(wp.floor(x))
-    tolerance = SAME_SURFACE * float(cells.size) * depth / intrinsics[0]
+    tolerance = SAME_SURFACE * float(cells.size) * plane.width
     seen = float(0.0)
     total = float(0.0)
     for i in range(2):
@@ -163,9 +148,8 @@ def lit_share(
             c = wp.clamp(left + j, 0, cells.cells.width - 1)
             weight = vertical * (1.0 - wp.abs(x - float(left + j))) + LEAST_WEIGHT
             pixel = cell_pixel(cells, r, c)
-            slope = facing + float(pixel[0] - row) * normal[1] / intrinsics[1] + float(pixel[1] - column) * normal[0] / intrinsics[0]
-            apart = wp.abs(hits.depth[view, pixel[0], pixel[1]] * slope - depth * facing)
-            if int(hits.code[view, pixel[0], pixel[1]]) != code or apart > tolerance:
+            apart = off_plane(plane, pixel[0] - row, pixel[1] - column, hits.depth[view, pixel[0], pixel[1]])
+            if hits.code[view, pixel[0], pixel[1]] != plane.code or apart > tolerance:
                 weight *= LEAST_WEIGHT
             seen += weight * lit[view, r, c]
             total += weight

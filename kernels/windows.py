@@ -2,12 +2,13 @@
 
 import warp as wp
 
-from synpick_warp.kernels.camera_rays import Cameras, camera_ray, tile_pixel
+from synpick_warp.kernels.camera_rays import Cameras, tile_pixel
 from synpick_warp.kernels.cells import LEAST_WEIGHT, SAME_SURFACE, CellGrid, Guide, cell_pixel, cell_place
 from synpick_warp.kernels.color import luminance
 from synpick_warp.kernels.even_light import Light, ratio
 from synpick_warp.kernels.gather import Gathered
 from synpick_warp.kernels.hits import NOTHING
+from synpick_warp.kernels.tangent import Plane, off_plane, pixel_plane
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -34,34 +35,16 @@ class Shares:
     between: wp.array3d[wp.vec3]
 
 
-@wp.struct
-class Plane:
-    """The tangent plane of a cell's surface, as its neighbours in the image see it."""
-
-    code: wp.uint8
-    normal: wp.vec3
-    height: float
-    """Distance from the camera's centre, times a sign [m]."""
-    facing: float
-    """n . ray of the cell's own ray, and by how much n . ray changes from row to row and column to column: it is linear in the image."""
-    down: float
-    right: float
-    tolerance: float
-    """How far from the plane a cell may lie [m]."""
-
-
 @wp.func
 def plane_at(cells: CellGrid, guide: Guide, intrinsics: wp.vec4, view: int, row: int, column: int) -> Plane:
-    made = Plane()
+    """The tangent plane of what a cell shows; rows and columns are of cells."""
     pixel = cell_pixel(cells, row, column)
     depth = guide.depth[view, row, column]
-    made.code = guide.code[view, row, column]
-    made.normal = guide.normal[view, row, column]
-    made.facing = wp.dot(made.normal, camera_ray(intrinsics, pixel[0], pixel[1], wp.vec2(0.0, 0.0)))
-    made.down = float(cells.size) * made.normal[1] / intrinsics[1]
-    made.right = float(cells.size) * made.normal[0] / intrinsics[0]
-    made.height = depth * made.facing
-    made.tolerance = SAME_SURFACE * float(cells.size) * depth / intrinsics[0]
+    made = pixel_plane(intrinsics, pixel[0], pixel[1], guide.code[view, row, column], depth, guide.normal[view, row, column])
+    size = float(cells.size)
+    made.down = size * made.down
+    made.right = size * made.right
+    made.width = size * made.width
     return made
 
 
@@ -70,9 +53,8 @@ def likeness(guide: Guide, plane: Plane, view: int, row: int, column: int, down:
     """Weight of the cell at (row, column), so many cells down and right of the plane's own; 0 on another body."""
     if guide.code[view, row, column] != plane.code:
         return 0.0
-    slope = plane.facing + float(down) * plane.down + float(right) * plane.right
     weight = BODY_WEIGHT
-    if wp.abs(guide.depth[view, row, column] * slope - plane.height) < plane.tolerance * float(stride):
+    if off_plane(plane, down, right, guide.depth[view, row, column]) < SAME_SURFACE * plane.width * float(stride):
         cosine = wp.max(wp.dot(guide.normal[view, row, column], plane.normal), 0.0)
         square = cosine * cosine
         weight += square * square * square * square
@@ -281,28 +263,14 @@ def soften_shares_kernel(
 
 
 @wp.func
-def pixel_plane(cells: CellGrid, intrinsics: wp.vec4, row: int, column: int, code: int, depth: float, normal: wp.vec3) -> Plane:
-    """The tangent plane of what a pixel shows; `normal` is in the camera's axes. `down` and `right` are from pixel to pixel."""
-    made = Plane()
-    made.code = wp.uint8(code)
-    made.normal = normal
-    made.facing = wp.dot(normal, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
-    made.down = normal[1] / intrinsics[1]
-    made.right = normal[0] / intrinsics[0]
-    made.height = depth * made.facing
-    made.tolerance = SAME_SURFACE * float(cells.size) * depth / intrinsics[0]
-    return made
-
-
-@wp.func
 def cell_likeness(guide: Guide, cells: CellGrid, plane: Plane, view: int, row: int, column: int, r: int, c: int) -> float:
     """1 if the cell (r, c) is on the surface that the pixel (row, column) shows, LEAST_WEIGHT if on another, 0 if on none."""
     code = guide.code[view, r, c]
     if int(code) == NOTHING:
         return 0.0
     pixel = cell_pixel(cells, r, c)
-    slope = plane.facing + float(pixel[0] - row) * plane.down + float(pixel[1] - column) * plane.right
-    if code != plane.code or wp.abs(guide.depth[view, r, c] * slope - plane.height) > plane.tolerance:
+    apart = off_plane(plane, pixel[0] - row, pixel[1] - column, guide.depth[view, r, c])
+    if code != plane.code or apart > SAME_SURFACE * float(cells.size) * plane.width:
         return LEAST_WEIGHT
     return 1.0
 
@@ -318,9 +286,7 @@ def with_cell(light: Light, shares: Shares, view: int, row: int, column: int, we
 
 
 @wp.func
-def gathered_share(
-    guide: Guide, shares: Shares, cells: CellGrid, intrinsics: wp.vec4, view: int, row: int, column: int, plane: Plane
-) -> Light:
+def gathered_share(guide: Guide, shares: Shares, cells: CellGrid, view: int, row: int, column: int, plane: Plane) -> Light:
     """Shares of even light at a pixel, from the four cells about it; those on other surfaces count next to nothing.
 
     If all four are on other surfaces, those around them are looked at too: light changes less along a surface than from one to another.
