@@ -190,9 +190,10 @@ class _Run:
         batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
         if len(batch):
             self.exporters.tick(batch)
-        for views in self.factory.stream.render(snapshot, report):
-            self.exporters.write(views)
-            self.summary.views += len(views)
+        if self.exporters.views:
+            for views in self.factory.stream.render(snapshot, report):
+                self.exporters.write(views)
+                self.summary.views += len(views)
         records = self.factory.log.see(report)
         for world in np.flatnonzero(report.column("phase") == phases.OVER).tolist():
             self._end(report, world, records[int(report.column("episode")[world])])

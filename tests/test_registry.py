@@ -18,6 +18,7 @@ class Fake:
     """Remembers its calls; `whole` waits until it is let go."""
 
     records = False
+    views = False
     kept: tuple[str, ...] = ()
 
     def __init__(self, _: DataSet | None) -> None:
@@ -49,6 +50,7 @@ class Fake:
 
 class Other(Fake):
     records = True
+    views = True
     kept = ("b", "a")
 
     @staticmethod
@@ -94,3 +96,10 @@ def test_files_and_room_are_those_of_all():
     assert sorted(both.write_constants()) == [Path("a"), Path("b")]
     assert registry.slot_bytes((Fake, Other), None) == 9  # type: ignore[arg-type]
     assert registry.join((Fake, Other), None, None, None) == [Path("a"), Path("b")]  # type: ignore[arg-type]
+
+
+def test_views_and_records_are_asked_for_if_one_exporter_wants_them():
+    assert [(together.records, together.views) for together in (Exporters((Fake,), None), Exporters((Fake, Other), None))] == [
+        (False, False), (True, True),
+    ]  # fmt: skip
+    assert [kind.views for kind in exporter_kinds(FORMATS)] == [name in ("bop", "shards") for name in registry.EXPORTERS]

@@ -18,6 +18,7 @@ from synpick_warp import bake
 from synpick_warp.bake import run_bake
 from synpick_warp.configs.schema import Config
 from synpick_warp.progress import SilentProgress
+from synpick_warp.stages.stream import FrameStream
 from tests.exporter_contract import digests
 from tests.reference.sights import SHORT
 from tests.reference.small_worlds import catalog, settings
@@ -41,6 +42,8 @@ def out(tmp_path_factory, mixed) -> Path:
     folder = tmp_path_factory.mktemp("bake") / "set"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bake, "load_catalog", lambda config, report: catalog())
+        # Nobody asks for pictures.
+        patch.setattr(FrameStream, "render", lambda *_: pytest.fail("views were rendered"))
         run_bake(mixed, folder, SilentProgress())
         run_bake(replace(mixed, bake=replace(mixed.bake, worlds=3)), folder.with_name("again"), SilentProgress())
     return folder

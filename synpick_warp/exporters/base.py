@@ -43,6 +43,8 @@ class Exporter(Protocol):
 
     records: ClassVar[bool]
     """Whether ticks must come with their arrays `tick` and `steps`."""
+    views: ClassVar[bool]
+    """Whether there must be views; where no exporter asks for any, none are rendered."""
 
     def __init__(self, data_set: DataSet) -> None:
         """Writes nothing yet."""

@@ -45,6 +45,7 @@ class Exporters:
     def __init__(self, kinds: Iterable[type[Exporter]], data_set: DataSet) -> None:
         self._all = tuple(kind(data_set) for kind in kinds)
         self.records = any(exporter.records for exporter in self._all)
+        self.views = any(exporter.views for exporter in self._all)
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`; formats may share constants, which then are the same."""

@@ -41,6 +41,7 @@ class SceneExporter(ABC):
     """
 
     records = False
+    views = True
     hidden: ClassVar[str]
     """Folder in `PARTIAL`."""
     write_view: ClassVar[Callable[..., None]]

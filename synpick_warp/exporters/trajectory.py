@@ -53,6 +53,7 @@ class TrajectoryExporter:
     """
 
     records = True
+    views = False
 
     def __init__(self, data_set: DataSet) -> None:
         """See `Exporter`."""

@@ -29,6 +29,7 @@ class UsdExporter:
     """
 
     records = False
+    views = False
 
     def __init__(self, data_set: DataSet) -> None:
         """See `Exporter`."""
