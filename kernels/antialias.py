@@ -17,6 +17,7 @@ from synpick_warp.kernels.hits import (
     Meshes,
     Table,
     body_of,
+    face_normal,
     hit_table,
     trace_candidates,
 )
@@ -33,6 +34,8 @@ ROOKS = wp.constant(wp.types.matrix(shape=(8, 2), dtype=float)(
 """Where they pass [px from the pixel's centre]: no two in one of eight rows or columns (Direct3D's standard pattern of eight)."""
 BITS = wp.constant(4)
 """Of a sample in `Picture.mix`."""
+LOWEST = wp.constant(wp.uint32(15))
+"""The lowest BITS."""
 AROUND = wp.constant(9)
 """Pixels of a square of 3 x 3."""
 SEGMENT_TILES = wp.constant(32)
@@ -69,7 +72,7 @@ def pixel_radiance(picture: Picture, view: int, row: int, column: int) -> wp.vec
         return picture.radiance[view, row, column]
     total = wp.vec3(0.0, 0.0, 0.0)
     for sample in range(SAMPLES):
-        step = neighbour(int((mix >> wp.uint32(BITS * sample)) & wp.uint32(15)))
+        step = neighbour(int((mix >> wp.uint32(BITS * sample)) & LOWEST))
         total += picture.radiance[view, row + step[0], column + step[1]]
     return total / float(SAMPLES)
 
@@ -157,15 +160,6 @@ def seen_candidates(bodies: Bodies, view: int, tile: int, seen: wp.uint64) -> wp
 
 
 @wp.func
-def hit_normal(meshes: Meshes, bodies: Bodies, cameras: Cameras, camera: int, view: int, hit: Hit, instances: int) -> wp.vec3:
-    """Unit normal of the triangle or table that a ray hit, in the camera's axes; either side."""
-    if hit.code == TABLE:
-        return wp.transpose(cameras.to_world[camera]) * wp.vec3(0.0, 0.0, 1.0)
-    body = body_of(hit.code, instances)
-    return wp.transpose(bodies.turn[view, body]) * wp.mesh_eval_face_normal(meshes.id[bodies.mesh[view, body]], hit.triangle)
-
-
-@wp.func
 def like_pixel(
     hits: Hits, grid: ImageGrid, intrinsics: wp.vec4, view: int, row: int, column: int, offset: wp.vec2, hit: Hit, normal: wp.vec3
 ) -> int:
@@ -230,6 +224,6 @@ def mix_edges_kernel(
         hit = hit_table(table, cameras, camera, ray, hit)
         normal = wp.vec3(0.0, 0.0, 0.0)
         if hit.code != NOTHING:
-            normal = hit_normal(meshes, bodies, cameras, camera, view, hit, instances)
+            normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, view, hit, instances)
         best = like_pixel(hits, grid, intrinsics, view, row, column, offset, hit, normal)
         wp.atomic_or(mix_inout, view, row, column, wp.uint32(best) << wp.uint32(BITS * sample))

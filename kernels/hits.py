@@ -12,6 +12,8 @@ NOTHING = wp.constant(0)
 TABLE = wp.constant(252)
 FIRST_FIXTURE = wp.constant(253)
 """Codes of `frames`: 0 nothing, 1 + instance_id, 252 table, 253 tote, 254 finger, 255 cup."""
+FIXTURES = wp.constant(3)
+"""Tote, finger and cup, in this order, come after a world's instances, and their meshes after the catalog's."""
 FAR = wp.constant(1.0e30)
 """Stands for no hit yet [m]."""
 RAY_OFFSET = wp.constant(2.0e-4)
@@ -248,6 +250,15 @@ def read_hit(hits: Hits, view: int, row: int, column: int) -> Hit:
     hit.barycentric = hits.barycentric[view, row, column]
     hit.depth = hits.depth[view, row, column]
     return hit
+
+
+@wp.func
+def face_normal(meshes: Meshes, bodies: Bodies, view: int, hit: Hit, instances: int) -> wp.vec3:
+    """Unit normal, in the world, of the triangle or table that a ray hit; either side."""
+    if hit.code == TABLE:
+        return wp.vec3(0.0, 0.0, 1.0)
+    body = body_of(hit.code, instances)
+    return wp.transpose(bodies.world_turn[view, body]) * wp.mesh_eval_face_normal(meshes.id[bodies.mesh[view, body]], hit.triangle)
 
 
 @wp.kernel(cuda_max_registers=RAY_REGISTERS)

@@ -3,12 +3,10 @@
 import warp as wp
 
 from synpick_warp.kernels.camera_rays import PIXEL_CENTER, TILE_HEIGHT, TILE_WIDTH, Cameras, ImageGrid, camera_ray, projected_box
-from synpick_warp.kernels.hits import FAR, Bodies, Meshes, body_ray_start
+from synpick_warp.kernels.hits import FAR, FIXTURES, Bodies, Meshes, body_ray_start
 
 wp.set_module_options({"enable_backward": False})
 
-FIXTURES = wp.constant(3)
-"""Tote, finger and cup, in this order, come after a world's instances."""
 TILE_REACH = wp.constant(5.5)
 """Rays of a tile pass within this many pixels of the ray of its middle: half its diagonal, 4.5, and colour samples' offsets."""
 

@@ -5,22 +5,23 @@ import warp as wp
 from synpick_warp.kernels.camera_rays import Cameras, camera_ray, hit_position, tile_pixel
 from synpick_warp.kernels.cells import LEAST_WEIGHT, SAME_SURFACE, CellGrid, cell_number, cell_pixel, cell_place
 from synpick_warp.kernels.environment import Lights, turned
-from synpick_warp.kernels.hits import FAR, NOTHING, RAY_OFFSET, RAY_REGISTERS, TABLE, Bodies, Hits, Meshes, Table, body_of, is_blocked
+from synpick_warp.kernels.hits import (
+    FAR,
+    NOTHING,
+    RAY_OFFSET,
+    RAY_REGISTERS,
+    Bodies,
+    Hits,
+    Meshes,
+    Table,
+    face_normal,
+    is_blocked,
+    read_hit,
+)
 from synpick_warp.kernels.sampling import around, sobol_point
 from synpick_warp.kernels.tangent import Plane, off_plane, pixel_plane
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
-
-
-@wp.func
-def face_normal(meshes: Meshes, bodies: Bodies, hits: Hits, view: int, row: int, column: int, instances: int) -> wp.vec3:
-    """Unit normal, in the world, of the triangle or table that a pixel shows; either side."""
-    code = int(hits.code[view, row, column])
-    if code == TABLE:
-        return wp.vec3(0.0, 0.0, 1.0)
-    body = body_of(code, instances)
-    local = wp.mesh_eval_face_normal(meshes.id[bodies.mesh[view, body]], hits.triangle[view, row, column])
-    return wp.transpose(bodies.world_turn[view, body]) * local
 
 
 @wp.kernel(cuda_max_registers=RAY_REGISTERS)
@@ -57,7 +58,7 @@ def cast_shadow_rays_kernel(
     if wp.max(lights.main_irradiance[which]) > 0.0 and int(hits.code[view, pixel[0], pixel[1]]) != NOTHING:
         camera = view_camera[view]
         ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
-        normal = face_normal(meshes, bodies, hits, view, pixel[0], pixel[1], instances)
+        normal = face_normal(meshes, bodies, view, read_hit(hits, view, pixel[0], pixel[1]), instances)
         if wp.dot(normal, cameras.to_world[camera] * ray) > 0.0:
             normal = -normal
         middle = turned(lights.main_direction[which], light_turn[view_world[view]])
@@ -109,7 +110,7 @@ def filter_shadows_kernel(
         lit_out[view, row, column] = 1.0
         return
     camera = view_camera[view]
-    normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, hits, view, pixel[0], pixel[1], instances)
+    normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, view, read_hit(hits, view, pixel[0], pixel[1]), instances)
     plane = pixel_plane(cameras.intrinsics[camera], pixel[0], pixel[1], code, hits.depth[view, pixel[0], pixel[1]], normal)
     tolerance = SAME_SURFACE * float(cells.size) * plane.width
     seen = float(0.0)

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.brdf import Gloss
-from synpick_warp.kernels.hits import Bodies, Meshes
+from synpick_warp.kernels.hits import FIXTURES, Bodies, Meshes
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,7 +65,7 @@ def towards(normal: wp.vec3, reference: wp.vec3) -> wp.vec3:
 def table_surface(meshes: Meshes, view_direction: wp.vec3) -> Surface:
     """The table's surface; `view_direction` points to the camera."""
     result = Surface()
-    result.row = meshes.entries + 3
+    result.row = meshes.entries + FIXTURES
     result.face_normal = towards(wp.vec3(0.0, 0.0, 1.0), view_direction)
     result.normal = result.face_normal
     return result

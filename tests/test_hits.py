@@ -12,6 +12,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import hits
 from synpick_warp.scenes.meshes import read_mesh
 from synpick_warp.scenes.shapes import Fixture
+from synpick_warp.stages import buffers
 from tests.reference.raycast import cast_scene
 from tests.reference.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, render, sheet
 
@@ -31,6 +32,7 @@ def random_quaternion(rng):
 def test_codes_are_those_of_the_frames():
     codes = [hits.NOTHING, hits.TABLE, hits.FIRST_FIXTURE, hits.FIRST_FIXTURE + 1, hits.FIRST_FIXTURE + 2]
     assert [int(code) for code in codes] == [frames.NOTHING, frames.TABLE, frames.TOTE, frames.FINGER, frames.CUP]
+    assert hits.FIXTURES == len(buffers.FIXTURES)
 
 
 def test_a_ball_shows_its_area_and_its_nearest_depth(device):
