@@ -32,7 +32,7 @@ def random_quaternion(rng):
 def test_codes_are_those_of_the_frames():
     codes = [hits.NOTHING, hits.TABLE, hits.FIRST_FIXTURE, hits.FIRST_FIXTURE + 1, hits.FIRST_FIXTURE + 2]
     assert [int(code) for code in codes] == [frames.NOTHING, frames.TABLE, frames.TOTE, frames.FINGER, frames.CUP]
-    assert hits.FIXTURES == len(buffers.FIXTURES)
+    assert len(buffers.FIXTURES) == hits.FIXTURES
 
 
 def test_a_ball_shows_its_area_and_its_nearest_depth(device):
