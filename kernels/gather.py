@@ -12,7 +12,7 @@ from synpick_warp.kernels.cells import CellGrid, Guide, cell_number, cell_pixel,
 from synpick_warp.kernels.draws import PATHS, stream_key
 from synpick_warp.kernels.even_light import even_light
 from synpick_warp.kernels.hits import NOTHING, Bodies, Hits, read_hit
-from synpick_warp.kernels.paths import PathRules, PathScene, Place, Reflected, reflected_light, vertex_at
+from synpick_warp.kernels.paths import ENDED, PathRules, PathScene, Place, Reflected, begun, scattered, vertex_at
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -112,11 +112,17 @@ def gather_kernel(
     even = even_light(scene.lights, place.light, place.turn, vertex.brdf)
     number = cell_number(PERIOD, row, column) * rules.samples
     sum = Reflected()
-    for sample in range(rules.samples):
-        reflected = reflected_light(scene, bodies, rules, place, number + sample, vertex, width)
-        sum.diffuse += limited(reflected.diffuse, most_share * even.diffuse)
-        sum.between += limited(reflected.between, most_share * even.diffuse)
-        sum.gloss += limited(reflected.gloss, most_share * even.gloss)
+    # One loop over all scatterings of all paths: a thread whose path ends early begins the next while others of its warp go on.
+    sample = int(0)
+    path = begun(vertex, width)
+    while sample < rules.samples:
+        path = scattered(scene, bodies, rules, place, number + sample, vertex.brdf.diffuse, path)
+        if path.bounce == ENDED:
+            sum.diffuse += limited(path.found.diffuse, most_share * even.diffuse)
+            sum.between += limited(path.found.between, most_share * even.diffuse)
+            sum.gloss += limited(path.found.gloss, most_share * even.gloss)
+            path = begun(vertex, width)
+            sample += 1
     gathered_out.diffuse[view, row, column] = sum.diffuse / float(rules.samples)
     gathered_out.between[view, row, column] = sum.between / float(rules.samples)
     gathered_out.gloss[view, row, column] = sum.gloss / float(rules.samples)

@@ -128,7 +128,7 @@ def lies_in(room: Room, point: wp.vec3) -> bool:
 @wp.func
 def misses_tote(room: Room, start: wp.vec3, direction: wp.vec3, reach: float) -> bool:
     """Whether it is plain that a ray meets no triangle of the tote before `reach`: what of it is no higher than the tote begins and ends in
-    the room, which is convex. Most rays to lights, and those that meet an object in the tote, are spared its tree thus."""
+    the room, which is convex. Camera rays that meet an object in the tote are spared its tree thus; for those of paths it does not pay."""
     begin = float(0.0)
     end = float(reach)
     if direction[2] > 0.0:
@@ -362,7 +362,6 @@ def is_blocked(
             turn = bodies.world_turn[view, body]
             start = turn * (origin - bodies.position[view, body])
             local = turn * direction
-            if body != instances or not misses_tote(meshes.room, start, local, reach):
-                if wp.mesh_query_ray_anyhit(meshes.id[bodies.mesh[view, body]], start, local, reach):
-                    return True
+            if wp.mesh_query_ray_anyhit(meshes.id[bodies.mesh[view, body]], start, local, reach):
+                return True
     return False

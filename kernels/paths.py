@@ -24,7 +24,6 @@ from synpick_warp.kernels.hits import (
     body_of,
     hit_table,
     is_blocked,
-    misses_tote,
     trace_camera_ray,
 )
 from synpick_warp.kernels.sampling import Chances, LightSample, light_density, sample_light, scrambled_point
@@ -42,6 +41,7 @@ MOST_POINT = wp.constant(0.99999994)
 """The largest float32 below 1."""
 DIMENSIONS = wp.constant(3)
 """Points in the unit square that a scattering takes: light, surface, and (lobe, roulette)."""
+ENDED = wp.constant(-1)
 SCATTERED_SPREAD = wp.constant(0.1)
 """A path's width grows by this much per metre [m/m] after it met a rough surface, so that textures it meets later are read coarsely."""
 
@@ -120,6 +120,19 @@ class Vertex:
     brdf: Brdf
 
 
+@wp.struct
+class Path:
+    """A path on its way: what it has found, and the surface at its end, at which it will scatter next."""
+
+    found: Reflected
+    through: Through
+    vertex: Vertex
+    bounce: int
+    """Scatterings so far; ENDED: it will not scatter."""
+    width: float
+    """Of what it stands for, across it [m]."""
+
+
 @wp.func
 def nearest_hit(scene: PathScene, bodies: Bodies, view: int, instances: int, origin: wp.vec3, direction: wp.vec3) -> Hit:
     """The nearest hit of a ray along a unit vector, all in the world; `depth` is the distance [m]. The companion of `is_blocked`."""
@@ -139,15 +152,14 @@ def nearest_hit(scene: PathScene, bodies: Bodies, view: int, instances: int, ori
             turn = bodies.world_turn[view, body]
             start = turn * (origin - bodies.position[view, body])
             local = turn * direction
-            if body != instances or not misses_tote(scene.meshes.room, start, local, best.depth):
-                query = wp.mesh_query_ray(scene.meshes.id[bodies.mesh[view, body]], start, local, best.depth)
-                if query.result:
-                    best.depth = query.t
-                    best.triangle = query.face
-                    best.barycentric = wp.vec2(query.u, query.v)
-                    best.code = body + 1
-                    if body >= instances:
-                        best.code = FIRST_FIXTURE + body - instances
+            query = wp.mesh_query_ray(scene.meshes.id[bodies.mesh[view, body]], start, local, best.depth)
+            if query.result:
+                best.depth = query.t
+                best.triangle = query.face
+                best.barycentric = wp.vec2(query.u, query.v)
+                best.code = body + 1
+                if body >= instances:
+                    best.code = FIRST_FIXTURE + body - instances
     return best
 
 
@@ -256,48 +268,59 @@ def escaped_light(scene: PathScene, rules: PathRules, place: Place, light: int, 
 
 
 @wp.func
-def reflected_light(
-    scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, number: int, first: Vertex, spread: float
-) -> Reflected:
-    """What the surface at the vertex `first` reflects of the light that path `number` finds; `spread` is the path's width there [m]."""
-    total = Reflected()
-    through = Through()
-    vertex = first
-    width = float(spread)
-    light = place.first_light
-    for bounce in range(rules.bounces):
-        dimension = 1 + DIMENSIONS * bounce
-        direct = direct_light(scene, bodies, rules, place, light, vertex, path_point(place, number, dimension))
-        if wp.max(direct.radiance) > 0.0:
-            parts = evaluate_parts(scene.surfaces.gloss, vertex.brdf, direct.direction)
-            total = lit(total, extended(through, parts, vertex.brdf.diffuse, bounce), direct.radiance, bounce)
+def begun(first: Vertex, width: float) -> Path:
+    """A path from the surface that the camera sees; `width` is its own there [m]."""
+    path = Path()
+    path.vertex = first
+    path.width = width
+    return path
 
-        choice = path_point(place, number, dimension + 2)
-        direction = scatter(vertex.brdf, choice[0], path_point(place, number, dimension + 1))
-        drawn_density = density(vertex.brdf, direction)
-        if drawn_density <= 0.0 or wp.dot(direction, vertex.face_normal) <= 0.0:
-            break
-        parts = evaluate_parts(scene.surfaces.gloss, vertex.brdf, direction)
-        through = extended(through, parts, vertex.brdf.diffuse, bounce)
-        through.diffuse = through.diffuse / drawn_density
-        through.gloss = through.gloss / drawn_density
-        if bounce >= rules.roulette:
-            luck = wp.min(wp.max(wp.cw_mul(first.brdf.diffuse, through.diffuse) + through.gloss), MOST_LUCK)
-            if choice[1] >= luck:
-                break
-            through.diffuse = through.diffuse / luck
-            through.gloss = through.gloss / luck
-        hit = nearest_hit(scene, bodies, place.view, rules.instances, vertex.origin, direction)
-        if hit.code == NOTHING:
-            total = lit(total, through, escaped_light(scene, rules, place, light, direction, drawn_density), bounce)
-            break
-        if bounce + 1 == rules.bounces:
-            break
-        width += SCATTERED_SPREAD * vertex.brdf.roughness * hit.depth
-        position = vertex.origin + hit.depth * direction
-        vertex = vertex_at(scene, bodies, place.view, rules.instances, hit, position, -direction, width, rules.least_roughness)
-        light = place.light
-    return total
+
+@wp.func
+def scattered(scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, number: int, first_diffuse: wp.vec3, path: Path) -> Path:
+    """Path `number` after it has scattered once more: with the light that it found so, at its next surface or ENDED.
+
+    `first_diffuse` is the diffuse colour of its first surface, by which all diffuse light will be multiplied.
+    """
+    bounce = path.bounce
+    light = place.light
+    if bounce == 0:
+        light = place.first_light
+    made = path
+    made.bounce = ENDED
+    dimension = 1 + DIMENSIONS * bounce
+    direct = direct_light(scene, bodies, rules, place, light, path.vertex, path_point(place, number, dimension))
+    if wp.max(direct.radiance) > 0.0:
+        parts = evaluate_parts(scene.surfaces.gloss, path.vertex.brdf, direct.direction)
+        made.found = lit(made.found, extended(path.through, parts, path.vertex.brdf.diffuse, bounce), direct.radiance, bounce)
+
+    choice = path_point(place, number, dimension + 2)
+    direction = scatter(path.vertex.brdf, choice[0], path_point(place, number, dimension + 1))
+    drawn_density = density(path.vertex.brdf, direction)
+    if drawn_density <= 0.0 or wp.dot(direction, path.vertex.face_normal) <= 0.0:
+        return made
+    parts = evaluate_parts(scene.surfaces.gloss, path.vertex.brdf, direction)
+    through = extended(path.through, parts, path.vertex.brdf.diffuse, bounce)
+    scale = 1.0 / drawn_density
+    if bounce >= rules.roulette:
+        luck = wp.min(scale * wp.max(wp.cw_mul(first_diffuse, through.diffuse) + through.gloss), MOST_LUCK)
+        if choice[1] >= luck:
+            return made
+        scale = scale / luck
+    through.diffuse = through.diffuse * scale
+    through.gloss = through.gloss * scale
+    hit = nearest_hit(scene, bodies, place.view, rules.instances, path.vertex.origin, direction)
+    if hit.code == NOTHING:
+        made.found = lit(made.found, through, escaped_light(scene, rules, place, light, direction, drawn_density), bounce)
+        return made
+    if bounce + 1 == rules.bounces:
+        return made
+    made.through = through
+    made.width = path.width + SCATTERED_SPREAD * path.vertex.brdf.roughness * hit.depth
+    position = path.vertex.origin + hit.depth * direction
+    made.vertex = vertex_at(scene, bodies, place.view, rules.instances, hit, position, -direction, made.width, rules.least_roughness)
+    made.bounce = bounce + 1
+    return made
 
 
 @wp.kernel
@@ -352,6 +375,9 @@ def trace_paths_kernel(
             start = hit_position(cameras, camera, ray, hit.depth)
             width = footprint * hit.depth
             vertex = vertex_at(scene, bodies, view, rules.instances, hit, start, -direction, width, 0.0)
-            reflected = reflected_light(scene, bodies, rules, place, number, vertex, width)
-            total += wp.cw_mul(vertex.brdf.diffuse, reflected.diffuse + reflected.between) + reflected.gloss
+            diffuse = vertex.brdf.diffuse
+            path = begun(vertex, width)
+            while path.bounce != ENDED:
+                path = scattered(scene, bodies, rules, place, number, diffuse, path)
+            total += wp.cw_mul(diffuse, path.found.diffuse + path.found.between) + path.found.gloss
     radiance_out[view, row, column] = total / float(rules.samples)

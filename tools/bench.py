@@ -226,7 +226,7 @@ def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], objec
             "filter light": lambda: shading.filter(camera, count),
             "shadows of the main light": lambda: shading.cast_shadows(snapshot, bodies, hits, world, camera, count),
             "shade": lambda: shading.light(snapshot, bodies, hits, world, camera, count, picture.radiance),
-            "anti-alias": lambda: shading.smooth(bodies, hits, camera, count, picture.mix),
+            "anti-alias": lambda: shading.smooth(bodies, hits, camera, count, picture),
         }
     else:
         stages["trace paths"] = lambda: shading.shade(snapshot, bodies, hits, world, camera, count, picture)

@@ -77,16 +77,16 @@ class ShadowArrays:
 
 
 @dataclass(frozen=True, eq=False)
-class EdgePixels:
-    """Pixels that anti-aliasing works on."""
+class Edges:
+    """Squares between the centres of four pixels that anti-aliasing works on."""
 
-    place: wp.array = device_array("view", "segment", "segment_pixel", dtype=wp.int32)
-    """Row times width plus column of each; a segment is a run of tiles."""
+    place: wp.array = device_array("view", "segment", "segment_square", dtype=wp.int32)
+    """Row times columns plus column of each; a segment is a run of tiles of squares."""
     number: wp.array = device_array("view", "segment", dtype=wp.int32)
     """How many there are."""
 
 
-FAST_SCRATCH = ((GuideArrays, 1), (GatheredArrays, 2), (ShareArrays, 2), (ShadowArrays, 1), (EdgePixels, 1))
+FAST_SCRATCH = ((GuideArrays, 1), (GatheredArrays, 2), (ShareArrays, 2), (ShadowArrays, 1), (Edges, 1))
 """What `FastPicture` allocates, and how often."""
 
 
@@ -99,14 +99,14 @@ def cell_sizes(config: Config, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions that the arrays here name beside the view, for images of `width` x `height` px."""
     size = cell_size(config, width)
     shadow = max(1, size // 2)
-    segments = -(-build_grid(width, height).tiles // int(SEGMENT_TILES)) if config.render.antialias else 0
+    segments = -(-square_grid(width, height).tiles // int(SEGMENT_TILES)) if config.render.antialias else 0
     return {
         "cell_row": -(-height // size),
         "cell_column": -(-width // size),
         "shadow_row": -(-height // shadow),
         "shadow_column": -(-width // shadow),
         "segment": segments,
-        "segment_pixel": int(SEGMENT_TILES) * int(TILE_PIXELS),
+        "segment_square": int(SEGMENT_TILES) * int(TILE_PIXELS),
     }
 
 
@@ -118,6 +118,11 @@ def cell_grid(image: Any, size: int, window: int) -> Any:
     grid.image = image
     grid.cells = build_grid(-(-image.width // size), -(-image.height // size))
     return grid
+
+
+def square_grid(width: int, height: int) -> Any:
+    """The struct `ImageGrid` of the squares between pixels' centres, and of the halves of such at an image's rim."""
+    return build_grid(width + 1, height + 1)
 
 
 def spread_threads(cells: Any) -> int:
@@ -151,7 +156,8 @@ class FastPicture:
         self.chosen, self.shares = (filled(Shares, allocate(ShareArrays, sizes, scene.device)) for _ in range(2))
         self.shadows = allocate(ShadowArrays, sizes, scene.device)
         self.antialias = config.render.antialias
-        self.edges = allocate(EdgePixels, sizes, scene.device)
+        self.squares = square_grid(scene.width, scene.height)
+        self.edges = allocate(Edges, sizes, scene.device)
 
     def shade(
         self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int, picture: Any
@@ -172,7 +178,7 @@ class FastPicture:
         self.cast_shadows(snapshot, bodies, hits, view_world, view_camera, count)
         self.light(snapshot, bodies, hits, view_world, view_camera, count, picture.radiance)
         if self.antialias:
-            self.smooth(bodies, hits, view_camera, count, picture.mix)
+            self.smooth(bodies, hits, view_camera, count, picture)
 
     def gather(self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int) -> None:
         """Trace the cells' paths."""
@@ -214,19 +220,20 @@ class FastPicture:
         inputs += [self.guide, self.shares, self.shadows.smooth, view_world, view_camera, self.rules.instances]
         self._launch(shade_kernel, scene.grid, count, inputs, [radiance])
 
-    def smooth(self, bodies: Any, hits: Any, view_camera: wp.array, count: int, mix: wp.array) -> None:
-        """Which pixels' radiance those on edges show."""
+    def smooth(self, bodies: Any, hits: Any, view_camera: wp.array, count: int, picture: Any) -> None:
+        """Which pixels' radiance those on edges show: `mix` of the struct `Picture`."""
         scene, edges = self.scene, self.edges
         edges.number.zero_()
-        # Atomics of a launch on the CPU hold in one thread alone, so it is not cut into pieces.
-        pixels = count * scene.grid.tiles * int(TILE_PIXELS)
-        inputs = [scene.cameras, scene.grid, hits, view_camera]
-        outputs = [mix, edges.place, edges.number]
-        wp.launch(find_edges_kernel, dim=pixels, inputs=inputs, outputs=outputs, device=scene.device, block_dim=BLOCK)
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, bodies, hits, edges.place, edges.number, view_camera]
+        # Atomics of a launch on the CPU hold in one thread alone, so these are not cut into pieces.
+        inputs = [scene.cameras, scene.grid, self.squares, hits, picture.radiance, view_camera]
+        outputs = [picture.mix, edges.place, edges.number]
+        squares = count * self.squares.tiles * int(TILE_PIXELS)
+        wp.launch(find_edges_kernel, dim=squares, inputs=inputs, outputs=outputs, device=scene.device, block_dim=BLOCK)
         threads = EDGE_THREADS if scene.device.is_cuda else int(SAMPLES)
-        inputs += [self.rules.instances, threads]
-        launch_pixels(mix_edges_kernel, count * edges.number.shape[1] * threads, inputs, [mix], scene.device)
+        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.squares, bodies, hits, edges.place, edges.number]
+        inputs += [view_camera, self.rules.instances, threads]
+        samples = count * edges.number.shape[1] * threads
+        wp.launch(mix_edges_kernel, dim=samples, inputs=inputs, outputs=[picture.mix], device=scene.device, block_dim=BLOCK)
 
     def _launch(self, kernel: wp.Kernel, grid: Any, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         launch_pixels(kernel, count * grid.tiles * int(TILE_PIXELS), inputs, outputs, self.scene.device)
