@@ -117,7 +117,8 @@ def test_a_bodys_edge_over_itself_is_told_by_depth(device):
 
 def test_a_boxs_edge_mixes_its_two_sides(device):
     """A box that turns an edge to the camera: left of it one side, right of it the other."""
-    picture = shown(device, (box(0.1, 0.3, 0.1), turned(0.003, 0.0, 0.0, np.pi / 4, axis=1), (0.9, 0.9, 0.9)), lights=(sun((0.7, 0.0, 0.7)),))
+    ridged = (box(0.1, 0.3, 0.1), turned(0.003, 0.0, 0.0, np.pi / 4, axis=1), (0.9, 0.9, 0.9))
+    picture = shown(device, ridged, lights=(sun((0.7, 0.0, 0.7)),))
     ridge = VIEW.matrix[0, 2] + 0.003 / (2.0 - 0.1 / np.sqrt(2.0)) * VIEW.matrix[0, 0]
     column = int(ridge)
     source = sources(picture)[10:30, column]
