@@ -38,7 +38,7 @@ class Bake:
         choices=(*MODES, MIXED),
     )
     mix: tuple[float, float, float] = setting((1.0, 1.0, 1.0), "", "With mode mixed: weights of pick, target and move.", low=0.0, high=1000)
-    worlds: int = setting(4, "", "Totes simulated side by side.", low=1, high=65536)
+    worlds: int = setting(4, "", "Totes simulated side by side; a GPU has at least 8.", low=1, high=65536)
     episodes: int = setting(4, "", "Sequences to make; each becomes one BOP scene a camera.", low=1)
     seed: int = setting(0, "", "Every random draw follows from it.", low=0, high=2**63 - 1)
     device: str = setting("auto", "", "cpu, cuda:N, or auto: the first GPU if there is one.")
@@ -295,7 +295,7 @@ class Render:
         0.3, "stops", "Each episode's exposure is off by up to so much, evenly: cameras step by a third of a stop.", low=0.0, high=5.0
     )
     cell: int = setting(
-        0, "px", "With mode fast: paths start from the middles of cells so wide; 0: as many px as make 480 cells across.", low=0, high=64
+        0, "px", "With mode fast: paths start from the middles of cells so wide; 0: as many px as leave 384 across.", low=0, high=64
     )
     cell_paths: int = setting(2, "", "With mode fast: paths a cell; powers of two are spread most evenly.", low=1, high=1024)
     antialias: bool = setting(True, "", "With mode fast: a pixel where surfaces meet mixes their colours; reference always does.")

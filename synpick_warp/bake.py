@@ -42,6 +42,7 @@ from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch, edge_sizes
 from synpick_warp.stages.fast import FAST_SCRATCH, cell_sizes
 from synpick_warp.stages.layers import MOVING, MotionArrays
 from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
+from synpick_warp.stages.physics import with_enough_worlds
 from synpick_warp.stages.plan import CycleArrays, VoteArrays, plan_sizes
 from synpick_warp.stages.record import record_kinds, record_sizes
 from synpick_warp.stages.render import PictureArrays, Renderer
@@ -79,6 +80,7 @@ def build_factory(
         SynpickError: Device, models, lights, tote or cameras cannot be used.
     """
     device = pick_device(config.bake.device)
+    config = with_enough_worlds(config, device)
     progress.stage("loading objects and lights")
     cameras = make_cameras(config.cameras)
     fixtures = (tote_fixture(config.tote), finger_fixture(config.gripper), cup_fixture(config.gripper))
@@ -244,6 +246,7 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     Newton's own arrays come on top. Body slots are counted at their most: as many for each kind as there is room for objects.
     """
     device: wp.Device = pick_device(config.bake.device)
+    config = with_enough_worlds(config, device)
     room = config.arrangement.max_objects
     worlds = world_sizes(config, build.GRIPPER_BODIES + 2 * room)
     views = view_sizes(config, device)

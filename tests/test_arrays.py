@@ -13,7 +13,7 @@ from synpick_warp.device import pick_device
 from synpick_warp.stages.bodies import BodyArrays, HitArrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch
-from synpick_warp.stages.fast import EdgePixels, GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_sizes
+from synpick_warp.stages.fast import Edges, GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_sizes
 from synpick_warp.stages.layers import MotionArrays
 from synpick_warp.stages.perceive import SightScratch, count_views
 from synpick_warp.stages.plan import CycleArrays, VoteArrays
@@ -29,7 +29,7 @@ NAMES = (
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
     WorldState, AttemptState, SealState, LastFrame, Sighting, Plan, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays,
-    PictureArrays, EdgeBuffers, EdgeScratch, GuideArrays, GatheredArrays, ShareArrays, ShadowArrays, EdgePixels,
+    PictureArrays, EdgeBuffers, EdgeScratch, GuideArrays, GatheredArrays, ShareArrays, ShadowArrays, Edges,
 ]  # fmt: skip
 LOOKING = [LookArrays, SightScratch, VoteArrays, CycleArrays]
 LAYERS = [LayerBuffers, MotionArrays]
@@ -86,7 +86,7 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
 
 
 @pytest.mark.parametrize(
-    ("cell", "width", "shape"), [(0, 8, (6, 8, 6, 8)), (0, 1920, (2, 480, 3, 960)), (3, 8, (2, 3, 6, 8)), (64, 8, (1,) * 4)]
+    ("cell", "width", "shape"), [(0, 8, (6, 8, 6, 8)), (0, 960, (3, 480, 6, 960)), (0, 1920, (2, 384, 3, 960)), (3, 8, (2, 3, 6, 8)), (64, 8, (1,) * 4)]
 )
 def test_cells_cover_the_image(cell, width, shape):
     sizes = cell_sizes(settings(render__cell=cell), width, 6)

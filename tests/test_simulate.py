@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from synpick_warp.outcome import Ending
 from synpick_warp.scenes import build
 from synpick_warp.stages import arrange
 from synpick_warp.stages.constants import GRIPPER_HOME
+from synpick_warp.stages.physics import with_enough_worlds
 from synpick_warp.stages.simulate import Simulation
 from tests.reference.small_worlds import ANGLE, BOX, CUBE, catalog, report, run_ticks, settings
 
@@ -313,3 +316,10 @@ def test_a_pile_without_time_is_unsettled(device):
     expected = [(*settle, 0)] * (ticks - 1) + [(*over, 0)] + [(*settle, 1)] * (ticks - 1) + [(*over, 1)]
     assert rows[: 2 * ticks] == expected
     assert [row[0] for row in rows[2 * ticks :]] == [phases.IDLE] * (6 - 2 * ticks)
+
+
+@pytest.mark.parametrize(("cuda", "asked", "made"), [(True, 1, 8), (True, 7, 8), (True, 8, 8), (True, 64, 64), (False, 1, 1)])
+def test_a_gpu_gets_worlds_enough_that_their_number_does_not_matter(cuda, asked, made):
+    config = with_enough_worlds(settings(bake__worlds=asked), SimpleNamespace(is_cuda=cuda))  # pyright: ignore[reportArgumentType]
+    assert config.bake.worlds == made
+    assert replace(config, bake=replace(config.bake, worlds=asked)) == settings(bake__worlds=asked)

@@ -22,8 +22,8 @@ from synpick_warp.stages.launch import BLOCK, launch_pixels
 from synpick_warp.stages.reference import path_rules
 from synpick_warp.stages.render_scene import RenderScene, build_grid
 
-CELLS_ACROSS = 480
-"""Cells in a picture's width if the setting leaves their size open: 1.5 mm wide at the bottom of the tote."""
+CELLS_ACROSS = 384
+"""Cells in a picture's width, or a few more, if the setting leaves their size open: 1.9 mm wide at the bottom of the tote."""
 SHADOW_WINDOW = 4
 """Width of the window that shares shadow rays among cells: 16 rays find how much of a lamp is hidden."""
 LEAST_ROUGHNESS = 0.3
@@ -92,7 +92,7 @@ FAST_SCRATCH = ((GuideArrays, 1), (GatheredArrays, 2), (ShareArrays, 2), (Shadow
 
 def cell_size(config: Config, width: int) -> int:
     """Width of a cell of a fast picture of this width [px]."""
-    return config.render.cell or max(1, round(width / CELLS_ACROSS))
+    return config.render.cell or max(1, width // CELLS_ACROSS)
 
 
 def cell_sizes(config: Config, width: int, height: int) -> dict[str, int]:

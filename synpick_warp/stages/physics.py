@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Protocol
 
 import newton
@@ -18,6 +19,20 @@ from synpick_warp.scenes import build
 CONTACT_GAP = 0.1
 # A joint limit's row is made when the joint comes this near to it [rad].
 JOINT_LIMIT_GAP = 0.2
+# On a GPU, models of one and two worlds round otherwise than those of 8 to 512, which agree bit by bit (tools/compare_worlds.py, H200).
+LEAST_GPU_WORLDS = 8
+
+
+def with_enough_worlds(config: Config, device: wp.Device) -> Config:
+    """The settings with so many worlds that an episode does not depend on their number. Those that get no episode rest.
+
+    Args:
+        config: All settings.
+        device: Where the worlds will be.
+    """
+    if not device.is_cuda or config.bake.worlds >= LEAST_GPU_WORLDS:
+        return config
+    return replace(config, bake=replace(config.bake, worlds=LEAST_GPU_WORLDS))
 
 
 class Watcher(Protocol):
