@@ -7,12 +7,13 @@ each pixel multiplies it by its own unhindered light (after Heitz, Hill and McGu
 
 import warp as wp
 
+from synpick_warp.kernels.brdf import even_gloss
 from synpick_warp.kernels.camera_rays import Cameras, camera_ray, hit_position
 from synpick_warp.kernels.cells import CellGrid, Guide, cell_number, cell_pixel, spread_cell
 from synpick_warp.kernels.draws import PATHS, stream_key
-from synpick_warp.kernels.even_light import even_light
+from synpick_warp.kernels.even_light import Light, even_light
 from synpick_warp.kernels.hits import NOTHING, Bodies, Hits, read_hit
-from synpick_warp.kernels.paths import ENDED, PathRules, PathScene, Place, Reflected, begun, scattered, vertex_at
+from synpick_warp.kernels.paths import ENDED, PathRules, PathScene, Place, Reflected, Vertex, begun, scattered, vertex_at
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -20,6 +21,9 @@ GATHER_REGISTERS = 56
 """As `kernels.hits.RAY_REGISTERS`; with paths, a few less are better still."""
 PERIOD = wp.constant(16)
 """Cells take their points from one sequence by their place in squares of PERIOD x PERIOD; aligned smaller squares hold aligned runs."""
+MOST_BOUNCES = wp.constant(4.0)
+"""A path counts with at most so many times what a white surface sends back that faces the main light, where that is more than the share
+of the map's light: few paths find it, and those for others, too."""
 PHASES = wp.constant(1.0)
 """Points of the first dimension move so far through their unit square along the picture's height and width: slowly within a window, which
 so keeps its points evenly spread, but enough for the picture's mean to be right."""
@@ -61,6 +65,43 @@ def paths_place(
     place.key = stream_key(rules.seed, episode, 0, PATHS)
     place.shift = wp.vec2(PHASES * float(row) / float(cells.cells.height), PHASES * float(column) / float(cells.cells.width))
     return place
+
+
+@wp.func
+def mean_light(
+    scene: PathScene,
+    bodies: Bodies,
+    rules: PathRules,
+    place: Place,
+    number: int,
+    first: Vertex,
+    width: float,
+    even: Light,
+    most_share: float,
+) -> Reflected:
+    """What the surface at `first` reflects of the light that paths from `number` on find, on the average.
+
+    A path counts with at most `most_share` times the light that comes if nothing hides it, `even`; what other surfaces send, by
+    MOST_BOUNCES more, since `even` knows nothing of the main light.
+    """
+    sum = Reflected()
+    bounced = (MOST_BOUNCES / wp.PI) * scene.lights.main_irradiance[place.light]
+    # One loop over all scatterings of all paths: a thread whose path ends early begins the next while others of its warp go on.
+    sample = int(0)
+    path = begun(first, width)
+    while sample < rules.samples:
+        path = scattered(scene, bodies, rules, place, number + sample, first.brdf.diffuse, path)
+        if path.bounce == ENDED:
+            sum.diffuse += limited(path.found.diffuse, most_share * even.diffuse)
+            sum.between += limited(path.found.between, most_share * even.diffuse + bounced)
+            sum.gloss += limited(path.found.gloss, most_share * even.gloss + wp.cw_mul(even_gloss(first.brdf), bounced))
+            path = begun(first, width)
+            sample += 1
+    share = 1.0 / float(rules.samples)
+    sum.diffuse = share * sum.diffuse
+    sum.between = share * sum.between
+    sum.gloss = share * sum.gloss
+    return sum
 
 
 @wp.kernel(cuda_max_registers=GATHER_REGISTERS)
@@ -111,21 +152,10 @@ def gather_kernel(
     place = paths_place(scene, cells, rules, view, row, column, episode[world], light[world], light_turn[world])
     even = even_light(scene.lights, place.light, place.turn, vertex.brdf)
     number = cell_number(PERIOD, row, column) * rules.samples
-    sum = Reflected()
-    # One loop over all scatterings of all paths: a thread whose path ends early begins the next while others of its warp go on.
-    sample = int(0)
-    path = begun(vertex, width)
-    while sample < rules.samples:
-        path = scattered(scene, bodies, rules, place, number + sample, vertex.brdf.diffuse, path)
-        if path.bounce == ENDED:
-            sum.diffuse += limited(path.found.diffuse, most_share * even.diffuse)
-            sum.between += limited(path.found.between, most_share * even.diffuse)
-            sum.gloss += limited(path.found.gloss, most_share * even.gloss)
-            path = begun(vertex, width)
-            sample += 1
-    gathered_out.diffuse[view, row, column] = sum.diffuse / float(rules.samples)
-    gathered_out.between[view, row, column] = sum.between / float(rules.samples)
-    gathered_out.gloss[view, row, column] = sum.gloss / float(rules.samples)
+    found = mean_light(scene, bodies, rules, place, number, vertex, width, even, most_share)
+    gathered_out.diffuse[view, row, column] = found.diffuse
+    gathered_out.between[view, row, column] = found.between
+    gathered_out.gloss[view, row, column] = found.gloss
     gathered_out.even_diffuse[view, row, column] = even.diffuse
     gathered_out.even_gloss[view, row, column] = even.gloss
     guide_out.normal[view, row, column] = wp.transpose(cameras.to_world[camera]) * vertex.brdf.normal

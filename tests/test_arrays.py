@@ -24,7 +24,7 @@ from tests.reference.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset part tile "
-    "cell_row cell_column shadow_row shadow_column segment segment_pixel"
+    "cell_row cell_column shadow_row shadow_column segment segment_square"
 )
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
@@ -86,7 +86,8 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
 
 
 @pytest.mark.parametrize(
-    ("cell", "width", "shape"), [(0, 8, (6, 8, 6, 8)), (0, 960, (3, 480, 6, 960)), (0, 1920, (2, 384, 3, 960)), (3, 8, (2, 3, 6, 8)), (64, 8, (1,) * 4)]
+    ("cell", "width", "shape"),
+    [(0, 8, (6, 8, 6, 8)), (0, 960, (3, 480, 6, 960)), (0, 1920, (2, 384, 3, 960)), (3, 8, (2, 3, 6, 8)), (64, 8, (1,) * 4)],
 )
 def test_cells_cover_the_image(cell, width, shape):
     sizes = cell_sizes(settings(render__cell=cell), width, 6)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import warp as wp
@@ -239,3 +240,19 @@ def test_edges_of_a_dark_pit_do_not_take_the_light_of_its_rim(device):
     floor = fast.instance[0] == 1
     bright = [np.quantile(picture.radiance[0][floor].mean(axis=-1), 0.98) for picture in (fast, path)]
     assert bright[0] < 1.1 * bright[1]
+
+
+def test_a_slope_that_only_a_sunlit_one_lights_is_as_bright_as_in_the_reference(device):
+    """A valley under a low sun and a nearly black sky: the slope that turns away has nothing but light from the other one."""
+    half = np.pi / 8
+    slopes = [
+        (sheet(0.2, 0.3), surface((0.9, 0.9, 0.9)), (side * 0.0707, 0.0, 0.0707, 0.0, side * -np.sin(half), 0.0, np.cos(half)))
+        for side in (-1, 1)
+    ]
+    low_sun = (sun((-0.9, 0.0, 0.3), sky=0.002),)
+    configs = (settings(cell_paths=16, cell=1), settings(REFERENCE, samples=256))
+    fast, reference = (shown(device, *slopes, lights=low_sun, config=config) for config in configs)
+    for instance in (1, 2):
+        inside = cv2.erode((fast.instance[0] == instance).astype(np.uint8), np.ones((3, 3))) > 0
+        seen = [picture.radiance[0][inside].mean() for picture in (fast, reference)]
+        assert seen[0] == pytest.approx(seen[1], rel=0.05)
