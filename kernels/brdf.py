@@ -186,6 +186,22 @@ def facets(half_way: wp.vec3, alpha: float) -> float:
 
 
 @wp.func
+def facets_towards_disc(half_way: wp.vec3, alpha: float, radius: float) -> float:
+    """Mean D of GGX over half vectors whose slopes lie in a disc of this radius about a local one's; `facets` if the radius is 0.
+
+    Over slopes GGX is the even distribution on a sphere in stereographic projection, which turns discs into caps, whose area is known.
+    """
+    c2 = wp.max(half_way[2] * half_way[2], MIN_COSINE)
+    away = (half_way[0] * half_way[0] + half_way[1] * half_way[1]) / (c2 * alpha * alpha)
+    wide = radius * radius / (alpha * alpha)
+    near = 1.0 + away - wide
+    root = wp.sqrt(near * near + 4.0 * wide)
+    if near >= 0.0:
+        return 2.0 / (wp.PI * alpha * alpha * c2 * c2 * root * (root + near))
+    return (root - near) / (2.0 * wp.PI * radius * radius * c2 * c2 * root)
+
+
+@wp.func
 def schlick(cosine: float) -> float:
     """Share by which F rises from F₀ to 1."""
     x = wp.clamp(1.0 - cosine, 0.0, 1.0)
@@ -213,18 +229,13 @@ class Reflection:
 
 
 @wp.func
-def evaluate_parts(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> Reflection:
-    """How much of the light from `incoming` a surface reflects; none below the surface."""
+def reflected_parts(gloss: Gloss, brdf: Brdf, i: wp.vec3, o: wp.vec3, half_way: wp.vec3, density: float) -> Reflection:
+    """How much of the light from the local direction i a surface reflects to o, with `density` of facets about the half vector."""
     made = Reflection()
-    i = to_local(brdf, incoming)
-    o = to_local(brdf, brdf.outgoing)
-    if i[2] <= 0.0 or o[2] <= 0.0:
-        return made
     one = wp.vec3(1.0, 1.0, 1.0)
-    half_way = wp.normalize(i + o)
     fresnel = brdf.reflectance + schlick(wp.dot(o, half_way)) * (one - brdf.reflectance)
     masking = 2.0 / (smith(i[2], brdf.alpha) + smith(o[2], brdf.alpha))
-    single = facets(half_way, brdf.alpha) * masking / (4.0 * wp.max(o[2], MIN_COSINE)) * fresnel
+    single = density * masking / (4.0 * wp.max(o[2], MIN_COSINE)) * fresnel
 
     albedo = gloss_albedo(gloss, brdf.roughness, i[2])
     lost = (1.0 - albedo[0] - albedo[1]) * (1.0 - brdf.albedo[0] - brdf.albedo[1]) / wp.max(1.0 - brdf.mean[0] - brdf.mean[1], LEAST_LOST)
@@ -235,9 +246,35 @@ def evaluate_parts(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> Reflection:
 
 
 @wp.func
+def evaluate_parts(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> Reflection:
+    """How much of the light from `incoming` a surface reflects; none below the surface."""
+    i = to_local(brdf, incoming)
+    o = to_local(brdf, brdf.outgoing)
+    if i[2] <= 0.0 or o[2] <= 0.0:
+        return Reflection()
+    half_way = wp.normalize(i + o)
+    return reflected_parts(gloss, brdf, i, o, half_way, facets(half_way, brdf.alpha))
+
+
+@wp.func
 def evaluate(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> wp.vec3:
     """f times the cosine to `incoming`, from where light comes; 0 below the surface [1/sr]."""
     parts = evaluate_parts(gloss, brdf, incoming)
+    return parts.gloss + parts.diffuse * brdf.diffuse
+
+
+@wp.func
+def evaluate_disc(gloss: Gloss, brdf: Brdf, middle: wp.vec3, spread: float) -> wp.vec3:
+    """Mean of `evaluate` over a disc about the direction `middle`; `spread` is the tangent of its angular radius, and small."""
+    i = to_local(brdf, middle)
+    o = to_local(brdf, brdf.outgoing)
+    if i[2] <= 0.0 or o[2] <= 0.0:
+        return wp.vec3(0.0, 0.0, 0.0)
+    half_way = wp.normalize(i + o)
+    # Half vectors turn by half the angle in the plane of both directions, by more across it; slopes change by more than angles do. The
+    # disc has the area of the ellipse that this makes of it.
+    radius = 0.5 * spread / wp.sqrt(wp.max(wp.dot(o, half_way) * half_way[2] * half_way[2] * half_way[2], MIN_COSINE))
+    parts = reflected_parts(gloss, brdf, i, o, half_way, facets_towards_disc(half_way, brdf.alpha, radius))
     return parts.gloss + parts.diffuse * brdf.diffuse
 
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.brdf import MIN_ALPHA, Brdf, Gloss, brdf_at, evaluate
+from synpick_warp.kernels.brdf import Brdf, Gloss, brdf_at, evaluate_disc
 from synpick_warp.kernels.camera_rays import Cameras, camera_ray, tile_pixel
 from synpick_warp.kernels.cells import CellGrid, Guide
 from synpick_warp.kernels.environment import Lights, background_radiance, turned
@@ -24,11 +24,9 @@ def lit_surface(gloss: Gloss, lights: Lights, light: int, turn: float, brdf: Brd
     even = even_light(lights, light, turn, brdf)
     result = wp.cw_mul(brdf.diffuse, wp.cw_mul(even.diffuse, share.diffuse) + share.between) + wp.cw_mul(even.gloss, share.gloss)
     if lit > 0.0:
-        disc = brdf
-        # The light's disc widens the highlight.
-        disc.alpha = wp.clamp(brdf.alpha + 0.5 * lights.main_spread[light], MIN_ALPHA, 1.0)
         to_light = turned(lights.main_direction[light], turn)
-        result += lit * wp.cw_mul(evaluate(gloss, disc, to_light), lights.main_irradiance[light])
+        reflected = evaluate_disc(gloss, brdf, to_light, lights.main_spread[light])
+        result += lit * wp.cw_mul(reflected, lights.main_irradiance[light])
     return result
 
 

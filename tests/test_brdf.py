@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.stages.gloss import measure_gloss
-from tests.reference.brdf_probe import evaluated, scatter_kernel, toward
+from tests.reference.brdf_probe import evaluate_disc_kernel, evaluated, scatter_kernel, toward
 
 WHITE, BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 ROUGHNESSES = (0.0, 0.13, 0.3, 0.55, 0.8, 1.0)
@@ -107,3 +107,40 @@ def test_directions_are_drawn_with_the_density_that_is_said(gloss, metallic, rou
     chi = ((found - count * expected)[large] ** 2 / (count * expected)[large]).sum()
     # Mean n, standard deviation sqrt(2n); five of them, and 2 % for the integral over the bins.
     assert chi < large.sum() + 5.0 * np.sqrt(2.0 * large.sum())
+
+
+def disc(middle: np.ndarray, spread: float, count: int = 4096) -> np.ndarray:
+    """Directions (count, 3) spread evenly over a disc about a direction; `spread` is the tangent of its angular radius."""
+    number = np.arange(count) + 0.5
+    radius, angle = spread * np.sqrt(number / count), number * np.pi * (3.0 - np.sqrt(5.0))
+    aside = np.cross(middle, (0.0, 1.0, 0.0))
+    aside /= np.linalg.norm(aside)
+    across = np.cross(middle, aside)
+    made = middle + radius[:, None] * (np.cos(angle)[:, None] * aside + np.sin(angle)[:, None] * across)
+    return made / np.linalg.norm(made, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("spread", [0.005, 0.035, 0.07])
+@pytest.mark.parametrize("roughness", [0.15, 0.3, 0.5, 1.0])
+def test_a_discs_light_is_the_mean_of_its_points(gloss, roughness, spread):
+    """Within the highlight, on its slope, far outside. A disc of half vectors stands for an ellipse, which shows at a sharp highlight's rim."""
+    material, outgoing = (WHITE, 1.0, roughness), toward(0.9)
+    azimuth = np.pi + np.array([0.0, 0.0, 0.0, 0.0, 0.3])
+    middles = toward(np.array([0.9, 0.88, 0.8, 0.5, 0.9]), azimuth)
+    value = wp.empty(len(middles), dtype=wp.vec3, device=gloss.albedo.device)
+    inputs = [gloss, wp.vec3(*WHITE), 1.0, roughness, wp.vec3(*outgoing), wp.array(middles.astype(np.float32), dtype=wp.vec3), spread]
+    wp.launch(evaluate_disc_kernel, len(middles), inputs, [value], device=value.device)
+    for found, middle in zip(value.numpy(), middles, strict=True):
+        mean = evaluated(gloss, material, outgoing, disc(middle, spread))[0].mean(axis=0)
+        np.testing.assert_allclose(found, mean, rtol=0.08 if roughness < 0.2 else 0.04)
+
+
+@given(cosine=st.floats(0.02, 1.0), other=st.floats(0.02, 1.0), azimuth=st.floats(0.0, 6.3), roughness=SHARE, metallic=SHARE)
+@settings(max_examples=60, deadline=None)
+def test_a_point_is_a_disc_without_width(gloss, cosine, other, azimuth, roughness, metallic):
+    outgoing, middle = toward(cosine), toward(other, azimuth)
+    value = wp.empty(1, dtype=wp.vec3, device=gloss.albedo.device)
+    middles = wp.array([middle.astype(np.float32)], dtype=wp.vec3)
+    wp.launch(evaluate_disc_kernel, 1, [gloss, wp.vec3(*WHITE), metallic, roughness, wp.vec3(*outgoing), middles, 0.0], [value])
+    expected = evaluated(gloss, (WHITE, metallic, roughness), outgoing, middle[None])[0]
+    np.testing.assert_allclose(value.numpy(), expected, rtol=2e-3, atol=1e-6)

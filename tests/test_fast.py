@@ -256,3 +256,16 @@ def test_a_slope_that_only_a_sunlit_one_lights_is_as_bright_as_in_the_reference(
         inside = cv2.erode((fast.instance[0] == instance).astype(np.uint8), np.ones((3, 3))) > 0
         seen = [picture.radiance[0][inside].mean() for picture in (fast, reference)]
         assert seen[0] == pytest.approx(seen[1], rel=0.05)
+
+
+@pytest.mark.parametrize("roughness", [0.2, 0.5])
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_a_small_lamp_shines_on_gloss_as_in_the_reference(device, metallic, roughness):
+    """Beside its highlight, and in it."""
+    plate = (sheet(0.3, 0.2), surface((0.8, 0.8, 0.8), metallic, roughness))
+    for cosine in (0.9, 0.99):
+        light = (lamp(cosine, np.radians(2.0), 500.0, 0.01),)
+        configs = (settings(cell_paths=16, cell=1), settings(REFERENCE, samples=256))
+        fast, reference = (shown(device, plate, lights=light, config=config) for config in configs)
+        inside = cv2.erode((fast.instance[0] == 1).astype(np.uint8), np.ones((5, 5))) > 0
+        assert fast.radiance[0][inside].mean() == pytest.approx(reference.radiance[0][inside].mean(), rel=0.02)

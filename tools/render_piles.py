@@ -100,7 +100,7 @@ def _summary(config: Config, pairs: list[Pair], still: list[float], moved: list[
         Row("fast against reference, mean", mean, "dB", f">= {LEAST_PSNR:g}", mean >= LEAST_PSNR),
         Row("fast against reference, least", min(pair.quality for pair in pairs), "dB"),
         bounded("bias of mean radiance, mean", float(np.mean([pair.bias for pair in pairs])), "%", MOST_BIAS),
-        Row("bias of mean radiance, largest", max((pair.bias for pair in pairs), key=abs), "%"),
+        bounded("bias of mean radiance, largest", max((pair.bias for pair in pairs), key=abs), "%", MOST_BIAS),
         bounded("fast: frames of a still scene, mean difference", float(np.mean(still)), "grey", MOST_FLICKER),
         Row(f"fast: the same, objects moved by {1e3 * CREEP:g} mm", float(np.mean(moved)), "grey"),
         Row("reference: a picture", seconds, "s"),

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.brdf import Gloss, brdf_at, density, evaluate, scatter
+from synpick_warp.kernels.brdf import Gloss, brdf_at, density, evaluate, evaluate_disc, scatter
 from synpick_warp.kernels.sampling import Chances, light_density, sample_light, scrambled_point
 
 wp.set_module_options({"enable_backward": False})
@@ -29,6 +29,24 @@ def evaluate_kernel(
     brdf = brdf_at(gloss, base, metallic, roughness, UP, outgoing[i])
     value_out[i] = evaluate(gloss, brdf, incoming[i])
     density_out[i] = density(brdf, incoming[i])
+
+
+@wp.kernel
+def evaluate_disc_kernel(
+    # In:
+    gloss: Gloss,
+    base: wp.vec3,
+    metallic: float,
+    roughness: float,
+    outgoing: wp.vec3,
+    middle: wp.array[wp.vec3],
+    spread: float,
+    # Out:
+    value_out: wp.array[wp.vec3],
+):
+    """Mean of f cos over discs about `middle`, normal +z."""
+    i = wp.tid()
+    value_out[i] = evaluate_disc(gloss, brdf_at(gloss, base, metallic, roughness, UP, outgoing), middle[i], spread)
 
 
 @wp.kernel
