@@ -123,7 +123,7 @@ def disc(middle: np.ndarray, spread: float, count: int = 4096) -> np.ndarray:
 @pytest.mark.parametrize("spread", [0.005, 0.035, 0.07])
 @pytest.mark.parametrize("roughness", [0.15, 0.3, 0.5, 1.0])
 def test_a_discs_light_is_the_mean_of_its_points(gloss, roughness, spread):
-    """Within the highlight, on its slope, far outside. A disc of half vectors stands for an ellipse, which shows at a sharp highlight's rim."""
+    """Within the highlight, on its slope, far outside. A disc of half vectors stands for an ellipse, as a sharp highlight shows."""
     material, outgoing = (WHITE, 1.0, roughness), toward(0.9)
     azimuth = np.pi + np.array([0.0, 0.0, 0.0, 0.0, 0.3])
     middles = toward(np.array([0.9, 0.88, 0.8, 0.5, 0.9]), azimuth)
