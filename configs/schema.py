@@ -295,7 +295,7 @@ class Render:
         0.3, "stops", "Each episode's exposure is off by up to so much, evenly: cameras step by a third of a stop.", low=0.0, high=5.0
     )
     cell: int = setting(
-        0, "px", "With mode fast: paths start from the middles of cells so wide; 0: as many px as leave 384 across.", low=0, high=64
+        0, "px", "With mode fast: paths start from the middles of cells so wide; 0: as many as leave at least 384 across.", low=0, high=64
     )
     cell_paths: int = setting(2, "", "With mode fast: paths a cell; powers of two are spread most evenly.", low=1, high=1024)
     antialias: bool = setting(True, "", "With mode fast: a pixel where surfaces meet mixes their colours; reference always does.")

@@ -44,9 +44,12 @@ CREASE = wp.constant(1.5)
 here."""
 LEAST_BEND = wp.constant(0.1)
 JUMP = wp.constant(8.0)
-"""A surface that seems to bend by more than JUMP [m/m], but from one side of a square by less than LEAST_BEND, ends at that side of it."""
+"""A surface that seems to bend by more than JUMP [m/m], but from one side of a square by less than LEAST_BEND, ends at that side.
+This spares rays, and changes no picture."""
 CONTRAST = wp.constant(0.08)
-"""Colours whose radiance differs by less than this share need no mixing: a grey level or two."""
+"""Colours of which no channel differs by more than this share are not mixed: half of it, which is lost at most, is four grey levels."""
+DIM = wp.constant(0.1)
+"""What is darker than this share of the brightest channel counts as so bright: who looks at a colour sees little of its dark channels."""
 NEARNESS = wp.constant(0.1)
 """Being a pixel farther away counts against a corner like being so far off the sample's surface [widths of a pixel]."""
 
@@ -85,13 +88,21 @@ def pixel_radiance(picture: Picture, view: int, row: int, column: int) -> wp.vec
 @wp.func
 def bends(hits: Hits, grid: ImageGrid, focal: float, view: int, row: int, column: int, down: int, right: int) -> bool:
     """Whether a body's surface bends or ends between a pixel and the next one `down` or `right`: 1/z of a plane is linear in the image,
-    so each two pixels on one side tell what the next should be."""
-    if row < down or column < right or row + 2 * down >= grid.height or column + 2 * right >= grid.width:
-        return False
+    so each two pixels on one side tell what the next should be. At the picture's rim one side speaks for both."""
     middle = 1.0 / hits.depth[view, row, column]
     next = 1.0 / hits.depth[view, row + down, column + right]
-    before = wp.abs(1.0 / hits.depth[view, row - down, column - right] + next - 2.0 * middle)
-    behind = wp.abs(1.0 / hits.depth[view, row + 2 * down, column + 2 * right] + middle - 2.0 * next)
+    before = float(0.0)
+    behind = float(0.0)
+    starts = row >= down and column >= right
+    ends = row + 2 * down < grid.height and column + 2 * right < grid.width
+    if starts:
+        before = wp.abs(1.0 / hits.depth[view, row - down, column - right] + next - 2.0 * middle)
+    if ends:
+        behind = wp.abs(1.0 / hits.depth[view, row + 2 * down, column + 2 * right] + middle - 2.0 * next)
+    if not starts:
+        before = behind
+    elif not ends:
+        behind = before
     bend = focal * (before + behind) / middle
     return bend > CREASE and (bend < JUMP or focal * wp.min(before, behind) > LEAST_BEND * middle)
 
@@ -104,8 +115,12 @@ def differs(picture: wp.array3d[wp.vec3], view: int, top: int, left: int, bottom
     c = picture[view, bottom, left]
     d = picture[view, bottom, right]
     most = wp.max(wp.max(a, b), wp.max(c, d))
-    least = wp.min(wp.min(a, b), wp.min(c, d))
-    return wp.max(most - least) > CONTRAST * wp.max(most)
+    apart = most - wp.min(wp.min(a, b), wp.min(c, d))
+    dim = DIM * wp.max(most)
+    for channel in range(3):
+        if apart[channel] > CONTRAST * wp.max(most[channel], dim):
+            return True
+    return False
 
 
 @wp.func

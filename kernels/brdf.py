@@ -23,7 +23,7 @@ DIELECTRIC = wp.constant(0.04)
 MIN_ALPHA = wp.constant(0.01)
 """Smallest squared roughness; smoother surfaces would mirror a lamp as a point that no pixel meets."""
 MIN_COSINE = wp.constant(1.0e-4)
-"""Cosines are kept off zero by this much before something is divided by them."""
+"""Cosines, and products of such, are kept off zero by this much before something is divided by them."""
 LEAST_FACING = wp.constant(0.01)
 """Interpolated normals are bent until this is their cosine to the side from which they are seen."""
 LEAST_RISE = wp.constant(1.0e-7)
@@ -257,22 +257,18 @@ def evaluate_parts(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> Reflection:
 
 
 @wp.func
-def evaluate(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> wp.vec3:
-    """f times the cosine to `incoming`, from where light comes; 0 below the surface [1/sr]."""
-    parts = evaluate_parts(gloss, brdf, incoming)
-    return parts.gloss + parts.diffuse * brdf.diffuse
-
-
-@wp.func
 def evaluate_disc(gloss: Gloss, brdf: Brdf, middle: wp.vec3, spread: float) -> wp.vec3:
-    """Mean of `evaluate` over a disc about the direction `middle`; `spread` is the tangent of its angular radius, and small."""
+    """Mean over a disc of directions about `middle` of f times the cosine; `spread` is the tangent of its angular radius, and small.
+
+    The half vectors of a disc fill an ellipse, for which a disc of the same area stands: wide lamps seen from cosines below 0.5 in sharp
+    gloss shine too bright in the highlight's middle, too dark at its side.
+    """
     i = to_local(brdf, middle)
     o = to_local(brdf, brdf.outgoing)
     if i[2] <= 0.0 or o[2] <= 0.0:
         return wp.vec3(0.0, 0.0, 0.0)
     half_way = wp.normalize(i + o)
-    # Half vectors turn by half the angle in the plane of both directions, by more across it; slopes change by more than angles do. The
-    # disc has the area of the ellipse that this makes of it.
+    # Half vectors turn by half the angle in the plane of both directions, by more across it; slopes change by more than angles do.
     radius = 0.5 * spread / wp.sqrt(wp.max(wp.dot(o, half_way) * half_way[2] * half_way[2] * half_way[2], MIN_COSINE))
     parts = reflected_parts(gloss, brdf, i, o, half_way, facets_towards_disc(half_way, brdf.alpha, radius))
     return parts.gloss + parts.diffuse * brdf.diffuse

@@ -22,8 +22,8 @@ GATHER_REGISTERS = 56
 PERIOD = wp.constant(16)
 """Cells take their points from one sequence by their place in squares of PERIOD x PERIOD; aligned smaller squares hold aligned runs."""
 MOST_BOUNCES = wp.constant(4.0)
-"""A path counts with at most so many times what a white surface sends back that faces the main light, where that is more than the share
-of the map's light: few paths find it, and those for others, too."""
+"""A path's light from other surfaces counts by so many times what a white one that faces the main light sends back more: few paths find
+such a one, and those for others, too."""
 PHASES = wp.constant(1.0)
 """Points of the first dimension move so far through their unit square along the picture's height and width: slowly within a window, which
 so keeps its points evenly spread, but enough for the picture's mean to be right."""

@@ -345,7 +345,6 @@ def is_blocked(
     origin: wp.vec3,
     direction: wp.vec3,
     reach: float,
-    instances: int,
 ) -> bool:
     """Whether anything lies within `reach` [m] of `origin` along the unit vector `direction`, all in the world."""
     if table.visible != 0 and direction[2] < 0.0:

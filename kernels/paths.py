@@ -253,7 +253,7 @@ def direct_light(scene: PathScene, bodies: Bodies, rules: PathRules, place: Plac
     weight = heuristic(rules.strategy, BY_LIGHT, drawn.density, density(vertex.brdf, made.direction)) / drawn.density
     if weight <= 0.0 or wp.dot(made.direction, vertex.brdf.normal) <= 0.0:
         return made
-    if is_blocked(scene.meshes, scene.table, bodies, place.view, vertex.origin, made.direction, FAR, rules.instances):
+    if is_blocked(scene.meshes, scene.table, bodies, place.view, vertex.origin, made.direction, FAR):
         return made
     made.radiance = weight * background_radiance(scene.lights, light, drawn.direction)
     return made

@@ -69,7 +69,7 @@ def cast_shadow_rays_kernel(
             angle = wp.TAU * point[1]
             direction = wp.normalize(around(middle, wp.vec3(radius * wp.cos(angle), radius * wp.sin(angle), 1.0)))
             origin = hit_position(cameras, camera, ray, hits.depth[view, pixel[0], pixel[1]]) + RAY_OFFSET * normal
-            if is_blocked(meshes, table, bodies, view, origin, direction, FAR, instances):
+            if is_blocked(meshes, table, bodies, view, origin, direction, FAR):
                 lit = 0.0
     lit_out[view, row, column] = lit
 

@@ -43,7 +43,9 @@ def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
 def memory_report(config: Config) -> Table:
     """Shape, unit and size of every declared array of a bake with these settings, and their sum."""
     from synpick_warp.bake import describe_arrays
+    from synpick_warp.stages.physics import with_enough_worlds
 
+    config = with_enough_worlds(config, pick_device(config.bake.device))
     rows = describe_arrays(config)
     width, height = config.cameras.resolution
     table = Table("array", "shape", "unit", "MiB", title=f"{config.bake.worlds} worlds, {width}x{height}", show_footer=True)

@@ -120,6 +120,16 @@ def disc(middle: np.ndarray, spread: float, count: int = 4096) -> np.ndarray:
     return made / np.linalg.norm(made, axis=1, keepdims=True)
 
 
+def discs(gloss, material, outgoing, middles, spread):
+    """Mean f cos (N, 3) over discs about directions (N, 3)."""
+    base, metallic, roughness = material
+    given = wp.array(middles.astype(np.float32), dtype=wp.vec3, device=gloss.albedo.device)
+    value = wp.empty(len(middles), dtype=wp.vec3, device=given.device)
+    inputs = [gloss, wp.vec3(*base), metallic, roughness, wp.vec3(*outgoing), given, spread]
+    wp.launch(evaluate_disc_kernel, len(middles), inputs, [value], device=given.device)
+    return value.numpy().astype(np.float64)
+
+
 @pytest.mark.parametrize("spread", [0.005, 0.035, 0.07])
 @pytest.mark.parametrize("roughness", [0.15, 0.3, 0.5, 1.0])
 def test_a_discs_light_is_the_mean_of_its_points(gloss, roughness, spread):
@@ -127,10 +137,7 @@ def test_a_discs_light_is_the_mean_of_its_points(gloss, roughness, spread):
     material, outgoing = (WHITE, 1.0, roughness), toward(0.9)
     azimuth = np.pi + np.array([0.0, 0.0, 0.0, 0.0, 0.3])
     middles = toward(np.array([0.9, 0.88, 0.8, 0.5, 0.9]), azimuth)
-    value = wp.empty(len(middles), dtype=wp.vec3, device=gloss.albedo.device)
-    inputs = [gloss, wp.vec3(*WHITE), 1.0, roughness, wp.vec3(*outgoing), wp.array(middles.astype(np.float32), dtype=wp.vec3), spread]
-    wp.launch(evaluate_disc_kernel, len(middles), inputs, [value], device=value.device)
-    for found, middle in zip(value.numpy(), middles, strict=True):
+    for found, middle in zip(discs(gloss, material, outgoing, middles, spread), middles, strict=True):
         mean = evaluated(gloss, material, outgoing, disc(middle, spread))[0].mean(axis=0)
         np.testing.assert_allclose(found, mean, rtol=0.08 if roughness < 0.2 else 0.04)
 
@@ -139,8 +146,6 @@ def test_a_discs_light_is_the_mean_of_its_points(gloss, roughness, spread):
 @settings(max_examples=60, deadline=None)
 def test_a_point_is_a_disc_without_width(gloss, cosine, other, azimuth, roughness, metallic):
     outgoing, middle = toward(cosine), toward(other, azimuth)
-    value = wp.empty(1, dtype=wp.vec3, device=gloss.albedo.device)
-    middles = wp.array([middle.astype(np.float32)], dtype=wp.vec3)
-    wp.launch(evaluate_disc_kernel, 1, [gloss, wp.vec3(*WHITE), metallic, roughness, wp.vec3(*outgoing), middles, 0.0], [value])
-    expected = evaluated(gloss, (WHITE, metallic, roughness), outgoing, middle[None])[0]
-    np.testing.assert_allclose(value.numpy(), expected, rtol=2e-3, atol=1e-6)
+    material = (WHITE, metallic, roughness)
+    expected = evaluated(gloss, material, outgoing, middle[None])[0]
+    np.testing.assert_allclose(discs(gloss, material, outgoing, middle[None], 0.0), expected, rtol=2e-3, atol=1e-6)

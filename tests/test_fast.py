@@ -242,12 +242,13 @@ def test_edges_of_a_dark_pit_do_not_take_the_light_of_its_rim(device):
     assert bright[0] < 1.1 * bright[1]
 
 
-def test_a_slope_that_only_a_sunlit_one_lights_is_as_bright_as_in_the_reference(device):
-    """A valley under a low sun and a nearly black sky: the slope that turns away has nothing but light from the other one."""
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_a_slope_that_only_a_sunlit_one_lights_is_as_bright_as_in_the_reference(device, metallic):
+    """A valley under a low sun and a nearly black sky: the slope that turns away has light from the other one alone, diffuse or gloss."""
     half = np.pi / 8
     slopes = [
-        (sheet(0.2, 0.3), surface((0.9, 0.9, 0.9)), (side * 0.0707, 0.0, 0.0707, 0.0, side * -np.sin(half), 0.0, np.cos(half)))
-        for side in (-1, 1)
+        (sheet(0.2, 0.3), surface((0.9, 0.9, 0.9), share), (side * 0.0707, 0.0, 0.0707, 0.0, side * -np.sin(half), 0.0, np.cos(half)))
+        for side, share in ((-1, metallic), (1, 0.0))
     ]
     low_sun = (sun((-0.9, 0.0, 0.3), sky=0.002),)
     configs = (settings(cell_paths=16, cell=1), settings(REFERENCE, samples=256))

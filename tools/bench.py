@@ -42,6 +42,7 @@ from synpick_warp.exporters.registry import Exporters, exporter_kinds
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.fast import FastPicture
+from synpick_warp.stages.physics import with_enough_worlds
 from synpick_warp.stages.simulate import Simulation
 from synpick_warp.stages.stream import STATUS_COLUMNS, FrameStream, TickReader, TickReport
 
@@ -73,6 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = _config(options)
         device = pick_device(config.bake.device)
+        config = with_enough_worlds(config, device)
         width, height = config.cameras.resolution
         measured = f"{config.bake.worlds} worlds, {len(config.cameras.positions)} cameras, {width}x{height}"
         machine = dict([*describe_machine(device), ("measured", measured)])
@@ -226,8 +228,9 @@ def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], objec
             "filter light": lambda: shading.filter(camera, count),
             "shadows of the main light": lambda: shading.cast_shadows(snapshot, bodies, hits, world, camera, count),
             "shade": lambda: shading.light(snapshot, bodies, hits, world, camera, count, picture.radiance),
-            "anti-alias": lambda: shading.smooth(bodies, hits, camera, count, picture),
         }
+        if shading.antialias:
+            stages["anti-alias"] = lambda: shading.smooth(bodies, hits, camera, count, picture)
     else:
         stages["trace paths"] = lambda: shading.shade(snapshot, bodies, hits, world, camera, count, picture)
     return stages | {

@@ -1,7 +1,8 @@
 """Simulate the same episodes in different numbers of worlds, and tell whether they are the same bit by bit, and what that costs.
 
-Each number of worlds gives a run, the first one two, and the last one a third with physics recorded; on a GPU the first and the last
-number's are made again without the solver's rows in a fixed order (physics.deterministic). Exits with 1 if episodes differ that should
+Each number of worlds gives a run, the first one two, and the last one a further one with physics recorded; on a GPU the first number's
+two and the last one's are made again without the solver's rows in a fixed order (physics.deterministic). A GPU never has fewer than
+eight worlds: one that is asked for is simulated beside seven idle ones, as in a bake. Exits with 1 if episodes differ that should
 not, with 2 if nothing can be simulated.
 
     python tools/compare_worlds.py --device cuda:0 --models DIR --worlds 8,1,64,512 --episodes 8
@@ -47,6 +48,7 @@ class Run:
     """One run, held against the first of its kind."""
 
     worlds: int
+    """Asked for."""
     deterministic: bool
     recorded: bool
     tick: float

@@ -34,6 +34,7 @@ from synpick_warp.kernels import phases
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.physics import with_enough_worlds
 from synpick_warp.stages.simulate import RECORDS
 from synpick_warp.stages.stream import HostCopy, TickReader, TickReport
 
@@ -53,6 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = _config(options)
         device = pick_device(config.bake.device)
+        config = with_enough_worlds(config, device)
         factory = build_factory(config, SilentProgress())
     except SynpickError as error:
         print(f"pick_report: {error}", file=sys.stderr)

@@ -32,6 +32,7 @@ from synpick_warp.outcome import Ending
 from synpick_warp.scenes import build
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.shapes import Catalog
+from synpick_warp.stages.physics import with_enough_worlds
 from synpick_warp.stages.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
 
@@ -101,6 +102,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = _config(options)
         device = pick_device(config.bake.device)
+        config = with_enough_worlds(config, device)
         catalog = load_catalog(config, report=console.print)
         started = time.perf_counter()
         simulation = Simulation(config, catalog, 1, device)

@@ -23,13 +23,15 @@ from synpick_warp.stages.reference import path_rules
 from synpick_warp.stages.render_scene import RenderScene, build_grid
 
 CELLS_ACROSS = 384
-"""Cells in a picture's width, or a few more, if the setting leaves their size open: 1.9 mm wide at the bottom of the tote."""
+"""Cells in a picture's width, at least, and fewer than twice as many, if the setting leaves their size open: at full HD they are 1.9 mm
+wide at the bottom of the tote. Narrower pictures have cells of a pixel."""
 SHADOW_WINDOW = 4
 """Width of the window that shares shadow rays among cells: 16 rays find how much of a lamp is hidden."""
 LEAST_ROUGHNESS = 0.3
 """Of surfaces that a path meets after the first (Kaplanyan and Dachsbacher, 2013): caustics are smeared, not sprinkled."""
 MOST_SHARE = 8.0
-"""A path counts with at most this many times the unhindered light, or single ones would show as patches."""
+"""A path counts with at most this many times the map's unhindered light, or single ones would show as patches; light from surfaces that
+the main light shines on comes on top."""
 ROULETTE = 1
 """Scatterings before dim paths may end early: few paths are long, since many neighbours share them."""
 EDGE_THREADS = 128

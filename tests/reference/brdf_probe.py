@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.brdf import Gloss, brdf_at, density, evaluate, evaluate_disc, scatter
+from synpick_warp.kernels.brdf import Gloss, brdf_at, density, evaluate_disc, evaluate_parts, scatter
 from synpick_warp.kernels.sampling import Chances, light_density, sample_light, scrambled_point
 
 wp.set_module_options({"enable_backward": False})
@@ -27,7 +27,8 @@ def evaluate_kernel(
     """f cos and the density of drawing `incoming`, normal +z."""
     i = wp.tid()
     brdf = brdf_at(gloss, base, metallic, roughness, UP, outgoing[i])
-    value_out[i] = evaluate(gloss, brdf, incoming[i])
+    parts = evaluate_parts(gloss, brdf, incoming[i])
+    value_out[i] = parts.gloss + parts.diffuse * brdf.diffuse
     density_out[i] = density(brdf, incoming[i])
 
 
