@@ -79,7 +79,7 @@ def test_a_second_reference_tells_of_noise(tmp_path, monkeypatch):
 
 
 def test_a_sheet_has_a_labelled_row_a_map_and_goes_on_beside_itself(tmp_path):
-    pairs = [render_piles.Pair(f"map {number}", shot(100), shot(110)) for number in range(render_sheet.MOST_ROWS + 2)]
+    pairs = [render_piles.Pair(f"map {number}", shot(100), shot(110), 100 / 255) for number in range(render_sheet.MOST_ROWS + 2)]
     files = render_sheet.contact_sheets(pairs, tmp_path / "deep" / "sheet.png")
     assert [file.name for file in files] == ["sheet.png", "sheet-2.png"]
     first, second = (cv2.imread(str(file)) for file in files)
@@ -93,7 +93,7 @@ def test_a_sheet_has_a_labelled_row_a_map_and_goes_on_beside_itself(tmp_path):
 
 
 def test_large_pictures_are_made_smaller():
-    pair = render_piles.Pair("map", shot(10, (72, 1280)), shot(10, (72, 1280)))
+    pair = render_piles.Pair("map", shot(10, (72, 1280)), shot(10, (72, 1280)), 1.0)
     assert render_sheet.draw_sheet([pair]).shape == (2 * render_sheet.LINE + 36 + render_sheet.GAP, 3 * (640 + render_sheet.GAP), 3)
 
 
