@@ -19,7 +19,7 @@ from synpick_warp.scenes import build
 CONTACT_GAP = 0.1
 # A joint limit's row is made when the joint comes this near to it [rad].
 JOINT_LIMIT_GAP = 0.2
-# On an H200, models of one and two worlds round otherwise than those of 8, 12, 64 and 512, which agree bit by bit.
+# On an H200, models of one and two worlds round otherwise than those of 8, 64 and 512, which agree bit by bit.
 LEAST_GPU_WORLDS = 8
 
 
