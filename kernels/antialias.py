@@ -108,12 +108,12 @@ def bends(hits: Hits, grid: ImageGrid, focal: float, view: int, row: int, column
 
 
 @wp.func
-def differs(picture: wp.array3d[wp.vec3], view: int, top: int, left: int, bottom: int, right: int) -> bool:
+def differs(radiance: wp.array3d[wp.vec3], view: int, top: int, left: int, bottom: int, right: int) -> bool:
     """Whether the colours of a square's corners differ so much that mixing them shows."""
-    a = picture[view, top, left]
-    b = picture[view, top, right]
-    c = picture[view, bottom, left]
-    d = picture[view, bottom, right]
+    a = radiance[view, top, left]
+    b = radiance[view, top, right]
+    c = radiance[view, bottom, left]
+    d = radiance[view, bottom, right]
     most = wp.max(wp.max(a, b), wp.max(c, d))
     apart = most - wp.min(wp.min(a, b), wp.min(c, d))
     dim = DIM * wp.max(most)
@@ -229,7 +229,7 @@ def like_corner(
     """Which corner of a square shows best what a ray `offset` [px] off the centre of its corner `own` hit: the same body, near the tangent
     plane there, close by. `own`, if none shows that body. `plane` is the hit's, as that pixel sees it."""
     best = own
-    least = float(1.0e30)
+    least = float(wp.inf)
     for corner in range(CORNERS):
         r = corner_row(row, corner)
         c = corner_column(column, corner)

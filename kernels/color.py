@@ -8,6 +8,8 @@ LUMINANCE_RED = wp.constant(0.2126)
 LUMINANCE_GREEN = wp.constant(0.7152)
 LUMINANCE_BLUE = wp.constant(0.0722)
 """Rec. 709."""
+LEAST_LIGHT = wp.constant(1.0e-20)
+"""Light is kept off zero by this much before something is divided by it."""
 
 
 @wp.func

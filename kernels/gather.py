@@ -10,6 +10,7 @@ import warp as wp
 from synpick_warp.kernels.brdf import even_gloss
 from synpick_warp.kernels.camera_rays import Cameras, camera_ray, hit_position
 from synpick_warp.kernels.cells import CellGrid, Guide, cell_number, cell_pixel, spread_cell
+from synpick_warp.kernels.color import LEAST_LIGHT
 from synpick_warp.kernels.draws import PATHS, stream_key
 from synpick_warp.kernels.even_light import Light, even_light
 from synpick_warp.kernels.hits import NOTHING, Bodies, Hits, read_hit
@@ -49,7 +50,7 @@ class Gathered:
 @wp.func
 def limited(light: wp.vec3, most: wp.vec3) -> wp.vec3:
     """`light`, made darker if it exceeds `most`, in the same colour."""
-    return light * wp.min(1.0, wp.max(most) / wp.max(wp.max(light), 1.0e-20))
+    return light * wp.min(1.0, wp.max(most) / wp.max(wp.max(light), LEAST_LIGHT))
 
 
 @wp.func

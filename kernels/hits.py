@@ -23,7 +23,7 @@ MAX_COUNTS = wp.constant(65535.0)
 
 
 @wp.struct
-class Room:
+class Hollow:
     """A convex room in the tote's own frame that none of its triangles reaches into, open at the top: see `scenes.shapes.Hollow`."""
 
     half: wp.vec3
@@ -46,7 +46,7 @@ class Meshes:
     """Bounding sphere in the mesh's own frame [m]."""
     entries: int
     """Catalog entries; the mesh of fixture f is entries + f."""
-    room: Room
+    hollow: Hollow
     """The tote's."""
 
 
@@ -112,34 +112,34 @@ class Hit:
 
 
 @wp.func
-def lies_in(room: Room, point: wp.vec3) -> bool:
-    """Whether a point at most as high as the top lies in a room."""
+def lies_in(hollow: Hollow, point: wp.vec3) -> bool:
+    """Whether a point at most as high as the top lies in a hollow."""
     x = wp.abs(point[0])
     y = wp.abs(point[1])
     z = point[2]
     return (
-        z >= room.floor
-        and x <= room.half[0] + z * room.growth[0]
-        and y <= room.half[1] + z * room.growth[1]
-        and x + y <= room.half[2] + z * room.growth[2]
+        z >= hollow.floor
+        and x <= hollow.half[0] + z * hollow.growth[0]
+        and y <= hollow.half[1] + z * hollow.growth[1]
+        and x + y <= hollow.half[2] + z * hollow.growth[2]
     )
 
 
 @wp.func
-def misses_tote(room: Room, start: wp.vec3, direction: wp.vec3, reach: float) -> bool:
+def misses_tote(hollow: Hollow, start: wp.vec3, direction: wp.vec3, reach: float) -> bool:
     """Whether it is plain that a ray meets no triangle of the tote before `reach`: what of it is no higher than the tote begins and ends in
-    the room, which is convex. Camera rays that meet an object in the tote are spared its tree thus; for those of paths it does not pay."""
+    the hollow, which is convex. Camera rays that meet an object in the tote are spared its tree thus; for rays of paths it does not pay."""
     begin = float(0.0)
     end = float(reach)
     if direction[2] > 0.0:
-        end = wp.min(reach, (room.top - start[2]) / direction[2])
-    elif start[2] > room.top:
+        end = wp.min(reach, (hollow.top - start[2]) / direction[2])
+    elif start[2] > hollow.top:
         begin = FAR
         if direction[2] < 0.0:
-            begin = (room.top - start[2]) / direction[2]
+            begin = (hollow.top - start[2]) / direction[2]
     if begin >= end:
-        return room.half[0] > 0.0
-    return lies_in(room, start + begin * direction) and lies_in(room, start + end * direction)
+        return hollow.half[0] > 0.0
+    return lies_in(hollow, start + begin * direction) and lies_in(hollow, start + end * direction)
 
 
 @wp.func
@@ -191,7 +191,7 @@ def trace_candidates(
                     reach = FAR
                 start = body_ray_start(bodies, view, body, ray)
                 direction = bodies.turn[view, body] * ray
-                if body != instances or not misses_tote(meshes.room, start, direction, reach):
+                if body != instances or not misses_tote(meshes.hollow, start, direction, reach):
                     query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, direction, reach)
                     if query.result:
                         if body < instances:

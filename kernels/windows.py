@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.kernels.camera_rays import Cameras, tile_pixel
 from synpick_warp.kernels.cells import LEAST_WEIGHT, SAME_SURFACE, CellGrid, Guide, cell_pixel, cell_place
-from synpick_warp.kernels.color import luminance
+from synpick_warp.kernels.color import LEAST_LIGHT, luminance
 from synpick_warp.kernels.even_light import Light, ratio
 from synpick_warp.kernels.gather import Gathered
 from synpick_warp.kernels.hits import NOTHING
@@ -89,7 +89,7 @@ def widened(window: Window, gathered: Gathered, view: int, row: int, column: int
 @wp.func
 def bright_ratio(light: wp.vec3, even: wp.vec3) -> float:
     """Of luminances; even light is never 0 unless the whole map is."""
-    return luminance(light) / wp.max(luminance(even), 1.0e-20)
+    return luminance(light) / wp.max(luminance(even), LEAST_LIGHT)
 
 
 @wp.kernel

@@ -10,7 +10,8 @@ import trimesh
 import warp as wp
 
 from synpick_warp.configs.schema import Tote
-from synpick_warp.kernels.hits import FAR, Room, misses_tote
+from synpick_warp.kernels.hits import FAR, misses_tote
+from synpick_warp.kernels.hits import Hollow as DeviceHollow
 from synpick_warp.scenes.shapes import Hollow
 from synpick_warp.scenes.tote import tote_fixture
 from tests.reference.rays import first_hit
@@ -42,7 +43,7 @@ def corners(hollow: Hollow) -> np.ndarray:
 @wp.kernel
 def misses_tote_kernel(
     # In:
-    room: Room,
+    hollow: DeviceHollow,
     start: wp.array[wp.vec3],
     direction: wp.array[wp.vec3],
     reach: wp.array[float],
@@ -51,13 +52,13 @@ def misses_tote_kernel(
 ):
     """1 where `misses_tote`."""
     ray = wp.tid()
-    result_out[ray] = int(misses_tote(room, start[ray], direction[ray], reach[ray]))
+    result_out[ray] = int(misses_tote(hollow, start[ray], direction[ray], reach[ray]))
 
 
 def missed(hollow: Hollow, start: np.ndarray, direction: np.ndarray, reach: np.ndarray, device) -> np.ndarray:
-    room = Room()
-    room.half, room.growth, room.floor, room.top = wp.vec3(*hollow.half), wp.vec3(*hollow.growth), hollow.floor, hollow.top
-    inputs = [room] + [
+    given = DeviceHollow()
+    given.half, given.growth, given.floor, given.top = wp.vec3(*hollow.half), wp.vec3(*hollow.growth), hollow.floor, hollow.top
+    inputs = [given] + [
         wp.array(values, dtype=kind, device=device) for values, kind in ((start, wp.vec3), (direction, wp.vec3), (reach, float))
     ]
     result = wp.zeros(len(start), dtype=wp.int32, device=device)

@@ -34,7 +34,6 @@ from synpick_warp.kernels import phases
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.physics import with_enough_worlds
 from synpick_warp.stages.simulate import RECORDS
 from synpick_warp.stages.stream import HostCopy, TickReader, TickReport
 
@@ -54,7 +53,6 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = _config(options)
         device = pick_device(config.bake.device)
-        config = with_enough_worlds(config, device)
         factory = build_factory(config, SilentProgress())
     except SynpickError as error:
         print(f"pick_report: {error}", file=sys.stderr)
@@ -72,7 +70,8 @@ def main(arguments: list[str] | None = None) -> int:
         interrupted = True
         print("pick_report: interrupted", file=sys.stderr)
     rows = report(tally)
-    pace = {"worlds": config.bake.worlds, "ticks": meter.ticks, "seconds": meter.seconds, "ticks/s": meter.ticks / meter.seconds}
+    worlds = factory.simulation.layout.worlds
+    pace = {"worlds": worlds, "ticks": meter.ticks, "seconds": meter.seconds, "ticks/s": meter.ticks / meter.seconds}
     machine = describe_machine(device)
     tables(console, machine, rows, tally, pace)
     if options.json:

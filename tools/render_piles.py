@@ -18,6 +18,7 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.shapes import Catalog
 from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.physics import with_enough_worlds
 from synpick_warp.stages.simulate import Simulation
 
 LEAST_PSNR = 32.0
@@ -148,6 +149,8 @@ def settled(config: Config, catalog: Catalog, lights: int, device: Any) -> Snaps
     Raises:
         SynpickError: One does not come to rest.
     """
+    wanted = config.bake.worlds
+    config = with_enough_worlds(config, device)
     simulation = Simulation(config, catalog, lights, device)
     record = simulation.records[0]
     piles: dict[int, dict[str, np.ndarray]] = {}
@@ -156,12 +159,15 @@ def settled(config: Config, catalog: Catalog, lights: int, device: Any) -> Snaps
         host = {item.name: getattr(record.snapshot, item.name).numpy() for item in fields(Snapshot)}
         for world in np.flatnonzero(simulation.state.phase.numpy() == phases.ACT):
             piles.setdefault(int(world), {name: array[world].copy() for name, array in host.items()})
-        if len(piles) == config.bake.worlds:
+        if len(piles) == wanted:
             break
     else:
-        raise SynpickError(f"only {len(piles)} of {config.bake.worlds} piles came to rest within {MOST_TICKS} ticks; give another seed")
+        raise SynpickError(f"only {len(piles)} of {wanted} piles came to rest within {MOST_TICKS} ticks; give another seed")
     for item in fields(Snapshot):
-        getattr(record.snapshot, item.name).assign(np.stack([piles[world][item.name] for world in sorted(piles)]))
+        rows = getattr(record.snapshot, item.name).numpy().copy()
+        for world, pile in piles.items():
+            rows[world] = pile[item.name]
+        getattr(record.snapshot, item.name).assign(rows)
     record.snapshot.light.assign(np.arange(config.bake.worlds, dtype=np.int32) % lights)
     return record.snapshot
 

@@ -12,7 +12,7 @@ import warp as wp
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.camera_rays import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.environment import Lights
-from synpick_warp.kernels.hits import Meshes, Room, Table
+from synpick_warp.kernels.hits import Meshes, Table
 from synpick_warp.kernels.paths import PathScene
 from synpick_warp.kernels.surfaces import Surfaces
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
@@ -104,11 +104,10 @@ def build_meshes(
     # One part in a million more, so that rounding never lets a sphere exclude its own mesh.
     meshes.radius = wp.array(np.array(radius) * (1.0 + 1e-6), dtype=wp.float32, device=device)
     meshes.entries = entries
-    meshes.room = Room()
-    meshes.room.half = wp.vec3(-1.0, -1.0, -1.0)
+    meshes.hollow.half = wp.vec3(-1.0, -1.0, -1.0)
     if hollow is not None:
-        meshes.room.half, meshes.room.growth = wp.vec3(*hollow.half), wp.vec3(*hollow.growth)
-        meshes.room.floor, meshes.room.top = hollow.floor, hollow.top
+        meshes.hollow.half, meshes.hollow.growth = wp.vec3(*hollow.half), wp.vec3(*hollow.growth)
+        meshes.hollow.floor, meshes.hollow.top = hollow.floor, hollow.top
     return meshes, keep
 
 
