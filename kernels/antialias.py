@@ -287,7 +287,7 @@ def mix_edges_kernel(
             ray = camera_ray(intrinsics, r, c, offset)
             seen = seen_bodies(hits, grid, view, row, column, instances)
             candidates = seen_candidates(bodies, view, tile_of(grid, r, c), seen)
-            hit = trace_candidates(meshes, bodies, view, candidates, ray, instances, False)
+            hit = trace_candidates(meshes, bodies, view, candidates, ray, instances)
             hit = hit_table(table, cameras, camera, ray, hit)
             normal = wp.vec3(0.0, 0.0, 0.0)
             if hit.code != NOTHING:

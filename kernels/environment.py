@@ -73,8 +73,9 @@ def map_corners(direction: wp.vec3, rows: int, columns: int) -> Corners:
     made.right = at[1] - float(column)
     made.upper = wp.clamp(row, 0, rows - 1)
     made.lower = wp.clamp(row + 1, 0, rows - 1)
-    made.west = (column + columns) % columns
-    made.east = (column + 1) % columns
+    # -1 is the last column, as `columns` is the first.
+    made.west = wp.where(column < 0, columns - 1, column)
+    made.east = wp.where(column + 1 == columns, 0, column + 1)
     return made
 
 
@@ -97,9 +98,8 @@ def background_radiance(lights: Lights, light: int, direction: wp.vec3) -> wp.ve
 
 
 @wp.func
-def reflection_texel(lights: Lights, light: int, level: int, direction: wp.vec3) -> wp.vec3:
-    """One level of the blurred reflections from a unit direction in the map's frame, bilinear."""
-    at = map_corners(direction, lights.reflection.shape[2], lights.reflection.shape[3])
+def reflection_texel(lights: Lights, light: int, level: int, at: Corners) -> wp.vec3:
+    """One level of the blurred reflections, bilinear."""
     return bilinear(
         at,
         lights.reflection[light, level, at.upper, at.west],
@@ -114,9 +114,10 @@ def reflected_radiance(lights: Lights, light: int, direction: wp.vec3, roughness
     """Mean radiance of the reflection lobe of a rough surface about a unit direction in the map's frame."""
     level = wp.clamp(roughness * float(REFLECTION_LEVELS) - 1.0, 0.0, float(REFLECTION_LEVELS - 1))
     lower = wp.min(int(level), REFLECTION_LEVELS - 2)
+    at = map_corners(direction, lights.reflection.shape[2], lights.reflection.shape[3])
     return wp.lerp(
-        reflection_texel(lights, light, lower, direction),
-        reflection_texel(lights, light, lower + 1, direction),
+        reflection_texel(lights, light, lower, at),
+        reflection_texel(lights, light, lower + 1, at),
         level - float(lower),
     )
 

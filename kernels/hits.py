@@ -1,4 +1,4 @@
-"""What every pixel's ray hits: primary hits with amodal bits, and occlusion queries."""
+"""What rays hit, by the trees of meshes: nearest hits of camera rays, and occlusion queries."""
 
 import warp as wp
 
@@ -44,6 +44,10 @@ class Meshes:
     center: wp.array[wp.vec3]
     radius: wp.array[float]
     """Bounding sphere in the mesh's own frame [m]."""
+    first_triangle: wp.array[int]
+    """Number of the mesh's first triangle among all; one row more than there are meshes."""
+    corner: wp.array[wp.vec3]
+    """Three corners of each triangle, in the mesh's own frame [m]."""
     entries: int
     """Catalog entries; the mesh of fixture f is entries + f."""
     hollow: Hollow
@@ -83,6 +87,8 @@ class Bodies:
     """The bodies that are there, by `near`, the tote last: rays that meet the nearest first seldom have to look at the rest."""
     present: wp.array[int]
     """How many these are, one a view."""
+    backdrop: wp.array[int]
+    """1: the view's tote stands at the world's origin, as in the backdrop that was rendered before."""
     candidates: wp.array2d[wp.uint64]
     """Of a view's tile: bit k is set if rays of its pixels may meet body order[k]."""
 
@@ -108,7 +114,6 @@ class Hit:
     triangle: int
     barycentric: wp.vec2
     depth: float
-    amodal: wp.uint32
 
 
 @wp.func
@@ -172,9 +177,8 @@ def trace_candidates(
     candidates: wp.uint64,
     ray: wp.vec3,
     instances: int,
-    amodal: bool,
 ) -> Hit:
-    """Nearest hit among these bodies, as in `Bodies.candidates`; with `amodal`, hidden instances are tested as well and get their bit."""
+    """Nearest hit among these bodies, as in `Bodies.candidates`."""
     best = Hit()
     best.code = NOTHING
     best.depth = FAR
@@ -185,37 +189,27 @@ def trace_candidates(
             body = bodies.order[view, number]
             near = bodies.near[view, body]
             if near < best.depth:
-                # Amodal bits need to know of hits behind the nearest one too; fixtures have no bit.
                 reach = best.depth - near
-                if amodal and body < instances:
-                    reach = FAR
                 start = body_ray_start(bodies, view, body, ray)
                 direction = bodies.turn[view, body] * ray
                 if body != instances or not misses_tote(meshes.hollow, start, direction, reach):
                     query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, direction, reach)
                     if query.result:
-                        if body < instances:
-                            best.amodal = best.amodal | (wp.uint32(1) << wp.uint32(body))
-                        depth = near + query.t
-                        if depth < best.depth:
-                            best.depth = depth
-                            best.triangle = query.face
-                            best.barycentric = wp.vec2(query.u, query.v)
-                            best.code = body + 1
-                            if body >= instances:
-                                best.code = FIRST_FIXTURE + body - instances
-            elif amodal and body < instances:
-                if hits_body(meshes, bodies, view, body, ray):
-                    best.amodal = best.amodal | (wp.uint32(1) << wp.uint32(body))
+                        best.depth = near + query.t
+                        best.triangle = query.face
+                        best.barycentric = wp.vec2(query.u, query.v)
+                        best.code = body + 1
+                        if body >= instances:
+                            best.code = FIRST_FIXTURE + body - instances
         left = left >> wp.uint64(1)
         number += 1
     return best
 
 
 @wp.func
-def trace_camera_ray(meshes: Meshes, bodies: Bodies, view: int, tile: int, ray: wp.vec3, instances: int, amodal: bool) -> Hit:
+def trace_camera_ray(meshes: Meshes, bodies: Bodies, view: int, tile: int, ray: wp.vec3, instances: int) -> Hit:
     """Nearest hit among the tile's candidates; see `trace_candidates`."""
-    return trace_candidates(meshes, bodies, view, bodies.candidates[view, tile], ray, instances, amodal)
+    return trace_candidates(meshes, bodies, view, bodies.candidates[view, tile], ray, instances)
 
 
 @wp.func
@@ -243,7 +237,7 @@ def store_hit(hits: Hits, view: int, row: int, column: int, hit: Hit):
 
 @wp.func
 def read_hit(hits: Hits, view: int, row: int, column: int) -> Hit:
-    """The hit of a pixel, without its amodal bits."""
+    """The hit of a pixel."""
     hit = Hit()
     hit.code = int(hits.code[view, row, column])
     hit.triangle = hits.triangle[view, row, column]
@@ -253,56 +247,20 @@ def read_hit(hits: Hits, view: int, row: int, column: int) -> Hit:
 
 
 @wp.func
+def triangle_normal(meshes: Meshes, mesh: int, triangle: int) -> wp.vec3:
+    """Unit normal of a mesh's triangle, in the mesh's own frame."""
+    first = 3 * (meshes.first_triangle[mesh] + triangle)
+    corner = meshes.corner[first]
+    return wp.normalize(wp.cross(meshes.corner[first + 1] - corner, meshes.corner[first + 2] - corner))
+
+
+@wp.func
 def face_normal(meshes: Meshes, bodies: Bodies, view: int, hit: Hit, instances: int) -> wp.vec3:
     """Unit normal, in the world, of the triangle or table that a ray hit; either side."""
     if hit.code == TABLE:
         return wp.vec3(0.0, 0.0, 1.0)
     body = body_of(hit.code, instances)
-    return wp.transpose(bodies.world_turn[view, body]) * wp.mesh_eval_face_normal(meshes.id[bodies.mesh[view, body]], hit.triangle)
-
-
-@wp.kernel(cuda_max_registers=RAY_REGISTERS)
-def trace_hits_kernel(
-    # Scene:
-    meshes: Meshes,
-    table: Table,
-    cameras: Cameras,
-    grid: ImageGrid,
-    # In:
-    bodies: Bodies,
-    view_camera: wp.array[int],
-    instances: int,
-    counts_per_meter: float,
-    first: int,
-    # Out:
-    hits_out: Hits,
-    instance_out: wp.array3d[wp.uint8],
-    depth_out: wp.array3d[wp.uint16],
-    amodal_out: wp.array3d[wp.uint32],
-):
-    """Cast one ray through the centre of each pixel.
-
-    Depth is planar, in counts rounded to nearest, 0 where nothing is hit or the count does not fit. Bit i of `amodal_out` is set
-    where the ray hits instance i, hidden or not.
-    """
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
-        return
-    camera = view_camera[view]
-    ray = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
-    hit = trace_camera_ray(meshes, bodies, view, tile_of(grid, row, column), ray, instances, True)
-    hit = hit_table(table, cameras, camera, ray, hit)
-
-    store_hit(hits_out, view, row, column, hit)
-    instance_out[view, row, column] = wp.uint8(hit.code)
-    amodal_out[view, row, column] = hit.amodal
-    counts = wp.rint(hit.depth * counts_per_meter)
-    if counts > MAX_COUNTS:
-        counts = 0.0
-    depth_out[view, row, column] = wp.uint16(counts)
+    return wp.transpose(bodies.world_turn[view, body]) * triangle_normal(meshes, bodies.mesh[view, body], hit.triangle)
 
 
 @wp.kernel(cuda_max_registers=RAY_REGISTERS)
@@ -332,7 +290,7 @@ def trace_sample_kernel(
     if camera < 0:
         return
     ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
-    hit = trace_camera_ray(meshes, bodies, view, tile_of(grid, row, column), ray, instances, False)
+    hit = trace_camera_ray(meshes, bodies, view, tile_of(grid, row, column), ray, instances)
     store_hit(hits_out, view, row, column, hit_table(table, cameras, camera, ray, hit))
 
 

@@ -366,7 +366,7 @@ def trace_paths_kernel(
     for number in range(rules.samples):
         offset = scrambled_point(place.key, number, 0) - wp.vec2(0.5, 0.5)
         ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
-        hit = trace_camera_ray(scene.meshes, bodies, view, tile_of(grid, row, column), ray, rules.instances, False)
+        hit = trace_camera_ray(scene.meshes, bodies, view, tile_of(grid, row, column), ray, rules.instances)
         hit = hit_table(scene.table, cameras, camera, ray, hit)
         direction = wp.normalize(cameras.to_world[camera] * ray)
         if hit.code == NOTHING:

@@ -58,6 +58,8 @@ def prepare_bodies_kernel(
         mesh = meshes.entries + body - instances
         placed = fixture_pose[world, body - instances]
     bodies_out.mesh[view, body] = mesh
+    if body == instances:
+        bodies_out.backdrop[view] = int(mesh >= 0 and placed == wp.transform_identity(dtype=float))
     if mesh < 0:
         bodies_out.box[view, body] = wp.vec4i(0, 0, -1, -1)
         bodies_out.sphere[view, body] = wp.vec4(0.0, 0.0, 0.0, -1.0)

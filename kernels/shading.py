@@ -7,7 +7,7 @@ from synpick_warp.kernels.camera_rays import Cameras, camera_ray, tile_pixel
 from synpick_warp.kernels.cells import CellGrid, Guide
 from synpick_warp.kernels.environment import Lights, background_radiance, turned
 from synpick_warp.kernels.even_light import Light, even_light
-from synpick_warp.kernels.hits import NOTHING, RAY_REGISTERS, TABLE, Bodies, Hits, body_of
+from synpick_warp.kernels.hits import NOTHING, TABLE, Bodies, Hits, body_of
 from synpick_warp.kernels.paths import PathScene
 from synpick_warp.kernels.shadows import lit_share
 from synpick_warp.kernels.surfaces import base_color, mesh_surface, table_surface
@@ -15,6 +15,9 @@ from synpick_warp.kernels.tangent import pixel_plane
 from synpick_warp.kernels.windows import Shares, gathered_share
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+SHADE_REGISTERS = 80
+"""Most registers of a thread that shades: it waits less than one that casts rays, and has more to keep."""
 
 
 @wp.func
@@ -30,7 +33,7 @@ def lit_surface(gloss: Gloss, lights: Lights, light: int, turn: float, brdf: Brd
     return result
 
 
-@wp.kernel(cuda_max_registers=RAY_REGISTERS)
+@wp.kernel(cuda_max_registers=SHADE_REGISTERS)
 def shade_kernel(
     # Scene:
     scene: PathScene,

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.brdf import Gloss
-from synpick_warp.kernels.hits import FIXTURES, Bodies, Meshes
+from synpick_warp.kernels.hits import FIXTURES, Bodies, Meshes, triangle_normal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -13,11 +13,10 @@ MIN_TILT = wp.constant(0.1)
 
 @wp.struct
 class Surfaces:
-    """Constant, one row a mesh and a last one for the table; vertices, triangles and texels of all meshes lie one after the other."""
+    """Constant, one row a mesh and a last one for the table; triangles, in the order of `Meshes`, and texels lie one after the other."""
 
-    first_vertex: wp.array[int]
-    first_triangle: wp.array[int]
     normal: wp.array[wp.vec3]
+    """Of each corner of each triangle, as `Meshes.corner` has them."""
     uv: wp.array[wp.vec2]
     uv_density: wp.array[float]
     """Texture lengths per metre, one a triangle."""
@@ -88,22 +87,22 @@ def mesh_surface(
     to_world = wp.transpose(bodies.world_turn[view, body])
     result = Surface()
     result.row = mesh
-    result.face_normal = towards(to_world * wp.mesh_eval_face_normal(meshes.id[mesh], triangle), view_direction)
-    first = surfaces.first_vertex[mesh]
-    i = first + wp.mesh_get_index(meshes.id[mesh], 3 * triangle)
-    j = first + wp.mesh_get_index(meshes.id[mesh], 3 * triangle + 1)
-    k = first + wp.mesh_get_index(meshes.id[mesh], 3 * triangle + 2)
+    result.face_normal = towards(to_world * triangle_normal(meshes, mesh, triangle), view_direction)
+    number = meshes.first_triangle[mesh] + triangle
+    a = 3 * number
+    b = a + 1
+    c = a + 2
     u = barycentric[0]
     v = barycentric[1]
     w = 1.0 - u - v
-    smooth = to_world * (u * surfaces.normal[i] + v * surfaces.normal[j] + w * surfaces.normal[k])
+    smooth = to_world * (u * surfaces.normal[a] + v * surfaces.normal[b] + w * surfaces.normal[c])
     result.normal = result.face_normal
     if wp.length_sq(smooth) > 0.0:
         result.normal = wp.normalize(towards(smooth, result.face_normal))
-    result.uv = u * surfaces.uv[i] + v * surfaces.uv[j] + w * surfaces.uv[k]
+    result.uv = u * surfaces.uv[a] + v * surfaces.uv[b] + w * surfaces.uv[c]
     # A tilted pixel is longer one way only; the root is its mean stretch.
     tilt = wp.sqrt(wp.max(wp.dot(result.face_normal, view_direction), MIN_TILT))
-    result.uv_footprint = pixel_width / tilt * surfaces.uv_density[surfaces.first_triangle[mesh] + triangle]
+    result.uv_footprint = pixel_width / tilt * surfaces.uv_density[number]
     return result
 
 
@@ -125,10 +124,11 @@ def level_color(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> wp.vec
     top = int(wp.floor(y))
     right_share = x - float(left)
     lower_share = y - float(top)
-    right = (left + 1) % width
-    bottom = (top + 1) % height
-    left = (left + width) % width
-    top = (top + height) % height
+    # Both are at least -1 and less than the level's size; a division for the remainder would cost more than the texels.
+    right = wp.where(left + 1 == width, 0, left + 1)
+    bottom = wp.where(top + 1 == height, 0, top + 1)
+    left = wp.where(left < 0, width - 1, left)
+    top = wp.where(top < 0, height - 1, top)
     first = surfaces.first_texel[row, level]
     return wp.lerp(
         wp.lerp(texel_color(surfaces, first + top * width + left), texel_color(surfaces, first + top * width + right), right_share),

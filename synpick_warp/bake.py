@@ -44,6 +44,7 @@ from synpick_warp.stages.layers import MOVING, MotionArrays
 from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
 from synpick_warp.stages.physics import with_enough_worlds
 from synpick_warp.stages.plan import CycleArrays, VoteArrays, plan_sizes
+from synpick_warp.stages.raster import MarkArrays, mark_sizes
 from synpick_warp.stages.record import record_kinds, record_sizes
 from synpick_warp.stages.render import PictureArrays, Renderer
 from synpick_warp.stages.render_scene import build_render_scene
@@ -257,6 +258,8 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
     groups += [(EdgeBuffers, edge_sizes(views), ring), (EdgeScratch, edge_sizes(views), 1)]
     groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
+    pixels = mark_sizes(views["view"], *config.cameras.resolution)
+    groups += [(MarkArrays, pixels, 1), (HitArrays, pixels | {"view": len(config.cameras.positions)}, 1)]
     if any(kind.records for kind in exporter_kinds(config.bake.formats)):
         groups += [(kind, record_sizes(config, worlds), 1 + RECORDS) for kind in record_kinds(config)]
     if MOVING.intersection(config.render.layers):

@@ -17,6 +17,7 @@ from synpick_warp.stages.fast import Edges, GatheredArrays, GuideArrays, ShadowA
 from synpick_warp.stages.layers import MotionArrays
 from synpick_warp.stages.perceive import SightScratch, count_views
 from synpick_warp.stages.plan import CycleArrays, VoteArrays
+from synpick_warp.stages.raster import MarkArrays
 from synpick_warp.stages.render import PictureArrays
 from synpick_warp.stages.sight import LookArrays, Plan, Sighting
 from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus
@@ -24,12 +25,12 @@ from tests.reference.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset part tile "
-    "cell_row cell_column shadow_row shadow_column segment segment_square"
+    "cell_row cell_column shadow_row shadow_column segment segment_square block"
 )
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
     WorldState, AttemptState, SealState, LastFrame, Sighting, Plan, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays,
-    PictureArrays, EdgeBuffers, EdgeScratch, GuideArrays, GatheredArrays, ShareArrays, ShadowArrays, Edges,
+    PictureArrays, EdgeBuffers, EdgeScratch, GuideArrays, GatheredArrays, ShareArrays, ShadowArrays, Edges, MarkArrays,
 ]  # fmt: skip
 LOOKING = [LookArrays, SightScratch, VoteArrays, CycleArrays]
 LAYERS = [LayerBuffers, MotionArrays]
@@ -110,7 +111,7 @@ def test_a_bake_that_may_pick_has_the_arrays_of_looking_as_well(mode):
     shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in LOOKING}}
     assert shapes["LookArrays.component"] == shapes["SightScratch.gap"] == (looks, 48, 64)
     assert shapes["VoteArrays.count"] == (looks, room, room, 2)
-    assert [name for name, *_ in rows].count("HitArrays.depth") == 2
+    assert [name for name, *_ in rows].count("HitArrays.depth") == 3
 
 
 def test_a_mixture_without_picking_has_none():

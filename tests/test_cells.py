@@ -175,7 +175,7 @@ def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
     out = allocate(ViewBuffers, sizes, device)
     zero = wp.zeros(1, dtype=wp.int32, device=device)
     renderer.prepare_bodies(snapshot(toy, device), zero, zero, 1)
-    renderer.trace_hits(zero, 1, out)
+    renderer.find_hits(zero, 1, out)
     return out, renderer
 
 
@@ -188,7 +188,7 @@ def test_no_body_that_a_tiles_rays_meet_is_left_out(device, seed):
     assert present == 14
     kept = {name: getattr(out, name).numpy().copy() for name in ("instance", "depth", "amodal")}
     renderer.bodies.candidates.fill_(wp.uint64((1 << 14) - 1))
-    renderer.trace_hits(wp.zeros(1, dtype=wp.int32, device=device), 1, out)
+    renderer.find_hits(wp.zeros(1, dtype=wp.int32, device=device), 1, out)
     for name, image in kept.items():
         np.testing.assert_array_equal(image, getattr(out, name).numpy())
     counts = np.array([int(value).bit_count() for value in candidates])

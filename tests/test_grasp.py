@@ -114,7 +114,7 @@ class Grasps:
         self.grasp = allocate(Plan, sizes, device)
         self.look.world.assign(np.arange(views))
         renderer.prepare_bodies(snapshot(toy, device), self.look.world, self.look.camera, views)
-        renderer.trace_hits(self.look.camera, views, allocate(ViewBuffers, sizes, device))
+        renderer.find_hits(self.look.camera, views, allocate(ViewBuffers, sizes, device))
         self.ids, self.depth = renderer.hits.code.numpy().astype(int) - 1, renderer.hits.depth.numpy()
         self.found = planning.look_at(self.ids, self.depth, instances)
         self.look.component.assign(self.found["component"])

@@ -240,7 +240,8 @@ def test_trace_shows_what_the_renderer_shows_without_a_gripper(device):
     code, depth = sight.hits.code.numpy(), sight.hits.depth.numpy()
     for view, world in ((0, 1), (2, 0)):
         assert (code[view] == expected.instance[world]).all()
-        assert (depth[view] == expected.exact_depth[world]).all()
+        # The renderer finds its hits triangle by triangle, looks do by trees.
+        np.testing.assert_allclose(depth[view], expected.exact_depth[world], rtol=1e-6)
     assert (code[1] == 77).all()
     assert sight.look.camera.numpy().tolist() == [0, -1, 0]
 

@@ -193,7 +193,7 @@ def _render(config: Config, factory: Factory, least: float) -> Iterator[Row]:
     for name, launch in _render_stages(factory, count).items():
         spent[name] = seconds_per_call(launch, device, least / 4, BURST) / count
         yield Row("render", f"a view: {name}", 1e3 * spent[name], "ms")
-    yield Row("render", "views, ground truth alone", 1.0 / (spent["prepare bodies"] + spent["trace hits"] + spent["annotate"]), "1/s")
+    yield Row("render", "views, ground truth alone", 1.0 / (spent["prepare bodies"] + spent["find hits"] + spent["annotate"]), "1/s")
     yield Row("render", "views, all stages", 1.0 / spent["all"], "1/s")
     if device.is_cuda:
         size = sum(array.capacity for array in stream.copies[0].source)
@@ -220,7 +220,7 @@ def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], objec
     world, camera = (wp.array(values, dtype=wp.int32, device=simulation.device) for values in (view // cameras, view % cameras))
     stages: dict[str, Callable[[], object]] = {
         "prepare bodies": lambda: renderer.prepare_bodies(snapshot, world, camera, count),
-        "trace hits": lambda: renderer.trace_hits(camera, count, out),
+        "find hits": lambda: renderer.find_hits(camera, count, out),
     }
     if isinstance(shading, FastPicture):
         stages |= {

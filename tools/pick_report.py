@@ -144,7 +144,7 @@ class Eyes:
             count = min(self.batch, len(self.world) - first)
             world, camera = (_part(views, first, count) for views in self.lists)
             self.renderer.prepare_bodies(snapshot, world, camera, count)
-            self.renderer.trace_hits(camera, count, self.out)
+            self.renderer.find_hits(camera, count, self.out)
             annotate(self.renderer.scene, self.renderer.bodies, camera, count, self.out)
             wp.copy(_part(self.pixels, first, count), _part(self.out.pixels, 0, count))
         self.copy.start(None)

@@ -27,6 +27,7 @@ class BodyArrays:
     sphere: wp.array = device_array("view", "body", dtype=wp.vec4, unit="m, m²")
     order: wp.array = device_array("view", "body", dtype=wp.int32)
     present: wp.array = device_array("view", dtype=wp.int32)
+    backdrop: wp.array = device_array("view", dtype=wp.int32)
     candidates: wp.array = device_array("view", "tile", dtype=wp.uint64)
 
 

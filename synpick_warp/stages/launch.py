@@ -56,3 +56,20 @@ def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: li
 
     for _ in _pool().map(launch_piece, range(0, pixels, size)):
         pass
+
+
+def launch_views(kernel: wp.Kernel, views: int, each: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:
+    """Launch a kernel over `each` threads for each view; its last input is the range's begin. Threads of a view may write the same place.
+
+    On the CPU, where Warp's atomic operations are none, the threads of a view run one after the other, and views side by side.
+    """
+    if device.is_cuda:
+        wp.launch(kernel, dim=views * each, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=BLOCK)
+        return
+    kernel.module.load(device, 1)
+
+    def launch_view(view: int) -> None:
+        wp.launch(kernel, dim=each, inputs=[*inputs, view * each], outputs=outputs, device=device)
+
+    for _ in _pool().map(launch_view, range(views)):
+        pass

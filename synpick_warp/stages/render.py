@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.configs.schema import REFERENCE, Config
 from synpick_warp.kernels.antialias import Picture
-from synpick_warp.kernels.camera_rays import TILE_PIXELS
-from synpick_warp.kernels.hits import Bodies, Hits, trace_hits_kernel
+from synpick_warp.kernels.hits import Bodies, Hits
 from synpick_warp.stages.annotate import annotate
 from synpick_warp.stages.bodies import BodyArrays, HitArrays, body_sizes, filled, place_bodies
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.develop import Developer
 from synpick_warp.stages.fast import FastPicture
-from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.layers import LayerPainter
+from synpick_warp.stages.raster import Rasterizer
 from synpick_warp.stages.reference import ReferencePicture
 from synpick_warp.stages.render_scene import RenderScene
 
@@ -47,7 +45,6 @@ class Renderer:
         self.scene = scene
         self.instances = instances
         self.views = views
-        self.counts_per_meter = 1000.0 / config.bop.depth_scale
         self.arrays = (
             allocate(BodyArrays, sizes, scene.device),
             allocate(HitArrays, sizes, scene.device),
@@ -60,6 +57,7 @@ class Renderer:
             self.shading: FastPicture | ReferencePicture = ReferencePicture(config, scene, instances)
         else:
             self.shading = FastPicture(config, scene, instances, views)
+        self.rasterizer = Rasterizer(scene, instances, 1000.0 / config.bop.depth_scale, views)
         self.layers = LayerPainter(config, scene, instances, views)
         self.developer = Developer(config, scene, views)
 
@@ -90,7 +88,7 @@ class Renderer:
         if count == 0:
             return
         self.prepare_bodies(snapshot, view_world, view_camera, count)
-        self.trace_hits(view_camera, count, out)
+        self.find_hits(view_camera, count, out)
         if layers is not None:
             self.layers.draw(snapshot, self.bodies, self.hits, view_world, view_camera, count, layers)
         self.shading.shade(snapshot, self.bodies, self.hits, view_world, view_camera, count, self.picture)
@@ -103,16 +101,10 @@ class Renderer:
         visible = snapshot.fixture_visible
         place_bodies(scene, scene.cameras, scene.grid, snapshot, visible, view_world, view_camera, count, self.bodies)
 
-    def trace_hits(self, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
+    def find_hits(self, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
         """Depth, identities and amodal bits, and the hits for shading."""
-        scene = self.scene
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.bodies, view_camera, self.instances, self.counts_per_meter]
-        self._launch(trace_hits_kernel, count, inputs, [self.hits, out.instance, out.depth, out.amodal])
+        self.rasterizer.find(self.bodies, view_camera, count, self.hits, out)
 
     def develop(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
         """Radiance to bytes."""
         self.developer.develop(snapshot, view_world, view_camera, count, self.picture, out)
-
-    def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        pixels = count * self.scene.grid.tiles * int(TILE_PIXELS)
-        launch_pixels(kernel, pixels, inputs, outputs, self.scene.device)

@@ -69,6 +69,11 @@ def packed_colors(image: np.ndarray) -> np.ndarray:
     return red | green << 8 | blue << 16
 
 
+def corner_values(values: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
+    """Values of a mesh's vertices (V, C), for the three corners of each triangle (3 F, C): what a triangle has lies together."""
+    return values[mesh.faces].reshape(-1, values.shape[1])
+
+
 def uv_density(mesh: TriangleMesh) -> np.ndarray:
     """Texture lengths per metre on each triangle (F) float32: the root of the ratio of areas, 0 for triangles without area."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
@@ -103,6 +108,8 @@ def build_meshes(
     meshes.center = wp.array(center, dtype=wp.vec3, device=device)
     # One part in a million more, so that rounding never lets a sphere exclude its own mesh.
     meshes.radius = wp.array(np.array(radius) * (1.0 + 1e-6), dtype=wp.float32, device=device)
+    meshes.first_triangle = wp.array(np.cumsum([0] + [len(shape.faces) for shape in shapes]), dtype=wp.int32, device=device)
+    meshes.corner = wp.array(np.concatenate([corner_values(s.vertices, s) for s in shapes]), dtype=wp.vec3, device=device)
     meshes.entries = entries
     meshes.hollow.half = wp.vec3(-1.0, -1.0, -1.0)
     if hollow is not None:
@@ -124,10 +131,8 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
             total += len(texels[-1])
     sizes = [(chain[0].shape[1], chain[0].shape[0]) if chain else (0, 0) for chain in chains]
     surfaces = Surfaces()
-    surfaces.first_vertex = wp.array(np.cumsum([0] + [len(s.vertices) for s in shapes[:-1]]), dtype=wp.int32, device=device)
-    surfaces.first_triangle = wp.array(np.cumsum([0] + [len(s.faces) for s in shapes[:-1]]), dtype=wp.int32, device=device)
-    surfaces.normal = wp.array(np.concatenate([s.normals for s in shapes]), dtype=wp.vec3, device=device)
-    surfaces.uv = wp.array(np.concatenate([s.uv for s in shapes]), dtype=wp.vec2, device=device)
+    surfaces.normal = wp.array(np.concatenate([corner_values(s.normals, s) for s in shapes]), dtype=wp.vec3, device=device)
+    surfaces.uv = wp.array(np.concatenate([corner_values(s.uv, s) for s in shapes]), dtype=wp.vec2, device=device)
     surfaces.uv_density = wp.array(np.concatenate([uv_density(s) for s in shapes]), dtype=wp.float32, device=device)
     surfaces.color = wp.array(srgb_to_linear(np.array([m.color for m in materials])), dtype=wp.vec3, device=device)
     surfaces.metallic = wp.array([m.metallic for m in materials], dtype=wp.float32, device=device)

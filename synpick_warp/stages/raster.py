@@ -1,0 +1,127 @@
+"""Launching the search for what the rays through pixels' centres meet, before a backdrop that is rendered once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from synpick_warp.arrays import allocate, device_array
+from synpick_warp.errors import CatalogError
+from synpick_warp.kernels.camera_rays import TILE_PIXELS
+from synpick_warp.kernels.hits import Bodies, Hits
+from synpick_warp.kernels.raster import (
+    MOST_TRIANGLES,
+    Marks,
+    clear_marks_kernel,
+    mark_blocks_kernel,
+    mark_triangles_kernel,
+    read_marks_kernel,
+)
+from synpick_warp.stages.bodies import BodyArrays, HitArrays, body_sizes, filled, place_bodies
+from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
+from synpick_warp.stages.launch import launch_pixels, launch_views
+from synpick_warp.stages.render_scene import RenderScene
+
+BLOCKS = 32768
+"""Blocks of large triangles that a view has room for: thirteen objects of some hundred to some thousand triangles, as the embedded ones,
+have 14,000 at full HD in front of a camera, dense meshes a tenth of that. Without room a single thread does them, which is slow."""
+TRIANGLE_THREADS = 4096
+"""Threads that share the triangles of a body on a GPU: a dense mesh keeps them busy, and those of a box cost little."""
+BLOCK_THREADS = 16384
+"""Threads that share the blocks of a view on a GPU."""
+
+
+@dataclass(frozen=True, eq=False)
+class MarkArrays:
+    """Arrays of the struct `Marks`."""
+
+    nearest: wp.array = device_array("view", "row", "column", dtype=wp.uint64)
+    block: wp.array = device_array("view", "block", dtype=wp.vec4i)
+    blocks: wp.array = device_array("view", dtype=wp.int32)
+
+
+class Rasterizer:
+    """Finds primary hits. Owns its scratch and the backdrop; `find` only launches.
+
+    Attributes:
+        backdrop: The struct `Hits`, a row a camera: what the tote, standing where it always does, and the table show.
+    """
+
+    def __init__(self, scene: RenderScene, instances: int, counts_per_meter: float, views: int) -> None:
+        """
+        Args:
+            scene: Constant data.
+            instances: Room for instances of a world.
+            counts_per_meter: Counts of the depth image.
+            views: Most views of a batch.
+
+        Raises:
+            CatalogError: A mesh has more triangles than a mark can name.
+        """
+        most = max(len(mesh.indices) // 3 for mesh in scene.keep)
+        if most > MOST_TRIANGLES:
+            raise CatalogError(f"a mesh has {most} triangles; at most {MOST_TRIANGLES} can be rendered")
+        self.scene = scene
+        self.instances = instances
+        self.counts_per_meter = counts_per_meter
+        self.marks = filled(Marks, allocate(MarkArrays, mark_sizes(views, scene.width, scene.height), scene.device))
+        self.backdrop = self._render_backdrop()
+
+    def find(self, bodies: Any, view_camera: wp.array, count: int, hits: Any, out: ViewBuffers) -> None:
+        """What each pixel of the first `count` views shows.
+
+        Args:
+            bodies: The struct `Bodies`, prepared for these views.
+            view_camera: Camera of each view (B) int32.
+            count: Views in use.
+            hits: The struct `Hits`; written.
+            out: Its `instance`, `depth` and `amodal` are written.
+        """
+        self._mark(self.marks, self.instances, bodies, view_camera, count, out.amodal)
+        self._read(self.marks, self.instances, self.backdrop, bodies, view_camera, count, hits, out)
+
+    def _mark(self, marks: Any, instances: int, bodies: Any, view_camera: wp.array, count: int, amodal: wp.array) -> None:
+        scene, on_gpu = self.scene, self.scene.device.is_cuda
+        pixels = count * scene.grid.tiles * int(TILE_PIXELS)
+        launch_pixels(clear_marks_kernel, pixels, [scene.grid], [marks, amodal], scene.device)
+        inputs = [scene.meshes, scene.cameras, scene.grid, bodies, view_camera, instances]
+        for kernel, threads, shares in (
+            (mark_triangles_kernel, TRIANGLE_THREADS, bodies.mesh.shape[1]),
+            (mark_blocks_kernel, BLOCK_THREADS, 1),
+        ):
+            each = threads if on_gpu else 1
+            launch_views(kernel, count, shares * each, [*inputs, each], [marks, amodal], scene.device)
+
+    def _read(
+        self, marks: Any, instances: int, backdrop: Any, bodies: Any, view_camera: wp.array, count: int, hits: Any, out: ViewBuffers
+    ) -> None:
+        scene = self.scene
+        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, backdrop, bodies, marks, view_camera]
+        inputs += [instances, self.counts_per_meter]
+        pixels = count * scene.grid.tiles * int(TILE_PIXELS)
+        launch_pixels(read_marks_kernel, pixels, inputs, [hits, out.instance, out.depth], scene.device)
+
+    def _render_backdrop(self) -> Any:
+        """What every camera sees of a world that has the tote alone."""
+        scene, device, cameras = self.scene, self.scene.device, self.scene.camera_count
+        sizes = mark_sizes(cameras, scene.width, scene.height) | body_sizes(0, scene.width, scene.height)
+        world = allocate(Snapshot, {"world": 1, "instance": 0, "fixture": len(FIXTURES)}, device)
+        world.fixture_pose.fill_(wp.transform_identity())
+        tote = wp.array([[1, 0, 0]], dtype=wp.int32, device=device)
+        view_world = wp.zeros(cameras, dtype=wp.int32, device=device)
+        view_camera = wp.array(range(cameras), dtype=wp.int32, device=device)
+        bodies, hits = filled(Bodies, allocate(BodyArrays, sizes, device)), filled(Hits, allocate(HitArrays, sizes, device))
+        marks = filled(Marks, allocate(MarkArrays, sizes, device))
+        out = allocate(ViewBuffers, sizes, device, ("instance", "depth", "amodal"))
+        place_bodies(scene, scene.cameras, scene.grid, world, tote, view_world, view_camera, cameras, bodies)
+        bodies.backdrop.zero_()
+        self._mark(marks, 0, bodies, view_camera, cameras, out.amodal)
+        self._read(marks, 0, hits, bodies, view_camera, cameras, hits, out)
+        return hits
+
+
+def mark_sizes(views: int, width: int, height: int) -> dict[str, int]:
+    """Extents of the dimensions that `MarkArrays` names."""
+    return {"view": views, "row": height, "column": width, "block": BLOCKS}
