@@ -10,7 +10,7 @@ from synpick_warp.kernels.even_light import Light, even_light
 from synpick_warp.kernels.hits import NOTHING, TABLE, Bodies, Hits, body_of
 from synpick_warp.kernels.paths import PathScene
 from synpick_warp.kernels.shadows import lit_share
-from synpick_warp.kernels.surfaces import base_color, mesh_surface, table_surface
+from synpick_warp.kernels.surfaces import base_color, mesh_surface, table_surface, widened_roughness
 from synpick_warp.kernels.tangent import pixel_plane
 from synpick_warp.kernels.windows import Shares, gathered_share
 
@@ -83,7 +83,8 @@ def shade_kernel(
         surface = mesh_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
     color = base_color(scene.surfaces, surface)
     metallic = scene.surfaces.metallic[surface.row]
-    brdf = brdf_at(scene.surfaces.gloss, color, metallic, scene.surfaces.roughness[surface.row], surface.normal, outgoing)
+    roughness = widened_roughness(scene.surfaces.roughness[surface.row], surface.spread)
+    brdf = brdf_at(scene.surfaces.gloss, color, metallic, roughness, surface.normal, outgoing)
     normal = wp.transpose(cameras.to_world[camera]) * surface.face_normal
     plane = pixel_plane(intrinsics, row, column, hits.code[view, row, column], depth, normal)
     share = gathered_share(guide, shares, cells, view, row, column, plane)

@@ -7,6 +7,10 @@ from synpick_warp.kernels.hits import FIXTURES, Bodies, Meshes, triangle_normal
 
 wp.set_module_options({"enable_backward": False})
 
+PIXEL_VARIANCE = wp.constant(1.0 / 12.0)
+"""Of a place in a pixel along an axis [px²]."""
+MOST_WIDENING = wp.constant(0.18)
+"""Largest increase of the squared GGX width by what a pixel's normals differ."""
 MIN_TILT = wp.constant(0.1)
 """Bounds how far a pixel stretches on a surface seen edge-on."""
 
@@ -20,6 +24,8 @@ class Surfaces:
     uv: wp.array[wp.vec2]
     uv_density: wp.array[float]
     """Texture lengths per metre, one a triangle."""
+    bend: wp.array[float]
+    """How fast the interpolated normal turns along the triangle, both ways together [rad/m], one a triangle."""
     color: wp.array[wp.vec3]
     """Base colour, linear."""
     metallic: wp.array[float]
@@ -50,6 +56,8 @@ class Surface:
     uv: wp.vec2
     uv_footprint: float
     """Width of the pixel on the surface, in texture lengths."""
+    spread: float
+    """How far apart the normals in the pixel point [rad]."""
 
 
 @wp.func
@@ -103,6 +111,7 @@ def mesh_surface(
     # A tilted pixel is longer one way only; the root is its mean stretch.
     tilt = wp.sqrt(wp.max(wp.dot(result.face_normal, view_direction), MIN_TILT))
     result.uv_footprint = pixel_width / tilt * surfaces.uv_density[number]
+    result.spread = pixel_width / tilt * surfaces.bend[number]
     return result
 
 
@@ -152,3 +161,10 @@ def base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
     fine = level_color(surfaces, surface.row, lower, surface.uv)
     coarse = level_color(surfaces, surface.row, upper, surface.uv)
     return wp.cw_mul(color, wp.lerp(fine, coarse, level - float(lower)))
+
+
+@wp.func
+def widened_roughness(roughness: float, spread: float) -> float:
+    """Roughness of what a pixel shows whose normals lie so far apart: a lobe as wide as all of theirs (Kaplanyan et al., 2016)."""
+    alpha = roughness * roughness
+    return wp.sqrt(wp.sqrt(wp.min(alpha * alpha + wp.min(PIXEL_VARIANCE * spread * spread, MOST_WIDENING), 1.0)))

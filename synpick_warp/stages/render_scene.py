@@ -134,6 +134,7 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     surfaces.normal = wp.array(np.concatenate([corner_values(s.normals, s) for s in shapes]), dtype=wp.vec3, device=device)
     surfaces.uv = wp.array(np.concatenate([corner_values(s.uv, s) for s in shapes]), dtype=wp.vec2, device=device)
     surfaces.uv_density = wp.array(np.concatenate([uv_density(s) for s in shapes]), dtype=wp.float32, device=device)
+    surfaces.bend = wp.array(np.concatenate([normal_bend(s) for s in shapes]), dtype=wp.float32, device=device)
     surfaces.color = wp.array(srgb_to_linear(np.array([m.color for m in materials])), dtype=wp.vec3, device=device)
     surfaces.metallic = wp.array([m.metallic for m in materials], dtype=wp.float32, device=device)
     surfaces.roughness = wp.array([m.roughness for m in materials], dtype=wp.float32, device=device)
@@ -144,6 +145,16 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     surfaces.gloss = measure_gloss(device)
     surfaces.linear = wp.array(srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=device)
     return surfaces
+
+
+def normal_bend(mesh: TriangleMesh) -> np.ndarray:
+    """How fast the interpolated normal turns along each triangle (F) float32 [rad/m]: the Frobenius norm of its gradient there."""
+    edges, turns = (np.diff(values[mesh.faces].astype(np.float64), axis=1) for values in (mesh.vertices, mesh.normals))
+    # A gradient G takes edges E, as columns, to the turns G E of the normal along them: |G|² is the trace of (EᵀE)⁻¹ (GE)ᵀ(GE).
+    gram, turned = (rows @ rows.transpose(0, 2, 1) for rows in (edges, turns))
+    adjugate = gram[:, ::-1, ::-1] * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    squared, area = np.einsum("fij,fij->f", adjugate, turned), np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    return (np.sqrt(np.maximum(squared, 0.0)) / np.where(area > 0.0, area, np.inf)).astype(np.float32)
 
 
 def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
