@@ -120,6 +120,8 @@ def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> 
         int(wp.floor(wp.clamp(most[0] + MARGIN, -1.0, width - 1.0))),
         int(wp.floor(wp.clamp(most[1] + MARGIN, -1.0, height - 1.0))),
     )
+    if found.pixels[2] < found.pixels[0] or found.pixels[3] < found.pixels[1]:
+        return found
     # From the box's corner on, numbers are small. The margin is that of the longest edge that the box can hold.
     a -= least
     b -= least
