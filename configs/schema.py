@@ -297,7 +297,10 @@ class Render:
     cell: int = setting(
         0, "px", "With mode fast: paths start from the middles of cells so wide; 0: as many as leave at least 384 across.", low=0, high=64
     )
-    cell_paths: int = setting(2, "", "With mode fast: paths a cell; powers of two are spread most evenly.", low=1, high=1024)
+    cell_paths: int = setting(
+        0, "", "With mode fast: paths a cell; powers of two are spread most evenly; 0: 2, or 1 if more than 480 cells lie across.",
+        low=0, high=1024,
+    )
     antialias: bool = setting(True, "", "With mode fast: a pixel where surfaces meet mixes their colours; reference always does.")
     tone: str = setting(
         SHOULDER, "", "shoulder: linear up to 0.6, highlights compressed; linear: cut off at 1; filmic: ACES' curve, middle grey kept.",

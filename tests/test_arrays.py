@@ -13,7 +13,7 @@ from synpick_warp.device import pick_device
 from synpick_warp.stages.bodies import BodyArrays, HitArrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch
-from synpick_warp.stages.fast import Edges, GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_sizes
+from synpick_warp.stages.fast import Edges, GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_paths, cell_sizes
 from synpick_warp.stages.layers import MotionArrays
 from synpick_warp.stages.perceive import SightScratch, count_views
 from synpick_warp.stages.plan import CycleArrays, VoteArrays
@@ -93,6 +93,14 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
 def test_cells_cover_the_image(cell, width, shape):
     sizes = cell_sizes(settings(render__cell=cell), width, 6)
     assert tuple(sizes[name] for name in ("cell_row", "cell_column", "shadow_row", "shadow_column")) == shape
+
+
+@pytest.mark.parametrize(
+    ("cell", "width", "paths"), [(0, 320, 2), (0, 480, 2), (0, 481, 1), (0, 640, 1), (0, 960, 2), (0, 1920, 2), (1, 1920, 1)]
+)
+def test_small_cells_have_one_path_and_wider_ones_two(cell, width, paths):
+    assert cell_paths(settings(render__cell=cell), width) == paths
+    assert cell_paths(settings(render__cell=cell, render__cell_paths=5), width) == 5
 
 
 def test_the_reference_has_no_cells():
