@@ -10,6 +10,8 @@ wp.set_module_options({"enable_backward": False})
 
 MARGIN = wp.constant(0.02)
 """A triangle's footprint is larger by this [px], against rounding of its projected corners: 2e-4 px at 2,000 columns."""
+FARTHEST = wp.constant(16384.0)
+"""A corner projected farther out than this [px] is not known to within MARGIN: then every pixel is tried."""
 UNSURE = wp.constant(1.0e-3)
 """A difference of products smaller than this share of them is computed in float64, where it is exact."""
 
@@ -99,10 +101,10 @@ def edge_line(start: wp.vec2, end: wp.vec2, sense: float, margin: float) -> wp.v
 def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> Footprint:
     """Pixels of the image whose rays a triangle may meet."""
     found = Footprint()
+    found.pixels = wp.vec4i(0, 0, grid.width - 1, grid.height - 1)
     depth = wp.vec3(triangle.near + triangle.a[2], triangle.near + triangle.b[2], triangle.near + triangle.c[2])
     if wp.min(depth) < NEAR_PLANE:
         # A corner so close has no useful projection.
-        found.pixels = wp.vec4i(0, 0, grid.width - 1, grid.height - 1)
         return found
     focal = wp.vec2(intrinsics[0], intrinsics[1])
     middle = wp.vec2(intrinsics[2] - PIXEL_CENTER, intrinsics[3] - PIXEL_CENTER)
@@ -111,7 +113,8 @@ def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> 
     c = wp.cw_mul(focal, wp.vec2(triangle.c[0], triangle.c[1]) / depth[2]) + middle
     least = wp.min(wp.min(a, b), c)
     most = wp.max(wp.max(a, b), c)
-    # Clamped before the conversion: an int cannot hold what a corner close to the near plane may project to.
+    if wp.max(wp.max(-least), wp.max(most)) > FARTHEST:
+        return found
     width = float(grid.width)
     height = float(grid.height)
     found.pixels = wp.vec4i(

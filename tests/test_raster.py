@@ -96,6 +96,21 @@ def test_loose_triangles_of_any_size_agree_with_float64(seed, count, size):
     assert (found["amodal"][both] == 1).all()
 
 
+@pytest.mark.parametrize("depth", [-0.5, 0.0, 1e-3, 2e-3, 5e-3, 0.05])
+def test_triangles_that_end_at_the_camera_are_seen_to_their_edges(device, depth):
+    """A strip of triangles that comes as near as `depth` [m], with its far ends across the picture."""
+    rng = np.random.default_rng(7)
+    near, far = rng.uniform(-0.02, 0.02, (12, 2)), rng.uniform(-0.25, 0.25, (12, 2, 2))
+    corners = np.stack([np.concatenate([n, [1.0 - depth]]) for n in near])[:, None]
+    corners = np.concatenate([corners, np.concatenate([far, np.zeros((12, 2, 1))], axis=2)], axis=1)
+    found = hits_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), device)
+    expected, clear = depth_in_float64(corners)
+    sure = clear > 0.02
+    assert sure.mean() > 0.4
+    np.testing.assert_array_equal(found["code"][sure] == 1, expected[sure] < NEVER)
+    assert (expected < NEVER).sum() > 500
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_trees_find_the_same(device, seed):
     rng = np.random.default_rng(seed)
