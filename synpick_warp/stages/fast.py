@@ -27,7 +27,7 @@ CELLS_ACROSS = 384
 wide at the bottom of the tote. Narrower pictures have cells of a pixel."""
 TWO_PATHS_ACROSS = 480
 """With at most so many cells in a picture's width a cell has two paths if the setting leaves that open, with more, one: at 640x360, where
-cells are pixels, ten piles have 32.4 dB then, which two bring to 33.6 dB in nearly twice the time."""
+cells are pixels, ten piles have 32.4 dB then, which two bring to 33.6 dB in 1.5 times the time."""
 SHADOW_WINDOW = 4
 """Width of the window that shares shadow rays among cells: 16 rays find how much of a lamp is hidden."""
 LEAST_ROUGHNESS = 0.3
