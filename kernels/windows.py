@@ -22,8 +22,6 @@ RING = wp.constant(1)
 """How many cells farther a pixel looks for its surface if none of the four about it is on it."""
 BODY_WEIGHT = wp.constant(0.02)
 """Weight of a cell on the same body but another surface: it calms places that have few like them around."""
-CERTAIN = wp.constant(1.0)
-"""A narrower window is believed as far as its squared difference from the wider one exceeds its variance by this factor."""
 
 
 @wp.struct
@@ -152,9 +150,9 @@ def narrowed(wide: wp.vec3, narrow: wp.vec3, variance: float) -> wp.vec3:
     """`wide`, moved towards `narrow` as far as their difference is more than the noise of `narrow`, of this variance."""
     difference = luminance(narrow) - luminance(wide)
     square = difference * difference
-    if square <= CERTAIN * variance:
+    if square <= variance:
         return wide
-    return wide + (1.0 - CERTAIN * variance / square) * (narrow - wide)
+    return wide + (1.0 - variance / square) * (narrow - wide)
 
 
 @wp.kernel
@@ -166,13 +164,13 @@ def choose_windows_kernel(
     guide: Guide,
     gathered: Gathered,
     view_camera: wp.array[int],
+    doubt: float,
     first: int,
     # Out:
     shares_out: Shares,
 ):
     """Shares of even light from the widest window that tells no other than the narrower ones: 4 x 4 blocks, 2 x 2 or one about each cell.
-
-    Blocks of a window do not overlap, so that a mean over n of them has an n-th of a block's variance.
+    Blocks of a window do not overlap, so that a mean over n of them has an n-th of a block's variance, which is `doubt` times the found.
     """
     cell = tile_pixel(cells.cells, wp.tid() + first)
     view = cell[0]
@@ -208,7 +206,7 @@ def choose_windows_kernel(
         shares_out.gloss[view, row, column] = own_gloss
         shares_out.between[view, row, column] = gathered.between[view, row, column]
         return
-    variance = variance / wide.weight
+    variance = doubt * variance / wide.weight
     diffuse = ratio(wide.diffuse, wide.even_diffuse)
     gloss = ratio(wide.gloss, wide.even_gloss)
     if middle.weight > 0.0:

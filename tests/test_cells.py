@@ -138,6 +138,20 @@ def test_the_filter_follows_a_step_without_noise_and_averages_noise():
     assert inside.mean() == pytest.approx(noise[4:44, 4:60].mean(), abs=0.03)
 
 
+def test_who_doubts_more_believes_fewer_narrow_windows():
+    """Rare bright cells: a block that has some is taken for bright, unless its variance is known to be found too low."""
+    flat = FlatFilter(64, 48, pick_device("cpu"))
+    for name in ("even_diffuse", "even_gloss"):
+        flat.assign(name, np.ones((48, 64)))
+    rare = 20.0 * (np.random.default_rng(0).uniform(size=(48, 64)) < 0.05)
+    flat.assign("diffuse", rare)
+    spread = [flat.run(doubt)["diffuse"][8:40, 8:56, 0].std() for doubt in (0.0, 0.5, 1.0, 2.0, 1e9)]
+    assert (np.diff(spread) < 0.0).all()
+    # At one end blocks as they are, at the other windows of 256 cells.
+    assert spread[-1] == pytest.approx(rare.std() / 16.0, rel=0.4)
+    assert spread[0] > 3.0 * spread[-1]
+
+
 def test_other_bodies_and_other_depths_do_not_mix():
     flat = FlatFilter(32, 32, pick_device("cpu"))
     for name in ("even_diffuse", "even_gloss"):

@@ -103,13 +103,13 @@ class FlatFilter:
         rgb = values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
         getattr(self.gathered, name).assign(rgb[None].astype(np.float32))
 
-    def run(self) -> dict[str, np.ndarray]:
+    def run(self, doubt: float = 1.0) -> dict[str, np.ndarray]:
         """Shares (row, column, 3) by name: of the chosen windows, and after softening."""
         shared = [self.cameras, self.cells, self.guide]
-        for kernel, source, out in (
-            (sum_blocks_kernel, self.gathered, self.blocks), (choose_windows_kernel, self.blocks, self.chosen),
-            (soften_shares_kernel, self.chosen, self.shares),
+        for kernel, source, rules, out in (
+            (sum_blocks_kernel, self.gathered, (), self.blocks), (choose_windows_kernel, self.blocks, (doubt,), self.chosen),
+            (soften_shares_kernel, self.chosen, (), self.shares),
         ):  # fmt: skip
-            wp.launch(kernel, self.count, [*shared, source, self.view_camera, 0], [out], device=self.device)
+            wp.launch(kernel, self.count, [*shared, source, self.view_camera, *rules, 0], [out], device=self.device)
         made = {name: getattr(self.shares, name).numpy()[0] for name in ("diffuse", "gloss", "between")}
         return made | {f"chosen_{name}": getattr(self.chosen, name).numpy()[0] for name in ("diffuse", "gloss", "between")}
