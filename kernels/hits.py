@@ -156,6 +156,14 @@ def body_of(code: int, instances: int) -> int:
 
 
 @wp.func
+def code_of(body: int, instances: int) -> int:
+    """A hit's code for a row of `Bodies`."""
+    if body >= instances:
+        return FIRST_FIXTURE + body - instances
+    return body + 1
+
+
+@wp.func
 def body_ray_start(bodies: Bodies, view: int, body: int, ray: wp.vec3) -> wp.vec3:
     """Where a camera ray passes the body's near depth, in the body's frame [m]."""
     return bodies.start[view, body] + bodies.near[view, body] * (bodies.turn[view, body] * wp.vec3(ray[0], ray[1], 0.0))
@@ -198,9 +206,7 @@ def trace_candidates(
                         best.depth = near + query.t
                         best.triangle = query.face
                         best.barycentric = wp.vec2(query.u, query.v)
-                        best.code = body + 1
-                        if body >= instances:
-                            best.code = FIRST_FIXTURE + body - instances
+                        best.code = code_of(body, instances)
         left = left >> wp.uint64(1)
         number += 1
     return best

@@ -13,7 +13,6 @@ from synpick_warp.kernels.draws import PATHS, mix, stream_key
 from synpick_warp.kernels.environment import Lights, background_radiance, turned
 from synpick_warp.kernels.hits import (
     FAR,
-    FIRST_FIXTURE,
     NOTHING,
     RAY_OFFSET,
     TABLE,
@@ -22,6 +21,7 @@ from synpick_warp.kernels.hits import (
     Meshes,
     Table,
     body_of,
+    code_of,
     hit_table,
     is_blocked,
     trace_camera_ray,
@@ -157,9 +157,7 @@ def nearest_hit(scene: PathScene, bodies: Bodies, view: int, instances: int, ori
                 best.depth = query.t
                 best.triangle = query.face
                 best.barycentric = wp.vec2(query.u, query.v)
-                best.code = body + 1
-                if body >= instances:
-                    best.code = FIRST_FIXTURE + body - instances
+                best.code = code_of(body, instances)
     return best
 
 

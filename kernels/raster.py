@@ -5,7 +5,6 @@ import warp as wp
 from synpick_warp.kernels.camera_rays import Cameras, ImageGrid, camera_ray, tile_pixel
 from synpick_warp.kernels.hits import (
     FAR,
-    FIRST_FIXTURE,
     MAX_COUNTS,
     NOTHING,
     Bodies,
@@ -13,6 +12,7 @@ from synpick_warp.kernels.hits import (
     Hits,
     Meshes,
     Table,
+    code_of,
     hit_table,
     read_hit,
     store_hit,
@@ -222,13 +222,11 @@ def mark_blocks_kernel(
 
 @wp.func
 def marked_hit(meshes: Meshes, bodies: Bodies, view: int, instances: int, mark: wp.uint64, ray: wp.vec3) -> Hit:
-    """The hit that left a mark."""
-    name = wp.uint32(mark & wp.uint64(0xFFFFFFFF))
+    """The hit that left a mark, whose lower half is a name."""
+    name = wp.uint32(mark)
     body = int(name >> TRIANGLE_BITS)
     hit = Hit()
-    hit.code = body + 1
-    if body >= instances:
-        hit.code = FIRST_FIXTURE + body - instances
+    hit.code = code_of(body, instances)
     hit.triangle = int(name & ((wp.uint32(1) << TRIANGLE_BITS) - wp.uint32(1)))
     hit.depth = wp.cast(wp.uint32(mark >> DEPTH_BITS), float)
     weights = ray_weights(camera_triangle(meshes, bodies, view, body, hit.triangle), ray)

@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False})
 PIXEL_VARIANCE = wp.constant(1.0 / 12.0)
 """Of a place in a pixel along an axis [px²]."""
 MOST_WIDENING = wp.constant(0.18)
-"""Largest increase of the squared GGX width by what a pixel's normals differ."""
+"""Largest increase of the squared GGX width by what a pixel's normals differ (Tokuyoshi and Kaplanyan, 2019)."""
 MIN_TILT = wp.constant(0.1)
 """Bounds how far a pixel stretches on a surface seen edge-on."""
 

@@ -125,7 +125,7 @@ def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> 
     )
     if found.pixels[2] < found.pixels[0] or found.pixels[3] < found.pixels[1]:
         return found
-    # From the box's corner on, numbers are small. The margin is that of the longest edge that the box can hold.
+    # From the box's corner on, numbers are small. The margin is that of the longest edge that the box can hold, and of no less than 1 px.
     a -= least
     b -= least
     c -= least

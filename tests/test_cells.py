@@ -8,16 +8,12 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.arrays import allocate
 from synpick_warp.device import pick_device
 from synpick_warp.kernels.gather import PERIOD
-from synpick_warp.scenes.shapes import Catalog
-from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.fast import cell_grid, spread_threads
-from synpick_warp.stages.render import Renderer
-from synpick_warp.stages.render_scene import build_grid, build_render_scene
+from synpick_warp.stages.render_scene import build_grid
 from tests.reference.fast_probe import FlatFilter, narrowed_kernel, number_kernel, scrambled_kernel, sobol_kernel, visit_kernel
-from tests.reference.toy_scene import ToyScene, ball, box, camera, entry, sheet, snapshot
+from tests.reference.toy_scene import ToyScene, ball, box, camera, entry, sheet, traced
 
 BITS = 32
 
@@ -179,18 +175,6 @@ def pile(rng, count: int) -> ToyScene:
         position = rng.uniform(-0.4, 0.4, 3) * min(number, 1)
         placed.append((int(rng.integers(len(meshes))), (*position, *(quaternion / np.linalg.norm(quaternion)))))
     return ToyScene([entry(mesh) for mesh in meshes], [placed], (view,), room=count + 2)
-
-
-def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
-    """Primary hits alone."""
-    scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
-    renderer = Renderer(toy.settings(), scene, toy.room, 1)
-    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
-    out = allocate(ViewBuffers, sizes, device)
-    zero = wp.zeros(1, dtype=wp.int32, device=device)
-    renderer.prepare_bodies(snapshot(toy, device), zero, zero, 1)
-    renderer.find_hits(zero, 1, out)
-    return out, renderer
 
 
 @pytest.mark.parametrize("seed", range(12))

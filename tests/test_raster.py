@@ -11,18 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp import frames
-from synpick_warp.arrays import allocate
 from synpick_warp.device import pick_device
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.camera_rays import TILE_PIXELS
 from synpick_warp.kernels.hits import trace_sample_kernel
-from synpick_warp.scenes.shapes import Catalog, Fixture, TriangleMesh
+from synpick_warp.scenes.shapes import Fixture, TriangleMesh
 from synpick_warp.stages import raster
-from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.launch import launch_pixels
-from synpick_warp.stages.render import Renderer
-from synpick_warp.stages.render_scene import build_render_scene
-from tests.reference.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, sheet, snapshot
+from tests.reference.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, sheet, traced
 
 VIEW = camera(96, 64, 150.0, (0.0, 0.0, 1.0))
 NEVER = 1.0e6
@@ -35,20 +31,12 @@ def triangles(corners: np.ndarray) -> TriangleMesh:
 
 
 def hits_of(toy: ToyScene, device: wp.Device, by_trees: bool = False) -> dict[str, np.ndarray]:
-    """What world 0 shows to camera 0: the arrays of `Hits`, and amodal bits unless trees are asked."""
-    config = toy.settings()
-    scene = build_render_scene(config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
-    renderer = Renderer(config, scene, toy.room, 1)
-    out = allocate(
-        ViewBuffers, {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}, device
-    )
-    first = wp.zeros(1, dtype=wp.int32, device=device)
-    renderer.prepare_bodies(snapshot(toy, device), first, first, 1)
+    """What world 0 shows to camera 0: the arrays of `Hits`, by trees if asked, and amodal bits."""
+    out, renderer = traced(toy, device)
     if by_trees:
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, renderer.bodies, first, toy.room, wp.vec2(0.0, 0.0)]
+        scene, camera_number = renderer.scene, wp.zeros(1, dtype=wp.int32, device=device)
+        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, renderer.bodies, camera_number, toy.room, wp.vec2(0.0, 0.0)]
         launch_pixels(trace_sample_kernel, scene.grid.tiles * int(TILE_PIXELS), inputs, [renderer.hits], device)
-    else:
-        renderer.find_hits(first, 1, out)
     found = {name: getattr(renderer.hits, name).numpy()[0].copy() for name in ("code", "triangle", "barycentric", "depth")}
     return found | {"amodal": out.amodal.numpy()[0].copy()}
 

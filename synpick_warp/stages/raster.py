@@ -49,13 +49,14 @@ class Rasterizer:
         backdrop: The struct `Hits`, a row a camera: what the tote, standing where it always does, and the table show.
     """
 
-    def __init__(self, scene: RenderScene, instances: int, counts_per_meter: float, views: int) -> None:
+    def __init__(self, scene: RenderScene, instances: int, counts_per_meter: float, views: int, backdrop: Any = None) -> None:
         """
         Args:
             scene: Constant data.
             instances: Room for instances of a world.
             counts_per_meter: Counts of the depth image.
             views: Most views of a batch.
+            backdrop: As the attribute; None: it is rendered.
 
         Raises:
             CatalogError: A mesh has more triangles than a mark can name.
@@ -67,7 +68,7 @@ class Rasterizer:
         self.instances = instances
         self.counts_per_meter = counts_per_meter
         self.marks = filled(Marks, allocate(MarkArrays, mark_sizes(views, scene.width, scene.height), scene.device))
-        self.backdrop = self._render_backdrop()
+        self.backdrop = render_backdrop(scene) if backdrop is None else backdrop
 
     def find(self, bodies: Any, view_camera: wp.array, count: int, hits: Any, out: ViewBuffers) -> None:
         """What each pixel of the first `count` views shows.
@@ -79,47 +80,35 @@ class Rasterizer:
             hits: The struct `Hits`; written.
             out: Its `instance`, `depth` and `amodal` are written.
         """
-        self._mark(self.marks, self.instances, bodies, view_camera, count, out.amodal)
-        self._read(self.marks, self.instances, self.backdrop, bodies, view_camera, count, hits, out)
-
-    def _mark(self, marks: Any, instances: int, bodies: Any, view_camera: wp.array, count: int, amodal: wp.array) -> None:
-        scene, on_gpu = self.scene, self.scene.device.is_cuda
+        scene, marks, device = self.scene, self.marks, self.scene.device
         pixels = count * scene.grid.tiles * int(TILE_PIXELS)
-        launch_pixels(clear_marks_kernel, pixels, [scene.grid], [marks, amodal], scene.device)
-        inputs = [scene.meshes, scene.cameras, scene.grid, bodies, view_camera, instances]
-        for kernel, threads, shares in (
-            (mark_triangles_kernel, TRIANGLE_THREADS, bodies.mesh.shape[1]),
-            (mark_blocks_kernel, BLOCK_THREADS, 1),
-        ):
-            each = threads if on_gpu else 1
-            launch_views(kernel, count, shares * each, [*inputs, each], [marks, amodal], scene.device)
+        launch_pixels(clear_marks_kernel, pixels, [scene.grid], [marks, out.amodal], device)
+        inputs = [scene.meshes, scene.cameras, scene.grid, bodies, view_camera, self.instances]
+        threads = (TRIANGLE_THREADS, BLOCK_THREADS) if device.is_cuda else (1, 1)
+        each = bodies.mesh.shape[1] * threads[0]
+        launch_views(mark_triangles_kernel, count, each, [*inputs, threads[0]], [marks, out.amodal], device)
+        launch_views(mark_blocks_kernel, count, threads[1], [*inputs, threads[1]], [marks, out.amodal], device)
+        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.backdrop, bodies, marks, view_camera]
+        inputs += [self.instances, self.counts_per_meter]
+        launch_pixels(read_marks_kernel, pixels, inputs, [hits, out.instance, out.depth], device)
 
-    def _read(
-        self, marks: Any, instances: int, backdrop: Any, bodies: Any, view_camera: wp.array, count: int, hits: Any, out: ViewBuffers
-    ) -> None:
-        scene = self.scene
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, backdrop, bodies, marks, view_camera]
-        inputs += [instances, self.counts_per_meter]
-        pixels = count * scene.grid.tiles * int(TILE_PIXELS)
-        launch_pixels(read_marks_kernel, pixels, inputs, [hits, out.instance, out.depth], scene.device)
 
-    def _render_backdrop(self) -> Any:
-        """What every camera sees of a world that has the tote alone."""
-        scene, device, cameras = self.scene, self.scene.device, self.scene.camera_count
-        sizes = mark_sizes(cameras, scene.width, scene.height) | body_sizes(0, scene.width, scene.height)
-        world = allocate(Snapshot, {"world": 1, "instance": 0, "fixture": len(FIXTURES)}, device)
-        world.fixture_pose.fill_(wp.transform_identity())
-        tote = wp.array([[1, 0, 0]], dtype=wp.int32, device=device)
-        view_world = wp.zeros(cameras, dtype=wp.int32, device=device)
-        view_camera = wp.array(range(cameras), dtype=wp.int32, device=device)
-        bodies, hits = filled(Bodies, allocate(BodyArrays, sizes, device)), filled(Hits, allocate(HitArrays, sizes, device))
-        marks = filled(Marks, allocate(MarkArrays, sizes, device))
-        out = allocate(ViewBuffers, sizes, device, ("instance", "depth", "amodal"))
-        place_bodies(scene, scene.cameras, scene.grid, world, tote, view_world, view_camera, cameras, bodies)
-        bodies.backdrop.zero_()
-        self._mark(marks, 0, bodies, view_camera, cameras, out.amodal)
-        self._read(marks, 0, hits, bodies, view_camera, cameras, hits, out)
-        return hits
+def render_backdrop(scene: RenderScene) -> Any:
+    """What every camera sees of a world that has the tote alone: the struct `Hits`, a row a camera."""
+    device, cameras = scene.device, scene.camera_count
+    sizes = {"view": cameras, "row": scene.height, "column": scene.width} | body_sizes(0, scene.width, scene.height)
+    world = allocate(Snapshot, {"world": 1, "instance": 0, "fixture": len(FIXTURES)}, device)
+    world.fixture_pose.fill_(wp.transform_identity())
+    tote = wp.array([[1, 0, 0]], dtype=wp.int32, device=device)
+    view_world = wp.zeros(cameras, dtype=wp.int32, device=device)
+    view_camera = wp.array(range(cameras), dtype=wp.int32, device=device)
+    bodies, hits = filled(Bodies, allocate(BodyArrays, sizes, device)), filled(Hits, allocate(HitArrays, sizes, device))
+    place_bodies(scene, scene.cameras, scene.grid, world, tote, view_world, view_camera, cameras, bodies)
+    # Nothing stands before it yet; its depth image is of no use, in whatever unit.
+    bodies.backdrop.zero_()
+    out = allocate(ViewBuffers, sizes, device, ("instance", "depth", "amodal"))
+    Rasterizer(scene, 0, 1.0, cameras, backdrop=hits).find(bodies, view_camera, cameras, hits, out)
+    return hits
 
 
 def mark_sizes(views: int, width: int, height: int) -> dict[str, int]:

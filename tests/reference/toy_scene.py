@@ -177,3 +177,15 @@ def render(toy: ToyScene, device: wp.Device) -> Picture:
     images = {name: getattr(out, name).numpy() for name in ("color", "depth", "instance", "amodal", "pixels", "boxes")}
     shown = renderer.picture
     return Picture(**images, exact_depth=renderer.hits.depth.numpy(), radiance=shown.radiance.numpy(), mix=shown.mix.numpy())
+
+
+def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
+    """Primary hits alone: what world 0 shows to camera 0."""
+    scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+    renderer = Renderer(toy.settings(), scene, toy.room, 1)
+    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
+    out = allocate(ViewBuffers, sizes, device)
+    zero = wp.zeros(1, dtype=wp.int32, device=device)
+    renderer.prepare_bodies(snapshot(toy, device), zero, zero, 1)
+    renderer.find_hits(zero, 1, out)
+    return out, renderer
