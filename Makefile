@@ -30,7 +30,7 @@ checks: $(VENV)/installed-dev
 	$(BIN)/ruff check --quiet --output-format concise .
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/basedpyright
-	$(BIN)/python tools/check_kernels.py
+	$(BIN)/python -m tools.checks.kernels
 
 clean:
 	rm -rf $(VENV) $(DEMO) build dist *.egg-info .pytest_cache .hypothesis .ruff_cache .import_linter_cache

@@ -10,7 +10,7 @@ SHOULDER = "shoulder"
 LINEAR = "linear"
 FILMIC = "filmic"
 TONES = (SHOULDER, LINEAR, FILMIC)
-"""Tone curves; their laws are those of `kernels.develop`."""
+"""Tone curves; their laws are those of `kernels.render.images.postprocess`."""
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ PRESS = wp.constant(4)
 LIFT = wp.constant(5)
 """The goal moves up; what hangs on the cup is judged at the end of the tick in which it arrives."""
 
-# Codes of synpick_warp.outcome.Ending; a test keeps the two in step.
+# Codes of synpick_warp.codes.Ending; a test keeps the two in step.
 ENDING_RUNNING = wp.constant(0)
 ENDING_FINISHED = wp.constant(1)
 ENDING_EMPTIED = wp.constant(2)
@@ -50,7 +50,7 @@ ENDING_SOLVER_OVERFLOW = wp.constant(6)
 ENDING_NOT_FINITE = wp.constant(7)
 ENDING_SIGHT_OVERFLOW = wp.constant(8)
 
-# Codes of synpick_warp.outcome.Outcome; the same test.
+# Codes of synpick_warp.codes.Outcome; the same test.
 OUTCOME_NONE = wp.constant(0)
 OUTCOME_TARGET_PICKED = wp.constant(1)
 OUTCOME_OTHER_PICKED = wp.constant(2)

@@ -17,8 +17,8 @@ from synpick_warp.configs.modes import mode_weights
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.gripper import cup_collider, finger_collider, rod_inertia
-from synpick_warp.scenes.shapes import Catalog, CatalogEntry, ConvexPiece
 from synpick_warp.scenes.tote import TABLE_SIZE, guide_walls, tote_colliders
+from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
 
 # Mass [kg] and inertia [kg·m²] of an empty slot; its weight is cancelled, so that only their being positive matters.
 EMPTY_MASS = 0.1
@@ -114,7 +114,7 @@ def repeats_that_occur(config: Config) -> set[bool]:
 
 
 def _draw_trials(volume: np.ndarray, budget: float, room: int, repeats: bool) -> np.ndarray:
-    """Draw as kernels.arrangement.draw_objects_kernel does: catalog indices (SLOT_TRIALS, room), -1 after the last."""
+    """Draw as kernels.sim.arrangement.draw_objects_kernel does: catalog indices (SLOT_TRIALS, room), -1 after the last."""
     numbers = np.random.default_rng(0)
     drawn = np.full((SLOT_TRIALS, room), -1, dtype=np.int32)
     total = np.zeros(SLOT_TRIALS)

@@ -6,7 +6,7 @@ import numpy as np
 
 from synpick_warp.configs.schema import Cameras
 from synpick_warp.errors import ConfigError
-from synpick_warp.scenes.shapes import Camera
+from synpick_warp.scenes.types import Camera
 
 PARALLEL = 1e-6
 """Sine of the angle below which `up` counts as parallel to the view direction."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from synpick_warp.configs.schema import Gripper
-from synpick_warp.scenes.collision import limited_hull
-from synpick_warp.scenes.procedural_meshes import join, lathe, make_mesh, solid
-from synpick_warp.scenes.shapes import ConvexPiece, Fixture, Material
+from synpick_warp.scenes.collision.shapes import limited_hull
+from synpick_warp.scenes.embedded.meshes import join, lathe, make_mesh, solid
+from synpick_warp.scenes.types import ConvexPiece, Fixture, Material
 
 SIDES = 40
 """Points around the visible parts."""

@@ -10,8 +10,8 @@ import numpy as np
 
 from synpick_warp.errors import LightError
 from synpick_warp.scenes.appearance import srgb_to_linear
-from synpick_warp.scenes.shapes import LightMap, Sun
-from synpick_warp.scenes.skies import directions, skies
+from synpick_warp.scenes.embedded.skies import directions, skies
+from synpick_warp.scenes.types import LightMap, Sun
 
 MAX_HEIGHT = 512
 """Maps with more rows are reduced to this many: half the map's 0.35° is finer than any shading here resolves."""

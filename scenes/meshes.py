@@ -17,7 +17,7 @@ from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.appearance import Finish, as_color, bake_vertex_colors, join_textures, linear_to_srgb, read_texture, rgb8
-from synpick_warp.scenes.shapes import TriangleMesh
+from synpick_warp.scenes.types import TriangleMesh
 
 SUFFIXES = (".ply", ".obj", ".glb")
 

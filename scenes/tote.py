@@ -9,9 +9,9 @@ import numpy as np
 
 from synpick_warp.configs.schema import Tote
 from synpick_warp.errors import ConfigError
-from synpick_warp.scenes.collision import limited_hull
-from synpick_warp.scenes.procedural_meshes import Patch, join, loft, make_mesh, rounded_rectangle, solid, strips
-from synpick_warp.scenes.shapes import ConvexPiece, Fixture, Hollow, Material
+from synpick_warp.scenes.collision.shapes import limited_hull
+from synpick_warp.scenes.embedded.meshes import Patch, join, loft, make_mesh, rounded_rectangle, solid, strips
+from synpick_warp.scenes.types import ConvexPiece, Fixture, Hollow, Material
 
 CORNER_RADIUS = 0.02
 """Radius of the inner vertical edges at the floor [m], as moulded boxes have it; it grows by as much as the draft opens the corner."""

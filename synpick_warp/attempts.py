@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import phases
-from synpick_warp.outcome import Ending, Outcome
 from synpick_warp.stages.stream import TickReport
 
 MODE_NAMES = {int(phases.MOVE): "move", int(phases.PICK): "pick", int(phases.TARGET): "target"}
@@ -24,7 +24,7 @@ Vector = tuple[float, ...]
 
 @dataclass(frozen=True)
 class InstanceSight:
-    """What was concluded of one instance; see `stages.sight.Sighting` for units and meaning. Pixels are column, row."""
+    """What was concluded of one instance; see `stages.perception.arrays.Sighting` for units and meaning. Pixels are column, row."""
 
     instance: int
     object_id: int

@@ -16,42 +16,42 @@ from synpick_warp.arrays import memory_table
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import FAST, Config
+from synpick_warp.dataset.manifest import digest_inputs, episode_place, read_record
+from synpick_warp.dataset.writing import Output, complete
 from synpick_warp.device import pick_device
 from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_redrawn
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import DataSet, Exporter
-from synpick_warp.exporters.pool import WriterPool
 from synpick_warp.exporters.registry import Exporters, exporter_kinds, slot_bytes
+from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.interrupt import StopRequest
 from synpick_warp.kernels import phases
-from synpick_warp.manifest import digest_inputs, episode_place, read_record
-from synpick_warp.output import Output, complete
 from synpick_warp.progress import Progress
 from synpick_warp.scenes import build
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.shapes import Camera, Catalog, LightMap
 from synpick_warp.scenes.tote import tote_fixture
-from synpick_warp.stages.bodies import BodyArrays, HitArrays, body_sizes
+from synpick_warp.scenes.types import Camera, Catalog, LightMap
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.develop import SpreadArrays, has_spread
-from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch, edge_sizes
-from synpick_warp.stages.fast import FAST_SCRATCH, cell_sizes
-from synpick_warp.stages.layers import MOVING, MotionArrays
-from synpick_warp.stages.perceive import SCRATCH, count_views, sight_sizes
-from synpick_warp.stages.physics import with_enough_worlds
-from synpick_warp.stages.plan import CycleArrays, VoteArrays, plan_sizes
-from synpick_warp.stages.raster import MarkArrays, mark_sizes
-from synpick_warp.stages.record import record_kinds, record_sizes
-from synpick_warp.stages.render import PictureArrays, Renderer
-from synpick_warp.stages.render_scene import build_render_scene
-from synpick_warp.stages.sight import Plan, Sighting
-from synpick_warp.stages.simulate import RECORDS, Simulation
+from synpick_warp.stages.perception.arrays import Plan, Sighting
+from synpick_warp.stages.perception.plan import CycleArrays, VoteArrays, plan_sizes
+from synpick_warp.stages.perception.segment import SCRATCH, count_views, sight_sizes
+from synpick_warp.stages.render.denoised import FAST_SCRATCH, cell_sizes
+from synpick_warp.stages.render.layers import MOVING, MotionArrays
+from synpick_warp.stages.render.mask_runs import EdgeBuffers, EdgeScratch, edge_sizes
+from synpick_warp.stages.render.postprocess import SpreadArrays, has_spread
+from synpick_warp.stages.render.raster import MarkArrays, mark_sizes
+from synpick_warp.stages.render.renderer import PictureArrays, Renderer
+from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.view_setup import BodyArrays, HitArrays, body_sizes
+from synpick_warp.stages.sim.physics import with_enough_worlds
+from synpick_warp.stages.sim.simulate import RECORDS, Simulation
+from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
+from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, name_lights, tick_batch, view_sizes
-from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from synpick_warp.attempts import EpisodeRecord
+from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import EpisodeEnd
-from synpick_warp.outcome import Ending, Outcome
 from synpick_warp.stages.stream import TickReport
 
 PLACES = 6

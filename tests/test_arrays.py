@@ -10,18 +10,18 @@ import warp as wp
 from synpick_warp.arrays import allocate, device_array, memory_table
 from synpick_warp.bake import describe_arrays
 from synpick_warp.device import pick_device
-from synpick_warp.stages.bodies import BodyArrays, HitArrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch
-from synpick_warp.stages.fast import Edges, GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_paths, cell_sizes
-from synpick_warp.stages.layers import MotionArrays
-from synpick_warp.stages.perceive import SightScratch, count_views
-from synpick_warp.stages.plan import CycleArrays, VoteArrays
-from synpick_warp.stages.raster import MarkArrays
-from synpick_warp.stages.render import PictureArrays
-from synpick_warp.stages.sight import LookArrays, Plan, Sighting
-from synpick_warp.stages.worlds import AttemptState, SealState, WorldState, WorldStatus
-from tests.reference.small_worlds import settings
+from synpick_warp.stages.perception.arrays import LookArrays, Plan, Sighting
+from synpick_warp.stages.perception.plan import CycleArrays, VoteArrays
+from synpick_warp.stages.perception.segment import SightScratch, count_views
+from synpick_warp.stages.render.denoised import Edges, GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_paths, cell_sizes
+from synpick_warp.stages.render.layers import MotionArrays
+from synpick_warp.stages.render.mask_runs import EdgeBuffers, EdgeScratch
+from synpick_warp.stages.render.raster import MarkArrays
+from synpick_warp.stages.render.renderer import PictureArrays
+from synpick_warp.stages.render.view_setup import BodyArrays, HitArrays
+from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus
+from tests.worlds.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset part tile "

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.attempts import AttemptLog, AttemptRecord, EpisodeRecord, InstanceSight, SightRecord
+from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.modes import may_pick
-from synpick_warp.explain_record import read_attempts
 from synpick_warp.kernels import phases
-from synpick_warp.outcome import Ending, Outcome
-from tests.reference.scripted_worlds import Ticks, World, bits, play, report
-from tests.reference.small_worlds import settings
+from synpick_warp.viz.explain_record import read_attempts
+from tests.worlds.scripted_worlds import Ticks, World, bits, play, report
+from tests.worlds.small_worlds import settings
 
 ROOM = 4
 OBJECT_IDS = np.array([3, 8, 21], np.int32)

@@ -13,15 +13,16 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp import bake, cli
+from synpick_warp import bake
 from synpick_warp.bake import run_bake
+from synpick_warp.cli import commands
+from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.bop import BopExporter
-from synpick_warp.outcome import Ending, Outcome
+from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.progress import SilentProgress
-from tests.reference.sights import SHORT
-from tests.reference.small_worlds import QUICK, catalog, settings
+from tests.worlds.sights import SHORT
+from tests.worlds.small_worlds import QUICK, catalog, settings
 
 EPISODES, CAMERAS = 3, 3
 WIDTH, HEIGHT = 96, 54
@@ -294,7 +295,7 @@ def test_episodes_that_are_given_up(tmp_path, capsys):
     """One arrangement without time to settle: no scenes, exit code 1, and the reason in the list of episodes."""
     out = tmp_path / "set"
     given = arguments(settle__max_time=0.1, settle__tries=1, bake__episodes=2)
-    assert cli.main(["bake", "--out", str(out), *given]) == cli.EXIT_INCOMPLETE
+    assert commands.main(["bake", "--out", str(out), *given]) == commands.EXIT_INCOMPLETE
     capsys.readouterr()
     rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
     assert [(row["episode"], row["ending"], row["frames"], row["seconds"]) for row in rows] == [(n, "unsettled", 0, 0.0) for n in range(2)]
@@ -334,7 +335,7 @@ def small_disk(tmp_path):
 
 def test_a_full_disk_is_one_line_and_exit_code_2(small_disk, capsys):
     out = small_disk / "set"
-    assert cli.main(["bake", "--out", str(out), *arguments()]) == cli.EXIT_MISTAKE
+    assert commands.main(["bake", "--out", str(out), *arguments()]) == commands.EXIT_MISTAKE
     said = capsys.readouterr().err.strip().splitlines()
     assert said[-1].startswith("synpick-warp: error: cannot write ")
     assert "No space left on device" in said[-1]
@@ -354,6 +355,6 @@ def test_a_worker_that_fails_ends_the_bake_with_one_line(tmp_path, capsys, monke
 
     out = tmp_path / "set"
     monkeypatch.setattr(BopExporter, "write", blocked)
-    assert cli.main(["bake", "--out", str(out), *arguments()]) == cli.EXIT_MISTAKE
+    assert commands.main(["bake", "--out", str(out), *arguments()]) == commands.EXIT_MISTAKE
     said = capsys.readouterr().err.strip().splitlines()
     assert said[-1].startswith("synpick-warp: error: cannot write ")

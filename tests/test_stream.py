@@ -13,14 +13,16 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.exporters.rle import find_edges, listed_edges
+from synpick_warp.exporters.writing.rle import find_edges, listed_edges
 from synpick_warp.frames import EFFECTS, FrameBatch
-from synpick_warp.kernels import pack, phases
-from synpick_warp.stages import stream, worlds
+from synpick_warp.kernels import phases
+from synpick_warp.kernels.sim import snapshot as pack
+from synpick_warp.stages import stream
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
-from synpick_warp.stages.render_scene import build_lights
-from synpick_warp.stages.sight import Plan, Sighting
-from synpick_warp.stages.simulate import TickRecord
+from synpick_warp.stages.perception.arrays import Plan, Sighting
+from synpick_warp.stages.render.scene import build_lights
+from synpick_warp.stages.sim import worlds
+from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.stream import (
     FrameStream,
     HostCopy,
@@ -32,8 +34,8 @@ from synpick_warp.stages.stream import (
     view_sizes,
     views_per_batch,
 )
-from tests.reference.small_worlds import settings
-from tests.reference.toy_scene import even_light, sun
+from tests.worlds.small_worlds import settings
+from tests.worlds.toy_scene import even_light, sun
 
 WORLDS, ROOM = 5, 3
 OBJECT_IDS = np.array([4, 7, 11], np.int32)

@@ -40,7 +40,7 @@
 #
 # DATA/cache is a cache folder as XDG has it, so that concave objects need not be decomposed on the GPU machine, which takes minutes.
 # Fill it where there is time, by any command that loads the same models with the same settings:
-#     XDG_CACHE_HOME=$PWD/.gpu/data/cache python tools/rest_report.py --models .gpu/data/ycbv_models --arrangements 1 --device cpu
+#     XDG_CACHE_HOME=$PWD/.gpu/data/cache python -m tools.reports.rest --models .gpu/data/ycbv_models --arrangements 1 --device cpu
 
 set -uo pipefail
 
@@ -67,7 +67,7 @@ deadline=$((SECONDS + ${TOTAL_LIMIT:-490}))
 failed=0
 export PYTHONUNBUFFERED=1 COLUMNS=160
 
-synpick=("$python" -c 'import sys; from synpick_warp.cli import main; sys.exit(main())')
+synpick=("$python" -c 'import sys; from synpick_warp.cli.commands import main; sys.exit(main())')
 models=() lights=()
 [ -d "$data/ycbv_models" ] && models=(--models "$data/ycbv_models")
 [ -d "$data/hdri" ] && lights=(--lights "$data/hdri")
@@ -112,25 +112,25 @@ settings_of() {
 }
 
 measure_rest() {
-    step "piles at rest" "${REST_LIMIT:-$1}" "$python" tools/rest_report.py --device "$device" "${models[@]}" \
+    step "piles at rest" "${REST_LIMIT:-$1}" "$python" -m tools.reports.rest --device "$device" "${models[@]}" \
         --arrangements "${ARRANGEMENTS:-64}" --json "$results/rest.json"
 }
 
 measure_bench() {
     settings_of "${BENCH_SETTINGS:-}"
-    step "speeds" "${BENCH_LIMIT:-$1}" "$python" tools/bench.py --device "$device" "${models[@]}" "${lights[@]}" \
+    step "speeds" "${BENCH_LIMIT:-$1}" "$python" -m tools.bench --device "$device" "${models[@]}" "${lights[@]}" \
         --worlds "${WORLDS:-512}" --resolution "${BENCH_RESOLUTION:-1920x1080}" --parts "${BENCH_PARTS:-physics,sight,render,write}" \
         "${settings[@]}" --json "$results/bench.json"
 }
 
 measure_render() {
-    step "pictures" "${RENDER_LIMIT:-$1}" "$python" tools/render_report.py --device "$device" "${models[@]}" "${lights[@]}" \
+    step "pictures" "${RENDER_LIMIT:-$1}" "$python" -m tools.reports.render --device "$device" "${models[@]}" "${lights[@]}" \
         --scenes "${RENDER_SCENES:-10}" --samples "${RENDER_SAMPLES:-1024}" --size "${RENDER_SIZE:-960x540}" \
         --sheet "$results/pictures.jpg" --json "$results/render.json"
 }
 
 measure_devices() {
-    step "two devices" "${DEVICES_LIMIT:-$1}" "$python" tools/compare_pictures.py --devices "cpu,$device" "${models[@]}" "${lights[@]}"
+    step "two devices" "${DEVICES_LIMIT:-$1}" "$python" -m tools.checks.compare_pictures --devices "cpu,$device" "${models[@]}" "${lights[@]}"
 }
 
 # Episodes in different numbers of worlds, then two bakes of them, in the first and the last number of worlds.
@@ -142,15 +142,15 @@ measure_sameness() {
             --worlds "$number" --episodes "${SAME_EPISODES:-8}" --resolution 320x180 --formats bop,shards,usd,zarr "${settings[@]}" \
             --set "render.layers=[normals,albedo,nocs,classes,flow,scene_flow,depth_sensor]" --out "$bakes/same-$number"
     done
-    step "both bakes" 60 "$python" tools/compare_runs.py "$bakes/same-${worlds%%,*}" "$bakes/same-${worlds##*,}"
-    step "trajectories" 30 "$python" tools/check_trajectory.py "$bakes/same-${worlds%%,*}"
-    step "numbers of worlds" "$((all / 2))" "$python" tools/compare_worlds.py --device "$device" "${models[@]}" --worlds "$worlds" \
+    step "both bakes" 60 "$python" -m tools.checks.compare_runs "$bakes/same-${worlds%%,*}" "$bakes/same-${worlds##*,}"
+    step "trajectories" 30 "$python" -m tools.checks.trajectory "$bakes/same-${worlds%%,*}"
+    step "numbers of worlds" "$((all / 2))" "$python" -m tools.checks.compare_worlds --device "$device" "${models[@]}" --worlds "$worlds" \
         --episodes "${SAME_EPISODES:-8}" --ticks "${SAME_TICKS:-60}" --set bake.mode=mixed "${settings[@]}" --json "$results/worlds.json"
 }
 
 measure_pick() {
     settings_of "${PICK_SETTINGS:-}"
-    step "picking" "${PICK_LIMIT:-$1}" "$python" tools/pick_report.py --device "$device" "${models[@]}" \
+    step "picking" "${PICK_LIMIT:-$1}" "$python" -m tools.reports.pick --device "$device" "${models[@]}" \
         --episodes "${PICK_EPISODES:-64}" "${settings[@]}" --json "$results/picks.json"
 }
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import ClassVar, Protocol
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.pool import WriterPool, shared_bytes
+from synpick_warp.exporters.writing.pool import WriterPool, shared_bytes
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
-from synpick_warp.scenes.shapes import Camera, Catalog, LightMap
+from synpick_warp.scenes.types import Camera, Catalog, LightMap
 
 PIXEL_BYTES = (3, 2, 1, 4)
 """Of `FrameBatch`'s color, depth, instance and amodal."""

@@ -9,14 +9,14 @@ from pathlib import Path
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters.base import DataSet, Exporter
-from synpick_warp.exporters.pool import WriterPool
+from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 
 EXPORTERS = {
-    "bop": ("bop", "BopExporter"),
-    "shards": ("shards", "ShardsExporter"),
-    "usd": ("usd", "UsdExporter"),
-    "zarr": ("trajectory", "TrajectoryExporter"),
+    "bop": ("bop.exporter", "BopExporter"),
+    "shards": ("bop.shards", "ShardsExporter"),
+    "usd": ("usd.exporter", "UsdExporter"),
+    "zarr": ("trajectory.exporter", "TrajectoryExporter"),
 }
 """Format -> (module in this package, class in it). Modules are imported when their format is asked for."""
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from synpick_warp.arrays import device_array
-from synpick_warp.kernels.effects import Strengths
+from synpick_warp.kernels.render.images.camera_effects import Strengths
 
 FIXTURES = ("tote", "finger", "cup")
 """What `Snapshot.fixture_pose` holds, in order."""

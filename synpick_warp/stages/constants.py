@@ -12,8 +12,8 @@ from synpick_warp.configs.modes import mode_weights
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels import structs
 from synpick_warp.scenes import build
-from synpick_warp.scenes.shapes import Catalog, CatalogEntry
-from synpick_warp.stages.worlds import CORNERS
+from synpick_warp.scenes.types import Catalog, CatalogEntry
+from synpick_warp.stages.sim.worlds import CORNERS
 
 # Where the gripper waits while objects fall and while the worlds are looked at [m]: beside the tote, outside every camera's view.
 GRIPPER_HOME = (3.0, 0.0, 1.0)

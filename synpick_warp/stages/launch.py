@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.kernels.camera_rays import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 
 BLOCK = 128
 """Threads of a block: four tiles of 8 x 4 pixels."""

@@ -14,11 +14,11 @@ from synpick_warp.arrays import allocate, memory_table
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.edges import EdgeBuffers, EdgeScratch, edge_sizes, list_edges
-from synpick_warp.stages.record import host_record, record_arrays, tick_measures
-from synpick_warp.stages.render import Renderer
-from synpick_warp.stages.simulate import TickRecord
-from synpick_warp.stages.worlds import MEASURE_COLUMNS, STATUS_COLUMNS
+from synpick_warp.stages.render.mask_runs import EdgeBuffers, EdgeScratch, edge_sizes, list_edges
+from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.sim.simulate import TickRecord
+from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
+from synpick_warp.stages.sim.worlds import MEASURE_COLUMNS, STATUS_COLUMNS
 
 # Bytes of one batch's images on a GPU: large enough to fill it, small enough that several batches are in flight.
 BATCH_BYTES = 512 << 20

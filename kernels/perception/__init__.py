@@ -1,0 +1,1 @@
+"""Device code of perception and grasp planning: segmentation, contours, suction points, clutter graph, grasps."""

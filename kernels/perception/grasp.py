@@ -1,0 +1,135 @@
+"""Where and how the cup meets the target: grasp point, smoothed normal, and the gripper's inverse kinematics."""
+
+import warp as wp
+
+from synpick_warp.kernels.render.lighting.materials import Surfaces, mesh_surface
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray
+from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Hits, Meshes
+from synpick_warp.kernels.structs import PickData
+
+wp.set_module_options({"enable_backward": False})
+
+UPRIGHT = wp.constant(1.0e-6)
+"""A normal whose horizontal part is shorter is vertical: what is left of it is rounding, and has no direction."""
+
+
+@wp.func
+def gripper_angles(normal: wp.vec3) -> wp.vec2:
+    """Yaw ψ of the finger in (-π/2, π/2] and tilt θ of the cup [rad]: (sin θ cos ψ, sin θ sin ψ, cos θ) = normal; 0, 0 if that is vertical.
+
+    The tilt axis, (-sin ψ, cos ψ, 0), is perpendicular to the normal. Half a turn of yaw is enough, as the cup tilts both ways.
+    """
+    across = wp.length(wp.vec2(normal[0], normal[1]))
+    if across < UPRIGHT:
+        return wp.vec2(0.0, 0.0)
+    yaw = wp.atan2(normal[1], normal[0])
+    tilt = wp.atan2(across, normal[2])
+    if yaw > 0.5 * wp.PI:
+        return wp.vec2(yaw - wp.PI, -tilt)
+    if yaw <= -0.5 * wp.PI:
+        return wp.vec2(yaw + wp.PI, -tilt)
+    return wp.vec2(yaw, tilt)
+
+
+@wp.func
+def axis_position(point: wp.vec3, normal: wp.vec3, tip: float) -> wp.vec3:
+    """Where the tilt axis is when the cup's tip, `tip` [m] from it, touches `point` along `normal`."""
+    return point + tip * normal
+
+
+@wp.func
+def limited_normal(normal: wp.vec3, limit: float) -> wp.vec3:
+    """A normal of any length as a unit vector, turned up to an angle of at most `limit` [rad] with the vertical; zero: the vertical."""
+    length = wp.length(normal)
+    if length == 0.0:
+        return wp.vec3(0.0, 0.0, 1.0)
+    unit = normal / length
+    if unit[2] >= wp.cos(limit):
+        return unit
+    across = wp.length(wp.vec2(unit[0], unit[1]))
+    if across < UPRIGHT:
+        return wp.vec3(0.0, 0.0, 1.0)
+    lean = wp.sin(limit) / across
+    return wp.vec3(lean * unit[0], lean * unit[1], wp.cos(limit))
+
+
+@wp.kernel
+def smooth_normal_kernel(
+    # Scene:
+    meshes: Meshes,
+    surfaces: Surfaces,
+    cameras: Cameras,
+    grid: ImageGrid,
+    window: int,
+    # In:
+    bodies: Bodies,
+    hits: Hits,
+    view_world: wp.array[int],
+    view_camera: wp.array[int],
+    component: wp.array3d[int],
+    largest: wp.array2d[int],
+    suction: wp.array2d[wp.vec2i],
+    target: wp.array[int],
+    # Out:
+    normal_out: wp.array[wp.vec3],
+):
+    """n = Σ n_p over the pixels p within `window` columns and rows of the suction point that show the target's largest component.
+
+    n_p is the interpolated unit normal of the surface, towards the camera. Not a unit vector yet; the order of the sum is fixed.
+    """
+    view = wp.tid()
+    world = view_world[view]
+    if world < 0 or target[world] < 0:
+        return
+    instance = target[world]
+    camera = view_camera[view]
+    p = suction[world, instance]
+    total = wp.vec3(0.0, 0.0, 0.0)
+    for row in range(wp.max(p[1] - window, 0), wp.min(p[1] + window + 1, grid.height)):
+        for column in range(wp.max(p[0] - window, 0), wp.min(p[0] + window + 1, grid.width)):
+            if component[view, row, column] == largest[view, instance]:
+                ray = cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
+                triangle = hits.triangle[view, row, column]
+                barycentric = hits.barycentric[view, row, column]
+                # Of the surface only the normal counts; the pixel's width matters to textures.
+                surface = mesh_surface(meshes, surfaces, bodies, view, instance, triangle, barycentric, -wp.normalize(ray), 0.0)
+                total += surface.normal
+    normal_out[world] = total
+
+
+@wp.kernel
+def frame_grasp_kernel(
+    # Scene:
+    cameras: Cameras,
+    pick: PickData,
+    # State:
+    normal_inout: wp.array[wp.vec3],
+    # In:
+    hits: Hits,
+    view_world: wp.array[int],
+    view_camera: wp.array[int],
+    suction: wp.array2d[wp.vec2i],
+    target: wp.array[int],
+    # Out:
+    point_out: wp.array[wp.vec3],
+    yaw_out: wp.array[float],
+    tilt_out: wp.array[float],
+):
+    """Grasp point c + Rᵀ (d · ray) [m], d the depth of the suction point; unit normal within the tilt's limit; yaw and tilt for it [rad].
+
+    Worlds without a target keep what they had.
+    """
+    view = wp.tid()
+    world = view_world[view]
+    if world < 0 or target[world] < 0:
+        return
+    camera = view_camera[view]
+    p = suction[world, target[world]]
+    ray = camera_ray(cameras.intrinsics[camera], p[1], p[0], wp.vec2(0.0, 0.0)) * hits.depth[view, p[1], p[0]]
+    away = wp.vec3d(wp.float64(ray[0]), wp.float64(ray[1]), wp.float64(ray[2]))
+    point_out[world] = wp.vec3(cameras.center[camera] + wp.transpose(cameras.rotation[camera]) * away)
+    normal = limited_normal(normal_inout[world], pick.tilt_limit)
+    angles = gripper_angles(normal)
+    normal_inout[world] = normal
+    yaw_out[world] = angles[0]
+    tilt_out[world] = angles[1]

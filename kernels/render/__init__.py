@@ -1,0 +1,1 @@
+"""Device code of the renderer: visibility, lighting, output images."""

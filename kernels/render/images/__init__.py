@@ -1,0 +1,1 @@
+"""Output images: anti-aliasing, post-processing, annotation layers, boxes and masks."""

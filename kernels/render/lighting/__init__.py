@@ -1,0 +1,1 @@
+"""Light transport: materials, BRDF, environment lighting, path tracing, denoising, shading."""

@@ -1,0 +1,1 @@
+"""Primary visibility: cameras, view setup, triangle rasterizer, G-buffer."""

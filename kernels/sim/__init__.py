@@ -1,0 +1,1 @@
+"""Device code of the simulation: arrangements, settling, the gripper's tasks and control, the suction cup."""

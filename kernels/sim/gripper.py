@@ -1,0 +1,186 @@
+"""Where the gripper is to be: corners of the tote in turn when moving, a grasp and a lift when picking."""
+
+import warp as wp
+
+from synpick_warp.kernels.phases import ACT, APPROACH, DESCEND, LIFT, MOVE
+from synpick_warp.kernels.rng import CORNERS, stream_key, uniform_index
+from synpick_warp.kernels.sim.impedance import impedance_force
+from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, PickData
+
+wp.set_module_options({"enable_backward": False})
+
+# The tote has four corners; each round visits all of them.
+ROUND = wp.constant(4)
+
+
+@wp.func
+def corner_of(code: int, corner: wp.vec3) -> wp.vec3:
+    """Corner 0 to 3: bit 0 is the sign of x, bit 1 that of y."""
+    x = corner[0]
+    y = corner[1]
+    if (code & 1) == 1:
+        x = -x
+    if (code & 2) == 2:
+        y = -y
+    return wp.vec3(x, y, corner[2])
+
+
+@wp.kernel
+def begin_moving_kernel(
+    # Scene:
+    seed: wp.uint64,
+    layout: LayoutData,
+    move: MoveData,
+    # State:
+    address: wp.array[wp.vec2i],
+    mode: wp.array[int],
+    phase: wp.array[int],
+    frame_inout: wp.array[int],
+    joint_q_inout: wp.array[float],
+    joint_qd_inout: wp.array[float],
+    # Out:
+    order_out: wp.array2d[int],
+    goal_out: wp.array[wp.vec3],
+    waypoint_out: wp.array[int],
+):
+    """Count frames. When a world of mode MOVE begins to act: draw the order of the corners, put the gripper above the first.
+
+    Each round is a Fisher-Yates shuffle of the four corners.
+    """
+    world = wp.tid()
+    if phase[world] != ACT:
+        frame_inout[world] = -1
+        return
+    frame_inout[world] = frame_inout[world] + 1
+    if frame_inout[world] > 0 or mode[world] != MOVE:
+        return
+    key = stream_key(seed, address[world][0], address[world][1], CORNERS)
+    for visit in range(move.waypoints):
+        order_out[world, visit] = visit % ROUND
+    for visit in range(move.waypoints):
+        left = ROUND - visit % ROUND
+        other = visit + uniform_index(key, visit, left)
+        kept = order_out[world, visit]
+        order_out[world, visit] = order_out[world, other]
+        order_out[world, other] = kept
+    goal = corner_of(order_out[world, 0], move.corner)
+    goal = wp.vec3(goal[0], goal[1], move.start_height + move.tip)
+    goal_out[world] = goal
+    waypoint_out[world] = 0
+    place_gripper(layout, world, goal, 0.0, joint_q_inout, joint_qd_inout)
+
+
+@wp.func
+def place_gripper(layout: LayoutData, world: int, position: wp.vec3, tilt: float, joint_q: wp.array[float], joint_qd: wp.array[float]):
+    """Put a world's gripper somewhere, at rest."""
+    for axis in range(3):
+        joint_q[world * layout.coords + axis] = position[axis]
+    joint_q[world * layout.coords + TILT] = tilt
+    for axis in range(layout.gripper_dofs):
+        joint_qd[world * layout.dofs + axis] = 0.0
+
+
+@wp.func
+def advanced(goal: wp.vec3, target: wp.vec3, stride: float) -> wp.vec3:
+    """The goal, moved towards the target by a stride, and no farther than to it."""
+    way = target - goal
+    distance = wp.length(way)
+    if distance <= stride:
+        return target
+    return goal + way * (stride / distance)
+
+
+@wp.func
+def task_target(task: int, point: wp.vec3, normal: wp.vec3, pick: PickData, tip: float) -> wp.vec3:
+    """Where the tilt axis is to be at the end of a task [m]: so that the cup's tip is at the grasp point, before it, or above it."""
+    axis = point + tip * normal
+    if task == APPROACH:
+        return axis + pick.near * normal
+    if task == LIFT:
+        return axis + wp.vec3(0.0, 0.0, pick.lift_height)
+    return axis
+
+
+@wp.kernel
+def move_goals_kernel(
+    # Scene:
+    move: MoveData,
+    pick: PickData,
+    # State:
+    phase: wp.array[int],
+    mode: wp.array[int],
+    order: wp.array2d[int],
+    point: wp.array[wp.vec3],
+    normal: wp.array[wp.vec3],
+    task_inout: wp.array[int],
+    steps_inout: wp.array[int],
+    waypoint_inout: wp.array[int],
+    goal_inout: wp.array[wp.vec3],
+):
+    """Move the goals on by one step, at constant speed.
+
+    Moving: towards the next corner. Picking: APPROACH to `near` before the grasp point, then DESCEND along the normal, then PRESS, where
+    it waits, as after a LIFT; these two are ended by the tick.
+    """
+    world = wp.tid()
+    if phase[world] != ACT:
+        return
+    goal = goal_inout[world]
+    if mode[world] == MOVE:
+        if waypoint_inout[world] < move.waypoints:
+            target = corner_of(order[world, waypoint_inout[world]], move.corner)
+            target = wp.vec3(target[0], target[1], target[2] + move.tip)
+            goal = advanced(goal, target, move.speed * move.step)
+            goal_inout[world] = goal
+            if goal == target:
+                waypoint_inout[world] = waypoint_inout[world] + 1
+        return
+    task = task_inout[world]
+    steps_inout[world] = steps_inout[world] + 1
+    if task < APPROACH:
+        return
+    speed = pick.speed
+    if task == DESCEND:
+        speed = pick.near_speed
+    elif task == LIFT:
+        speed = pick.lift_speed
+    target = task_target(task, point[world], normal[world], pick, move.tip)
+    goal = advanced(goal, target, speed * move.step)
+    goal_inout[world] = goal
+    if goal == target and (task == APPROACH or task == DESCEND):
+        task_inout[world] = task + 1
+        steps_inout[world] = 0
+
+
+@wp.kernel
+def drive_gripper_kernel(
+    # Scene:
+    layout: LayoutData,
+    move: MoveData,
+    pick: PickData,
+    # State:
+    phase: wp.array[int],
+    mode: wp.array[int],
+    task: wp.array[int],
+    goal: wp.array[wp.vec3],
+    joint_q: wp.array[float],
+    joint_qd: wp.array[float],
+    # Out:
+    joint_f_out: wp.array[float],
+):
+    """Pull the gripper after its goal: F = impedance + m g. At home it only bears its weight."""
+    world = wp.tid()
+    q = world * layout.coords
+    qd = world * layout.dofs
+    offset = goal[world] - wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
+    velocity = wp.vec3(joint_qd[qd], joint_qd[qd + 1], joint_qd[qd + 2])
+    force = wp.vec3(0.0, 0.0, 0.0)
+    if phase[world] == ACT:
+        if mode[world] == MOVE:
+            force = impedance_force(offset, velocity, move.stiffness, move.damping, move.force, move.mass, move.step)
+        elif task[world] >= APPROACH:
+            force = impedance_force(offset, velocity, pick.stiffness, pick.damping, pick.force, move.mass, move.step)
+    joint_f_out[qd] = force[0]
+    joint_f_out[qd + 1] = force[1]
+    joint_f_out[qd + 2] = force[2] + move.mass * move.gravity
+    joint_f_out[qd + TILT] = 0.0

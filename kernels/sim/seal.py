@@ -1,0 +1,267 @@
+"""What holds objects to the cup: seals, each a spring-damper that breaks, and contacts that it replaces."""
+
+import warp as wp
+
+from synpick_warp.kernels.sim.cup_rays import CUP, tip_pose
+from synpick_warp.kernels.structs import TILT, LayoutData, SuctionData
+
+wp.set_module_options({"enable_backward": False})
+
+# A contact that is not to act is this far from touching [m]; stages.sim.physics makes the solver skip contacts far nearer than that.
+APART = wp.constant(1.0)
+
+
+@wp.struct
+class Response:
+    """How a unit wrench at the tip accelerates a point and a frame there: a symmetric 6 x 6 matrix in blocks of 3 x 3."""
+
+    linear: wp.mat33
+    """Acceleration of the point by a force [1/kg]."""
+    mixed: wp.mat33
+    """Acceleration of the point by a torque; transposed, angular acceleration by a force [1/(kg·m)]."""
+    angular: wp.mat33
+    """Angular acceleration by a torque [1/(kg·m²)]."""
+
+
+@wp.struct
+class Turn:
+    """How far an object is turned from where it was caught, and what the seal has against it."""
+
+    torque: wp.vec3
+    """On the object, without damping [N·m]."""
+    stiffness: wp.mat33
+    """[N·m/rad]"""
+
+
+@wp.struct
+class Wrench:
+    """On the object, at the tip, in the world's axes."""
+
+    force: wp.vec3
+    torque: wp.vec3
+
+
+@wp.func
+def object_response(inverse_mass: float, inverse_inertia: wp.mat33, lever: wp.vec3) -> Response:
+    """Of a free body at `lever` from its centre of mass, with the inverse inertia in the world's axes.
+
+    A force F accelerates the point by F/m + (I⁻¹ (r x F)) x r, a torque T by (I⁻¹ T) x r.
+    """
+    cross = wp.skew(lever)
+    made = Response()
+    made.mixed = -cross * inverse_inertia
+    made.linear = inverse_mass * wp.identity(n=3, dtype=float) + made.mixed * cross
+    made.angular = inverse_inertia
+    return made
+
+
+@wp.func
+def gripper_response(suction: SuctionData, axis: wp.vec3, lever: wp.vec3, seals: int) -> Response:
+    """Of an n-th of the gripper at `lever` from the tilt axis: it slides as a whole, and turns about the axis against its drive.
+
+    With n seals that pull at the same mass, each may reckon with an n-th of it. An approximation, which shapes how a seal swings in,
+    not what it bears: sliding and tilting are taken as independent.
+    """
+    way = wp.cross(axis, lever)
+    slide = float(seals) / (suction.finger_mass + suction.cup_mass)
+    tilt = float(seals) / suction.tilt_inertia
+    made = Response()
+    made.linear = slide * wp.identity(n=3, dtype=float) + tilt * wp.outer(way, way)
+    made.mixed = tilt * wp.outer(way, axis)
+    made.angular = tilt * wp.outer(axis, axis)
+    return made
+
+
+@wp.func
+def sum_responses(a: Response, b: Response) -> Response:
+    """Of one body against the other."""
+    made = Response()
+    made.linear = a.linear + b.linear
+    made.mixed = a.mixed + b.mixed
+    made.angular = a.angular + b.angular
+    return made
+
+
+@wp.func
+def seal_turn(cup: wp.quat, caught: wp.quat, suction: SuctionData) -> Turn:
+    """Twist and swing of the frame in which the object was caught, against the cup's.
+
+    With the relative rotation q: twist φ = 2 atan2(q_z, q_w) about the cup's axis z; swing θ between z and the turned z', about
+    n = z x z' / |z x z'|. Torque -k_twist φ z - k_swing (θ - limit) n, the latter beyond the limit only.
+    """
+    relative = wp.quat_inverse(cup) * caught
+    if relative[3] < 0.0:
+        relative = -relative
+    axis = wp.quat_rotate(cup, wp.vec3(0.0, 0.0, 1.0))
+    made = Turn()
+    made.torque = -suction.twist_stiffness * 2.0 * wp.atan2(relative[2], relative[3]) * axis
+    made.stiffness = suction.twist_stiffness * wp.outer(axis, axis)
+    turned = wp.quat_rotate(relative, wp.vec3(0.0, 0.0, 1.0))
+    sine = wp.sqrt(turned[0] * turned[0] + turned[1] * turned[1])
+    beyond = wp.atan2(sine, turned[2]) - suction.swing_limit
+    if beyond > 0.0 and sine > 0.0:
+        normal = wp.quat_rotate(cup, wp.vec3(-turned[1] / sine, turned[0] / sine, 0.0))
+        made.torque = made.torque - suction.swing_stiffness * beyond * normal
+        made.stiffness = made.stiffness + suction.swing_stiffness * wp.outer(normal, normal)
+    return made
+
+
+@wp.func
+def seal_wrench(offset: wp.vec3, turn: Turn, velocity: wp.vec3, spin: wp.vec3, response: Response, suction: SuctionData) -> Wrench:
+    """Wrench w on the object of a spring-damper that is implicit in offset and velocity at the end of the step h.
+
+    w = K (e + h u') + D u' with u' = u - h W w, hence (1 + h (h K + D) W) w = K e + (h K + D) u. Offset e and velocity u are the tip's
+    against the object's point and frame there, W is the sum of both responses. Stable for every mass, stiffness and damping.
+    """
+    h = suction.step
+    one = wp.identity(n=3, dtype=float)
+    pull = h * suction.stiffness + suction.damping
+    hold = h * turn.stiffness + suction.twist_damping * one
+    force = suction.stiffness * offset + pull * velocity
+    torque = turn.torque + hold * spin
+    # Blocks of the 6 x 6 system, solved for the torque first.
+    upper = wp.inverse(one + (h * pull) * response.linear)
+    right = (h * pull) * response.mixed
+    left = h * hold * wp.transpose(response.mixed) * upper
+    lower = one + h * hold * response.angular - left * right
+    made = Wrench()
+    made.torque = wp.inverse(lower) * (torque - left * force)
+    made.force = upper * (force - right * made.torque)
+    return made
+
+
+@wp.func
+def seal_load(force: wp.vec3, axis: wp.vec3) -> float:
+    """Tension and shear [N]: size of the force on the object without the part that presses it against the cup."""
+    return wp.length(force - wp.min(wp.dot(force, axis), 0.0) * axis)
+
+
+@wp.func
+def release_seal(held: wp.array2d[int], load: wp.array2d[float], joint_f: wp.array[float], world: int, instance: int, first_dof: int):
+    """Let go of an instance whose six degrees of freedom begin at `first_dof`."""
+    held[world, instance] = 0
+    load[world, instance] = 0.0
+    for axis in range(6):
+        joint_f[first_dof + axis] = 0.0
+
+
+@wp.func
+def apply_wrench(wrench: Wrench, arm: wp.vec3, lever: wp.vec3, hinge: wp.vec3, joint_f: wp.array[float], gripper: int, first: int):
+    """Write a wrench at the tip to the object's degrees of freedom from `first`, and add the opposite to the gripper's.
+
+    `arm` leads to the tip from the object's centre of mass, `lever` from the tilt axis. What would turn the finger its joint bears.
+    """
+    torque = wrench.torque + wp.cross(arm, wrench.force)
+    for axis in range(3):
+        joint_f[first + axis] = wrench.force[axis]
+        joint_f[first + 3 + axis] = torque[axis]
+        joint_f[gripper + axis] = joint_f[gripper + axis] - wrench.force[axis]
+    joint_f[gripper + TILT] = joint_f[gripper + TILT] - wp.dot(hinge, wrench.torque + wp.cross(lever, wrench.force))
+
+
+@wp.kernel
+def hold_objects_kernel(
+    # Scene:
+    layout: LayoutData,
+    suction: SuctionData,
+    body_com: wp.array[wp.vec3],
+    body_inv_mass: wp.array[float],
+    body_inv_inertia: wp.array[wp.mat33],
+    # State:
+    slot: wp.array2d[int],
+    anchor: wp.array2d[wp.transform],
+    limit: wp.array[float],
+    body_q: wp.array[wp.transform],
+    body_qd: wp.array[wp.spatial_vector],
+    held_inout: wp.array2d[int],
+    load_inout: wp.array2d[float],
+    peak_inout: wp.array[float],
+    joint_f_inout: wp.array[float],
+):
+    """Wrench of every seal on its object, and the opposite on the gripper; a seal whose load exceeds the limit breaks instead."""
+    world = wp.tid()
+    seals = int(0)
+    for instance in range(layout.instances):
+        seals += held_inout[world, instance]
+    if seals == 0:
+        return
+    cup = world * layout.bodies + CUP
+    tip = tip_pose(body_q[cup], suction.tip)
+    place = wp.transform_get_translation(tip)
+    axis = wp.transform_vector(tip, wp.vec3(0.0, 0.0, 1.0))
+    hinge = wp.transform_vector(tip, wp.vec3(0.0, 1.0, 0.0))
+    lever = place - wp.transform_get_translation(body_q[cup])
+    spin = wp.spatial_bottom(body_qd[cup])
+    velocity = wp.spatial_top(body_qd[cup]) + wp.cross(spin, place - wp.transform_point(body_q[cup], body_com[cup]))
+    gripper = gripper_response(suction, hinge, lever, seals)
+    dof = world * layout.dofs
+    for instance in range(layout.instances):
+        if held_inout[world, instance] != 0:
+            s = slot[world, instance]
+            body = world * layout.bodies + layout.gripper_bodies + s
+            caught = body_q[body] * wp.transform_inverse(anchor[world, instance])
+            arm = place - wp.transform_point(body_q[body], body_com[body])
+            turned = wp.quat_to_matrix(wp.transform_get_rotation(body_q[body]))
+            own = object_response(body_inv_mass[body], turned * body_inv_inertia[body] * wp.transpose(turned), arm)
+            rate = wp.spatial_bottom(body_qd[body])
+            slip = velocity - wp.spatial_top(body_qd[body]) - wp.cross(rate, arm)
+            turn = seal_turn(wp.transform_get_rotation(tip), wp.transform_get_rotation(caught), suction)
+            wrench = seal_wrench(place - wp.transform_get_translation(caught), turn, slip, spin - rate, sum_responses(own, gripper),
+                                 suction)
+            load = seal_load(wrench.force, axis)
+            first = dof + layout.gripper_dofs + 6 * s
+            if load > limit[world]:
+                release_seal(held_inout, load_inout, joint_f_inout, world, instance, first)
+            else:
+                load_inout[world, instance] = load
+                peak_inout[world] = wp.max(peak_inout[world], load)
+                apply_wrench(wrench, arm, lever, hinge, joint_f_inout, dof, first)
+
+
+@wp.func
+def hangs(layout: LayoutData, world: int, body: int, slot: wp.array2d[int], held: wp.array2d[int]) -> bool:
+    """Whether a seal holds the body, which is not the gripper's."""
+    found = bool(False)
+    s = body - world * layout.bodies - layout.gripper_bodies
+    for instance in range(layout.instances):
+        if held[world, instance] != 0 and slot[world, instance] == s:
+            found = True
+    return found
+
+
+@wp.kernel
+def ignore_held_contacts_kernel(
+    # Scene:
+    layout: LayoutData,
+    shape_body: wp.array[int],
+    # State:
+    contact_count: wp.array[int],
+    slot: wp.array2d[int],
+    held: wp.array2d[int],
+    shape0: wp.array[int],
+    shape1: wp.array[int],
+    # Out:
+    margin_out: wp.array[float],
+):
+    """Pull contacts of a cup with what hangs on it so far apart that the solver makes no rows for them: they would fight the seal.
+
+    The collision pipeline writes all margins anew each time, and has by then kept what it matches the next contacts with. Taking the
+    shapes away instead would make one pair of bodies of all such contacts of all worlds, and the solver's time grows with a pair's
+    square.
+    """
+    contact = wp.tid()
+    if contact >= contact_count[0] or shape0[contact] < 0 or shape1[contact] < 0:
+        return
+    a = shape_body[shape0[contact]]
+    b = shape_body[shape1[contact]]
+    if a < 0 or b < 0:
+        return
+    cup = a
+    other = b
+    if b % layout.bodies == CUP:
+        cup = b
+        other = a
+    if cup % layout.bodies != CUP:
+        return
+    if hangs(layout, cup // layout.bodies, other, slot, held):
+        margin_out[contact] = -APART

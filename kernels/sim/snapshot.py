@@ -1,0 +1,167 @@
+"""What leaves a tick: the snapshot for pictures and a few numbers a world for the host."""
+
+import warp as wp
+
+from synpick_warp.kernels.phases import ACT, LOOK, OVER, delivers
+from synpick_warp.kernels.structs import LayoutData
+
+wp.set_module_options({"enable_backward": False})
+
+# Columns of the status table; a test keeps them in step with stages.sim.worlds.STATUS_COLUMNS.
+STATUS_PHASE = wp.constant(0)
+STATUS_ENDING = wp.constant(1)
+STATUS_EPISODE = wp.constant(2)
+STATUS_REDRAW = wp.constant(3)
+STATUS_FRAME = wp.constant(4)
+STATUS_LIVE = wp.constant(5)
+STATUS_MODE = wp.constant(6)
+STATUS_TASK = wp.constant(7)
+STATUS_ATTEMPT = wp.constant(8)
+STATUS_OUTCOME = wp.constant(9)
+STATUS_TARGET = wp.constant(10)
+STATUS_HITS = wp.constant(11)
+STATUS_CAUGHT = wp.constant(12)
+STATUS_HELD = wp.constant(13)
+# Columns of the table of measures.
+MEASURE_LOAD = wp.constant(0)
+
+
+@wp.kernel
+def take_snapshot_kernel(
+    # Scene:
+    layout: LayoutData,
+    # State:
+    phase: wp.array[int],
+    ending: wp.array[int],
+    address: wp.array[wp.vec2i],
+    frame: wp.array[int],
+    task: wp.array[int],
+    entry: wp.array2d[int],
+    slot: wp.array2d[int],
+    body_q: wp.array[wp.transform],
+    # Out:
+    live_out: wp.array[int],
+    episode_out: wp.array[int],
+    frame_out: wp.array[int],
+    entry_out: wp.array2d[int],
+    pose_out: wp.array2d[wp.transform],
+    fixture_pose_out: wp.array2d[wp.transform],
+    fixture_visible_out: wp.array2d[int],
+):
+    """Copy what pictures need. A tick is a frame while the gripper acts, and once more when it has finished.
+
+    The gripper is not in the picture while it LOOKs: it then waits at home.
+    """
+    world = wp.tid()
+    live = int(0)
+    if phase[world] == ACT or (phase[world] == OVER and delivers(ending[world])):
+        live = 1
+    live_out[world] = live
+    episode_out[world] = address[world][0]
+    frame_out[world] = frame[world]
+    body = world * layout.bodies
+    for instance in range(layout.instances):
+        entry_out[world, instance] = entry[world, instance]
+        if entry[world, instance] >= 0:
+            pose_out[world, instance] = body_q[body + layout.gripper_bodies + slot[world, instance]]
+    gripper = wp.where(task[world] == LOOK, 0, 1)
+    fixture_pose_out[world, 0] = wp.transform_identity()
+    fixture_visible_out[world, 0] = 1
+    for link in range(2):
+        fixture_pose_out[world, 1 + link] = body_q[body + link]
+        fixture_visible_out[world, 1 + link] = gripper
+
+
+@wp.struct
+class FramePoses:
+    """What a frame must tell the next one: parts of a snapshot."""
+
+    live: wp.array[int]
+    episode: wp.array[int]
+    frame: wp.array[int]
+    entry: wp.array2d[int]
+    pose: wp.array2d[wp.transform]
+    """Object to world [m]."""
+    fixture_pose: wp.array2d[wp.transform]
+    """Fixture to world [m]."""
+    fixture_visible: wp.array2d[int]
+
+
+@wp.kernel
+def link_frames_kernel(
+    # In:
+    now: FramePoses,
+    # Out:
+    last_inout: FramePoses,
+    follows_out: wp.array[int],
+    entry_out: wp.array2d[int],
+    pose_out: wp.array2d[wp.transform],
+    fixture_pose_out: wp.array2d[wp.transform],
+    fixture_visible_out: wp.array2d[int],
+):
+    """Put the last tick's poses beside this one's, and keep these for the next.
+
+    A frame follows the last one if that was the frame before it in the same episode: an episode's first frame follows none.
+    """
+    world = wp.tid()
+    follows = int(0)
+    if now.live[world] != 0 and last_inout.live[world] != 0:
+        if now.episode[world] == last_inout.episode[world] and now.frame[world] == last_inout.frame[world] + 1:
+            follows = 1
+    follows_out[world] = follows
+    last_inout.live[world] = now.live[world]
+    last_inout.episode[world] = now.episode[world]
+    last_inout.frame[world] = now.frame[world]
+    for instance in range(now.entry.shape[1]):
+        entry_out[world, instance] = last_inout.entry[world, instance]
+        pose_out[world, instance] = last_inout.pose[world, instance]
+        last_inout.entry[world, instance] = now.entry[world, instance]
+        last_inout.pose[world, instance] = now.pose[world, instance]
+    for fixture in range(now.fixture_pose.shape[1]):
+        fixture_pose_out[world, fixture] = last_inout.fixture_pose[world, fixture]
+        fixture_visible_out[world, fixture] = last_inout.fixture_visible[world, fixture]
+        last_inout.fixture_pose[world, fixture] = now.fixture_pose[world, fixture]
+        last_inout.fixture_visible[world, fixture] = now.fixture_visible[world, fixture]
+
+
+@wp.kernel
+def pack_status_kernel(
+    # State:
+    live: wp.array[int],
+    phase: wp.array[int],
+    ending: wp.array[int],
+    address: wp.array[wp.vec2i],
+    frame: wp.array[int],
+    mode: wp.array[int],
+    task: wp.array[int],
+    attempt: wp.array[int],
+    outcome: wp.array[int],
+    target: wp.array[int],
+    hits: wp.array[int],
+    caught: wp.array[wp.uint32],
+    hanging: wp.array[wp.uint32],
+    peak: wp.array[float],
+    # Out:
+    status_out: wp.array2d[int],
+    measure_out: wp.array2d[float],
+):
+    """Gather the few numbers of each world that the host reads."""
+    world = wp.tid()
+    status_out[world, STATUS_PHASE] = phase[world]
+    status_out[world, STATUS_ENDING] = ending[world]
+    status_out[world, STATUS_EPISODE] = address[world][0]
+    status_out[world, STATUS_REDRAW] = address[world][1]
+    status_out[world, STATUS_FRAME] = frame[world]
+    status_out[world, STATUS_LIVE] = live[world]
+    status_out[world, STATUS_MODE] = mode[world]
+    status_out[world, STATUS_TASK] = task[world]
+    status_out[world, STATUS_ATTEMPT] = attempt[world]
+    status_out[world, STATUS_OUTCOME] = outcome[world]
+    status_out[world, STATUS_TARGET] = target[world]
+    status_out[world, STATUS_HITS] = 0
+    status_out[world, STATUS_CAUGHT] = 0
+    if attempt[world] >= 0:
+        status_out[world, STATUS_HITS] = hits[world]
+        status_out[world, STATUS_CAUGHT] = int(caught[world])
+    status_out[world, STATUS_HELD] = int(hanging[world])
+    measure_out[world, MEASURE_LOAD] = peak[world]

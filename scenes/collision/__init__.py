@@ -1,0 +1,1 @@
+"""Collision shapes: convex hulls, convex decomposition, half-spaces."""

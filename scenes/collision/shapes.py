@@ -1,0 +1,127 @@
+"""Collision shapes of a catalog's objects, kept on disk by content."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+import signal
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
+from synpick_warp.scenes.collision.hulls import limited_hull
+from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
+
+# Part of the cache's key. Raise it with any change to hulls.py or decomposition.py that gives other shapes for the same input.
+_RECIPE = 1
+
+
+def default_cache_dir() -> Path:
+    """Where shapes are kept unless told otherwise: the user's cache folder (XDG base directory specification)."""
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "synpick-warp" / "collision"
+
+
+def collision_shapes(
+    names: Sequence[str], meshes: Sequence[TriangleMesh], recipes: Sequence[ShapeRecipe], cache_dir: Path, report: Callable[[str], None]
+) -> list[tuple[ConvexPiece, ...]]:
+    """The collision shape of each mesh, from the cache where it has been made before.
+
+    Args:
+        names: Of the objects, for reports and errors.
+        meshes: As long as `names`.
+        recipes: As long as `names`.
+        cache_dir: Folder of the cache; made if it is missing. If it cannot be written, that is reported and shapes are made each time.
+        report: Takes one line of progress at a time.
+
+    Raises:
+        CatalogError: A mesh has no volume, or its decomposition failed.
+    """
+    files = [cache_dir / f"{_key(mesh, recipe)}.npz" for mesh, recipe in zip(meshes, recipes, strict=True)]
+    shapes = [_load(file) for file in files]
+    missing = [index for index, shape in enumerate(shapes) if shape is None]
+    slow = [index for index in missing if recipes[index].concave]
+    if slow:
+        report(f"decomposing {len(slow)} concave objects, once, up to a minute each: {', '.join(names[index] for index in slow)}")
+    jobs = [(meshes[index], recipes[index]) for index in slow]
+    writable = True
+    # Each shape is kept as soon as it is there: a bake that is stopped meanwhile has not worked in vain.
+    for index, shape in zip(slow, _decompose_all(jobs), strict=True):
+        if not shape:
+            raise CatalogError(f"{names[index]}: no decomposition into convex pieces found; repair the mesh, or set concave = false")
+        report(f"{names[index]}: {len(shape)} convex pieces")
+        shapes[index] = shape
+        writable = writable and _save(files[index], shape, report)
+    for index in (index for index in missing if not recipes[index].concave):
+        try:
+            shape = (limited_hull(meshes[index].vertices, recipes[index].hull_vertices),)
+        except CatalogError as error:
+            raise CatalogError(f"{names[index]}: {error}") from error
+        shapes[index] = shape
+        writable = writable and _save(files[index], shape, report)
+    return [shape or () for shape in shapes]
+
+
+def _decompose_all(jobs: list[tuple[TriangleMesh, ShapeRecipe]]) -> Iterator[tuple[ConvexPiece, ...]]:
+    """Decompose in as many processes as there are cores and jobs, in order. CoACD has global state: threads would share it."""
+    if len(jobs) <= 1:
+        yield from (decompose(*job) for job in jobs)
+        return
+    # Spawned, not forked: a copy of a process that has used a GPU cannot run. Ctrl-C ends the children at once, in native code too.
+    stop = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_DFL)}
+    with ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), mp_context=get_context("spawn"), **stop) as pool:
+        try:
+            yield from pool.map(decompose, *zip(*jobs, strict=True))
+        except BrokenProcessPool as error:
+            raise CatalogError("a process that decomposed concave objects died, perhaps for want of memory; try again") from error
+
+
+def _key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
+    version = importlib.metadata.version("coacd") if recipe.concave else ""
+    digest = hashlib.sha256(f"{_RECIPE} {recipe} {version} {mesh.vertices.shape} {mesh.faces.shape}".encode())
+    digest.update(mesh.vertices.astype("<f4").tobytes())
+    digest.update(mesh.faces.astype("<i4").tobytes())
+    return digest.hexdigest()
+
+
+def _load(file: Path) -> tuple[ConvexPiece, ...] | None:
+    """The pieces in a cache file; None if there is none, or a damaged one."""
+    try:
+        # Opened here, because np.load leaves a damaged file open.
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+            vertices, faces, counts = data["vertices"], data["faces"], data["counts"]
+        ends = np.cumsum(counts, axis=0)[:-1]
+        pairs = zip(np.split(vertices, ends[:, 0]), np.split(faces, ends[:, 1]), strict=True)
+        pieces = tuple(ConvexPiece(np.ascontiguousarray(v, np.float32), np.ascontiguousarray(f, np.int32)) for v, f in pairs)
+        sound = all(np.isfinite(p.vertices).all() and p.faces.min() >= 0 and p.faces.max() < len(p.vertices) for p in pieces)
+    except Exception:  # a damaged file raises nearly anything; whatever it is, the shape is made anew
+        return None
+    return pieces if sound and pieces else None
+
+
+def _save(file: Path, pieces: tuple[ConvexPiece, ...], report: Callable[[str], None]) -> bool:
+    """Write a cache file whole or not at all: several bakes may share the folder. False if it cannot be written."""
+    vertices, faces = (np.concatenate(rows) for rows in zip(*((piece.vertices, piece.faces) for piece in pieces), strict=True))
+    counts = np.array([(len(piece.vertices), len(piece.faces)) for piece in pieces])
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=".", suffix=".tmp")
+        try:
+            with os.fdopen(handle, "wb") as stream:
+                np.savez(stream, vertices=vertices, faces=faces, counts=counts)
+            os.replace(temporary, file)
+        except BaseException:
+            os.unlink(temporary)
+            raise
+    except OSError as error:
+        report(f"collision shapes are not kept: {file.parent} cannot be written ({error.strerror})")
+        return False
+    return True

@@ -1,0 +1,1 @@
+"""The embedded object set and light maps, made in code."""

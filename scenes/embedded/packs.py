@@ -1,0 +1,217 @@
+"""Embedded objects that are packed food and household goods: cartons, tins and bottles with printed labels. Lengths [m]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from synpick_warp.scenes.embedded import textures as paint
+from synpick_warp.scenes.embedded.meshes import (
+    BOX_FACES,
+    Patch,
+    at_height,
+    cap,
+    ellipse,
+    join,
+    lathe,
+    loft,
+    rounded_box,
+    rounded_rectangle,
+    solid,
+)
+from synpick_warp.scenes.embedded.textures import Color
+
+SHEET = 1024
+"""Width of a printed sheet [px]: about 3 px/mm, as fine as the cameras see at 2 m and full HD."""
+SIDES = 48
+"""Points around a tin or a bottle."""
+CARTON_EDGE = 0.0015
+SILVER: Color = (204, 205, 208)
+
+Shape = tuple[Patch, np.ndarray]
+"""The surface of an object and its texture."""
+Motif = Callable[[np.ndarray], None]
+
+
+@dataclass(frozen=True)
+class Label:
+    """What is printed on a pack."""
+
+    title: tuple[str, ...]
+    subtitle: str
+    net: str
+    color: Color
+    accent: Color
+    text: Color
+    motif: Motif
+    seed: int
+    food: bool = True
+    """Food has a table of nutrition facts."""
+
+
+def front(width: int, height: int, label: Label) -> np.ndarray:
+    """The panel that sells."""
+    image = paint.blank(width, height, label.color)
+    paint.fill(image, (0.0, 0.0, 1.0, 0.05), label.accent)
+    paint.fill(image, (0.0, 0.93, 1.0, 1.0), label.accent)
+    label.motif(image)
+    lines = len(label.title)
+    for row, line in enumerate(label.title):
+        paint.write(image, line, (0.06, 0.08 + 0.3 * row / lines, 0.94, 0.08 + 0.3 * (row + 0.95) / lines), label.text)
+    paint.write(image, label.subtitle, (0.08, 0.395, 0.92, 0.46), label.text, paint.FONT)
+    paint.write(image, label.net, (0.06, 0.86, 0.6, 0.92), label.text, paint.FONT)
+    return image
+
+
+def back(width: int, height: int, label: Label) -> np.ndarray:
+    """The panel that explains."""
+    image = paint.blank(width, height, paint.PAPER)
+    paint.fill(image, (0.0, 0.0, 1.0, 0.16), label.color)
+    paint.write(image, " ".join(label.title), (0.06, 0.03, 0.94, 0.13), label.text)
+    paint.small_print(image, (0.08, 0.2, 0.92, 0.5), (92, 88, 84), 8, label.seed)
+    paint.fill(image, (0.08, 0.53, 0.56, 0.94), label.accent)
+    paint.small_print(image, (0.11, 0.56, 0.53, 0.91), paint.legible(label.accent), 7, label.seed + 1)
+    paint.bar_code(image, (0.6, 0.72, 0.94, 0.94), label.seed + 2)
+    return image
+
+
+def side(width: int, height: int, label: Label) -> np.ndarray:
+    """The panel with the table."""
+    image = paint.blank(width, height, label.color)
+    if width > height:
+        paint.write(image, " ".join(label.title), (0.04, 0.12, 0.6, 0.88), label.text)
+        paint.facts(image, (0.68, 0.06, 0.97, 0.94), label.seed + 3)
+        return image
+    paint.write(image, " ".join(label.title), (0.06, 0.03, 0.94, 0.13), label.text)
+    if label.food:
+        paint.facts(image, (0.08, 0.16, 0.92, 0.62), label.seed + 3)
+    else:
+        paint.fill(image, (0.08, 0.16, 0.92, 0.62), paint.PAPER)
+        paint.write(image, "Directions", (0.14, 0.18, 0.86, 0.26), paint.INK)
+        paint.small_print(image, (0.14, 0.28, 0.86, 0.6), paint.INK, 10, label.seed + 3)
+    paint.small_print(image, (0.1, 0.66, 0.9, 0.95), label.text, 9, label.seed + 4)
+    return image
+
+
+def other_side(width: int, height: int, label: Label) -> np.ndarray:
+    """The panel with the name alone."""
+    image = paint.blank(width, height, label.accent)
+    text = paint.legible(label.accent)
+    if width > height:
+        paint.write(image, " ".join(label.title), (0.05, 0.12, 0.7, 0.88), text)
+        paint.bar_code(image, (0.74, 0.15, 0.97, 0.85), label.seed + 5)
+        return image
+    paint.write(image, " ".join(label.title), (0.06, 0.06, 0.94, 0.2), text)
+    paint.small_print(image, (0.1, 0.3, 0.9, 0.6), text, 8, label.seed + 6)
+    paint.write(image, label.net, (0.1, 0.85, 0.9, 0.93), text, paint.FONT)
+    return image
+
+
+def end(width: int, height: int, label: Label) -> np.ndarray:
+    """A small face with the name."""
+    image = paint.blank(width, height, label.color)
+    paint.fill(image, (0.0, 0.0, 1.0, 0.1), label.accent)
+    paint.fill(image, (0.0, 0.9, 1.0, 1.0), label.accent)
+    paint.write(image, " ".join(label.title), (0.08, 0.25, 0.92, 0.75), label.text)
+    return image
+
+
+def carton(size: tuple[float, float, float], label: Label) -> Shape:
+    """A box of card; its largest face is the front, the face opposite the back."""
+    scale = (SHEET - 8 * paint.PADDING) / (2 * (size[0] + size[1]))
+    x, y, z = (round(length * scale) for length in size)
+    extent = {"+x": (y, z), "-x": (y, z), "+y": (x, z), "-y": (x, z), "+z": (x, y), "-z": (x, y)}
+    thin = "xyz"[int(np.argmin(size))]
+    panels = {"+x": side, "-x": other_side, "+y": side, "-y": other_side, "+z": end, "-z": end, f"+{thin}": front, f"-{thin}": back}
+    images = {name: panels[name](*extent[name], label) for name in BOX_FACES}
+    texture, at = paint.pack(images, SHEET)
+    return rounded_box(size, CARTON_EDGE, at), texture
+
+
+def wrapper(width: int, height: int, label: Label, *, twice: bool = False) -> np.ndarray:
+    """A label for a tin, unrolled: front in the middle, table and text left and right; or the front twice, half a turn apart."""
+    if twice:
+        half = front(width // 2, height, label)
+        return np.concatenate([half, half], axis=1)
+    third = width // 3
+    left, middle, right = back(third, height, label), front(width - 2 * third, height, label), side(third, height, label)
+    paint.fill(left, (0.0, 0.0, 1.0, 0.05), label.accent)
+    return np.concatenate([left, middle, right], axis=1)
+
+
+def tin(ring: np.ndarray, height: float, label_image: np.ndarray, ends: dict[str, np.ndarray], metal: Color, seed: int) -> Shape:
+    """A tin: rims of metal at both ends, the label between them.
+
+    Args:
+        ring: Outline (n, 2) of the rim [m].
+        height: Height [m].
+        label_image: The label, unrolled.
+        ends: Pictures `top` and `bottom`.
+        metal: Colour of rims.
+        seed: For the scratches.
+    """
+    texture, at = paint.pack({"label": label_image, "metal": paint.brushed(256, 64, metal, seed), **ends}, SHEET)
+    half = height / 2
+    narrow = 1 - 0.0012 / np.abs(ring).max()
+
+    def level(scale: float, z: float) -> np.ndarray:
+        return at_height(ring * scale, z)
+
+    lower = np.stack([level(0.93, -half + 0.002), level(0.95, -half), level(0.99, -half), level(1.0, -half + 0.001)])
+    lower = np.concatenate([lower, np.stack([level(1.0, -half + 0.003), level(narrow, -half + 0.004)])])
+    upper = lower[::-1] * (1, 1, -1)
+    body = np.stack([lower[-1], *(level(narrow, z) for z in np.linspace(-half, half, 5)[1:-1]), upper[0]])
+    patch = join(
+        cap(lower[0], at["bottom"], below=True), loft(lower, at["metal"]), loft(body, at["label"]), loft(upper, at["metal"]),
+        cap(upper[-1], at["top"]),
+    )  # fmt: skip
+    return patch, texture
+
+
+def stamped_end(size: int, color: Color, seed: int, text: str) -> np.ndarray:
+    """The end of a tin: grooves, and a line of print if there is text."""
+    image = (0.6 * paint.rings(size, (color, (140, 141, 146)), 3.0) + 0.4 * paint.brushed(size, size, color, seed)).astype(np.uint8)
+    if text:
+        paint.write(image, text, (0.25, 0.42, 0.75, 0.58), (70, 72, 80), paint.FONT)
+    return image
+
+
+def bottle(
+    levels: list[tuple[float, float, float, float]],
+    neck: list[tuple[float, float]],
+    band: tuple[int, int],
+    images: dict[str, np.ndarray],
+) -> Shape:
+    """A bottle with a screw cap.
+
+    Args:
+        levels: (width, depth, exponent, z) of the body from the bottom to the neck [m].
+        neck: (radius, z) of the cap's profile, from its lower edge to its top [m].
+        band: First and last level that carry the label.
+        images: `label` (unrolled), `body`, `cap`.
+    """
+    texture, at = paint.pack(images, SHEET)
+    rings = np.stack([at_height(ellipse(width, depth, SIDES, exponent), z) for width, depth, exponent, z in levels])
+    first, last = band
+    body = join(
+        cap(rings[0], at["body"], below=True),
+        loft(rings[: first + 1], at["body"]),
+        loft(rings[first : last + 1], at["label"]),
+        loft(rings[last:], at["body"]),
+        cap(rings[-1], at["body"]),
+    )
+    return join(body, solid(lathe(neck, SIDES), at["cap"])), texture
+
+
+def tin_label_size(ring: np.ndarray, height: float) -> tuple[int, int]:
+    """Pixels of a label that goes once around a tin."""
+    around = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1).sum()
+    width = SHEET - 2 * paint.PADDING
+    return width, round(width * (height - 0.008) / around)
+
+
+def label_ring(width: float, depth: float, radius: float) -> np.ndarray:
+    """Outline of a tin with flat sides [m]."""
+    return rounded_rectangle(width, depth, radius, 10)

@@ -1,0 +1,119 @@
+"""The embedded light maps: six skies and rooms made from formulas. Radiance in arbitrary units where a white wall is about 1."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from synpick_warp.scenes.types import LightMap
+
+HEIGHT = 128
+"""Rows of an embedded map; it has twice as many columns."""
+
+Rgb = tuple[float, float, float]
+
+
+def directions(height: int) -> np.ndarray:
+    """Unit vectors (height, 2 * height, 3) of an equirectangular map's pixels: row 0 is up, column u is azimuth / 2π + 0.5."""
+    polar = (np.arange(height) + 0.5) / height * np.pi
+    azimuth = ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5) * 2 * np.pi
+    sine = np.sin(polar)[:, None]
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.broadcast_to(np.cos(polar)[:, None], (height, 2 * height))], axis=2)
+
+
+def skies() -> tuple[LightMap, ...]:
+    """The embedded light maps, sorted by name; always the same."""
+    view = directions(HEIGHT)
+    makers = {
+        "low_sun": _low_sun, "mixed_lamps": _mixed_lamps, "overcast": _overcast,
+        "softboxes": _softboxes, "warehouse": _warehouse, "window": _window,
+    }  # fmt: skip
+    return tuple(LightMap(name, np.maximum(make(view), 0.0).astype(np.float32)) for name, make in sorted(makers.items()))
+
+
+def _overcast(view: np.ndarray) -> np.ndarray:
+    """The CIE overcast sky, (1 + 2 sin h) / 3 of the zenith, over a grey ground."""
+    sky = _color((1.55, 1.65, 1.80)) * ((1 + 2 * np.clip(view[..., 2:], 0, 1)) / 3)
+    return _ground(view, sky, (0.28, 0.27, 0.25))
+
+
+def _low_sun(view: np.ndarray) -> np.ndarray:
+    """A clear sky, blue above and pale at the horizon, and a low warm sun."""
+    up = np.clip(view[..., 2:], 0, 1)
+    near = view @ _toward(35.0, 22.0)
+    sky = _color((0.22, 0.42, 0.90)) * up**0.5 + _color((0.95, 0.88, 0.76)) * (1 - up) ** 4 * 0.8
+    glow = _color((1.0, 0.72, 0.40)) * (1.6 * np.exp((near - 1) * 18) + 0.25 * np.exp((near - 1) * 3))[..., None]
+    sun = _color((1.0, 0.82, 0.58)) * (900 * np.exp((near - 1) * 2600))[..., None]
+    return _ground(view, sky + glow + sun, (0.34, 0.28, 0.21))
+
+
+def _softboxes(view: np.ndarray) -> np.ndarray:
+    """A dim studio with two large panels overhead and a small one behind."""
+    room = _room(view, (0.16, 0.16, 0.17), (0.10, 0.10, 0.10))
+    room += _color((15.0, 14.6, 14.0)) * _panel(view, (0.9, 0.2), (0.42, 0.62), 0.06)
+    room += _color((8.5, 8.9, 9.6)) * _panel(view, (-0.9, -0.3), (0.38, 0.55), 0.06)
+    return room + _color((5.0, 5.0, 5.0)) * _panel(view, (0.1, -1.9), (0.6, 0.25), 0.06)
+
+
+def _warehouse(view: np.ndarray) -> np.ndarray:
+    """A hall with five rows of lamps under its roof."""
+    hall = _room(view, (0.34, 0.35, 0.35), (0.22, 0.21, 0.20))
+    for row in np.linspace(-2.0, 2.0, 5):
+        for place in np.linspace(-2.4, 2.4, 7):
+            hall += _color((13.0, 13.4, 12.6)) * _panel(view, (place, row), (0.22, 0.05), 0.025)
+    return hall
+
+
+def _window(view: np.ndarray) -> np.ndarray:
+    """A room with a large window on its +y side, sky in its upper part and trees in its lower."""
+    room = _room(view, (0.30, 0.28, 0.25), (0.20, 0.16, 0.12))
+    depth = np.maximum(view[..., 1], 1e-6)
+    across, rise = view[..., 0] / depth, view[..., 2] / depth
+    frame = _step(0.85 - np.abs(across), 0.03) * _step(0.62 - np.abs(rise - 0.55), 0.03) * _step(view[..., 1], 0.02)
+    bars = 1 - (_step(0.03 - np.abs(across), 0.012) + _step(0.025 - np.abs(rise - 0.62), 0.012)).clip(0, 1)
+    outside = _color((7.0, 8.2, 10.5)) * _step(rise - 0.25, 0.12)[..., None] + _color((1.4, 1.9, 1.0)) * _step(0.25 - rise, 0.12)[..., None]
+    bounce = np.clip(-view[..., 1], 0, 1)[..., None] ** 2 * _color((0.45, 0.44, 0.42))
+    return room + bounce + outside * (frame * bars)[..., None]
+
+
+def _mixed_lamps(view: np.ndarray) -> np.ndarray:
+    """A warm lamp on one side, a cold panel on the other, a greenish tube overhead."""
+    room = _room(view, (0.20, 0.19, 0.19), (0.13, 0.12, 0.11))
+    for azimuth, height, width, color in ((200.0, 38.0, 260.0, (46.0, 27.0, 11.0)), (320.0, 30.0, 420.0, (30.0, 16.0, 6.0))):
+        room += _color(color) * np.exp((view @ _toward(azimuth, height) - 1) * width)[..., None]
+    room += _color((5.5, 7.4, 10.8)) * _panel(view, (1.25, 0.6), (0.5, 0.5), 0.08)
+    return room + _color((6.6, 7.8, 6.2)) * _panel(view, (-0.2, -0.4), (0.06, 1.1), 0.04)
+
+
+def _room(view: np.ndarray, walls: Rgb, floor: Rgb) -> np.ndarray:
+    """A plain room: walls that brighten upward, over a floor."""
+    return _ground(view, _color(walls) * (0.7 + 0.6 * np.clip(view[..., 2:], 0, 1)), floor)
+
+
+def _ground(view: np.ndarray, above: np.ndarray, color: Rgb) -> np.ndarray:
+    """`above` over a ground of one colour, with a soft horizon just below eye height."""
+    share = _step(view[..., 2] + 0.02, 0.03)[..., None]
+    return above * share + _color(color) * (0.75 - 0.25 * view[..., 2:]) * (1 - share)
+
+
+def _panel(view: np.ndarray, center: tuple[float, float], half: tuple[float, float], soft: float) -> np.ndarray:
+    """Share (H, W, 1) covered by a level panel one unit overhead: centre and half size in units of its height."""
+    height = np.maximum(view[..., 2], 1e-6)
+    x, y = view[..., 0] / height - center[0], view[..., 1] / height - center[1]
+    inside = _step(half[0] - np.abs(x), soft) * _step(half[1] - np.abs(y), soft) * _step(view[..., 2] - 0.1, 0.05)
+    return inside[..., None]
+
+
+def _step(value: np.ndarray, width: float) -> np.ndarray:
+    """A smooth step from 0 to 1 around zero."""
+    share = np.clip(value / width * 0.5 + 0.5, 0, 1)
+    return share * share * (3 - 2 * share)
+
+
+def _toward(azimuth: float, height: float) -> np.ndarray:
+    """Unit vector from azimuth and height over the horizon [°]."""
+    turn, rise = np.radians(azimuth), np.radians(height)
+    return np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
+
+
+def _color(color: Rgb) -> np.ndarray:
+    return np.array(color)

@@ -1,0 +1,205 @@
+"""Pictures for the embedded objects: printed labels, bar codes, wood, metal, peel. Every random number has a fixed seed.
+
+Images are (H, W, 3) uint8, sRGB, red first, row 0 at the top. Boxes are (left, top, right, bottom) as shares of the image.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from synpick_warp.scenes.embedded.meshes import Rect
+
+Color = tuple[int, int, int]
+Box = tuple[float, float, float, float]
+
+FONT = cv2.FONT_HERSHEY_DUPLEX
+BOLD = cv2.FONT_HERSHEY_TRIPLEX
+INK: Color = (28, 26, 30)
+PAPER: Color = (244, 241, 232)
+PADDING = 3
+"""Border around each image of a sheet that repeats its edge, so that filtering does not bleed [px]."""
+
+
+def blank(width: int, height: int, color: Color) -> np.ndarray:
+    """An image of one colour."""
+    return np.full((height, width, 3), color, np.uint8)
+
+
+def legible(ground: Color) -> Color:
+    """The colour of print that stands out from the ground: dark on light, light on dark."""
+    return INK if 0.3 * ground[0] + 0.6 * ground[1] + 0.1 * ground[2] > 130 else PAPER
+
+
+def pack(images: dict[str, np.ndarray], width: int) -> tuple[np.ndarray, dict[str, Rect]]:
+    """Put images on one sheet of the given width [px], in rows in the order given; the sheet and where each image lies."""
+    places: dict[str, tuple[int, int]] = {}
+    x = y = row = 0
+    for name, image in images.items():
+        high, wide = image.shape[0] + 2 * PADDING, image.shape[1] + 2 * PADDING
+        if x and x + wide > width:
+            x, y, row = 0, y + row, 0
+        places[name] = (x, y)
+        x, row = x + wide, max(row, high)
+    sheet = np.zeros((y + row, max(width, max(p[0] + images[n].shape[1] + 2 * PADDING for n, p in places.items())), 3), np.uint8)
+    rects = {}
+    for name, (left, top) in places.items():
+        padded = cv2.copyMakeBorder(images[name], PADDING, PADDING, PADDING, PADDING, cv2.BORDER_REPLICATE)
+        sheet[top : top + padded.shape[0], left : left + padded.shape[1]] = padded
+        right, bottom = left + padded.shape[1] - PADDING, top + padded.shape[0] - PADDING
+        rects[name] = (
+            (left + PADDING) / sheet.shape[1], 1 - bottom / sheet.shape[0],
+            right / sheet.shape[1], 1 - (top + PADDING) / sheet.shape[0],
+        )  # fmt: skip
+    return sheet, rects
+
+
+def fill(image: np.ndarray, box: Box, color: Color) -> None:
+    """Paint a rectangle."""
+    left, top, right, bottom = _pixels(image, box)
+    image[top:bottom, left:right] = color
+
+
+def dot(image: np.ndarray, x: float, y: float, radius: float, color: Color) -> None:
+    """Paint a disc; the radius is a share of the image's shorter side."""
+    center = (round(x * image.shape[1]), round(y * image.shape[0]))
+    cv2.circle(image, center, max(1, round(radius * min(image.shape[:2]))), color, -1, cv2.LINE_AA)
+
+
+def write(image: np.ndarray, text: str, box: Box, color: Color, font: int = BOLD) -> None:
+    """Print one line of text, as large as the box allows, in its middle."""
+    left, top, right, bottom = _pixels(image, box)
+    (wide, high), below = cv2.getTextSize(text, font, 1.0, 1)
+    scale = min((right - left) / wide, (bottom - top) / (high + below))
+    (wide, high), _ = cv2.getTextSize(text, font, scale, 1)
+    origin = ((left + right - wide) // 2, (top + bottom + high) // 2)
+    cv2.putText(image, text, origin, font, scale, color, max(1, round(1.6 * scale)), cv2.LINE_AA)
+
+
+def small_print(image: np.ndarray, box: Box, color: Color, rows: int, seed: int) -> None:
+    """Lines of words too small to read."""
+    rng = np.random.default_rng(seed)
+    left, top, right, bottom = _pixels(image, box)
+    pitch = (bottom - top) / rows
+    for row in range(rows):
+        x, y = float(left), round(top + pitch * (row + 0.5))
+        end = right if row < rows - 1 else left + (right - left) * 0.6
+        while x < end - pitch:
+            length = min(pitch * rng.uniform(0.6, 3.2), end - x)
+            cv2.line(image, (round(x), y), (round(x + length), y), color, max(1, round(pitch * 0.38)))
+            x += length + pitch * 0.6
+
+
+def bar_code(image: np.ndarray, box: Box, seed: int) -> None:
+    """A bar code with its number, on white."""
+    rng = np.random.default_rng(seed)
+    fill(image, box, (252, 252, 252))
+    left, top, right, bottom = _pixels(image, box)
+    bars = np.repeat(np.arange(58) % 2, rng.integers(1, 4, 58))
+    columns = np.arange(left + 4, right - 4)
+    dark = bars[(np.arange(len(columns)) * len(bars)) // max(len(columns), 1)] == 0
+    image[top + 3 : bottom - max(4, (bottom - top) // 4), columns[dark]] = INK
+    digits = "".join(str(digit) for digit in rng.integers(0, 10, 12))
+    write(image, digits, (box[0] + 0.01, box[3] - (box[3] - box[1]) * 0.22, box[2] - 0.01, box[3]), INK, FONT)
+
+
+def facts(image: np.ndarray, box: Box, seed: int) -> None:
+    """A table of nutrition facts."""
+    rng = np.random.default_rng(seed)
+    fill(image, box, (250, 249, 244))
+    left, top, right, bottom = _pixels(image, box)
+    cv2.rectangle(image, (left, top), (right - 1, bottom - 1), INK, 2)
+    table = image[top + 3 : bottom - 3, left + 4 : right - 4]
+    write(table, "Nutrition Facts", (0.02, 0.01, 0.98, 0.14), INK)
+    fill(table, (0.0, 0.15, 1.0, 0.18), INK)
+    names = ("Energy", "Fat", "Saturates", "Salt", "Carbohydrate", "Fibre", "Sugars", "Protein")
+    for row, name in enumerate(names):
+        y = 0.2 + 0.1 * row
+        write(table, f"{name:<13}", (0.02, y + 0.01, 0.6, y + 0.095), INK, FONT)
+        write(table, f"{rng.integers(1, 60)} g", (0.72, y + 0.01, 0.98, y + 0.095), INK, FONT)
+        fill(table, (0.0, y + 0.095, 1.0, y + 0.105), (120, 118, 120))
+
+
+def grain(width: int, height: int, scale: tuple[float, float], seed: int) -> np.ndarray:
+    """Smooth noise (H, W) from 0 to 1, with spots of the given width and height [px]."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.random((max(2, round(height / scale[1])), max(2, round(width / scale[0])))).astype(np.float32)
+    smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
+    return np.clip(smooth, 0.0, 1.0)
+
+
+def plain(color: Color, seed: int, roughness: float = 0.04) -> np.ndarray:
+    """A moulded surface: one colour with faint specks."""
+    size = 128
+    noise = 0.6 * grain(size, size, (2, 2), seed) + 0.4 * grain(size, size, (24, 24), seed + 1) - 0.5
+    return _shade(np.array(color, np.float32) * (1 + 2 * roughness * noise[..., None]))
+
+
+def brushed(width: int, height: int, color: Color, seed: int) -> np.ndarray:
+    """Metal with fine scratches from left to right."""
+    noise = 0.7 * grain(width, height, (60, 1.5), seed) + 0.3 * grain(width, height, (width / 2, 6), seed + 1) - 0.5
+    return _shade(np.array(color, np.float32) * (1 + 0.3 * noise[..., None]))
+
+
+def rings(size: int, colors: tuple[Color, Color], count: float) -> np.ndarray:
+    """Concentric grooves of two colours, the same seen from every side."""
+    axis = (np.arange(size) + 0.5) / size * 2 - 1
+    radius = np.hypot(*np.meshgrid(axis, axis))
+    wave = (0.5 + 0.5 * np.cos(radius * 2 * np.pi * count))[..., None]
+    return _shade(np.array(colors[0], np.float32) * wave + np.array(colors[1], np.float32) * (1 - wave))
+
+
+def wood(width: int, height: int, seed: int) -> np.ndarray:
+    """Wood along the grain, which runs up; the same after half a turn, so that faces of a block cannot be told apart."""
+    x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None]
+    warp = 0.45 * (_half_turn(grain(width, height, (width / 2, height / 2.5), seed)) - 0.5)
+    year = 0.5 + 0.5 * np.sin(2 * np.pi * (4.0 * (np.abs(x) + 0.2 * warp) + 2.0 * warp))
+    fibre = _half_turn(grain(width, height, (1.5, 40), seed + 1)) - 0.5
+    tone = np.clip(0.45 + 0.4 * (year**3 - 0.4) + 0.7 * fibre, 0, 1)[..., None]
+    return _shade(np.array((146, 98, 52), np.float32) * tone + np.array((220, 180, 124), np.float32) * (1 - tone))
+
+
+def end_grain(size: int, seed: int) -> np.ndarray:
+    """Wood across the grain: year rings around the middle, the same after each quarter turn."""
+    axis = np.linspace(-1.0, 1.0, size, dtype=np.float32)
+    radius = np.hypot(*np.meshgrid(axis, axis))
+    warp = grain(size, size, (size / 4, size / 4), seed)
+    warp = (warp + np.rot90(warp) + np.rot90(warp, 2) + np.rot90(warp, 3)) / 4 - 0.5
+    year = (0.5 + 0.5 * np.sin(2 * np.pi * 9 * (radius + 0.12 * warp)))[..., None]
+    return _shade(np.array((138, 92, 50), np.float32) * year + np.array((206, 164, 110), np.float32) * (1 - year))
+
+
+def foam(width: int, height: int, color: Color, seed: int) -> np.ndarray:
+    """Fine-pored foam, the same after half a turn."""
+    pores = _half_turn(grain(width, height, (3, 3), seed))
+    blotch = _half_turn(grain(width, height, (30, 30), seed + 1)) - 0.5
+    tone = 1 - np.clip(0.42 - pores, 0, 1) + 0.12 * blotch
+    return _shade(np.array(color, np.float32) * tone[..., None])
+
+
+def peel(width: int, height: int, seed: int) -> np.ndarray:
+    """A banana's skin, unrolled: stem at the top, green below it, brown streaks and specks, a dark lower tip."""
+    y = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None]
+    streak = grain(width, height, (7, 130), seed)
+    blotch = grain(width, height, (10, 16), seed + 1)
+    yellow, green, brown = (np.array(c, np.float32) for c in ((238, 200, 62), (150, 170, 60), (84, 58, 30)))
+    unripe = np.clip(1 - y / 0.22, 0, 1)[..., None]
+    color = yellow * (1 - unripe) + green * unripe
+    edges = 0.5 + 0.5 * np.cos(2 * np.pi * 5 * np.linspace(0, 1, width, dtype=np.float32))[None]
+    spots = np.clip((blotch - 0.8) * 8, 0, 1) + np.clip((streak - 0.86) * 6, 0, 1) + 0.25 * edges**12
+    tips = np.clip(1 - y / 0.035, 0, 1) + np.clip((y - 0.955) / 0.03, 0, 1)
+    share = np.clip(0.75 * spots + tips, 0, 1)[..., None]
+    return _shade((color * (1 - share) + brown * share) * (0.94 + 0.12 * streak[..., None]))
+
+
+def _half_turn(noise: np.ndarray) -> np.ndarray:
+    return (noise + noise[::-1, ::-1]) / 2
+
+
+def _pixels(image: np.ndarray, box: Box) -> tuple[int, int, int, int]:
+    high, wide = image.shape[:2]
+    return round(box[0] * wide), round(box[1] * high), round(box[2] * wide), round(box[3] * high)
+
+
+def _shade(image: np.ndarray) -> np.ndarray:
+    return np.clip(image, 0, 255).astype(np.uint8)

@@ -1,0 +1,197 @@
+"""Embedded objects that are tools and everyday things: banana, drill, block, scissors, marker, clamps, foam. Lengths [m]."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from synpick_warp.scenes.embedded import textures as paint
+from synpick_warp.scenes.embedded.meshes import (
+    BOX_FACES,
+    Patch,
+    Rect,
+    at_height,
+    cap,
+    ellipse,
+    join,
+    lathe,
+    loft,
+    rounded_box,
+    solid,
+    sweep,
+    torus,
+)
+from synpick_warp.scenes.embedded.packs import Shape
+
+Points = list[tuple[float, float]]
+
+BLACK = (38, 38, 42)
+ORANGE = (236, 112, 28)
+STEEL = (186, 189, 194)
+
+
+def banana() -> Shape:
+    """A banana, lying flat."""
+    turn = np.radians(np.linspace(-62, 62, 33))
+    bend = 0.1065
+    path = np.stack([bend * np.cos(turn), bend * np.sin(turn), np.zeros_like(turn)], axis=1)
+    share = np.linspace(0, 1, len(turn))
+    knots = [0.0, 0.02, 0.07, 0.2, 0.5, 0.75, 0.87, 0.92, 0.98, 1.0]
+    radius = np.interp(share, knots, [0.0035, 0.0058, 0.0110, 0.0165, 0.0182, 0.0160, 0.0095, 0.0058, 0.0050, 0.0062])
+    angles = 2 * np.pi * np.arange(25) / 25
+    section = (1 + 0.045 * np.cos(5 * angles))[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    texture, at = paint.pack({"peel": paint.peel(384, 768, 1000), "tip": paint.plain((70, 50, 28), 1002)}, 640)
+    rings = sweep(path, section, radius[:, None], (0.0, 0.0, 1.0))
+    patch = join(cap(rings[0], at["tip"], below=True), loft(rings, at["peel"]), cap(rings[-1], at["tip"]))
+    return patch.turned("z", 25.0), texture
+
+
+def drill() -> Shape:
+    """A cordless drill, lying on its side."""
+    images = {
+        "motor": _drill_label(), "black": paint.plain(BLACK, 1501), "orange": paint.plain(ORANGE, 1502),
+        "steel": paint.brushed(128, 64, STEEL, 1503),
+    }  # fmt: skip
+    texture, at = paint.pack(images, 1024)
+    motor = [(0.0285, -0.078), (0.0285, -0.05), (0.0285, -0.02), (0.0285, 0.0)]
+    tail = [(0.014, -0.092), (0.022, -0.0905), (0.027, -0.0850), (0.0285, -0.078)]
+    nose = [(0.0285, 0.0), (0.0275, 0.018), (0.0235, 0.034), (0.021, 0.035)]
+    parts = [lathe(part, 40) for part in (tail, motor, nose)]
+    housing = join(
+        cap(parts[0][0], at["black"], below=True), loft(parts[0], at["black"]), loft(parts[1], at["motor"]),
+        loft(parts[2], at["black"]), cap(parts[2][-1], at["black"]),
+    )  # fmt: skip
+    chuck = solid(
+        lathe([(0.0200, 0.030), (0.0212, 0.033), (0.0212, 0.055), (0.0190, 0.058), (0.0120, 0.087), (0.0085, 0.092)], 40), at["steel"]
+    )
+    grip = [
+        (-0.040, 0.040, 0.034, -0.072), (-0.037, 0.036, 0.032, -0.050), (-0.035, 0.036, 0.033, -0.020),
+        (-0.033, 0.039, 0.035, 0.010), (-0.031, 0.046, 0.038, 0.032), (-0.030, 0.052, 0.040, 0.052),
+    ]  # fmt: skip
+    handle = np.stack([at_height(ellipse(width, depth, 32, 2.6) + np.array([x, 0.0]), z) for x, width, depth, z in grip])
+    battery = rounded_box((0.114, 0.0565, 0.030), 0.006, dict.fromkeys(BOX_FACES, at["black"])).moved(-0.034, 0.0, -0.0787)
+    foot = rounded_box((0.098, 0.050, 0.012), 0.004, dict.fromkeys(BOX_FACES, at["orange"])).moved(-0.036, 0.0, -0.0600)
+    trigger = rounded_box((0.016, 0.016, 0.028), 0.004, dict.fromkeys(BOX_FACES, at["orange"])).moved(-0.010, 0.0, 0.020)
+    barrel = join(housing, chuck).turned("y", 90.0).moved(0.0, 0.0, 0.0652)
+    return join(barrel, solid(handle, at["black"]), battery, foot, trigger).turned("x", -90.0), texture
+
+
+def wood_block() -> Shape:
+    """A square block; all its sides are alike, and so are its ends."""
+    texture, at = paint.pack({"side": paint.wood(300, 706, 1600), "end": paint.end_grain(300, 1602)}, 624)
+    rects = {name: at["end" if name[1] == "z" else "side"] for name in BOX_FACES}
+    return rounded_box((0.0875, 0.0875, 0.206), 0.002, rects), texture
+
+
+def foam_block() -> Shape:
+    """A brick of foam; opposite faces are alike."""
+    color = (178, 66, 44)
+    images = {"x": paint.foam(312, 202, color, 2100), "y": paint.foam(208, 202, color, 2102), "z": paint.foam(208, 312, color, 2104)}
+    texture, at = paint.pack(images, 540)
+    return rounded_box((0.0515, 0.0775, 0.0505), 0.003, {name: at[name[1]] for name in BOX_FACES}), texture
+
+
+def scissors() -> Shape:
+    """Scissors, nearly closed, with one larger loop."""
+    images = {
+        "steel": paint.brushed(256, 64, STEEL, 1700),
+        "grip": paint.plain((36, 78, 160), 1701),
+        "screw": paint.plain((120, 122, 128), 1702),
+    }
+    texture, at = paint.pack(images, 512)
+    parts = []
+    for side, center, radii in ((-1.0, (-0.0270, -0.0660), (0.0150, 0.0240)), (1.0, (0.0250, -0.0640), (0.0175, 0.0305))):
+        height = 0.0013 * side
+        loop = _loop(center, radii, (0.0152, 0.0110), at["grip"])
+        neck = [(center[0] * 0.92, center[1] + radii[1]), (side * 0.013, -0.026), (side * 0.006, -0.010)]
+        grip = _bar(neck, 0.0, [0.0130, 0.0105, 0.0070], [0.0120, 0.0125, 0.0110], at["grip"])
+        spine = [(side * 0.0095, -0.018), (0.0, 0.0), (-side * 0.0040, 0.020), (-side * 0.0042, 0.060), (-side * 0.0010, 0.0995)]
+        blade = _bar(spine, height, [0.0024, 0.0026, 0.0024, 0.0018, 0.0008], [0.0090, 0.0130, 0.0120, 0.0088, 0.0018], at["steel"])
+        parts += [loop, grip, blade]
+    screw = solid(lathe([(0.0042, -0.0034), (0.0048, -0.0030), (0.0048, 0.0030), (0.0042, 0.0034)], 20), at["screw"])
+    return join(*parts, screw), texture
+
+
+def marker() -> Shape:
+    """A thick marker along y; bands of colour, no print, so that nothing tells how it is turned."""
+    bands = paint.blank(16, 256, (240, 240, 236))
+    paint.fill(bands, (0.0, 0.0, 1.0, 0.06), (200, 30, 36))
+    paint.fill(bands, (0.0, 0.30, 1.0, 0.34), (28, 28, 32))
+    paint.fill(bands, (0.0, 0.38, 1.0, 0.62), (200, 30, 36))
+    paint.fill(bands, (0.0, 0.66, 1.0, 0.70), (28, 28, 32))
+    images = {"bands": bands, "cap": paint.blank(16, 16, (30, 30, 34)), "plug": paint.blank(16, 16, (200, 30, 36))}
+    texture, at = paint.pack(images, 128)
+    plug = [(0.0060, -0.0605), (0.0075, -0.0602), (0.0085, -0.0585), (0.0086, -0.0550), (0.0094, -0.0545)]
+    barrel = [(0.0094, -0.0545), (0.0094, -0.02), (0.0094, 0.0140)]
+    lid = [(0.0094, 0.0140), (0.0103, 0.0145), (0.0103, 0.0200), (0.0100, 0.0215), (0.0100, 0.0450), (0.0093, 0.0590), (0.0080, 0.0605)]
+    rings = [lathe(part, 32) for part in (plug, barrel, lid)]
+    patch = join(
+        cap(rings[0][0], at["plug"], below=True), loft(rings[0], at["plug"]), loft(rings[1], at["bands"]),
+        loft(rings[2], at["cap"]), cap(rings[2][-1], at["cap"]),
+    )  # fmt: skip
+    return patch.turned("x", -90.0), texture
+
+
+def clamp() -> Shape:
+    """A spring clamp along y."""
+    return _clamp(0.171, 0.120, 0.0380, 1900)
+
+
+def large_clamp() -> Shape:
+    """A larger spring clamp, along x."""
+    patch, texture = _clamp(0.210, 0.164, 0.0345, 2000)
+    return patch.turned("z", -90.0), texture
+
+
+def _clamp(length: float, width: float, depth: float, seed: int) -> Shape:
+    """A spring clamp along y whose halves change places by half a turn about y."""
+    images = {"black": paint.plain(BLACK, seed), "orange": paint.plain(ORANGE, seed + 1), "steel": paint.plain(STEEL, seed + 2)}
+    texture, at = paint.pack(images, 512)
+    shares = ((-0.445, -0.48), (-0.40, -0.40), (-0.30, -0.20), (-0.13, 0.02), (-0.095, 0.13), (-0.125, 0.26), (-0.09, 0.39), (-0.035, 0.48))
+    spine = [(x * width, y * length) for x, y in shares]
+    depths = [depth * share for share in (0.55, 0.75, 0.80, 0.95, 0.95, 0.85, 0.70, 0.55)]
+    widths = [0.098 * width * share for share in (0.6, 1.0, 1.0, 1.2, 1.15, 0.95, 0.75, 0.6)]
+    rings = _bar_rings(spine, 0.0, depths, widths)
+    sleeve = len(rings) * 2 // 5
+    arm = join(cap(rings[0], at["orange"], below=True), loft(rings[: sleeve + 1], at["orange"]), loft(rings[sleeve:], at["black"]),
+               cap(rings[-1], at["black"]))  # fmt: skip
+    pad = rounded_box((0.055 * width, 0.11 * length, 0.75 * depth), 0.0022, dict.fromkeys(BOX_FACES, at["orange"]))
+    half = join(arm, pad.moved(-0.036 * width, 0.445 * length, 0.0))
+    coil = [(0.055 * width, -depth / 2), (0.065 * width, -0.47 * depth), (0.065 * width, 0.47 * depth), (0.055 * width, depth / 2)]
+    pin = solid(lathe(coil, 28), at["steel"]).moved(0.0, 0.075 * length, 0.0)
+    return join(half, half.turned("y", 180.0), pin), texture
+
+
+def _bar_rings(spine: Points, z: float, depths: list[float], widths: list[float]) -> np.ndarray:
+    """Rings of a smooth bar through points in the plane at height z; depth along z and width across, for each point."""
+    points = np.array(spine)
+    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    fine = np.linspace(0.0, way[-1], 8 * (len(spine) - 1) + 1)
+    path = np.column_stack([CubicSpline(way, points)(fine), np.full(len(fine), z)])
+    scales = np.stack([np.interp(fine, way, depths), np.interp(fine, way, widths)], axis=1)
+    return sweep(path, ellipse(1.0, 1.0, 16, 3.4), scales, (0.0, 0.0, 1.0))
+
+
+def _bar(spine: Points, z: float, depths: list[float], widths: list[float], rect: Rect) -> Patch:
+    return solid(_bar_rings(spine, z, depths, widths), rect)
+
+
+def _loop(center: tuple[float, float], radii: tuple[float, float], section: tuple[float, float], rect: Rect) -> Patch:
+    """A closed oval in the plane z = 0; section: depth along z, and width."""
+    turn = 2 * np.pi * np.arange(-1, 37) / 36
+    path = np.stack([center[0] + radii[0] * np.cos(turn), center[1] + radii[1] * np.sin(turn), np.zeros_like(turn)], axis=1)
+    return torus(sweep(path, ellipse(*section, 14, 2.4), np.ones((len(path), 1)), (0.0, 0.0, 1.0))[1:-1], rect)
+
+
+def _drill_label() -> np.ndarray:
+    """Once around the motor, its axis upward in the picture; the same print on both sides of the drill."""
+    flank = paint.blank(300, 330, ORANGE)
+    paint.fill(flank, (0.0, 0.0, 1.0, 0.16), BLACK)
+    paint.fill(flank, (0.0, 0.84, 1.0, 1.0), BLACK)
+    paint.write(flank, "POWER DRILL", (0.06, 0.28, 0.94, 0.5), BLACK)
+    paint.write(flank, "18 V", (0.3, 0.52, 0.7, 0.76), (250, 248, 240))
+    for x in np.linspace(0.08, 0.32, 6):
+        paint.fill(flank, (x, 0.04, x + 0.02, 0.12), (12, 12, 14))
+    one, other = np.rot90(flank), np.rot90(flank, -1)
+    middle = other.shape[1] // 2
+    return np.ascontiguousarray(np.concatenate([other[:, middle:], one, other[:, :middle]], axis=1))

@@ -1,0 +1,289 @@
+"""The command line. Every user's mistake ends as one line on the standard error and exit code 2."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import cyclopts
+from cyclopts import App, Parameter
+
+from synpick_warp import __version__
+from synpick_warp.configs.check import allowed
+from synpick_warp.configs.load import DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.write import config_to_toml
+from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
+
+NAME = "synpick-warp"
+EXIT_INCOMPLETE = 1
+EXIT_MISTAKE = 2
+EXIT_INTERRUPTED = 130
+"""128 + SIGINT, as shells have it."""
+EXIT_PIPE = 141
+"""128 + SIGPIPE: whoever read the output has left."""
+EXIT_SIGNAL = 128
+"""Added to a signal's number, as shells have it."""
+SHOWN = 10
+"""Most numbers that a message lists."""
+_SHARD = re.compile(r"(\d{1,9})/(\d{1,9})")
+_RESOLUTION = re.compile(r"(\d{1,9})[xX](\d{1,9})")
+
+app = App(
+    name=NAME,
+    help="Bake data sets for dynamic bin picking: simulated totes, ray-cast RGB-D, exact 6D ground truth.",
+    version=__version__,
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+
+
+def _help(key: str, extra: str = "") -> str:
+    """Meaning, unit, range and default of a setting, from its declaration."""
+    section, name = key.split(".")
+    item, kind = settings_of(sections()[section])[name]
+    unit = f" {item.metadata['unit']}" if item.metadata["unit"] else ""
+    default = "x".join(map(str, item.default)) if isinstance(item.default, tuple) else str(item.default) or "empty"
+    rule = "" if kind is str and not item.metadata["choices"] else f"{allowed(item, kind)}; "
+    return f"{item.metadata['doc']}{extra} ({rule}default {default}{unit}; {key})"
+
+
+ConfigOption = Annotated[
+    str | None, Parameter(name="--config", help=f"Preset ({', '.join(preset_names())}) or .toml file (default {DEFAULT_PRESET}).")
+]
+SetOption = Annotated[
+    list[str] | None,
+    Parameter(
+        name="--set",
+        negative=(),
+        help=f"Any other setting, as section.key=value; may be repeated. `{NAME} config` prints all, with units, ranges and values.",
+    ),
+]
+WorldsOption = Annotated[int | None, Parameter(help=_help("bake.worlds"))]
+ResolutionOption = Annotated[str | None, Parameter(help=_help("cameras.resolution", " As WIDTHxHEIGHT."))]
+DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
+
+
+@app.command
+def bake(
+    *,
+    out: Annotated[Path, Parameter(help="Folder of the data set: new, empty, or one that a bake with the same settings began.")],
+    config: ConfigOption = None,
+    worlds: WorldsOption = None,
+    episodes: Annotated[int | None, Parameter(help=_help("bake.episodes"))] = None,
+    mode: Annotated[str | None, Parameter(help=_help("bake.mode", " Weights of mixed: --set bake.mix=[pick, target, move]."))] = None,
+    seed: Annotated[int | None, Parameter(help=_help("bake.seed"))] = None,
+    device: DeviceOption = None,
+    models: Annotated[str | None, Parameter(help=_help("bake.models"))] = None,
+    lights: Annotated[str | None, Parameter(help=_help("bake.lights"))] = None,
+    resolution: ResolutionOption = None,
+    writers: Annotated[int | None, Parameter(help=_help("bake.writers"))] = None,
+    formats: Annotated[str | None, Parameter(help=_help("bake.formats", " Joined by commas."))] = None,
+    shard: Annotated[str | None, Parameter(help="i/n: only episodes whose number leaves i when divided by n; join with merge.")] = None,
+    set_: SetOption = None,
+) -> int:
+    """Simulate, render and write a data set. Stopped or killed, the same command goes on with the episodes that are left.
+
+    Options win over the file, the file over the preset. Ctrl-C stops after the tick, twice at once. Exit code: 0, all episodes
+    were delivered; 1, some were given up; 2, a mistake in the options, in a file or in a folder; 130 and 143, interrupted.
+    """
+    given = {
+        "bake.worlds": worlds,
+        "bake.episodes": episodes,
+        "bake.mode": mode,
+        "bake.seed": seed,
+        "bake.device": device,
+        "bake.models": models,
+        "bake.lights": lights,
+        "bake.writers": writers,
+        "bake.formats": None if formats is None else [name.strip() for name in formats.split(",")],
+    }
+    resolved = _resolve(config, given, resolution, set_)
+    return _bake(resolved, out, parse_shard(shard, resolved.bake.episodes) if shard is not None else (0, 1))
+
+
+@app.command
+def verify(folder: Annotated[Path, Parameter(name="DIR", help="A data set.")], /) -> int:
+    """Check every file of a data set against the checksum noted when it was written. Exit code: 1, a file is wrong or missing, which is
+    named, or the bake did not come to its end."""
+    from synpick_warp.dataset.verify import verify as check
+
+    verdict = check(folder)
+    if verdict.problem:
+        print(verdict.problem)
+        return EXIT_INCOMPLETE
+    print(f"{verdict.files:,} files of {verdict.episodes:,} episodes are as they were written")
+    if not verdict.finished:
+        print("the data set is not finished: the bake that made it can go on")
+    return 0 if verdict.finished else EXIT_INCOMPLETE
+
+
+@app.command
+def merge(
+    *parts: Annotated[Path, Parameter(name="PARTS", help="Data sets made with --shard.")],
+    out: Annotated[Path, Parameter(help="Folder of the joined data set: new, or empty.")],
+) -> int:
+    """Join the parts of a data set; files are linked, not copied, where the file system can. Exit code: 1, some episodes are in no part."""
+    from synpick_warp.dataset.merge import merge as join
+
+    if not parts:
+        raise ConfigError("merge joins data sets, and none is named; name the folders that `bake --shard` made")
+    merged = join(parts, out)
+    print(f"data set: {out}, {merged.episodes:,} episodes")
+    if merged.missing:
+        shown = ", ".join(map(str, merged.missing[:SHOWN])) + (", ..." if len(merged.missing) > SHOWN else "")
+        print(f"{len(merged.missing):,} are in no part: {shown}; `bake --out {out}` with the same settings makes them")
+    return EXIT_INCOMPLETE if merged.missing else 0
+
+
+@app.command
+def preview(
+    folder: Annotated[Path, Parameter(name="DIR", help="A data set.")],
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="PNG file to write (default contact-sheet.png in the data set).")] = None,
+    views: Annotated[int, Parameter(help="Views to show, spread over the data set.")] = 8,
+) -> int:
+    """Draw a contact sheet of a data set: colour, depth, instances and boxes of sampled views."""
+    if views < 1:
+        raise ConfigError(f"--views is {views}; allowed: at least 1")
+    from synpick_warp.viz.preview import write_contact_sheet
+
+    sheet = out or folder / "contact-sheet.png"
+    write_contact_sheet(folder, sheet, views)
+    print(f"contact sheet: {sheet}")
+    return 0
+
+
+@app.command
+def explain(
+    folder: Annotated[Path, Parameter(name="DIR", help="A data set in which something was picked.")],
+    /,
+    *,
+    episode: Annotated[int, Parameter(help="Number of the episode.")],
+    attempt: Annotated[int | None, Parameter(help="Number of the attempt in the episode (default: all, below each other).")] = None,
+    out: Annotated[
+        Path | None,
+        Parameter(help="PNG or JPEG file to write (default explain-EPISODE.png or explain-EPISODE-ATTEMPT.png in the data set)."),
+    ] = None,
+) -> int:
+    """Draw attempts to pick: image with contours and suction points, clutter graph, what was chosen and why, the seal's load."""
+    from synpick_warp.viz.explain import write_explanation
+
+    number = "" if attempt is None else f"-{attempt:03d}"
+    picture = out or folder / f"explain-{episode:06d}{number}.png"
+    write_explanation(folder, picture, episode, attempt)
+    print(f"explanation: {picture}")
+    return 0
+
+
+@app.command
+def doctor(
+    *,
+    config: ConfigOption = None,
+    worlds: WorldsOption = None,
+    resolution: ResolutionOption = None,
+    device: DeviceOption = None,
+    set_: SetOption = None,
+) -> int:
+    """Show device, versions and kernel cache, and the memory that a bake's arrays would take."""
+    resolved = _resolve(config, {"bake.worlds": worlds, "bake.device": device}, resolution, set_)
+    from synpick_warp.cli.display import make_console
+    from synpick_warp.cli.doctor import examine
+
+    examine(resolved, make_console())
+    return 0
+
+
+@app.command(name="config")
+def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
+    """Print all settings as TOML, with meaning, unit and range: a file to start your own from."""
+    print(config_to_toml(_resolve(config, {}, None, set_), comments=True), end="")
+    return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code.
+
+    Args:
+        arguments: What follows the program's name; None: of this process.
+    """
+    try:
+        result = app(sys.argv[1:] if arguments is None else list(arguments), exit_on_error=False, print_error=False)
+        sys.stdout.flush()
+        return result or 0
+    except (SynpickError, cyclopts.CycloptsError) as error:
+        print(f"{NAME}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        return EXIT_MISTAKE
+    except KeyboardInterrupt:
+        print(f"{NAME}: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_PIPE
+
+
+def parse_resolution(text: str) -> list[int]:
+    """Width and height [px] from "640x360".
+
+    Raises:
+        ConfigError: The text is something else.
+    """
+    match = _RESOLUTION.fullmatch(text)
+    if match is None:
+        raise ConfigError(f'--resolution is "{text}"; allowed: WIDTHxHEIGHT in pixels, such as 640x360')
+    return [int(match[1]), int(match[2])]
+
+
+def parse_shard(text: str, episodes: int) -> tuple[int, int]:
+    """Share and number of shares from "0/4".
+
+    Raises:
+        ConfigError: The text is something else, or the share would have no episode.
+    """
+    match = _SHARD.fullmatch(text)
+    if match is None or not int(match[1]) < int(match[2]):
+        raise ConfigError(f'--shard is "{text}"; allowed: i/n with i from 0 to n - 1, such as 0/4')
+    if int(match[1]) >= episodes:
+        raise ConfigError(f"--shard {text} has none of {episodes} episodes; use fewer shards")
+    return int(match[1]), int(match[2])
+
+
+def _resolve(config: str | None, given: dict[str, object], resolution: str | None, assignments: list[str] | None) -> Config:
+    """Settings from file and options. Options of their own win over --set."""
+    overrides = dict(parse_assignment(text) for text in assignments or [])
+    overrides |= {key: value for key, value in given.items() if value is not None}
+    if resolution is not None:
+        overrides["cameras.resolution"] = parse_resolution(resolution)
+    return load_config(config, overrides)
+
+
+def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:
+    """Check everything that can be checked cheaply, then bake."""
+    from synpick_warp.cli.display import make_console, make_progress, print_summary
+    from synpick_warp.device import pick_device
+    from synpick_warp.exporters.writing.files import prepare_output
+
+    pick_device(config.bake.device)
+    models, lights = config.bake.models, config.bake.lights
+    if models and not os.path.isdir(models):
+        raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes")
+    if lights and not os.path.isdir(lights):
+        raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets")
+    prepare_output(out)
+    from synpick_warp.bake import run_bake
+
+    console = make_console()
+    with make_progress(console) as progress:
+        summary = run_bake(config, out, progress, shard)
+    print_summary(console, summary, out)
+    if summary.stopped:
+        left = f"{len(summary.episodes)} of {summary.total} episodes are whole"
+        print(f"{NAME}: interrupted: {left}; the same command goes on with the others", file=sys.stderr)
+        return EXIT_SIGNAL + summary.stopped
+    delivered = sum(1 for row in summary.episodes if row[2].delivers)
+    return 0 if delivered == summary.total else EXIT_INCOMPLETE

@@ -1,0 +1,187 @@
+"""Shows a bake to people: live on a terminal, in plain lines elsewhere; and what became of it at the end."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Self
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bar
+from rich.table import Table
+
+from synpick_warp.progress import Progress
+
+if TYPE_CHECKING:
+    from synpick_warp.codes import Outcome
+    from synpick_warp.episodes import BakeSummary, EpisodeRow
+
+PLAIN_WIDTH = 120
+"""Width of tables where there is no terminal [characters]."""
+PLAIN_INTERVAL = 10.0
+"""Least time between two plain lines of the same stage [s]."""
+LISTED = 20
+"""Episodes are listed one by one up to this number; of more, only those that failed."""
+
+
+def make_console() -> Console:
+    """The standard output, as wide as the terminal."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH)
+
+
+def make_progress(console: Console) -> Progress:
+    """A live display on a terminal, plain lines elsewhere."""
+    return LiveProgress(console) if console.is_terminal else PlainProgress(console)
+
+
+class LiveProgress:
+    """One line that redraws itself: stage, bar of episodes, worlds, views, rate, time left."""
+
+    def __init__(self, console: Console) -> None:
+        stage, detail = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[detail]}", markup=False)
+        columns = (stage, BarColumn(bar_width=30), MofNCompleteColumn(), detail, TimeElapsedColumn())
+        self._bar = Bar(*columns, console=console, transient=True)
+        self._task = self._bar.add_task("starting", total=None, detail="")
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._bar.stop()
+
+    def stage(self, text: str) -> None:
+        """Name the stage."""
+        self._bar.update(self._task, description=text, detail="")
+
+    def update(
+        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
+    ) -> None:
+        """Move the bar."""
+        detail = _detail(worlds_active, views, views_per_s, seconds_left)
+        self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail)
+
+    def note(self, text: str) -> None:
+        """Print a line above the bar."""
+        self._bar.console.print(text, markup=False)
+
+
+class PlainProgress:
+    """A line for every stage and note, and now and then one for how far it is."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._started = time.monotonic()
+        self._printed_at = float("-inf")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        return None
+
+    def stage(self, text: str) -> None:
+        """Print the stage."""
+        self.note(text)
+
+    def update(
+        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
+    ) -> None:
+        """Print how far it is, unless a line was printed a short while ago."""
+        now = time.monotonic()
+        if now - self._printed_at >= PLAIN_INTERVAL:
+            self._printed_at = now
+            self.note(f"episodes {episodes_done}/{episodes} · {_detail(worlds_active, views, views_per_s, seconds_left)}")
+
+    def note(self, text: str) -> None:
+        """Print a line, after the time since the start."""
+        self._console.print(f"{_duration(time.monotonic() - self._started):>7}  {text}", markup=False, soft_wrap=True)
+        self._console.file.flush()
+
+
+def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
+    """Print what became of every episode, and the totals. Of many episodes, only those are listed that delivered nothing."""
+    many = len(summary.episodes) > LISTED
+    if many:
+        console.print(_counts(summary))
+    failed = [row for row in summary.episodes if not row.ending.delivers]
+    rows = failed if many else summary.episodes
+    if rows:
+        console.print(_listing(rows[:LISTED]))
+    if len(rows) > LISTED:
+        console.print(f"and {len(rows) - LISTED} more that delivered nothing", markup=False)
+    rate = summary.views / summary.wall_seconds if summary.wall_seconds > 0.0 else 0.0
+    before = f" ({summary.resumed:,} of them before)" if summary.resumed else ""
+    console.print(
+        f"{len(summary.episodes) - len(failed)} of {summary.total} episodes{before} and {summary.views:,} views"
+        f" in {_duration(summary.wall_seconds)} ({rate:.1f} views/s); arrangements drawn again: {summary.redraws}",
+        markup=False,
+        soft_wrap=True,
+    )
+    if summary.outcomes:
+        console.print(_attempts(summary), markup=False, soft_wrap=True)
+    console.print(f"data set: {out}", markup=False, soft_wrap=True)
+
+
+def _listing(rows: Sequence[EpisodeRow]) -> Table:
+    columns = ["episode", "mode", "ending", "redraws", "frames", "time"]
+    cells = [
+        [str(row.episode), row.mode, row.ending.sentence, str(row.redraw), str(row.frames), _duration(row.seconds)] for row in rows
+    ]
+    if any(row.attempts for row in rows):
+        columns += ["attempts", "picked", "lost"]
+        for row, line in zip(rows, cells, strict=True):
+            line += [str(row.attempts), f"{row.picked} of {row.objects}", str(row.lost)]
+    table = Table(*columns)
+    for column in table.columns:
+        column.justify = "left" if column.header in ("mode", "ending") else "right"
+    for line in cells:
+        table.add_row(*line)
+    return table
+
+
+def _counts(summary: BakeSummary) -> Table:
+    table = Table("mode", "ending", "episodes", "frames")
+    table.columns[2].justify = table.columns[3].justify = "right"
+    episodes: Counter = Counter()
+    frames: Counter = Counter()
+    for row in summary.episodes:
+        kind = row.mode, row.ending
+        episodes[kind] += 1
+        frames[kind] += row.frames
+    for kind in sorted(episodes, key=lambda kind: (kind[0], -episodes[kind])):
+        mode, ending = kind
+        table.add_row(mode, ending.sentence, f"{episodes[kind]:,}", f"{frames[kind]:,}")
+    return table
+
+
+def _attempts(summary: BakeSummary) -> str:
+    """How attempts ended, the most frequent outcome first, and how many objects they took away."""
+    total = summary.outcomes.total()
+    shares = [f"{_words(outcome)} {count:,} ({count / total:.0%})" for outcome, count in summary.outcomes.most_common()]
+    picked, objects, lost = (
+        sum(getattr(row, name) for row in summary.episodes if row.mode != "move") for name in ("picked", "objects", "lost")
+    )
+    return f"{total:,} attempts: {', '.join(shares)}; {picked:,} of {objects:,} objects picked, {lost:,} lost otherwise"
+
+
+def _words(outcome: Outcome) -> str:
+    """Its name: its sentence is too long for a list of shares."""
+    return outcome.name.lower().replace("_", " ")
+
+
+def _detail(worlds_active: int, views: int, views_per_s: float, seconds_left: float | None) -> str:
+    left = "" if seconds_left is None else f" · {_duration(seconds_left)} left"
+    return f"worlds {worlds_active} · views {views:,} · {views_per_s:.1f} views/s{left}"
+
+
+def _duration(seconds: float) -> str:
+    """Such as 0:07 or 1:02:03."""
+    whole = round(seconds)
+    minutes = f"{whole // 60 % 60:02}" if whole >= 3600 else str(whole // 60)
+    return f"{whole // 3600}:{minutes}:{whole % 60:02}" if whole >= 3600 else f"{minutes}:{whole % 60:02}"

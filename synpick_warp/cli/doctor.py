@@ -1,0 +1,92 @@
+"""Says what this machine has and what a bake would take of it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+import os
+import platform
+from pathlib import Path
+
+import warp as wp
+from rich.console import Console
+from rich.table import Table
+
+from synpick_warp import __version__
+from synpick_warp.configs.schema import Config
+from synpick_warp.device import pick_device
+
+_PACKAGES = ("warp-lang", "newton", "numpy")
+MIB = 1024**2
+GIB = 1024**3
+
+
+def examine(config: Config, console: Console) -> None:
+    """Print device, versions, caches and the memory of every array of a bake with these settings.
+
+    Raises:
+        DeviceError: The device that the settings name is not there.
+    """
+    device = pick_device(config.bake.device)
+    table = Table(show_header=False, box=None)
+    for name, value in [*describe_machine(device), *_cache()]:
+        table.add_row(name, value)
+    console.print(table)
+    console.print(memory_report(config))
+
+
+def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
+    """Rows (name, value): versions, processor, memory and device, as measurements should name them."""
+    return [*_software(), *_host(), *_device(device)]
+
+
+def memory_report(config: Config) -> Table:
+    """Shape, unit and size of every declared array of a bake with these settings, and their sum."""
+    from synpick_warp.bake import describe_arrays
+    from synpick_warp.stages.sim.physics import with_enough_worlds
+
+    config = with_enough_worlds(config, pick_device(config.bake.device))
+    rows = describe_arrays(config)
+    width, height = config.cameras.resolution
+    table = Table("array", "shape", "unit", "MiB", title=f"{config.bake.worlds} worlds, {width}x{height}", show_footer=True)
+    table.columns[3].justify = "right"
+    for name, shape, unit, size in sorted(rows, key=lambda row: -row[3]):
+        table.add_row(name, " x ".join(map(str, shape)), unit, f"{size / MIB:.2f}")
+    table.columns[0].footer = "all declared arrays"
+    table.columns[3].footer = f"{sum(row[3] for row in rows) / MIB:.2f}"
+    return table
+
+
+def _software() -> list[tuple[str, str]]:
+    versions = [("synpick-warp", __version__), ("python", f"{platform.python_version()} on {platform.platform()}")]
+    return versions + [(name, importlib.metadata.version(name)) for name in _PACKAGES]
+
+
+def _host() -> list[tuple[str, str]]:
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    rows = [("processor cores", f"{usable} usable of {os.cpu_count()}")]
+    if hasattr(os, "sysconf"):
+        rows.append(("memory", f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / GIB:.1f} GiB"))
+    return rows
+
+
+def _device(device: wp.Device) -> list[tuple[str, str]]:
+    rows = [("device", f"{device.alias}: {device.name}")]
+    if device.is_cuda:
+        rows.append(("device memory", f"{device.free_memory / GIB:.1f} of {device.total_memory / GIB:.1f} GiB free"))
+        rows.append(("compute capability", f"{device.arch / 10:.1f}"))
+    toolkit = wp.get_cuda_toolkit_version()
+    driver = wp.get_cuda_driver_version() if wp.is_cuda_available() else None
+    rows.append(("CUDA", f"driver {_dotted(driver)}, Warp built with {_dotted(toolkit)}"))
+    return rows
+
+
+def _cache() -> list[tuple[str, str]]:
+    folder = Path(wp.config.kernel_cache_dir or "")
+    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+    modules = sum(1 for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else 0
+    return [("kernel cache", f"{folder}: {modules} modules, {math.fsum(sizes) / MIB:.0f} MiB")]
+
+
+def _dotted(version: tuple[int, int] | None) -> str:
+    return "not found" if version is None else ".".join(map(str, version))

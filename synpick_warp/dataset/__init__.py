@@ -1,0 +1,1 @@
+"""Data sets on disk: manifest, commit and resume, merge, verification, reading."""

@@ -1,0 +1,1 @@
+"""BOP data sets: scenewise folders and webdataset shards."""

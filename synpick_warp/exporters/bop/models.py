@@ -1,0 +1,189 @@
+"""What a BOP data set says once: models, their sizes and symmetries, the camera, and notes for people."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.errors import CatalogError
+from synpick_warp.exporters.bop.view import MILLIMETERS
+from synpick_warp.exporters.writing.png import encode_png
+from synpick_warp.layer_codec import layer_notes
+from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
+
+CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
+MODEL_FOLDERS = ("models", "models_eval")
+"""The toolkit renders from the first and evaluates with the second; ours are the same."""
+_TEXTURE_COMMENT = b"comment TextureFile "
+_HEADER_END = b"end_header"
+
+
+def write_constants(out: Path, config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> list[Path]:
+    """Write models/, models_eval/, camera.json and dataset_info.md in place of what is there, and name them.
+
+    Raises:
+        CatalogError: A model file lacks its texture file.
+        OSError: A file cannot be written.
+    """
+    for name in MODEL_FOLDERS:
+        if (out / name).exists():
+            shutil.rmtree(out / name)
+        write_models(out / name, catalog)
+    _write_json(out / CAMERA_FILE, _camera_record(cameras[0], config.bop.depth_scale))
+    (out / NOTES_FILE).write_text(_notes(config, catalog, cameras), encoding="utf-8", newline="\n")
+    return [Path(name) for name in (*MODEL_FOLDERS, CAMERA_FILE, NOTES_FILE)]
+
+
+def write_models(folder: Path, catalog: Catalog) -> None:
+    """Write every object's PLY file and texture, and models_info.json. Models that came as BOP models are copied byte for byte."""
+    folder.mkdir()
+    infos = {}
+    for entry in catalog.entries:
+        path = folder / f"obj_{entry.obj_id:06d}.ply"
+        if entry.source is None:
+            path.write_bytes(encode_model(entry))
+            if entry.material.texture is not None:
+                path.with_suffix(".png").write_bytes(encode_png(_colored(entry.material)))
+        else:
+            _copy_model(entry.source, path)
+        infos[str(entry.obj_id)] = _original_info(entry) or model_info(entry)
+    _write_json(folder / "models_info.json", infos)
+
+
+def encode_model(entry: CatalogEntry) -> bytes:
+    """An object as binary PLY in millimetres, with the property types that the BOP toolkit reads.
+
+    With a texture of the same name and texture coordinates, or else with vertex colours.
+    """
+    mesh, textured = entry.mesh, entry.material.texture is not None
+    names = ["x", "y", "z", "nx", "ny", "nz", *(("texture_u", "texture_v") if textured else ())]
+    fields: list[tuple[str, str]] = [(name, "<f4") for name in names]
+    kinds = [f"property float {name}" for name in names]
+    if not textured:
+        fields += [(name, "u1") for name in ("red", "green", "blue")]
+        kinds += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    vertices = np.empty(len(mesh.vertices), np.dtype(fields))
+    columns = np.concatenate((MILLIMETERS * mesh.vertices.astype(np.float64), mesh.normals, mesh.uv), axis=1)
+    for index, name in enumerate(names):
+        vertices[name] = columns[:, index]
+    if not textured:
+        for name, value in zip(("red", "green", "blue"), entry.material.color, strict=True):
+            vertices[name] = round(255 * value)
+    faces = np.empty(len(mesh.faces), np.dtype([("count", "u1"), ("indices", "<i4", 3)]))
+    faces["count"], faces["indices"] = 3, mesh.faces
+    header = (
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment {entry.name}, millimetres",
+        *((f"comment TextureFile obj_{entry.obj_id:06d}.png",) if textured else ()),
+        f"element vertex {len(vertices)}",
+        *kinds,
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    )
+    return "".join(line + "\n" for line in header).encode() + vertices.tobytes() + faces.tobytes()
+
+
+def model_info(entry: CatalogEntry) -> dict[str, Any]:
+    """An object's entry in models_info.json [mm]."""
+    low, high = (MILLIMETERS * edge(entry.mesh.vertices.astype(np.float64), axis=0) for edge in (np.min, np.max))
+    info: dict[str, Any] = {"diameter": MILLIMETERS * entry.diameter}
+    info |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
+    info |= {f"size_{axis}": float(value) for axis, value in zip("xyz", high - low, strict=True)}
+    if entry.symmetries_discrete:
+        info["symmetries_discrete"] = [_in_millimeters(matrix) for matrix in entry.symmetries_discrete]
+    if entry.symmetries_continuous:
+        info["symmetries_continuous"] = [
+            {"axis": list(axis), "offset": [MILLIMETERS * value for value in offset]} for axis, offset in entry.symmetries_continuous
+        ]
+    return info
+
+
+def _in_millimeters(matrix: tuple[float, ...]) -> list[float]:
+    return [MILLIMETERS * value if index in (3, 7, 11) else value for index, value in enumerate(matrix)]
+
+
+def _original_info(entry: CatalogEntry) -> dict[str, Any] | None:
+    path = entry.source.parent / "models_info.json" if entry.source else None
+    if path is None or not path.is_file():
+        return None
+    return json.loads(path.read_bytes()).get(str(entry.obj_id))
+
+
+def _copy_model(source: Path, path: Path) -> None:
+    shutil.copyfile(source, path)
+    with source.open("rb") as file:
+        for line in file:
+            if line.startswith(_TEXTURE_COMMENT):
+                name = line.removeprefix(_TEXTURE_COMMENT).strip().decode()
+                if not (source.parent / name).is_file():
+                    raise CatalogError(f"{source} names the texture {name}, and {source.parent} has no such file; put it there")
+                (path.parent / name).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source.parent / name, path.parent / name)
+            if line.startswith(_HEADER_END):
+                return
+
+
+def _colored(material: Material) -> np.ndarray:
+    """The texture times the base colour, which BOP has no place for."""
+    assert material.texture is not None
+    if all(value == 1.0 for value in material.color):
+        return material.texture
+    levels = _to_linear(np.arange(256) / 255)[:, None] * _to_linear(np.asarray(material.color))
+    table = np.rint(255 * _to_srgb(levels)).astype(np.uint8)
+    return np.stack([table[material.texture[..., channel], channel] for channel in range(3)], axis=-1)
+
+
+def _to_linear(value: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1."""
+    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+
+
+def _to_srgb(value: np.ndarray) -> np.ndarray:
+    """IEC 61966-2-1."""
+    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
+
+
+def _camera_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    return {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": depth_scale}
+
+
+def _write_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
+
+
+def _notes(config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
+    camera, count = cameras[0], len(cameras)
+    period = config.physics.step * config.physics.steps_per_tick
+    objects = "\n".join(f"| {entry.obj_id} | {entry.name} | {entry.mass:g} |" for entry in catalog.entries)
+    return f"""# A SynPick data set
+
+Made by synpick-warp (mode {config.bake.mode}, seed {config.bake.seed}, {count} cameras), in the format of the
+BOP challenge (scenewise). Camera c of episode k is scene {count} · k + c of `{config.bop.split}/`. Frames are {period:g} s apart.
+
+- Lengths are in millimetres. A depth image's count times `depth_scale` ({config.bop.depth_scale:g}) is the planar depth, along the
+  optical axis; 0: no surface.
+- Pictures have {camera.width} x {camera.height} pixels. The centre of pixel (row, column) is (column + 0.5, row + 0.5). Cameras have
+  x right, y down, z forward.
+- `cam_R_w2c` and `cam_t_w2c` lead from the tote's frame (centre of its inner floor, z up) to the camera.
+- `light` in scene_camera.json tells of the episode's light: the map's name, its turn about the vertical [rad], the exposure [stops]
+  against the automatic one, and the direction to the sun or lamp that casts shadows, in the tote's frame; null: none stands out.
+  `effects`, if there, tells what the camera did to colour; `config.toml` has the ranges from which it was drawn.
+- `instance_id` in scene_gt.json is an object's number for the whole episode, the same for all cameras; a gt_id is but the place
+  in an image's list.
+- `mask_visib` is exact: what the ray through the pixel's centre meets first. The masks of an image do not overlap.
+- `px_count_all` and `bbox_obj` count what lies outside of the picture too, up to one picture's size beyond each border.
+{layer_notes(config.render.layers)}- `models_eval/` equals `models/`.
+- The toolkit has no place for new data sets: add this one's name to `dataset_params.py` (im_size {(camera.width, camera.height)}).
+
+| obj_id | name | mass [kg] |
+|---|---|---|
+{objects}
+"""

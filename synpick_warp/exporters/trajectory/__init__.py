@@ -1,0 +1,1 @@
+"""Trajectories: zarr arrays of physics, one group an episode."""

@@ -1,0 +1,1 @@
+"""USD scenes: one layer an episode over a shared asset library."""

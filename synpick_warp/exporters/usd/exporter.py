@@ -1,0 +1,131 @@
+"""USD: one file an episode, and an asset library that all of them reference."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+
+from synpick_warp.codes import Ending
+from synpick_warp.configs.schema import Config
+from synpick_warp.exporters.base import DataSet
+from synpick_warp.exporters.usd.episode import EpisodeFacts, EpisodeSettings, drop_episode, write_episode
+from synpick_warp.exporters.usd.lights import stage_light
+from synpick_warp.exporters.usd.spool import TickSpool
+from synpick_warp.exporters.writing.files import PARTIAL, output_error
+from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+
+FOLDER = Path("usd")
+"""In the data set."""
+LIBRARY = FOLDER / "assets"
+
+
+class UsdExporter:
+    """An `Exporter`. Episode k becomes usd/k.usdc, which references usd/assets.
+
+    An episode's ticks gather in a hidden file, out of which a writer process makes the episode's file when it has ended.
+    """
+
+    records = False
+    views = False
+
+    def __init__(self, data_set: DataSet) -> None:
+        """See `Exporter`."""
+        self._data_set = data_set
+        self._hidden = data_set.out / PARTIAL / FOLDER
+        self._spools: dict[int, TickSpool] = {}
+        self._begun = 0
+
+    @staticmethod
+    def slot_bytes(config: Config) -> int:
+        """See `Exporter`: no images are handed over."""
+        return 0
+
+    @staticmethod
+    def join(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+        """See `Exporter`: nothing spans episodes but the assets."""
+        return []
+
+    def write_constants(self) -> list[Path]:
+        """See `Exporter`: the asset library."""
+        from synpick_warp.exporters.usd.assets import write_library  # pxr takes a while to load, and this is its only use here
+
+        data_set = self._data_set
+        library = data_set.out / LIBRARY
+        try:
+            for folder in (library.parent, library):
+                folder.mkdir(exist_ok=True)
+            write_library(library, data_set.config, data_set.catalog, data_set.lights)
+        except OSError as error:
+            raise output_error(library, error) from error
+        return [LIBRARY]
+
+    def write(self, batch: FrameBatch) -> None:
+        """See `Exporter`: pictures are not for USD."""
+
+    def tick(self, batch: TickBatch) -> None:
+        """See `Exporter`."""
+        for world in range(len(batch)):
+            number = int(batch.episode[world])
+            spool = self._spools.get(number) or self._begin(number, batch.object_id.shape[1])
+            try:
+                spool.add(batch, world)
+            except OSError as error:
+                raise output_error(spool.path, error) from error
+
+    def end(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
+        """See `Exporter`."""
+        pool, spool = self._data_set.pool, self._spools.pop(end.episode, None)
+        if spool is None:
+            whole()
+        elif not Ending(end.ending).delivers:
+            pool.submit(drop_episode, (), (spool.path,), path=spool.path, done=whole)
+        else:
+            try:
+                spool.flush()
+            except OSError as error:
+                raise output_error(spool.path, error) from error
+            place = self._place(end.episode)
+            arguments = (spool.path, spool.instances, place, EpisodeFacts.of(end), self._settings)
+            pool.submit(write_episode, (), arguments, path=place, done=whole)
+        pool.poll()
+
+    def files(self, episode: int) -> list[Path]:
+        """See `Exporter`: the one file."""
+        place = self._place(episode)
+        return [place.relative_to(self._data_set.out)] if os.path.lexists(place) else []
+
+    def close(self) -> None:
+        """See `Exporter`."""
+        self._spools.clear()
+
+    def abort(self) -> None:
+        """See `Exporter`."""
+        self._spools.clear()
+
+    def _begin(self, number: int, instances: int) -> TickSpool:
+        # A number of its own for every arrangement: the last one's file may not be removed yet.
+        self._begun += 1
+        try:
+            self._hidden.mkdir(exist_ok=True)
+        except OSError as error:
+            raise output_error(self._hidden, error) from error
+        spool = self._spools[number] = TickSpool(self._hidden / f"{number:06d}-{self._begun}", instances)
+        return spool
+
+    def _place(self, episode: int) -> Path:
+        return self._data_set.out / FOLDER / f"{episode:06d}.usdc"
+
+    @cached_property
+    def _settings(self) -> EpisodeSettings:
+        data_set = self._data_set
+        config = data_set.config
+        return EpisodeSettings(
+            tick_rate=1.0 / (config.physics.step * config.physics.steps_per_tick),
+            gravity=config.physics.gravity,
+            cameras=data_set.cameras,
+            lights=tuple(stage_light(index, light, config.render.exposure) for index, light in enumerate(data_set.lights)),
+            names={entry.obj_id: entry.name for entry in data_set.catalog.entries},
+        )

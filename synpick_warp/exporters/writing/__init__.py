@@ -1,0 +1,1 @@
+"""Writing: the writer process pool, atomic files, checksums, image encoders."""

@@ -1,0 +1,1 @@
+"""Host side of perception and grasp planning."""

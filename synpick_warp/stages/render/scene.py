@@ -1,0 +1,242 @@
+"""Constant device data of the renderer: meshes, surfaces, cameras, lights. Shared by all worlds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import warp as wp
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.kernels.render.lighting.environment import Lights
+from synpick_warp.kernels.render.lighting.materials import Surfaces
+from synpick_warp.kernels.render.lighting.path_tracing import PathScene
+from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
+from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
+from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.types import Camera, Catalog, Fixture, Hollow, LightMap, Material, TriangleMesh
+from synpick_warp.stages.render.chances import build_chances
+from synpick_warp.stages.render.gloss import measure_gloss
+from synpick_warp.stages.render.light_tables import light_table
+
+TABLE_ROUGHNESS = 0.8
+"""The table is matt; it has no setting of its own but its colour."""
+
+
+@dataclass(frozen=True, eq=False)
+class RenderScene:
+    """What all views share. The structs are arguments of kernels; `keep` holds the meshes whose ids they contain."""
+
+    meshes: Any
+    surfaces: Any
+    cameras: Any
+    lights: Any
+    table: Any
+    paths: Any
+    """The struct `PathScene`: all that paths meet."""
+    grid: Any
+    obj_id: wp.array
+    """Of each catalog entry (entry) int32."""
+    camera_count: int
+    device: wp.Device
+    keep: tuple[wp.Mesh, ...]
+
+    @property
+    def width(self) -> int:
+        return self.grid.width
+
+    @property
+    def height(self) -> int:
+        return self.grid.height
+
+
+def mip_levels(texture: np.ndarray) -> list[np.ndarray]:
+    """A texture (H, W, 3) uint8 and its halvings down to one texel, averaged in linear light."""
+    levels = [np.ascontiguousarray(texture)]
+    linear = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)[texture]
+    while max(linear.shape[:2]) > 1:
+        height, width = linear.shape[:2]
+        linear = cv2.resize(linear, (max(width // 2, 1), max(height // 2, 1)), interpolation=cv2.INTER_AREA)
+        levels.append(np.rint(linear_to_srgb(linear) * 255.0).astype(np.uint8))
+    return levels
+
+
+def packed_colors(image: np.ndarray) -> np.ndarray:
+    """The colours of an image (H, W, 3) uint8, row by row, as `Surfaces.texel` holds them (H W) uint32."""
+    red, green, blue = image.reshape(-1, 3).T.astype(np.uint32)
+    return red | green << 8 | blue << 16
+
+
+def corner_values(values: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
+    """Values of a mesh's vertices (V, C), for the three corners of each triangle (3 F, C): what a triangle has lies together."""
+    return values[mesh.faces].reshape(-1, values.shape[1])
+
+
+def uv_density(mesh: TriangleMesh) -> np.ndarray:
+    """Texture lengths per metre on each triangle (F) float32: the root of the ratio of areas, 0 for triangles without area."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    flat = mesh.uv[mesh.faces].astype(np.float64)
+    edge, other = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+    uv_area = np.abs(edge[:, 0] * other[:, 1] - edge[:, 1] * other[:, 0])
+    return np.sqrt(uv_area / np.where(area > 0.0, area, np.inf)).astype(np.float32)
+
+
+def build_meshes(
+    shapes: list[TriangleMesh], entries: int, device: wp.Device, hollow: Hollow | None = None
+) -> tuple[Any, tuple[wp.Mesh, ...]]:
+    """One `wp.Mesh` a shape, and the struct `Meshes` about them; `hollow` is the tote's."""
+    keep = tuple(
+        wp.Mesh(
+            points=wp.array(shape.vertices, dtype=wp.vec3, device=device),
+            indices=wp.array(shape.faces.reshape(-1), dtype=wp.int32, device=device),
+            bvh_constructor="sah",
+            bvh_leaf_size=1,
+        )
+        for shape in shapes
+    )
+    lower = np.array([shape.vertices.min(axis=0) for shape in shapes])
+    upper = np.array([shape.vertices.max(axis=0) for shape in shapes])
+    center = ((lower + upper) / 2.0).astype(np.float32)
+    radius = [np.linalg.norm(shape.vertices.astype(np.float64) - c, axis=1).max() for shape, c in zip(shapes, center, strict=True)]
+    meshes = Meshes()
+    meshes.id = wp.array([mesh.id for mesh in keep], dtype=wp.uint64, device=device)
+    meshes.lower = wp.array(lower, dtype=wp.vec3, device=device)
+    meshes.upper = wp.array(upper, dtype=wp.vec3, device=device)
+    meshes.center = wp.array(center, dtype=wp.vec3, device=device)
+    # One part in a million more, so that rounding never lets a sphere exclude its own mesh.
+    meshes.radius = wp.array(np.array(radius) * (1.0 + 1e-6), dtype=wp.float32, device=device)
+    meshes.first_triangle = wp.array(np.cumsum([0] + [len(shape.faces) for shape in shapes]), dtype=wp.int32, device=device)
+    meshes.corner = wp.array(np.concatenate([corner_values(s.vertices, s) for s in shapes]), dtype=wp.vec3, device=device)
+    meshes.entries = entries
+    meshes.hollow.half = wp.vec3(-1.0, -1.0, -1.0)
+    if hollow is not None:
+        meshes.hollow.half, meshes.hollow.growth = wp.vec3(*hollow.half), wp.vec3(*hollow.growth)
+        meshes.hollow.floor, meshes.hollow.top = hollow.floor, hollow.top
+    return meshes, keep
+
+
+def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device: wp.Device) -> Any:
+    """Pack normals, texture coordinates, materials and mip-mapped textures; `materials` has one more than `shapes`, for the table."""
+    chains = [mip_levels(material.texture) if material.texture is not None else [] for material in materials]
+    depth = max(1, *(len(chain) for chain in chains))
+    first_texel = np.zeros((len(chains), depth), dtype=np.int32)
+    texels, total = [], 0
+    for row, chain in enumerate(chains):
+        for level, image in enumerate(chain):
+            first_texel[row, level] = total
+            texels.append(packed_colors(image))
+            total += len(texels[-1])
+    sizes = [(chain[0].shape[1], chain[0].shape[0]) if chain else (0, 0) for chain in chains]
+    surfaces = Surfaces()
+    surfaces.normal = wp.array(np.concatenate([corner_values(s.normals, s) for s in shapes]), dtype=wp.vec3, device=device)
+    surfaces.uv = wp.array(np.concatenate([corner_values(s.uv, s) for s in shapes]), dtype=wp.vec2, device=device)
+    surfaces.uv_density = wp.array(np.concatenate([uv_density(s) for s in shapes]), dtype=wp.float32, device=device)
+    surfaces.bend = wp.array(np.concatenate([normal_bend(s) for s in shapes]), dtype=wp.float32, device=device)
+    surfaces.color = wp.array(srgb_to_linear(np.array([m.color for m in materials])), dtype=wp.vec3, device=device)
+    surfaces.metallic = wp.array([m.metallic for m in materials], dtype=wp.float32, device=device)
+    surfaces.roughness = wp.array([m.roughness for m in materials], dtype=wp.float32, device=device)
+    surfaces.texture_size = wp.array(sizes, dtype=wp.vec2i, device=device)
+    surfaces.first_texel = wp.array(first_texel, dtype=wp.int32, device=device)
+    surfaces.texture_levels = wp.array([len(chain) for chain in chains], dtype=wp.int32, device=device)
+    surfaces.texel = wp.array(np.concatenate(texels) if texels else np.zeros(1, np.uint32), dtype=wp.uint32, device=device)
+    surfaces.gloss = measure_gloss(device)
+    surfaces.linear = wp.array(srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=device)
+    return surfaces
+
+
+def normal_bend(mesh: TriangleMesh) -> np.ndarray:
+    """How fast the interpolated normal turns along each triangle (F) float32 [rad/m]: the Frobenius norm of its gradient there."""
+    edges, turns = (np.diff(values[mesh.faces].astype(np.float64), axis=1) for values in (mesh.vertices, mesh.normals))
+    # A gradient G takes edges E, as columns, to the turns G E of the normal along them: |G|² is the trace of (EᵀE)⁻¹ (GE)ᵀ(GE).
+    gram, turned = (rows @ rows.transpose(0, 2, 1) for rows in (edges, turns))
+    adjugate = gram[:, ::-1, ::-1] * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    squared, area = np.einsum("fij,fij->f", adjugate, turned), np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    return (np.sqrt(np.maximum(squared, 0.0)) / np.where(area > 0.0, area, np.inf)).astype(np.float32)
+
+
+def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
+    """The struct `Cameras`."""
+    rotation = np.array([camera.rotation for camera in cameras], dtype=np.float64)
+    translation = np.array([camera.translation for camera in cameras], dtype=np.float64)
+    matrices = [camera.matrix for camera in cameras]
+    made = Cameras()
+    made.intrinsics = wp.array([(k[0, 0], k[1, 1], k[0, 2], k[1, 2]) for k in matrices], dtype=wp.vec4, device=device)
+    made.rotation = wp.array(rotation, dtype=wp.mat33d, device=device)
+    made.center = wp.array(-np.einsum("kji,kj->ki", rotation, translation), dtype=wp.vec3d, device=device)
+    made.to_world = wp.array(rotation.transpose(0, 2, 1), dtype=wp.mat33, device=device)
+    return made
+
+
+def build_grid(width: int, height: int) -> Any:
+    """The struct `ImageGrid`."""
+    grid = ImageGrid()
+    grid.width, grid.height = width, height
+    grid.tile_columns = -(-width // int(TILE_WIDTH))
+    grid.tiles = grid.tile_columns * -(-height // int(TILE_HEIGHT))
+    assert int(TILE_WIDTH) * int(TILE_HEIGHT) == int(TILE_PIXELS)
+    return grid
+
+
+def build_lights(maps: tuple[LightMap, ...], ground: np.ndarray | None, exposure: float, device: wp.Device) -> Any:
+    """The struct `Lights`; `exposure` multiplies the automatic exposure, `ground` is the table's linear albedo."""
+    tables = [light_table(light, ground) for light in maps]
+    lights = Lights()
+    lights.maps = len(tables)
+    backgrounds = np.stack([t.background for t in tables] + [t.rest for t in tables])
+    lights.background = wp.array(backgrounds, dtype=wp.vec3, device=device)
+    lights.reflection = wp.array(np.stack([t.reflection for t in tables]), dtype=wp.vec3, device=device)
+    lights.irradiance = wp.array(np.stack([t.irradiance for t in tables]), dtype=wp.vec3, device=device)
+    lights.main_direction = wp.array(np.stack([t.main_direction for t in tables]), dtype=wp.vec3, device=device)
+    lights.main_irradiance = wp.array(np.stack([t.main_irradiance for t in tables]), dtype=wp.vec3, device=device)
+    lights.main_spread = wp.array([t.main_spread for t in tables], dtype=wp.float32, device=device)
+    lights.exposure = wp.array([exposure * t.exposure for t in tables], dtype=wp.float32, device=device)
+    return lights
+
+
+def build_render_scene(
+    config: Config,
+    catalog: Catalog,
+    fixtures: tuple[Fixture, Fixture, Fixture],
+    cameras: tuple[Camera, ...],
+    lights: tuple[LightMap, ...],
+    device: wp.Device,
+) -> RenderScene:
+    """Put all constant data of the renderer on the device.
+
+    Args:
+        config: All settings.
+        catalog: The objects; an instance's `entry` is the index into it.
+        fixtures: Tote, finger, cup, each in its own frame.
+        cameras: All of the same image size; a view's camera is the index into it.
+        lights: A world's light is the index into it.
+        device: Where to put it.
+    """
+    shapes = [entry.mesh for entry in catalog.entries] + [fixture.mesh for fixture in fixtures]
+    table_material = Material(color=config.render.table_color, texture=None, metallic=0.0, roughness=TABLE_ROUGHNESS)
+    materials = [entry.material for entry in catalog.entries] + [fixture.material for fixture in fixtures] + [table_material]
+    meshes, keep = build_meshes(shapes, len(catalog), device, fixtures[0].hollow)
+    table = Table()
+    table.visible, table.height = int(config.render.table), -config.tote.wall
+    ground = srgb_to_linear(np.array(config.render.table_color)) if config.render.table else None
+    paths = PathScene()
+    paths.meshes = meshes
+    paths.table = table
+    paths.surfaces = build_surfaces(shapes, materials, device)
+    paths.lights = build_lights(lights, ground, config.render.exposure, device)
+    paths.chances = build_chances(paths.lights.background.numpy(), device, config.render.table)
+    return RenderScene(
+        meshes=meshes,
+        surfaces=paths.surfaces,
+        cameras=build_cameras(cameras, device),
+        lights=paths.lights,
+        table=table,
+        paths=paths,
+        grid=build_grid(cameras[0].width, cameras[0].height),
+        obj_id=wp.array([entry.obj_id for entry in catalog.entries], dtype=wp.int32, device=device),
+        camera_count=len(cameras),
+        device=device,
+        keep=keep,
+    )

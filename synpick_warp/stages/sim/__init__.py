@@ -1,0 +1,1 @@
+"""Host side of the simulation: worlds, physics, the stages of a tick."""

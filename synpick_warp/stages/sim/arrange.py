@@ -1,0 +1,145 @@
+"""New episodes into free worlds: numbers, objects, drop poses; then settling until the pile is at rest."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from synpick_warp.kernels.sim import arrangement, endings, rest
+from synpick_warp.stages.constants import SceneData
+from synpick_warp.stages.perception.arrays import Sighting
+from synpick_warp.stages.sim.physics import Physics
+from synpick_warp.stages.sim.worlds import AttemptState, WorldState
+
+
+def take_episodes(state: WorldState, episodes: wp.array, tries: int) -> None:
+    """Give worlds whose episode is over the next of the numbers `episodes`, or their own again if it delivered nothing."""
+    wp.launch(
+        arrangement.take_episodes_kernel,
+        dim=1,
+        inputs=[state.phase.shape[0], episodes, tries, state.address, state.phase, state.ending, state.next_episode],
+        device=state.phase.device,
+    )
+
+
+def draw_objects(scene: SceneData, state: WorldState, seed: int) -> None:
+    """Draw mode, objects and light of worlds that start an episode."""
+    worlds, device = state.phase.shape[0], state.phase.device
+    wp.launch(
+        arrangement.draw_modes_kernel,
+        dim=worlds,
+        inputs=[wp.uint64(seed), scene.mode, state.address, state.phase],
+        outputs=[state.mode],
+        device=device,
+    )
+    wp.launch(
+        arrangement.draw_objects_kernel,
+        dim=worlds,
+        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, state.address, state.mode, state.phase, state.ending],
+        outputs=[state.entry, state.slot],
+        device=device,
+    )
+    wp.launch(
+        arrangement.draw_lights_kernel,
+        dim=worlds,
+        inputs=[wp.uint64(seed), scene.drop, state.address, state.phase],
+        outputs=[state.light, state.light_turn, state.light_exposure],
+        device=device,
+    )
+
+
+def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
+    """Empty the worlds that start, stack the drawn objects above the tote, and load all that into the physics."""
+    worlds, device = state.phase.shape[0], state.phase.device
+    joints = [physics.state.joint_q, physics.state.joint_qd, physics.control.joint_f]
+    wp.launch(
+        arrangement.empty_worlds_kernel,
+        dim=worlds,
+        inputs=[scene.layout, scene.catalog, scene.drop, state.phase],
+        outputs=[state.variant, *joints, state.restarted, state.progress, state.stuck],
+        device=device,
+    )
+    wp.launch(
+        arrangement.drop_objects_kernel,
+        dim=worlds,
+        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, state.address, state.entry, state.slot, state.phase],
+        outputs=[state.variant, *joints],
+        device=device,
+    )
+    physics.load(state.variant, state.restarted)
+
+
+def measure_depth(state: WorldState, physics: Physics) -> None:
+    """Deepest penetration of each body, from the contacts of the last step."""
+    contacts = physics.contacts
+    state.depth.zero_()
+    wp.launch(
+        rest.measure_depth_kernel,
+        dim=contacts.rigid_contact_max,
+        inputs=[contacts.rigid_contact_count, contacts.rigid_contact_shape0, contacts.rigid_contact_shape1, contacts.rigid_contact_point0,
+                contacts.rigid_contact_point1, contacts.rigid_contact_normal, contacts.rigid_contact_margin0,
+                contacts.rigid_contact_margin1, physics.model.shape_body, physics.state.body_q],
+        outputs=[state.depth],
+        device=state.phase.device,
+    )
+
+
+def measure_shift(scene: SceneData, state: WorldState, physics: Physics) -> None:
+    """How far each instance moved in the last tick."""
+    wp.launch(
+        rest.measure_shift_kernel,
+        dim=state.entry.shape,
+        inputs=[scene.layout, scene.catalog, state.entry, state.slot, physics.state.body_q, state.previous],
+        outputs=[state.shift],
+        device=state.phase.device,
+    )
+
+
+def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
+    """Re-drop what left the tote or is stuck, count ticks at rest, let worlds at rest act."""
+    measure_depth(state, physics)
+    measure_shift(scene, state, physics)
+    wp.launch(
+        rest.redrop_objects_kernel,
+        dim=state.phase.shape[0],
+        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, scene.settle, state.address, state.phase, state.entry,
+                state.slot, physics.state.body_q, state.depth, state.stuck, state.progress, physics.state.joint_q,
+                physics.state.joint_qd],
+        device=state.phase.device,
+    )
+    wp.launch(
+        rest.judge_rest_kernel,
+        dim=state.phase.shape[0],
+        inputs=[scene.layout, scene.settle, state.entry, state.shift, state.phase, state.progress],
+        device=state.phase.device,
+    )
+
+
+def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, sighting: Sighting, physics: Physics) -> None:
+    """End episodes that failed or are finished."""
+    worlds, device = state.phase.shape[0], state.phase.device
+    wp.launch(
+        endings.judge_tasks_kernel,
+        dim=worlds,
+        inputs=[scene.layout, scene.move, scene.pick, state.phase, state.mode, state.entry, state.waypoint, attempts.task,
+                attempts.failures],
+        outputs=[state.ending],
+        device=device,
+    )
+    wp.launch(
+        endings.judge_episodes_kernel,
+        dim=worlds,
+        inputs=[scene.layout, scene.settle, state.entry, state.slot, physics.state.body_q, physics.solver.constraint_overflow,
+                sighting.overflow, state.progress, state.phase, state.ending],
+        device=device,
+    )
+
+
+def set_guides(scene: SceneData, state: WorldState, physics: Physics) -> None:
+    """Guide walls stand while a world's objects fall."""
+    wp.launch(
+        rest.set_guides_kernel,
+        dim=(state.phase.shape[0], scene.guide_shapes.shape[0]),
+        inputs=[scene.layout, scene.guide_shapes, state.progress],
+        outputs=[physics.model.shape_transform],
+        device=state.phase.device,
+    )

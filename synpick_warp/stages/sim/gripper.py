@@ -1,0 +1,142 @@
+"""The gripper's tasks: goals, force, and how attempts begin and end."""
+
+from __future__ import annotations
+
+import newton
+import warp as wp
+
+from synpick_warp.kernels.sim import gripper, tasks
+from synpick_warp.stages.constants import SceneData
+from synpick_warp.stages.perception.arrays import Plan, Sighting
+from synpick_warp.stages.sim.physics import Physics
+from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
+
+
+def begin_moving(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
+    """Count frames; where a world begins to move, draw the corners' order and put the gripper above the first."""
+    wp.launch(
+        gripper.begin_moving_kernel,
+        dim=state.phase.shape[0],
+        inputs=[wp.uint64(seed), scene.layout, scene.move, state.address, state.mode, state.phase, state.frame, physics.state.joint_q,
+                physics.state.joint_qd],
+        outputs=[state.order, state.goal, state.waypoint],
+        device=state.phase.device,
+    )
+
+
+def begin_picking(
+    scene: SceneData, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, physics: Physics
+) -> None:
+    """Where a world begins to pick, let it look; forget the outcomes of the last tick."""
+    wp.launch(
+        tasks.begin_picking_kernel,
+        dim=state.phase.shape[0],
+        inputs=[scene.layout, state.phase, state.mode, state.frame],
+        outputs=[attempts.task, attempts.steps, attempts.attempt, attempts.outcome, attempts.failures, plan.target, plan.yaw,
+                 sighting.overflow, attempts.removed, physics.control.joint_target_q],
+        device=state.phase.device,
+    )
+
+
+def forget_seals(state: WorldState, seals: SealState) -> None:
+    """Before a world's objects fall, let go of what hung on its cup."""
+    wp.launch(tasks.forget_seals_kernel, dim=seals.held.shape, inputs=[state.phase], outputs=[seals.held], device=state.phase.device)
+
+
+def set_fingers(scene: SceneData, state: WorldState, physics: Physics) -> None:
+    """Let the finger collide where the gripper moves, and not where it picks."""
+    wp.launch(
+        tasks.set_fingers_kernel,
+        dim=state.phase.shape[0],
+        inputs=[scene.layout, state.mode],
+        outputs=[physics.model.shape_transform],
+        device=state.phase.device,
+    )
+
+
+def drive_gripper(
+    scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics, current: newton.State
+) -> None:
+    """Move the goals on by one step and set the grippers' forces."""
+    worlds, device = state.phase.shape[0], state.phase.device
+    wp.launch(
+        gripper.move_goals_kernel,
+        dim=worlds,
+        inputs=[scene.move, scene.pick, state.phase, state.mode, state.order, plan.point, plan.normal, attempts.task, attempts.steps,
+                state.waypoint, state.goal],
+        device=device,
+    )
+    wp.launch(
+        gripper.drive_gripper_kernel,
+        dim=worlds,
+        inputs=[scene.layout, scene.move, scene.pick, state.phase, state.mode, attempts.task, state.goal, current.joint_q,
+                current.joint_qd],
+        outputs=[physics.control.joint_f],
+        device=device,
+    )
+
+
+def remove_lost(scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
+    """Take out of the scene what has left the tote."""
+    wp.launch(
+        tasks.remove_lost_kernel,
+        dim=state.entry.shape,
+        inputs=[scene.layout, scene.drop, scene.settle, scene.pick, state.phase, state.slot, state.shift, physics.state.body_q,
+                state.entry],
+        outputs=[attempts.removed, seals.held],
+        device=state.phase.device,
+    )
+
+
+def end_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, plan: Plan, physics: Physics) -> None:
+    """Judge lifts that are over, take what was picked out of the scene, and send grippers home."""
+    worlds, device = state.phase.shape[0], state.phase.device
+    wp.launch(
+        tasks.count_held_kernel, dim=worlds, inputs=[scene.layout, state.entry, seals.held], outputs=[attempts.hanging], device=device
+    )
+    wp.launch(
+        tasks.advance_tasks_kernel,
+        dim=worlds,
+        inputs=[scene.move, scene.pick, state.phase, state.mode, state.goal, plan.point, plan.normal, plan.target, attempts.caught,
+                attempts.hanging, attempts.task, attempts.steps, attempts.failures],
+        outputs=[attempts.outcome],
+        device=device,
+    )
+    wp.launch(
+        tasks.end_attempts_kernel,
+        dim=worlds,
+        inputs=[scene.layout, scene.drop, state.phase, attempts.task, attempts.hanging],
+        outputs=[state.entry, attempts.removed, seals.held, physics.state.joint_q, physics.state.joint_qd, physics.control.joint_target_q],
+        device=device,
+    )
+
+
+def park_removed(scene: SceneData, state: WorldState, attempts: AttemptState, physics: Physics) -> None:
+    """Keep what has left the scene out of the way."""
+    wp.launch(
+        tasks.park_removed_kernel,
+        dim=state.entry.shape,
+        inputs=[scene.layout, state.slot, attempts.removed],
+        outputs=[physics.state.joint_q, physics.state.joint_qd, physics.control.joint_f],
+        device=state.phase.device,
+    )
+
+
+def begin_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
+    """Where a world has looked, put the gripper above the grasp."""
+    worlds, device = state.phase.shape[0], state.phase.device
+    wp.launch(
+        tasks.begin_attempts_kernel,
+        dim=worlds,
+        inputs=[state.phase, plan.target, attempts.task, attempts.attempt],
+        outputs=[attempts.steps, attempts.hits, attempts.caught],
+        device=device,
+    )
+    wp.launch(
+        tasks.place_grippers_kernel,
+        dim=worlds,
+        inputs=[scene.layout, scene.move, scene.pick, state.phase, attempts.task, attempts.steps, plan.point, plan.normal, plan.tilt],
+        outputs=[state.goal, physics.state.joint_q, physics.state.joint_qd, physics.control.joint_target_q],
+        device=device,
+    )
+    physics.turn_fingers(plan.yaw)

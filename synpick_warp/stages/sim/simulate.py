@@ -1,0 +1,188 @@
+"""All worlds, one tick at a time. Nothing here asks the device for an answer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from synpick_warp.arrays import allocate
+from synpick_warp.configs.modes import may_pick
+from synpick_warp.configs.schema import Config
+from synpick_warp.kernels.sim import snapshot as pack
+from synpick_warp.scenes.build import build_model
+from synpick_warp.scenes.types import Catalog
+from synpick_warp.stages.buffers import LastFrame, Snapshot
+from synpick_warp.stages.constants import SceneData, make_scene_data
+from synpick_warp.stages.perception.arrays import Plan, Sighting
+from synpick_warp.stages.perception.perceive import Looker
+from synpick_warp.stages.render.scene import RenderScene
+from synpick_warp.stages.sim import arrange, gripper
+from synpick_warp.stages.sim.physics import Physics
+from synpick_warp.stages.sim.step_log import PhysicsRecord, Recorder
+from synpick_warp.stages.sim.suction import Suction
+from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
+
+# A tick is recorded while the last one's record is still read.
+RECORDS = 2
+
+
+@dataclass(frozen=True, eq=False)
+class TickRecord:
+    """What one tick leaves for pictures and for the host."""
+
+    snapshot: Snapshot
+    status: WorldStatus
+    sighting: Sighting
+    plan: Plan
+    physics: PhysicsRecord | None = None
+    """None: nobody asked for it."""
+
+
+class Simulation:
+    """N worlds that take episodes by number until none is left."""
+
+    def __init__(
+        self,
+        config: Config,
+        catalog: Catalog,
+        lights: int,
+        device: wp.Device,
+        render_scene: RenderScene | None = None,
+        episodes: Sequence[int] | None = None,
+        records_physics: bool = False,
+    ) -> None:
+        """Build the model and allocate all state.
+
+        Args:
+            config: Settings.
+            catalog: The objects.
+            lights: How many light maps there are to draw from.
+            device: Where everything lies.
+            render_scene: What the gripper's side sees; not needed if all episodes move.
+            episodes: Numbers of the episodes to simulate, in order; None: from 0, as many as are set.
+            records_physics: Whether records have `physics`.
+
+        Raises:
+            ValueError: There is nothing to see, but episodes that pick.
+        """
+        self.config = config
+        self.device = device
+        built = build_model(config, catalog, device)
+        self.layout = built.layout
+        self.physics = Physics(config, built)
+        self.scene: SceneData = make_scene_data(config, catalog, built, lights, device)
+        numbers = range(config.bake.episodes) if episodes is None else episodes
+        self.episodes = wp.array(np.asarray(numbers, np.int32), dtype=wp.int32, device=device)
+        sizes = world_sizes(config, built.layout.bodies_per_world)
+        self.state = allocate(WorldState, sizes, device)
+        self.attempts = allocate(AttemptState, sizes, device)
+        self.seals = allocate(SealState, sizes, device)
+        self.sighting = allocate(Sighting, sizes, device)
+        self.plan = allocate(Plan, sizes, device)
+        self.last = allocate(LastFrame, sizes, device)
+        self.recorder: Recorder | None = None
+        if records_physics:
+            self.recorder = Recorder(config, self.scene, self.state, self.attempts, self.seals, self.physics, sizes)
+        self.records = tuple(self._make_record(sizes) for _ in range(RECORDS))
+        self.suction: Suction | None = None
+        self.looker: Looker | None = None
+        if may_pick(config):
+            if render_scene is None:
+                raise ValueError("episodes that pick need a render_scene to look at")
+            self.suction = Suction(config, catalog, render_scene, device)
+            self.looker = Looker(config, render_scene, self.scene, self.state, self.attempts, self.sighting, self.plan)
+
+    def _make_record(self, sizes: dict[str, int]) -> TickRecord:
+        physics = self.recorder.new_record() if self.recorder is not None else None
+        return TickRecord(*(allocate(kind, sizes, self.device) for kind in (Snapshot, WorldStatus, Sighting, Plan)), physics=physics)
+
+    def tick(self, record: TickRecord) -> None:
+        """Hand out episodes, simulate one tick, judge, record what came of it in one of `records`, and look where one must choose."""
+        state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
+        arrange.take_episodes(state, self.episodes, self.config.settle.tries)
+        arrange.draw_objects(scene, state, seed)
+        arrange.drop_objects(scene, state, physics, seed)
+        arrange.set_guides(scene, state, physics)
+        gripper.set_fingers(scene, state, physics)
+        gripper.forget_seals(state, self.seals)
+        self.seals.peak.zero_()
+        if self.recorder is not None:
+            self.recorder.keep_drops()
+        physics.tick(self._drive, self._let_go_of_contacts, self.recorder if self.config.trajectory.steps else None)
+        arrange.judge_settling(scene, state, physics, seed)
+        arrange.set_guides(scene, state, physics)
+        gripper.begin_moving(scene, state, physics, seed)
+        gripper.begin_picking(scene, state, self.attempts, self.sighting, self.plan, physics)
+        gripper.remove_lost(scene, state, self.attempts, self.seals, physics)
+        if self.suction is not None:
+            self.suction.count_seal_rays(scene, state, self.attempts, self.seals, physics)
+            gripper.end_attempts(scene, state, self.attempts, self.seals, self.plan, physics)
+        gripper.park_removed(scene, state, self.attempts, physics)
+        physics.refresh_poses()
+        arrange.judge_episodes(scene, state, self.attempts, self.sighting, physics)
+        self._take_snapshot(record)
+        if self.recorder is not None and record.physics is not None:
+            self.recorder.take(record.physics)
+        if self.looker is not None:
+            self.looker.look(record.snapshot)
+            gripper.begin_attempts(scene, state, self.attempts, self.plan, physics)
+            _copy(record.sighting, self.sighting)
+            _copy(record.plan, self.plan)
+
+    def _drive(self, current: newton.State) -> None:
+        """Forces before a step."""
+        gripper.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current)
+        if self.recorder is not None:
+            self.recorder.keep_force()
+        if self.suction is not None:
+            self.suction.hold_objects(self.scene, self.state, self.seals, self.physics, current)
+
+    def _let_go_of_contacts(self) -> None:
+        """After contacts were found."""
+        if self.suction is not None:
+            self.suction.ignore_held_contacts(self.scene, self.state, self.seals, self.physics)
+
+    def _take_snapshot(self, record: TickRecord) -> None:
+        state, attempts, snapshot, status = self.state, self.attempts, record.snapshot, record.status
+        device = self.device
+        wp.launch(
+            pack.take_snapshot_kernel,
+            dim=self.layout.worlds,
+            inputs=[self.scene.layout, state.phase, state.ending, state.address, state.frame, attempts.task, state.entry, state.slot,
+                    self.physics.state.body_q],
+            outputs=[snapshot.live, snapshot.episode, snapshot.frame, snapshot.entry, snapshot.pose, snapshot.fixture_pose,
+                     snapshot.fixture_visible],
+            device=device,
+        )
+        wp.launch(
+            pack.pack_status_kernel,
+            dim=self.layout.worlds,
+            inputs=[snapshot.live, state.phase, state.ending, state.address, state.frame, state.mode, attempts.task, attempts.attempt,
+                    attempts.outcome, self.plan.target, attempts.hits, attempts.caught, attempts.hanging, self.seals.peak],
+            outputs=[status.table, status.measures],
+            device=device,
+        )
+        outputs = [_frame_poses(self.last), snapshot.follows, snapshot.last_entry, snapshot.last_pose, snapshot.last_fixture_pose]
+        outputs += [snapshot.last_fixture_visible]
+        wp.launch(pack.link_frames_kernel, dim=self.layout.worlds, inputs=[_frame_poses(snapshot)], outputs=outputs, device=device)
+        wp.copy(snapshot.light, state.light)
+        wp.copy(snapshot.light_turn, state.light_turn)
+        wp.copy(snapshot.light_exposure, state.light_exposure)
+
+
+def _frame_poses(arrays: Snapshot | LastFrame) -> Any:
+    """The struct `FramePoses` of arrays of the same names."""
+    made = pack.FramePoses()
+    for item in fields(LastFrame):
+        setattr(made, item.name, getattr(arrays, item.name))
+    return made
+
+
+def _copy(target: Sighting | Plan, source: Sighting | Plan) -> None:
+    for item in fields(source):
+        wp.copy(getattr(target, item.name), getattr(source, item.name))

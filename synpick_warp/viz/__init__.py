@@ -1,0 +1,1 @@
+"""Visualization from files alone: contact sheets and explained pick attempts."""

@@ -1,0 +1,267 @@
+"""Draws attempts to pick as the paper's figure does, from a data set's files alone: image, contours, suction points, clutter graph."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Config
+from synpick_warp.errors import DatasetError
+from synpick_warp.viz.explain_graph import (
+    CYCLIC,
+    GREY,
+    INK,
+    OUTVOTED,
+    RED,
+    WHITE,
+    clutter_edges,
+    disc,
+    draw_graph,
+    fixed,
+    put_boxed,
+    readable_on,
+)
+from synpick_warp.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_load, draw_words
+from synpick_warp.viz.explain_record import MODE_WORDS, Attempt, Pixel, labels, read_attempts
+from synpick_warp.viz.preview import FONT, Image, check_picture_name, instance_color, put_text, read_image, read_json, write_picture
+
+MARGIN = 20
+"""Around everything on the sheet, and between columns [px]."""
+HEAD = 64
+"""Height of the headline and of the captions below it [px]."""
+IMAGE_WIDTH = 880
+"""Of the colour image on the sheet; it is never higher than `_HIGHEST` [px]."""
+_HIGHEST = 880
+_GRAPH_WIDTH = 500
+_LEAST_HEIGHT = 640
+"""Of a row, without its headline [px]."""
+_LABEL = 0.5
+"""Size of an object's label on the image; the target's is larger."""
+_HALO = 3
+"""Width of dark edges around bright lines on the image [px]."""
+_MODEL_NAME = re.compile(rb"^comment (.+), millimetres\r?$", re.MULTILINE)
+"""How the exporter signs a model that it made."""
+_PLY_HEAD = 2048
+"""Within so many bytes of a PLY file the comments stand [B]."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """What the files of camera 0 show of an attempt."""
+
+    place: str
+    color: Image
+    masks: dict[int, np.ndarray] | None
+    """Instance -> visible mask of the colour image; None: the data set has none."""
+
+
+def write_explanation(dataset: Path, out: Path, episode: int, attempt: int | None) -> Path:
+    """Draw one attempt of an episode, or all of them below each other, and write the picture.
+
+    Args:
+        dataset: Folder of the data set.
+        out: PNG or JPEG file to write; its folder is made.
+        episode: Its number.
+        attempt: Its number within the episode; None: all.
+
+    Raises:
+        ConfigError: The data set's config.toml is damaged.
+        DatasetError: There is no such attempt, or a file is missing or damaged.
+        OutputError: The picture cannot be written.
+    """
+    check_picture_name(out)
+    if not dataset.is_dir():
+        raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
+    attempts = read_attempts(dataset, episode, attempt)
+    path = dataset / "config.toml"
+    if not path.is_file():
+        raise DatasetError(f"{dataset} has no config.toml; the settings of the bake are needed to explain what it did")
+    config = load_config(str(path), {})
+    names = object_names(dataset, config, {one.object_id for each in attempts for one in each.seen})
+    rows = [_row(each, _read_scene(dataset, config, each), names, config) for each in attempts]
+    return write_picture(out, np.concatenate(rows))
+
+
+def object_names(dataset: Path, config: Config, object_ids: set[int]) -> dict[int, str]:
+    """obj_id -> name, of those that have one: in the model that the exporter made, else in the settings' object table."""
+    infos = read_json(dataset / "models" / "models_info.json")
+    names = {}
+    for object_id in object_ids:
+        path = dataset / "models" / f"obj_{object_id:06d}.ply"
+        made = None
+        if path.is_file():
+            with path.open("rb") as file:
+                made = _MODEL_NAME.search(file.read(_PLY_HEAD))
+        size = float(infos.get(str(object_id), {}).get("diameter", 0.0)) / 1000.0
+        fits = (row.name for row in config.object_rows if row.id == object_id and _fits(row.diameter, size, config))
+        name = made[1].decode(errors="replace") if made else next(fits, "")
+        if name:
+            names[object_id] = name
+    return names
+
+
+def _fits(expected: float, size: float, config: Config) -> bool:
+    return abs(size - expected) <= config.objects.diameter_tolerance * expected
+
+
+def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
+    scene = dataset / config.bop.split / f"{len(config.cameras.positions) * attempt.episode:06d}"
+    stem = f"{attempt.frame:06d}"
+    truth = read_json(scene / "scene_gt.json").get(str(attempt.frame))
+    if truth is None:
+        raise DatasetError(f"{scene}/scene_gt.json has no image {attempt.frame}, of which {dataset}/attempts.jsonl tells")
+    color = read_image(scene / "rgb", stem, cv2.IMREAD_COLOR)
+    masks = None
+    folder = scene / "mask_visib"
+    if folder.is_dir():
+        seen = attempt.objects
+        masks = {
+            record["instance_id"]: read_image(folder, f"{stem}_{index:06d}", cv2.IMREAD_GRAYSCALE)
+            for index, record in enumerate(truth)
+            if record.get("instance_id") in seen
+        }
+    return _Scene(f"{scene.parent.name}/{scene.name}, image {attempt.frame}", color, masks)
+
+
+def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
+    """Where a pixel of the sight image lies in the colour image (column, row), in both of which whole numbers are pixel centres.
+
+    Both have the same camera in the middle, and their widths the same angle of view; heights may show more or less.
+
+    Args:
+        pixel: Column and row in the sight image.
+        resolution: Width and height of the sight image [px].
+        size: Width and height of the colour image [px].
+    """
+    scale = size[0] / resolution[0]
+    column, row = ((value + 0.5 - old / 2) * scale + new / 2 - 0.5 for value, old, new in zip(pixel, resolution, size, strict=True))
+    return column, row
+
+
+def image_scale(size: tuple[int, int]) -> float:
+    """By how much the colour image of that width and height [px] is enlarged on the sheet."""
+    return min(IMAGE_WIDTH / size[0], _HIGHEST / size[1])
+
+
+def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Config) -> Image:
+    image = _draw_image(attempt, scene)
+    words = draw_words(attempt, names, config)
+    left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
+    height = max(left, words.shape[0], _LEAST_HEIGHT)
+    sheet = np.full((HEAD + height + 2 * MARGIN, IMAGE_WIDTH + _GRAPH_WIDTH + WORDS_WIDTH + 4 * MARGIN, 3), 255, np.uint8)
+    columns = MARGIN, 2 * MARGIN + IMAGE_WIDTH, 3 * MARGIN + IMAGE_WIDTH + _GRAPH_WIDTH
+    top = MARGIN + HEAD
+    _paste(sheet, image, columns[0], top)
+    _draw_key(sheet, columns[0], top + image.shape[0] + 24)
+    plot = draw_load(attempt, config, IMAGE_WIDTH, height - image.shape[0] - 2 * LINE - MARGIN)
+    _paste(sheet, plot, columns[0], top + height - plot.shape[0])
+    states = {edge.state for edge in clutter_edges(attempt, config.sight.min_votes)}
+    foot = _graph_foot(states) if attempt.seen else []
+    _paste(sheet, draw_graph(attempt, config.sight.min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
+    for number, (text, color) in enumerate(foot):
+        put_text(sheet, text, (columns[1], top + height - LINE * (len(foot) - 1 - number) - 6), SMALL, color)
+    _paste(sheet, words, columns[2], top)
+    head = f"Episode {attempt.episode}, attempt {attempt.number} ({MODE_WORDS[attempt.mode]}): {attempt.sentence}"
+    put_text(sheet, head, (MARGIN, MARGIN + 20), 0.68, GREEN if attempt.picked else RED, 2)
+    captions = [f"camera 0: {scene.place}", "clutter graph", "choice and outcome"]
+    if scene.masks is None:
+        captions[0] += "; no contours: this data set has no masks"
+    for text, column in zip(captions, columns, strict=True):
+        put_text(sheet, text, (column, top - 9), TEXT, SOFT)
+    sheet[-1] = GREY
+    return sheet
+
+
+def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:
+    sheet[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
+
+
+def _draw_image(attempt: Attempt, scene: _Scene) -> Image:
+    """The colour image, darker but for the target, with contours and suction points."""
+    height, width = scene.color.shape[:2]
+    scale = image_scale((width, height))
+    size = (round(scale * width), round(scale * height))
+    color = cv2.resize(scene.color, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    drawn = (0.62 * color).astype(np.uint8)
+    order = sorted(scene.masks or {}, key=lambda instance: instance == attempt.target)
+    for instance in order:
+        mask = cv2.resize(np.minimum((scene.masks or {})[instance], 1) * 255, size, interpolation=cv2.INTER_LINEAR) > 127
+        _draw_contours(drawn, color, mask, instance, instance == attempt.target)
+    short = labels(attempt)
+    for one in attempt.seen:
+        places = [to_color_image(point, attempt.resolution, (width, height)) for point in (*one.candidates, one.suction)]
+        points = [(scale * (x + 0.5) - 0.5, scale * (y + 0.5) - 0.5) for x, y in places]
+        target = one.instance == attempt.target
+        for kind, point in enumerate(points[:-1]):
+            draw_mark(drawn, kind, point)
+        draw_chosen(drawn, points[-1], instance_color(one.instance), target)
+        _put_label(drawn, short[one.instance], points[-1], instance_color(one.instance), 1.3 * _LABEL if target else _LABEL)
+    return drawn
+
+
+def _draw_contours(drawn: Image, color: Image, mask: np.ndarray, instance: int, target: bool) -> None:
+    """Contours of all parts and holes of a mask, in place; the target keeps its brightness and gets a tint and a white edge."""
+    lines = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
+    shade = instance_color(instance)
+    if target:
+        drawn[mask] = (0.72 * color[mask] + 0.28 * np.array(shade)).astype(np.uint8)
+        cv2.drawContours(drawn, lines, -1, WHITE, 3 * _HALO, cv2.LINE_AA)
+        cv2.drawContours(drawn, lines, -1, shade, _HALO + 1, cv2.LINE_AA)
+    else:
+        cv2.drawContours(drawn, lines, -1, INK, _HALO + 1, cv2.LINE_AA)
+        cv2.drawContours(drawn, lines, -1, shade, 2, cv2.LINE_AA)
+
+
+def draw_mark(picture: Image, kind: int, place: tuple[float, float]) -> None:
+    """A candidate for the suction point, white with a dark edge: pole, a ring; centroid, a cross; half-way, a diamond."""
+    x, y = place
+    reach = 5.0
+    shapes = {
+        1: [[(x - reach, y), (x + reach, y)], [(x, y - reach), (x, y + reach)]],
+        2: [[(x - reach, y), (x, y - reach), (x + reach, y), (x, y + reach), (x - reach, y)]],
+    }
+    for color, thickness in ((INK, 4), (WHITE, 2)):
+        if kind == 0:
+            disc(picture, place, reach, color, thickness)
+        else:
+            for line in shapes[kind]:
+                cv2.polylines(picture, [fixed(np.array(line))], False, color, thickness, cv2.LINE_AA, 4)
+
+
+def draw_chosen(picture: Image, place: tuple[float, float], color: tuple[int, int, int], target: bool) -> None:
+    """A suction point: a disc in the object's colour; the target's has a ring about it as well."""
+    if target:
+        disc(picture, place, 14, INK, 5)
+        disc(picture, place, 14, WHITE, 3)
+    disc(picture, place, 5.5, INK)
+    disc(picture, place, 4.0, color)
+
+
+def _put_label(picture: Image, text: str, point: tuple[float, float], color: tuple[int, int, int], size: float) -> None:
+    (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
+    place = (point[0] + (22 if size > _LABEL else 13) + width / 2, point[1] - 8 - height / 2)
+    put_boxed(picture, text, place, size, readable_on(color), color)
+
+
+def _draw_key(sheet: Image, x: int, y: int) -> None:
+    """What the marks on the image mean."""
+    for kind, text in enumerate(("pole of inaccessibility", "centroid", "half-way", "suction point", "that of the target")):
+        place = (x + (17.0 if kind == 4 else 8.0), y - 4.5)
+        if kind < 3:
+            draw_mark(sheet, kind, place)
+        else:
+            draw_chosen(sheet, place, (200, 200, 200), kind == 4)
+        put_text(sheet, text, (round(place[0]) + (26 if kind == 4 else 14), y), SMALL, SOFT)
+        x += 44 + cv2.getTextSize(text, FONT, SMALL, 1)[0][0]
+
+
+def _graph_foot(states: set[str]) -> Sequence[tuple[str, tuple[int, int, int]]]:
+    lines = [("arrow: from the object on top to the one below, with its votes", SOFT), ("badge: number of objects above", SOFT)]
+    lines += [(f"dashed: {OUTVOTED}", GREY)] if OUTVOTED in states else []
+    return lines + ([(f"dashed: {CYCLIC}", RED)] if CYCLIC in states else [])

@@ -1,0 +1,278 @@
+"""The record of an attempt to pick: read from a data set's attempts.jsonl, and told in words."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from synpick_warp.codes import ATTEMPTS_FILE
+from synpick_warp.configs.schema import Config
+from synpick_warp.errors import DatasetError
+
+MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
+CANDIDATES = ("pole", "centroid", "middle")
+"""Where a suction point may lie, in the order of `SeenObject.distances`."""
+
+Pixel = tuple[float, float]
+"""Column and row in the sight image; whole numbers are pixel centres."""
+
+
+@dataclass(frozen=True)
+class SeenObject:
+    """What was concluded of one instance of which something was visible."""
+
+    instance: int
+    object_id: int
+    visible: int
+    """Pixels of its largest component."""
+    share: float
+    """Visible share of the expected area."""
+    candidates: tuple[Pixel, Pixel, Pixel]
+    """As `CANDIDATES`."""
+    distances: tuple[float, float, float]
+    """Distance of each to the contour [px]."""
+    suction: Pixel
+    above: frozenset[int]
+    """Instances from which an edge of the clutter graph runs to this one."""
+    all_above: frozenset[int]
+    """Instances from which a path does."""
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One try to pick."""
+
+    episode: int
+    number: int
+    mode: str
+    frame: int
+    """Image from which was chosen."""
+    end_frame: int
+    sentence: str
+    """Of the outcome."""
+    target: int | None
+    tilt: float | None
+    """Of the cup [rad]; None, as `hits`: nothing was chosen."""
+    rays: int
+    hits: int
+    good_seal: bool
+    caught: tuple[int, ...]
+    picked: tuple[int, ...]
+    load: tuple[float, ...]
+    """Largest load of any seal in each tick of the lift [N]; the suction was switched on at the end of the first."""
+    resolution: tuple[int, int]
+    """Width and height of the sight image [px]."""
+    seen: tuple[SeenObject, ...]
+    votes: dict[tuple[int, int], float]
+    """(lower, upper): what the contour of the lower says for the upper lying above it."""
+
+    @property
+    def objects(self) -> dict[int, SeenObject]:
+        """Instance -> what was seen of it."""
+        return {one.instance: one for one in self.seen}
+
+    def ranked(self) -> list[SeenObject]:
+        """In the order of choice: fewest objects above, then largest share; in targeted picking the reverse."""
+        sign = -1 if self.mode == "target" else 1
+        return sorted(self.seen, key=lambda one: (sign * len(one.all_above), -sign * one.share, one.instance))
+
+
+def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attempt]:
+    """The attempts of an episode, ordered, or one of them.
+
+    Raises:
+        DatasetError: The file is missing or damaged, or has no such episode or attempt.
+    """
+    path = dataset / ATTEMPTS_FILE
+    records = _read_records(path)
+    episodes = sorted({record["episode"] for _, record in records})
+    if episode not in episodes:
+        raise DatasetError(f"{path} has no attempt of episode {episode}; {_which('episodes that have', episodes)}")
+    rows = sorted((record["attempt"], line, record) for line, record in records if record["episode"] == episode)
+    numbers = [row[0] for row in rows]
+    if number is not None and number not in numbers:
+        raise DatasetError(f"{path} has no attempt {number} of episode {episode}; {_which('attempts', numbers)}")
+    attempts = []
+    for count, line, record in rows:
+        if number in (None, count):
+            try:
+                attempts.append(_attempt(record))
+            except KeyError as error:
+                raise DatasetError(f"{path}, line {line}: the record has no {error.args[0]}") from error
+            except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
+                raise DatasetError(f"{path}, line {line}: the record of an attempt has a value of the wrong kind: {error}") from error
+    return attempts
+
+
+def _read_records(path: Path) -> list[tuple[int, dict[str, Any]]]:
+    """Line number and object of every line."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        raise DatasetError(
+            f"{path.parent} has no {path.name}: nothing was picked; explain draws attempts of a bake with mode pick, target or mixed"
+        ) from error
+    except OSError as error:
+        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path} is no text: byte {error.start} is no UTF-8") from error
+    records = []
+    for line, text in enumerate(lines, start=1):
+        try:
+            record = json.loads(text)
+        except ValueError as error:
+            raise DatasetError(f"{path}, line {line} is no JSON: {error}") from error
+        if not isinstance(record, dict) or not all(type(record.get(key)) is int for key in ("episode", "attempt")):
+            raise DatasetError(f"{path}, line {line} is no record of an attempt: it needs whole numbers episode and attempt")
+        records.append((line, record))
+    return records
+
+
+def _which(what: str, numbers: list[int]) -> str:
+    """Whole numbers, ascending, with runs put together."""
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    return f"{what}: {', '.join(f'{low}' if low == high else f'{low} to {high}' for low, high in runs) or 'none'}"
+
+
+def _attempt(record: dict[str, Any]) -> Attempt:
+    sight = record["sight"]
+    width, height = map(int, sight["resolution"])
+    if min(width, height) < 1:
+        raise ValueError(f"resolution is {width} x {height}")
+    seen = tuple(_seen(one) for one in sight["instances"] if one["visible"] > 0)
+    target = None if record["target"] is None else int(record["target"])
+    if target is not None and target not in {one.instance for one in seen}:
+        raise ValueError(f"target is {target}, which was not seen")
+    if record["mode"] not in MODE_WORDS:
+        raise ValueError(f"mode is {json.dumps(record['mode'])}")
+    return Attempt(
+        episode=record["episode"],
+        number=record["attempt"],
+        mode=record["mode"],
+        frame=int(record["frame"]),
+        end_frame=int(record["end_frame"]),
+        sentence=str(record["sentence"]),
+        target=target,
+        tilt=None if record["tilt"] is None else float(record["tilt"]),
+        rays=int(record["rays"] or 0),
+        hits=int(record["hits"] or 0),
+        good_seal=bool(record["good_seal"]),
+        caught=tuple(map(int, record["caught"])),
+        picked=tuple(map(int, record["picked"])),
+        load=tuple(map(_finite, record["load"])),
+        resolution=(width, height),
+        seen=seen,
+        votes={(int(lower), int(upper)): _finite(votes) for lower, upper, votes in sight["votes"]},
+    )
+
+
+def _seen(record: dict[str, Any]) -> SeenObject:
+    first, second, third = map(_finite, record["distances"])
+    return SeenObject(
+        instance=int(record["instance"]),
+        object_id=int(record["object_id"]),
+        visible=int(record["visible"]),
+        share=float(record["share"]),
+        candidates=(_pixel(record["pole"]), _pixel(record["centroid"]), _pixel(record["middle"])),
+        distances=(first, second, third),
+        suction=_pixel(record["suction"]),
+        above=frozenset(map(int, record["above"])),
+        all_above=frozenset(map(int, record["all_above"])),
+    )
+
+
+def _pixel(value: Any) -> Pixel:
+    column, row = map(_finite, value)
+    return column, row
+
+
+def _finite(value: Any) -> float:
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is not finite")
+    return float(value)
+
+
+def labels(attempt: Attempt) -> dict[int, str]:
+    """Short name of every seen instance: its obj_id, with a letter where several have the same."""
+    by_object: dict[int, list[int]] = {}
+    for one in attempt.seen:
+        by_object.setdefault(one.object_id, []).append(one.instance)
+    return {
+        instance: f"{object_id}{chr(ord('a') + place) if len(group) > 1 else ''}"
+        for object_id, group in by_object.items()
+        for place, instance in enumerate(group)
+    }
+
+
+def full_names(attempt: Attempt, names: Mapping[int, str]) -> dict[int, str]:
+    """Label and the object's name, where it has one."""
+    short = labels(attempt)
+    return {one.instance: f"{short[one.instance]} {names.get(one.object_id, '')}".rstrip() for one in attempt.seen}
+
+
+def suction_kind(one: SeenObject) -> int:
+    """Which of `CANDIDATES` the suction point is: the nearest, as the point is a whole pixel."""
+    return min(range(len(CANDIDATES)), key=lambda kind: math.dist(one.candidates[kind], one.suction))
+
+
+def choice_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> list[str]:
+    """What was chosen and why, and where the cup is put, in sentences."""
+    if attempt.target is None:
+        return ["target: none, nothing is visible"]
+    full = full_names(attempt, names)
+    one = attempt.objects[attempt.target]
+    kind = suction_kind(one)
+    share = one.distances[kind] / one.distances[0] if one.distances[0] else 1.0
+    where = ("pole of inaccessibility", "centroid", "half-way point")[kind] + (f", {share:.2f} of the pole's distance" if kind else "")
+    tilt = "" if attempt.tilt is None else f"; cup tilted by {abs(math.degrees(attempt.tilt)):.0f} degrees"
+    return [f"target: {full[attempt.target]}: {_reason(attempt, one, full, config)}", f"suction point: {where}{tilt}"]
+
+
+def _reason(attempt: Attempt, one: SeenObject, full: Mapping[int, str], config: Config) -> str:
+    targeted = attempt.mode == "target"
+    count = len(one.all_above)
+    above = f"{count} object{'' if count == 1 else 's'} above"
+    first = attempt.ranked()[0]
+    if first.share != one.share or len(first.all_above) != count:
+        if targeted and config.target.random_after_failure:
+            return f"{above}; drawn at random after a failed attempt"
+        return f"{above}; the rule would name {full[first.instance]}"
+    equals = sum(len(other.all_above) == count for other in attempt.seen)
+    if len(attempt.seen) == 1:
+        return f"{above}; the only object in sight"
+    if equals == 1:
+        return f"{above}, the {'most' if targeted else 'fewest'} of all"
+    return f"{above}; visible share {one.share:.2f}, the {'smallest' if targeted else 'largest'} of {equals} such"
+
+
+def seal_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> list[str]:
+    """Rays, seal, load and what hung on the cup, in sentences; none if nothing was chosen."""
+    if attempt.target is None:
+        return []
+    full = full_names(attempt, names)
+    lines = [f"rays: {attempt.hits} of {attempt.rays} hit"]
+    if attempt.hits:
+        lines[0] += f"; {'good' if attempt.good_seal else 'poor'} seal, breaks at {break_force(attempt, config):g} N"
+        peak = f"; largest load {max(attempt.load):.1f} N" if attempt.load else ""
+        lines.append(f"caught: {_listed(attempt.caught, full)}{peak}")
+        lines.append(f"picked: {_listed(attempt.picked, full)}")
+    return lines
+
+
+def break_force(attempt: Attempt, config: Config) -> float:
+    """Load at which a seal of the attempt breaks [N]."""
+    return config.suction.good_force if attempt.good_seal else config.suction.poor_force
+
+
+def _listed(instances: tuple[int, ...], full: Mapping[int, str]) -> str:
+    """An object that is caught need not be visible from camera 0."""
+    return ", ".join(full.get(instance, f"instance {instance}, unseen") for instance in instances) or "nothing"

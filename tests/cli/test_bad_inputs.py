@@ -1,0 +1,166 @@
+"""Materials, textures and light maps as users bring them: what reaches the renderer, and what the command line refuses in one line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from synpick_warp.arrays import allocate
+from synpick_warp.cli.commands import main
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Config
+from synpick_warp.scenes.appearance import read_texture
+from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.types import Catalog, Material
+from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers
+from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.render.scene import build_render_scene
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, camera, entry, even_light, sheet, snapshot
+
+TEXEL, PIXELS = 0.01, 5
+"""Width of a texel on a sheet [m], and in the picture: an odd number, so that some pixel's centre is a texel's."""
+IBL = "[Header]\nName = Room\n[Reflection]\nREFfile = room.hdr\n"
+
+
+def glb(file: Path, **material) -> Path:
+    """A box with texture coordinates and a glTF material."""
+    box = trimesh.creation.box((0.1, 0.08, 0.06))
+    box.visual = TextureVisuals(uv=np.random.default_rng(0).random((8, 2)), material=PBRMaterial(**material))
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(trimesh.Scene([box]).export(file_type="glb"))
+    return file
+
+
+def test_a_gltf_material_reaches_the_renderer(tmp_path, device):
+    """Factors times the mean of the picture that glTF keeps roughness (green) and metalness (blue) in."""
+    rough = np.zeros((4, 6, 3), np.uint8)
+    rough[:, :3], rough[:, 3:] = (9, 100, 200), (9, 200, 240)
+    glb(
+        tmp_path / "models" / "box.glb",
+        baseColorFactor=(255, 128, 0, 255),
+        baseColorTexture=Image.new("RGB", (5, 3), (200, 100, 50)),
+        metallicFactor=0.5,
+        roughnessFactor=0.8,
+        metallicRoughnessTexture=Image.fromarray(rough),
+    )
+    config = load_config(None, {"bake.models": str(tmp_path / "models")})
+    catalog = load_catalog(config, tmp_path / "cache")
+    toy = ToyScene([], [], (camera(8, 8, 8.0, (0.0, 0.0, 1.0)),))
+    scene = build_render_scene(config, catalog, toy.fixtures, toy.cameras, (even_light(),), device)
+    surfaces = scene.surfaces
+    assert surfaces.metallic.numpy()[0] == pytest.approx(0.5 * 220 / 255, abs=1e-3)
+    assert surfaces.roughness.numpy()[0] == pytest.approx(0.8 * 150 / 255, abs=1e-3)
+    # glTF's factor is linear, as are the renderer's colours.
+    assert surfaces.color.numpy()[0] == pytest.approx((1.0, 128 / 255, 0.0), abs=2e-3)
+    assert surfaces.texture_size.numpy()[0].tolist() == [5, 3]
+    assert surfaces.texel.numpy()[0] == 200 | 100 << 8 | 50 << 16
+
+
+def albedo(material: Material, rows: int, columns: int, device) -> np.ndarray:
+    """The base colour of a sheet of so many texels (rows x PIXELS, columns x PIXELS, 3) uint8, as the renderer looks it up."""
+    view = camera(PIXELS * columns, PIXELS * rows, PIXELS / TEXEL, (0.0, 0.0, 1.0))
+    toy = ToyScene([entry(sheet(TEXEL * columns, TEXEL * rows), material)], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (view,))
+    config = replace(Config(), render=replace(Config().render, table=False, layers=("albedo",)))
+    scene = build_render_scene(config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
+    layers = allocate(LayerBuffers, sizes, device, ("albedo",))
+    zero = wp.zeros(1, dtype=wp.int32, device=device)
+    Renderer(config, scene, toy.room, 1).render(snapshot(toy, device), zero, zero, 1, allocate(ViewBuffers, sizes, device), layers)
+    return layers.albedo.numpy()[0]
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (13, 5)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_textures_of_any_size_and_depth_are_looked_up_where_they_are(tmp_path, device, size, dtype):
+    """At the centre of a texel filtering gives that texel, to a grey level."""
+    largest = np.iinfo(dtype).max
+    pixels = np.random.default_rng(1).integers(0, largest + 1, (*size, 3)).astype(dtype)
+    assert cv2.imwrite(str(tmp_path / "t.png"), pixels)
+    seen = albedo(Material((1.0, 1.0, 1.0), read_texture(tmp_path / "t.png", "a.ply"), 0.0, 0.5), *size, device)
+    middle = seen[PIXELS // 2 :: PIXELS, PIXELS // 2 :: PIXELS]
+    assert middle.shape == pixels.shape
+    assert np.abs(middle - pixels[..., ::-1] / largest * 255.0).max() <= 2.0
+
+
+def test_a_mesh_without_texture_coordinates_shows_its_base_colour(device):
+    color = (0.2, 0.4, 0.6)
+    material = Material(color, None, 0.0, 0.5)
+    assert np.abs(albedo(material, 3, 3, device) - 255.0 * np.array(color)).max() <= 1.0
+
+
+def radiance(value: float = 0.5) -> np.ndarray:
+    image = np.full((8, 16, 3), 0.5, np.float32)
+    image[3, 5, 1] = value
+    return image
+
+
+def float_picture(file: Path, value: float) -> None:
+    """A picture of floats whose name says that it is a radiance map: unlike those, it can hold any number."""
+    file.write_bytes(cv2.imencode(".tiff", radiance(value))[1].tobytes())
+
+
+def truncated(file: Path) -> None:
+    data = cv2.imencode(".hdr", np.random.default_rng(0).random((32, 64, 3)).astype(np.float32))[1].tobytes()
+    file.write_bytes(data[: len(data) // 2])
+
+
+def box_models(folder: Path) -> Path:
+    folder.mkdir()
+    (folder / "box.obj").write_bytes(trimesh.creation.box((0.08, 0.06, 0.05)).export(file_type="obj").encode())
+    return folder
+
+
+def mistake(capsys, *arguments: object) -> str:
+    """Run the program, expect exit code 2 and one line, and return what it says."""
+    assert main([str(argument) for argument in arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("synpick-warp: error: ")
+    return line.removeprefix("synpick-warp: error: ")
+
+
+@pytest.mark.parametrize(
+    ("write", "said"),
+    [
+        (lambda folder: truncated(folder / "a.hdr"), "{folder}/a.hdr cannot be read as an image: it is empty, cut short or of another "),
+        (lambda folder: (folder / "a.hdr").write_text("no picture"), "{folder}/a.hdr cannot be read as an image"),
+        (lambda folder: (folder / "room.ibl").write_text(IBL), "{folder}/room.ibl names REFfile = room.hdr, which is not beside it; "),
+        (lambda folder: float_picture(folder / "a.hdr", np.nan), "{folder}/a.hdr has radiance that is infinite or not a number"),
+        (lambda folder: float_picture(folder / "a.hdr", np.inf), "{folder}/a.hdr has radiance that is infinite or not a number"),
+        (lambda folder: float_picture(folder / "a.hdr", -1.0), "{folder}/a.hdr has negative radiance (-1); replace the map"),
+        (lambda folder: None, "lights folder {folder} holds no light map; "),
+    ],
+    ids=["truncated", "text", "set without map", "nan", "inf", "negative", "empty folder"],
+)
+def test_lights_that_cannot_be_used_are_one_line(tmp_path, capsys, write, said):
+    models, folder, out = box_models(tmp_path / "models"), tmp_path / "lights", tmp_path / "deep" / "data"
+    folder.mkdir()
+    write(folder)
+    heard = mistake(
+        capsys, "bake", "--config", "smoke", "--device", "cpu", "--models", models, "--lights", folder, "--mode", "move", "--out", out
+    )
+    assert heard.startswith(said.format(folder=folder))
+    assert not out.parent.exists()
+
+
+def test_a_texture_cut_short_is_one_line(tmp_path, capsys):
+    models, out = tmp_path / "models", tmp_path / "deep" / "data"
+    models.mkdir()
+    (models / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl skin\n"
+        "f 1/1 3/2 2/3\nf 1/1 2/2 4/3\nf 1/1 4/2 3/3\nf 2/1 3/2 4/3\n"
+    )
+    (models / "a.mtl").write_text("newmtl skin\nmap_Kd t.png\n")
+    data = cv2.imencode(".png", np.random.default_rng(0).integers(0, 256, (33, 21, 3)).astype(np.uint8))[1].tobytes()
+    (models / "t.png").write_bytes(data[: len(data) // 2])
+    heard = mistake(capsys, "bake", "--config", "smoke", "--device", "cpu", "--models", models, "--mode", "move", "--out", out)
+    assert heard.startswith(f"{models}/t.png: not readable as a picture (")
+    assert not out.parent.exists()

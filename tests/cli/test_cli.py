@@ -1,0 +1,316 @@
+"""The command line: options, exit codes, one line for a mistake, nothing left behind."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+import tomllib
+import types
+from pathlib import Path
+
+import pytest
+import trimesh
+import warp as wp
+
+from synpick_warp import __version__
+from synpick_warp.cli.commands import main
+from synpick_warp.codes import Ending
+from synpick_warp.configs.load import load_config
+from synpick_warp.episodes import BakeSummary, EpisodeRow
+from synpick_warp.errors import OutputError
+
+needs_bake = pytest.mark.skipif(importlib.util.find_spec("synpick_warp.bake") is None, reason="there is no bake yet")
+
+
+def finished(number: int) -> BakeSummary:
+    rows = [EpisodeRow(episode, 0, Ending.FINISHED, 10, 1.0, "move", 9, 0, 0, 0, 9) for episode in range(number)]
+    return BakeSummary(number, rows, views=30 * number, wall_seconds=2.0, redraws=1)
+
+
+@pytest.fixture
+def bakes(monkeypatch):
+    """Stand-in for bake.py; collects what it was called with. `result` may be set to a summary or an error."""
+    module = types.ModuleType("synpick_warp.bake")
+    calls = []
+
+    def run_bake(config, out, progress, shard):
+        calls.append((config, out, shard))
+        progress.stage("building worlds")
+        progress.update(episodes_done=0, episodes=2, worlds_active=2, views=0, views_per_s=0.0, seconds_left=None)
+        progress.note("a note")
+        if isinstance(module.result, BaseException):
+            raise module.result
+        return module.result
+
+    module.result = finished(4)
+    module.calls = calls
+    module.run_bake = run_bake
+    module.describe_arrays = lambda config: [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
+    monkeypatch.setitem(sys.modules, "synpick_warp.bake", module)
+    return module
+
+
+def mistake(capsys, *arguments: str) -> str:
+    """Run, expect exit code 2 and one line, and return what it says."""
+    assert main(arguments) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("synpick-warp: error: ")
+    return lines[0].removeprefix("synpick-warp: error: ")
+
+
+def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
+    out = tmp_path / "new" / "data"
+    given = {"config": "smoke", "worlds": 3, "episodes": 4, "seed": 7, "device": "cpu", "resolution": "64x48", "writers": 1, "mode": "move"}
+    arguments = [f"--{name}={value}" for name, value in given.items()]
+    assert main(["bake", "--out", str(out), *arguments, "--set", "move.speed=0.2", "--set", "bake.seed=1"]) == 0
+    [(config, folder, shard)] = bakes.calls
+    assert (folder, shard) == (out, (0, 1))
+    expected = {"bake.worlds": 3, "bake.episodes": 4, "bake.seed": 7, "bake.device": "cpu", "bake.writers": 1}
+    assert config == load_config("smoke", expected | {"cameras.resolution": [64, 48], "move.speed": 0.2})
+    printed = capsys.readouterr().out
+    assert "building worlds\n" in printed
+    assert "episodes 0/2 · worlds 2 · views 0" in printed
+    assert "4 of 4 episodes and 120 views in 0:02 (60.0 views/s); arrangements drawn again: 1" in printed
+
+
+def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, capsys):
+    bakes.result = finished(2)
+    bakes.result.episodes[1] = bakes.result.episodes[1]._replace(redraw=19, ending=Ending.UNSETTLED, frames=0)
+    assert main(["bake", "--out", str(tmp_path / "a"), "--device", "cpu", "--episodes", "2"]) == 1
+    assert "did not come to rest" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--worlds", "0"], "bake.worlds is 0 on the command line; allowed: at least 1, at most 65536"),
+        (["--episodes", "0"], "bake.episodes is 0 on the command line; allowed: at least 1"),
+        (["--worlds", "many"], 'Invalid value for --worlds: unable to convert "many" into int.'),
+        (["--resolution", "0x0"], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
+        (["--resolution", "640"], '--resolution is "640"; allowed: WIDTHxHEIGHT in pixels, such as 640x360'),
+        (["--resolution", "640x-1"], '--resolution is "640x-1"; allowed: WIDTHxHEIGHT in pixels, such as 640x360'),
+        (["--mode", "juggle"], 'bake.mode is "juggle" on the command line; allowed: pick, target, move, mixed'),
+        (["--mode", "mvoe"], 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed; did you mean move?'),
+        (["--mode", ""], 'bake.mode is "" on the command line; allowed: pick, target, move, mixed'),
+        (["--mode", "mixed", "--set", "bake.mix=[0, 0, 0]"], "bake.mix is [0.0, 0.0, 0.0] on the command line; allowed: at least one "),
+        (["--mode", "mixed", "--set", "bake.mix=pick"], 'bake.mix is "pick" on the command line; allowed: 3 numbers in a list'),
+        (["--set", "suction.poor_force=50"], "suction.poor_force is 50.0 on the command line; allowed: at most suction.good_force, 40 [N]"),
+        (["--device", "tpu"], 'bake.device is "tpu"; allowed: cpu, cuda:N such as cuda:0, or auto'),
+        (["--models", "no-such"], "there is no models folder no-such; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes"),
+        (["--lights", "no-such"], "there is no lights folder no-such; --lights takes a folder of .hdr maps and sIBL sets"),
+        (["--config", "no-such.toml"], "there is no file no-such.toml; give a .toml file or a preset: smoke, synpick, synpick-released"),
+        (["--config", "smook"], 'there is no preset "smook"; presets: smoke, synpick, synpick-released; '),
+        (["--set", "physics.stepp=1"], "there is no key physics.stepp, set on the command line; keys of physics: step, "),
+        (["--set", "physics.step"], "--set physics.step has no value; "),
+        (["--wrlds", "3"], "Unknown option: --wrlds. Did you mean --worlds?"),
+        (["extra"], "Unused Tokens: ['extra']."),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, bakes, capsys, monkeypatch, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    device = [] if "--device" in arguments else ["--device", "cpu"]
+    assert mistake(capsys, "bake", "--out", "deep/data", *device, *arguments).startswith(said)
+    assert not bakes.calls
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(wp.get_cuda_device_count() > 0, reason="this machine has a GPU")
+def test_a_gpu_that_is_not_there(tmp_path, bakes, capsys):
+    said = mistake(capsys, "bake", "--out", str(tmp_path / "data"), "--device", "cuda:0")
+    assert said == "cuda:0 was asked for, but Warp finds no CUDA device here; use --device cpu"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_key_in_a_file(tmp_path, bakes, capsys):
+    (tmp_path / "my.toml").write_text("[bake]\nworld = 3\n")
+    said = mistake(capsys, "bake", "--out", str(tmp_path / "data"), "--config", str(tmp_path / "my.toml"))
+    assert said.startswith(f"there is no key bake.world, set in {tmp_path / 'my.toml'}; keys of bake: mode, mix, worlds, ")
+    assert said.endswith("did you mean worlds?")
+
+
+@pytest.mark.parametrize("arguments", [["bake"], ["bake", "--out"], ["bkae"], ["preview"], ["--frobnicate"]])
+def test_incomplete_command_lines(capsys, arguments):
+    mistake(capsys, *arguments)
+
+
+def test_formats_and_share_are_passed_on(tmp_path, bakes):
+    assert main(["bake", "--device=cpu", f"--out={tmp_path}", "--formats=zarr, bop", "--shard=1/3"]) == 0
+    [(config, _, shard)] = bakes.calls
+    assert config.bake.formats == ("zarr", "bop")
+    assert shard == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("--formats=bop,obj", 'bake.formats is ["bop", "obj"] on the command line; allowed: any of bop, shards, usd, zarr'),
+        ("--shard=3", '--shard is "3"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
+        ("--shard=4/4", '--shard is "4/4"; allowed: i/n with i from 0 to n - 1, such as 0/4'),
+        ("--shard=4/8", "--shard 4/8 has none of 4 episodes; use fewer shards"),
+    ],
+)
+def test_formats_and_shares_that_are_not_there(tmp_path, bakes, capsys, option, said):
+    assert mistake(capsys, "bake", "--device=cpu", f"--out={tmp_path}", option) == said
+
+
+def test_a_stopped_bake_says_how_to_go_on(tmp_path, bakes, capsys):
+    bakes.result = finished(4)
+    bakes.result.stopped = 2
+    assert main(["bake", "--device=cpu", f"--out={tmp_path}"]) == 130
+    assert capsys.readouterr().err.endswith("interrupted: 4 of 4 episodes are whole; the same command goes on with the others\n")
+
+
+def test_output_folder_that_is_not_empty(tmp_path, bakes, capsys):
+    (tmp_path / "mine.txt").write_text("precious")
+    said = mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path))
+    assert said == f"{tmp_path} is not empty; --out takes a new or an empty folder, or a data set to go on with"
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
+    assert not bakes.calls
+
+
+def test_output_folder_that_is_a_file(tmp_path, bakes, capsys):
+    (tmp_path / "file").write_text("precious")
+    said = mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "file"))
+    assert said == f"{tmp_path / 'file'} is a file; --out takes a new or an empty folder"
+    said = mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "file" / "data"))
+    assert said.startswith(f"cannot write {tmp_path / 'file' / 'data'}: Not a directory; ")
+
+
+def test_output_folder_that_cannot_be_written(tmp_path, bakes, capsys):
+    if os.geteuid() == 0:
+        pytest.skip("root may write everywhere")
+    tmp_path.chmod(0o500)
+    assert ": Permission denied; " in mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "data"))
+
+
+def test_a_mistake_found_while_baking_takes_empty_folders_away_again(tmp_path, bakes, capsys):
+    bakes.result = OutputError("the disk\nis full")
+    assert mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path / "a" / "b")) == "the disk is full"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_empty_folder_is_used_and_kept(tmp_path, bakes, capsys):
+    bakes.result = OutputError("no")
+    mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path))
+    assert tmp_path.is_dir()
+
+
+def test_interrupt(tmp_path, bakes, capsys):
+    bakes.result = KeyboardInterrupt()
+    assert main(["bake", "--device", "cpu", "--out", str(tmp_path / "data")]) == 130
+    assert capsys.readouterr().err == "synpick-warp: interrupted\n"
+
+
+def test_a_fault_of_ours_keeps_its_traceback(tmp_path, bakes):
+    bakes.result = ZeroDivisionError()
+    with pytest.raises(ZeroDivisionError):
+        main(["bake", "--device", "cpu", "--out", str(tmp_path / "data")])
+
+
+def test_help_shows_units_and_defaults(capsys):
+    assert main(["bake", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "default 1920x1080 px; cameras.resolution" in text
+    assert "Totes simulated side by side; a GPU has at least 8. (at least 1, at most 65536; default 4; bake.worlds)" in text
+
+
+def test_help_says_how_modes_are_mixed(capsys):
+    assert main(["bake", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "Weights of mixed: --set bake.mix=[pick, target, move]" in text
+    assert "(pick, target, move, mixed; default pick; bake.mode)" in text
+
+
+@pytest.mark.parametrize("mode", ["pick", "target", "move", "mixed"])
+def test_every_mode_is_passed_on(tmp_path, bakes, mode):
+    assert main(["bake", "--out", str(tmp_path), "--device", "cpu", "--mode", mode, "--set", "bake.mix=[1, 2, 0]"]) == 0
+    [(config, *_)] = bakes.calls
+    assert (config.bake.mode, config.bake.mix) == (mode, (1.0, 2.0, 0.0))
+
+
+def test_config_prints_what_it_would_use(capsys):
+    assert main(["config", "--config", "smoke", "--set", "move.force=12"]) == 0
+    document = tomllib.loads(capsys.readouterr().out)
+    assert document["move"]["force"] == 12.0
+    assert document["arrangement"]["volume"] == load_config("smoke", {}).arrangement.volume
+
+
+def test_doctor(capsys, bakes):
+    assert main(["doctor", "--worlds", "16", "--resolution", "640x360", "--device", "cpu"]) == 0
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("newton", "numpy", "warp-lang", "processor cores", "kernel cache"))
+    assert all(word in text for word in ("16 worlds, 640x360", "Snapshot.pose", "16 x 24", "2.00"))
+
+
+COMMAND = [sys.executable, "-c", "import sys; from synpick_warp.cli import main; sys.exit(main())"]
+
+
+def test_version():
+    result = subprocess.run([*COMMAND, "--version"], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == __version__
+
+
+def test_a_reader_that_leaves_is_no_fault():
+    reader, writer = os.pipe()
+    os.close(reader)
+    result = subprocess.run([*COMMAND, "config"], stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writer)
+    assert (result.returncode, result.stderr) == (141, "")
+
+
+PLY_HEAD = "ply\nformat ascii 1.0\n{comment}element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+
+
+@needs_bake
+@pytest.mark.parametrize(
+    "ply",
+    [
+        PLY_HEAD.format(comment="") + "end_header\n0 0 0\n9 0 0\n0 9 0\n",
+        PLY_HEAD.format(comment="comment TextureFile gone.png\n")
+        + "property float texture_u\nproperty float texture_v\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        + "0 0 0 0 0\n9 0 0 1 0\n0 9 0 0 1\n3 0 1 2\n",
+    ],
+    ids=["no faces", "no texture file"],
+)
+def test_models_that_cannot_be_used(tmp_path, capsys, ply):
+    models = tmp_path / "models"
+    models.mkdir()
+    (models / "models_info.json").write_text('{"1": {"diameter": 12.7}}')
+    (models / "obj_000001.ply").write_text(ply)
+    said = mistake(capsys, "bake", "--config", "smoke", "--device", "cpu", "--models", str(models), "--out", str(tmp_path / "data"))
+    assert "obj_000001.ply" in said
+    assert not (tmp_path / "data").exists()
+
+
+def boxes(folder: Path, *sides: float) -> None:
+    """A folder of cubes with these sides [m], as OBJ files."""
+    folder.mkdir()
+    for number, side in enumerate(sides):
+        (folder / f"cube_{number}.obj").write_bytes(trimesh.creation.box((side, side, side)).export(file_type="obj").encode())
+
+
+@needs_bake
+@pytest.mark.parametrize(
+    ("sides", "settings", "said"),
+    [
+        ((), "", "models folder {models}: no models in it; "),
+        ((0.05, 0.6), "", "cube_1: too large for the tote: 0.6 x 0.6 x 0.6 m, 1.039 m from end to end, but the tote's opening is "),
+        ((0.05, 50.0), "", "cube_1: too large for the tote: 50 x 50 x 50 m, "),
+        ((0.25, 0.2), "", "arrangement.volume is 0.003 m³, but the smallest object, cube_1, takes 0.008 m³; make it larger"),
+        ((0.05,), '[[object_rows]]\nid = 1\nname = "cube_0"\ndiameter = 0.0866\nmass = 0\n', "object_rows[0].mass is 0 in {file}; "),
+        ((0.05,), '[[object_rows]]\nid = 1\nname = "cube_0"\ndiameter = 0.0866\nmass = 1e-30\n', "cube_0: mass 1e-30 kg in its row "),
+        ((0.05,), "[objects]\ndensity = 1e-12\n", "cube_0: mass 1.25e-16 kg by objects.density; "),
+    ],
+    ids=["empty", "too large", "millimetres", "over budget", "no mass", "hardly a mass", "hardly a density"],
+)
+def test_objects_that_cannot_be_baked(tmp_path, capsys, sides, settings, said):
+    """One line, before anything is simulated, and nothing in the data set's place."""
+    models, file, out = tmp_path / "models", tmp_path / "my.toml", tmp_path / "deep" / "data"
+    boxes(models, *sides)
+    file.write_text(f'preset = "smoke"\n{settings}')
+    heard = mistake(capsys, "bake", "--config", str(file), "--device", "cpu", "--models", str(models), "--out", str(out))
+    assert heard.startswith(said.format(models=models, file=file))
+    assert not out.parent.exists()

@@ -1,0 +1,90 @@
+"""What people see of a bake, and at its end."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from synpick_warp.cli.display import LiveProgress, PlainProgress, print_summary
+from synpick_warp.codes import Ending, Outcome
+from synpick_warp.episodes import BakeSummary, EpisodeRow
+from synpick_warp.progress import Progress, SilentProgress
+
+
+def row(episode: int, redraw: int, ending: Ending, frames: int, seconds: float, mode: str = "move", *counts: int) -> EpisodeRow:
+    return EpisodeRow(episode, redraw, ending, frames, seconds, mode, *(counts or (9, 0, 0, 0, 9)))
+
+
+def printed(summary: BakeSummary) -> str:
+    console = Console(file=io.StringIO(), width=120)
+    print_summary(console, summary, Path("data"))
+    return console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_short_bake_lists_every_episode():
+    rows = [row(0, 0, Ending.FINISHED, 120, 61.0), row(1, 2, Ending.FINISHED, 119, 3661.0)]
+    text = printed(BakeSummary(len(rows), rows, views=717, wall_seconds=10.0))
+    assert "1:01 " in text
+    assert "1:01:01" in text
+    assert text.count(Ending.FINISHED.sentence) == 2
+    assert "attempts" not in text
+    assert "picked" not in text
+
+
+def test_a_bake_that_picked_tells_of_attempts():
+    rows = [
+        row(0, 0, Ending.EMPTIED, 573, 38.2, "pick", 9, 10, 9, 0, 0),
+        row(1, 0, Ending.GAVE_UP, 90, 6.0, "target", 8, 4, 2, 1, 5),
+        row(2, 0, Ending.FINISHED, 416, 27.7),
+    ]
+    outcomes = Counter({Outcome.DROPPED: 3, Outcome.TARGET_PICKED: 10, Outcome.OTHER_PICKED: 1})
+    text = printed(BakeSummary(len(rows), rows, views=3000, wall_seconds=10.0, outcomes=outcomes))
+    lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines()]
+    assert [line[-3:] for line in lines if line and line[0] in "012"][:2] == [["10", "9 of 9", "0"], ["4", "2 of 8", "1"]]
+    assert {line[1] for line in lines if line and line[1]} == {"pick", "target", "move"}
+    expected = "14 attempts: target picked 10 (71%), dropped 3 (21%), other picked 1 (7%); 11 of 17 objects picked, 1 lost otherwise"
+    assert expected in text.splitlines()
+
+
+def test_a_long_bake_lists_counts_and_failures():
+    rows = [row(episode, 0, Ending.NOT_FINITE if episode % 4 == 0 else Ending.FINISHED, 5, 1.0) for episode in range(100)]
+    text = printed(BakeSummary(len(rows), rows, views=1500, wall_seconds=10.0))
+    assert text.count(Ending.FINISHED.sentence) == 1
+    assert text.count(Ending.NOT_FINITE.sentence) == 1 + 20
+    assert "and 5 more that delivered nothing" in text
+    assert "75 of 100 episodes" in text
+
+
+@pytest.mark.parametrize("kind", [LiveProgress, PlainProgress])
+def test_progress_displays(kind):
+    console = Console(file=io.StringIO(), width=120, highlight=False, force_terminal=kind is LiveProgress)
+    progress: Progress = kind(console)
+    with progress:
+        progress.stage("baking [bold]")
+        for done in range(50):
+            progress.update(episodes_done=done, episodes=50, worlds_active=4, views=done, views_per_s=3.0, seconds_left=90.0)
+        progress.note("note [x]")
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "note [x]" in text
+    assert "1:30 left" in text
+    if kind is PlainProgress:
+        lines = ["baking [bold]", "episodes 0/50 · worlds 4 · views 0 · 3.0 views/s · 1:30 left", "note [x]"]
+        assert text.splitlines() == [f"   0:00  {line}" for line in lines]
+
+
+def test_silence():
+    with SilentProgress() as progress:
+        progress.stage("a")
+        progress.update(episodes_done=0, episodes=1, worlds_active=1, views=0, views_per_s=0.0, seconds_left=None)
+        progress.note("b")
+
+
+def test_what_was_there_before_is_told_apart():
+    text = printed(
+        BakeSummary(3, [row(number, 0, Ending.FINISHED, 10, 1.0) for number in range(3)], views=30, wall_seconds=10.0, resumed=2)
+    )
+    assert "3 of 3 episodes (2 of them before) and 30 views in 0:10 (3.0 views/s)" in text

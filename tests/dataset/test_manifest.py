@@ -1,0 +1,133 @@
+"""What a data set says of its making: which settings bind, how differences are told, what counts as whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from synpick_warp.configs.load import load_config, settings_of
+from synpick_warp.configs.schema import Config
+from synpick_warp.dataset import manifest
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.writing.checksums import files_below, write_record
+from synpick_warp.scenes.embedded.skies import skies
+from tests.worlds.small_worlds import catalog, settings
+
+
+def changed(key: str) -> Config:
+    """Settings of which one is another than in `settings()`, whatever it is."""
+    config = settings()
+    section, name = key.split(".")
+    part = getattr(config, section)
+    value = getattr(part, name)
+    return dataclasses.replace(config, **{section: dataclasses.replace(part, **{name: other(value)})})
+
+
+def other(value: object) -> object:
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, tuple):
+        return (other(value[0]), *value[1:]) if value else ("x",)
+    return f"{value}x" if isinstance(value, str) else value + 1  # type: ignore[operator]
+
+
+def keys() -> Iterator[str]:
+    config = settings()
+    for section in dataclasses.fields(config):
+        if section.name != "object_rows":
+            yield from (f"{section.name}.{name}" for name in settings_of(type(getattr(config, section.name))))
+
+
+@pytest.mark.parametrize("key", list(keys()))
+def test_every_setting_binds_but_the_free_ones(key):
+    said = manifest.describe_differences(manifest.make_manifest(changed(key)), manifest.make_manifest(settings()))
+    assert said.startswith(f"{key} is ") if key not in manifest.FREE else said == ""
+
+
+def test_free_settings_exist():
+    assert set(manifest.FREE) <= set(keys())
+
+
+def test_the_order_of_formats_is_of_no_account():
+    one, two = (manifest.make_manifest(settings(bake__formats=given)) for given in (["zarr", "bop"], ["bop", "zarr", "bop"]))
+    assert one == two
+
+
+def test_a_table_of_objects_binds(tmp_path):
+    path = tmp_path / "my.toml"
+    path.write_text('preset = "smoke"\n[[object_rows]]\nid = 1\ndiameter = 0.1\n')
+    assert manifest.make_manifest(load_config(str(path), {})) != manifest.make_manifest(load_config("smoke", {}))
+
+
+def test_versions_bind():
+    content = manifest.make_manifest(settings())
+    assert all(content["versions"].values())
+    later = content | {"versions": content["versions"] | {"newton": "1.9.0"}}
+    assert manifest.describe_differences(later, content) == f'versions.newton is "1.9.0", there "{content["versions"]["newton"]}"'
+
+
+def test_a_manifest_comes_back(tmp_path):
+    content = manifest.make_manifest(settings())
+    (tmp_path / manifest.MANIFEST_FILE).write_bytes(manifest.encode_manifest(content))
+    assert manifest.read_manifest(tmp_path) == content
+    assert content["seed"] == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("{", "is damaged"), ("[]", "it has no object"), ('{"format": 9}', "has the format 9; this version reads 1"),
+     ('{"format": 1, "settings": {}, "settings_checksum": "0"}', "changed by hand")],
+)  # fmt: skip
+def test_manifests_that_are_none(tmp_path, text, said):
+    (tmp_path / manifest.MANIFEST_FILE).write_text(text)
+    with pytest.raises(DatasetError, match=said):
+        manifest.read_manifest(tmp_path)
+
+
+def test_inputs_are_known_by_their_content():
+    known = manifest.digest_inputs(catalog(), skies())
+    assert known == manifest.digest_inputs(catalog(), skies())
+    entry = catalog().entries[1]
+    heavier = dataclasses.replace(catalog(), entries=(*catalog().entries[:1], dataclasses.replace(entry, mass=9.0), *catalog().entries[2:]))
+    assert manifest.digest_inputs(heavier, skies())["objects"] != known["objects"]
+    brighter = (dataclasses.replace(skies()[0], radiance=skies()[0].radiance * np.float32(2)), *skies()[1:])
+    digests = manifest.digest_inputs(catalog(), brighter)
+    assert (digests["objects"], digests["lights"] != known["lights"]) == (known["objects"], True)
+
+
+def test_a_record_has_every_file_once_and_is_whole_while_they_are_there(tmp_path):
+    (tmp_path / "a" / "deep").mkdir(parents=True)
+    (tmp_path / "manifest").mkdir()
+    for name in ("a/deep/two", "a/one", "three"):
+        (tmp_path / name).write_text(name)
+    place = manifest.episode_place(7)
+    given = [manifest.Path("three"), manifest.Path("a"), manifest.Path("a/one")]
+    assert [str(path) for path in files_below(tmp_path, given)] == ["a/deep/two", "a/one", "three"]
+    assert not manifest.seems_whole(tmp_path, place)
+    write_record(tmp_path, place, given, {"row": {"frames": 3}})
+    record = manifest.read_record(tmp_path, place)
+    assert record is not None
+    assert (record["row"], record["files"], record["bytes"]) == ({"frames": 3}, 3, 20)
+    assert list(manifest.read_checksums(tmp_path, place)) == ["a/deep/two", "a/one", "three"]
+    assert manifest.recorded_episodes(tmp_path) == [7]
+    assert manifest.seems_whole(tmp_path, place)
+    (tmp_path / "a/one").write_text("longer")
+    assert not manifest.seems_whole(tmp_path, place)
+    (tmp_path / "a/one").unlink()
+    assert not manifest.seems_whole(tmp_path, place)
+
+
+def test_a_list_that_does_not_fit_its_record(tmp_path):
+    (tmp_path / "manifest").mkdir()
+    (tmp_path / "file").write_text("x")
+    place = manifest.CONSTANTS
+    write_record(tmp_path, place, [manifest.Path("file")], {})
+    path = tmp_path / "manifest" / "constants.sha256"
+    path.write_text(path.read_text().replace("file", "elif"))
+    with pytest.raises(DatasetError, match="does not fit"):
+        manifest.read_checksums(tmp_path, place)
+    assert json.loads((tmp_path / "manifest" / "constants.json").read_text())["files"] == 1

@@ -1,0 +1,329 @@
+"""Bakes that are killed, stopped or fail, and go on: what is there in the end is what an undisturbed bake makes."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.cli.commands import main
+from synpick_warp.dataset import writing
+from synpick_warp.dataset.manifest import CONSTANTS, episode_place, read_checksums, recorded_episodes
+from synpick_warp.dataset.merge import merge
+from synpick_warp.dataset.verify import verify
+from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.exporters.writing.files import PARTIAL
+from tests.harness.bake_server import TINY, BakeServer
+
+KILLS = 20
+EPISODES = TINY["bake.episodes"]
+PAGE = os.sysconf("SC_PAGE_SIZE")
+FILES_OF_THE_MANIFEST = 2 + 2 * (EPISODES + 2)
+"""Settings, manifest and records have no checksum of their own."""
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[BakeServer]:
+    with BakeServer() as server:
+        yield server
+
+
+@pytest.fixture(scope="module")
+def whole(server, tmp_path_factory) -> Path:
+    """An undisturbed bake."""
+    out = tmp_path_factory.mktemp("whole") / "set"
+    assert server.bake(out, warm=True) == 0
+    return out
+
+
+@pytest.fixture(scope="module")
+def expected(whole) -> dict[str, str]:
+    return digests(whole)
+
+
+def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_bake(server, expected, tmp_path):
+    """The time of each kill is drawn anew; whenever a bake comes to its end in between, another folder is begun. The longest time to a kill
+    follows the bakes that end: a machine may be busy while the first is timed."""
+    numbers = random.Random(0)
+    started = time.monotonic()
+    assert server.bake(tmp_path / "timed") == 0
+    longest = time.monotonic() - started
+    kills = finished = 0
+    while kills < KILLS or (tmp_path / f"set {finished}").exists():
+        out = tmp_path / f"set {finished}"
+        started = time.monotonic()
+        process = server.start(out)
+        if kills < KILLS:
+            kill_after(process, numbers.uniform(0.0, longest))
+        code = server.wait()
+        assert code in (0, -signal.SIGKILL)
+        kills += code != 0
+        if code == 0:
+            assert digests(out) == expected
+            finished += 1
+            longest = min(longest, 2.0 * (time.monotonic() - started))
+
+
+def kill_after(process: int, seconds: float) -> None:
+    """Kill a process, or see it end before."""
+    end = time.monotonic() + seconds
+    with contextlib.suppress(ProcessLookupError):
+        while time.monotonic() < end:
+            os.kill(process, 0)
+            time.sleep(0.01)
+        os.kill(process, signal.SIGKILL)
+
+
+@pytest.fixture(scope="module")
+def changes(server, whole, tmp_path_factory) -> int:
+    """How often an undisturbed bake opens a file of its folder for writing, renames or removes one, or makes or removes a folder."""
+    folder = tmp_path_factory.mktemp("counted")
+    assert server.bake(folder / "set", alone=True, count=str(folder / "count")) == 0
+    assert digests(folder / "set") == digests(whole)
+    return int((folder / "count").read_text())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.4, 0.97, 0.995])
+def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected, changes, tmp_path, share):
+    """All files are written by the process that is killed, so that it is known where: at the beginning, amid files, amid lists."""
+    out = tmp_path / "set"
+    assert server.bake(out, alone=True, kill_at=1 + round(share * changes)) == -signal.SIGKILL
+    server.bake(out, alone=True, kill_at=round((1.0 - share) * changes / 2))
+    assert server.bake(out, alone=True) == 0
+    assert digests(out) == expected
+
+
+def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expected, tmp_path):
+    log = tmp_path / "log"
+    changed = {"physics.friction": 0.4, "bake.seed": 3, "bake.worlds": 1}
+    assert server.bake(whole, settings=changed, log=str(log)) == 2
+    (line,) = log.read_text().splitlines()
+    assert line.startswith(f"synpick-warp: error: {whole} was begun with other settings: ")
+    assert "bake.seed is 3, there 0; physics.friction is 0.4, there 0.5; " in line
+    assert "worlds" not in line
+    log.unlink()
+    assert server.bake(whole, settings={"bake.episodes": 2}, log=str(log)) == 2
+    assert "bake.episodes is 2, but" in log.read_text()
+    assert digests(whole) == expected
+
+
+def test_a_data_set_can_grow_with_other_worlds_and_writers(server, expected, tmp_path):
+    out = tmp_path / "set"
+    free = {"bake.worlds": 1, "bake.writers": 2, "render.views_per_batch": 2}
+    assert server.bake(out, settings={"bake.episodes": 2, **free}) == 0
+    assert verify(out).finished
+    assert server.bake(out) == 0
+    assert digests(out) == expected
+
+
+def test_shares_are_joined_to_what_one_bake_makes(server, expected, tmp_path):
+    parts = [tmp_path / str(part) for part in range(3)]
+    for part, folder in enumerate(parts):
+        assert server.bake(folder, arguments=["--shard", f"{part}/3"]) == 0
+        assert recorded_episodes(folder) == list(range(part, EPISODES, 3))
+        assert verify(folder).finished
+    merged = merge(parts, tmp_path / "set")
+    assert (merged.episodes, merged.missing) == (EPISODES, [])
+    assert digests(tmp_path / "set") == expected
+    assert verify(tmp_path / "set") == ("", EPISODES, len(expected) - FILES_OF_THE_MANIFEST, True)
+
+
+def test_a_part_that_lacks_episodes_is_joined_and_goes_on(server, expected, tmp_path):
+    assert server.bake(tmp_path / "part", arguments=["--shard", "1/2"]) == 0
+    merged = merge([tmp_path / "part"], tmp_path / "set")
+    assert (merged.episodes, merged.missing) == (2, [0, 2])
+    assert server.bake(tmp_path / "set") == 0
+    assert digests(tmp_path / "set") == expected
+
+
+def test_parts_that_do_not_fit(server, whole, tmp_path):
+    assert server.bake(tmp_path / "other", settings={"bake.seed": 1, "bake.episodes": 1}) == 0
+    with pytest.raises(DatasetError, match=r"was made with other settings than .*: bake.seed is 1, there 0"):
+        merge([whole, tmp_path / "other"], tmp_path / "set")
+    with pytest.raises(DatasetError, match=r"has no manifest\.json"):
+        merge([whole, tmp_path], tmp_path / "set")
+    assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_once_it_finishes_what_is_whole(server, expected, tmp_path, number):
+    out, log = tmp_path / "set", tmp_path / "log"
+    process = server.start(out, log=str(log), settings={"bake.worlds": 1})
+    wait_for(lambda: len(recorded_episodes(out)) >= 1)
+    os.kill(process, number)
+    assert server.wait() == 128 + number
+    there = recorded_episodes(out)
+    assert 1 <= len(there) < EPISODES
+    said = log.read_text()
+    assert "stopping after this tick" in said
+    assert f"interrupted: {len(there)} of {EPISODES} episodes are whole" in said
+    verdict = verify(out)
+    assert (verdict.problem, verdict.finished) == ("", False)
+    assert not (out / PARTIAL).exists()
+    assert server.bake(out) == 0
+    assert digests(out) == expected
+
+
+def test_stopped_twice_it_ends_at_once(server, expected, tmp_path):
+    out, log = tmp_path / "set", tmp_path / "log"
+    process = server.start(out, log=str(log))
+    wait_for(lambda: any((out / PARTIAL).rglob("*.png")))
+    os.kill(process, signal.SIGINT)
+    wait_for(lambda: log.exists() and "stopping" in log.read_text())
+    os.kill(process, signal.SIGINT)
+    assert server.wait() == 130
+    assert server.bake(out) == 0
+    assert digests(out) == expected
+
+
+# ---- when something fails ----
+
+
+def test_a_writer_that_is_killed(server, expected, tmp_path):
+    out, log = tmp_path / "set", tmp_path / "log"
+    process = server.start(out, log=str(log))
+    wait_for(lambda: len(recorded_episodes(out)) >= 1)
+    (writer,) = children(process)
+    os.kill(writer, signal.SIGKILL)
+    goes_on_after(server, out, log, expected, "a writer process was ended by SIGKILL")
+
+
+def test_the_folder_is_removed(server, expected, tmp_path):
+    out, log = tmp_path / "set", tmp_path / "log"
+    server.start(out, log=str(log))
+    wait_for(lambda: len(recorded_episodes(out)) >= 1)
+    out.rename(tmp_path / "moved")
+    assert server.wait() == 2
+    assert log.read_text().splitlines()[-1] == f"synpick-warp: error: {out} was removed while the bake wrote to it"
+    assert not out.exists()
+    assert server.bake(tmp_path / "moved") == 0
+    assert digests(tmp_path / "moved") == expected
+
+
+def test_a_file_that_cannot_be_written(server, expected, tmp_path):
+    """Files of so many bytes cannot be had, as on a full disk: pictures can, an episode's lists cannot."""
+    out, log = tmp_path / "set", tmp_path / "log"
+    assert server.bake(out, settings={"bake.episodes": 2}) == 0
+    server.start(out, log=str(log), alone=True, most_bytes=10_000)
+    goes_on_after(server, out, log, expected, "cannot write ")
+
+
+def test_a_full_disk(server, expected, small_disk):
+    out, log = small_disk / "set", small_disk.parent / "log"
+    server.start(out, log=str(log))
+    assert server.wait() == 2
+    said = log.read_text().splitlines()[-1]
+    assert said.startswith("synpick-warp: error: cannot write ")
+    assert "No space left on device" in said
+    there = recorded_episodes(out)
+    assert 1 <= len(there) < EPISODES
+    assert verify(out).problem == ""
+    assert not (out / PARTIAL).exists()
+    subprocess.run(["mount", "-o", "remount,size=50m", small_disk], check=True)
+    assert server.bake(out) == 0
+    assert digests(out) == expected
+
+
+def goes_on_after(server: BakeServer, out: Path, log: Path, expected: dict[str, str], said: str) -> None:
+    """The bake that runs ends with one line and exit code 2; whole episodes stay, and the next goes on."""
+    assert server.wait() == 2
+    assert log.read_text().splitlines()[-1].startswith(f"synpick-warp: error: {said}")
+    there = recorded_episodes(out)
+    assert 1 <= len(there) < EPISODES
+    assert verify(out).problem == ""
+    assert not (out / PARTIAL).exists()
+    assert server.bake(out) == 0
+    assert digests(out) == expected
+
+
+@pytest.fixture
+def small_disk(whole, tmp_path) -> Iterator[Path]:
+    """A file system with room for half of the episodes, and a little more."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    constants, episodes = (
+        sum(-(-(whole / name).stat().st_size // PAGE) * PAGE for place in places for name in read_checksums(whole, place))
+        for places in ([CONSTANTS], [episode_place(number) for number in range(EPISODES)])
+    )
+    size = f"size={(constants + 0.6 * episodes) / 1024:.0f}k"
+    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", folder], capture_output=True).returncode:
+        pytest.skip("mounting needs root")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def children(process: int) -> list[int]:
+    """Numbers of a process's children."""
+    return [int(number) for number in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+
+
+# ---- verify ----
+
+
+@pytest.fixture
+def copied(whole, tmp_path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "set"))
+
+
+def test_an_undisturbed_data_set_is_as_it_was_written(whole, expected):
+    assert verify(whole) == ("", EPISODES, len(expected) - FILES_OF_THE_MANIFEST, True)
+    listed = subprocess.run(["sha256sum", "--check", "--quiet", *whole.glob("manifest/*.sha256")], cwd=whole, capture_output=True)
+    assert listed.returncode == 0
+
+
+def test_what_is_wrong_or_missing_is_named(copied, capsys):
+    def said() -> str:
+        assert main(["verify", str(copied)]) == 1
+        return capsys.readouterr().out.strip()
+
+    targets = copied / "test_targets_bop19.json"
+    targets.write_bytes(targets.read_bytes()[:-1])
+    assert said() == f"{targets} has another checksum than when it was written"
+    picture = copied / "train/000004/depth/000002.png"
+    picture.unlink()
+    assert said() == f"{picture} is missing"
+    model = copied / "models/models_info.json"
+    model.write_bytes(model.read_bytes() + b" ")
+    assert said() == f"{model} has another checksum than when it was written"
+    settings = copied / "config.toml"
+    settings.write_text(settings.read_text().replace("seed = 0", "seed = 1"))
+    assert said() == f"{settings} is not as the manifest: bake.seed is 1, there 0"
+    manifest = copied / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"friction": 0.5', '"friction": 0.6'))
+    assert main(["verify", str(copied)]) == 2
+    assert "do not fit their checksum" in capsys.readouterr().err
+
+
+def test_an_episode_that_lost_a_file_is_made_again(server, copied, expected):
+    (copied / "train/000004/depth/000002.png").unlink()
+    assert server.bake(copied) == 0
+    assert digests(copied) == expected
+
+
+def test_a_folder_is_one_bakes_at_a_time(copied, monkeypatch):
+    monkeypatch.setattr(writing, "LOCK_TIMEOUT", 0.2)
+    handle = writing.lock_folder(copied)
+    with pytest.raises(OutputError, match="another bake writes to"):
+        writing.lock_folder(copied)
+    os.close(handle)
+    os.close(writing.lock_folder(copied))

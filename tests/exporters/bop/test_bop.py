@@ -1,0 +1,369 @@
+"""BOP data sets, written by the real pool from frames of boxes, and read back with OpenCV and json."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.sensors import Effects
+from synpick_warp.errors import CatalogError, OutputError
+from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.models import encode_model, write_models
+from synpick_warp.exporters.bop.scene import SceneSettings, finish_episode, make_scene
+from synpick_warp.exporters.bop.view import RECORDS, records_block
+from synpick_warp.exporters.writing.files import prepare_output
+from synpick_warp.exporters.writing.folder import open_folder
+from synpick_warp.scenes.types import Catalog
+from tests.exporters.writing.test_rle import decode
+from tests.harness.exporter_contract import ExporterContract, digests, export, exporter_data_set, exporting, feed, finish
+from tests.worlds.box_views import OBJECT_IDS, SIZES, batches, cameras, catalog, config, ends, poses
+
+EPISODES = (0, 2)
+FRAMES = 3
+LENSES = cameras()
+VIEW = next(batches(1, (0,), 1, LENSES))
+
+
+def make(out: Path, processes: int = 2, episodes: tuple[int, ...] = EPISODES, **bop: object) -> Path:
+    return export(BopExporter, out, config(**bop), episodes, processes)
+
+
+def load(path: Path) -> object:
+    return json.loads(path.read_text())
+
+
+def light_of(episode: int) -> dict[str, object]:
+    direction = [0.0, 0.6, 0.8] if episode else None
+    return {"map": f"map {episode}", "turn": 0.5 * episode, "exposure": -0.25, "direction": direction}
+
+
+def rows():
+    """Every view of the data set: its batch, its scene and its number."""
+    for batch in batches(1, EPISODES, FRAMES, LENSES):
+        yield batch, f"{3 * int(batch.episode[0]) + int(batch.camera[0]):06d}", int(batch.frame[0])
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    return make(tmp_path_factory.mktemp("bop") / "not" / "there" / "yet")
+
+
+@pytest.fixture(scope="module")
+def split(dataset) -> Path:
+    return dataset / "train_pbr"
+
+
+def test_the_tree_is_bops_and_nothing_else(dataset, split):
+    assert {path.name for path in dataset.iterdir()} == {
+        "camera.json", "dataset_info.md", "models", "models_eval", "test_targets_bop19.json", "test_targets_bop24.json", "train_pbr",
+    }  # fmt: skip
+    assert {path.name for path in split.iterdir()} == {f"{scene:06d}" for scene in (0, 1, 2, 6, 7, 8)}
+    for scene in split.iterdir():
+        assert {path.name for path in scene.iterdir()} == {
+            "rgb", "depth", "mask", "mask_visib", "scene_camera.json", "scene_gt.json", "scene_gt_info.json", "scene_gt_coco.json",
+        }  # fmt: skip
+        names = [f"{frame:06d}" for frame in range(FRAMES)]
+        masks = {f"{name}_{index:06d}.png" for name in names for index in range(3)}
+        assert {path.name for path in (scene / "rgb").iterdir()} == {f"{name}.jpg" for name in names}
+        assert {path.name for path in (scene / "depth").iterdir()} == {f"{name}.png" for name in names}
+        assert {path.name for path in (scene / "mask").iterdir()} == masks
+        assert {path.name for path in (scene / "mask_visib").iterdir()} == masks
+
+
+def test_pictures_and_masks_come_back(split):
+    for batch, scene, frame in rows():
+        depth = cv2.imread(str(split / scene / "depth" / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert depth.dtype == np.uint16
+        np.testing.assert_array_equal(depth, batch.depth[0])
+        color = cv2.imread(str(split / scene / "rgb" / f"{frame:06d}.jpg"))[..., ::-1]
+        assert np.median(np.abs(color.astype(int) - batch.color[0])) <= 3
+        for index, instance in enumerate(np.flatnonzero(OBJECT_IDS >= 0)):
+            name = f"{frame:06d}_{index:06d}.png"
+            whole = cv2.imread(str(split / scene / "mask" / name), cv2.IMREAD_UNCHANGED)
+            seen = cv2.imread(str(split / scene / "mask_visib" / name), cv2.IMREAD_UNCHANGED)
+            assert whole.dtype == seen.dtype == np.uint8
+            np.testing.assert_array_equal(whole, np.where(batch.amodal[0] >> np.uint32(instance) & 1, 255, 0))
+            np.testing.assert_array_equal(seen, np.where(batch.instance[0] == 1 + instance, 255, 0))
+
+
+def test_camera_and_poses_are_in_millimetres_and_lead_from_model_to_camera(split):
+    corners = np.array([[0.08, -0.05, 0.03], [0.0, 0.01, -0.02]])
+    for _, scene, frame in rows():
+        camera = load(split / scene / "scene_camera.json")[str(frame)]
+        lens = LENSES[int(scene) % 3]
+        assert camera == {
+            "cam_K": lens.matrix.ravel().tolist(),
+            "cam_R_w2c": lens.rotation.ravel().tolist(),
+            "cam_t_w2c": (1000 * lens.translation).tolist(),
+            "depth_scale": 0.1,
+            "light": light_of(int(scene) // 3),
+        }
+        truth = load(split / scene / "scene_gt.json")[str(frame)]
+        assert [record["instance_id"] for record in truth] == [0, 2, 3]
+        assert [record["obj_id"] for record in truth] == [3, 7, 3]
+        for record in truth:
+            pose = poses(int(scene) // 3, frame)[record["instance_id"]].astype(np.float64)
+            world = trimesh.transformations.quaternion_matrix(pose[[6, 3, 4, 5]])[:3, :3] @ corners.T + pose[:3, None]
+            expected = 1000 * (lens.rotation @ world + lens.translation[:, None])
+            found = np.reshape(record["cam_R_m2c"], (3, 3)) @ (1000 * corners.T) + np.reshape(record["cam_t_m2c"], (3, 1))
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+def test_counts_and_boxes(split):
+    for batch, scene, frame in rows():
+        infos = load(split / scene / "scene_gt_info.json")[str(frame)]
+        assert len(infos) == 3
+        for info, instance in zip(infos, np.flatnonzero(OBJECT_IDS >= 0), strict=True):
+            whole, valid, visible = batch.pixels[0, instance].tolist()
+            assert (info["px_count_all"], info["px_count_valid"], info["px_count_visib"]) == (whole, valid, visible)
+            assert info["visib_fract"] == visible / whole
+            ys, xs = np.nonzero(batch.instance[0] == 1 + instance)
+            if visible:
+                assert info["bbox_visib"] == [xs.min(), ys.min(), np.ptp(xs), np.ptp(ys)]
+                x_min, y_min, x_max, y_max = batch.boxes[0, instance, 0].tolist()
+                assert info["bbox_obj"] == [x_min, y_min, x_max - x_min, y_max - y_min]
+            else:
+                assert info["bbox_visib"] == info["bbox_obj"] == [-1, -1, -1, -1]
+
+
+def test_the_frames_reach_the_interesting_cases(split):
+    """An object that leaves the picture to the left, and one that is partly hidden."""
+    infos = [info for scene in split.iterdir() for view in load(scene / "scene_gt_info.json").values() for info in view]
+    assert any(info["bbox_obj"][0] < 0 and info["px_count_visib"] for info in infos)
+    assert any(0 < info["visib_fract"] < 0.9 and info["bbox_obj"][0] >= 0 for info in infos)
+
+
+def test_coco_masks_and_boxes(split):
+    for scene in split.iterdir():
+        coco = load(scene / "scene_gt_coco.json")
+        assert coco["categories"] == [{"id": obj_id, "name": str(obj_id), "supercategory": "synpick"} for obj_id in SIZES]
+        assert [image["file_name"] for image in coco["images"]] == [f"rgb/{frame:06d}.jpg" for frame in range(FRAMES)]
+        assert [annotation["id"] for annotation in coco["annotations"]] == list(range(1, len(coco["annotations"]) + 1))
+        expected = []
+        for frame, infos in load(scene / "scene_gt_info.json").items():
+            for index, (info, record) in enumerate(zip(infos, load(scene / "scene_gt.json")[frame], strict=True)):
+                name = f"{int(frame):06d}_{index:06d}.png"
+                whole, seen = (cv2.imread(str(scene / kind / name), cv2.IMREAD_UNCHANGED) > 0 for kind in ("mask", "mask_visib"))
+                if seen.any():
+                    expected.append((int(frame), record["obj_id"], whole, seen, info))
+        assert len(expected) == len(coco["annotations"])
+        for annotation, (frame, obj_id, whole, seen, info) in zip(coco["annotations"], expected, strict=True):
+            assert (annotation["image_id"], annotation["category_id"], annotation["area"]) == (frame, obj_id, seen.sum())
+            ys, xs = np.nonzero(whole)
+            assert annotation["bbox"] == [xs.min(), ys.min(), np.ptp(xs) + 1, np.ptp(ys) + 1]
+            assert annotation["ignore"] == (info["visib_fract"] < 0.1)
+            np.testing.assert_array_equal(decode(annotation["segmentation"]["counts"], *annotation["segmentation"]["size"]), seen)
+
+
+def test_targets_count_visible_instances(dataset, split):
+    detect, localize = (load(dataset / f"test_targets_bop{year}.json") for year in (24, 19))
+    views = [(int(scene.name), frame) for scene in sorted(split.iterdir()) for frame in range(FRAMES)]
+    assert [(target["scene_id"], target["im_id"]) for target in detect] == views
+    expected = []
+    for scene, frame in views:
+        infos = load(split / f"{scene:06d}" / "scene_gt_info.json")[str(frame)]
+        truth = load(split / f"{scene:06d}" / "scene_gt.json")[str(frame)]
+        seen = [record["obj_id"] for record, info in zip(truth, infos, strict=True) if info["visib_fract"] >= 0.1]
+        expected += [
+            {"im_id": frame, "inst_count": seen.count(obj_id), "obj_id": obj_id, "scene_id": scene} for obj_id in sorted(set(seen))
+        ]
+    assert localize == expected
+    assert {target["inst_count"] for target in localize} == {1, 2}
+
+
+def test_camera_file(dataset):
+    record = {"width": 96, "height": 72, "fx": 288.0, "fy": 288.0, "cx": 48.0, "cy": 36.0, "depth_scale": 0.1}
+    assert load(dataset / "camera.json") == record
+
+
+@pytest.mark.parametrize("folder", ["models", "models_eval"])
+def test_models_are_plain_ply_in_millimetres(dataset, folder):
+    infos = load(dataset / folder / "models_info.json")
+    for obj_id, size in SIZES.items():
+        path = dataset / folder / f"obj_{obj_id:06d}.ply"
+        np.testing.assert_allclose(trimesh.load(path, process=False).extents, 1000 * np.array(size), rtol=1e-6)
+        header = path.read_bytes().split(b"end_header")[0].decode()
+        assert set(re.findall(r"property (?:list )?(\w+)", header)) <= {"float", "uchar", "int", "uint"}
+        assert [infos[str(obj_id)][f"size_{axis}"] for axis in "xyz"] == pytest.approx(1000 * np.array(size))
+        assert infos[str(obj_id)]["diameter"] == pytest.approx(1000 * np.linalg.norm(size))
+    assert infos["7"]["symmetries_discrete"] == [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 2, 0, 0, 0, 1]]
+    assert infos["7"]["symmetries_continuous"] == [{"axis": [0, 0, 1], "offset": [1, 0, 0]}]
+    texture = cv2.imread(str(dataset / folder / "obj_000003.png"))[..., ::-1]
+    np.testing.assert_array_equal(texture, catalog().entries[0].material.texture)
+    assert "comment TextureFile obj_000003.png" in (dataset / folder / "obj_000003.ply").read_bytes().split(b"end_header")[0].decode()
+
+
+def test_the_same_frames_give_the_same_bytes_whatever_the_number_of_processes(dataset, tmp_path):
+    for processes in (0, 2):
+        assert digests(make(tmp_path / str(processes), processes)) == digests(dataset)
+
+
+def test_effects_that_are_on_are_told_and_a_views_jpeg_quality_is_its_own(tmp_path):
+    effects = Effects(exposure_jitter=1.0, blur=(0.0, 2.0), jpeg_quality=(5, 40))
+    export(BopExporter, tmp_path / "set", replace(config(), effects=effects), (0,), 0)
+    for scene in range(3):
+        folder = tmp_path / "set/train_pbr" / f"{scene:06d}"
+        for frame in range(FRAMES):
+            record = load(folder / "scene_camera.json")[str(frame)]
+            first = float(10 * scene + frame)
+            assert record["effects"] == {"exposure": first, "blur": first + 5, "jpeg_quality": first + 8}
+            assert record["light"] == light_of(0)
+            picture = next(batch.color[0] for batch, name, number in rows() if name == f"{scene:06d}" and number == frame)
+            quality = (cv2.IMWRITE_JPEG_QUALITY, int(first) + 8)
+            expected = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), quality)[1].tobytes()
+            assert (folder / "rgb" / f"{frame:06d}.jpg").read_bytes() == expected
+
+
+def test_png_colour_without_masks_and_coco(tmp_path):
+    out = make(tmp_path / "set", episodes=(0,), split="test", color_format="png", masks=False, coco=False)
+    batch = VIEW
+    np.testing.assert_array_equal(cv2.imread(str(out / "test/000000/rgb/000000.png"))[..., ::-1], batch.color[0])
+    names = {path.name for path in (out / "test/000000").iterdir()}
+    assert names == {"rgb", "depth", "scene_camera.json", "scene_gt.json", "scene_gt_info.json"}
+
+
+def test_an_episode_that_never_ended_is_left_out(tmp_path):
+    with exporting(BopExporter, tmp_path / "set", config()) as exporter:
+        exporter.write_constants()
+        for batch in batches(5, (1,), 2, LENSES):
+            exporter.write(batch)
+        finish(exporter)
+    assert list((tmp_path / "set/train_pbr").iterdir()) == []
+    assert load(tmp_path / "set/test_targets_bop19.json") == load(tmp_path / "set/test_targets_bop24.json") == []
+
+
+def lose_a_writer(out: Path) -> None:
+    with exporting(BopExporter, out, config()) as exporter:
+        exporter.write_constants()
+        pool = exporter_data_set(exporter).pool
+        feed(exporter, (0,))
+        pool.wait()
+        os.kill(pool._workers[0].process.pid, signal.SIGKILL)
+        for _ in range(100):
+            feed(exporter, (1,))
+
+
+def test_a_killed_writer_is_reported_and_whole_scenes_stay(tmp_path):
+    with pytest.raises(OutputError, match="a writer process was ended by SIGKILL"):
+        lose_a_writer(tmp_path)
+    assert sorted(path.name for path in (tmp_path / "train_pbr").iterdir()) == ["000000", "000001", "000002"]
+
+
+def lose_a_frame(out: Path) -> None:
+    with exporting(BopExporter, out, config()) as exporter:
+        exporter.write_constants()
+        for batch in batches(5, (0,), 3, LENSES):
+            exporter.write(batch)
+        exporter.end(ends((0,), 4)[0], lambda: None)
+        finish(exporter)
+
+
+def test_records_come_in_any_order_and_each_frame_once(tmp_path):
+    settings = SceneSettings("train_pbr", 3, 4, 3, ".jpg", True, (5,))
+    for frames in ((2, 0, 1), (2, 0, 1, 0), (2, 0)):
+        scene, place = tmp_path / "hidden", tmp_path / "-".join(map(str, frames))
+        make_scene(scene, True, ())
+        with open_folder(scene) as folder:
+            for frame in frames:
+                annotations = [b'{"of": %d}' % frame] * frame
+                folder.append(RECORDS, records_block(frame, (b'{"view": %d}' % frame, b"[]", b"[1]", *annotations)))
+        if frames != (2, 0, 1):
+            with pytest.raises(OutputError, match=f"has {len(frames)} of 3 frames"):
+                finish_episode(((scene, place),), settings)
+            shutil.rmtree(scene)
+            continue
+        finish_episode(((scene, place),), settings)
+        assert load(place / "scene_camera.json") == {str(frame): {"view": frame} for frame in range(3)}
+        assert list(load(place / "scene_gt_info.json").items()) == [(str(frame), [1]) for frame in range(3)]
+        assert load(place / "scene_gt_coco.json")["annotations"] == [
+            {"id": number, "of": frame} for number, frame in ((1, 1), (2, 2), (3, 2))
+        ]
+        assert not (place / RECORDS).exists()
+
+
+def test_a_missing_frame_is_no_whole_scene(tmp_path):
+    with pytest.raises(OutputError, match="has 3 of 4 frames"):
+        lose_a_frame(tmp_path)
+    assert list((tmp_path / "train_pbr").iterdir()) == []
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", folder], capture_output=True).returncode:
+        pytest.skip("mounting needs root")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+def test_a_full_disk_ends_the_bake_with_one_line(small_disk):
+    with pytest.raises(OutputError, match=r"cannot write .*: No space left on device") as caught:
+        make(small_disk, episodes=tuple(range(20)), color_format="png")
+    assert "\n" not in str(caught.value)
+    for scene in (small_disk / "train_pbr").iterdir():
+        assert len(list((scene / "rgb").iterdir())) == len(load(scene / "scene_gt.json")) == FRAMES
+
+
+def test_output_folders_that_cannot_be_used(tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "note").write_text("")
+    before = digests(tmp_path)
+    with pytest.raises(OutputError, match="is not empty; --out takes a new or an empty folder"):
+        prepare_output(tmp_path / "full")
+    with pytest.raises(OutputError, match="is a file; --out takes a new or an empty folder"):
+        prepare_output(tmp_path / "file")
+    for bad in (tmp_path / "file" / "below", Path("/dev/null/x")):
+        with pytest.raises(OutputError, match="cannot write"):
+            prepare_output(bad)
+    assert digests(tmp_path) == before
+
+
+def test_preparing_leaves_nothing_behind(tmp_path):
+    prepare_output(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "c").mkdir()
+    prepare_output(tmp_path / "c")
+    assert list((tmp_path / "c").iterdir()) == []
+
+
+def from_file(path: Path) -> Catalog:
+    entry = catalog().entries[0]
+    return Catalog((type(entry)(**{**entry.__dict__, "source": path}),))
+
+
+def test_bop_models_are_copied_byte_for_byte(tmp_path):
+    source = tmp_path / "source"
+    source.mkdir()
+    model = encode_model(catalog().entries[0]).replace(b"TextureFile obj_000003.png", b"TextureFile label.png")
+    (source / "obj_000003.ply").write_bytes(model)
+    info = {"diameter": 197.98, "min_x": -80.0, "note": "kept"}
+    (source / "models_info.json").write_text(json.dumps({"3": info}))
+    with pytest.raises(CatalogError, match=r"names the texture label\.png"):
+        write_models(tmp_path / "without", from_file(source / "obj_000003.ply"))
+    (source / "label.png").write_bytes(b"any bytes")
+    write_models(tmp_path / "models", from_file(source / "obj_000003.ply"))
+    assert (tmp_path / "models/obj_000003.ply").read_bytes() == model
+    assert (tmp_path / "models/label.png").read_bytes() == b"any bytes"
+    assert load(tmp_path / "models/models_info.json") == {"3": info}
+
+
+class TestContract(ExporterContract):
+    kind = BopExporter
+
+    @classmethod
+    def config(cls) -> Config:
+        return config(("flow", "classes"))

@@ -1,0 +1,237 @@
+"""The zarr store: the exporters' contract, and everything in it as plain zarr reads it, against what was in memory."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from synpick_warp.codes import Outcome
+from synpick_warp.exporters.trajectory import arrays as tables
+from synpick_warp.exporters.trajectory.episode import attempt_arrays
+from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
+from synpick_warp.exporters.trajectory.spool import SPOOL_TICKS, spool_bytes
+from synpick_warp.exporters.trajectory.store import shard_rows
+from synpick_warp.kernels import phases
+from tests.harness.exporter_contract import ExporterContract, digests, exporting
+from tests.worlds import box_views, trajectories
+from tests.worlds.trajectories import ATTEMPT, STEP_COUNT, UNSEEN, config, ends, ticks, write_set
+
+EPISODES = (0, 4)
+FRAMES = 2 * SPOOL_TICKS + 3
+INSTANCES = 4
+"""One more than the index of the last that box_views has."""
+
+
+class TestContract(ExporterContract):
+    kind = TrajectoryExporter
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return write_set(tmp_path_factory.mktemp("zarr") / "set", config(), EPISODES, FRAMES)
+
+
+@pytest.fixture(scope="module")
+def store(folder) -> zarr.Group:
+    return zarr.open_group(folder / tables.STORE, mode="r")
+
+
+def arrays(group: zarr.Group) -> dict[str, zarr.Array]:
+    return {path: member for path, member in group.members(max_depth=None) if isinstance(member, zarr.Array)}
+
+
+def taken(episode: int) -> list:
+    """The episode's ticks, as memory has them."""
+    return list(ticks((episode,), FRAMES))
+
+
+@pytest.mark.parametrize("episode", EPISODES)
+def test_ticks_are_those_in_memory(store, episode):
+    group, batches = store[f"{tables.EPISODES}/{episode:06d}/ticks"], taken(episode)
+    assert set(group.array_keys()) == set(tables.TICKS.arrays)
+    for name in tables.TICKS.arrays:
+        memory = np.concatenate([batch.tick.get(name, getattr(batch, name, None)) for batch in batches])
+        if tables.TICKS.arrays[name].dims[1:2] == ("instance",):
+            memory = memory[:, :INSTANCES]
+        if name == "pose":
+            memory[group["object_id"][:] < 0] = np.nan
+        np.testing.assert_array_equal(group[name][:], memory, err_msg=name)
+
+
+@pytest.mark.parametrize("episode", EPISODES)
+def test_steps_are_those_in_memory(store, episode):
+    group, batches = store[f"{tables.EPISODES}/{episode:06d}/steps"], taken(episode)
+    assert set(group.array_keys()) == set(tables.STEPS.arrays)
+    for name in set(tables.STEPS.arrays) - {"time"}:
+        memory = np.concatenate([batch.steps[name][0] for batch in batches])
+        if tables.STEPS.arrays[name].dims[1:2] == ("instance",):
+            memory = memory[:, :INSTANCES]
+        np.testing.assert_array_equal(group[name][:], memory, err_msg=name)
+
+
+def test_a_steps_time_is_at_its_end(store):
+    episode = store[f"{tables.EPISODES}/000004"]
+    step, time = store.attrs["step"], episode["steps/time"][:]
+    assert len(time) == FRAMES * STEP_COUNT
+    np.testing.assert_array_equal(time[STEP_COUNT - 1 :: STEP_COUNT], episode["ticks/time"][:])
+    np.testing.assert_allclose(np.diff(time.reshape(FRAMES, STEP_COUNT)), step, rtol=1e-9)
+
+
+def test_what_an_episode_says_of_itself(store):
+    episode = store[f"{tables.EPISODES}/000004"]
+    attributes = dict(episode.attrs)
+    light = attributes.pop("light")
+    assert {name: light[name] for name in ("map", "turn", "exposure")} == {"map": 0, "turn": 2.0, "exposure": 0.25}
+    assert light["units"] == {"turn": "rad", "exposure": "stops"}
+    assert attributes == {
+        "episode": 4, "redraw": 1, "frames": FRAMES, "ending": "emptied", "sentence": "no object is left in the tote", "seed": 0,
+        "mode": "pick", "picked": 2, "redrops": 4,
+    }  # fmt: skip
+    np.testing.assert_array_equal(episode["arrangement/object_id"][:], box_views.OBJECT_IDS[:INSTANCES])
+    np.testing.assert_array_equal(episode["arrangement/mass"][:], [0.3, np.nan, 0.3, 0.3])
+    drops = taken(4)[0].tick["drop_pose"][0, :INSTANCES]
+    drops[1] = np.nan
+    np.testing.assert_array_equal(episode["arrangement/drop_pose"][:], drops)
+
+
+def test_attempts_as_columns(store):
+    attempts = store[f"{tables.EPISODES}/000000/attempts"]
+    found = {name: attempts[name][:].tolist() for name in attempts.array_keys()}
+    lines = [json.loads(line) for line in bytes(found.pop("record")).splitlines()]
+    assert lines == [ATTEMPT, UNSEEN]
+    assert found["outcome"] == [Outcome.TARGET_PICKED, Outcome.NOTHING_SEEN]
+    assert (found["target"], found["object_id"], found["frame"], found["end_frame"]) == ([2, -1], [7, -1], [1, 6], [5, 7])
+    assert (found["point"][0], found["normal"][0], found["yaw"][0], found["tilt"][0]) == ([0.1, 0.2, 0.3], [0, 0, 1], 0.25, -0.5)
+    assert np.isnan(found["point"][1]).all()
+    assert np.isnan(found["yaw"][1])
+    assert found["caught"] == [[False, False, True, False], [False] * 4]
+    assert found["picked"] == [[False, False, True, True], [False] * 4]
+    np.testing.assert_array_equal(found["load"], [[0.0, 3.25], [np.nan, np.nan]])
+
+
+def test_an_episode_without_attempts_has_empty_columns(tmp_path):
+    with exporting(TrajectoryExporter, tmp_path, config()) as exporter:
+        exporter.write_constants()
+        for batch in ticks((0,), 1):
+            exporter.tick(batch)
+        (end,) = box_views.ends((0,), 1)
+        exporter.end(end, lambda: None)
+        exporter._data_set.pool.wait()
+    attempts = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000" / "attempts", mode="r")
+    assert {array.shape[0] for array in arrays(attempts).values()} == {0}
+    assert set(attempts.array_keys()) == set(tables.ATTEMPTS.arrays)
+
+
+def test_columns_of_attempts_have_the_tables_types():
+    made = attempt_arrays([ATTEMPT], 4)
+    assert {name: values.dtype.str for name, values in made.items()} == {name: one.dtype for name, one in tables.ATTEMPTS.arrays.items()}
+
+
+def test_objects_and_cameras(store):
+    entries, lenses = box_views.catalog().entries, box_views.cameras()
+    objects, cameras = store["objects"], store["cameras"]
+    assert objects.attrs["names"] == [entry.name for entry in entries]
+    assert objects["object_id"][:].tolist() == [entry.obj_id for entry in entries]
+    np.testing.assert_array_equal(objects["mass"][:], [entry.mass for entry in entries])
+    np.testing.assert_array_equal(objects["inertia"][:], [entry.inertia for entry in entries])
+    np.testing.assert_array_equal(cameras["matrix"][:], [lens.matrix for lens in lenses])
+    np.testing.assert_array_equal(cameras["rotation"][:], [lens.rotation for lens in lenses])
+    np.testing.assert_array_equal(cameras["translation"][:], [lens.translation for lens in lenses])
+    assert cameras["resolution"][:].tolist() == [[lens.width, lens.height] for lens in lenses]
+
+
+def test_every_array_says_what_it_is(store):
+    """Unit, meaning, and a name for each dimension; every group a description."""
+    found = arrays(store)
+    once, each = (sum(len(doc.arrays) for doc in docs.values()) for docs in (tables.CONSTANTS, tables.EPISODE))
+    assert len(found) == once + len(EPISODES) * each
+    for path, array in found.items():
+        assert array.attrs["unit"], path
+        assert array.attrs["description"].endswith("."), path
+        names = array.metadata.dimension_names
+        assert len(names) == len(set(names)) == array.ndim, path
+        for dim, labels in array.attrs.get("labels", {}).items():
+            assert len(labels) == array.shape[names.index(dim)], path
+        if array.dtype.kind in "iu" and (codes := array.attrs.get("codes")) and array.size:
+            assert array[:].max() < len(codes), path
+    for path, group in store.members(max_depth=None):
+        if isinstance(group, zarr.Group) and path.count("/") != 1:
+            assert group.attrs["description"].endswith("."), path
+
+
+def test_dimensions_of_one_name_have_one_extent(store):
+    """Within an episode, as xarray wants it, but for what is of no fixed number."""
+    for episode in EPISODES:
+        extents: dict[str, set[int]] = {}
+        for array in arrays(store[f"{tables.EPISODES}/{episode:06d}"]).values():
+            for name, extent in zip(array.metadata.dimension_names, array.shape, strict=True):
+                extents.setdefault(name, set()).add(extent)
+        assert {name: len(found) for name, found in extents.items()} == dict.fromkeys(extents, 1)
+
+
+def test_the_store_is_sharded_and_compressed_by_zstd(store):
+    pose = store[f"{tables.EPISODES}/000000/steps/pose"]
+    assert (pose.chunks, pose.shards) == ((2 * STEP_COUNT, INSTANCES, 7), (6 * STEP_COUNT, INSTANCES, 7))
+    assert [codec.to_dict()["name"] for codec in pose.compressors] == ["zstd"]
+    assert pose.metadata.zarr_format == 3
+
+
+def test_two_writes_are_identical_whatever_writes_them(tmp_path, folder):
+    assert digests(write_set(tmp_path, config(), EPISODES[::-1], FRAMES, processes=0)) == digests(folder)
+
+
+def test_without_steps_there_are_ticks_alone(tmp_path):
+    write_set(tmp_path, config(steps=False), (0,), 3, steps=False)
+    episode = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000", mode="r")
+    assert set(episode.group_keys()) == set(tables.EPISODE) - {"steps"}
+    assert spool_bytes(config(steps=False)) < spool_bytes(config()) / 3
+
+
+def test_missing_frames_are_an_error(tmp_path):
+    with exporting(TrajectoryExporter, tmp_path, config(), processes=0) as exporter:
+        for batch in ticks((0,), 2):
+            exporter.tick(batch)
+        with pytest.raises(ValueError, match="ended with 3 frames, but 2 came"):
+            exporter.end(ends((0,), 3)[0], lambda: None)
+
+
+def test_an_array_that_nothing_describes_is_an_error(tmp_path):
+    (batch,) = ticks((0,), 1)
+    batch.steps["magic"] = batch.steps["goal"]
+    with exporting(TrajectoryExporter, tmp_path, config()) as exporter, pytest.raises(ValueError, match="magic"):
+        exporter.tick(batch)
+
+
+@given(ticks=st.integers(0, 5000), chunk=st.integers(1, 64), chunks=st.integers(1, 64), rows=st.integers(1, 40))
+@settings(max_examples=200)
+def test_files_are_whole_chunks_of_whole_ticks_and_no_larger_than_needed(ticks, chunk, chunks, rows):
+    made, shard = shard_rows(trajectories.config(chunk_ticks=chunk, shard_chunks=chunks).trajectory, ticks, rows)
+    assert made == chunk * rows
+    assert shard % made == 0
+    assert shard <= chunks * made
+    assert shard - made < max(1, ticks * rows)
+
+
+def test_names_of_codes_are_those_of_kernels_and_outcomes():
+    tasks = ("no_task", *tables.TASKS[1:])
+    for names in (tables.PHASES, tables.MODES, tasks):
+        assert [int(getattr(phases, name.upper())) for name in names] == list(range(len(names)))
+    assert list(tables.OUTCOMES) == [outcome.name.lower() for outcome in Outcome]
+
+
+def test_an_episode_without_instances_has_empty_axes(tmp_path):
+    (batch,) = ticks((0,), 1)
+    batch.object_id.fill(-1)
+    with exporting(TrajectoryExporter, tmp_path, config(), processes=0) as exporter:
+        exporter.write_constants()
+        exporter.tick(batch)
+        exporter.end(box_views.ends((0,), 1)[0], lambda: None)
+    episode = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000", mode="r")
+    assert episode["steps/pose"].shape == (STEP_COUNT, 0, 7)
+    assert episode["steps/goal"].shape == (STEP_COUNT, 3)

@@ -1,0 +1,116 @@
+"""A bake with the format zarr: the laws of motion hold in what is read back, and the number of worlds changes no byte of it."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+import synpick_warp
+from synpick_warp import bake
+from synpick_warp.bake import run_bake
+from synpick_warp.configs.schema import Config
+from synpick_warp.progress import SilentProgress
+from synpick_warp.stages.stream import FrameStream
+from tests.harness.exporter_contract import digests
+from tests.worlds.sights import SHORT
+from tests.worlds.small_worlds import catalog, settings
+
+TOOL = "tools.checks.trajectory"
+
+
+@pytest.fixture(scope="module")
+def mixed() -> Config:
+    """One episode that picks and others of any mode, in some seconds."""
+    return settings(**SHORT | {
+        "bake__formats": ["zarr"], "bake__mode": "mixed", "bake__episodes": 3, "arrangement__max_objects": 2, "pick__failures": 1,
+        "sight__resolution": [160, 90], "cameras__resolution": [32, 18], "physics__step": 4e-3, "physics__steps_per_tick": 16,
+        "physics__substeps": 1, "physics__iterations": 8,
+    })  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory, mixed) -> Path:
+    """A finished bake of boxes; beside it one of another number of worlds."""
+    folder = tmp_path_factory.mktemp("bake") / "set"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bake, "load_catalog", lambda config, report: catalog())
+        # Nobody asks for pictures.
+        patch.setattr(FrameStream, "render", lambda *_: pytest.fail("views were rendered"))
+        run_bake(mixed, folder, SilentProgress())
+        run_bake(replace(mixed, bake=replace(mixed.bake, worlds=3)), folder.with_name("again"), SilentProgress())
+    return folder
+
+
+def check(monkeypatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", [TOOL, *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_module(TOOL, run_name="__main__")
+    return ended.value.code
+
+
+def test_another_number_of_worlds_gives_the_same_bytes(out):
+    assert digests(out / "trajectory.zarr") == digests(out.with_name("again") / "trajectory.zarr")
+
+
+def test_the_laws_of_motion_hold(out, monkeypatch, capsys):
+    assert check(monkeypatch, out) == 0
+    assert "VIOLATED" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("array", "what"),
+    [
+        ("steps/velocity", "change of momentum"), ("steps/contact_force", "contacts of all objects against their weight"),
+        ("steps/pose", "last step against frame"), ("steps/goal", "gripper: force against its law"),
+        ("steps/seal_load", "largest load of a tick"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_found(out, tmp_path, monkeypatch, capsys, array, what):
+    picking = next(episode for episode in synpick_warp.open(out).values() if episode.attributes["mode"] != "move")
+    shutil.copytree(out, tmp_path / "set")
+    one = zarr.open_array(tmp_path / "set" / f"trajectory.zarr/episodes/{picking.number:06d}" / array, mode="r+")
+    values = 1.2 * one[:]
+    values[1::2] += 0.02
+    one[:] = values
+    assert check(monkeypatch, tmp_path / "set") == 1
+    assert any("VIOLATED" in line and what in line for line in capsys.readouterr().out.splitlines())
+
+
+def test_a_folder_without_trajectories_cannot_be_checked(tmp_path, monkeypatch, capsys):
+    assert check(monkeypatch, tmp_path) == 2
+    assert "has no trajectories" in capsys.readouterr().err
+    assert check(monkeypatch, tmp_path, "--episodes", 0) == 2
+
+
+def test_what_is_opened_is_what_was_baked(out, mixed):
+    data = synpick_warp.open(out)
+    assert data.config == mixed
+    lines = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    for row, episode in zip(lines, data.values(), strict=True):
+        known = {name: value for name, value in row.items() if name != "checksum"}
+        assert {name: episode.attributes[name] for name in known} == known
+    attempts = [json.loads(line) for line in (out / "attempts.jsonl").read_text().splitlines()]
+    assert [attempt for episode in data.values() for attempt in episode.attempts] == attempts
+    assert any(attempt["outcome"] == "target_picked" for attempt in attempts)
+    for row, episode in zip(lines, data.values(), strict=True):
+        there = episode.ticks["object_id"][:] >= 0
+        assert (there[0].sum(), there[-1].sum()) == (row["objects"], row["left"])
+        assert episode.steps["time"].shape == (16 * row["frames"],)
+        kinds = episode.arrangement["object_id"][:]
+        np.testing.assert_allclose(episode.arrangement["mass"][:], [data.objects[kind - 1].mass for kind in kinds])
+
+
+def test_the_table_of_memory_counts_what_is_recorded(mixed):
+    """What a tick is written into, and two records; none for formats that ask for none."""
+    rows = [row for row in bake.describe_arrays(mixed) if row[0] == "StepArrays.pose"]
+    assert rows == [("StepArrays.pose", (1, 16, 4), "m", 16 * 4 * 28)] * 3
+    without = replace(mixed, bake=replace(mixed.bake, formats=("bop",)))
+    assert not any(row[0].startswith("StepArrays") for row in bake.describe_arrays(without))

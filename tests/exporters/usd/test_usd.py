@@ -1,0 +1,220 @@
+"""USD data sets as files: the exporters' contract, assets, references, and what USD's validators say."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdSemantics, UsdShade, UsdUtils, UsdValidation
+
+from synpick_warp.errors import OutputError
+from synpick_warp.exporters.usd.exporter import UsdExporter
+from synpick_warp.exporters.usd.parts import new_asset, save_layer
+from synpick_warp.scenes.appearance import srgb_to_linear
+from tests.harness.exporter_contract import ExporterContract, digests
+from tests.worlds import small_worlds, usd_sets
+
+CATALOG = usd_sets.textured(small_worlds.catalog())
+
+
+class TestContract(ExporterContract):
+    kind = UsdExporter
+
+    def joins(self) -> bool:
+        return False
+
+
+@pytest.fixture(scope="module")
+def config():
+    return usd_sets.settings()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, config) -> Path:
+    """The USD files of a data set of two episodes."""
+    return usd_sets.write_set(tmp_path_factory.mktemp("usd") / "set", config, CATALOG, (0, 4))
+
+
+def layers(folder: Path) -> list[Path]:
+    """Every file that USD reads."""
+    return sorted(folder.rglob("*.usdc"))
+
+
+def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
+    stage = new_asset("thing", "thing")
+    with pytest.raises(FileNotFoundError, match="No such file"):
+        save_layer(stage.GetRootLayer(), tmp_path / "gone" / "thing.usdc")
+    assert not (tmp_path / "gone").exists()
+    (tmp_path / "taken.usdc").mkdir()
+    with pytest.raises(OutputError, match=r"cannot write .*taken\.usdc: "):
+        save_layer(stage.GetRootLayer(), tmp_path / "taken.usdc")
+
+
+LIMITED = """
+import resource, signal, sys
+from pathlib import Path
+from synpick_warp.errors import OutputError
+from synpick_warp.exporters.usd.parts import new_asset, save_layer
+stage = new_asset("thing", "thing")
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))
+try:
+    save_layer(stage.GetRootLayer(), Path(sys.argv[1]))
+except OutputError as error:
+    sys.exit(str(error))
+"""
+
+
+def test_a_file_that_is_cut_short_is_an_error(tmp_path):
+    """In a process of its own, since the limit holds for all that one writes."""
+    done = subprocess.run((sys.executable, "-c", LIMITED, str(tmp_path / "thing.usdc")), capture_output=True, text=True)
+    assert done.stderr == f"cannot write {tmp_path / 'thing.usdc'}: File too large; free space or rights there\n"
+
+
+def test_an_episode_is_a_file_and_assets_are_shared(folder):
+    names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert names == {
+        "000000.usdc", "000004.usdc",
+        *(f"assets/{name}.usdc" for name in ("obj_000001", "obj_000002", "obj_000003", "tote", "finger", "cup", "table")),
+        "assets/textures/obj_000002.png", "assets/lights/light_000.exr", "assets/lights/light_001.exr",
+    }  # fmt: skip
+    assert (folder / "000000.usdc").stat().st_size < 60_000
+
+
+def test_two_bakes_are_identical(tmp_path, folder, config):
+    again = usd_sets.write_set(tmp_path / "again", config, CATALOG, (4, 0))
+    assert digests(again) == digests(folder)
+
+
+def test_all_references_are_relative_and_lead_somewhere(folder):
+    found = set()
+    for path in layers(folder):
+        for asset in Sdf.Layer.FindOrOpen(str(path)).GetExternalAssetDependencies():
+            assert Path(asset).is_relative_to(folder)
+        text = Sdf.Layer.FindOrOpen(str(path)).ExportToString()
+        assert str(folder) not in text
+        _, _, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
+        assert missing == []
+        layers_used, assets, _ = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
+        found |= {Path(layer.realPath) for layer in layers_used} | {Path(asset) for asset in assets}
+    # The map that no episode has is not referenced.
+    assert {path.resolve() for path in folder.rglob("*") if path.is_file()} - found == {folder / "assets/lights/light_000.exr"}
+
+
+def test_a_data_set_may_be_moved(tmp_path, folder):
+    place = tmp_path / "elsewhere"
+    place.mkdir()
+    for path in folder.rglob("*"):
+        target = place / path.relative_to(folder)
+        target.mkdir(exist_ok=True) if path.is_dir() else target.write_bytes(path.read_bytes())
+    stage = Usd.Stage.Open(str(place / "000000.usdc"))
+    assert len(UsdGeom.Mesh(stage.GetPrimAtPath("/Episode/Tote/Visual")).GetPointsAttr().Get()) > 100
+
+
+def test_validators_find_nothing(folder):
+    for path in layers(folder):
+        assert list(complaints(path)) == []
+
+
+def complaints(path: Path) -> Iterator[str]:
+    """What `usdchecker` would print: all validators that there are; in USD 26 they took the place of `UsdUtils.ComplianceChecker`."""
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    assert len(validators) > 20
+    for error in UsdValidation.ValidationContext(validators).Validate(Usd.Stage.Open(str(path))):
+        yield f"{error.GetName()}: {error.GetMessage()}"
+
+
+def test_validators_would_find_something(tmp_path):
+    stage = Usd.Stage.CreateNew(str(tmp_path / "bad.usda"))
+    UsdGeom.Xform.Define(stage, "/Root").GetPrim().GetReferences().AddReference("./nowhere.usdc")
+    stage.Save()
+    assert list(complaints(tmp_path / "bad.usda"))
+
+
+def test_stages_say_their_units_and_times(folder, config):
+    for path in layers(folder):
+        stage = Usd.Stage.Open(str(path))
+        assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+        assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+        assert UsdPhysics.GetStageKilogramsPerUnit(stage) == 1.0
+        assert stage.GetDefaultPrim()
+    stage = Usd.Stage.Open(str(folder / "000004.usdc"))
+    rate = 1.0 / (config.physics.step * config.physics.steps_per_tick)
+    assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == pytest.approx(rate)
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, usd_sets.FRAMES - 1)
+    facts = stage.GetDefaultPrim().GetCustomData()
+    assert facts.items() >= {"episode": 4, "redraw": 0, "frames": usd_sets.FRAMES, "ending": "emptied"}.items()
+
+
+@pytest.mark.parametrize("entry", CATALOG.entries, ids=lambda entry: entry.name)
+def test_objects_have_their_meshes_and_surfaces(folder, entry):
+    stage = Usd.Stage.Open(str(folder / f"assets/obj_{entry.obj_id:06d}.usdc"))
+    root = stage.GetDefaultPrim()
+    assert root.GetCustomDataByKey("obj_id") == entry.obj_id
+    assert list(UsdSemantics.LabelsAPI(root, "class").GetLabelsAttr().Get()) == [entry.name]
+    mesh = UsdGeom.Mesh(root.GetChild("Visual"))
+    np.testing.assert_array_equal(mesh.GetPointsAttr().Get(), entry.mesh.vertices)
+    np.testing.assert_array_equal(mesh.GetNormalsAttr().Get(), entry.mesh.normals)
+    np.testing.assert_array_equal(np.reshape(mesh.GetFaceVertexIndicesAttr().Get(), (-1, 3)), entry.mesh.faces)
+    np.testing.assert_array_equal(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get(), entry.mesh.uv)
+    assert UsdGeom.Mesh.ValidateTopology(
+        mesh.GetFaceVertexIndicesAttr().Get(), mesh.GetFaceVertexCountsAttr().Get(), len(entry.mesh.vertices)
+    )[0]  # fmt: skip
+    material, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
+    shader, _, _ = material.ComputeSurfaceSource()
+    assert shader.GetShaderId() == "UsdPreviewSurface"
+    assert shader.GetInput("metallic").Get() == pytest.approx(entry.material.metallic)
+    assert shader.GetInput("roughness").Get() == pytest.approx(entry.material.roughness)
+    linear, color = srgb_to_linear(entry.material.color), shader.GetInput("diffuseColor")
+    if entry.material.texture is None:
+        np.testing.assert_allclose(color.Get(), linear, rtol=1e-6)
+        return
+    image = UsdShade.Shader(color.GetConnectedSources()[0][0].source.GetPrim())
+    np.testing.assert_allclose(image.GetInput("scale").Get(), [*linear, 1.0], rtol=1e-6)
+    assert image.GetInput("sourceColorSpace").Get() == "sRGB"
+    picture = cv2.imread(image.GetInput("file").Get().resolvedPath)
+    np.testing.assert_array_equal(picture[..., ::-1], entry.material.texture)
+    reader = UsdShade.Shader(image.GetInput("st").GetConnectedSources()[0][0].source.GetPrim())
+    assert reader.GetInput("varname").Get() == "st"
+
+
+def test_every_visible_mesh_has_a_surface_and_every_collider_friction(folder, config):
+    stage = Usd.Stage.Open(str(folder / "000000.usdc"))
+    seen = solid = 0
+    for prim in stage.Traverse():
+        binding = UsdShade.MaterialBindingAPI(prim)
+        if prim.HasAPI(UsdPhysics.CollisionAPI):
+            solid += 1
+            assert UsdGeom.Imageable(prim).ComputePurpose() == UsdGeom.Tokens.guide
+            contact = UsdPhysics.MaterialAPI(binding.ComputeBoundMaterial("physics")[0].GetPrim())
+            assert contact.GetDynamicFrictionAttr().Get() == contact.GetStaticFrictionAttr().Get() == config.physics.friction
+            if prim.IsA(UsdGeom.Mesh):
+                assert UsdPhysics.MeshCollisionAPI(prim).GetApproximationAttr().Get() == "convexHull"
+        elif prim.IsA(UsdGeom.Gprim):
+            seen += 1
+            assert binding.ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
+    # Table, tote, finger, cup and three objects; a box, nine pieces, two, and four of the objects of which one has two.
+    assert (seen, solid) == (7, 1 + 9 + 2 + 4)
+
+
+def test_without_a_table_in_the_pictures_it_only_collides(tmp_path):
+    folder = usd_sets.write_set(tmp_path / "set", usd_sets.settings(render__table=False), CATALOG, frames=2)
+    stage = Usd.Stage.Open(str(folder / "000000.usdc"))
+    table = stage.GetPrimAtPath("/Episode/Table")
+    assert not table.GetChild("Visual")
+    box = UsdGeom.Boundable(table.GetPrimAtPath("Collision/box"))
+    bounds = UsdGeom.BBoxCache(0, [UsdGeom.Tokens.guide]).ComputeWorldBound(box.GetPrim()).ComputeAlignedRange()
+    np.testing.assert_allclose(bounds.GetMax(), (10.0, 10.0, -0.0045), atol=1e-6)
+
+
+def test_lights_are_named_after_their_maps(folder):
+    stage = Usd.Stage.Open(str(folder / "000000.usdc"))
+    dome = UsdLux.DomeLight.Get(stage, "/Episode/Lights/Dome")
+    assert dome.GetPrim().GetDisplayName() == "mixed_lamps"
+    assert dome.GetTextureFileAttr().Get().path == "./assets/lights/light_001.exr"
+    assert dome.GetExposureAttr().Get() == usd_sets.STOPS

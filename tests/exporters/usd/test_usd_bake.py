@@ -1,0 +1,108 @@
+"""A bake in BOP and USD at once: what USD's cameras see of USD's bodies is what BOP's masks show, pixel by pixel."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom
+from scipy.spatial import ConvexHull
+
+from synpick_warp import bake
+from synpick_warp.bake import run_bake
+from synpick_warp.configs.schema import Config
+from synpick_warp.progress import SilentProgress
+from tests.exporters.usd.test_usd import complaints
+from tests.harness.exporter_contract import digests
+from tests.worlds.sights import SHORT
+from tests.worlds.small_worlds import catalog, settings
+
+CAMERAS = 3
+NEAR = 0.02
+"""Pixels whose centre is so near to an outline may be in or out [px]: USD's lenses have 32 bits."""
+
+
+@pytest.fixture(scope="module")
+def picking() -> Config:
+    """Two objects, picked or not, in a second or two."""
+    return settings(**SHORT | {
+        "bake__formats": ["bop", "usd"], "bake__episodes": 1, "arrangement__max_objects": 2, "pick__failures": 1,
+        "sight__resolution": [160, 90], "cameras__resolution": [192, 108], "physics__step": 4e-3, "physics__steps_per_tick": 16,
+        "physics__substeps": 1, "physics__iterations": 6,
+    })  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory, picking) -> Path:
+    """A finished bake of boxes."""
+    folder = tmp_path_factory.mktemp("bake") / "set"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(bake, "load_catalog", lambda config, report: catalog())
+        run_bake(picking, folder, SilentProgress())
+        again = replace(picking, bake=replace(picking.bake, worlds=2))
+        run_bake(again, folder.with_name("again"), SilentProgress())
+    return folder
+
+
+def test_another_number_of_worlds_gives_the_same_bytes(out):
+    assert (out / "usd/000000.usdc").exists()
+    assert digests(out / "usd") == digests(out.with_name("again") / "usd")
+
+
+def test_validators_find_nothing(out):
+    for path in sorted((out / "usd").rglob("*.usdc")):
+        assert list(complaints(path)) == []
+
+
+@pytest.mark.parametrize("camera", range(CAMERAS))
+def test_usd_shows_what_the_masks_show(out, picking, camera):
+    stage = Usd.Stage.Open(str(out / "usd/000000.usdc"))
+    scene = out / picking.bop.split / f"{camera:06d}"
+    truth = json.loads((scene / "scene_gt.json").read_text())
+    assert stage.GetEndTimeCode() == len(truth) - 1
+    seen = 0
+    for frame in range(len(truth)):
+        lens = UsdGeom.Camera.Get(stage, f"/Episode/Cameras/camera_{camera}").GetCamera(frame).frustum
+        view = np.array(lens.ComputeViewMatrix() * lens.ComputeProjectionMatrix())
+        records = {record["instance_id"]: place for place, record in enumerate(truth[str(frame)])}
+        bodies = visible_objects(stage, frame)
+        assert set(bodies) == set(records)
+        for instance, prim in bodies.items():
+            mask = cv2.imread(str(scene / f"mask/{frame:06d}_{records[instance]:06d}.png"), cv2.IMREAD_UNCHANGED) > 0
+            depth = inside(prim, frame, view, mask.shape)
+            assert not (mask & (depth < -NEAR)).any()
+            assert not (~mask & (depth > NEAR)).any()
+            seen += mask.sum()
+    assert seen > 1000
+
+
+def visible_objects(stage: Usd.Stage, frame: int) -> dict[int, Usd.Prim]:
+    """Prims of the objects that are there, by instance_id."""
+    prims = stage.GetPrimAtPath("/Episode/Objects").GetChildren()
+    there = [prim for prim in prims if UsdGeom.Imageable(prim).ComputeVisibility(frame) != UsdGeom.Tokens.invisible]
+    return {prim.GetCustomDataByKey("instance_id"): prim for prim in there}
+
+
+def inside(prim: Usd.Prim, frame: int, view: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """How far inside an object's outline the centres of pixels lie (H, W) [px]; negative: outside. Its pieces are convex."""
+    height, width = shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    best = np.full(shape, -np.inf)
+    to_screen = np.array(UsdGeom.XformCache(frame).GetLocalToWorldTransform(prim)) @ view
+    for piece in prim.GetChild("Collision").GetChildren():
+        points = np.array(UsdGeom.Mesh(piece).GetPointsAttr().Get(), np.float64)
+        shown = np.column_stack([points, np.ones(len(points))]) @ to_screen
+        at = (shown[:, :2] / shown[:, 3:] * [0.5, -0.5] + 0.5) * [width, height]
+        normals = ConvexHull(at).equations
+        best = np.maximum(best, -(normals[:, :1, None] * x + normals[:, 1:2, None] * y + normals[:, 2:, None]).max(axis=0))
+    return best
+
+
+def test_some_object_was_picked(out):
+    """Otherwise the test above would not see anything vanish."""
+    rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
+    assert sum(row["picked"] for row in rows) > 0

@@ -1,0 +1,268 @@
+"""What a USD episode shows: poses, visibility, cameras and light, read with USD's own functions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pxr import Gf, Usd, UsdGeom, UsdLux, UsdRender, UsdSemantics
+
+from synpick_warp.exporters.usd.episode import EpisodeFacts, EpisodeSettings
+from synpick_warp.exporters.usd.lights import part_sun, stage_light, write_light_maps
+from synpick_warp.exporters.usd.spool import TickSpool, read_ticks
+from synpick_warp.exporters.usd.stage import FIXTURES, episode_layer
+from synpick_warp.scenes import sun as main_light
+from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.embedded.skies import directions, skies
+from synpick_warp.scenes.types import Camera, LightMap, Sun
+from synpick_warp.stages.render import light_tables
+from tests.exporters.usd.test_exr import decode
+from tests.worlds import usd_sets
+
+SETTINGS = usd_sets.settings()
+LENSES = make_cameras(SETTINGS.cameras)
+TICKS = usd_sets.episode_ticks(0)
+ROWS = 64
+
+
+def spooled(folder, ticks=TICKS) -> np.ndarray:
+    """The ticks as a writer process reads them."""
+    spool = TickSpool(folder / "ticks", ticks[0].object_id.shape[1])
+    for batch in ticks:
+        spool.add(batch, 0)
+    spool.flush()
+    return read_ticks(spool.path, spool.instances)
+
+
+def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[LightMap, ...] = skies()[:2]) -> Usd.Stage:
+    """The stage of an episode, without its assets."""
+    made = tuple(stage_light(index, light, 1.0) for index, light in enumerate(lights))
+    facts = EpisodeFacts(0, 0, len(rows), "emptied")
+    layer = episode_layer(rows, facts, EpisodeSettings(15.0, 9.81, cameras, made, {1: "one", 2: "two", 3: "three"}))
+    for prim in layer.rootPrims["Episode"].nameChildren.values():
+        for each in (prim, *prim.nameChildren.values()):
+            each.referenceList.ClearEdits()
+    stage = Usd.Stage.Open(layer)
+    stage.layer = layer  # type: ignore[attr-defined]
+    return stage
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory) -> np.ndarray:
+    return spooled(tmp_path_factory.mktemp("ticks"))
+
+
+@pytest.fixture(scope="module")
+def stage(rows):
+    return open_episode(rows)
+
+
+def matrix(pose: np.ndarray) -> np.ndarray:
+    """A pose (7) as a matrix (4, 4) that turns columns."""
+    x, y, z, w = pose[3:].astype(np.float64)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    made = np.eye(4)
+    made[:3, :3] += 2 * w * cross + 2 * cross @ cross
+    made[:3, 3] = pose[:3]
+    return made
+
+
+def placed(prim: Usd.Prim, time: float) -> np.ndarray:
+    """Where a prim is (4, 4), for columns."""
+    return np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim)).T
+
+
+@pytest.mark.parametrize("instance", np.flatnonzero(usd_sets.OBJECT_IDS >= 0).tolist())
+def test_objects_are_where_they_were_at_every_tick(stage, instance):
+    prim = stage.GetPrimAtPath(f"/Episode/Objects/instance_{instance:02d}")
+    for frame, batch in enumerate(TICKS):
+        present = batch.object_id[0, instance] >= 0
+        assert (UsdGeom.Imageable(prim).ComputeVisibility(frame) == UsdGeom.Tokens.inherited) == present
+        if present:
+            np.testing.assert_allclose(placed(prim, frame), matrix(batch.pose[0, instance]), atol=5e-7)
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_fixtures_are_where_they_were_at_every_tick(stage, index):
+    prim = stage.GetPrimAtPath(list(FIXTURES.values())[index])
+    for frame, batch in enumerate(TICKS):
+        seen = UsdGeom.Imageable(prim).ComputeVisibility(frame) == UsdGeom.Tokens.inherited
+        assert seen == bool(batch.fixture_visible[0, index])
+        np.testing.assert_allclose(placed(prim, frame), matrix(batch.fixture_pose[0, index]), atol=5e-7)
+
+
+def test_visibility_changes_at_the_tick_and_not_before(stage):
+    prim = UsdGeom.Imageable(stage.GetPrimAtPath(f"/Episode/Objects/instance_{usd_sets.PICKED:02d}"))
+    assert prim.ComputeVisibility(usd_sets.PICKED_FRAME - 0.01) == UsdGeom.Tokens.inherited
+    assert prim.ComputeVisibility(usd_sets.PICKED_FRAME) == UsdGeom.Tokens.invisible
+    assert prim.GetVisibilityAttr().GetTimeSamples() == [0.0, usd_sets.PICKED_FRAME]
+
+
+def test_physics_engines_find_the_first_frame_without_a_time(stage):
+    for instance in (0, 2, 3):
+        prim = stage.GetPrimAtPath(f"/Episode/Objects/instance_{instance:02d}")
+        np.testing.assert_allclose(placed(prim, Usd.TimeCode.Default()), matrix(TICKS[0].pose[0, instance]), atol=5e-7)
+
+
+def test_what_rests_has_no_samples_and_quaternions_do_not_jump(stage):
+    resting = UsdGeom.Xformable(stage.GetPrimAtPath("/Episode/Objects/instance_03"))
+    assert not resting.TransformMightBeTimeVarying()
+    orient = stage.GetPrimAtPath("/Episode/Objects/instance_00").GetAttribute("xformOp:orient")
+    assert orient.GetTimeSamples() == list(range(usd_sets.FRAMES))
+    values = [np.array([q.GetReal(), *q.GetImaginary()]) for q in map(orient.Get, range(usd_sets.FRAMES))]
+    assert all(first @ second > 0.9 for first, second in pairwise(values))
+
+
+def test_instances_are_named_in_every_way(stage):
+    prims = stage.GetPrimAtPath("/Episode/Objects").GetChildren()
+    assert [prim.GetName() for prim in prims] == ["instance_00", "instance_02", "instance_03"]
+    for prim, instance, obj_id in zip(prims, (0, 2, 3), (3, 1, 2), strict=True):
+        assert prim.GetCustomDataByKey("instance_id") == instance
+        assert list(UsdSemantics.LabelsAPI(prim, "instance").GetLabelsAttr().Get()) == [str(instance)]
+        primvars = UsdGeom.PrimvarsAPI(prim)
+        assert [primvars.GetPrimvar(name).Get() for name in ("instance_id", "obj_id")] == [instance, obj_id]
+        assert prim.GetDisplayName() == {3: "three", 1: "one", 2: "two"}[obj_id]
+
+
+SKEW = Camera(
+    640, 400, np.array([[900.0, 0, 301.5], [0, 850.0, 222.25], [0, 0, 1]]), LENSES[1].rotation, np.array([0.1, -0.2, 1.5])
+)  # fmt: skip
+
+
+@given(
+    st.integers(0, 3),
+    st.tuples(*[st.floats(-0.4, 0.4)] * 3),
+)
+def test_usd_projects_as_the_cameras_do(tmp_path_factory, index, point):
+    lenses = (*LENSES, SKEW)
+    stage = _cameras_stage(tmp_path_factory, lenses)
+    camera = lenses[index]
+    x, y, z = camera.matrix @ (camera.rotation @ point + camera.translation)
+    np.testing.assert_allclose(project(stage, index, camera, np.array(point)), (x / z, y / z), atol=1e-3)
+
+
+STAGES: list[Usd.Stage] = []
+
+
+def _cameras_stage(tmp_path_factory, lenses) -> Usd.Stage:
+    if not STAGES:
+        STAGES.append(open_episode(spooled(tmp_path_factory.mktemp("cameras")), lenses))
+    return STAGES[0]
+
+
+def project(stage: Usd.Stage, index: int, camera: Camera, point: np.ndarray) -> tuple[float, float]:
+    """Pixel coordinates of a point by USD's frustum."""
+    frustum = UsdGeom.Camera.Get(stage, f"/Episode/Cameras/camera_{index}").GetCamera(0).frustum
+    shown = (frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix()).Transform(Gf.Vec3d(*point.tolist()))
+    assert -1.0 < shown[2] < 1.0  # in front of the camera
+    return (shown[0] + 1.0) / 2.0 * camera.width, (1.0 - shown[1]) / 2.0 * camera.height
+
+
+def test_films_are_36_mm_wide_and_products_know_the_resolution(stage):
+    for index, camera in enumerate(LENSES):
+        lens = UsdGeom.Camera.Get(stage, f"/Episode/Cameras/camera_{index}")
+        # Tenths of a unit of one metre.
+        assert 100.0 * lens.GetHorizontalApertureAttr().Get() == pytest.approx(36.0)
+        fov = lens.GetCamera(0).GetFieldOfView(Gf.Camera.FOVHorizontal)
+        assert fov == pytest.approx(SETTINGS.cameras.fov, abs=1e-4)
+        product = UsdRender.Product.Get(stage, f"/Episode/Render/camera_{index}")
+        assert tuple(product.GetResolutionAttr().Get()) == (camera.width, camera.height)
+        assert product.GetCameraRel().GetTargets() == [lens.GetPath()]
+
+
+def sunny(azimuth: float, polar: float, irradiance: float = 3.0, sharpness: float = 3000.0, rows: int = ROWS) -> LightMap:
+    """A dim map with a bright place, and a sun that stands for it. A sharpness of 100 is too wide for a light of its own."""
+    a, p = np.radians(azimuth), np.radians(polar)
+    toward = np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
+    radiance = 0.2 + 30.0 * np.exp(sharpness * (directions(rows) @ toward - 1.0))[..., None] * np.array([1.0, 0.9, 0.7])
+    return LightMap("sunny", radiance.astype(np.float32), Sun(toward, irradiance * np.array([1.0, 0.8, 0.5])))
+
+
+@pytest.mark.parametrize(("azimuth", "polar"), [(0.0, 60.0), (90.0, 45.0), (-130.0, 20.0), (170.0, 75.0)])
+def test_the_dome_shows_its_map_where_the_pictures_do(tmp_path, rows, azimuth, polar):
+    light = replace(sunny(azimuth, polar), sun=None)
+    (tmp_path / "lights").mkdir()
+    write_light_maps(tmp_path, (light, light))
+    picture = decode((tmp_path / "lights/light_001.exr").read_bytes())
+    stage = open_episode(rows, lights=(light, light))
+    # OpenEXR, "Latitude-longitude map": the first column is longitude π, the first row latitude π/2; latitude π/2 is +y,
+    # longitude 0 is +z and π/2 is +x. UsdLux follows it.
+    row, column = np.unravel_index(picture.sum(axis=2).argmax(), picture.shape[:2])
+    longitude = np.pi - (column + 0.5) / picture.shape[1] * 2 * np.pi
+    latitude = np.pi / 2 - (row + 0.5) / picture.shape[0] * np.pi
+    local = np.array([np.cos(latitude) * np.sin(longitude), np.sin(latitude), np.cos(latitude) * np.cos(longitude)])
+    found = placed(stage.GetPrimAtPath("/Episode/Lights/Dome"), 0)[:3, :3] @ local
+    a, p = np.radians(azimuth) + usd_sets.TURN, np.radians(polar)
+    expected = np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
+    assert np.degrees(np.arccos(found @ expected)) < 180.0 / ROWS
+
+
+def test_the_dome_is_turned_as_usd_would_turn_it(rows):
+    """USD's own correction for z up finds that it is there already, and on a bare dome is the same operation."""
+    stage = open_episode(rows)
+    dome = UsdLux.DomeLight.Get(stage, "/Episode/Lights/Dome")
+    names = [op.GetOpName() for op in UsdGeom.Xformable(dome).GetOrderedXformOps()]
+    dome.OrientToStageUpAxis()
+    assert [op.GetOpName() for op in UsdGeom.Xformable(dome).GetOrderedXformOps()] == names
+    bare = UsdLux.DomeLight.Define(stage, "/Bare")
+    bare.OrientToStageUpAxis()
+    (op,) = UsdGeom.Xformable(bare).GetOrderedXformOps()
+    assert (op.GetOpName(), op.Get()) == (names[-1], dome.GetPrim().GetAttribute(names[-1]).Get())
+
+
+@pytest.mark.parametrize(("azimuth", "polar"), [(0.0, 60.0), (90.0, 45.0), (-130.0, 20.0)])
+def test_suns_shine_from_where_they_stand(rows, azimuth, polar):
+    light = sunny(azimuth, polar)
+    stage = open_episode(rows, lights=(light, light))
+    sun = UsdLux.DistantLight.Get(stage, "/Episode/Lights/Sun")
+    found = placed(sun.GetPrim(), 0)[:3, :3] @ [0.0, 0.0, -1.0]
+    a, p = np.radians(azimuth) + usd_sets.TURN, np.radians(polar)
+    np.testing.assert_allclose(found, -np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)]), atol=1e-6)
+    assert sun.GetNormalizeAttr().Get()
+    assert np.radians(sun.GetAngleAttr().Get() / 2) == pytest.approx(np.arctan(part_sun(light)[2]), rel=1e-5)
+    irradiance = np.array(sun.GetColorAttr().Get()) * sun.GetIntensityAttr().Get()
+    made = stage_light(0, light, 1.0)
+    np.testing.assert_allclose(irradiance, made.intensity * np.array(made.sun_irradiance), rtol=1e-5)
+
+
+def test_maps_without_a_sun_have_none(stage):
+    assert not stage.GetPrimAtPath("/Episode/Lights/Sun")
+
+
+@pytest.mark.parametrize("irradiance", [0.01, 3.0, 100.0])
+@pytest.mark.parametrize("rows", [256, 512])
+@pytest.mark.parametrize("sharpness", [100.0, 3000.0])
+def test_no_light_counts_twice(irradiance, rows, sharpness):
+    """Map and sun are those of the pictures, whether the sun is a light of its own or a disc in its map."""
+    light = sunny(30.0, 50.0, irradiance, sharpness, rows)
+    rest, beam, spread = part_sun(light)
+    table = light_tables.light_table(light, None)
+    assert spread == pytest.approx(table.main_spread, rel=1e-4)
+    assert (spread > main_light.MAIN_LIGHT_SPREAD) == (not beam.any()) == (sharpness == 100.0)
+    np.testing.assert_allclose(beam, table.main_irradiance, rtol=1e-5)
+    near = directions(256) @ light.sun.direction > np.cos(np.radians(15.0))
+    found, expected = main_light.resized(rest, 256), table.rest
+    np.testing.assert_allclose(found[~near], expected[~near], rtol=1e-4)
+    solid = main_light.map_directions(256)[1]
+    parts = [(image * solid[..., None])[near].sum(axis=0) for image in (found, expected)]
+    np.testing.assert_allclose(*parts, rtol=5e-3)
+    if beam.any():
+        np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+def test_wide_suns_are_in_the_map_alone(rows):
+    light = sunny(30.0, 50.0, sharpness=100.0)
+    stage = open_episode(rows, lights=(light, light))
+    assert not stage.GetPrimAtPath("/Episode/Lights/Sun")
+
+
+@pytest.mark.parametrize(
+    "light", [*skies(), sunny(30.0, 50.0), replace(sunny(30.0, 50.0, sharpness=100.0), name="wide")], ids=lambda light: light.name
+)
+def test_brightness_is_that_of_the_pictures(light):
+    expected = light_tables.light_table(light, None).exposure
+    assert stage_light(0, light, 1.5).intensity == pytest.approx(1.5 * expected, rel=0.03)

@@ -1,0 +1,25 @@
+"""Kernel that lets tests call the gripper's inverse kinematics."""
+
+import warp as wp
+
+from synpick_warp.kernels.perception import grasp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def frame_kernel(
+    normal: wp.array[wp.vec3],
+    limit: float,
+    point: wp.vec3,
+    tip: float,
+    angles_out: wp.array[wp.vec2],
+    limited_out: wp.array[wp.vec3],
+    axis_out: wp.array[wp.vec3],
+):
+    """Limited normal, its angles, and where the tilt axis is."""
+    i = wp.tid()
+    limited = grasp.limited_normal(normal[i], limit)
+    limited_out[i] = limited
+    angles_out[i] = grasp.gripper_angles(limited)
+    axis_out[i] = grasp.axis_position(point, limited, tip)

@@ -1,0 +1,39 @@
+"""Kernels that let tests call device functions."""
+
+import warp as wp
+
+from synpick_warp.kernels import rng
+from synpick_warp.kernels.sim import impedance
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def draw_kernel(
+    seed: wp.array[wp.uint64],
+    address: wp.array2d[int],
+    count: int,
+    key_out: wp.array[wp.uint64],
+    uniform_out: wp.array[float],
+    index_out: wp.array[int],
+    rotation_out: wp.array[wp.quat],
+):
+    """One number of each kind at each address: episode, redraw, purpose, index."""
+    i = wp.tid()
+    key = rng.stream_key(seed[i], address[i, 0], address[i, 1], address[i, 2])
+    key_out[i] = key
+    uniform_out[i] = rng.uniform(key, address[i, 3])
+    index_out[i] = rng.uniform_index(key, address[i, 3], count)
+    rotation_out[i] = rng.uniform_rotation(key, address[i, 3])
+
+
+@wp.kernel
+def force_kernel(
+    offset: wp.array[wp.vec3],
+    velocity: wp.array[wp.vec3],
+    law: wp.array2d[float],
+    force_out: wp.array[wp.vec3],
+):
+    """The gripper's force; law: stiffness, damping, limit, mass, time step."""
+    i = wp.tid()
+    force_out[i] = impedance.impedance_force(offset[i], velocity[i], law[i, 0], law[i, 1], law[i, 2], law[i, 3], law[i, 4])

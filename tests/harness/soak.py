@@ -1,0 +1,131 @@
+"""Ticks without end through the writers of all formats: what memory and open files do meanwhile.
+
+    python -m tests.reference.soak --ticks 10000
+
+prints a line now and then, and at the end JSON: samples of memory [B] and of open files, each the sum over the bake and its writers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import shutil
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synpick_warp.codes import Ending
+from synpick_warp.configs.schema import FORMATS, Config
+from synpick_warp.dataset.manifest import episode_place, read_record
+from synpick_warp.dataset.writing import Output
+from synpick_warp.episodes import EpisodeRow
+from synpick_warp.exporters.base import DataSet
+from synpick_warp.exporters.registry import Exporters, exporter_kinds, slot_bytes
+from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.scenes.embedded.skies import skies
+from tests.worlds import box_views, trajectories
+
+WORLDS = 2
+FRAMES = 25
+"""Of an episode."""
+SEEN = 8
+"""Frames that come again and again."""
+SAMPLES = 50
+KEPT = 4
+"""Episodes whose files stay, so that no disk fills."""
+
+
+def settings() -> tuple[Config, tuple]:
+    """Small pictures, all formats, and the cameras."""
+    lenses = box_views.cameras(48, 36)
+    config = trajectories.config(chunk_ticks=8, shard_chunks=4)
+    bake = dataclasses.replace(config.bake, formats=FORMATS, episodes=1)
+    return dataclasses.replace(config, bake=bake, cameras=dataclasses.replace(config.cameras, resolution=(48, 36))), lenses
+
+
+def renamed(batch: Any, episodes: np.ndarray, frame: int) -> Any:
+    """The same as a frame of other episodes."""
+    number = np.repeat(episodes, len(batch.episode) // len(episodes)).astype(np.int32)
+    return dataclasses.replace(batch, episode=number, frame=np.full(len(number), frame, np.int32))
+
+
+def frames_of(lenses: tuple) -> list[tuple[FrameBatch, TickBatch]]:
+    """Views and ticks of SEEN frames."""
+    worlds = tuple(range(WORLDS))
+    views = list(box_views.batches(WORLDS * len(lenses), worlds, SEEN, lenses))
+    return list(zip(views, trajectories.ticks(worlds, SEEN), strict=True))
+
+
+def end_of(episode: int) -> EpisodeEnd:
+    """Every episode ends well, with an attempt."""
+    row = EpisodeRow(episode, 0, Ending.FINISHED, FRAMES, 1.0, "pick", 3, 1, 1, 0, 2)
+    attempt = json.dumps(trajectories.ATTEMPT | {"episode": episode}) + "\n"
+    return EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (attempt,))
+
+
+def sample(pool: WriterPool) -> tuple[int, int]:
+    """Resident memory [B] and number of open files, of the bake and its writers."""
+    memory = files = 0
+    for process in (os.getpid(), *(worker.process.pid for worker in pool._workers)):
+        memory += int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        files += len(os.listdir(f"/proc/{process}/fd"))
+    return memory, files
+
+
+def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
+    """Samples of memory and of open files."""
+    config, lenses = settings()
+    kinds = exporter_kinds(config.bake.formats)
+    frames = frames_of(lenses)
+    memory, files = [], []
+    with Output(out, config, ()) as output, WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
+        exporters = Exporters(kinds, DataSet(out, config, box_views.catalog(), lenses, skies(), pool))
+        output.begin(exporters, {}, pool)
+        for tick in range(ticks):
+            first, frame = divmod(tick, FRAMES)
+            episodes = np.arange(WORLDS) + WORLDS * first
+            views, worlds = frames[frame % SEEN]
+            exporters.tick(renamed(worlds, episodes, frame))
+            exporters.write(renamed(views, episodes, frame))
+            if frame == FRAMES - 1:
+                for episode in episodes.tolist():
+                    end = end_of(episode)
+                    exporters.end(end, partial(output.record, exporters, pool, end))
+                _forget(out, exporters, WORLDS * (first - KEPT))
+            if (tick + 1) % max(1, ticks // SAMPLES) == 0:
+                pool.wait()
+                for values, value in zip((memory, files), sample(pool), strict=True):
+                    values.append(value)
+                print(f"{tick + 1:6d} ticks  {memory[-1] / 1e6:8.2f} MB  {files[-1]} files", file=sys.stderr, flush=True)
+        exporters.close()
+    return memory, files
+
+
+def _forget(out: Path, exporters: Exporters, before: int) -> None:
+    for episode in range(max(0, before - WORLDS), before):
+        assert read_record(out, episode_place(episode))
+        for path in (*exporters.files(episode), *(Path(f"{episode_place(episode)}{suffix}") for suffix in (".json", ".sha256"))):
+            shutil.rmtree(out / path) if (out / path).is_dir() else (out / path).unlink()
+
+
+def main() -> None:
+    """See above."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--ticks", type=int, default=10_000)
+    parser.add_argument("--writers", type=int, default=2)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        memory, files = soak(given.ticks, given.writers, Path(folder) / "set")
+    late = memory[len(memory) // 5 :]
+    print(json.dumps({"memory": memory, "files": files, "growth": max(late) / min(late) - 1.0}))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""Pixels and rays, tiles, projected boxes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, camera_ray, projected_box, tile_pixel
+from synpick_warp.stages.render.scene import build_grid
+from tests.twins.raycast import rotation_of
+
+WIDTH, HEIGHT, FOCAL = 160, 90, 200.0
+
+
+@wp.kernel
+def visit_kernel(grid: ImageGrid, visits: wp.array3d[int]):
+    pixel = tile_pixel(grid, wp.tid())
+    if pixel[1] < grid.height and pixel[2] < grid.width:
+        wp.atomic_add(visits, pixel[0], pixel[1], pixel[2], 1)
+
+
+@wp.kernel
+def ray_kernel(intrinsics: wp.vec4, offset: wp.vec2, rays: wp.array2d[wp.vec3]):
+    row, column = wp.tid()
+    rays[row, column] = camera_ray(intrinsics, row, column, offset)
+
+
+@wp.kernel
+def box_kernel(
+    lower: wp.array[wp.vec3],
+    upper: wp.array[wp.vec3],
+    turn: wp.array[wp.mat33d],
+    position: wp.array[wp.vec3d],
+    intrinsics: wp.vec4,
+    grid: ImageGrid,
+    boxes: wp.array[wp.vec4i],
+):
+    i = wp.tid()
+    boxes[i] = projected_box(lower[i], upper[i], turn[i], position[i], intrinsics, grid)
+
+
+def project(lower, upper, turn, position):
+    boxes = wp.zeros(1, dtype=wp.vec4i, device="cpu")
+    inputs = [
+        wp.array([lower], dtype=wp.vec3, device="cpu"),
+        wp.array([upper], dtype=wp.vec3, device="cpu"),
+        wp.array([turn], dtype=wp.mat33d, device="cpu"),
+        wp.array([position], dtype=wp.vec3d, device="cpu"),
+        wp.vec4(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2),
+        build_grid(WIDTH, HEIGHT),
+    ]
+    wp.launch(box_kernel, dim=1, inputs=inputs, outputs=[boxes], device="cpu")
+    return boxes.numpy()[0]
+
+
+@pytest.mark.parametrize(("width", "height"), [(8, 4), (1, 1), (33, 17), (7, 9)])
+def test_tiles_visit_every_pixel_once(width, height):
+    grid = build_grid(width, height)
+    visits = wp.zeros((2, height, width), dtype=int, device="cpu")
+    wp.launch(visit_kernel, dim=2 * grid.tiles * 32, inputs=[grid], outputs=[visits], device="cpu")
+    assert (visits.numpy() == 1).all()
+
+
+def test_rays_pass_pixel_centres():
+    rays = wp.zeros((2, 3), dtype=wp.vec3, device="cpu")
+    wp.launch(ray_kernel, dim=(2, 3), inputs=[wp.vec4(10.0, 20.0, 1.5, 1.0), wp.vec2(0.0, 0.0)], outputs=[rays], device="cpu")
+    np.testing.assert_allclose(rays.numpy()[0, 0], [-1.0 / 10.0, -0.5 / 20.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(rays.numpy()[1, 2], [1.0 / 10.0, 0.5 / 20.0, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(rays.numpy()[0, 1][0], 0.0, atol=1e-7)
+    wp.launch(ray_kernel, dim=(2, 3), inputs=[wp.vec4(10.0, 20.0, 1.5, 1.0), wp.vec2(0.5, -0.5)], outputs=[rays], device="cpu")
+    np.testing.assert_allclose(rays.numpy()[0, 0], [-0.5 / 10.0, -1.0 / 20.0, 1.0], rtol=1e-6)
+
+
+def test_a_box_straight_ahead_has_a_known_projection():
+    # Half a width of 0.1 m at 1 m is 20 px; the nearest face decides; one pixel of margin.
+    assert project((-0.1, -0.1, 0.0), (0.1, 0.1, 1.0), np.eye(3), (0, 0, 1.0)).tolist() == [59, 24, 101, 66]
+
+
+def test_what_lies_behind_covers_nothing_and_what_passes_the_camera_may_cover_all():
+    assert project((-0.1,) * 3, (0.1,) * 3, np.eye(3), (0, 0, -1.0)).tolist() == [0, 0, -1, -1]
+    assert project((-0.1,) * 3, (0.1,) * 3, np.eye(3), (0, 0, 0.05)).tolist() == [-160, -90, 319, 179]
+
+
+def test_what_lies_beyond_the_canvas_covers_nothing():
+    assert project((-0.1,) * 3, (0.1,) * 3, np.eye(3), (5.0, 0, 1.0)).tolist() == [0, 0, -1, -1]
+    assert project((-0.1,) * 3, (0.1,) * 3, np.eye(3), (0, -3.0, 1.0)).tolist() == [0, 0, -1, -1]
+
+
+@given(
+    size=st.tuples(*[st.floats(0.001, 0.3)] * 3),
+    quaternion=st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: np.linalg.norm(q) > 0.1),
+    position=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-0.3, 3.0)),
+    seed=st.integers(0, 1000),
+)
+def test_no_point_of_a_box_projects_outside_its_pixels(size, quaternion, position, seed):
+    turn = rotation_of(np.array(quaternion))
+    half = np.array(size, np.float32) / 2
+    left, top, right, bottom = project(-half, half, turn, position)
+    points = np.random.default_rng(seed).uniform(-1, 1, (200, 3)) * half.astype(np.float64) @ turn.T + position
+    points = points[points[:, 2] > 1e-3]
+    columns = points[:, 0] / points[:, 2] * FOCAL + WIDTH / 2
+    rows = points[:, 1] / points[:, 2] * FOCAL + HEIGHT / 2
+    on_canvas = (columns >= -WIDTH) & (columns < 2 * WIDTH) & (rows >= -HEIGHT) & (rows < 2 * HEIGHT)
+    columns, rows = columns[on_canvas], rows[on_canvas]
+    assert (np.floor(columns) >= left).all()
+    assert (np.floor(columns) <= right).all()
+    assert (np.floor(rows) >= top).all()
+    assert (np.floor(rows) <= bottom).all()

@@ -1,0 +1,160 @@
+"""Primary hits: depth, identities, amodal bits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from synpick_warp import frames
+from synpick_warp.configs.schema import Config
+from synpick_warp.kernels.render.visibility import gbuffer
+from synpick_warp.scenes.meshes import read_mesh
+from synpick_warp.scenes.types import Fixture
+from synpick_warp.stages import buffers
+from tests.twins.raycast import cast_scene
+from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, render, sheet
+
+NARROW = camera(160, 90, 453.7, (0.0, 0.0, 2.0))
+"""The default camera at a twelfth of its resolution."""
+
+
+def one(mesh, pose, view, **more):
+    return ToyScene([entry(mesh)], [[(0, pose)]], (view,), **more)
+
+
+def random_quaternion(rng):
+    q = rng.normal(size=4)
+    return tuple(q / np.linalg.norm(q))
+
+
+def test_codes_are_those_of_the_frames():
+    codes = [gbuffer.NOTHING, gbuffer.TABLE, gbuffer.FIRST_FIXTURE, gbuffer.FIRST_FIXTURE + 1, gbuffer.FIRST_FIXTURE + 2]
+    assert [int(code) for code in codes] == [frames.NOTHING, frames.TABLE, frames.TOTE, frames.FINGER, frames.CUP]
+    assert len(buffers.FIXTURES) == gbuffer.FIXTURES
+
+
+def test_a_ball_shows_its_area_and_its_nearest_depth(device):
+    picture = render(one(ball(0.1, 5), (0.0, 0.0, 0.3, *UPRIGHT), camera(161, 91, 400.0, (0.0, 0.0, 1.3))), device)
+    # The silhouette of a sphere of radius r at distance d is a circle of radius f r / sqrt(d² - r²).
+    area = np.pi * (400.0 * 0.1) ** 2 / (1.0 - 0.1**2)
+    assert abs((picture.instance[0] == 1).sum() / area - 1.0) < 0.01
+    assert picture.depth[0, 45, 80] == 9000
+    assert picture.amodal[0, 45, 80] == 1
+    assert picture.depth[0, 0, 0] == 0
+    assert picture.instance[0, 0, 0] == frames.NOTHING
+
+
+def test_pixel_centres_lie_at_half(device):
+    # A sheet whose edges project to columns 70.25 and 80.25 and rows 35.75 and 45.75: it holds the centres of columns 70 to 79 and
+    # rows 36 to 45. Were centres at whole numbers, it would hold columns 71 to 80.
+    view = camera(160, 90, 100.0, (0.0, 0.0, 1.0))
+    x, y = (75.25 - 80.0) / 100.0, -(40.75 - 45.0) / 100.0
+    picture = render(one(sheet(0.1, 0.1), (x, y, 0.0, *UPRIGHT), view), device)
+    rows, columns = np.nonzero(picture.instance[0])
+    assert (columns.min(), columns.max(), rows.min(), rows.max()) == (70, 79, 36, 45)
+    assert len(rows) == 100
+    assert (picture.depth[0][picture.instance[0] == 1] == 10000).all()
+
+
+def test_hidden_instances_keep_their_bits(device):
+    toy = one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW)
+    toy.placed[0] += [(0, (0.05, 0.0, 0.1, *UPRIGHT)), (0, (0.0, 0.03, -0.1, *UPRIGHT))]
+    picture = render(toy, device)
+    bits, instance = picture.amodal[0], picture.instance[0]
+    assert bits[45, 80] == 0b111
+    assert instance[45, 80] == 2
+    left = 80 - int(0.08 * 453.7 / 2.0)
+    assert bits[45, left] == 0b101
+    assert instance[45, left] == 1
+    assert (bits[instance == 3] == 0b100).all()
+    assert ((bits >> (np.maximum(instance, 1) - 1)) & 1)[instance > 0].all()
+
+
+def test_no_instance_leaves_no_trace(device):
+    toy = one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW)
+    toy.placed = [[], toy.placed[0]]
+    picture = render(toy, device)
+    assert not picture.amodal[0].any()
+    assert not picture.instance[0].any()
+    assert picture.amodal[1].any()
+
+
+def test_fixtures_and_table_are_seen_but_have_no_bits(device):
+    fixtures = (Fixture(box(0.3, 0.1, 0.1), GREY), Fixture(box(0.02, 0.02, 0.2), GREY), Fixture(box(0.02, 0.02, 0.02), GREY))
+    toy = one(sheet(0.1, 0.1), (0.0, 0.0, 0.07, *UPRIGHT), NARROW, fixtures=fixtures, table=True)
+    toy.fixture_poses = ((0.0, 0.0, 0.0, *UPRIGHT), (0.0, 0.0, 0.2, *UPRIGHT), (0.1, 0.0, 0.2, *UPRIGHT))
+    toy.fixtures_visible = (1, 1, 0)
+    picture = render(toy, device)
+    instance, depth = picture.instance[0], picture.depth[0]
+    assert set(np.unique(instance)) == {1, frames.TABLE, frames.TOTE, frames.FINGER}
+    assert set(np.unique(picture.amodal[0])) == {0, 1}
+    assert instance[45, 80] == frames.FINGER
+    assert picture.amodal[0][45, 80] == 1
+    assert depth[45, 80] == 17000
+    assert (depth[instance == frames.TOTE].min(), depth[instance == 1].min()) == (19500, 19300)
+    assert depth[0, 0] == round((2.0 + toy.config.tote.wall) * 1e4)
+
+
+def test_depth_beyond_sixteen_bits_is_no_depth(device):
+    config = replace(Config(), bop=replace(Config().bop, depth_scale=0.03))
+    picture = render(one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW, config=config), device)
+    assert picture.instance[0, 45, 80] == 1
+    assert picture.depth[0, 45, 80] == 0
+
+
+def test_worlds_and_cameras_do_not_mix(device):
+    views = (NARROW, camera(160, 90, 453.7, (0.1, 0.0, 1.0)))
+    poses = [(0.0, 0.0, 0.0, *UPRIGHT), (0.02, 0.03, 0.2, *UPRIGHT)]
+    together = render(ToyScene([entry(box(0.1, 0.05, 0.02))], [[(0, pose)] for pose in poses], views), device)
+    for world, pose in enumerate(poses):
+        for number, view in enumerate(views):
+            alone = render(ToyScene([entry(box(0.1, 0.05, 0.02))], [[(0, pose)]], (view,)), device)
+            for name in ("color", "depth", "instance", "amodal", "pixels", "boxes"):
+                np.testing.assert_array_equal(getattr(together, name)[2 * world + number], getattr(alone, name)[0])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_hits_agree_with_rays_in_float64(device, seed):
+    rng = np.random.default_rng(seed)
+    meshes = [box(0.16, 0.07, 0.2), ball(0.06, 3), box(0.2, 0.004, 0.1), ball(0.1, 1)]
+    poses = [(*rng.uniform((-0.15, -0.1, 0.0), (0.15, 0.1, 0.2)), *random_quaternion(rng)) for _ in meshes]
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    # A camera that looks at the pile from anywhere.
+    view = camera(160, 90, 453.7, tuple(turn.T @ (0.0, 0.0, -2.0)), turn)
+    check_against_reference(render(ToyScene([entry(m) for m in meshes], [list(enumerate(poses))], (view,)), device), meshes, poses, view)
+
+
+@pytest.mark.parametrize("numbers", [(3, 13, 15), (11, 14, 17)])
+def test_real_objects_agree_with_rays_in_float64(device, real_models, numbers):
+    rng = np.random.default_rng(numbers[0])
+    meshes = [read_mesh(real_models / f"obj_{number:06d}.ply", 1e-3)[0] for number in numbers]
+    poses = [(*rng.uniform((-0.1, -0.05, 0.0), (0.1, 0.05, 0.2)), *random_quaternion(rng)) for _ in meshes]
+    picture = render(ToyScene([entry(m) for m in meshes], [list(enumerate(poses))], (NARROW,)), device)
+    check_against_reference(picture, meshes, poses, NARROW)
+
+
+def check_against_reference(picture, meshes, poses, view):
+    depth, instance, amodal = cast_scene(meshes, poses, view)
+    # At most 0.05 % of a mask's pixels may differ; at this size that is one pixel on an edge at most.
+    for i in range(len(meshes)):
+        reference = (amodal >> np.uint32(i)) & 1
+        differing = (reference != ((picture.amodal[0] >> np.uint32(i)) & 1)).sum()
+        assert differing <= max(1, 5e-4 * reference.sum())
+    same = picture.instance[0] == instance
+    assert (~same).sum() <= 1
+    seen = same & (instance > 0)
+    # A ray within rounding of a silhouette may meet the surface behind it; everywhere else float32 must not show.
+    error = np.abs(picture.exact_depth[0] - depth)[seen]
+    assert np.quantile(error, 0.999) < 2e-6
+    assert (error > 1e-4).sum() <= 1
+    assert np.quantile(np.abs(picture.depth[0] * 1e-4 - depth)[seen], 0.999) < 0.5e-4 + 2e-6
+
+
+def test_a_fine_mesh_has_no_holes(device):
+    # 20,480 triangles over 12,000 pixels: rays pass close to edges and corners everywhere.
+    picture = render(one(ball(0.1, 5), (0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.927), camera(160, 90, 700.0, (0.0, 0.0, 1.0))), device)
+    rows, columns = np.mgrid[:90, :160]
+    assert picture.amodal[0][np.hypot(rows - 44.5, columns - 79.5) < 65.0].all()

@@ -1,0 +1,192 @@
+"""Triangles find their rays: the hits that a search by trees and one in float64 find, whatever the triangles' size, order and place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from synpick_warp import frames
+from synpick_warp.device import pick_device
+from synpick_warp.errors import CatalogError
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.gbuffer import trace_sample_kernel
+from synpick_warp.scenes.types import Fixture, TriangleMesh
+from synpick_warp.stages.launch import launch_pixels
+from synpick_warp.stages.render import raster
+from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, sheet, traced
+
+VIEW = camera(96, 64, 150.0, (0.0, 0.0, 1.0))
+NEVER = 1.0e6
+"""Depth that stands for no hit [m]."""
+
+
+def triangles(corners: np.ndarray) -> TriangleMesh:
+    """A mesh of loose triangles (F, 3, 3) [m]."""
+    return flat_shaded(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+
+
+def hits_of(toy: ToyScene, device: wp.Device, by_trees: bool = False) -> dict[str, np.ndarray]:
+    """What world 0 shows to camera 0: the arrays of `Hits`, by trees if asked, and amodal bits."""
+    out, renderer = traced(toy, device)
+    if by_trees:
+        scene, camera_number = renderer.scene, wp.zeros(1, dtype=wp.int32, device=device)
+        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, renderer.bodies, camera_number, toy.room, wp.vec2(0.0, 0.0)]
+        launch_pixels(trace_sample_kernel, scene.grid.tiles * int(TILE_PIXELS), inputs, [renderer.hits], device)
+    found = {name: getattr(renderer.hits, name).numpy()[0].copy() for name in ("code", "triangle", "barycentric", "depth")}
+    return found | {"amodal": out.amodal.numpy()[0].copy()}
+
+
+def depth_in_float64(corners: np.ndarray, view=VIEW) -> tuple[np.ndarray, np.ndarray]:
+    """Nearest planar depth (H, W) [m] by Möller and Trumbore's test, and how clearly (H, W) each ray meets or misses every triangle."""
+    k = view.matrix
+    x, y = (np.arange(view.width) + 0.5 - k[0, 2]) / k[0, 0], (np.arange(view.height) + 0.5 - k[1, 2]) / k[1, 1]
+    ray = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((view.height, view.width))], axis=-1)
+    nearest, clear = np.full(ray.shape[:2], NEVER), np.full(ray.shape[:2], np.inf)
+    for a, b, c in corners.astype(np.float32).astype(np.float64) @ view.rotation.T + view.translation:
+        across = np.cross(ray, c - a)
+        determinant = across @ (b - a)
+        # Edge on it may be met or not.
+        clear = np.minimum(clear, np.abs(determinant) / (np.linalg.norm(b - a) * np.linalg.norm(c - a) + 1e-30) * 1e3)
+        safe = np.where(determinant == 0.0, 1.0, determinant)
+        u, v = across @ -a / safe, ray @ np.cross(-a, b - a) / safe
+        depth = np.cross(-a, b - a) @ (c - a) / safe
+        weights = np.stack([u, v, 1.0 - u - v, depth])
+        met = (weights >= 0.0).all(axis=0) & (determinant != 0.0)
+        # How far, in px, the point is from an edge; and a ray that starts on the triangle is at depth 0.
+        clear = np.minimum(clear, np.abs(weights).min(axis=0) * 1e3)
+        nearest = np.where(met & (depth < nearest), depth, nearest)
+    return nearest, clear
+
+
+def random_triangles(seed: int, count: int, size: float, spread: float) -> np.ndarray:
+    """Loose triangles about the origin (count, 3, 3) [m]."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(-spread, spread, (count, 1, 3)) + size * rng.normal(size=(count, 3, 3))
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), count=st.integers(1, 12), size=st.sampled_from([0.003, 0.03, 0.3, 2.0]))
+def test_loose_triangles_of_any_size_agree_with_float64(seed, count, size):
+    """Two metres are much larger than the camera's distance of one: such triangles pass through its plane, and behind it."""
+    corners = random_triangles(seed, count, size, 0.2)
+    found = hits_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), pick_device("cpu"))
+    depth, clear = depth_in_float64(corners)
+    sure = clear > 0.1
+    assert sure.mean() > 0.5
+    np.testing.assert_array_equal(found["code"][sure] == 1, depth[sure] < NEVER)
+    both = sure & (depth < NEVER)
+    np.testing.assert_allclose(found["depth"][both], depth[both], rtol=2e-4)
+    assert (found["amodal"][both] == 1).all()
+
+
+@pytest.mark.parametrize("depth", [-0.5, 0.0, 1e-3, 2e-3, 5e-3, 0.05])
+def test_triangles_that_end_at_the_camera_are_seen_to_their_edges(device, depth):
+    """A strip of triangles that comes as near as `depth` [m], with its far ends across the picture."""
+    rng = np.random.default_rng(7)
+    near, far = rng.uniform(-0.02, 0.02, (12, 2)), rng.uniform(-0.25, 0.25, (12, 2, 2))
+    corners = np.stack([np.concatenate([n, [1.0 - depth]]) for n in near])[:, None]
+    corners = np.concatenate([corners, np.concatenate([far, np.zeros((12, 2, 1))], axis=2)], axis=1)
+    found = hits_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), device)
+    expected, clear = depth_in_float64(corners)
+    sure = clear > 0.02
+    assert sure.mean() > 0.4
+    np.testing.assert_array_equal(found["code"][sure] == 1, expected[sure] < NEVER)
+    assert (expected < NEVER).sum() > 500
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_trees_find_the_same(device, seed):
+    rng = np.random.default_rng(seed)
+    meshes = [ball(0.1, 4), box(0.2, 0.1, 0.05), ball(0.05, 2), sheet(0.4, 0.3)]
+    poses = [(*rng.uniform((-0.2, -0.1, 0.0), (0.2, 0.1, 0.3)), *(q / np.linalg.norm(q))) for q in rng.normal(size=(4, 4))]
+    fixtures = (Fixture(box(0.7, 0.5, 0.02), GREY), Fixture(box(0.05, 0.05, 0.3), GREY), Fixture(ball(0.04, 3), GREY))
+    placed = ((0.01, 0.0, 0.0, *UPRIGHT), (0.1, 0.1, 0.4, *UPRIGHT), (0.1, 0.1, 0.2, *UPRIGHT))
+    toy = ToyScene([entry(m) for m in meshes], [list(enumerate(poses))], (VIEW,), fixtures=fixtures, fixture_poses=placed,
+                   fixtures_visible=(1, 1, 1), table=True)  # fmt: skip
+    ours, theirs = hits_of(toy, device), hits_of(toy, device, by_trees=True)
+    np.testing.assert_array_equal(ours["code"], theirs["code"])
+    assert set(np.unique(ours["code"])) >= {1, 2, 4, frames.TOTE, frames.FINGER}
+    met = (ours["code"] != frames.NOTHING) & (ours["code"] != frames.TABLE)
+    same = met & (ours["triangle"] == theirs["triangle"])
+    assert same.sum() > 0.99 * met.sum()
+    np.testing.assert_allclose(ours["depth"], theirs["depth"], rtol=3e-6)
+    np.testing.assert_allclose(ours["barycentric"][same], theirs["barycentric"][same], atol=2e-4)
+
+
+def test_no_ray_is_lost_between_triangles_that_share_edges(device):
+    """The edges of a fan of 4 x 4 squares pass through the centres of pixels; each is met, from either side of the sheet."""
+    # Pixel centres lie 1 / 150 m apart at a distance of one; corners at every third, each in its own, rounded, coordinates.
+    x, y = (np.arange(-13, 14, 3) + 0.5) / 150.0, (np.arange(-10, 11, 3) + 0.5) / 150.0
+    faces = []
+    for j in range(len(y) - 1):
+        for i in range(len(x) - 1):
+            a, b, c, d = ((x[i], y[j], 0), (x[i + 1], y[j], 0), (x[i + 1], y[j + 1], 0), (x[i], y[j + 1], 0))
+            faces += [(a, b, c), (c, d, a)] if (i + j) % 2 else [(d, a, b), (b, c, d)]
+    mesh = triangles(np.array(faces))
+    for turn in (UPRIGHT, (1.0, 0.0, 0.0, 0.0)):
+        found = hits_of(ToyScene([entry(mesh)], [[(0, (0.0, 0.0, 0.0, *turn))]], (VIEW,)), device)
+        rows, columns = np.nonzero(found["code"] == 1)
+        inside = found["code"][rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+        assert (inside == 1).all()
+        assert inside.size >= 24 * 18
+
+
+def test_the_order_of_triangles_and_bodies_does_not_matter(device):
+    corners = random_triangles(3, 300, 0.05, 0.2)
+    shuffled = np.random.default_rng(0).permutation(len(corners))
+    first, second = (
+        hits_of(ToyScene([entry(triangles(c))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), device) for c in (corners, corners[shuffled])
+    )
+    np.testing.assert_array_equal(first["depth"], second["depth"])
+    np.testing.assert_array_equal(first["amodal"], second["amodal"])
+    met = first["code"] == 1
+    np.testing.assert_array_equal(first["triangle"][met], shuffled[second["triangle"][met]])
+
+
+@pytest.mark.parametrize("room", [0, 3, raster.BLOCKS])
+def test_large_triangles_are_done_with_room_for_their_blocks_or_without(device, room, monkeypatch):
+    toy = ToyScene([entry(box(0.3, 0.2, 0.1))], [[(0, (0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.927))]], (camera(192, 128, 300.0, (0.0, 0.0, 1.0)),))
+    expected = hits_of(toy, device, by_trees=True)
+    monkeypatch.setattr(raster, "BLOCKS", room)
+    found = hits_of(toy, device)
+    np.testing.assert_array_equal(found["code"], expected["code"])
+    np.testing.assert_array_equal(found["amodal"], (expected["code"] == 1).astype(np.uint32))
+    assert (found["code"] == 1).sum() > 20 * 256
+
+
+def test_the_backdrop_shows_what_the_tote_itself_would(device):
+    """The same turn as another quaternion is not the pose of the backdrop: then the tote's own triangles are drawn."""
+    fixtures = (Fixture(box(0.5, 0.3, 0.05), GREY), Fixture(box(0.05, 0.05, 0.3), GREY), Fixture(box(0.1, 0.1, 0.1), GREY))
+    poses = [(0, (0.05, 0.02, 0.02, 0.1, 0.2, 0.3, 0.927)), (0, (-0.1, 0.0, -0.2, *UPRIGHT))]
+    toy = ToyScene([entry(box(0.1, 0.1, 0.1))], [poses], (VIEW, camera(96, 64, 120.0, (0.1, 0.0, 0.8))), fixtures=fixtures,
+                   fixtures_visible=(1, 1, 0), table=True)  # fmt: skip
+    other = replace(toy, fixture_poses=((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0), *toy.fixture_poses[1:]))
+    pictures = [render(scene, device) for scene in (toy, other)]
+    for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance"):
+        np.testing.assert_array_equal(getattr(pictures[0], name), getattr(pictures[1], name))
+    assert {1, frames.TABLE, frames.TOTE, frames.FINGER} <= set(np.unique(pictures[0].instance))
+    # Who lies under the tote keeps its bits, and only those.
+    assert ((pictures[0].amodal & 2) != 0).any()
+    assert not (pictures[0].instance == 2).any()
+
+
+def test_a_tote_that_stands_elsewhere_or_is_gone_leaves_the_backdrop(device):
+    fixtures = (Fixture(box(0.5, 0.3, 0.05), GREY),) * 3
+    toy = ToyScene([entry(box(0.1, 0.1, 0.1))], [[]], (VIEW,), fixtures=fixtures, fixtures_visible=(1, 0, 0))
+    home = hits_of(toy, device)["code"] == frames.TOTE
+    moved = hits_of(replace(toy, fixture_poses=((0.1, 0.0, 0.0, *UPRIGHT),) * 3), device)["code"] == frames.TOTE
+    gone = hits_of(replace(toy, fixtures_visible=(0, 0, 0)), device)["code"]
+    assert home.sum() > 1000
+    np.testing.assert_array_equal(np.roll(home, 15, axis=1)[:, 15:], moved[:, 15:])
+    assert not gone.any()
+
+
+def test_a_mesh_with_more_triangles_than_marks_can_name_is_refused(device, monkeypatch):
+    monkeypatch.setattr(raster, "MOST_TRIANGLES", 11)
+    with pytest.raises(CatalogError, match="a mesh has 12 triangles; at most 11"):
+        hits_of(ToyScene([entry(box(0.1, 0.1, 0.1))], [[]], (VIEW,)), device)

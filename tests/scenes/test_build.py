@@ -1,0 +1,287 @@
+"""The model of all worlds: layout arithmetic, room for objects, and objects put into slots."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from synpick_warp.errors import ConfigError
+from synpick_warp.scenes import build
+from synpick_warp.scenes.tote import guide_walls
+from synpick_warp.scenes.types import Catalog
+from tests.twins import arrangement
+from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, settings
+
+WORLDS = 3
+
+
+def config_of(**overrides: object):
+    return settings(bake__worlds=WORLDS, **overrides)
+
+
+@pytest.fixture(scope="module")
+def objects() -> Catalog:
+    return catalog(BOX, ANGLE, CUBE)
+
+
+@pytest.fixture(scope="module")
+def built(device, objects) -> build.BuiltModel:
+    return build.build_model(config_of(), objects, device)
+
+
+# ---- layout ----
+
+
+def test_the_layout_is_the_models(built):
+    layout, model = built.layout, built.model
+    assert model.world_count == layout.worlds == WORLDS
+    assert model.body_count == WORLDS * layout.bodies_per_world
+    assert model.joint_coord_count == WORLDS * layout.coords_per_world
+    assert model.joint_dof_count == WORLDS * layout.dofs_per_world
+    # Variants' shapes follow after those of all worlds.
+    assert model.shape_count >= WORLDS * layout.shapes_per_world
+    np.testing.assert_array_equal(model.body_world.numpy(), np.repeat(np.arange(WORLDS), layout.bodies_per_world))
+    shapes = model.shape_world.numpy()[: WORLDS * layout.shapes_per_world]
+    np.testing.assert_array_equal(shapes, np.repeat(np.arange(WORLDS), layout.shapes_per_world))
+
+
+def test_gripper_and_slots_stand_where_the_layout_says(built):
+    layout, labels = built.layout, [label.split("/")[-1] for label in built.model.body_label]
+    for world in range(WORLDS):
+        first = world * layout.bodies_per_world
+        assert labels[first : first + build.GRIPPER_BODIES] == ["finger", "cup"]
+        slots = labels[first + build.GRIPPER_BODIES : first + layout.bodies_per_world]
+        assert slots[: layout.single_slots] == [f"single_{slot}" for slot in range(layout.single_slots)]
+        assert slots[layout.single_slots :] == [f"compound_{slot}" for slot in range(layout.compound_slots)]
+
+
+def test_joint_coordinates_move_the_body_of_their_slot(built):
+    """Slot s of world w: seven coordinates from w · coords + 4 + 7 s. The gripper: x, y, z, tilt."""
+    layout, model = built.layout, built.model
+    state = model.state()
+    q = np.zeros((WORLDS, layout.coords_per_world), np.float32)
+    q[:, 6 + build.GRIPPER_DOFS :: 7] = 1.0
+    for world in range(WORLDS):
+        q[world, :4] = (world, 0.2, 0.3, 0.0)
+        for slot in range(layout.slots):
+            first = build.GRIPPER_DOFS + 7 * slot
+            q[world, first : first + 3] = (world, slot, 7.0)
+    state.joint_q.assign(q.reshape(-1))
+    newton.eval_fk(model, state.joint_q, state.joint_qd, state)
+    place = state.body_q.numpy().reshape(WORLDS, layout.bodies_per_world, 7)[:, :, :3]
+    for world in range(WORLDS):
+        np.testing.assert_allclose(place[world, :2], np.tile([world, 0.2, 0.3], (2, 1)), atol=1e-6)
+        np.testing.assert_allclose(place[world, 2:], [[world, slot, 7.0] for slot in range(layout.slots)], atol=1e-6)
+
+
+def test_dofs_push_the_body_of_their_slot(device, built):
+    """A force on the z dof of one slot lifts that body and no other."""
+    layout, model = built.layout, built.model
+    starts = model.joint_qd_start.numpy()
+    for world in range(WORLDS):
+        for slot in range(layout.slots):
+            dof = world * layout.dofs_per_world + build.GRIPPER_DOFS + 6 * slot
+            joint = int(np.flatnonzero(starts == dof)[0])
+            assert model.joint_child.numpy()[joint] == world * layout.bodies_per_world + build.GRIPPER_BODIES + slot
+
+
+def test_guide_shapes_are_the_guide_walls(built):
+    config = config_of()
+    walls = guide_walls(config.tote, config.physics.guide_height)
+    assert len(built.layout.guide_shapes) == len(walls)
+    for world in range(WORLDS):
+        for guide, wall in zip(built.layout.guide_shapes, walls, strict=True):
+            shape = world * built.layout.shapes_per_world + guide
+            assert built.model.shape_body.numpy()[shape] == -1
+            source = built.model.shape_source[shape]
+            np.testing.assert_allclose(np.sort(source.vertices, axis=0), np.sort(wall.vertices, axis=0), atol=1e-6)
+
+
+def test_slots_begin_empty(built):
+    layout = built.layout
+    mass = built.model.body_mass.numpy().reshape(WORLDS, -1)[:, build.GRIPPER_BODIES :]
+    np.testing.assert_allclose(mass, build.EMPTY_MASS)
+    selected = built.model.body_variant.numpy().reshape(WORLDS, -1)[:, build.GRIPPER_BODIES :]
+    kinds = np.where(np.arange(layout.slots) < layout.single_slots, *built.empty_variant)
+    np.testing.assert_array_equal(selected, np.tile(kinds, (WORLDS, 1)))
+
+
+# ---- objects in slots ----
+
+
+def test_a_slot_becomes_the_object_that_is_selected(built, objects):
+    """Every object into the first slot of its kind in world 1: mass, centre of mass, inertia; others keep theirs."""
+    layout, model = built.layout, built.model
+    for index, entry in enumerate(objects.entries):
+        slot = layout.single_slots if len(entry.pieces) > 1 else 0
+        body = layout.bodies_per_world + build.GRIPPER_BODIES + slot
+        variant = np.full(model.body_count, -1, np.int32)
+        variant[body] = built.variant[index]
+        model.select_body_variants(wp.array(variant, dtype=int, device=model.device))
+        assert model.body_mass.numpy()[body] == pytest.approx(entry.mass, rel=1e-6)
+        np.testing.assert_allclose(model.body_com.numpy()[body], entry.center_of_mass, atol=1e-7)
+        np.testing.assert_allclose(model.body_inertia.numpy()[body], entry.inertia, rtol=1e-4, atol=1e-6 * np.trace(entry.inertia))
+        np.testing.assert_allclose(model.body_inv_mass.numpy()[body], 1 / entry.mass, rtol=1e-6)
+        np.testing.assert_allclose(model.body_inv_inertia.numpy()[body] @ entry.inertia, np.eye(3), atol=1e-3)
+        assert model.body_mass.numpy()[body + layout.bodies_per_world] == pytest.approx(build.EMPTY_MASS)
+        shapes = np.flatnonzero(model.shape_body.numpy() == body)
+        flags = model.shape_flags.numpy()[shapes] & int(newton.ShapeFlags.COLLIDE_SHAPES)
+        assert (flags != 0).sum() == len(entry.pieces)
+        variant[body] = built.empty_variant[slot > 0]
+        model.select_body_variants(wp.array(variant, dtype=int, device=model.device))
+        assert (model.shape_flags.numpy()[shapes] & int(newton.ShapeFlags.COLLIDE_SHAPES) == 0).all()
+        assert model.body_mass.numpy()[body] == pytest.approx(build.EMPTY_MASS)
+
+
+def test_the_grippers_mass_is_the_settings(built):
+    gripper, mass = config_of().gripper, built.model.body_mass.numpy().reshape(WORLDS, -1)
+    np.testing.assert_allclose(mass[:, :2], np.tile([gripper.finger_mass, gripper.cup_mass], (WORLDS, 1)), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("shapes", "kinds"), [((BOX, CUBE), (3, 0)), ((ANGLE,), (0, 3))], ids=("single", "compound"))
+def test_catalogs_of_one_kind(device, shapes, kinds):
+    built = build.build_model(config_of(), catalog(*shapes), device)
+    assert (built.layout.single_slots > 0, built.layout.compound_slots > 0) == (kinds[0] > 0, kinds[1] > 0)
+    assert built.model.body_count == WORLDS * built.layout.bodies_per_world
+    assert built.variant.tolist() == list(range(len(shapes)))
+
+
+# ---- how many slots ----
+
+
+def fake(volume: np.ndarray, compound: np.ndarray, objects: Catalog) -> Catalog:
+    """A catalog of given volumes and kinds."""
+    kinds = objects.entries[:2]
+    return Catalog(tuple(dataclasses.replace(kinds[int(kind)], volume=float(size)) for size, kind in zip(volume, compound, strict=True)))
+
+
+def needs(config, volume, compound, episodes: int, *, repeats: bool) -> np.ndarray:
+    """Slots (episode, kind) that the twin's draws take where there is room for all."""
+    room = config.arrangement.max_objects
+    taken = []
+    for episode in range(episodes):
+        drawn = arrangement.draw_objects(
+            0, episode, 0, volume=volume, compound=compound, budget=config.arrangement.volume, repeats=repeats,
+            room=room, single_slots=room, compound_slots=room,
+        )
+        kinds = compound[list(drawn.entries)] == 1
+        taken.append(((~kinds).sum(), kinds.sum()))
+    return np.array(taken)
+
+
+def overflows(taken: np.ndarray, slots: tuple[int, int]) -> float:
+    """Share of draws that find no slot for one of their objects."""
+    return float((taken > slots).any(axis=1).mean())
+
+
+@hypothesis_settings(max_examples=12)
+@given(
+    seed=st.integers(0, 2**32 - 1), size=st.sampled_from((0.5e-3, 1.5e-3, 6e-3)), share=st.sampled_from((0.2, 0.5)),
+    mode=st.sampled_from(("pick", "target", "move")),
+)
+def test_slots_hold_all_but_the_accepted_share_of_draws(seed, size, share, mode, objects):
+    """Found by brute force with the twin's draws; also where single objects may exceed the whole budget. One slot fewer would not do."""
+    numbers = np.random.default_rng(seed)
+    volume, compound = numbers.uniform(0.1 * size, size, 9), (numbers.uniform(size=9) < share).astype(int)
+    shortfall, episodes = 0.05, 400
+    config = settings(bake__mode=mode, arrangement__volume=3e-3, arrangement__max_objects=20, arrangement__slot_shortfall=shortfall)
+    slots = build.count_slots(config, fake(volume, compound, objects))
+    taken = needs(config, volume, compound, episodes, repeats=mode == "move")
+    # Four standard deviations of the brute force.
+    margin = 4 * np.sqrt(shortfall / episodes)
+    assert overflows(taken, slots) <= shortfall + margin
+    for fewer in ((slots[0] - 1, slots[1]), (slots[0], slots[1] - 1)):
+        if min(fewer) >= 0:
+            assert overflows(taken, fewer) >= shortfall - margin
+    assert max(slots) <= 20
+    if mode != "move":
+        assert slots[0] <= (compound == 0).sum()
+        assert slots[1] <= (compound == 1).sum()
+
+
+def test_the_accepted_share_is_that_of_both_kinds_together(objects):
+    """Known: two draws, each single or compound with even chances. With a slot of either kind a quarter fails twice, which makes a half."""
+    halves = fake(np.full(2, 1e-4), np.array([0, 1]), objects)
+    for shortfall, slots in ((0.3, (2, 1)), (0.2, (2, 2))):
+        config = settings(bake__mode="move", arrangement__max_objects=2, arrangement__volume=1.0, arrangement__slot_shortfall=shortfall)
+        assert build.count_slots(config, halves) == slots
+
+
+def test_with_a_budget_for_everything_and_no_repeats_every_object_has_a_slot(objects):
+    five = fake(np.full(5, 1e-4), np.array([0, 1, 1, 0, 0]), objects)
+    for room, slots in ((8, (3, 2)), (2, (2, 2))):
+        assert build.count_slots(settings(bake__mode="pick", arrangement__max_objects=room, arrangement__volume=1.0), five) == slots
+
+
+def test_without_repeats_a_budget_for_few_needs_few_slots(objects):
+    """Known: thirty objects, seven of which fill the budget; with repeats it is the same number of bodies, of any kind."""
+    thirty = fake(np.full(30, 1e-4), np.array([0] * 28 + [1] * 2), objects)
+    config = {"arrangement__volume": 7.5e-4, "arrangement__max_objects": 32}
+    assert build.count_slots(settings(bake__mode="pick", **config), thirty) == (7, 2)
+    single, compound = build.count_slots(settings(bake__mode="move", **config), thirty)
+    assert single == 7
+    assert compound > 2
+
+
+def test_the_first_object_is_drawn_again_until_one_fits_and_the_next_that_does_not_ends_the_draw(objects):
+    """Known: of a hundred objects only one fits, and it fits twice."""
+    volume = np.full(100, 1e-3)
+    volume[40] = 1e-4
+    rare = fake(volume, np.arange(100) == 40, objects)
+    # A second object fits in one draw of a hundred with repeats, and never without.
+    for mode, shortfall, most in (("move", 0.02, 1), ("move", 0.005, 2), ("pick", 0.005, 1)):
+        config = settings(bake__mode=mode, arrangement__volume=2.5e-4, arrangement__slot_shortfall=shortfall, arrangement__max_objects=2)
+        assert build.count_slots(config, rare) == (0, most)
+
+
+@pytest.mark.parametrize(
+    ("mode", "mix", "rules", "expected"),
+    [
+        ("pick", (1, 1, 1), (False, True), {False}),
+        ("target", (1, 1, 1), (False, True), {False}),
+        ("move", (1, 1, 1), (False, True), {True}),
+        ("mixed", (1, 1, 1), (False, True), {False, True}),
+        ("mixed", (1, 1, 0), (False, True), {False}),
+        ("mixed", (0, 0, 1), (False, True), {True}),
+        ("mixed", (0, 1, 1), (True, True), {True}),
+        ("mixed", (0, 1, 1), (True, False), {False, True}),
+    ],
+)
+def test_rules_of_repeating_that_occur(mode, mix, rules, expected):
+    config = settings(bake__mode=mode, bake__mix=list(mix), pick__repeats=rules[0], move__repeats=rules[1])
+    assert build.repeats_that_occur(config) == expected
+
+
+def test_mixed_modes_have_the_slots_of_the_mode_that_needs_most(objects):
+    """Of each kind: picking may need more of one and moving more of the other."""
+    some = fake(np.full(6, 1e-4), np.array([0, 0, 0, 0, 1, 1]), objects)
+    config = {"arrangement__volume": 5.5e-4, "arrangement__max_objects": 12}
+    single = [build.count_slots(settings(bake__mode=mode, **config), some) for mode in ("pick", "target", "move")]
+    assert build.count_slots(settings(bake__mode="mixed", **config), some) == tuple(np.max(single, axis=0))
+    assert build.count_slots(settings(bake__mode="mixed", bake__mix=[1, 1, 0], **config), some) == single[0] == single[1] != single[2]
+
+
+def test_no_kind_takes_more_slots_than_there_is_room_for_objects(objects):
+    config = settings(arrangement__max_objects=4, arrangement__volume=1.0)
+    single, compound = build.count_slots(config, fake(np.full(4, 1e-5), np.array([0, 0, 1, 1]), objects))
+    assert (single, compound) == (4, 4)
+    assert build.count_slots(config, fake(np.full(2, 1e-5), np.zeros(2), objects)) == (4, 0)
+
+
+@pytest.mark.parametrize("mode", ["move", "pick"])
+def test_a_budget_below_the_smallest_object_is_a_mistake(objects, mode):
+    config = settings(arrangement__volume=1e-4, bake__mode=mode)
+    with pytest.raises(ConfigError, match=r"volume is 0\.0001 m³, but the smallest object, boxes_3, takes 0\.000125 m³; make it larger"):
+        build.count_slots(config, objects)
+
+
+def test_the_same_slots_every_time(objects):
+    config = config_of(arrangement__max_objects=12, arrangement__volume=3e-3)
+    assert build.count_slots(config, objects) == build.count_slots(config, objects)

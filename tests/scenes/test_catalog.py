@@ -1,0 +1,320 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Arrangement, Bake, Config, ObjectRow, Objects, Tote
+from synpick_warp.errors import CatalogError
+from synpick_warp.scenes import catalog
+from synpick_warp.scenes.catalog import diameter, load_catalog
+from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.types import CatalogEntry
+
+# Litres of the convex hulls, and concave or not, as the README of the real data gives them.
+REAL_HULLS = {
+    1: 1.142, 2: 2.310, 3: 0.661, 4: 0.357, 5: 0.699, 6: 0.187, 7: 0.352, 8: 0.179, 9: 0.420, 10: 0.265, 11: 3.125, 12: 1.067, 13: 0.749,
+    14: 0.525, 15: 1.292, 16: 1.605, 17: 0.129, 18: 0.033, 19: 0.377, 20: 0.601, 21: 0.197,
+}  # fmt: skip
+REAL_CONCAVE = {13, 14, 15}
+
+
+def config_for(folder: Path, rows: tuple[ObjectRow, ...] = (), **objects) -> Config:
+    return Config(bake=Bake(models=str(folder)), objects=Objects(**objects), object_rows=rows)
+
+
+def write_box(file: Path, extents=(0.1, 0.1, 0.1), offset=(0.0, 0.0, 0.0)) -> Path:
+    """In metres, or in millimetres for names of BOP models."""
+    box = trimesh.creation.box(np.array(extents) * (1000 if file.name.startswith("obj_") else 1))
+    box.apply_translation(offset)
+    file.write_bytes(box.export(file_type="ply") if file.suffix == ".ply" else box.export(file_type=file.suffix[1:]).encode())
+    return file
+
+
+def write_info(folder: Path, content) -> None:
+    (folder / "models_info.json").write_text(content if isinstance(content, str) else json.dumps(content))
+
+
+def load(config: Config, cache: Path) -> tuple[CatalogEntry, ...]:
+    return load_catalog(config, cache / "cache").entries
+
+
+def assert_physical(entry: CatalogEntry) -> None:
+    low, middle, high = np.linalg.eigvalsh(entry.inertia)
+    assert low > 0.0
+    assert low + middle >= high
+    assert np.array_equal(entry.inertia, entry.inertia.T)
+    assert entry.mass > 0.0
+    assert entry.volume > 0.0
+    assert entry.diameter / 2 <= entry.radius * (1 + 1e-6)
+
+
+def test_a_bop_folder_in_millimetres(tmp_path):
+    write_box(tmp_path / "obj_000007.ply", (0.1, 0.2, 0.3))
+    write_box(tmp_path / "obj_000002.ply", (0.1, 0.1, 0.1))
+    turn = [-1, 0, 0, 10, 0, -1, 0, 20, 0, 0, 1, 30, 0, 0, 0, 1]
+    write_info(tmp_path, {
+        "2": {"diameter": 173.2, "symmetries_continuous": [{"axis": [0, 0, 2], "offset": [0, 5, 0]}]},
+        "7": {"symmetries_discrete": [turn]},
+        "9": {"diameter": -1},
+    })  # fmt: skip
+    two, seven = load(config_for(tmp_path), tmp_path)
+    assert (two.obj_id, seven.obj_id) == (2, 7)
+    assert two.name == "obj_000002"
+    assert two.source == tmp_path / "obj_000002.ply"
+    assert seven.volume == pytest.approx(6e-3)
+    assert seven.mass == pytest.approx(400.0 * 6e-3)
+    assert seven.diameter == pytest.approx(np.sqrt(0.14))
+    assert seven.radius == pytest.approx(np.sqrt(0.14) / 2)
+    assert np.allclose(np.diag(seven.inertia), 2.4 / 12 * np.array((0.13, 0.10, 0.05)))
+    assert seven.center_of_mass == pytest.approx((0.0, 0.0, 0.0), abs=1e-9)
+    assert seven.symmetries_discrete == ((-1, 0, 0, 0.01, 0, -1, 0, 0.02, 0, 0, 1, 0.03, 0, 0, 0, 1),)
+    assert two.symmetries_continuous == (((0.0, 0.0, 1.0), (0.0, 0.005, 0.0)),)
+    assert (two.material.metallic, two.material.roughness) == (0.1, 0.5)
+    assert_physical(two)
+
+
+def test_a_row_counts_if_number_and_diameter_agree(tmp_path):
+    for obj_id in (1, 2, 3):
+        write_box(tmp_path / f"obj_{obj_id:06d}.ply")
+    size = 0.1 * np.sqrt(3)
+    rows = (
+        ObjectRow(id=1, name="near", diameter=1.09 * size, mass=0.3, metallic=0.9, roughness=0.2),
+        ObjectRow(id=2, name="far", diameter=1.2 * size, mass=0.4),
+        ObjectRow(id=3, name="any size", mass=0.5),
+    )
+    one, two, three = load(config_for(tmp_path, rows), tmp_path)
+    assert (one.name, one.mass, one.material.metallic, one.material.roughness) == ("near", 0.3, 0.9, 0.2)
+    assert (two.name, two.mass) == ("obj_000002", pytest.approx(0.4))
+    assert (three.name, three.mass) == ("any size", 0.5)
+
+
+def test_meshes_of_a_users_own_in_metres(tmp_path):
+    write_box(tmp_path / "b.ply", (0.1, 0.2, 0.3))
+    write_box(tmp_path / "a.obj")
+    (tmp_path / "c.glb").write_bytes(trimesh.Scene([trimesh.creation.icosphere(2, 0.04)]).export(file_type="glb"))
+    (tmp_path / "notes.txt").write_text("no model")
+    (tmp_path / ".hidden.ply").write_text("no model")
+    # Numbers are only counts here: the row is found by name, not by number.
+    rows = (ObjectRow(id=1, name="other", diameter=0.1732, mass=9.0), ObjectRow(id=9, name="b", mass=0.7))
+    a, b, c = load(config_for(tmp_path, rows), tmp_path)
+    assert [(e.obj_id, e.name, e.source) for e in (a, b, c)] == [(1, "a", None), (2, "b", None), (3, "c", None)]
+    assert (a.mass, b.mass) == (pytest.approx(0.4), 0.7)
+    assert b.volume == pytest.approx(6e-3)
+    assert c.diameter == pytest.approx(0.08, rel=1e-3)
+
+
+def test_other_meshes_beside_bop_models_are_named_as_ignored(tmp_path):
+    write_box(tmp_path / "obj_000001.ply")
+    write_box(tmp_path / "spare.obj")
+    lines: list[str] = []
+    assert len(load_catalog(config_for(tmp_path), tmp_path / "cache", lines.append)) == 1
+    assert any("1 meshes" in line and "ignored" in line for line in lines)
+
+
+def test_concave_by_volumes_by_row_and_not(tmp_path, monkeypatch):
+    asked = {}
+
+    def remember(names, meshes, recipes, cache_dir, report):
+        asked.update({name: recipe.concave for name, recipe in zip(names, recipes, strict=True)})
+        raise CatalogError("enough")
+
+    monkeypatch.setattr(catalog, "collision_shapes", remember)
+    tube = trimesh.creation.annulus(0.04, 0.05, 0.1)
+    for name in ("hollow", "ruled"):
+        (tmp_path / f"{name}.ply").write_bytes(tube.export(file_type="ply"))
+    write_box(tmp_path / "solid.ply")
+    write_box(tmp_path / "wanted.ply")
+    rows = (ObjectRow(name="ruled", concave=False), ObjectRow(name="wanted", concave=True))
+    with pytest.raises(CatalogError, match="enough"):
+        load_catalog(config_for(tmp_path, rows), tmp_path / "cache")
+    assert asked == {"hollow": True, "ruled": False, "solid": False, "wanted": True}
+    with pytest.raises(CatalogError, match="enough"):
+        load_catalog(config_for(tmp_path, rows, concave_ratio=0.1), tmp_path / "cache")
+    assert asked["hollow"] is False
+
+
+def fails(config: Config, cache: Path, *words: str) -> None:
+    with pytest.raises(CatalogError) as caught:
+        load_catalog(config, cache / "cache")
+    assert "\n" not in str(caught.value)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_folders_that_are_not_there_or_empty(tmp_path):
+    fails(config_for(tmp_path / "gone"), tmp_path, "gone", "no such folder")
+    (tmp_path / "file").write_text("")
+    fails(config_for(tmp_path / "file"), tmp_path, "no such folder")
+    fails(config_for(tmp_path), tmp_path, "no models in it")
+
+
+def test_two_files_for_one_object(tmp_path):
+    write_box(tmp_path / "obj_000001.ply")
+    write_box(tmp_path / "obj_01.ply")
+    fails(config_for(tmp_path), tmp_path, "both object 1")
+    own = tmp_path / "own"
+    own.mkdir()
+    write_box(own / "a.ply")
+    write_box(own / "a.obj")
+    fails(config_for(own), tmp_path, "a.obj and a.ply have the same name")
+
+
+@pytest.mark.parametrize(
+    ("extents", "offset", "words"),
+    [
+        ((100, 100, 100), (0, 0, 0), ("too large for the tote", "173.2 m", "millimetres")),
+        ((1e-4, 1e-4, 1e-4), (0, 0, 0), ("0.0001732 m", "millimetres")),
+        ((0.1, 0.1, 0), (0, 0, 0), ("one plane",)),
+        ((0.1, 0.1, 0.1), (1, 0, 0), ("origin",)),
+    ],
+)
+def test_sizes_and_places_that_cannot_be_meant(tmp_path, extents, offset, words):
+    write_box(tmp_path / "thing.ply", extents, offset)
+    fails(config_for(tmp_path), tmp_path, "thing", *words)
+
+
+@pytest.mark.parametrize("mass", [0.0, -1.0, 1e-9, 1e5, np.inf, np.nan])
+def test_a_mass_must_be_one_that_bodies_have(tmp_path, mass):
+    write_box(tmp_path / "thing.ply")
+    said = f"mass {mass:g} kg in its row of the object table; allowed: 1e-07 to 10000 kg"
+    fails(config_for(tmp_path, (ObjectRow(name="thing", mass=mass),)), tmp_path, "thing", said)
+
+
+def test_a_density_that_leaves_no_mass(tmp_path):
+    write_box(tmp_path / "thing.ply")
+    fails(config_for(tmp_path, density=1e-12), tmp_path, "thing", "mass 1e-15 kg by objects.density")
+
+
+def turned_box(file: Path, extents: tuple[float, float, float], seed: int | None) -> Path:
+    """A box in some rotation: the pose in the file must not count."""
+    box = trimesh.creation.box(np.array(extents))
+    if seed is not None:
+        box.apply_transform(trimesh.transformations.random_rotation_matrix(np.random.default_rng(seed).uniform(size=3)))
+    file.write_bytes(box.export(file_type="ply"))
+    return file
+
+
+@pytest.mark.parametrize("seed", [None, 1, 2])
+@pytest.mark.parametrize(
+    ("extents", "said"),
+    [
+        ((0.4, 0.41, 0.42), "0.4 x 0.41 x 0.42 m, 0.7103 m from end to end, "),
+        ((0.36, 0.37, 0.38), "0.36 x 0.37 x 0.38 m, 0.641 m from end to end, "),
+        ((0.02, 0.55, 0.3), ""),
+        ((0.02, 0.57, 0.56), "0.02 x 0.56 x 0.57 m, "),
+        ((0.7, 0.03, 0.03), "0.03 x 0.03 x 0.7 m, 0.7013 m from end to end, but "),
+        ((0.6, 0.03, 0.03), ""),
+        ((0.54, 0.34, 0.1), ""),
+        ((0.3, 0.3, 0.3), ""),
+    ],
+)
+def test_objects_that_the_tote_cannot_take(tmp_path, extents, said, seed):
+    """By their tightest box, however they lie in their file. Those that it can take come to rest in simulations."""
+    write_box(tmp_path / "a.ply")
+    turned_box(tmp_path / "thing.ply", extents, seed)
+    if said:
+        tote = "but the tote's opening is 0.352 x 0.545 m, and 0.678 m the longest way through it; "
+        fails(config_for(tmp_path), tmp_path, f"thing: too large for the tote: {said}", tote, "millimetres")
+    else:
+        assert len(load(config_for(tmp_path), tmp_path)) == 2
+
+
+def test_a_small_tote_takes_small_objects(tmp_path):
+    write_box(tmp_path / "thing.ply", (0.2, 0.2, 0.2))
+    small = Tote(outer_size=(0.3, 0.2, 0.1), floor_size=(0.2, 0.1), rim_size=(0.25, 0.15))
+    fails(replace(config_for(tmp_path), tote=small), tmp_path, "thing", "opening is 0.15 x 0.25 m")
+
+
+def test_objects_that_no_budget_allows_are_named(tmp_path):
+    write_box(tmp_path / "large.ply", (0.2, 0.2, 0.2))
+    write_box(tmp_path / "small.ply")
+    lines: list[str] = []
+    assert len(load_catalog(config_for(tmp_path), tmp_path / "cache", lines.append)) == 2
+    assert lines == ["never drawn, since larger than arrangement.volume, 0.007 m³: large (0.008 m³)"]
+    roomy = replace(config_for(tmp_path), arrangement=Arrangement(volume=0.0081))
+    lines.clear()
+    load_catalog(roomy, tmp_path / "cache", lines.append)
+    assert not lines
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("{", ("not readable as JSON",)),
+        ("[]", ("list",)),
+        ({}, ("no entry for object 1",)),
+        ({"1": 5}, ("no entry for object 1",)),
+        ({"1": {"diameter": "big"}}, ('"big"', "number above 0")),
+        ({"1": {"diameter": 0}}, ("number above 0",)),
+        ('{"1": {"diameter": NaN}}', ("number above 0",)),
+        ({"1": {"diameter": 0.1732}}, ("173.2 mm", "0.1732")),
+        ({"1": {"symmetries_discrete": 3}}, ("symmetries_discrete", "a list")),
+        ({"1": {"symmetries_discrete": [[1, 2, 3]]}}, ("symmetries_discrete[0]", "16 finite numbers")),
+        ({"1": {"symmetries_discrete": [[2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}}, ("rigid",)),
+        ({"1": {"symmetries_discrete": [[-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}}, ("rigid",)),
+        ({"1": {"symmetries_continuous": [7]}}, ("axis and offset",)),
+        ({"1": {"symmetries_continuous": [{"offset": [0, 0, 0]}]}}, ("axis", "3 finite numbers")),
+        ({"1": {"symmetries_continuous": [{"axis": [0, 0, 0], "offset": [0, 0, 0]}]}}, ("zero",)),
+        ('{"1": {"symmetries_continuous": [{"axis": [0, 0, Infinity], "offset": [0, 0, 0]}]}}', ("finite",)),
+    ],
+)
+def test_a_broken_models_info(tmp_path, content, words):
+    write_box(tmp_path / "obj_000001.ply")
+    write_info(tmp_path, content)
+    fails(config_for(tmp_path), tmp_path, "models_info.json", *words)
+
+
+def test_without_a_models_info_nothing_is_symmetric(tmp_path):
+    write_box(tmp_path / "obj_000001.ply")
+    (entry,) = load(config_for(tmp_path), tmp_path)
+    assert entry.symmetries_discrete == ()
+    assert entry.symmetries_continuous == ()
+    assert entry.diameter == pytest.approx(0.1 * np.sqrt(3))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(4, 60))
+def test_the_diameter_is_the_largest_distance(seed, count):
+    points = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
+    distances = np.linalg.norm(points[:, None].astype(np.float64) - points[None], axis=-1)
+    assert diameter(points) == pytest.approx(distances.max(), rel=1e-12)
+
+
+def test_embedded_objects_need_no_folder_and_no_table(tmp_path, monkeypatch):
+    # Hulls only: decompositions of the embedded objects take longer than all other tests here.
+    raws = [replace(raw, concave=False) for raw in procedural_objects()]
+    monkeypatch.setattr(catalog, "procedural_objects", lambda: raws)
+    rows = tuple(ObjectRow(id=raw.obj_id, name="table", mass=99.0) for raw in raws)
+    entries = load(Config(object_rows=rows), tmp_path)
+    assert [entry.obj_id for entry in entries] == sorted(raw.obj_id for raw in raws)
+    for entry in entries:
+        assert entry.mass < 2.0
+        assert entry.source is None
+        assert_physical(entry)
+
+
+def test_the_real_objects(real_models, tmp_path):
+    # Rows from the preset, but no decompositions: they take minutes. `test_collision` decomposes a small bowl.
+    config = load_config("synpick", {})
+    rows = tuple(replace(row, concave=False) for row in config.object_rows)
+    config = replace(config, bake=replace(config.bake, models=str(real_models)), object_rows=rows)
+    entries = load(config, tmp_path)
+    assert [entry.obj_id for entry in entries] == list(range(1, 22))
+    for entry, row in zip(entries, rows, strict=True):
+        assert (entry.name, entry.mass) == (row.name, row.mass)
+        litres = entry.volume * 1e3
+        assert litres <= REAL_HULLS[entry.obj_id] * 1.02
+        assert litres >= REAL_HULLS[entry.obj_id] * 0.94
+        assert len(entry.pieces) == 1
+        assert len(entry.pieces[0].vertices) <= 64
+        assert_physical(entry)
+    assert {entry.obj_id for entry in entries if entry.symmetries_discrete} == {1, 16, 19, 20, 21}
+    assert {entry.obj_id for entry in entries if entry.symmetries_continuous} == {13, 18}
+    assert {row.id for row in load_config("synpick", {}).object_rows if row.concave} == REAL_CONCAVE

@@ -1,0 +1,265 @@
+from __future__ import annotations
+
+import collections
+from dataclasses import replace
+from pathlib import Path
+
+import coacd
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
+from synpick_warp.scenes.collision.hulls import hull_volume, limited_hull, mass_properties
+from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
+from synpick_warp.scenes.collision import shapes as collision
+from synpick_warp.scenes.meshes import smooth_normals
+from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
+
+HULL = ShapeRecipe(concave=False, hull_vertices=64, piece_vertices=16, pieces=8, concavity=0.2)
+CONCAVE = replace(HULL, concave=True)
+
+
+def as_mesh(shape: trimesh.Trimesh) -> TriangleMesh:
+    vertices, faces = shape.vertices.astype(np.float32), shape.faces.astype(np.int32)
+    return TriangleMesh(vertices, faces, smooth_normals(vertices, faces), np.zeros((len(vertices), 2), np.float32))
+
+
+def bowl(segments: int = 10) -> trimesh.Trimesh:
+    """Half a spherical shell, 0.1 m outside, 0.09 m inside, open at the top."""
+    angle = np.linspace(0.0, np.pi / 2, 5)
+    outer = np.stack([np.sin(angle), -np.cos(angle)], axis=1) * 0.1
+    inner = np.stack([np.sin(angle), -np.cos(angle)], axis=1)[::-1] * 0.09
+    return trimesh.creation.revolve(np.concatenate([outer, inner]), sections=segments)
+
+
+def assert_sound(piece: ConvexPiece) -> None:
+    """Closed, outward, convex, and no vertex unused."""
+    edges = collections.Counter((int(face[k]), int(face[(k + 1) % 3])) for face in piece.faces for k in range(3))
+    assert all(count == 1 and edges[end, start] == 1 for (start, end), count in edges.items())
+    assert set(piece.faces.reshape(-1)) == set(range(len(piece.vertices)))
+    corners = piece.vertices[piece.faces].astype(np.float64)
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.ptp(piece.vertices, axis=0).max()
+    heights = np.einsum("fi,fvi->fv", doubled, piece.vertices[None] - corners[:, :1])
+    assert heights.max() <= 1e-5 * size**3
+    assert mass_properties([piece]).volume > 0.0
+
+
+def never(line: str) -> None:
+    pytest.fail(line)
+
+
+def test_a_cube_keeps_its_eight_corners():
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 6)] * 3), axis=-1).reshape(-1, 3)
+    piece = limited_hull(grid, 64)
+    assert_sound(piece)
+    assert np.array_equal(np.unique(piece.vertices, axis=0), np.unique(np.sign(grid[np.abs(grid).min(axis=1) == 0.5]) / 2, axis=0))
+
+
+def test_mass_properties_of_a_cube_far_from_its_origin():
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    box.apply_translation((3.0, -2.0, 7.0))
+    found = mass_properties([ConvexPiece(box.vertices.astype(np.float32), box.faces.astype(np.int32))])
+    assert found.volume == pytest.approx(1.0)
+    assert found.center_of_mass == pytest.approx((3.0, -2.0, 7.0))
+    assert np.allclose(found.unit_inertia, np.eye(3) / 6)
+
+
+def test_mass_properties_of_two_boxes_are_those_of_one():
+    halves = [trimesh.creation.box(bounds=((left, 0.0, 0.0), (left + 0.1, 0.2, 0.3))) for left in (0.0, 0.1)]
+    found = mass_properties([ConvexPiece(half.vertices.astype(np.float32), half.faces.astype(np.int32)) for half in halves])
+    assert found.volume == pytest.approx(0.012)
+    assert np.allclose(np.diag(found.unit_inertia), np.array((0.2**2 + 0.3**2, 0.2**2 + 0.3**2, 0.2**2 + 0.2**2)) / 12)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(5, 60), st.floats(1e-2, 1.0))
+def test_mass_properties_are_physical_and_agree_with_trimesh(seed, count, flatness):
+    points = np.random.default_rng(seed).normal(size=(count, 3)) * (0.1, 0.1, 0.1 * flatness)
+    piece = limited_hull(points, 64)
+    found = mass_properties([piece])
+    twin = trimesh.Trimesh(piece.vertices, piece.faces, process=False)
+    assert found.volume == pytest.approx(twin.volume, rel=1e-4)
+    assert np.allclose(found.center_of_mass, twin.center_mass, atol=1e-5)
+    assert np.allclose(found.unit_inertia, twin.moment_inertia / twin.volume, atol=1e-4 * found.unit_inertia.max())
+    low, middle, high = np.linalg.eigvalsh(found.unit_inertia)
+    assert low > 0.0
+    assert low + middle >= high
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(4, 400), st.integers(8, 64), st.floats(1e-3, 1.0))
+def test_limited_hulls_are_sound_and_inside(seed, count, limit, flatness):
+    points = np.random.default_rng(seed).normal(size=(count, 3)) * (0.1, 0.05, 0.1 * flatness)
+    piece = limited_hull(points, limit)
+    assert_sound(piece)
+    assert len(piece.vertices) <= limit
+    given_rows = {tuple(row) for row in points.astype(np.float32)}
+    assert all(tuple(row) in given_rows for row in piece.vertices)
+
+
+def test_a_sphere_keeps_what_64_vertices_can():
+    # The largest polyhedron of 64 vertices in a sphere fills about 0.89 of it.
+    ball = trimesh.creation.icosphere(4, radius=0.05)
+    piece = limited_hull(ball.vertices, 64)
+    assert_sound(piece)
+    assert len(piece.vertices) == 64
+    assert mass_properties([piece]).volume > 0.86 * hull_volume(ball.vertices)
+    assert np.array_equal(limited_hull(ball.vertices, 64).vertices, piece.vertices)
+
+
+@pytest.mark.parametrize("points", [np.zeros((9, 3)), np.eye(3), np.random.default_rng(0).random((50, 3)) * (1, 1, 0), np.ones((1, 3))])
+def test_flat_points_have_no_hull(points):
+    assert hull_volume(points) == 0.0
+    with pytest.raises(CatalogError, match="one plane"):
+        limited_hull(points, 64)
+
+
+@pytest.fixture(scope="module")
+def bowl_shape(tmp_path_factory) -> tuple[Path, TriangleMesh, tuple[ConvexPiece, ...]]:
+    cache, mesh = tmp_path_factory.mktemp("cache"), as_mesh(bowl())
+    lines: list[str] = []
+    (shape,) = collision_shapes(["bowl"], [mesh], [CONCAVE], cache, lines.append)
+    assert any("bowl" in line for line in lines)
+    return cache, mesh, shape
+
+
+def test_a_bowl_stays_hollow(bowl_shape):
+    _, mesh, shape = bowl_shape
+    assert 2 <= len(shape) <= CONCAVE.pieces
+    for piece in shape:
+        assert_sound(piece)
+        assert len(piece.vertices) <= CONCAVE.piece_vertices
+    assert mass_properties(shape).volume < 0.7 * hull_volume(mesh.vertices)
+    # The middle of the opening is free: it lies outside of every piece.
+    middle = np.array((0.0, 0.0, -0.03))
+    for piece in shape:
+        corners = piece.vertices[piece.faces].astype(np.float64)
+        doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        assert np.einsum("fi,fi->f", doubled, middle - corners[:, 0]).max() > 0.0
+
+
+def test_the_cache_answers_the_second_time(bowl_shape, monkeypatch):
+    cache, mesh, shape = bowl_shape
+    monkeypatch.setattr(collision, "decompose", lambda *_: pytest.fail("made again"))
+    (again,) = collision_shapes(["bowl"], [mesh], [CONCAVE], cache, never)
+    assert len(again) == len(shape)
+    for one, two in zip(again, shape, strict=True):
+        assert np.array_equal(one.vertices, two.vertices)
+        assert np.array_equal(one.faces, two.faces)
+        assert one.vertices.dtype == np.float32
+        assert one.faces.dtype == np.int32
+
+
+def test_hulls_are_kept_too_and_no_scrap_is_left(tmp_path, monkeypatch):
+    mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
+    (shape,) = collision_shapes(["box"], [mesh], [HULL], tmp_path / "new", never)
+    assert [file.suffix for file in (tmp_path / "new").iterdir()] == [".npz"]
+    monkeypatch.setattr(collision, "limited_hull", lambda *_: pytest.fail("made again"))
+    (again,) = collision_shapes(["box"], [mesh], [HULL], tmp_path / "new", never)
+    assert np.array_equal(again[0].vertices, shape[0].vertices)
+
+
+def test_other_settings_and_other_meshes_have_other_files(tmp_path):
+    mesh = as_mesh(trimesh.creation.icosphere(3, radius=0.05))
+    moved = replace(mesh, vertices=mesh.vertices + np.float32(1e-3))
+    shapes = collision_shapes(["a", "b", "c"], [mesh, mesh, moved], [HULL, replace(HULL, hull_vertices=20), HULL], tmp_path, never)
+    assert len(list(tmp_path.iterdir())) == 3
+    assert [len(shape[0].vertices) for shape in shapes] == [64, 20, 64]
+
+
+@pytest.mark.parametrize("damage", [b"", b"scrap", None])
+def test_a_damaged_file_is_made_anew(tmp_path, damage):
+    mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
+    collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
+    (file,) = tmp_path.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
+    (shape,) = collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
+    assert_sound(shape[0])
+    assert file.read_bytes() == whole
+
+
+def test_a_file_that_names_missing_vertices_is_made_anew(tmp_path):
+    mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
+    collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
+    (file,) = tmp_path.iterdir()
+    with np.load(file) as data:
+        arrays = {**data, "faces": data["faces"] + 5}
+    np.savez(file, **arrays)
+    (shape,) = collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
+    assert_sound(shape[0])
+
+
+def test_without_a_writable_cache_shapes_are_made_all_the_same(tmp_path):
+    (tmp_path / "file").write_text("")
+    mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
+    lines: list[str] = []
+    shapes = collision_shapes(["a", "b"], [mesh, mesh], [HULL, HULL], tmp_path / "file" / "cache", lines.append)
+    assert len(shapes) == 2
+    assert len(lines) == 1
+    assert "cannot be written" in lines[0]
+
+
+def test_several_concave_objects_are_made_side_by_side_and_alike(tmp_path, bowl_shape):
+    _, mesh, shape = bowl_shape
+    other = as_mesh(bowl(8))
+    first, _ = collision_shapes(["one", "two"], [mesh, other], [CONCAVE, CONCAVE], tmp_path, lambda _: None)
+    assert len(first) == len(shape)
+    assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(first, shape, strict=True))
+
+
+def test_a_failed_decomposition_is_a_clear_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(collision, "decompose", lambda *_: ())
+    with pytest.raises(CatalogError, match="mug: no decomposition"):
+        collision_shapes(["mug"], [as_mesh(bowl())], [CONCAVE], tmp_path, lambda _: None)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("kind", "modes"),
+    [
+        ("closed", ["off"]),
+        ("open", ["auto"]),
+        ("apart", ["off"]),
+        ("joined", ["auto"]),
+        ("folded", ["off"]),
+        ("lost", ["off", "auto"]),
+    ],
+)
+def test_repair_is_for_open_surfaces_inner_walls_and_lost_parts(monkeypatch, kind, modes):
+    shell, asked = bowl(), []
+    if kind == "open":
+        shell.update_faces(np.arange(len(shell.faces)) > 0)
+    if kind in ("apart", "joined"):
+        other = trimesh.creation.icosphere(2, 0.05)
+        other.apply_translation((0.5 if kind == "apart" else 0.0, 0.0, 0.0))
+        shell = trimesh.util.concatenate([trimesh.creation.box((0.06, 0.2, 0.06)), other])
+    if kind == "folded":
+        shell = trimesh.Trimesh(shell.vertices, [*shell.faces, (0, 9, 30), (9, 0, 30)], process=False)
+
+    def run_coacd(mesh, *, preprocess_mode, **_):
+        asked.append(preprocess_mode)
+        small = kind == "lost" and preprocess_mode == "off"
+        return [(mesh.vertices * (0.1 if small else 1.0), mesh.indices)]
+
+    monkeypatch.setattr(coacd, "run_coacd", run_coacd)
+    (piece,) = decompose(as_mesh(shell), CONCAVE)
+    assert asked == modes
+    assert_sound(piece)
+
+
+def test_slivers_are_left_out(monkeypatch):
+    big, flat = trimesh.creation.box((0.1, 0.1, 0.1)).vertices, trimesh.creation.box((0.01, 0.01, 1e-5)).vertices
+    monkeypatch.setattr(coacd, "run_coacd", lambda *_, **__: [(big, None), (flat, None), (flat * (1, 1, 0), None)])
+    (piece,) = decompose(as_mesh(trimesh.creation.box((0.1, 0.1, 0.1))), CONCAVE)
+    assert mass_properties([piece]).volume == pytest.approx(1e-3)
+
+
+def test_the_default_cache_follows_the_environment(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert default_cache_dir() == tmp_path / "synpick-warp" / "collision"
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    assert default_cache_dir() == Path.home() / ".cache" / "synpick-warp" / "collision"

@@ -1,0 +1,258 @@
+"""The embedded objects: closed, of the right size and weight, printed the right way round, and as symmetric as they claim."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull, cKDTree
+
+from synpick_warp.scenes.catalog import diameter
+from synpick_warp.scenes.embedded.meshes import (
+    BOX_FACES,
+    NO_TEXTURE,
+    at_height,
+    ellipse,
+    lathe,
+    make_mesh,
+    rotation,
+    rounded_box,
+    rounded_rectangle,
+    solid,
+    sweep,
+    torus,
+)
+from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.embedded.textures import PADDING, blank, pack
+from synpick_warp.scenes.meshes import merge_positions, signed_volume
+from tests.twins.rays import edges_match
+
+TABLE = {
+    # id: mass [kg], diameter [m] of the real object, metallic, roughness
+    1: (0.414, 0.172, 0.6, 0.2), 2: (0.411, 0.270, 0.1, 0.5), 3: (0.514, 0.199, 0.1, 0.5), 4: (0.349, 0.121, 0.1, 0.5),
+    5: (0.603, 0.197, 0.3, 0.5), 6: (0.171, 0.090, 0.6, 0.2), 7: (0.187, 0.143, 0.1, 0.5), 8: (0.097, 0.114, 0.1, 0.5),
+    9: (0.370, 0.130, 0.6, 0.3), 10: (0.066, 0.198, 0.3, 0.3), 11: (0.244, 0.260, 0.1, 0.5), 12: (1.131, 0.259, 0.1, 0.5),
+    13: (0.147, 0.162, 0.6, 0.3), 14: (0.118, 0.125, 0.6, 0.3), 15: (0.895, 0.226, 0.1, 0.6), 16: (0.729, 0.237, 0.3, 0.5),
+    17: (0.082, 0.204, 0.1, 0.5), 18: (0.016, 0.121, 0.1, 0.5), 19: (0.125, 0.175, 0.1, 0.5), 20: (0.202, 0.217, 0.1, 0.5),
+    21: (0.028, 0.103, 0.1, 0.7),
+}  # fmt: skip
+HULL_LITRES = (
+    1.14,
+    2.31,
+    0.66,
+    0.36,
+    0.70,
+    0.19,
+    0.35,
+    0.18,
+    0.42,
+    0.27,
+    3.13,
+    1.07,
+    0.75,
+    0.53,
+    1.29,
+    1.61,
+    0.13,
+    0.033,
+    0.38,
+    0.60,
+    0.20,
+)
+"""Convex hulls of the real objects: what an arrangement's volume budget counts."""
+PRINTED = (1, 2, 3, 4, 5, 6, 7, 8, 9, 12, 14)
+CONCAVE = (13, 14, 15)
+OBJECTS = {raw.obj_id: raw for raw in procedural_objects()}
+
+
+@pytest.fixture(params=OBJECTS.values(), ids=lambda raw: raw.name)
+def raw(request):
+    return request.param
+
+
+def corners(raw):
+    return raw.mesh.vertices[raw.mesh.faces].astype(np.float64), raw.mesh.uv[raw.mesh.faces].astype(np.float64)
+
+
+def printed(number):
+    """Corners and texture coordinates of a printed object; of the mug only the outside of its wall, without the handle."""
+    points, uv = corners(OBJECTS[number])
+    if OBJECTS[number].name != "mug":
+        return points, uv
+    radius = 0.0465
+    outside = np.abs(np.hypot(points[..., 0] - points[..., 0].min() - radius, points[..., 1]) - radius).max(axis=1) < 1e-5
+    return points[outside], uv[outside]
+
+
+def colors(raw, uv):
+    texture = raw.material.texture
+    height, width = texture.shape[:2]
+    columns = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
+    rows = np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1)
+    return texture[rows, columns].astype(int)
+
+
+def surface_samples(raw):
+    """Points (N, 3) and colours (N, 3), four to a triangle."""
+    points, uv = corners(raw)
+    weights = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4]], dtype=float)
+    weights /= weights.sum(axis=1, keepdims=True)
+    return (weights @ points).reshape(-1, 3), colors(raw, (weights @ uv).reshape(-1, 2))
+
+
+def test_ids_masses_and_materials_are_those_of_the_table():
+    assert list(OBJECTS) == list(range(1, 22))
+    for number, (mass, _, metallic, roughness) in TABLE.items():
+        raw = OBJECTS[number]
+        assert (raw.mass, raw.material.metallic, raw.material.roughness) == (mass, metallic, roughness)
+        assert raw.concave == (number in CONCAVE)
+        assert raw.source is None
+    assert len({raw.name for raw in OBJECTS.values()}) == 21
+
+
+def test_surfaces_are_closed_and_face_outward(raw):
+    _, faces = merge_positions(raw.mesh.vertices, raw.mesh.faces)
+    assert edges_match(faces)
+    assert signed_volume(raw.mesh.vertices, raw.mesh.faces) > 0
+    assert 500 <= len(raw.mesh.faces) <= 6000
+
+
+def test_the_origin_is_the_middle_of_the_bounding_box(raw):
+    assert np.abs(raw.mesh.vertices.min(axis=0) + raw.mesh.vertices.max(axis=0)).max() < 2e-6
+
+
+def test_sizes_are_near_the_real_ones(raw):
+    assert diameter(raw.mesh.vertices) == pytest.approx(TABLE[raw.obj_id][1], rel=0.1)
+    assert ConvexHull(raw.mesh.vertices).volume * 1000 == pytest.approx(HULL_LITRES[raw.obj_id - 1], rel=0.16)
+
+
+def test_normals_are_units_on_the_outside(raw):
+    points, _ = corners(raw)
+    normals = raw.mesh.normals[raw.mesh.faces].astype(np.float64)
+    assert np.abs(np.linalg.norm(normals, axis=2) - 1).max() < 1e-3
+    flat = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    assert ((normals * flat[:, None]).sum(axis=2) > 0).all()
+
+
+def test_textures_are_pictures_and_are_met(raw):
+    texture = raw.material.texture
+    assert texture.dtype == np.uint8
+    assert texture.shape[2] == 3
+    assert raw.mesh.uv.min() >= 0
+    assert raw.mesh.uv.max() <= 1
+    assert len(np.unique(surface_samples(raw)[1], axis=0)) >= 3
+
+
+@pytest.mark.parametrize("number", PRINTED)
+def test_print_is_not_mirrored(number):
+    """Seen from outside, triangles run counter-clockwise in space and so they must in the picture."""
+    _, uv = printed(number)
+    first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    assert (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] > -1e-9).all()
+
+
+@pytest.mark.parametrize("number", PRINTED)
+def test_print_on_upright_faces_is_upright(number):
+    """On upright faces the picture's v grows with height: for v as a linear function on the triangle, dv/dz > 0."""
+    points, uv = printed(number)
+    normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+    area = np.linalg.norm(normal, axis=1)
+    upright = (np.abs(normal[:, 2]) < 1e-3 * area) & (area > 1e-7)
+    assert upright.any()
+    edges = np.stack([points[:, 1] - points[:, 0], points[:, 2] - points[:, 0]], axis=1)[upright]
+    rise = np.stack([uv[:, 1, 1] - uv[:, 0, 1], uv[:, 2, 1] - uv[:, 0, 1]], axis=1)[upright]
+    slope = np.einsum("nij,nj->ni", np.linalg.pinv(edges), rise)
+    assert (slope[:, 2] >= -1e-6).all()
+    assert (slope[:, 2] > 0.1).any()
+
+
+@pytest.mark.parametrize("number", CONCAVE)
+def test_concave_objects_leave_their_hulls_empty(number):
+    mesh = OBJECTS[number].mesh
+    assert signed_volume(mesh.vertices, mesh.faces) / ConvexHull(mesh.vertices).volume < 0.6
+
+
+def rotations(raw):
+    yield from (np.array(matrix).reshape(4, 4)[:3, :3] for matrix in raw.symmetries_discrete)
+    for axis, offset in raw.symmetries_continuous:
+        assert offset == (0.0, 0.0, 0.0)
+        name = "xyz"[int(np.argmax(axis))]
+        # The turned surfaces have 32 or 48 sides: these turns meet both.
+        yield from (rotation(name, 360 / 16 * step) for step in (1, 3, 8))
+
+
+def test_symmetries_keep_shape_and_colour(raw):
+    points, tint = surface_samples(raw)
+    tree = cKDTree(points)
+    for turn in rotations(raw):
+        assert np.linalg.det(turn) == pytest.approx(1)
+        assert not np.allclose(turn, np.eye(3))
+        distance, index = tree.query(points @ turn.T)
+        assert np.quantile(distance, 0.99) < 2e-3
+        near = distance < 1e-4
+        assert near.mean() > 0.9
+        assert np.quantile(np.abs(tint[near] - tint[index[near]]).max(axis=1), 0.95) <= 40
+
+
+def test_symmetries_are_those_bop_has():
+    discrete = {number: len(raw.symmetries_discrete) for number, raw in OBJECTS.items() if raw.symmetries_discrete}
+    assert discrete == {1: 1, 16: 7, 19: 1, 20: 1, 21: 3}
+    assert {number for number, raw in OBJECTS.items() if raw.symmetries_continuous} == {13, 18}
+
+
+def test_the_same_objects_come_every_time():
+    for old, new in zip(OBJECTS.values(), procedural_objects(), strict=True):
+        for name in ("vertices", "faces", "normals", "uv"):
+            assert np.array_equal(getattr(old.mesh, name), getattr(new.mesh, name))
+        assert np.array_equal(old.material.texture, new.material.texture)
+
+
+def volume(patch):
+    mesh = make_mesh(patch, centered=False)
+    assert edges_match(merge_positions(mesh.vertices, mesh.faces)[1])
+    return signed_volume(mesh.vertices, mesh.faces)
+
+
+@given(st.floats(0.02, 0.3), st.floats(0.02, 0.3), st.floats(0.02, 0.3), st.floats(0.01, 0.3))
+def test_a_rounded_box_has_the_volume_of_its_parts(x, y, z, share):
+    radius = share * min(x, y, z)
+    a, b, c = x - 2 * radius, y - 2 * radius, z - 2 * radius
+    exact = a * b * c + 2 * radius * (a * b + b * c + c * a) + np.pi * radius**2 * (a + b + c) + 4 / 3 * np.pi * radius**3
+    made = volume(rounded_box((x, y, z), radius, dict.fromkeys(BOX_FACES, NO_TEXTURE), segments=6))
+    assert made == pytest.approx(exact, rel=0.01)
+    assert made <= exact * (1 + 1e-3)
+
+
+def test_a_cylinder_has_the_volume_of_its_prism():
+    exact = 0.5 * 40 * np.sin(2 * np.pi / 40) * 0.05**2 * 0.1
+    assert volume(solid(lathe([(0.05, 0.0), (0.05, 0.1)], 40))) == pytest.approx(exact, rel=1e-3)
+
+
+def test_a_ring_has_the_volume_of_a_torus():
+    turn = 2 * np.pi * np.arange(-1, 65) / 64
+    path = np.stack([0.05 * np.cos(turn), 0.05 * np.sin(turn), 0 * turn], axis=1)
+    rings = sweep(path, ellipse(0.02, 0.02, 32), np.ones((len(path), 1)), (0.0, 0.0, 1.0))[1:-1]
+    assert volume(torus(rings)) == pytest.approx(2 * np.pi**2 * 0.05 * 0.01**2, rel=0.02)
+
+
+def test_edges_of_a_prism_stay_sharp_and_its_side_is_smooth():
+    mesh = make_mesh(solid(np.stack([at_height(rounded_rectangle(0.1, 0.06, 0.02, 8), z) for z in (0.0, 0.1)])), centered=False)
+    top = mesh.normals[(mesh.vertices[:, 2] == np.float32(0.1))]
+    assert np.allclose(np.sort(np.unique(np.abs(top[:, 2]).round(3))), [0, 1])
+    middle = (
+        np.abs(mesh.vertices - np.array([0.05 - 0.02 + 0.02 * np.sqrt(0.5), 0.03 - 0.02 + 0.02 * np.sqrt(0.5), 0.0])).max(axis=1) < 1e-6
+    )
+    side = mesh.normals[middle & (np.abs(mesh.normals[:, 2]) < 0.1)]
+    assert np.allclose(side, [[np.sqrt(0.5), np.sqrt(0.5), 0]], atol=1e-3)
+
+
+def test_a_sheet_returns_each_picture_at_its_place():
+    pictures = {name: blank(30, 20, (value, 0, 255 - value)) for name, value in (("a", 10), ("b", 90), ("c", 200))}
+    pictures["a"][0] = (0, 255, 0)
+    sheet, rects = pack(pictures, 90)
+    for name, (u0, v0, u1, v1) in rects.items():
+        rows = slice(round((1 - v1) * sheet.shape[0]), round((1 - v0) * sheet.shape[0]))
+        columns = slice(round(u0 * sheet.shape[1]), round(u1 * sheet.shape[1]))
+        assert np.array_equal(sheet[rows, columns], pictures[name])
+        assert np.array_equal(sheet[rows.start - PADDING, columns], pictures[name][0])

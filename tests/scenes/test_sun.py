@@ -1,0 +1,250 @@
+"""Suns of sIBL sets: where they stand, what they shine, and that no light counts twice."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from synpick_warp.errors import LightError
+from synpick_warp.scenes.appearance import srgb_to_linear
+from synpick_warp.scenes.embedded.skies import directions
+from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.sun import (
+    BACKGROUND_ROWS,
+    LUMINANCE,
+    MAIN_LIGHT_SPREAD,
+    SUN_SPREAD,
+    WHITE_VALUE,
+    map_directions,
+    replace_sun,
+    resized,
+    split_main_light,
+    sun_disc,
+)
+from synpick_warp.scenes.types import LightMap, Sun
+from synpick_warp.stages.render.light_tables import harmonics, light_table
+from tests.worlds import toy_scene
+
+ROWS = 64
+
+
+def bright_picture(u: float, v: float, value: float = 200.0) -> np.ndarray:
+    """A dim picture with a bright pixel at shares u to the right and v down."""
+    image = np.full((ROWS, 2 * ROWS, 3), 0.5, np.float32)
+    image[int(v * ROWS), int(u * 2 * ROWS)] = value
+    return image
+
+
+def loaded(folder, lines: str, image: np.ndarray) -> LightMap:
+    """A set with these lines in its section Sun, as `load_lights` has it."""
+    assert cv2.imwrite(str(folder / "ref.hdr"), image[..., ::-1].copy())
+    (folder / "room.ibl").write_text(f'[Reflection]\nREFfile = "ref.hdr"\n[Sun]\n{lines}')
+    (light,) = load_lights(str(folder))
+    return light
+
+
+@pytest.mark.parametrize(
+    ("u", "v", "expected"),
+    [
+        (0.5, 0.25, (1, 0, 1)),  # the picture's middle is +x
+        (0.75, 0.25, (0, -1, 1)),  # right of it for who stands inside is -y
+        (0.25, 0.25, (0, 1, 1)),
+        (0.0, 0.25, (-1, 0, 1)),
+        (1.0, 0.25, (-1, 0, 1)),
+        (0.3, 0.0, (0, 0, 1)),  # v grows down from the zenith
+        (0.5, 0.4, (np.sin(0.4 * np.pi), 0, np.cos(0.4 * np.pi))),
+    ],
+)
+def test_u_and_v_grow_right_and_down(tmp_path, u, v, expected):
+    sun = loaded(tmp_path, f"SUNu = {u}\nSUNv = {v}\n", np.ones((8, 16, 3), np.float32)).sun
+    assert sun is not None
+    np.testing.assert_allclose(sun.direction, np.array(expected) / np.linalg.norm(expected), atol=1e-12)
+
+
+@given(u=st.floats(0.0, 0.999), v=st.floats(0.03, 0.47))
+def test_a_set_and_its_map_agree_where_the_sun_is(u, v, tmp_path_factory):
+    light = loaded(tmp_path_factory.mktemp("set"), f"SUNu = {u}\nSUNv = {v}\n", bright_picture(u, v))
+    brightest = np.unravel_index(light.radiance.sum(axis=2).argmax(), light.radiance.shape[:2])
+    assert light.sun is not None
+    # Half a texel's diagonal.
+    assert directions(ROWS)[brightest] @ light.sun.direction >= np.cos(np.pi / ROWS / np.sqrt(2.0)) - 1e-6
+
+
+def test_colour_is_srgb_and_multi_makes_a_white_sheet_that_bright(tmp_path):
+    even = np.ones((8, 16, 3), np.float32)
+    sun = loaded(tmp_path, "SUNcolor = 255,188,0\nSUNmulti = 1.5\nSUNu = 0.5\nSUNv = 0.2\n", even).sun
+    np.testing.assert_allclose(sun.irradiance / np.pi, (1.5, 1.5 * srgb_to_linear(188 / 255), 0.0))
+    plain = loaded(tmp_path, "SUNu = 0.5\nSUNv = 0.2\n", even).sun
+    np.testing.assert_allclose(plain.irradiance / np.pi, 1.0)
+
+
+@pytest.mark.parametrize(
+    "lines", ["", "SUNcolor = 9,9,9\n", "SUNu = 0.5\nSUNv = 0.5\n", "SUNu = 0.5\nSUNv = 0.7\n", "SUNu = 0.5\nSUNv = 0.2\nSUNmulti = 0\n",
+              "SUNu = 0.5\nSUNv = 0.2\nSUNcolor = 0, 0, 0\n"],
+)  # fmt: skip
+def test_sets_without_a_sun(tmp_path, lines):
+    assert loaded(tmp_path, lines, np.ones((8, 16, 3), np.float32)).sun is None
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("SUNu = 1.2", "a number from 0 to 1"), ("SUNv = -0.1", "a number from 0 to 1"), ("SUNu = 0,67", "a number from 0 to 1"),
+        ("SUNv = nan", "a number from 0 to 1"), ("SUNu = left", "a number from 0 to 1"), ("SUNmulti = inf", "a number from 0 to 1e+06"),
+        ("SUNmulti = -1", "a number from 0 to 1e+06"), ("SUNcolor = 255,255", "3 numbers"), ("SUNcolor = 1,2,256", "from 0 to 255"),
+        ("SUNcolor = 1,,2", "3 numbers"), ("SUNcolor = white", "3 numbers"),
+    ],
+)  # fmt: skip
+def test_bad_numbers_are_one_clear_line(tmp_path, line, words):
+    with pytest.raises(LightError) as caught:
+        loaded(tmp_path, f"SUNu = 0.5\nSUNv = 0.2\n{line}\n", np.ones((8, 16, 3), np.float32))
+    message = str(caught.value)
+    assert "room.ibl" in message
+    assert line in message
+    assert words in message
+    assert "\n" not in message
+
+
+@pytest.mark.parametrize(("there", "missing"), [("SUNu", "SUNv"), ("SUNv", "SUNu")])
+def test_half_a_place_is_refused(tmp_path, there, missing):
+    with pytest.raises(LightError, match=f"room.ibl has {there} alone; a sun needs SUNu and SUNv, or neither"):
+        loaded(tmp_path, f"{there} = 0.2\n", np.ones((8, 16, 3), np.float32))
+
+
+@pytest.mark.parametrize(("degrees", "believed"), [(0.0, True), (7.0, True), (14.0, False), (90.0, False)])
+def test_the_map_decides_where_the_set_misses_its_bright_place(tmp_path, degrees, believed):
+    u, v = 0.30 + 0.5 / (2 * ROWS), 0.4
+    light = loaded(tmp_path, f"SUNu = {u}\nSUNv = {v - degrees / 180 if degrees < 45 else 1 - v}\n", bright_picture(u, v))
+    assert (light.sun is not None) == believed
+
+
+def test_any_of_the_brightest_places_will_do(tmp_path):
+    image = bright_picture(0.2, 0.3, 4.0)
+    image[int(0.3 * ROWS), int(0.8 * 2 * ROWS)] = 3.0
+    assert loaded(tmp_path, "SUNu = 0.8\nSUNv = 0.3\n", image).sun is not None
+    assert loaded(tmp_path, "SUNu = 0.5\nSUNv = 0.3\n", image).sun is None
+
+
+def test_the_real_set(real_lights):
+    """Kiara's sun stands 2° from the brightest pixel of its map, and is brighter and yellower than what the camera clipped."""
+    light = next(light for light in load_lights(str(real_lights)) if light.sun is not None)
+    assert light.name == "Kiara_Dawn"
+    assert light.sun is not None
+    brightest = np.unravel_index((light.radiance @ LUMINANCE).argmax(), light.radiance.shape[:2])
+    assert light.sun.direction @ directions(512)[brightest] > np.cos(np.radians(3.0))
+    np.testing.assert_allclose(light.sun.irradiance / np.pi, 1.5 * srgb_to_linear(np.array((255, 214, 170)) / 255))
+    table, alone = light_table(light, None), light_table(LightMap("kiara", light.radiance), None)
+    # The glow around it is wide: no main light, all stays in the map, and facing it is as bright as the set says.
+    assert table.main_spread > MAIN_LIGHT_SPREAD
+    assert not table.main_irradiance.any()
+    assert table.rest.tobytes() == table.background.tobytes()
+    rest = replace_sun(alone.background.astype(np.float64), light.sun)[0]
+    gained = facing(table.background, light.sun.direction) - facing(rest, light.sun.direction)
+    np.testing.assert_allclose(gained, light.sun.irradiance, rtol=0.01)
+    assert facing(table.background, light.sun.direction) @ LUMINANCE > facing(alone.background, light.sun.direction) @ LUMINANCE
+
+
+def clipped(direction, radius: float = 3.0, value: float = 20.0, rows: int = 128) -> np.ndarray:
+    """A dim map with a white disc about a direction, as cameras clip suns; `radius` [°]."""
+    towards = map_directions(rows)[0] @ direction
+    return np.where(towards[..., None] > np.cos(np.radians(radius)), value, 0.5).astype(np.float32) * np.ones(3, np.float32)
+
+
+def facing(radiance: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Irradiance (3) from a map on a surface with this normal, texel by texel."""
+    towards, solid = map_directions(len(radiance))
+    return (radiance * (np.maximum(towards @ normal, 0.0) * solid)[..., None]).sum(axis=(0, 1))
+
+
+SUN = Sun(np.array([0.48, -0.64, 0.6]), np.array([30.0, 20.0, 10.0]))
+
+
+def test_a_plane_that_faces_the_sun_gets_the_sun_and_the_rest_alone():
+    """The clipped disc is gone from diffuse light, reflections and background; the sun stands there instead."""
+    light = LightMap("set", clipped(SUN.direction), SUN)
+    table = light_table(light, None)
+    np.testing.assert_allclose(table.main_direction, SUN.direction, rtol=1e-6)
+    np.testing.assert_allclose(table.main_irradiance, SUN.irradiance, rtol=1e-6)
+    rest, _, taken, _ = split_main_light(light.radiance.astype(np.float64))
+    assert taken.min() > 0.1
+    np.testing.assert_allclose(harmonics(SUN.direction) @ table.irradiance, facing(rest, SUN.direction), rtol=0.03)
+    total = harmonics(SUN.direction) @ table.irradiance + table.main_irradiance
+    np.testing.assert_allclose(total, facing(rest, SUN.direction) + SUN.irradiance, rtol=0.01)
+    np.testing.assert_allclose(facing(table.background, SUN.direction), facing(rest, SUN.direction) + SUN.irradiance, rtol=0.01)
+    assert table.reflection.max() < 3.0
+
+
+def test_exposure_and_table_know_the_sun():
+    light = LightMap("set", clipped(SUN.direction), SUN)
+    upward = facing(light_table(light, None).background, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(light_table(light, None).exposure, WHITE_VALUE * np.pi / (upward @ LUMINANCE), rtol=0.01)
+    # From below comes what the table sends back; a downward plane sees nothing else.
+    ground = np.array([0.2, 0.3, 0.4])
+    below = harmonics(np.array([0.0, 0.0, -1.0])) @ light_table(light, ground).irradiance
+    np.testing.assert_allclose(below, ground * upward, rtol=0.1)
+
+
+def test_a_map_that_holds_its_sun_whole_keeps_its_light():
+    weak = Sun(SUN.direction, SUN.irradiance * 1e-4)
+    light = LightMap("set", clipped(SUN.direction, value=4000.0), weak)
+    taken = split_main_light(resized(light.radiance, BACKGROUND_ROWS))[2]
+    table = light_table(light, None)
+    np.testing.assert_allclose(table.main_irradiance @ LUMINANCE, taken @ LUMINANCE, rtol=1e-4)
+    np.testing.assert_allclose(table.main_irradiance / table.main_irradiance[0], weak.irradiance / weak.irradiance[0], rtol=1e-5)
+
+
+def test_a_sun_over_an_even_map_is_as_wide_as_the_sun():
+    table = light_table(LightMap("set", np.ones((64, 128, 3), np.float32), SUN), None)
+    assert table.main_spread == pytest.approx(SUN_SPREAD)
+    np.testing.assert_allclose(harmonics(SUN.direction) @ table.irradiance, np.pi, rtol=1e-3)
+    assert 0.05 < light_table(LightMap("set", clipped(SUN.direction), SUN), None).main_spread < 0.09
+
+
+@given(z=st.floats(1e-3, 1.0), azimuth=st.floats(-np.pi, np.pi), spread=st.floats(0.0, 0.5))
+def test_a_disc_gives_its_irradiance_and_stays_above_the_horizon(z, azimuth, spread):
+    across = np.sqrt(1.0 - z * z)
+    direction = np.array([across * np.cos(azimuth), across * np.sin(azimuth), z])
+    disc = sun_disc(np.zeros((ROWS, 2 * ROWS), bool), direction, SUN.irradiance, spread)
+    np.testing.assert_allclose(facing(disc, direction), SUN.irradiance)
+    assert not disc[ROWS // 2 :].any()
+    towards = map_directions(ROWS)[0][disc[..., 0] > 0.0] @ direction
+    assert towards.min() > np.cos(max(np.arctan(spread), np.pi / ROWS)) - 1e-9
+
+
+def test_hills_hide_their_part_of_the_disc():
+    """The half of the map on the +y side is dark: all light comes from the other, and as much as before."""
+    direction = np.array([0.8, 0.0, 0.6])
+    bright = map_directions(ROWS)[0][..., 1] < 0.0
+    disc = sun_disc(bright, direction, SUN.irradiance, 0.2)
+    np.testing.assert_allclose(facing(disc, direction), SUN.irradiance)
+    assert not disc[~bright].any()
+    whole = sun_disc(np.ones_like(bright), direction, SUN.irradiance, 0.2)
+    assert (disc[..., 0] > 0.0).sum() == (whole[..., 0] > 0.0).sum() / 2
+    # A sun wholly behind them is believed all the same.
+    np.testing.assert_allclose(sun_disc(np.zeros_like(bright), direction, SUN.irradiance, 0.2), whole)
+
+
+def test_maps_without_a_sun_are_as_before():
+    light = LightMap("map", clipped(SUN.direction))
+    rest, direction, irradiance, _ = split_main_light(resized(light.radiance, BACKGROUND_ROWS))
+    table = light_table(light, None)
+    np.testing.assert_allclose(table.main_direction, direction, rtol=1e-6)
+    np.testing.assert_allclose(table.main_irradiance, irradiance, rtol=1e-6)
+    assert facing(table.background, direction) == pytest.approx(facing(light.radiance, direction), rel=0.01)
+    assert table.background.shape == (BACKGROUND_ROWS, 2 * BACKGROUND_ROWS, 3)
+    assert facing(rest, direction)[0] < facing(light.radiance, direction)[0]
+
+
+def test_the_sets_sun_throws_the_shadow_in_its_colour(device):
+    """A small sheet 0.1 m above a large one; the set's sun at 45° over +x, red, over an even map: light returns where it does not reach."""
+    view = toy_scene.camera(64, 48, 200.0, (0.0, 0.0, 2.0))
+    flat, above = (0.0, 0.0, 0.0, *toy_scene.UPRIGHT), (0.0, 0.0, 0.1, *toy_scene.UPRIGHT)
+    entries = [toy_scene.entry(toy_scene.sheet(0.6, 0.4)), toy_scene.entry(toy_scene.sheet(0.04, 0.04))]
+    sun = Sun(np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0), np.array([4.0, 0.0, 0.0]))
+    lights = (LightMap("set", np.ones((64, 128, 3), np.float32), sun),)
+    lit = toy_scene.render(toy_scene.ToyScene(entries, [[(0, flat), (1, above)]], (view,), lights=lights), device).radiance[0]
+    assert lit[24, 22, 0] < 0.7 * lit[24, 42, 0]
+    np.testing.assert_allclose(lit[24, 22, 1:], lit[24, 42, 1:], rtol=0.1)

@@ -1,0 +1,379 @@
+"""Which objects are drawn, where they fall from, and who gets which episode."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from synpick_warp.codes import Ending
+from synpick_warp.kernels import phases
+from synpick_warp.kernels.sim import arrangement as kernels
+from synpick_warp.scenes import build
+from synpick_warp.stages.constants import make_scene_data
+from synpick_warp.stages.sim import arrange
+from tests.twins import arrangement
+from tests.worlds import small_worlds
+from tests.worlds.kernel_worlds import KernelWorlds
+
+WORLDS = 24
+SEED = 2**40 + 3
+
+
+@st.composite
+def catalogs(draw):
+    count = draw(st.integers(1, 12))
+    numbers = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    volume = numbers.uniform(0.02, draw(st.sampled_from((0.1, 0.5, 2.0))), count)
+    compound = (numbers.uniform(size=count) < draw(st.sampled_from((0.0, 0.3, 1.0)))).astype(np.int32)
+    return {
+        "volume": volume,
+        "compound": compound,
+        "radius": numbers.uniform(0.02, 0.3, count),
+        "instances": draw(st.integers(1, 16)),
+        "single_slots": draw(st.integers(0, 16)),
+        "compound_slots": draw(st.integers(0, 6)),
+        "drop": {"volume": draw(st.floats(0.01, 3.0)), "move_repeats": draw(st.integers(0, 1)), "pick_repeats": draw(st.integers(0, 1))},
+        "mix": draw(st.sampled_from(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (1.0, 1.0, 2.0)))),
+    }
+
+
+def made(device, worlds: int = WORLDS, mix: tuple[float, float, float] = (0.0, 0.0, 1.0), **sizes) -> KernelWorlds:
+    """Worlds whose episodes have modes with these weights of pick, target and move."""
+    default = {"volume": np.array([0.1, 0.2, 0.3]), "compound": np.array([0, 1, 0]), "radius": np.array([0.05, 0.1, 0.2]), "instances": 8,
+               "single_slots": 8, "compound_slots": 8}
+    made_worlds = KernelWorlds(device, worlds, **(default | sizes))
+    made_worlds.scene.mode.pick_share, made_worlds.scene.mode.pick_or_target_share = np.cumsum(mix)[:2] / np.sum(mix)
+    return made_worlds
+
+
+def may_repeat(worlds: KernelWorlds, world: int) -> bool:
+    """Whether objects may come several times in the mode that this world has."""
+    drop = worlds.scene.drop
+    return bool(drop.move_repeats if worlds.state.mode.numpy()[world] == phases.MOVE else drop.pick_repeats)
+
+
+def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangement]:
+    """What the twin draws for each world, in the mode that it has."""
+    return [
+        arrangement.draw_objects(
+            seed, *map(int, address), volume=worlds.volume, compound=worlds.compound, budget=worlds.scene.drop.volume,
+            repeats=may_repeat(worlds, world), room=worlds.instances, single_slots=worlds.single_slots,
+            compound_slots=worlds.compound_slots,
+        )
+        for world, address in enumerate(worlds.state.address.numpy())
+    ]
+
+
+@given(sizes=catalogs(), seed=st.integers(0, 2**63 - 1), first=st.integers(0, 2**30), redraw=st.integers(0, 20))
+def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, redraw, device):
+    worlds = made(device, **sizes)
+    worlds.begin(phases.START, first + np.arange(WORLDS), redraw)
+    worlds.set(worlds.state.entry, 99)
+    arrange.draw_objects(worlds.scene, worlds.state, seed)
+    entry, slot = worlds.state.entry.numpy(), worlds.state.slot.numpy()
+    for world, expected in enumerate(drawn(worlds, seed)):
+        count = len(expected.entries)
+        assert tuple(entry[world, :count]) == expected.entries
+        assert (entry[world, count:] == -1).all()
+        assert tuple(slot[world, :count]) == expected.slots
+        state = (worlds.state.phase.numpy()[world], worlds.state.ending.numpy()[world])
+        assert state == ((phases.OVER, Ending.ARRANGEMENT_OVERFLOW) if expected.overflow else (phases.START, Ending.RUNNING))
+        check_law(worlds, world, entry[world, :count], slot[world, :count])
+
+
+def check_law(worlds: KernelWorlds, world: int, entry: np.ndarray, slot: np.ndarray) -> None:
+    assert worlds.volume[entry].sum() <= worlds.scene.drop.volume * (1 + 1e-6)
+    assert len(set(slot)) == len(slot)
+    np.testing.assert_array_equal(slot >= worlds.single_slots, worlds.compound[entry] == 1)
+    assert (slot < worlds.slots).all()
+    if not may_repeat(worlds, world):
+        assert len(set(entry)) == len(entry)
+
+
+# ---- modes ----
+
+
+@pytest.fixture(scope="module")
+def built(device) -> build.BuiltModel:
+    return build.build_model(small_worlds.settings(), small_worlds.catalog(), device)
+
+
+def modes(built, device, mode: str, mix: tuple[float, float, float], episodes: np.ndarray, redraw: object = 0) -> np.ndarray:
+    """Mode of each episode, one world an episode, from settings to the device and back."""
+    config = small_worlds.settings(bake__mode=mode, bake__mix=list(mix))
+    worlds = made(device, worlds=len(episodes))
+    scene = make_scene_data(config, small_worlds.catalog(), built, 1, device)
+    worlds.scene = dataclasses.replace(worlds.scene, mode=scene.mode)
+    worlds.begin(phases.START, episodes, redraw)
+    worlds.set(worlds.state.mode, 99)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    return worlds.state.mode.numpy()
+
+
+@pytest.mark.parametrize(("mode", "code"), [("pick", phases.PICK), ("target", phases.TARGET), ("move", phases.MOVE)])
+def test_a_single_mode_is_every_episodes(built, device, mode, code):
+    assert (modes(built, device, mode, (1.0, 2.0, 3.0), np.arange(500)) == code).all()
+
+
+@given(mix=st.tuples(*[st.integers(0, 5)] * 3).filter(any), first=st.integers(0, 2**30))
+def test_mixed_modes_are_the_twins(mix, first, built, device):
+    episodes = first + np.arange(WORLDS)
+    np.testing.assert_array_equal(modes(built, device, "mixed", mix, episodes), arrangement.draw_modes(SEED, episodes, mix))
+
+
+@pytest.mark.parametrize("mix", [(1.0, 1.0, 1.0), (0.5, 0.3, 0.2), (3.0, 0.0, 1.0), (0.0, 2.0, 0.0), (1e-9, 0.0, 1e3), (1e3, 0.0, 1e-9)])
+def test_shares_of_modes_are_the_weights(built, device, mix):
+    """Within four standard deviations; a mode of weight 0 never comes, on whichever side it stands."""
+    episodes = 4000
+    found = modes(built, device, "mixed", mix, np.arange(episodes))
+    for code, share in zip((phases.PICK, phases.TARGET, phases.MOVE), np.array(mix) / sum(mix), strict=True):
+        assert (found == code).mean() == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / episodes))
+
+
+def test_an_episode_keeps_its_mode_in_any_world_and_arrangement(built, device):
+    """Whatever world has the episode, of however many, and however often its arrangement was drawn again."""
+    mix, episodes = (1.0, 1.0, 1.0), np.arange(60)
+    expected = modes(built, device, "mixed", mix, episodes)
+    numbers = np.random.default_rng(5)
+    for count in (7, 60):
+        some = numbers.permutation(episodes)[:count]
+        redraw = numbers.integers(0, 20, count)
+        np.testing.assert_array_equal(modes(built, device, "mixed", mix, some, redraw), expected[some])
+
+
+def test_modes_are_drawn_apart_from_objects(device):
+    """Where modes differ and the rules of repeating do not, all else of an episode is the same."""
+    episodes, objects = np.arange(WORLDS), []
+    for mix in ((1.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
+        worlds = made(device, mix=mix, drop={"move_repeats": 1, "pick_repeats": 1})
+        worlds.begin(phases.START, episodes)
+        arrange.draw_objects(worlds.scene, worlds.state, SEED)
+        objects.append((worlds.state.entry.numpy(), worlds.state.light_turn.numpy()))
+    for pick, mixed in zip(*objects, strict=True):
+        np.testing.assert_array_equal(pick, mixed)
+
+
+def test_a_budget_for_everything_draws_everything_without_repeats(device):
+    worlds = made(device, drop={"volume": 10.0, "move_repeats": 0})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    assert (np.sort(worlds.state.entry.numpy(), axis=1)[:, -3:] == [0, 1, 2]).all()
+    assert len(np.unique(worlds.state.entry.numpy(), axis=0)) == 6
+
+
+def test_the_budget_may_be_met_exactly(device):
+    worlds = made(device, volume=np.array([0.25]), compound=np.array([0]), radius=np.array([0.1]), drop={"volume": 1.0})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    assert ((worlds.state.entry.numpy() == 0).sum(axis=1) == 4).all()
+
+
+def test_an_object_that_never_fits_is_never_drawn(device):
+    worlds = made(device, drop={"volume": 0.25})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    entry = worlds.state.entry.numpy()
+    assert (entry[:, 0] >= 0).all()
+    assert not (entry == 2).any()
+
+
+def test_each_mode_has_its_own_rule_of_repeating(device):
+    """One bake: episodes of picking without repeats, episodes of moving with them."""
+    worlds = made(device, worlds=200, mix=(1.0, 1.0, 1.0), drop={"volume": 10.0, "move_repeats": 1, "pick_repeats": 0})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    moving = worlds.state.mode.numpy() == phases.MOVE
+    assert 0 < moving.sum() < 200
+    count = (worlds.state.entry.numpy() >= 0).sum(axis=1)
+    # Three entries, room for eight instances, a budget for all.
+    np.testing.assert_array_equal(count, np.where(moving, 8, 3))
+
+
+@pytest.mark.parametrize("mix", [(1.0, 0.0, 0.0), (1.0, 1.0, 2.0)])
+def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
+    """What scenes.build counts is enough for what the device draws, but for the accepted share."""
+    shortfall, episodes = 0.02, 2000
+    config = small_worlds.settings(bake__mode="mixed", bake__mix=list(mix), arrangement__volume=1.2e-3, arrangement__max_objects=12,
+                                   arrangement__slot_shortfall=shortfall)
+    objects = small_worlds.catalog()
+    single, compound = build.count_slots(config, objects)
+    worlds = made(device, episodes, mix, volume=np.array([entry.volume for entry in objects.entries]),
+                  compound=np.array([len(entry.pieces) > 1 for entry in objects.entries]), instances=12, single_slots=single,
+                  compound_slots=compound, drop={"volume": 1.2e-3, "move_repeats": 1, "pick_repeats": 0})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    over = (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).mean()
+    assert over <= shortfall + 4 * np.sqrt(shortfall / episodes)
+    assert (single, compound) == (2, 1) if mix[2] == 0.0 else over > 0.0
+
+
+@pytest.mark.parametrize("phase", [phases.EMPTY, phases.SETTLE, phases.ACT, phases.OVER])
+def test_worlds_at_work_keep_their_objects(device, phase):
+    worlds = made(device)
+    worlds.begin(phase)
+    worlds.set(worlds.state.entry, 2)
+    worlds.set(worlds.state.light, 7)
+    worlds.set(worlds.state.mode, 9)
+    joints = worlds.physics.state.joint_q
+    worlds.set(joints, 0.5)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    assert (worlds.state.entry.numpy() == 2).all()
+    assert (worlds.state.light.numpy() == 7).all()
+    assert (worlds.state.mode.numpy() == 9).all()
+    if phase != phases.OVER:
+        assert (worlds.state.variant.numpy().reshape(WORLDS, -1)[:, 2:] == -1).all()
+        assert (joints.numpy() == 0.5).all()
+        assert not worlds.state.restarted.numpy().any()
+
+
+@given(sizes=catalogs(), spread=st.floats(0.0, 1.0), clearance=st.floats(0.0, 0.05), episode=st.integers(0, 2**30))
+def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance, episode, device):
+    sizes["drop"] |= {"spread": spread, "clearance": clearance}
+    worlds = made(device, **sizes)
+    worlds.begin(phases.START, episode + np.arange(WORLDS))
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    over = worlds.state.phase.numpy() == phases.OVER
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    np.testing.assert_array_equal(worlds.state.phase.numpy(), np.where(over, phases.OVER, phases.SETTLE))
+    drop = worlds.scene.drop
+    rim = (drop.rim_length, drop.rim_width, drop.rim_height)
+    for world in range(WORLDS):
+        entry = worlds.state.entry.numpy()[world]
+        entry = entry[entry >= 0]
+        poses = worlds.coordinates()[world, worlds.state.slot.numpy()[world, : len(entry)]]
+        radius = worlds.radius[entry]
+        expected = arrangement.drop_poses(SEED, episode + world, 0, radius, rim=rim, clearance=clearance, spread=spread)
+        np.testing.assert_allclose(poses, expected, atol=1e-5)
+        place, bottom = poses[:, :3].astype(np.float64), poses[:, 2] - radius
+        assert (bottom >= drop.rim_height - 1e-5).all()
+        gaps = np.linalg.norm(place[:, None] - place[None], axis=2) - radius[:, None] - radius[None]
+        assert (gaps[~np.eye(len(entry), dtype=bool)] >= -1e-5).all()
+        for axis in range(2):
+            assert (np.abs(place[:, axis]) <= np.maximum(0.0, rim[axis] / 2 - radius) + 1e-6).all()
+
+
+def test_the_drop_uses_the_whole_spread(device):
+    worlds = made(device, worlds=500, radius=np.full(3, 0.05), drop={"spread": 1.0})
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    full = worlds.coordinates()[worlds.forces()[:, :, 2] == 0.0]
+    np.testing.assert_allclose(full[:, :2].min(axis=0), [-0.2, -0.1], atol=5e-3)
+    np.testing.assert_allclose(full[:, :2].max(axis=0), [0.2, 0.1], atol=5e-3)
+
+
+def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device):
+    worlds = made(device)
+    worlds.begin(phases.START)
+    worlds.set(worlds.physics.state.joint_qd, 1.0)
+    worlds.set(worlds.physics.control.joint_f, 7.0)
+    worlds.set(worlds.state.stuck, 5)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    state, catalog = worlds.state, worlds.scene.catalog
+    variant = state.variant.numpy().reshape(WORLDS, -1)
+    full = np.zeros((WORLDS, worlds.slots), dtype=bool)
+    for world, instance in zip(*np.nonzero(state.entry.numpy() >= 0), strict=True):
+        slot, entry = state.slot.numpy()[world, instance], state.entry.numpy()[world, instance]
+        full[world, slot] = True
+        assert variant[world, 2 + slot] == catalog.variant.numpy()[entry]
+    empty = np.where(np.arange(worlds.slots) < worlds.single_slots, catalog.empty_single, catalog.empty_compound)
+    np.testing.assert_array_equal(variant[:, 2:][~full], np.broadcast_to(empty, full.shape)[~full])
+    weight = np.array([0.0, 0.0, catalog.empty_mass * worlds.scene.drop.gravity, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(worlds.forces(), np.where(full[:, :, None], 0.0, weight), rtol=1e-6)
+    parked = [0.0, 0.0, kernels.PARKED_HEIGHT, 0.0, 0.0, 0.0, 1.0]
+    np.testing.assert_array_equal(worlds.coordinates()[~full], np.broadcast_to(np.float32(parked), worlds.coordinates()[~full].shape))
+    assert (worlds.physics.state.joint_qd.numpy() == 0.0).all()
+    assert (state.stuck.numpy() == 0).all()
+    np.testing.assert_array_equal(state.progress.numpy(), np.broadcast_to([0, 0, 0, 1], (WORLDS, 4)))
+    assert state.restarted.numpy()[:-1].all()
+    assert not state.restarted.numpy()[-1]
+    gripper = worlds.physics.state.joint_q.numpy().reshape(WORLDS, -1)[:, :4]
+    np.testing.assert_array_equal(gripper, np.tile([3.0, 0.0, 1.0, 0.0], (WORLDS, 1)))
+
+
+def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
+    worlds = made(device, compound_slots=0)
+    worlds.begin(phases.START)
+    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
+    over = worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW
+    assert over.any()
+    assert not over.all()
+    assert (worlds.state.entry.numpy()[over] == -1).all()
+    assert (worlds.coordinates()[over][:, :, 2] == kernels.PARKED_HEIGHT).all()
+    assert (worlds.forces()[over][:, :, 2] > 0.0).all()
+
+
+def take(device, phase, ending, address, following: int, *, episodes: int, tries: int):
+    """State after numbers are handed out: phase, ending, address, next number."""
+    worlds = made(device, worlds=len(phase))
+    state = worlds.state
+    for array, values in ((state.phase, phase), (state.ending, ending), (state.address, address), (state.next_episode, following)):
+        worlds.set(array, values)
+    arrange.take_episodes(state, wp.array(np.arange(episodes), dtype=wp.int32, device=device), tries)
+    return state.phase.numpy().tolist(), state.ending.numpy().tolist(), state.address.numpy().tolist(), int(state.next_episode.numpy()[0])
+
+
+def test_numbers_are_those_of_the_list(device):
+    worlds = made(device, worlds=3)
+    worlds.begin(phases.EMPTY, -1)
+    arrange.take_episodes(worlds.state, wp.array([7, 2], dtype=wp.int32, device=device), 1)
+    assert worlds.state.address.numpy().tolist() == [[7, 0], [2, 0], [-1, 0]]
+    assert worlds.state.phase.numpy().tolist() == [phases.START, phases.START, phases.IDLE]
+
+
+def test_empty_worlds_take_numbers_in_order(device):
+    assert take(device, [phases.EMPTY] * 3, 0, -1, 0, episodes=2, tries=1) == (
+        [phases.START, phases.START, phases.IDLE], [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2
+    )
+
+
+def test_an_episode_that_delivered_nothing_is_drawn_again_in_its_world_until_it_is_given_up(device):
+    over = [phases.OVER] * 4
+    ending = [Ending.UNSETTLED, Ending.FINISHED, Ending.NOT_FINITE, Ending.UNSETTLED]
+    address = [[3, 0], [4, 0], [5, 1], [6, 2]]
+    assert take(device, over, ending, address, 9, episodes=100, tries=3) == (
+        [phases.START] * 4, [Ending.RUNNING] * 4, [[3, 1], [9, 0], [5, 2], [10, 0]], 11
+    )
+
+
+def test_worlds_at_work_keep_their_numbers(device):
+    phase = [phases.SETTLE, phases.ACT, phases.IDLE]
+    assert take(device, phase, 0, [[0, 0], [1, 0], [-1, 0]], 2, episodes=9, tries=3) == (phase, [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2)
+
+
+@given(worlds=st.integers(1, 6), episodes=st.integers(1, 20), tries=st.integers(1, 4), seed=st.integers(0, 2**32 - 1))
+def test_every_episode_ends_once(worlds, episodes, tries, seed, device):
+    """Whatever becomes of episodes, each number is delivered or given up exactly once; then all worlds are idle."""
+    numbers = np.random.default_rng(seed)
+    made_worlds = made(device, worlds=worlds)
+    state = made_worlds.state
+    made_worlds.begin(phases.EMPTY, -1)
+    started, ended = [], []
+    listed = wp.array(np.arange(episodes), dtype=wp.int32, device=device)
+    for _ in range(8 * episodes * tries):
+        arrange.take_episodes(state, listed, tries)
+        phase, ending, address = state.phase.numpy(), state.ending.numpy(), state.address.numpy()
+        started += [tuple(address[world]) for world in np.flatnonzero(phase == phases.START)]
+        for world in np.flatnonzero(phase != phases.IDLE):
+            phase[world], ending[world] = phases.ACT, Ending.RUNNING
+            if numbers.uniform() < 0.5:
+                phase[world], ending[world] = phases.OVER, numbers.choice([Ending.FINISHED, Ending.UNSETTLED])
+                if ending[world] == Ending.FINISHED or address[world, 1] == tries - 1:
+                    ended.append(int(address[world, 0]))
+        if (phase == phases.IDLE).all():
+            break
+        made_worlds.set(state.phase, phase)
+        made_worlds.set(state.ending, ending)
+    assert (state.phase.numpy() == phases.IDLE).all()
+    assert sorted(ended) == list(range(episodes))
+    assert len(set(started)) == len(started)
+    assert [episode for episode, redraw in started if redraw == 0] == list(range(episodes))
+    assert (state.address.numpy()[:, 0] == -1).all()

@@ -1,0 +1,305 @@
+"""Seals in the real physics: what they bear, when they break, how objects swing; and their wrench against a twin."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from synpick_warp.configs.load import load_config
+from synpick_warp.scenes import build
+from synpick_warp.stages.sim import physics
+from synpick_warp.stages.sim.suction import Suction
+from tests.twins import suction as twin
+from tests.twins.raycast import rotation_of
+from tests.worlds.hanging import Hanging
+from tests.worlds.kernel_worlds import GRIPPER_DOFS, KernelWorlds, filled
+from tests.worlds.small_worlds import CUBE, catalog
+
+GRAVITY = 9.81
+# Masses of the object table [kg], the lightest to the heaviest.
+MASSES = np.sort([row.mass for row in load_config("synpick", {}).object_rows])
+LIFT = 0.5
+
+
+def size_of(mass: float) -> tuple[float, float, float]:
+    """A bar, a box or a large box [m]."""
+    return (0.12, 0.02, 0.02) if mass < 0.1 else (0.1, 0.07, 0.05) if mass < 0.5 else (0.25, 0.1, 0.07)
+
+
+def under(hanging: Hanging, share: float = 0.0) -> np.ndarray:
+    """Centres of objects that touch the tip with their upper side, so far out of their middle, as a share of half their length."""
+    place = np.zeros((hanging.worlds, hanging.instances, 3))
+    place[..., 0] = share * hanging.size[..., 0] / 2
+    place[..., 2] = -hanging.size[..., 2] / 2
+    return place
+
+
+@pytest.fixture(scope="module")
+def table(device) -> Hanging:
+    """A world for every mass of the object table."""
+    return Hanging(device, MASSES[:, None], [[size_of(mass)] for mass in MASSES])
+
+
+# ---- what a seal bears ----
+
+
+def test_the_table_spans_what_a_seal_must_hold():
+    assert len(MASSES) == 21
+    assert MASSES[0] == pytest.approx(0.016)
+    assert MASSES[-1] == pytest.approx(1.131)
+
+
+def test_hanging_still_the_load_is_the_weight_and_a_good_seal_lifts_everything(table):
+    table.start(under(table))
+    load = table.run(150)[-50:, :, 0]
+    assert (np.abs(load / (MASSES * GRAVITY) - 1.0) < 0.03).all()
+    table.speed[2] = LIFT
+    load = table.run(130)[:, :, 0]
+    assert (table.seals.held.numpy() == 1).all()
+    # Up to speed, without slack: more than the weight, and then the weight again.
+    assert (load.max(axis=0) > 1.2 * MASSES * GRAVITY).all()
+    assert (np.abs(load[-1] / (MASSES * GRAVITY) - 1.0) < 0.1).all()
+    poses, velocity = table.bodies()
+    np.testing.assert_allclose(velocity[:, 2, 2], LIFT, rtol=0.03)
+    # Stretched by no more than the paper's compliance.
+    tip = poses[:, 1, 2] - table.config.gripper.cup_length
+    np.testing.assert_allclose(poses[:, 2, 2] + table.size[:, 0, 2] / 2, tip, atol=5e-3)
+    np.testing.assert_allclose(table.seals.peak.numpy(), load.max(axis=0), rtol=1e-5)
+
+
+def test_a_poor_seal_holds_the_marker_and_drops_what_is_heavy(table):
+    table.start(under(table), limit=2.0)
+    table.speed[2] = LIFT
+    load = table.run(150)[:, :, 0]
+    held = table.seals.held.numpy()[:, 0]
+    assert held[0] == 1
+    assert (held[MASSES > 0.21] == 0).all()
+    # Heavier objects break off sooner: those held are the lightest.
+    assert (np.diff(held) <= 0).all()
+    assert load.max() <= 2.0
+    # Dropped objects feel no force any more, and fall.
+    force = table.physics.control.joint_f.numpy().reshape(len(MASSES), -1)[:, build.GRIPPER_DOFS :]
+    assert (force[held == 0] == 0.0).all()
+    assert (table.seals.load.numpy()[held == 0] == 0.0).all()
+    _, velocity = table.bodies()
+    assert (velocity[held == 0, 2, 2] < -0.2).all()
+    assert velocity[0, 2, 2] == pytest.approx(LIFT, rel=0.1)
+
+
+def test_what_hangs_by_its_edge_swings_little_more_than_the_limit(device):
+    masses = np.array([1.131, 0.729, 0.411, 0.066])
+    sizes = [(0.25, 0.1, 0.07), (0.2, 0.09, 0.09), (0.21, 0.16, 0.06), (0.18, 0.04, 0.04)]
+    hanging = Hanging(device, masses[:, None], [[size] for size in sizes])
+    hanging.start(under(hanging, 0.9))
+    limit = hanging.config.suction.swing_limit
+    most = np.zeros(4)
+    for _ in range(60):
+        hanging.run(4)
+        most = np.maximum(most, hanging.swing())
+    assert (most > limit).all()
+    assert (most < limit + 5.0).all()
+    hanging.run(60)
+    assert (hanging.swing() < limit + 2.0).all()
+    assert (hanging.seals.held.numpy() == 1).all()
+    np.testing.assert_allclose(hanging.seals.load.numpy()[:, 0], masses * GRAVITY, rtol=0.03)
+
+
+# ---- momentum and energy ----
+
+
+@pytest.fixture(scope="module")
+def floating(device) -> Hanging:
+    """The lightest and the heaviest object, without weight, on grippers that nothing holds."""
+    hanging = Hanging(device, [[0.016], [1.131]], [[(0.12, 0.02, 0.02)], [(0.2, 0.08, 0.06)]], physics__gravity=0.0)
+    hanging.carried = False
+    return hanging
+
+
+@pytest.mark.parametrize(("stiffness", "damping", "twist"), [(2e4, 100.0, 50.0), (1e6, 0.0, 500.0), (2e3, 100.0, 5.0)])
+def test_wrenches_are_opposite_and_give_no_energy(floating, stiffness, damping, twist):
+    """A pushed and spinning object takes its gripper along: the momentum stays, energy goes, at last both move as one."""
+    filled(floating.scene.suction, {"stiffness": stiffness, "damping": damping, "twist_stiffness": twist})
+    floating.start(under(floating, 0.4), limit=1e9)
+    speeds = floating.physics.state.joint_qd.numpy().reshape(2, -1)
+    speeds[:, build.GRIPPER_DOFS : build.GRIPPER_DOFS + 6] = (0.3, -0.2, 0.1, 1.0, 2.0, 3.0)
+    floating.physics.refresh_poses()
+    energy, momentum = floating.energy(), floating.momentum()
+    most = np.zeros(2)
+    for _ in range(100):
+        floating.run(1)
+        most = np.maximum(most, floating.energy())
+    assert (most <= energy * (1 + 1e-3)).all()
+    np.testing.assert_allclose(floating.momentum(), momentum, atol=2e-6)
+    floating.run(50)
+    together = (momentum**2).sum(axis=1) / (2 * (floating.mass[:, 0] + floating.gripper_mass))
+    assert (floating.energy() < together + 0.05 * energy).all()
+
+
+# ---- several objects, contacts ----
+
+
+@pytest.fixture(scope="module")
+def pair(device) -> Hanging:
+    """Two objects on each cup: side by side, and one much heavier than the other."""
+    return Hanging(device, [[0.4, 0.4], [0.016, 1.131]], [[(0.05, 0.05, 0.05)] * 2, [(0.04, 0.02, 0.02), (0.08, 0.05, 0.05)]])
+
+
+def beside(hanging: Hanging) -> np.ndarray:
+    """Two objects with a gap of 2 mm between them under the tip."""
+    place = under(hanging)
+    place[:, 0, 0], place[:, 1, 0] = -hanging.size[:, 0, 0] / 2 - 1e-3, hanging.size[:, 1, 0] / 2 + 1e-3
+    return place
+
+
+def test_two_objects_hang_on_one_cup_and_break_off_alone(pair):
+    pair.start(beside(pair))
+    pair.run(150)
+    # They lean on one another as they swing in: together they weigh what they weigh.
+    assert (pair.seals.held.numpy() == 1).all()
+    load = pair.run(50).mean(axis=0)
+    assert load.sum(axis=1) == pytest.approx(pair.mass.sum(axis=1) * GRAVITY, rel=0.1)
+    assert np.abs(pair.bodies()[1][:, 2:, :3]).max() < 0.01
+    pair.seals.limit.fill_(2.0)
+    pair.run(1)
+    assert pair.seals.held.numpy().tolist() == [[0, 0], [1, 0]]
+    pair.run(30)
+    assert pair.seals.held.numpy().tolist() == [[0, 0], [1, 0]]
+    assert pair.bodies()[1][1, 3, 2] < -0.4
+    assert abs(pair.bodies()[1][1, 2, 2]) < 0.1
+
+
+def test_a_cup_does_not_push_away_what_it_holds(pair):
+    """Caught 3 mm deep in the cup, an object hangs as any other and its weight is the load; contacts would push it out."""
+    place = under(pair)
+    place[:, 0, 2] += 3e-3
+    place[:, 1, 0] = 0.5
+    weight = pair.mass[:, 0] * GRAVITY
+    try:
+        for pair.ignoring in (False, True):
+            pair.start(place)
+            pair.seals.held.assign(np.array([[1, 0], [1, 0]]))
+            load = pair.run(60)[-1, :, 0]
+            assert (load == pytest.approx(weight, rel=0.03)) == pair.ignoring
+    finally:
+        pair.ignoring = True
+    poses, _ = pair.bodies()
+    low = poses[:, 1, 2] - pair.config.gripper.cup_length - pair.size[:, 0, 2] / 2 - poses[:, 2, 2]
+    assert low == pytest.approx(-3e-3 + weight / pair.config.suction.stiffness, abs=3e-4)
+
+
+def test_held_objects_touch_each_other_and_what_is_not_held_touches_the_cup(pair):
+    """Of the contacts between bodies, exactly those of a cup with what it holds are pulled apart."""
+    place = beside(pair)
+    place[..., 2] += 1e-3
+    pair.start(place)
+    pair.seals.held.assign(np.array([[1, 0], [1, 1]]))
+    pair.physics.pipeline.collide(pair.physics.state, pair.physics.contacts)
+
+    def pairs() -> list[tuple[int, int]]:
+        contacts, shape_body = pair.physics.contacts, pair.physics.model.shape_body.numpy()
+        count = int(contacts.rigid_contact_count.numpy()[0])
+        shapes = np.stack([contacts.rigid_contact_shape0.numpy(), contacts.rigid_contact_shape1.numpy()])[:, :count]
+        near = contacts.rigid_contact_margin0.numpy()[:count] > -physics.CONTACT_GAP
+        return sorted({(int(min(column)), int(max(column))) for column in shape_body[shapes][:, near].T})
+
+    one = pair.layout.bodies_per_world
+    cup, first, second = 1, 2, 3
+    both = {(one + cup, one + first), (one + cup, one + second)}
+    before = pairs()
+    assert {(cup, first), (cup, second), (first, second)} | both <= set(before)
+    pair.suction.ignore_held_contacts(pair.scene, pair.state, pair.seals, pair.physics)
+    assert set(pairs()) == set(before) - {(cup, first)} - both
+
+
+# ---- the law ----
+
+LAW = {"stiffness": 2e4, "damping": 100.0, "twist_stiffness": 50.0, "twist_damping": 0.1, "swing_limit": np.radians(5.0),
+       "swing_stiffness": 50.0, "tip": 0.055, "finger_mass": 1.5, "cup_mass": 0.5, "tilt_inertia": 0.4, "step": 2e-3}
+SLOTS = (3, 0, 2)
+
+
+def scripted(device, bodies: list[twin.Body], anchors: np.ndarray, held: list[int], limit: float) -> KernelWorlds:
+    """One world with a moving cup and three moving objects in the slots SLOTS."""
+    worlds = KernelWorlds(device, 1, volume=np.ones(1), compound=np.zeros(1, int), radius=np.ones(1), instances=3, single_slots=4,
+                          compound_slots=0)
+    filled(worlds.scene.suction, LAW)
+    rows = [1, *(2 + slot for slot in SLOTS)]
+    columns = {"body_q": (wp.transform, (7,), [body.pose for body in bodies]),
+               "body_qd": (wp.spatial_vector, (6,), [body.velocity for body in bodies]),
+               "body_com": (wp.vec3, (3,), [body.center for body in bodies]),
+               "body_inv_mass": (float, (), [1 / body.mass for body in bodies]),
+               "body_inv_inertia": (wp.mat33, (3, 3), [np.linalg.inv(body.inertia) for body in bodies])}
+    for name, (dtype, shape, values) in columns.items():
+        full = np.zeros((worlds.bodies, *shape), np.float32)
+        full[rows] = values
+        owner = worlds.physics.state if name in ("body_q", "body_qd") else worlds.physics.model
+        setattr(owner, name, wp.array(full, dtype=dtype, device=device))
+    worlds.set(worlds.state.slot, SLOTS)
+    worlds.set(worlds.seals.anchor, anchors)
+    worlds.set(worlds.seals.held, held)
+    worlds.set(worlds.seals.limit, limit)
+    worlds.set(worlds.seals.load, 9.0)
+    worlds.set(worlds.seals.peak, 1.0)
+    worlds.set(worlds.physics.control.joint_f, 7.0)
+    return worlds
+
+
+def drawn(seed: int) -> tuple[list[twin.Body], np.ndarray]:
+    """A cup and three objects of any mass, somewhat out of the places where they were caught, all moving."""
+    numbers = np.random.default_rng(seed)
+
+    def quaternion(size: float) -> np.ndarray:
+        q = np.append(size * numbers.normal(size=3), 1.0)
+        return q / np.linalg.norm(q)
+
+    bodies, anchors = [], []
+    for index in range(4):
+        mass = 10 ** numbers.uniform(-1.8, 0.1)
+        spread = numbers.normal(scale=0.03, size=(8, 3))
+        inertia = mass * (np.trace(spread.T @ spread) * np.eye(3) - spread.T @ spread) / 8
+        pose = np.concatenate([numbers.normal(size=3), quaternion(1.0)])
+        if index > 0:
+            anchors.append(np.concatenate([numbers.normal(scale=0.05, size=3), quaternion(1.0)]))
+            pose = np.array(_times(_times(_times(bodies[0].pose, [0, 0, -LAW["tip"], 0, 0, 0, 1]),
+                                          [*numbers.normal(scale=5e-4, size=3), *quaternion(0.05)]), anchors[-1]))
+        velocity = np.concatenate([numbers.normal(scale=0.05, size=3), numbers.normal(scale=0.3, size=3)])
+        center = numbers.normal(scale=0.02, size=3)
+        bodies.append(twin.Body(pose, velocity, mass, inertia, center))
+    return bodies, np.array(anchors)
+
+
+def _times(a, b) -> list[float]:
+    """Product of two poses."""
+    (x, y, z, w), (i, j, k, r) = a[3:], b[3:]
+    turned = [w * i + x * r + y * k - z * j, w * j - x * k + y * r + z * i, w * k + x * j - y * i + z * r, w * r - x * i - y * j - z * k]
+    return [*(np.asarray(a[:3]) + rotation_of(np.array(a[3:])) @ b[:3]), *turned]
+
+
+@given(seed=st.integers(0, 10_000), held=st.sampled_from([[1, 0, 0], [0, 1, 1], [1, 1, 1]]), limit=st.sampled_from([1e6, 5.0]))
+@settings(max_examples=30)
+def test_the_wrench_is_the_twins_and_what_is_not_held_is_left_alone(seed, held, limit, device):
+    bodies, anchors = drawn(seed)
+    worlds = scripted(device, bodies, anchors, held, limit)
+    expected = np.full(worlds.dofs, 7.0)
+    loads, kept, peak = [9.0] * 3, list(held), 1.0
+    for instance in np.flatnonzero(held):
+        force, reaction, load = twin.seal_wrench(bodies[0], bodies[1 + instance], anchors[instance], SimpleNamespace(**LAW), sum(held))
+        first = GRIPPER_DOFS + 6 * SLOTS[instance]
+        breaks = load > limit
+        expected[first : first + 6] = 0.0 if breaks else force
+        expected[:GRIPPER_DOFS] += 0.0 if breaks else reaction
+        loads[instance], kept[instance] = (0.0, 0) if breaks else (load, 1)
+        peak = max(peak, loads[instance])
+    meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
+    suction = Suction(load_config("smoke", {}), catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
+    suction.hold_objects(worlds.scene, worlds.state, worlds.seals, worlds.physics, worlds.physics.state)
+    scale = np.abs(expected).max()
+    np.testing.assert_allclose(worlds.physics.control.joint_f.numpy(), expected, rtol=3e-4, atol=1e-4 * scale)
+    np.testing.assert_allclose(worlds.seals.load.numpy()[0], loads, rtol=3e-4, atol=1e-4 * scale)
+    assert worlds.seals.held.numpy()[0].tolist() == kept
+    assert worlds.seals.peak.numpy()[0] == pytest.approx(peak, rel=3e-4, abs=1e-4 * scale)

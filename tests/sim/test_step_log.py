@@ -1,0 +1,270 @@
+"""What is recorded of every step: against the tick's own poses, the laws of motion, and the impedance law."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from synpick_warp.kernels import phases
+from synpick_warp.kernels.sim import step_log
+from synpick_warp.scenes import build
+from synpick_warp.scenes.types import Catalog
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.stream import TickReader, TickReport, tick_batch
+from tests.twins import impedance
+from tests.worlds.sights import SHORT, picking
+from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, settings
+
+LONGEST = 200
+COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__substeps": 1, "physics__iterations": 6}
+GRAVITY = 9.81
+
+
+class Log:
+    """All reports of a run with copies of what is recorded, one world."""
+
+    def __init__(self, simulation: Simulation, ticks: int = LONGEST) -> None:
+        self.reports: list[TickReport] = []
+        self.steps: list[dict[str, np.ndarray]] = []
+        self.ticks: list[dict[str, np.ndarray]] = []
+        readers = [TickReader(row) for row in simulation.records]
+        for number in range(ticks):
+            simulation.tick(simulation.records[number % 2])
+            readers[number % 2].start()
+            made = readers[number % 2].wait()
+            self.reports.append(made)
+            self.steps.append({name: values.copy() for name, values in made.steps.items()})
+            self.ticks.append({name: values.copy() for name, values in made.tick.items()})
+            if (made.column("phase") == phases.IDLE).all():
+                return
+
+    def column(self, name: str) -> np.ndarray:
+        return np.array([row.column(name)[0] for row in self.reports])
+
+    def all(self, name: str) -> np.ndarray:
+        """Of all steps, one after the other (step, ...)."""
+        return np.concatenate([steps[name][0] for steps in self.steps])
+
+
+@pytest.fixture(scope="module")
+def moved(device) -> tuple[Log, Simulation]:
+    """A cube and a box, from their fall to the end of an episode of moving."""
+    simulation = Simulation(settings(arrangement__max_objects=3), catalog(CUBE, BOX), 1, device, records_physics=True)
+    return Log(simulation), simulation
+
+
+@pytest.fixture(scope="module")
+def picked(device) -> tuple[Log, Simulation]:
+    """The same pile, picked."""
+    simulation = picking(settings(arrangement__max_objects=2, **SHORT), catalog(BOX, CUBE), device, records_physics=True)
+    return Log(simulation), simulation
+
+
+def masses(log: Log, objects: Catalog) -> np.ndarray:
+    """Mass of each instance in each tick [kg], NaN for none."""
+    table = np.append([entry.mass for entry in objects.entries], np.nan)
+    return np.array([table[row.entry[0]] for row in log.reports])
+
+
+@pytest.mark.parametrize("run", ["moved", "picked"])
+def test_the_last_step_is_what_the_tick_shows_to_the_bit(run, request):
+    log, _ = request.getfixturevalue(run)
+    seen = 0
+    for row, steps in zip(log.reports, log.steps, strict=True):
+        there = row.entry[0] >= 0
+        assert steps["pose"][0, -1][there].tobytes() == row.pose[0][there].tobytes()
+        seen += there.sum()
+        # Whoever has just been put above a grasp or sent home has not got there by physics.
+        if row.column("live")[0] and not row.column("outcome")[0] and row.column("frame")[0]:
+            assert steps["gripper_pose"][0, -1].tobytes() == row.snapshot.fixture_pose[0, 1:].tobytes()
+    assert seen > 10
+
+
+@pytest.mark.parametrize("run", ["moved", "picked"])
+def test_what_is_not_there_is_not_a_number(run, request):
+    log, _ = request.getfixturevalue(run)
+    names = [name for name, values in log.steps[0].items() if values.dtype.kind == "f"]
+    for row, steps, before in zip(log.reports[1:], log.steps[1:], log.reports[:-1], strict=True):
+        there = (before.entry[0] >= 0) if before.column("phase")[0] in (phases.SETTLE, phases.ACT) else (row.entry[0] >= 0)
+        for name in names:
+            values = steps[name][0]
+            if name.startswith("gripper") or values.shape[1:2] != there.shape or name in ("goal", "impedance_force"):
+                continue
+            assert np.isfinite(values[:, there]).all(), name
+            assert np.isnan(values[:, ~there]).all(), name
+        assert not steps["held"][0][:, ~there].any()
+        for name in ("gripper_pose", "gripper_velocity", "gripper_contact_force", "gripper_contact_load", "impedance_force"):
+            assert np.isfinite(steps[name]).all(), name
+
+
+@pytest.mark.parametrize("run", ["moved", "picked"])
+def test_momentum_changes_by_contacts_and_weight(run, request):
+    """m (v' - v) / h = F_contact - m g, in every step of every object that no seal holds: impacts, piles, what the gripper pushes."""
+    log, simulation = request.getfixturevalue(run)
+    step = simulation.config.physics.step
+    objects = catalog(CUBE, BOX) if run == "moved" else catalog(BOX, CUBE)
+    weights = np.repeat(masses(log, objects), simulation.config.physics.steps_per_tick, axis=0)
+    velocity, force, held = log.all("velocity").astype(float), log.all("contact_force").astype(float), log.all("held").astype(bool)
+    phase = np.repeat(log.column("phase"), simulation.config.physics.steps_per_tick)
+    change = weights[1:, :, None] * (np.diff(velocity, axis=0) / step + [0.0, 0.0, GRAVITY]) - force[1:]
+    free = ~held[1:] & ~held[:-1] & (phase[1:] == phases.ACT)[:, None] & np.isfinite(change).all(axis=2)
+    assert free.sum() > 500
+    assert force[1:][free].max() > 0.5
+    np.testing.assert_allclose(change[free], 0.0, atol=2e-4)
+
+
+def test_an_object_that_lies_alone_is_carried_by_its_weight(device):
+    """On the floor: the forces of its contacts sum to m g upwards, and no less is the sum of their sizes."""
+    objects = catalog(CUBE)
+    simulation = Simulation(settings(arrangement__max_objects=1), objects, 1, device, records_physics=True)
+    log = Log(simulation, 20)
+    weight = objects.entries[0].mass * GRAVITY
+    first = int(np.flatnonzero(log.column("live"))[0])
+    np.testing.assert_allclose(log.steps[first]["contact_force"][0, :, 0], np.tile([0.0, 0.0, weight], (33, 1)), atol=1e-3 * weight)
+    assert (log.steps[first]["contact_load"][0, :, 0] >= weight * (1.0 - 1e-3)).all()
+    drop = log.ticks[first]["drop_pose"][0, 0]
+    assert drop[2] > simulation.config.tote.outer_size[2] - simulation.config.tote.wall
+    # It fell freely from there: in n steps of h by h² g n (n + 1) / 2, with the speed of every other solver step.
+    half = simulation.config.physics.step / 2
+    fallen = drop[2] - log.steps[0]["pose"][0, :, 0, 2]
+    count = 2 * np.arange(1, 34)
+    np.testing.assert_allclose(fallen, half**2 * GRAVITY * count * (count + 1) / 2, atol=1e-5)
+    np.testing.assert_array_equal(log.steps[0]["contact_force"][0], 0.0)
+
+
+def test_velocities_are_those_of_poses(device):
+    """Of the centre of mass, which is not the origin, and about the world's axes: an L that falls and spins, one solver step a step."""
+    objects = catalog(ANGLE)
+    simulation = Simulation(settings(arrangement__max_objects=1, **COARSE), objects, 1, device, records_physics=True)
+    (entry,), step = objects.entries, simulation.config.physics.step
+    Log(simulation, 1)
+    slot = int(simulation.state.slot.numpy()[0, 0])
+    speeds = simulation.physics.state.joint_qd.numpy()
+    first = build.GRIPPER_DOFS + build.FREE_DOFS * slot
+    speeds[first : first + 6] = [0.1, -0.2, 1.0, 3.0, -2.0, 4.0]
+    simulation.physics.state.joint_qd.assign(speeds)
+    simulation.physics.refresh_poses()
+    (steps,) = Log(simulation, 1).steps
+    pose = steps["pose"][0, :, 0].astype(float)
+    center = pose[:, :3] + np.array([matrix(one) @ entry.center_of_mass for one in pose[:, 3:]])
+    np.testing.assert_allclose(np.diff(center, axis=0) / step, steps["velocity"][0, 1:, 0], atol=2e-4)
+    assert np.abs(np.diff(pose[:, :3], axis=0) / step - steps["velocity"][0, 1:, 0]).max() > 1e-2
+    turns = np.array([spin(before, after) for before, after in zip(pose[:-1, 3:], pose[1:, 3:], strict=True)]) / step
+    np.testing.assert_allclose(turns, steps["angular_velocity"][0, 1:, 0], atol=5e-3)
+    assert np.linalg.norm(turns, axis=1).min() > 5.0
+
+
+def matrix(quaternion: np.ndarray) -> np.ndarray:
+    x, y, z, w = quaternion / np.linalg.norm(quaternion)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
+
+
+def spin(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Rotation vector from one orientation to the other, in the world's axes [rad]."""
+    turn = matrix(after) @ matrix(before).T
+    axis = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / 2
+    return axis * (np.arcsin(np.linalg.norm(axis)) / np.linalg.norm(axis))
+
+
+@pytest.mark.parametrize("run", ["moved", "picked"])
+def test_the_force_is_the_impedance_law_of_goal_pose_and_velocity(run, request):
+    """Of the step's goal, and of pose and velocity at its beginning."""
+    log, simulation = request.getfixturevalue(run)
+    config = simulation.config
+    section = config.move if run == "moved" else config.pick
+    law = (section.stiffness, section.damping, section.force, config.gripper.finger_mass + config.gripper.cup_mass, config.physics.step)
+    checked = 0
+    for row, steps in zip(log.reports, log.steps, strict=True):
+        goal, force = steps["goal"][0], steps["impedance_force"][0]
+        drawn = np.isfinite(goal[:, 0])
+        assert not force[~drawn].any()
+        place, velocity = steps["gripper_pose"][0, :, 0, :3], steps["gripper_velocity"][0, :, 0]
+        for step in 1 + np.flatnonzero(drawn[1:]):
+            twin = impedance.force(goal[step].astype(float) - place[step - 1], velocity[step - 1].astype(float), *law)
+            np.testing.assert_allclose(force[step], twin, rtol=2e-4, atol=2e-3)
+            checked += 1
+        assert not drawn.any() or row.column("live")[0]
+    assert checked > 200
+
+
+def test_seal_loads_are_those_of_the_attempts(picked):
+    """The largest of a tick's steps is the load that attempts tell of, to the bit; what hangs bears its weight at last."""
+    log, _ = picked
+    loads = log.all("seal_load").reshape(len(log.reports), -1)
+    peak = np.nanmax(np.where(np.isnan(loads), 0.0, loads), axis=1)
+    assert peak.tolist() == [float(row.measure("load")[0]) for row in log.reports]
+    assert peak.max() > 0.5
+    held = log.all("held").astype(bool)
+    assert not log.all("seal_load")[~held & ~np.isnan(log.all("seal_load"))].any()
+    assert {phases.LIFT, phases.PRESS, phases.DESCEND, phases.APPROACH} <= set(log.all("task").tolist())
+    assert set(log.all("task")[held.any(axis=1)].tolist()) == {phases.LIFT}
+
+
+def test_ticks_say_what_the_status_says(picked):
+    log, _ = picked
+    for row, ticks in zip(log.reports, log.ticks, strict=True):
+        for name in ("phase", "task", "attempt", "outcome", "target", "hits"):
+            assert ticks[name][0] == row.column(name)[0]
+        assert ticks["load"][0] == row.measure("load")[0]
+        for name in ("held", "caught"):
+            assert (1 << np.flatnonzero(ticks[name][0])).sum() == row.column(name)[0]
+            assert ticks[name].shape == row.entry.shape
+
+
+def test_a_batch_has_the_live_worlds_arrays(moved):
+    log, _ = moved
+    row = next(row for row in log.reports if row.column("live")[0])
+    batch = tick_batch(row, np.array([4, 5], np.int32), 0.066)
+    assert batch.steps.keys() == row.steps.keys()
+    assert batch.steps["pose"].shape == (1, 33, 3, 7)
+    assert batch.tick["drop_pose"].shape == (1, 3, 7)
+
+
+def episodes(device, worlds: int, recorded: bool) -> dict[tuple[int, int], bytes]:
+    """What each live tick of each episode left, in so many worlds."""
+    config = settings(bake__worlds=worlds, bake__episodes=3, **COARSE)
+    simulation = Simulation(config, catalog(), 1, device, records_physics=recorded)
+    reader, made = TickReader(simulation.records[0]), {}
+    for _ in range(LONGEST):
+        simulation.tick(simulation.records[0])
+        reader.start()
+        row = reader.wait()
+        batch = tick_batch(row, np.array([1, 2, 3], np.int32), 0.064)
+        for world in range(len(batch)):
+            there = batch.object_id[world] >= 0
+            parts = [batch.pose[world][there], *(values[world] for values in batch.steps.values())]
+            parts += [values[world][there] if name == "drop_pose" else values[world] for name, values in batch.tick.items()]
+            made[int(batch.episode[world]), int(batch.frame[world])] = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+        if (row.column("phase") == phases.IDLE).all():
+            return made
+    raise AssertionError("the worlds did not come to an end")
+
+
+def test_a_record_is_the_same_in_any_world_and_changes_nothing(device):
+    alone = episodes(device, 1, True)
+    assert {episode for episode, _ in alone} == {0, 1, 2}
+    assert episodes(device, 3, True) == alone
+    bare = episodes(device, 3, False)
+    assert bare.keys() == alone.keys()
+    assert all(alone[key].startswith(poses) for key, poses in bare.items())
+
+
+def test_without_steps_there_are_ticks_alone(device):
+    config = settings(arrangement__max_objects=1, trajectory__steps=False, **COARSE)
+    log = Log(Simulation(config, catalog(CUBE), 1, device, records_physics=True), 1)
+    assert log.steps == [{}]
+    assert log.ticks[0]["drop_pose"].shape == (1, 1, 7)
+
+
+def test_sums_of_contact_forces_are_exact_and_opposite(device):
+    """Contacts 0 and 1 between bodies 0 and 1, contact 2 of body 1 with the world, one that is not finite, one beyond the count."""
+    force = np.zeros((5, 6), np.float32)
+    force[:, :3] = [[1.0, -2.0, 2.0], [0.5, 0.0, 0.0], [0.0, 0.0, 8.0], [np.nan, 1.0, 1.0], [100.0, 0.0, 0.0]]
+    shapes = np.array([[0, 1], [1, 0], [1, 2], [0, 1], [0, 1]], np.int32)
+    total = wp.zeros((2, 4), dtype=wp.int64, device=device)
+    inputs = [wp.array(values, dtype=int, device=device) for values in (np.array([0, 1, -1]), np.array([4]), shapes[:, 0], shapes[:, 1])]
+    forces = wp.array(force, dtype=wp.spatial_vector, device=device)
+    wp.launch(step_log.sum_contacts_kernel, dim=5, inputs=[*inputs, forces], outputs=[total], device=device)
+    np.testing.assert_array_equal(total.numpy() / float(step_log.COUNTS), [[0.5, -2.0, 2.0, 3.5], [-0.5, 2.0, 6.0, 11.5]])

@@ -1,0 +1,117 @@
+"""Layers as files: what is read is what was kept, within the steps that the notes state."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from synpick_warp.configs.schema import LAYERS
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.bop.view import write_layer
+from synpick_warp.layer_codec import decode_layer, encode_layer, layer_notes, layer_path, read_layer
+
+SIDES = st.tuples(st.integers(1, 6), st.integers(1, 6))
+
+
+def fields(channels: int, low: float, high: float):
+    """Layers of float32 whose pixels are all numbers or all NaN."""
+    numbers = st.floats(low, high, width=32)
+    shape = SIDES.map(lambda sides: (*sides, channels))
+    return st.tuples(shape.flatmap(lambda s: hnp.arrays(np.float32, s, elements=numbers)), st.integers(0, 2**32 - 1)).map(_with_holes)
+
+
+def _with_holes(drawn: tuple[np.ndarray, int]) -> np.ndarray:
+    values, bits = drawn
+    holes = (bits >> (np.arange(values[..., 0].size) % 32)) & 1
+    return np.where(holes.reshape(values.shape[:2])[..., None] == 1, np.float32(np.nan), values)
+
+
+def test_every_layer_has_a_way_into_files_and_a_note():
+    notes = layer_notes(LAYERS)
+    assert [line.split("`")[1] for line in notes.splitlines()] == [f"{name}/" for name in LAYERS]
+    assert layer_notes(("flow", "nocs")).count("\n") == 2
+    assert layer_notes(()) == ""
+
+
+@given(fields(2, -511.0, 511.0))
+def test_flow_comes_back_to_a_128th_of_a_pixel(values):
+    back = decode_layer("flow", encode_layer("flow", values))
+    assert back.dtype == np.float32
+    np.testing.assert_allclose(back, values, atol=1 / 128 + 1e-6)
+
+
+@given(fields(3, -0.625, 0.625))
+def test_scene_flow_comes_back_to_a_hundredth_of_a_millimetre(values):
+    back = decode_layer("scene_flow", encode_layer("scene_flow", values))
+    assert back.dtype == np.float32
+    np.testing.assert_allclose(back, values, atol=1e-5 + 1e-7)
+
+
+@given(hnp.arrays(np.float32, SIDES.map(lambda sides: (*sides, 3)), elements=st.floats(-1.0, 1.0, width=32)))
+def test_normals_and_places_come_back(values):
+    length = np.linalg.norm(values, axis=-1, keepdims=True)
+    normals = np.where(length > 0.1, values / np.maximum(length, 1e-9), np.float32(0.0))
+    np.testing.assert_allclose(decode_layer("normals", encode_layer("normals", normals)), normals, atol=0.51 / 32767)
+    places = np.abs(values)
+    np.testing.assert_allclose(decode_layer("nocs", encode_layer("nocs", places)), places, atol=0.51 / 65535)
+
+
+def test_flow_is_kittis():
+    """KITTI's development kit: u = (I_1 - 2^15) / 64, v = (I_2 - 2^15) / 64, known where I_3."""
+    image = encode_layer("flow", np.array([[(1.5, -2.0), (0.0, 0.0), (np.nan, np.nan)]], np.float32))
+    assert image.dtype == np.uint16
+    assert image.tolist() == [[[32768 + 96, 32768 - 128, 1], [32768, 32768, 1], [0, 0, 0]]]
+
+
+def test_motion_that_does_not_fit_is_unknown_and_not_cut():
+    flow = np.array([[(511.98, -512.0), (512.0, 0.0), (0.0, -512.1), (np.inf, 0.0)]], np.float32)
+    np.testing.assert_array_equal(np.isfinite(decode_layer("flow", encode_layer("flow", flow))).all(axis=-1), [[True, False, False, False]])
+    scene_flow = np.array([[(0.655, -0.655, 0.0), (0.0, 0.0, 0.656), (-0.656, 0.0, 0.0)]], np.float32)
+    back = decode_layer("scene_flow", encode_layer("scene_flow", scene_flow))
+    np.testing.assert_array_equal(np.isfinite(back).all(axis=-1), [[True, False, False]])
+
+
+def test_no_surface_differs_from_every_normal_and_place():
+    normals = np.array([[(0, 0, -1), (-1, 0, 0), (0, 0, 0)]], np.float32)
+    assert encode_layer("normals", normals).tolist() == [[[32768, 32768, 1], [1, 32768, 32768], [0, 0, 0]]]
+    np.testing.assert_array_equal(decode_layer("normals", encode_layer("normals", normals)), normals)
+
+
+VALUES = {
+    "normals": np.array([[(0, 0.6, -0.8)] * 3, [(0, 0, 0)] * 3], np.float32),
+    "albedo": np.arange(18, dtype=np.uint8).reshape(2, 3, 3),
+    "nocs": np.linspace(0, 1, 18, dtype=np.float32).reshape(2, 3, 3),
+    "classes": np.array([[0, 1, 21], [65535, 300, 0]], np.uint16),
+    "flow": np.array([[(1.25, -3.5)] * 3, [(np.nan, np.nan)] * 3], np.float32),
+    "scene_flow": np.array([[(0.002, -0.1, 0.05)] * 3, [(np.nan, np.nan, np.nan)] * 3], np.float32),
+    "depth_sensor": np.array([[0, 18000, 65535], [1, 17999, 18001]], np.uint16),
+}
+
+
+@pytest.mark.parametrize("name", LAYERS)
+def test_files_are_read_back(tmp_path, name):
+    (tmp_path / name).mkdir()
+    write_layer(VALUES[name], tmp_path, name, 12)
+    assert layer_path(tmp_path, name, 12) == tmp_path / name / "000012.png"
+    back = read_layer(tmp_path, name, 12)
+    assert (back.shape, back.dtype) == (VALUES[name].shape, VALUES[name].dtype)
+    np.testing.assert_allclose(back, VALUES[name], atol=2e-5)
+
+
+def test_files_that_are_none_are_reported(tmp_path):
+    with pytest.raises(DatasetError, match=r"there is no layer depth; layers: normals, "):
+        read_layer(tmp_path, "depth", 0)
+    with pytest.raises(DatasetError, match=r"there is no .*flow/000003.png; bake with render.layers naming flow"):
+        read_layer(tmp_path, "flow", 3)
+    (tmp_path / "flow").mkdir()
+    path = tmp_path / "flow" / "000003.png"
+    grey = cv2.imencode(".png", np.zeros((4, 4), np.uint16))[1].tobytes()
+    eight = cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1].tobytes()
+    for content in (b"", b"no picture", grey, eight):
+        path.write_bytes(content)
+        with pytest.raises(DatasetError, match="is no image of the layer flow"):
+            read_layer(tmp_path, "flow", 3)

@@ -1,0 +1,175 @@
+"""The check of data sets: it passes a right one, and fails each kind of wrong one, by the right measure."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+
+from synpick_warp.exporters.bop.exporter import BopExporter
+from tests.harness.exporter_contract import export
+from tests.worlds.box_views import cameras, config
+from tools.checks import dataset as tool
+
+LENSES = cameras(240, 180)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("check") / "set"
+    return export(BopExporter, out, config(), (0,), 0, 2, LENSES)
+
+
+@pytest.fixture
+def dataset(made, tmp_path) -> Path:
+    tool.read_json.cache_clear()
+    tool.read_model.cache_clear()
+    return Path(shutil.copytree(made, tmp_path / "set"))
+
+
+def violated(dataset: Path) -> set[str]:
+    return {name for name, measure in vars(tool.check(dataset, 6)).items() if not measure.holds}
+
+
+def edit_json(name: str, edit: Callable[[dict], None]) -> Callable[[Path], None]:
+    def damage(scene: Path) -> None:
+        content = json.loads((scene / name).read_text())
+        edit(content)
+        (scene / name).write_text(json.dumps(content))
+
+    return damage
+
+
+def edit_images(pattern: str, edit: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    def damage(scene: Path) -> None:
+        for path in sorted(scene.glob(pattern)):
+            cv2.imwrite(str(path), edit(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)))
+
+    return damage
+
+
+def add_to(key: str, place: int | None, value: float) -> Callable[[dict], None]:
+    def edit(content: dict) -> None:
+        record = content["0"][1]
+        if place is None:
+            record[key] += value
+        else:
+            record[key][place] += value
+
+    return edit
+
+
+def turn_inside_out(content: dict) -> None:
+    content["0"][0]["cam_R_m2c"] = [-value for value in content["0"][0]["cam_R_m2c"]]
+
+
+def blot(image: np.ndarray) -> np.ndarray:
+    image[60:90, 100:130] = 255
+    return image
+
+
+def shorten_run(content: dict) -> None:
+    counts = content["annotations"][0]["segmentation"]["counts"]
+    counts[1], counts[2] = counts[1] - 1, counts[2] + 1
+
+
+def scale_models(scene: Path) -> None:
+    for path in (scene.parent.parent / "models").glob("*.ply"):
+        mesh = trimesh.load(path, process=False)
+        mesh.apply_scale(0.97)
+        mesh.export(path)
+
+
+def test_a_right_data_set_passes(dataset):
+    assert violated(dataset) == set()
+
+
+DEPTH = edit_images("depth/*.png", lambda image: image + np.uint16(4))
+NEARER = edit_images("depth/*.png", lambda image: image - np.uint16(4))
+SHIFTED_MASKS = edit_images("mask*/*_000001.png", lambda image: np.roll(image, 1, axis=1))
+
+
+@pytest.mark.parametrize(
+    ("damage", "measures"),
+    [
+        (DEPTH, {"depth"}),
+        (NEARER, {"depth", "visible"}),
+        (edit_images("depth/*.png", lambda image: 0 * image), {"unknown", "count_valid"}),
+        (SHIFTED_MASKS, {"mask", "visible", "overlap", "box_visible", "coco"}),
+        (edit_images("mask_visib/*.png", blot), {"visible", "overlap", "outside", "count_visible", "coco"}),
+        (edit_json("scene_gt_info.json", add_to("px_count_all", None, 20)), {"count_all", "fraction"}),
+        (edit_json("scene_gt_info.json", add_to("px_count_valid", None, 1)), {"count_valid"}),
+        (edit_json("scene_gt_info.json", add_to("px_count_visib", None, -1)), {"count_visible", "fraction"}),
+        (edit_json("scene_gt_info.json", add_to("visib_fract", None, 1e-6)), {"fraction"}),
+        (edit_json("scene_gt_info.json", add_to("bbox_obj", 0, 2)), {"box_whole"}),
+        (edit_json("scene_gt_info.json", add_to("bbox_visib", 3, 1)), {"box_visible"}),
+        (edit_json("scene_gt_info.json", lambda content: content["0"].pop()), {"missing"}),
+        (edit_json("scene_gt_coco.json", shorten_run), {"coco"}),
+        (edit_json("scene_gt_coco.json", lambda content: content["annotations"].pop()), {"coco"}),
+        (edit_json("scene_gt.json", turn_inside_out), {"rotation"}),
+        (scale_models, {"depth", "mask", "visible", "count_all", "box_whole"}),
+    ],
+)
+def test_every_kind_of_damage_is_found(dataset, damage, measures):
+    if measures == {"missing"}:
+        for scene in (dataset / "train_pbr").iterdir():
+            damage(scene)
+            report = tool.Report()
+            tool.check_files(scene, report)
+            assert not report.missing.holds
+        return
+    for scene in sorted((dataset / "train_pbr").iterdir()):
+        damage(scene)
+    assert measures <= violated(dataset)
+
+
+def test_a_pose_of_one_camera_that_is_off_by_a_micrometre_and_a_half_is_found(dataset):
+    edit_json("scene_gt.json", add_to("cam_t_m2c", 2, 1.5e-3))(dataset / "train_pbr" / "000001")
+    assert violated(dataset) == {"world"}
+
+
+def test_a_missing_picture_is_found(dataset):
+    (dataset / "train_pbr/000002/rgb/000001.jpg").unlink()
+    assert violated(dataset) == {"missing"}
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", tool.__name__, *map(str, arguments)], capture_output=True, text=True, timeout=300)
+
+
+def test_exit_codes(dataset, tmp_path):
+    right = run(dataset, "--views", 2)
+    assert (right.returncode, right.stderr) == (0, "")
+    assert "VIOLATED" not in right.stdout
+    DEPTH(dataset / "train_pbr" / "000000")
+    wrong = run(dataset, "--views", 6)
+    assert wrong.returncode == 1
+    assert "depth against models, inside" in {line.split("  ")[0] for line in wrong.stdout.splitlines() if "VIOLATED" in line}
+    none = run(tmp_path / "none")
+    assert (none.returncode, none.stderr) == (2, f"check_dataset: {tmp_path / 'none'} has no scene\n")
+
+
+def test_rays_hit_a_known_triangle():
+    """A triangle across the optical axis, tilted: depth 1000 + x at the point (x, y)."""
+    corners = np.array([[[-100.0, -100, 900], [100, -100, 1100], [0, 100, 1000]]])
+    hit = tool.cast(corners, np.array([[100.0, 0, 20], [0, 100, 15], [0, 0, 1]]), 30, 40).inside(30, 40)
+    rows, columns = np.nonzero(np.isfinite(hit))
+    slope = (columns + 0.5 - 20) / 100
+    np.testing.assert_allclose(hit[rows, columns], 1000 / (1 - slope), rtol=1e-12)
+    assert len(rows) == pytest.approx(200, abs=12)  # Half of 200 x 200 mm at a metre, 100 px/m/m.
+
+
+def test_rays_count_what_lies_outside_of_the_picture():
+    corners = np.array([[[-400.0, -100, 1000], [0, -100, 1000], [-400, 300, 1000]], [[0, -100, 1000], [0, 300, 1000], [-400, 300, 1000]]])
+    hit = tool.cast(corners, np.array([[100.0, 0, 20], [0, 100, 15], [0, 0, 1]]), 30, 40)
+    assert hit.box() == [-20, 5, 39, 39]
+    assert np.isfinite(hit.depth).all()
+    assert np.isfinite(hit.inside(30, 40)).sum() == 20 * 25

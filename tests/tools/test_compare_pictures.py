@@ -1,0 +1,110 @@
+"""tools/checks/compare_pictures.py: what counts as a difference, and that devices are compared, or that it says why they are not."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+
+import numpy as np
+import pytest
+import warp as wp
+
+from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE
+from synpick_warp.stages.buffers import ViewBuffers
+from tools.checks import compare_pictures as tool
+
+FEW = (
+    "--set", "arrangement.volume=1e-3", "--set", "arrangement.max_objects=1",
+    "--set", "physics.substeps=1", "--set", "physics.steps_per_tick=10", "--set", "settle.min_time=0.1", "--set", "settle.rest_ticks=2",
+)  # fmt: skip
+"""One object, and as few steps as bring it to rest."""
+
+
+def numbers(difference) -> tuple[float, ...]:
+    return difference.differing, difference.mean, difference.largest, difference.beyond
+
+
+def test_every_output_has_a_tolerance():
+    assert {item.name for item in fields(ViewBuffers)} | set(LAYERS) == {*tool.TOLERANCES, "color"}
+    assert set(tool.COLORS) == {FAST, REFERENCE}
+
+
+def test_equal_outputs_do_not_differ():
+    for name, array in (
+        ("color", np.full((1, 2, 5, 3), 7, np.uint8)),
+        ("amodal", np.full((1, 2, 5), 2**32 - 1, np.uint32)),
+        ("boxes", np.full((1, 2, 2, 4), -1, np.int32)),
+        ("flow", np.full((1, 2, 5, 2), np.nan, np.float32)),
+    ):
+        difference = tool.compare(FAST, name, array, array.copy())
+        assert numbers(difference) == (0.0, 0.0, 0.0, 0.0)
+        assert difference.holds
+
+
+def test_a_pixel_differs_if_one_of_its_channels_does():
+    a = np.zeros((1, 2, 5, 3), np.uint8)
+    b = a.copy()
+    b[0, 0, 0] = 255, 0, 0
+    b[0, 1, 4] = 1, 2, 0
+    # The second differs by no more than the tolerance.
+    assert numbers(tool.compare(FAST, "color", a, b)) == pytest.approx((20.0, 25.7, 255.0, 10.0))
+    assert numbers(tool.compare(FAST, "color", b, a)) == pytest.approx((20.0, 25.7, 255.0, 10.0))
+    assert not tool.compare(FAST, "color", a, b).holds
+
+
+def test_names_are_equal_or_not():
+    a = np.zeros((1, 2, 5), np.uint32)
+    b = a.copy()
+    b[0, 0, 0] = 2**31
+    assert numbers(tool.compare(REFERENCE, "amodal", a, b)) == pytest.approx((10.0, 0.1, 1.0, 10.0))
+
+
+def test_a_rounded_depth_may_be_one_count_off():
+    a = np.zeros((1, 2, 5), np.uint16)
+    assert tool.compare(FAST, "depth", a, a + 1).holds
+    assert not tool.compare(FAST, "depth", a, a + 2).holds
+
+
+def test_known_here_and_unknown_there_is_a_difference():
+    a = np.full((1, 2, 5, 2), np.nan, np.float32)
+    b = a.copy()
+    b[0, 1, 2] = 0.0
+    assert numbers(tool.compare(FAST, "flow", a, b)) == pytest.approx((10.0, 0.0, np.inf, 10.0))
+
+
+def test_counts_and_boxes_are_compared_one_by_one():
+    a = np.zeros((2, 3, 2, 4), np.int32)
+    b = a.copy()
+    b[0, 0, 0, 0] = 2
+    assert numbers(tool.compare(FAST, "boxes", a, b)) == pytest.approx((100 / 48, 2 / 48, 2.0, 100 / 48))
+
+
+def test_a_device_and_itself(tmp_path):
+    file = tmp_path / "numbers.json"
+    options = ["--devices", "cpu,cpu", "--scenes", "1", "--size", "16x9", "--samples", "2", "--json", str(file), *FEW]
+    assert tool.main(options) == 0
+    rows = json.loads(file.read_text())["rows"]
+    assert {(row["mode"], row["output"]) for row in rows} == {
+        (mode, name) for mode in (FAST, REFERENCE) for name in (*tool.TOLERANCES, "color")
+    }
+    assert all(row["differing"] == 0.0 for row in rows)
+
+
+@pytest.mark.skipif(wp.get_cuda_device_count() > 0, reason="this machine has a GPU")
+def test_without_a_gpu_it_says_so(capsys):
+    assert tool.main([]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == "compare_pictures: cuda:0 was asked for, but Warp finds no CUDA device here; use --device cpu"
+
+
+@pytest.mark.parametrize("devices", ["cpu", "cpu,cpu,cpu", "cpu,tpu", ""])
+def test_devices_that_are_no_two_devices(capsys, devices):
+    assert tool.main(["--devices", devices]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_what_exceeds_its_tolerance_is_an_exit_code_of_its_own(monkeypatch, capsys):
+    a = np.zeros((1, 2, 5), np.uint8)
+    monkeypatch.setattr(tool, "compare_devices", lambda *_: [tool.compare(FAST, "instance", a, a + 1)])
+    assert tool.main(["--devices", "cpu,cpu"]) == 1
+    assert "VIOLATED" in capsys.readouterr().out

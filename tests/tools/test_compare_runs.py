@@ -1,0 +1,151 @@
+"""The first difference of two data sets is named: file, and the key, pixel, index or line in it."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import zarr
+from pxr import Usd, UsdGeom
+
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.write import config_to_toml
+from tools.checks import compare_runs as tool
+
+
+@pytest.fixture
+def runs(tmp_path) -> tuple[Path, Path]:
+    """Two equal folders with a file of every kind."""
+    first, second = tmp_path / "a", tmp_path / "b"
+    scene = first / "train" / "000004"
+    (scene / "depth").mkdir(parents=True)
+    (first / "usd").mkdir()
+    (first / "manifest").mkdir()
+    cv2.imwrite(str(scene / "depth" / "000002.png"), np.arange(48, dtype=np.uint16).reshape(6, 8))
+    (scene / "scene_gt.json").write_text(json.dumps({"0": [{"obj_id": 3, "cam_t_m2c": [1.0, 2.0, 3.0]}]}))
+    (first / "episodes.jsonl").write_text('{"frames": 7}\n{"frames": 8}\n')
+    (first / "manifest" / "000001.sha256").write_text("00  a\n11  b\n")
+    (first / "config.toml").write_text(config_to_toml(load_config("smoke", {})))
+    array = zarr.create_array(str(first / "trajectory.zarr" / "episodes" / "000001" / "pose"), shape=(4, 3), dtype="f4", chunks=(4, 3))
+    array[...] = np.arange(12).reshape(4, 3)
+    with tarfile.open(first / "shard-000000.tar", "w") as file:
+        add(file, "000001.gt.json", b"[1, 2]")
+    stage = Usd.Stage.CreateNew(str(first / "usd" / "000001.usdc"))
+    UsdGeom.Sphere.Define(stage, "/Ball").GetRadiusAttr().Set(2.0)
+    stage.Save()
+    shutil.copytree(first, second)
+    return first, second
+
+
+def add(file: tarfile.TarFile, name: str, data: bytes) -> None:
+    member = tarfile.TarInfo(name)
+    member.size = len(data)
+    file.addfile(member, io.BytesIO(data))
+
+
+def edit_image(folder: Path) -> None:
+    path = folder / "train/000004/depth/000002.png"
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    image[3, 5] += 4
+    image[4, 1] += 9
+    cv2.imwrite(str(path), image)
+
+
+def edit_truth(folder: Path) -> None:
+    path = folder / "train/000004/scene_gt.json"
+    path.write_text(path.read_text().replace("2.0", "2.5"))
+
+
+def edit_list(folder: Path) -> None:
+    (folder / "episodes.jsonl").write_text('{"frames": 7}\n{"frames": 9}\n')
+
+
+def edit_record(folder: Path) -> None:
+    (folder / "manifest" / "000001.sha256").write_text("00  a\n12  b\n")
+
+
+def edit_array(folder: Path) -> None:
+    zarr.open_array(folder / "trajectory.zarr/episodes/000001/pose", mode="r+")[2, 1] = 7.25
+
+
+def edit_shard(folder: Path) -> None:
+    with tarfile.open(folder / "shard-000000.tar", "w") as file:
+        add(file, "000001.gt.json", b"[1, 4]")
+
+
+def edit_usd(folder: Path) -> None:
+    stage = Usd.Stage.Open(str(folder / "usd" / "000001.usdc"))
+    UsdGeom.Sphere(stage.GetPrimAtPath("/Ball")).GetRadiusAttr().Set(3.0)
+    stage.Save()
+
+
+def edit_settings(folder: Path) -> None:
+    (folder / "config.toml").write_text(config_to_toml(load_config("smoke", {"bake.worlds": 9, "bake.seed": 5})))
+
+
+def remove(folder: Path) -> None:
+    (folder / "train/000004/depth/000002.png").unlink()
+
+
+CASES = [
+    (edit_image, "train/000004/depth/000002.png: row 3, column 5: 29 and 33; 2 of 48 values, by up to 9", "train/*/depth/*.png", 9.0),
+    (edit_truth, "train/000004/scene_gt.json: 0[0].cam_t_m2c[1]: 2.0 and 2.5", "train/*/scene_gt.json", 0.5),
+    (edit_list, "episodes.jsonl: [1].frames: 8 and 9", "episodes.jsonl", 1.0),
+    (edit_record, "manifest/000001.sha256: line 2: 11  b and 12  b", "manifest/*.sha256", None),
+    (
+        edit_array,
+        "trajectory.zarr/episodes/000001/pose/c/0/0: axis 0 2, axis 1 1: 7.0 and 7.25; 1 of 12 values, by up to 0.25",
+        "trajectory.zarr/episodes/*/pose/c/0",
+        0.25,
+    ),
+    (edit_shard, "shard-000000.tar: 000001.gt.json: [1]: 2 and 4", "shard-*.tar", 2.0),
+    (edit_usd, "usd/000001.usdc: line 5 as text: double radius = 2 and double radius = 3", "usd/*.usdc", None),
+    (edit_settings, "config.toml: bake.seed: 0 and 5", "config.toml", 5.0),
+]
+
+
+def test_equal_folders(runs, capsys):
+    assert tool.main([str(path) for path in runs]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == "no difference"
+
+
+@pytest.mark.parametrize(("edit", "said", "layer", "largest"), CASES, ids=lambda value: getattr(value, "__name__", ""))
+def test_the_first_difference_is_named_and_its_layer_measured(
+    runs, capsys, edit: Callable[[Path], None], said: str, layer: str, largest: float | None
+):
+    edit(runs[1])
+    assert tool.main([str(path) for path in runs]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-1] == f"first difference: {said}"
+    (row,) = (line.split() for line in lines if line.startswith(layer + " "))
+    assert row[1:] == ["1", "1", *(["no", "number"] if largest is None else [f"{largest:g}"])]
+    assert sum(line.split()[2] == "1" for line in lines[1:-1]) == 1
+
+
+def test_what_counts_most_comes_first(runs):
+    for edit, *_ in CASES:
+        edit(runs[1])
+    _, said = tool.compare(*runs)
+    assert said == "config.toml: bake.seed: 0 and 5"
+
+
+def test_settings_that_nothing_depends_on_are_no_difference(runs):
+    (runs[1] / "config.toml").write_text(config_to_toml(load_config("smoke", {"bake.worlds": 9, "bake.writers": 3})))
+    assert tool.compare(*runs)[1] == ""
+
+
+def test_missing_files_and_folders(runs, tmp_path, capsys):
+    remove(runs[1])
+    assert tool.compare(*runs)[1] == f"train/000004/depth/000002.png: only in {runs[0]}"
+    assert tool.compare(*runs[::-1])[1] == f"train/000004/depth/000002.png: only in {runs[0]}"
+    (tmp_path / "empty").mkdir()
+    for name in ("none", "empty"):
+        assert tool.main([str(runs[0]), str(tmp_path / name)]) == 2
+        assert name in capsys.readouterr().err

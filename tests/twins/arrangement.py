@@ -1,0 +1,82 @@
+"""Which objects an episode gets and where they are dropped from, in NumPy, from the laws in kernels.sim.arrangement's docstrings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tests.twins import rng
+
+MOST_DRAWS = 4096
+DRAWN_MODES = (1, 2, 0)
+"""Codes of the modes in the order of their weights: pick, target, move."""
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """What was drawn: catalog indices, body slots, and whether slots ran out."""
+
+    entries: tuple[int, ...]
+    slots: tuple[int, ...]
+    overflow: bool = False
+
+
+def draw_modes(seed: int, episodes: np.ndarray, weights: tuple[float, float, float]) -> np.ndarray:
+    """Mode of each episode: the first whose cumulative share of the weights exceeds the episode's number."""
+    number = rng.uniform(rng.stream_key(seed, episodes, 0, rng.MODE), 0)
+    share = (np.cumsum(weights) / np.sum(weights)).astype(np.float32)
+    return np.array(DRAWN_MODES)[np.searchsorted(share, number, side="right")]
+
+
+def draw_objects(
+    seed: int,
+    episode: int,
+    redraw: int,
+    *,
+    volume: np.ndarray,
+    compound: np.ndarray,
+    budget: float,
+    repeats: bool,
+    room: int,
+    single_slots: int,
+    compound_slots: int,
+) -> Arrangement:
+    """Draw until the next object would exceed the budget; sums in float32, as on the device."""
+    key = rng.stream_key(seed, episode, redraw, rng.OBJECTS)
+    sequence = rng.uniform_index(key, np.arange(MOST_DRAWS), len(volume))
+    entries: list[int] = []
+    slots: list[int] = []
+    free = {False: list(range(single_slots)), True: list(range(single_slots, single_slots + compound_slots))}
+    total = np.float32(0.0)
+    for candidate in map(int, sequence):
+        if not repeats and candidate in entries:
+            continue
+        following = total + np.float32(volume[candidate])
+        if following > np.float32(budget):
+            if entries:
+                break
+            continue
+        if not free[bool(compound[candidate])]:
+            return Arrangement((), (), overflow=True)
+        entries.append(candidate)
+        slots.append(free[bool(compound[candidate])].pop(0))
+        total = following
+        if len(entries) == room or (not repeats and len(entries) == len(volume)):
+            break
+    return Arrangement(tuple(entries), tuple(slots))
+
+
+def drop_poses(
+    seed: int, episode: int, redraw: int, radius: np.ndarray, *, rim: tuple[float, float, float], clearance: float, spread: float
+) -> np.ndarray:
+    """Poses (instance, 7) of the drop column of bounding spheres: z_i = rim + r_i + sum over j < i of (2 r_j + clearance)."""
+    count = len(radius)
+    key = rng.stream_key(seed, episode, redraw, rng.DROP)
+    poses = np.zeros((count, 7))
+    for axis in range(2):
+        side = 2.0 * rng.uniform(key, 5 * np.arange(count) + axis).astype(np.float64) - 1.0
+        poses[:, axis] = side * spread * np.maximum(0.0, rim[axis] / 2 - radius)
+    poses[:, 2] = rim[2] + radius + np.cumsum(2 * radius + clearance) - (2 * radius + clearance)
+    poses[:, 3:] = rng.uniform_rotation(key, 5 * np.arange(count) + 2)
+    return poses

@@ -1,0 +1,62 @@
+"""Rays against triangles in float64, triangle by triangle: what the renderer's hits must agree with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from synpick_warp.scenes.types import Camera, TriangleMesh
+
+
+def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation matrix of a quaternion x, y, z, w, normalised first."""
+    x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(np.asarray(quaternion, dtype=np.float64))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def cast_mesh(mesh: TriangleMesh, pose: np.ndarray, camera: Camera) -> np.ndarray:
+    """Planar depth of the nearest hit of each pixel's ray (H, W) float64 [m]; inf where there is none.
+
+    Every triangle must lie before the camera. A triangle with corners a, b, c in the camera's axes and a ray d = (x, y, 1):
+    z = a·n / d·n with n = (b - a) x (c - a), inside where the three determinants det(d, a, b), det(d, b, c), det(d, c, a) agree.
+    """
+    pose = np.asarray(pose, dtype=np.float32).astype(np.float64)
+    world = mesh.vertices.astype(np.float64) @ rotation_of(pose[3:]).T + pose[:3]
+    points = world @ camera.rotation.T + camera.translation
+    assert points[:, 2].min() > 0.0
+    fx, fy, cx, cy = camera.matrix[0, 0], camera.matrix[1, 1], camera.matrix[0, 2], camera.matrix[1, 2]
+    pixels = np.stack([points[:, 0] / points[:, 2] * fx + cx, points[:, 1] / points[:, 2] * fy + cy], axis=1)
+    corners = pixels[mesh.faces]
+    low = np.clip(np.floor(corners.min(axis=1)).astype(int) - 1, 0, [camera.width, camera.height])
+    high = np.clip(np.ceil(corners.max(axis=1)).astype(int) + 1, 0, [camera.width, camera.height])
+    x = (np.arange(camera.width) + 0.5 - cx) / fx
+    y = (np.arange(camera.height) + 0.5 - cy) / fy
+    depth = np.full((camera.height, camera.width), np.inf)
+    for face, (left, top), (right, bottom) in zip(mesh.faces, low, high, strict=True):
+        if right <= left or bottom <= top:
+            continue
+        a, b, c = points[face]
+        normal = np.cross(b - a, c - a)
+        columns, rows = x[None, left:right], y[top:bottom, None]
+        sides = [side[0] * columns + side[1] * rows + side[2] for side in (np.cross(a, b), np.cross(b, c), np.cross(c, a))]
+        inside = np.logical_and.reduce([s >= 0 for s in sides]) | np.logical_and.reduce([s <= 0 for s in sides])
+        facing = normal[0] * columns + normal[1] * rows + normal[2]
+        inside &= facing != 0.0
+        found = np.where(inside, (a @ normal) / np.where(facing == 0.0, 1.0, facing), np.inf)
+        part = depth[top:bottom, left:right]
+        np.minimum(part, found, out=part)
+    return depth
+
+
+def cast_scene(meshes: list[TriangleMesh], poses: list[np.ndarray], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth (H, W) float64 [m], inf for nothing; instance codes (H, W), 0 or 1 + index; amodal bits (H, W) uint32."""
+    depths = np.stack([cast_mesh(mesh, pose, camera) for mesh, pose in zip(meshes, poses, strict=True)])
+    depth = depths.min(axis=0)
+    instance = np.where(np.isfinite(depth), 1 + depths.argmin(axis=0), 0).astype(np.uint8)
+    bits = np.isfinite(depths) * (np.uint32(1) << np.arange(len(meshes), dtype=np.uint32))[:, None, None]
+    return depth, instance, bits.sum(axis=0).astype(np.uint32)

@@ -1,0 +1,345 @@
+"""Attempts drawn from a data set's files: what is in the picture and where, the words, and what happens to damaged files."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from synpick_warp.cli.commands import main
+from synpick_warp.configs.schema import Config, Sight, Target
+from synpick_warp.configs.write import config_to_toml
+from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.viz import explain
+from synpick_warp.viz.explain import object_names, to_color_image, write_explanation
+from synpick_warp.viz.explain_graph import RED
+from synpick_warp.viz.explain_panels import draw_load, fitted, ticks, wrapped
+from synpick_warp.viz.explain_record import choice_words, labels, seal_words
+from synpick_warp.viz.preview import FONT, instance_color
+from tests.harness.exporter_contract import export
+from tests.worlds.attempt_records import attempt, nothing_seen, record, seen, seen_object
+from tests.worlds.box_views import config
+
+EPISODES = (0, 1)
+TOP, LEFT = explain.MARGIN + explain.HEAD, explain.MARGIN
+SCALE = explain.IMAGE_WIDTH / 96
+NAMES = {1: "tin", 2: "box", 3: "mug"}
+
+
+def bake(out: Path, **bop: object) -> Path:
+    export(BopExporter, out, config(**bop), EPISODES, 0, 2)
+    (out / "config.toml").write_text(config_to_toml(config(**bop)))
+    return out
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    return bake(tmp_path_factory.mktemp("explain") / "set", split="train", color_format="png")
+
+
+@pytest.fixture
+def dataset(made, tmp_path) -> Path:
+    """Episode 1 with three attempts, from images 0 and 1."""
+    folder = Path(shutil.copytree(made, tmp_path / "set"))
+    boxes = [
+        seen_object(2, 7, (50, 38)),
+        seen_object(0, 3, (30, 20), above=[2], all_above=[2]),
+        seen_object(3, 3, (66, 36), above=[2], all_above=[2]),
+    ]
+    sight = {"resolution": [96, 72], "instances": boxes, "votes": [[0, 2, 9.0], [3, 2, 12.0], [2, 3, 5.0]]}
+    second = record(boxes[::-1], episode=1, attempt=1, frame=1, mode="target", picked=[], sentence="every seal broke during the lift")
+    third = nothing_seen(episode=1, attempt=2, frame=1)
+    return write(folder, third, record(boxes, episode=1, sight=sight), second, record(boxes, episode=4))
+
+
+def write(folder: Path, *records: dict) -> Path:
+    (folder / "attempts.jsonl").write_text("".join(json.dumps(line) + "\n" for line in records))
+    return folder
+
+
+def drawn(dataset: Path, number: int | None = 0) -> np.ndarray:
+    return cv2.imread(str(write_explanation(dataset, dataset / "picture.png", 1, number)))
+
+
+def colored(dataset: Path, frame: int = 0) -> np.ndarray:
+    """The colour image as large as on the sheet."""
+    color = cv2.imread(str(dataset / "train" / "000003" / "rgb" / f"{frame:06d}.png"))
+    return cv2.resize(color, (explain.IMAGE_WIDTH, round(SCALE * 72)), interpolation=cv2.INTER_CUBIC)
+
+
+def masked(dataset: Path, index: int, frame: int = 0) -> np.ndarray:
+    mask = cv2.imread(str(dataset / "train" / "000003" / "mask_visib" / f"{frame:06d}_{index:06d}.png"), cv2.IMREAD_GRAYSCALE)
+    return cv2.resize(mask, (explain.IMAGE_WIDTH, round(SCALE * 72)), interpolation=cv2.INTER_LINEAR) > 127
+
+
+def image_of(sheet: np.ndarray) -> np.ndarray:
+    return sheet[TOP : TOP + round(SCALE * 72), LEFT : LEFT + explain.IMAGE_WIDTH]
+
+
+def edge_share(image: np.ndarray, mask: np.ndarray, instance: int) -> float:
+    """Share of a mask's border that has the instance's colour."""
+    inside = cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0)
+    border = mask & (inside == 0)
+    return float((image[border] == instance_color(instance)).all(axis=1).mean())
+
+
+def test_the_target_is_bright_tinted_and_has_a_contour_where_its_mask_is(dataset):
+    color, image = colored(dataset), image_of(drawn(dataset))
+    target, other = masked(dataset, 1), masked(dataset, 0)
+    assert target.sum() > 500
+    inside, beside = (cv2.erode(mask.astype(np.uint8), np.ones((15, 15))) > 0 for mask in (target, other))
+    tinted = 0.72 * color[inside] + 0.28 * np.array(instance_color(2))
+    assert np.median(np.abs(image[inside] - tinted).max(axis=1)) <= 1
+    assert np.median(np.abs(image[beside] - 0.62 * color[beside]).max(axis=1)) <= 1
+    assert edge_share(image, target, 2) > 0.9
+    assert edge_share(image, other, 0) > 0.8
+    away = cv2.distanceTransform((~target).astype(np.uint8), cv2.DIST_L2, 5)
+    around = (away > 3) & (away < 4)
+    assert (image[around] > 230).all(axis=1).mean() > 0.8
+
+
+def test_another_target_another_highlight(dataset):
+    image = image_of(drawn(dataset, 1))
+    inside = cv2.erode(masked(dataset, 2, 1).astype(np.uint8), np.ones((15, 15))) > 0
+    expected = 0.72 * colored(dataset, 1)[inside] + 0.28 * np.array(instance_color(3))
+    assert np.median(np.abs(image[inside] - expected).max(axis=1)) <= 1
+
+
+@pytest.mark.parametrize(("resolution", "factor"), [([96, 72], 1.0), ([192, 144], 2.0), ([48, 36], 0.5)])
+def test_suction_points_are_drawn_where_they_are_at_any_sight_resolution(dataset, resolution, factor):
+    place = (21.0, 52.0)  # Nothing else is drawn there.
+    pixel = tuple((value + 0.5) * factor - 0.5 for value in place)
+    boxes = [seen_object(2, 7, pixel)]
+    write(dataset, record(boxes, episode=1, sight={"resolution": resolution, "instances": boxes, "votes": []}))
+    rows, columns = np.nonzero((image_of(drawn(dataset)) == instance_color(2)).all(axis=2))
+    x, y = (SCALE * (value + 0.5) - 0.5 for value in place)
+    disc = np.hypot(columns - x, rows - y) < 8
+    assert disc.sum() > 20
+    assert abs(columns[disc].mean() - x) < 0.5
+    assert abs(rows[disc].mean() - y) < 0.5
+
+
+def test_known_answers_of_scaling():
+    assert to_color_image((5.0, 7.0), (96, 72), (96, 72)) == (5.0, 7.0)
+    assert to_color_image((0.0, 0.0), (96, 72), (192, 144)) == (0.5, 0.5)
+    assert to_color_image((95.5, 71.5), (192, 144), (96, 72)) == (47.5, 35.5)
+    assert to_color_image((0.0, 0.0), (96, 36), (96, 72)) == (0.0, 18.0)
+
+
+def test_all_attempts_stand_below_each_other_in_order(dataset):
+    rows = [drawn(dataset, number) for number in range(3)]
+    np.testing.assert_array_equal(drawn(dataset, None), np.concatenate(rows))
+
+
+def test_without_masks_there_are_points_but_no_contours_and_it_says_so(made, tmp_path):
+    boxes = [seen_object(2, 7, (50, 38))]
+    bare = write(bake(tmp_path / "bare", split="train", color_format="png", masks=False), record(boxes, episode=1))
+    full = write(Path(shutil.copytree(made, tmp_path / "full")), record(boxes, episode=1))
+    first, second = drawn(bare), drawn(full)
+    assert edge_share(image_of(second), masked(full, 1), 2) > 0.9
+    assert edge_share(image_of(first), masked(full, 1), 2) < 0.1
+    captions = [sheet[TOP - 24 : TOP - 2, : LEFT + explain.IMAGE_WIDTH] < 200 for sheet in (first, second)]
+    ends_at = [np.flatnonzero(caption.any(axis=(0, 2))).max() for caption in captions]
+    assert ends_at[0] > ends_at[1] + 50
+
+
+def test_a_target_that_is_not_in_the_ground_truth_of_the_image_is_drawn_without_contour(dataset):
+    write(dataset, record([seen_object(1, 9, (40, 40))], episode=1))
+    assert drawn(dataset).shape[1] == drawn(dataset, None).shape[1]
+
+
+def test_names_come_from_the_models_or_from_the_object_table(dataset):
+    assert object_names(dataset, Config(), {3, 7}) == {3: "box 3", 7: "box 7"}
+    assert object_names(dataset, Config(), {5}) == {}
+    from synpick_warp.configs.load import load_config
+
+    (dataset / "models" / "models_info.json").write_text(json.dumps({"2": {"diameter": 269.6}, "4": {"diameter": 60.0}}))
+    assert object_names(dataset, load_config("synpick", {}), {2, 4}) == {2: "003_cracker_box"}
+
+
+def test_objects_that_come_twice_get_letters():
+    assert labels(attempt((seen(0, object_id=4), seen(3, object_id=2), seen(5, object_id=4)), {})) == {0: "4a", 5: "4b", 3: "2"}
+
+
+FIRST, SECOND, THIRD = seen(0, share=0.4), seen(1, share=0.6), seen(2, frozenset({0}), share=0.3)
+
+
+@pytest.mark.parametrize(
+    ("objects", "target", "mode", "said"),
+    [
+        ((FIRST,), 0, "pick", "target: 1 tin: 0 objects above; the only object in sight"),
+        ((FIRST, SECOND, THIRD), 1, "pick", "target: 2 box: 0 objects above; visible share 0.60, the largest of 2 such"),
+        ((FIRST, THIRD), 0, "pick", "target: 1 tin: 0 objects above, the fewest of all"),
+        ((FIRST, SECOND, THIRD), 2, "target", "target: 3 mug: 1 object above, the most of all"),
+        ((FIRST, SECOND), 0, "target", "target: 1 tin: 0 objects above; visible share 0.40, the smallest of 2 such"),
+        ((FIRST, SECOND, THIRD), 0, "pick", "target: 1 tin: 0 objects above; the rule would name 2 box"),
+        ((), None, "pick", "target: none, nothing is visible"),
+    ],
+)
+def test_why_it_was_chosen(objects, target, mode, said):
+    assert choice_words(attempt(objects, {}, target, mode=mode), NAMES, Config())[0] == said
+
+
+def test_a_draw_after_a_failure_is_named_where_the_settings_have_it():
+    drawn_one = attempt((FIRST, SECOND, THIRD), {}, 0, mode="target")
+    released = Config(target=Target(random_after_failure=True))
+    assert choice_words(drawn_one, NAMES, released)[0] == "target: 1 tin: 0 objects above; drawn at random after a failed attempt"
+
+
+@pytest.mark.parametrize(
+    ("suction", "said"),
+    [
+        ((10.0, 10.0), "suction point: pole of inaccessibility; cup tilted by 90 degrees"),
+        ((18.0, 10.0), "suction point: centroid, 0.50 of the pole's distance; cup tilted by 90 degrees"),
+        ((14.0, 11.0), "suction point: half-way point, 0.85 of the pole's distance; cup tilted by 90 degrees"),
+    ],
+)
+def test_where_the_suction_point_is(suction, said):
+    one = attempt((seen(0, suction=suction),), {}, 0, tilt=-np.pi / 2)
+    assert choice_words(one, NAMES, Config())[1] == said
+
+
+def test_what_the_seal_bore():
+    good = attempt((FIRST, SECOND), {}, 0, caught=(0, 1), picked=(1,), load=(1.0, 6.25, 3.0))
+    assert seal_words(good, NAMES, Config()) == [
+        "rays: 10 of 10 hit; good seal, breaks at 40 N",
+        "caught: 1 tin, 2 box; largest load 6.2 N",
+        "picked: 2 box",
+    ]
+    poor = attempt((FIRST,), {}, 0, hits=3, good_seal=False, caught=(7,))
+    said = ["rays: 3 of 10 hit; poor seal, breaks at 2 N", "caught: instance 7, unseen", "picked: nothing"]
+    assert seal_words(poor, NAMES, Config()) == said
+    assert seal_words(attempt((FIRST,), {}, 0, hits=0, load=(0.0, 0.0)), NAMES, Config()) == ["rays: 0 of 10 hit"]
+    assert seal_words(attempt((), {}), NAMES, Config()) == []
+
+
+def test_a_load_of_half_the_limit_lies_half_way_below_it():
+    plot = draw_load(attempt((FIRST,), {}, 0, load=(20.0,) * 9), Config(), 400, 200)
+    limit = np.flatnonzero((plot[:, 200] == RED).all(axis=1))
+    curve = np.flatnonzero((plot[:, 300, 0] > 120) & (plot[:, 300, 2] < 60))
+    axis = np.flatnonzero((plot[:, 53] < 80).all(axis=1))
+    assert abs(curve.mean() - (limit.mean() + axis.mean()) / 2) < 1
+
+
+def test_ticks():
+    assert ticks(44.8, 4) == [0, 20, 40]
+    assert ticks(2.24, 4) == [0, 1, 2]
+    assert ticks(0.33, 8) == pytest.approx([0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3])
+
+
+def test_text_fits():
+    text = "target: 5 mustard_bottle: 0 objects above; visible share 0.61, the largest of 3 such"
+    lines = wrapped(text, 0.5, 200)
+    assert " ".join(" ".join(lines).split()) == text
+    assert all(cv2.getTextSize(line, FONT, 0.5, 1)[0][0] <= 200 for line in lines)
+    assert fitted("tin", 0.5, 200) == "tin"
+    assert fitted(text, 0.5, 200).endswith("..")
+    assert cv2.getTextSize(fitted(text, 0.5, 200), FONT, 0.5, 2)[0][0] <= 200
+
+
+def damaged(**changes: object) -> str:
+    return json.dumps(record([seen_object(2, 7, (50, 38))], episode=1) | changes)
+
+
+NO_POLE = {"resolution": [96, 72], "instances": [seen_object(2, 7, (5, 5), pole=None)], "votes": []}
+CIRCLE = {
+    "resolution": [96, 72],
+    "instances": [seen_object(2, 7, (5, 5), above=[3]), seen_object(3, 3, (9, 9), above=[2])],
+    "votes": [],
+}
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("{", r"attempts\.jsonl, line 2 is no JSON: "),
+        ("", r"attempts\.jsonl, line 2 is no JSON: "),
+        ("[1]", r"line 2 is no record of an attempt: it needs whole numbers episode and attempt"),
+        ('{"episode": 1, "attempt": "0"}', r"line 2 is no record of an attempt"),
+        ('{"episode": 1, "attempt": 0}', r"line 2: the record has no sight"),
+        (damaged(frame="first"), r"line 2: the record of an attempt has a value of the wrong kind: .*'first'"),
+        (damaged(mode="move"), r'line 2: .* mode is "move"'),
+        (damaged(target=9), r"line 2: .* target is 9, which was not seen"),
+        (damaged(load=[float("inf")]), r"line 2: .* inf is not finite"),
+        (damaged(sight=NO_POLE), r"line 2: .*'NoneType'"),
+        (damaged(sight=CIRCLE), r"the clutter graph of attempt 0 of episode 1 runs in a circle"),
+        (damaged(frame=77), r"scene_gt\.json has no image 77, of which "),
+    ],
+)
+def test_a_damaged_record_is_one_clear_line(dataset, line, said):
+    good = json.dumps(record([seen_object(2, 7, (50, 38))], episode=0))
+    (dataset / "attempts.jsonl").write_text(f"{good}\n{line}\n")
+    with pytest.raises(DatasetError, match=said) as caught:
+        drawn(dataset)
+    assert "\n" not in str(caught.value)
+    assert not (dataset / "picture.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (lambda folder: shutil.rmtree(folder), r"there is no folder .*set; name the folder of a BOP data set"),
+        (lambda folder: (folder / "attempts.jsonl").unlink(), r"has no attempts\.jsonl: nothing was picked; .*mode pick, target or mixed"),
+        (lambda folder: (folder / "attempts.jsonl").write_bytes(b"\xff"), r"attempts\.jsonl is no text: byte 0 is no UTF-8"),
+        (lambda folder: (folder / "attempts.jsonl").write_text(""), r"has no attempt of episode 1; episodes that have: none"),
+        (lambda folder: (folder / "config.toml").unlink(), r"has no config\.toml"),
+        (lambda folder: (folder / "models" / "models_info.json").unlink(), r"cannot read .*models_info\.json: No such file"),
+        (lambda folder: shutil.rmtree(folder / "train" / "000003"), r"cannot read .*000003/scene_gt\.json: No such file"),
+        (lambda folder: (folder / "train/000003/rgb/000000.png").unlink(), r"there is no .*rgb/000000\.png or \.jpg"),
+        (lambda folder: (folder / "train/000003/rgb/000000.png").write_bytes(b"x"), r"000000\.png is no picture"),
+        (lambda folder: (folder / "train/000003/mask_visib/000000_000001.png").unlink(), r"there is no .*000000_000001\.png"),
+    ],
+)
+def test_what_is_missing_is_named_in_one_line(dataset, tmp_path, harm, said):
+    harm(dataset)
+    with pytest.raises(DatasetError, match=said) as caught:
+        write_explanation(dataset, tmp_path / "picture.png", 1, 0)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "picture.png").exists()
+
+
+def test_what_does_not_exist_is_answered_with_what_does(dataset):
+    with pytest.raises(DatasetError, match=r"has no attempt of episode 2; episodes that have: 1, 4$"):
+        write_explanation(dataset, dataset / "picture.png", 2, None)
+    with pytest.raises(DatasetError, match=r"has no attempt 3 of episode 1; attempts: 0 to 2$"):
+        write_explanation(dataset, dataset / "picture.png", 1, 3)
+    with pytest.raises(OutputError, match=r"picture\.bmp is no picture file; its name must end in \.png, \.jpg, \.jpeg"):
+        write_explanation(dataset, dataset / "picture.bmp", 1, None)
+
+
+def test_settings_decide_which_votes_make_edges(dataset):
+    before = drawn(dataset)
+    (dataset / "config.toml").write_text(config_to_toml(replace(config(split="train", color_format="png"), sight=Sight(min_votes=5.5))))
+    assert (drawn(dataset) != before).any()
+
+
+def test_the_command(dataset, tmp_path, capsys):
+    assert main(["explain", str(dataset), "--episode", "1"]) == 0
+    assert main(["explain", str(dataset), "--episode", "1", "--attempt", "2"]) == 0
+    assert main(["explain", str(dataset), "--episode", "1", "--attempt", "0", "--out", str(tmp_path / "deep" / "a.jpg")]) == 0
+    files = [dataset / "explain-000001.png", dataset / "explain-000001-002.png", tmp_path / "deep" / "a.jpg"]
+    assert capsys.readouterr().out == "".join(f"explanation: {file}\n" for file in files)
+    heights = [cv2.imread(str(file)).shape[0] for file in files]
+    assert heights[0] > heights[1] + heights[2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--episode", "2"], "attempts.jsonl has no attempt of episode 2; episodes that have: 1, 4"),
+        (["--episode", "1", "--attempt", "-1"], "attempts.jsonl has no attempt -1 of episode 1; attempts: 0 to 2"),
+        (["--episode", "1", "--out", "a.txt"], "a.txt is no picture file; its name must end in .png, .jpg, .jpeg"),
+        ([], 'Command "explain" parameter --episode requires an argument.'),
+    ],
+)
+def test_a_mistake_at_the_command_line_is_one_line_and_exit_code_2(dataset, capsys, monkeypatch, arguments, said):
+    monkeypatch.chdir(dataset)
+    assert main(["explain", ".", *arguments]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert line == f"synpick-warp: error: {said}"

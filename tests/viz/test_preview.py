@@ -1,0 +1,144 @@
+"""Contact sheets: what is on them, and what happens without a data set."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.view import write_layer
+from synpick_warp.viz.preview import find_scenes, sample, write_contact_sheet
+from tests.harness.exporter_contract import export
+from tests.worlds.box_views import cameras, config
+
+FRAMES = 5
+EPISODES = (0, 1)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("preview") / "set"
+    return export(BopExporter, out, config(), EPISODES, 0, FRAMES)
+
+
+@pytest.fixture
+def dataset(made, tmp_path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "set"))
+
+
+def test_a_row_a_view_and_four_pictures_a_row(dataset, tmp_path):
+    out = write_contact_sheet(dataset, tmp_path / "new" / "sheet.png", 4)
+    sheet = cv2.imread(str(out))
+    assert sheet.shape == (4 * (20 + 360 + 4), 4 * (480 + 4), 3)
+    first = sheet[20:380, :480]
+    scene, frame = sample(find_scenes(dataset), 4)[0]
+    color = cv2.imread(str(scene / "rgb" / f"{frame:06d}.jpg"))
+    np.testing.assert_array_equal(first[2::5, 2::5], color)
+
+
+def test_layers_get_columns_of_their_own(dataset, tmp_path):
+    shape = (cameras()[0].height, cameras()[0].width)
+    flow = np.full((*shape, 2), np.nan, np.float32)
+    flow[:, 10:20] = 4.0, 0.0
+    flow[:, 20:40] = 0.0, 0.0
+    values = {
+        "normals": np.broadcast_to(np.array([0, 0, -1], np.float32), (*shape, 3)),
+        "albedo": np.broadcast_to(np.array([200, 100, 50], np.uint8), (*shape, 3)),
+        "nocs": np.broadcast_to(np.array([1.0, 0.0, 0.2], np.float32), (*shape, 3)),
+        "classes": np.zeros(shape, np.uint16),
+        "flow": flow,
+        "scene_flow": np.full((*shape, 3), np.nan, np.float32),
+    }
+    for scene in find_scenes(dataset):
+        for name, layer in values.items():
+            (scene / name).mkdir()
+            for frame in range(FRAMES):
+                write_layer(layer, scene, name, frame)
+    sheet = cv2.imread(str(write_contact_sheet(dataset, tmp_path / "sheet.png", 1)))
+    assert sheet.shape[1] == 10 * (480 + 4)
+    panels = {name: sheet[20:380, 484 * (4 + i) : 484 * (4 + i) + 480] for i, name in enumerate(values)}
+    expected = {"normals": (255, 128, 128), "albedo": (50, 100, 200), "nocs": (51, 0, 255), "classes": (0, 0, 0)}
+    for name, color in (expected | {"scene_flow": (64, 64, 64)}).items():
+        assert (panels[name] == color).all(), name
+    # Flow to the right is red, none is black, unknown is grey.
+    scale = 480 // shape[1]
+    assert [panels["flow"][100, scale * column].tolist() for column in (5, 15, 30)] == [[64, 64, 64], [0, 0, 255], [0, 0, 0]]
+    (find_scenes(dataset)[0] / "flow" / "000002.png").unlink()
+    with pytest.raises(DatasetError, match=r"there is no .*flow/000002.png"):
+        write_contact_sheet(dataset, tmp_path / "sheet.png", 100)
+
+
+def test_views_are_spread_over_cameras_scenes_and_time(dataset):
+    views = sample(find_scenes(dataset), 6)
+    assert [int(scene.name) for scene, _ in views] == [0, 1, 2, 3, 4, 5]
+    assert len({frame for _, frame in views}) >= 4
+    assert {int(scene.name) % 3 for scene, _ in sample(find_scenes(dataset), 3)} == {0, 1, 2}
+
+
+def test_more_views_than_there_are_show_each_at_most_once(dataset):
+    views = sample(find_scenes(dataset), 200)
+    assert len(views) == len(set(views)) <= len(EPISODES) * 3 * FRAMES
+
+
+def test_instances_and_boxes_are_drawn_where_they_are(dataset, tmp_path):
+    sheet = cv2.imread(str(write_contact_sheet(dataset, tmp_path / "sheet.png", 1)))
+    scene, frame = sample(find_scenes(dataset), 1)[0]
+    index = 1
+    mask = cv2.imread(str(scene / "mask_visib" / f"{frame:06d}_{index:06d}.png"), cv2.IMREAD_GRAYSCALE) > 0
+    instances = sheet[20:380, 2 * 484 : 2 * 484 + 480][2::5, 2::5]
+    assert len(np.unique(instances[mask], axis=0)) == 1
+    color = instances[mask][0]
+    boxes = sheet[20:380, 3 * 484 : 3 * 484 + 480]
+    rows, columns = np.nonzero((boxes == color).all(axis=2))
+    x, y, width, height = json.loads((scene / "scene_gt_info.json").read_text())[str(frame)][index]["bbox_obj"]
+    assert abs(columns.min() - 5 * x) <= 2
+    assert abs(rows.min() - 5 * y) <= 2
+    assert abs(columns.max() - 5 * (x + width + 1)) <= 2
+    assert abs(rows.max() - 5 * (y + height + 1)) <= 2
+
+
+def test_a_set_without_masks_and_with_png_colour(tmp_path):
+    export(BopExporter, tmp_path / "set", config(masks=False, color_format="png"), (0,), 0, 1)
+    assert write_contact_sheet(tmp_path / "set", tmp_path / "sheet.jpg", 2).is_file()
+
+
+def test_folders_that_are_no_data_set(tmp_path):
+    with pytest.raises(DatasetError, match="there is no folder"):
+        write_contact_sheet(tmp_path / "none", tmp_path / "sheet.png", 1)
+    with pytest.raises(DatasetError, match="has no whole scene"):
+        write_contact_sheet(tmp_path, tmp_path / "sheet.png", 1)
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda scene: (scene / "scene_gt.json").unlink(), r"cannot read .*scene_gt\.json: No such file"),
+        (lambda scene: (scene / "scene_gt_info.json").write_text("{"), r"scene_gt_info\.json is no JSON file"),
+        (lambda scene: (scene / "scene_gt.json").write_text(json.dumps({"0": []})), "do not agree about image"),
+        (lambda scene: shutil.rmtree(scene / "rgb"), r"there is no .*rgb/.*\.png or \.jpg"),
+        (lambda scene: [path.write_bytes(b"") for path in (scene / "depth").iterdir()], "is no picture"),
+    ],
+)
+def test_a_damaged_data_set_is_one_clear_line(dataset, tmp_path, damage, message):
+    for scene in (dataset / "train_pbr").iterdir():
+        damage(scene)
+    with pytest.raises(DatasetError, match=message) as caught:
+        write_contact_sheet(dataset, tmp_path / "sheet.png", 3)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "sheet.png").exists()
+
+
+def test_what_can_not_be_written_is_one_clear_line(dataset, tmp_path):
+    with pytest.raises(OutputError, match="must end in"):
+        write_contact_sheet(dataset, tmp_path / "sheet.bmp", 1)
+    with pytest.raises(OutputError, match="at least 1"):
+        write_contact_sheet(dataset, tmp_path / "sheet.png", 0)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot write"):
+        write_contact_sheet(dataset, tmp_path / "file" / "sheet.png", 1)

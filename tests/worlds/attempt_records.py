@@ -1,0 +1,86 @@
+"""Records of attempts, as attempts.jsonl has them, for data sets made of boxes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from synpick_warp.viz.explain_record import Attempt, SeenObject
+
+
+def seen_object(instance: int, object_id: int, suction: tuple[float, float], **other: Any) -> dict[str, Any]:
+    """An entry of sight.instances; its three candidates lie beside each other, the suction point is the pole."""
+    column, row = suction
+    entry = {
+        "instance": instance,
+        "object_id": object_id,
+        "visible": 100,
+        "share": 0.5,
+        "pole": [column, row],
+        "centroid": [column + 8.0, row],
+        "middle": [column + 4.0, row],
+        "distances": [6.0, 3.0, 5.1],
+        "suction": [column, row],
+        "depth": 1.4,
+        "above": [],
+        "all_above": [],
+    }
+    return entry | other
+
+
+def record(seen: list[dict[str, Any]], **other: Any) -> dict[str, Any]:
+    """A line of attempts.jsonl: attempt 0 of episode 0, from image 0, that picked the first object of those given."""
+    target = seen[0]["instance"] if seen else None
+    line = {
+        "episode": 0,
+        "attempt": 0,
+        "mode": "pick",
+        "frame": 0,
+        "end_frame": 4,
+        "outcome": "TARGET_PICKED",
+        "sentence": "the target hung on the cup after the lift",
+        "target": target,
+        "object_id": seen[0]["object_id"] if seen else None,
+        "point": [0.0, 0.0, 0.1],
+        "normal": [0.0, 0.0, 1.0],
+        "yaw": 0.0,
+        "tilt": 0.2,
+        "rays": 10,
+        "hits": 10 if seen else 0,
+        "good_seal": bool(seen),
+        "caught": [target] if seen else [],
+        "picked": [target] if seen else [],
+        "load": [0.0, 20.0, 20.0, 20.0] if seen else [],
+        "sight": {"resolution": [96, 72], "instances": seen, "votes": []},
+    }
+    return line | other
+
+
+def nothing_seen(**other: Any) -> dict[str, Any]:
+    """The line of an attempt that ended before it began."""
+    gone = {
+        "sentence": "no object in the tote is visible",
+        "outcome": "NOTHING_SEEN",
+        "point": None,
+        "normal": None,
+        "yaw": None,
+        "tilt": None,
+    }
+    return record([]) | gone | other
+
+
+def attempt(seen: tuple[SeenObject, ...], votes: dict[tuple[int, int], float], target: int | None = None, **other: Any) -> Attempt:
+    """An attempt as `read_attempts` returns it, with the graph that is given."""
+    values: dict[str, Any] = {
+        "episode": 0, "number": 0, "mode": "pick", "frame": 0, "end_frame": 4, "sentence": "s", "target": target, "tilt": None, "rays": 10,
+        "hits": 10, "good_seal": True, "caught": (), "picked": (), "load": (), "resolution": (96, 72),
+    }  # fmt: skip
+    return Attempt(**(values | other), seen=seen, votes=votes)
+
+
+def seen(instance: int, above: frozenset[int] = frozenset(), all_above: frozenset[int] | None = None, **other: Any) -> SeenObject:
+    """A seen object as `read_attempts` returns it; its obj_id is its instance plus 1."""
+    values: dict[str, Any] = {
+        "object_id": instance + 1, "visible": 100, "share": 0.5, "candidates": ((10.0, 10.0), (18.0, 10.0), (14.0, 10.0)),
+        "distances": (6.0, 3.0, 5.1), "suction": (10.0, 10.0),
+    }  # fmt: skip
+    return SeenObject(instance=instance, above=above, all_above=above if all_above is None else all_above, **(values | other))

@@ -1,0 +1,208 @@
+"""Frame batches of scenes made of boxes, from the analytic intersection of ray and box in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import trimesh
+
+from synpick_warp.codes import Ending
+from synpick_warp.configs.schema import Bop, Cameras, Config, Render
+from synpick_warp.frames import EFFECTS, FINGER, TABLE, EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material, TriangleMesh
+
+ROOM = 5
+"""Instances that a world has room for; 1 and 4 do not exist."""
+OBJECT_IDS = np.array([3, -1, 7, 3, -1], np.int32)
+SIZES = {3: (0.16, 0.10, 0.06), 7: (0.05, 0.05, 0.20)}
+FINGER_SIZE = (0.05, 0.05, 0.10)
+FOCAL = 3.0
+"""Focal length in picture widths."""
+
+
+def config(layers: tuple[str, ...] = (), **bop: object) -> Config:
+    """Layers may be those of `_layers`."""
+    lens = cameras()[0]
+    return Config(bop=Bop(**bop), cameras=Cameras(resolution=(lens.width, lens.height)), render=Render(layers=layers))
+
+
+def catalog() -> Catalog:
+    texture = np.random.default_rng(0).integers(0, 256, (16, 24, 3), dtype=np.uint8)
+    return Catalog(tuple(_entry(obj_id, texture if obj_id == 3 else None) for obj_id in SIZES))
+
+
+def _entry(obj_id: int, texture: np.ndarray | None) -> CatalogEntry:
+    box = trimesh.creation.box(extents=SIZES[obj_id])
+    vertices = np.asarray(box.vertices, np.float32)
+    mesh = TriangleMesh(vertices, np.asarray(box.faces, np.int32), np.asarray(box.vertex_normals, np.float32), np.zeros((8, 2), np.float32))
+    turn = (-1.0, 0, 0, 0, 0, -1.0, 0, 0, 0, 0, 1.0, 0.002, 0, 0, 0, 1.0)
+    return CatalogEntry(
+        obj_id=obj_id,
+        name=f"box {obj_id}",
+        mesh=mesh,
+        material=Material(color=(1.0, 1.0, 1.0) if texture is not None else (0.5, 0.25, 0.0), texture=texture, metallic=0.0, roughness=0.5),
+        pieces=(),
+        volume=float(np.prod(SIZES[obj_id])),
+        radius=float(np.linalg.norm(SIZES[obj_id]) / 2),
+        mass=0.3,
+        center_of_mass=np.zeros(3),
+        inertia=np.eye(3),
+        diameter=float(np.linalg.norm(SIZES[obj_id])),
+        symmetries_discrete=(turn,) if obj_id == 7 else (),
+        symmetries_continuous=(((0.0, 0.0, 1.0), (0.001, 0.0, 0.0)),) if obj_id == 7 else (),
+        source=None,
+    )
+
+
+def cameras(width: int = 96, height: int = 72, count: int = 3) -> tuple[Camera, ...]:
+    """Cameras above the origin that look at it."""
+    return tuple(_camera(np.array([0.0, y, 1.5]), width, height) for y in (0.0, 0.4, -0.4)[:count])
+
+
+def _camera(place: np.ndarray, width: int, height: int) -> Camera:
+    forward = -place / np.linalg.norm(place)
+    right = np.array([1.0, 0.0, 0.0])
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.array([[FOCAL * width, 0, width / 2], [0, FOCAL * width, height / 2], [0, 0, 1.0]])
+    return Camera(width, height, matrix, rotation, -rotation @ place)
+
+
+def poses(episode: int, frame: int) -> np.ndarray:
+    """(ROOM, 7) float32. Instance 0 leaves the picture, instance 2 stands, instance 3 drifts under the finger."""
+    made = np.zeros((ROOM, 7), np.float32)
+    made[:, 6] = 1.0
+    turn = np.array([0.3 + 0.1 * frame, 0.2, 0.1 * episode, 1.7])  # Of any length: a quaternion is normalised where it is used.
+    made[0] = [-0.10 - 0.04 * frame, 0.07, 0.03, *turn]
+    made[2] = [0.02, -0.02, 0.05, 0.2, -0.3 - 0.1 * episode, 0.1, 1.0]
+    made[3] = [0.10 - 0.03 * frame, 0.01, 0.0, 0.0, 0.0, 0.4, 0.9]
+    return made
+
+
+def batches(
+    views: int, episodes: tuple[int, ...], frames: int, lenses: tuple[Camera, ...], depth_scale: float = 0.1
+) -> Iterator[FrameBatch]:
+    """All views of the episodes, interleaved as worlds that run side by side would bring them, in batches of at most `views`."""
+    order = [(episode, frame, camera) for frame in range(frames) for episode in episodes for camera in range(len(lenses))]
+    for start in range(0, len(order), views):
+        rows = [_view(episode, frame, camera, lenses[camera], depth_scale) for episode, frame, camera in order[start : start + views]]
+        layers = [_layers(row) for row in rows]
+        yield FrameBatch(
+            **{name: np.stack([row[name] for row in rows]) for name in rows[0]},
+            layers={name: np.stack([layer[name] for layer in layers]) for name in layers[0]},
+        )
+
+
+def _layers(view: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Layers that differ between views; no truth of the boxes."""
+    number = int(100 * view["episode"] + 10 * view["camera"] + view["frame"])
+    flow = np.stack([view["instance"] - np.float32(number), np.where(view["instance"] == TABLE, np.nan, 0.25)], axis=-1)
+    return {"classes": (view["instance"] + np.uint16(number)).astype(np.uint16), "flow": flow.astype(np.float32)}
+
+
+def ticks(worlds: int, episodes: tuple[int, ...], frames: int) -> Iterator[TickBatch]:
+    """Every frame of the episodes, at most `worlds` side by side."""
+    order = [(episode, frame) for frame in range(frames) for episode in episodes]
+    for start in range(0, len(order), worlds):
+        rows = [_tick(episode, frame) for episode, frame in order[start : start + worlds]]
+        yield TickBatch(**{name: np.stack([row[name] for row in rows]) for name in rows[0]})
+
+
+def _tick(episode: int, frame: int) -> dict[str, np.ndarray]:
+    fixtures = np.zeros((3, 7), np.float32)
+    fixtures[:, 6] = 1.0
+    fixtures[1:, :3] = [[0.1 - 0.02 * frame, 0.05, 0.2], [0.1 - 0.02 * frame, 0.05, 0.05]]
+    return {
+        "episode": np.int32(episode),
+        "frame": np.int32(frame),
+        "time": np.float64(frame / 15),
+        "object_id": OBJECT_IDS if frame < 2 else np.where(np.arange(ROOM) == 3, -1, OBJECT_IDS).astype(np.int32),
+        "pose": poses(episode, frame),
+        "fixture_pose": fixtures,
+        "fixture_visible": np.array([1, frame > 0, frame > 0], np.int32),
+        "light": np.int32(0),
+        "light_turn": np.float32(0.5 * episode),
+        "light_exposure": np.float32(0.25),
+    }
+
+
+def ends(episodes: tuple[int, ...], frames: int, ending: Ending = Ending.FINISHED, redraw: int = 0) -> list[EpisodeEnd]:
+    return [EpisodeEnd(episode, redraw, frames, int(ending)) for episode in episodes]
+
+
+def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: float) -> dict[str, np.ndarray]:
+    pose = poses(episode, frame)
+    depths = np.stack([_depth(SIZES[OBJECT_IDS[i]], pose[i], camera) if OBJECT_IDS[i] >= 0 else _nothing(camera) for i in range(ROOM)])
+    inner = depths[:, camera.height : 2 * camera.height, camera.width : 2 * camera.width]
+    finger_pose = np.array([0.1 - 0.02 * frame, 0.05, 0.2, 0.0, 0.0, 0.0, 1.0])
+    finger = _depth(FINGER_SIZE, finger_pose, camera)[camera.height : 2 * camera.height, camera.width : 2 * camera.width]
+    table = _table(camera)
+    nearest = np.argmin(np.concatenate((inner, finger[None], table[None])), axis=0)
+    depth = np.min(np.concatenate((inner, finger[None], table[None])), axis=0)
+    codes = np.array([*range(1, ROOM + 1), FINGER, TABLE], np.uint8)
+    instance = codes[nearest]
+    pixels, boxes = np.zeros((ROOM, 3), np.int32), np.tile(np.array([0, 0, -1, -1], np.int32), (ROOM, 2, 1))
+    for i in range(ROOM):
+        seen = instance == 1 + i
+        pixels[i] = np.isfinite(depths[i]).sum(), np.isfinite(inner[i]).sum(), seen.sum()
+        boxes[i, 0] = _box(np.isfinite(depths[i]), camera.width, camera.height)
+        boxes[i, 1] = _box(seen, 0, 0)
+    shade = (40 * (nearest + 1) % 256).astype(np.uint8)
+    return {
+        "episode": np.int32(episode),
+        "camera": np.int32(index),
+        "frame": np.int32(frame),
+        "time": np.float64(frame / 15),
+        "color": np.stack([shade, shade[::-1], np.full_like(shade, 90)], axis=-1),
+        "depth": np.rint(depth * 1000 / depth_scale).astype(np.uint16),
+        "instance": instance,
+        "amodal": sum(np.isfinite(inner[i]).astype(np.uint32) << np.uint32(i) for i in range(ROOM)),
+        "object_id": OBJECT_IDS,
+        "pose": pose,
+        "pixels": pixels,
+        "boxes": boxes,
+        "effects": np.arange(len(EFFECTS), dtype=np.float32) + np.float32(10 * index + frame),
+        "light_name": np.str_(f"map {episode}"),
+        "light_turn": np.float32(0.5 * episode),
+        "light_exposure": np.float32(-0.25),
+        "light_direction": np.array([0.0, 0.6, 0.8] if episode else [0.0, 0.0, 0.0], np.float32),
+    }
+
+
+def _rays(camera: Camera) -> np.ndarray:
+    """Directions with z = 1 in the camera's frame, over three widths and heights with the picture in the middle."""
+    x = np.arange(-camera.width, 2 * camera.width) + 0.5
+    y = np.arange(-camera.height, 2 * camera.height) + 0.5
+    columns, rows = np.meshgrid((x - camera.matrix[0, 2]) / camera.matrix[0, 0], (y - camera.matrix[1, 2]) / camera.matrix[1, 1])
+    return np.stack([columns, rows, np.ones_like(rows)], axis=-1)
+
+
+def _nothing(camera: Camera) -> np.ndarray:
+    return np.full((3 * camera.height, 3 * camera.width), np.inf)
+
+
+def _depth(size: tuple[float, ...], pose: np.ndarray, camera: Camera) -> np.ndarray:
+    """Planar depth of a box [m], infinite where rays miss: the slabs between its faces."""
+    x, y, z, w = pose[3:].astype(np.float64) / np.linalg.norm(pose[3:].astype(np.float64))
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+    origin = rotation.T @ (-camera.rotation.T @ camera.translation - pose[:3].astype(np.float64))
+    direction = _rays(camera) @ camera.rotation @ rotation
+    half = np.asarray(size, np.float32).astype(np.float64) / 2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        first, second = (-half - origin) / direction, (half - origin) / direction
+    near, far = np.minimum(first, second).max(axis=-1), np.maximum(first, second).min(axis=-1)
+    return np.where((near <= far) & (near > 0), near, np.inf)
+
+
+def _table(camera: Camera) -> np.ndarray:
+    rays = _rays(camera)[camera.height : 2 * camera.height, camera.width : 2 * camera.width] @ camera.rotation
+    height = (-camera.rotation.T @ camera.translation)[2]
+    return (-0.1 - height) / rays[..., 2]
+
+
+def _box(mask: np.ndarray, left: int, top: int) -> list[int]:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not rows.size:
+        return [0, 0, -1, -1]
+    return [int(columns[0]) - left, int(rows[0]) - top, int(columns[-1]) - left, int(rows[-1]) - top]

@@ -1,0 +1,137 @@
+"""Objects that hang on cups, in the real physics: boxes of any mass, caught where the test puts them, lifted by a scripted gripper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.arrays import allocate
+from synpick_warp.scenes import build
+from synpick_warp.scenes.types import Catalog
+from synpick_warp.stages.constants import make_scene_data
+from synpick_warp.stages.sim.physics import Physics
+from synpick_warp.stages.sim.suction import Suction
+from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, world_sizes
+from tests.twins.raycast import rotation_of
+from tests.worlds.small_worlds import catalog, settings
+
+Size = tuple[float, float, float]
+HEIGHT = 1.0
+"""Of the tilt axis at the start [m]: far above the tote."""
+COARSE = {"physics__steps_per_tick": 1, "physics__iterations": 4, "physics__rows_per_world": 96, "physics__contacts_per_world": 48}
+"""A step at a time, and no more room than bodies in the air need."""
+ROOM = 0.02
+"""Volume for one object [m³]."""
+
+
+class Hanging:
+    """Worlds in which every object is held by a seal from the start; object `instance` of world `world` has its own mass."""
+
+    def __init__(self, device, masses: Sequence[Sequence[float]], sizes: Sequence[Sequence[Size]], **overrides: object) -> None:
+        """Masses [kg] and sizes [m], by world and instance."""
+        self.mass = np.asarray(masses, float)
+        self.worlds, self.instances = self.mass.shape
+        self.size = np.asarray(sizes, float).reshape(self.worlds, self.instances, 3)
+        room = {"arrangement__max_objects": self.instances, "arrangement__volume": ROOM * self.instances}
+        self.config = settings(bake__worlds=self.worlds, **{**COARSE, **room, **overrides})
+        boxes = catalog(*[(tuple(size),) for size in self.size.reshape(-1, 3)]).entries
+        entries = tuple(replace(box, mass=mass, inertia=box.inertia * mass / box.mass)
+                        for box, mass in zip(boxes, self.mass.reshape(-1), strict=True))
+        self.inertia = np.stack([entry.inertia for entry in entries]).reshape(self.worlds, self.instances, 3, 3)
+        objects = Catalog(entries)
+        built = build.build_model(self.config, objects, device)
+        self.layout, self.physics = built.layout, Physics(self.config, built)
+        self.scene = make_scene_data(self.config, objects, built, 1, device)
+        extents = world_sizes(self.config, built.layout.bodies_per_world)
+        self.state, self.attempts, self.seals = (allocate(kind, extents, device) for kind in (WorldState, AttemptState, SealState))
+        meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
+        self.suction = Suction(self.config, objects, SimpleNamespace(meshes=meshes, keep=()), device)
+        order = np.arange(self.mass.size).reshape(self.mass.shape)
+        self.state.entry.assign(order)
+        self.state.slot.assign(np.tile(np.arange(self.instances), (self.worlds, 1)))
+        variant = np.full((self.worlds, built.layout.bodies_per_world), -1)
+        variant[:, build.GRIPPER_BODIES : build.GRIPPER_BODIES + self.instances] = built.variant[order]
+        self.state.variant.assign(variant.reshape(-1))
+        self.state.restarted.fill_(True)
+        self.gripper_mass = self.config.gripper.finger_mass + self.config.gripper.cup_mass
+        self.carried, self.ignoring = True, True
+        self.goal, self.speed = np.zeros((self.worlds, 3)), np.zeros(3)
+
+    def start(self, place: np.ndarray, limit: float = 40.0, quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> None:
+        """Everything at rest, the cups upright; catch the objects with centres at `place` (world, instance, 3), from the tip [m]."""
+        tip = np.array([0.0, 0.0, HEIGHT - self.config.gripper.cup_length])
+        turn = np.broadcast_to(quaternion, (self.worlds, self.instances, 4))
+        first = build.GRIPPER_DOFS
+        coordinates = self.physics.state.joint_q.numpy().reshape(self.worlds, -1)
+        coordinates[:, :first] = (0.0, 0.0, HEIGHT, 0.0)
+        coordinates[:, first : first + 7 * self.instances] = np.concatenate([tip + place, turn], axis=2).reshape(self.worlds, -1)
+        self.physics.state.joint_qd.zero_()
+        self.physics.control.joint_f.zero_()
+        self.physics.load(self.state.variant, self.state.restarted)
+        self.seals.anchor.assign(np.concatenate([place, turn], axis=2))
+        self.seals.held.fill_(1)
+        self.seals.limit.fill_(limit)
+        self.seals.peak.zero_()
+        self.goal[:], self.speed[:] = (0.0, 0.0, HEIGHT), 0.0
+
+    def run(self, steps: int) -> np.ndarray:
+        """So many steps; loads (step, world, instance) [N]."""
+        loads = []
+        for _ in range(steps):
+            self.physics.tick(self.drive, self.ignore)
+            loads.append(self.seals.load.numpy().copy())
+        return np.array(loads)
+
+    def drive(self, current) -> None:
+        """The impedance law of picking, or nothing, and the seals."""
+        pick, step = self.config.pick, self.config.physics.step
+        self.goal += step * self.speed
+        offset = self.goal - current.joint_q.numpy().reshape(self.worlds, -1)[:, :3]
+        velocity = current.joint_qd.numpy().reshape(self.worlds, -1)[:, :3]
+        gain = 1.0 + (pick.damping * step + pick.stiffness * step**2) / self.gripper_mass
+        force = self.physics.control.joint_f.numpy().reshape(self.worlds, -1)
+        force[:, : build.GRIPPER_DOFS] = 0.0
+        if self.carried:
+            force[:, :3] = (pick.stiffness * (offset - step * velocity) - pick.damping * velocity) / gain
+            force[:, 2] += self.gripper_mass * self.config.physics.gravity
+        self.suction.hold_objects(self.scene, self.state, self.seals, self.physics, current)
+
+    def ignore(self) -> None:
+        """Contacts of cups with what they hold."""
+        if self.ignoring:
+            self.suction.ignore_held_contacts(self.scene, self.state, self.seals, self.physics)
+
+    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (world, body, 7) and velocities (world, body, 6): finger, cup, objects."""
+        count = build.GRIPPER_BODIES + self.instances
+        state = self.physics.state
+        return tuple(array.numpy().reshape(self.worlds, -1, width)[:, :count].astype(float)
+                     for array, width in ((state.body_q, 7), (state.body_qd, 6)))  # type: ignore[return-value]
+
+    def swing(self) -> np.ndarray:
+        """Angle between each cup's axis and that of its first object, which was upright when it was caught (world) [°]."""
+        poses, _ = self.bodies()
+        axes = [np.stack([rotation_of(pose[3:])[:, 2] for pose in poses[:, body]]) for body in (1, 2)]
+        return np.degrees(np.arccos(np.clip((axes[0] * axes[1]).sum(axis=1), -1.0, 1.0)))
+
+    def momentum(self) -> np.ndarray:
+        """Of gripper and objects together (world, 3) [N·s]."""
+        _, velocity = self.bodies()
+        gripper = self.config.gripper.finger_mass * velocity[:, 0, :3] + self.config.gripper.cup_mass * velocity[:, 1, :3]
+        return gripper + np.einsum("wi,wic->wc", self.mass, velocity[:, 2:, :3])
+
+    def energy(self) -> np.ndarray:
+        """Kinetic, of gripper and objects together (world) [J]; the cup's spin is left out."""
+        poses, velocity = self.bodies()
+        gripper = np.tile([self.config.gripper.finger_mass, self.config.gripper.cup_mass], (self.worlds, 1))
+        masses = np.concatenate([gripper, self.mass], axis=1)
+        total = 0.5 * np.einsum("wb,wbc,wbc->w", masses, velocity[:, :, :3], velocity[:, :, :3])
+        for world in range(self.worlds):
+            for instance in range(self.instances):
+                spin = rotation_of(poses[world, 2 + instance, 3:]).T @ velocity[world, 2 + instance, 3:]
+                total[world] += 0.5 * spin @ self.inertia[world, instance] @ spin
+        return total

@@ -1,0 +1,93 @@
+"""Small scenes that simulate quickly: boxes and an L of two boxes, and settings under which an episode takes a second or two."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import trimesh
+
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Config
+from synpick_warp.scenes.collision.hulls import limited_hull, mass_properties
+from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, Material, TriangleMesh
+from synpick_warp.stages.sim.simulate import Simulation, TickRecord
+from synpick_warp.stages.stream import TickReader, TickReport
+
+BOX = ((0.08, 0.06, 0.04),)
+CUBE = ((0.05, 0.05, 0.05),)
+"""Sizes [m] of an object's boxes; the second of an L stands beside the first."""
+ANGLE = ((0.09, 0.03, 0.03), (0.03, 0.06, 0.03))
+DENSITY = 500.0
+
+QUICK = {
+    "bake.worlds": 1,
+    "bake.episodes": 1,
+    "bake.device": "cpu",
+    "bake.writers": 1,
+    "arrangement.max_objects": 3,
+    "arrangement.volume": 6e-4,
+    "settle.min_time": 0.1,
+    "settle.rest_ticks": 1,
+    "settle.late_time": 0.6,
+    "settle.tries": 3,
+    "move.rounds": 1,
+    "move.speed": 2.0,
+    "move.start_height": 0.15,
+}
+"""Overrides on the preset `smoke`."""
+
+
+def settings(**overrides: object) -> Config:
+    """QUICK with changes; keys with __ for the dot."""
+    return load_config("smoke", QUICK | {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+def catalog(*shapes: Sequence[tuple[float, float, float]]) -> Catalog:
+    """Objects made of boxes: obj_ids from 1."""
+    return Catalog(tuple(_entry(number, sizes) for number, sizes in enumerate(shapes or (BOX, CUBE, ANGLE), start=1)))
+
+
+def pieces(sizes: Sequence[tuple[float, float, float]]) -> tuple[ConvexPiece, ...]:
+    """One box about the origin, or two side by side along y with a common lower x and z."""
+    made = []
+    shift = np.zeros(3)
+    for size in sizes:
+        corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
+        made.append(limited_hull(corners + shift, 8))
+        shift = np.array([-(sizes[0][0] - sizes[-1][0]) / 2, (sizes[0][1] + sizes[-1][1]) / 2, 0.0])
+    return tuple(made)
+
+
+def _entry(obj_id: int, sizes: Sequence[tuple[float, float, float]]) -> CatalogEntry:
+    parts = pieces(sizes)
+    whole = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts])
+    whole.unmerge_vertices()
+    vertices = np.asarray(whole.vertices, np.float32)
+    mesh = TriangleMesh(vertices, np.asarray(whole.faces, np.int32), np.asarray(whole.vertex_normals, np.float32),
+                        np.zeros((len(vertices), 2), np.float32))
+    properties = mass_properties(parts)
+    mass = DENSITY * properties.volume
+    return CatalogEntry(
+        obj_id=obj_id, name=f"boxes_{obj_id}", mesh=mesh, material=Material((0.6, 0.5, 0.4), None, 0.0, 0.5), pieces=parts,
+        volume=properties.volume, radius=float(np.linalg.norm(vertices, axis=1).max()), mass=mass,
+        center_of_mass=properties.center_of_mass, inertia=mass * properties.unit_inertia,
+        diameter=float(np.linalg.norm(vertices[:, None] - vertices[None], axis=2).max()), symmetries_discrete=(),
+        symmetries_continuous=(), source=None,
+    )
+
+
+def report(record: TickRecord) -> TickReport:
+    """What a tick left, on the host."""
+    reader = TickReader(record)
+    reader.start()
+    return reader.wait()
+
+
+def run_ticks(simulation: Simulation, ticks: int) -> list[TickReport]:
+    """So many ticks."""
+    reports = []
+    for _ in range(ticks):
+        simulation.tick(simulation.records[0])
+        reports.append(report(simulation.records[0]))
+    return reports

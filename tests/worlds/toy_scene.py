@@ -1,0 +1,191 @@
+"""Small scenes whose pictures can be worked out by hand, and a way to render them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import trimesh
+import warp as wp
+
+from synpick_warp.arrays import allocate
+from synpick_warp.configs.schema import Config
+from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Fixture, LightMap, Material, TriangleMesh
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.render.scene import build_render_scene
+
+GREY = Material(color=(0.7, 0.7, 0.7), texture=None, metallic=0.0, roughness=0.8)
+DOWN = np.diag([1.0, -1.0, -1.0])
+"""World to camera for a camera that looks down, the image's up being +y."""
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+
+def flat_shaded(vertices: np.ndarray, faces: np.ndarray) -> TriangleMesh:
+    """A mesh with a vertex for every corner of every triangle, and no texture coordinates."""
+    corners = np.asarray(vertices, dtype=np.float64)[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    count = 3 * len(faces)
+    return TriangleMesh(
+        vertices=corners.reshape(count, 3).astype(np.float32),
+        faces=np.arange(count, dtype=np.int32).reshape(-1, 3),
+        normals=np.repeat(normals, 3, axis=0).astype(np.float32),
+        uv=np.zeros((count, 2), np.float32),
+    )
+
+
+def box(x: float, y: float, z: float) -> TriangleMesh:
+    """A box about its origin [m]."""
+    made = trimesh.creation.box(extents=(x, y, z))
+    return flat_shaded(made.vertices, made.faces)
+
+
+def ball(radius: float, subdivisions: int) -> TriangleMesh:
+    """A sphere of triangles with smooth normals, vertices on the sphere [m]."""
+    made = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    vertices = np.asarray(made.vertices)
+    return TriangleMesh(
+        vertices=vertices.astype(np.float32),
+        faces=np.asarray(made.faces, dtype=np.int32),
+        normals=(vertices / radius).astype(np.float32),
+        uv=np.zeros((len(vertices), 2), np.float32),
+    )
+
+
+def sheet(width: float, height: float) -> TriangleMesh:
+    """A rectangle that faces up, u along +x and v along +y."""
+    x, y = width / 2.0, height / 2.0
+    return TriangleMesh(
+        vertices=np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)], np.float32),
+        faces=np.array([(0, 1, 2), (0, 2, 3)], np.int32),
+        normals=np.tile(np.array([0, 0, 1], np.float32), (4, 1)),
+        uv=np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32),
+    )
+
+
+def entry(mesh: TriangleMesh, material: Material = GREY) -> CatalogEntry:
+    """A catalog entry of which only the look matters."""
+    return CatalogEntry(
+        obj_id=1,
+        name="toy",
+        mesh=mesh,
+        material=material,
+        pieces=(),
+        volume=1e-3,
+        radius=float(np.linalg.norm(mesh.vertices, axis=1).max()),
+        mass=1.0,
+        center_of_mass=np.zeros(3),
+        inertia=np.eye(3),
+        diameter=1.0,
+        symmetries_discrete=(),
+        symmetries_continuous=(),
+        source=None,
+    )
+
+
+def camera(width: int, height: int, focal: float, center: tuple[float, float, float], rotation: np.ndarray = DOWN) -> Camera:
+    """A camera at `center` [m] with its principal point in the middle of the image."""
+    matrix = np.array([[focal, 0.0, width / 2.0], [0.0, focal, height / 2.0], [0.0, 0.0, 1.0]])
+    return Camera(width, height, matrix, rotation, -rotation @ np.asarray(center, dtype=np.float64))
+
+
+def even_light(radiance: float = 1.0, rows: int = 16) -> LightMap:
+    """The same white light from everywhere."""
+    return LightMap("even", np.full((rows, 2 * rows, 3), radiance, np.float32))
+
+
+def sun(direction: tuple[float, float, float], sky: float = 0.3, strength: float = 2000.0, rows: int = 128) -> LightMap:
+    """An even sky with one bright texel."""
+    x, y, z = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
+    radiance = np.full((rows, 2 * rows, 3), sky, np.float32)
+    column = int((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * 2 * rows) % (2 * rows)
+    radiance[min(int(np.arccos(z) / np.pi * rows), rows - 1), column] = strength
+    return LightMap("sun", radiance)
+
+
+@dataclass
+class ToyScene:
+    """What to render. Poses are x, y, z [m] and a quaternion x, y, z, w; all cameras see world 0 unless `worlds` says otherwise."""
+
+    entries: list[CatalogEntry]
+    placed: list[list[tuple[int, tuple[float, ...]]]]
+    """For every world, (entry, pose) of its instances."""
+    cameras: tuple[Camera, ...]
+    lights: tuple[LightMap, ...] = (even_light(),)
+    fixtures: tuple[Fixture, Fixture, Fixture] = (Fixture(box(1, 1, 0.1), GREY),) + (Fixture(box(0.1, 0.1, 0.1), GREY),) * 2
+    fixture_poses: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, *UPRIGHT),) * 3
+    fixtures_visible: tuple[int, int, int] = (0, 0, 0)
+    room: int = 4
+    light_turn: float = 0.0
+    light_exposure: float = 0.0
+    table: bool = False
+    config: Config = field(default_factory=Config)
+
+    def settings(self) -> Config:
+        return replace(self.config, render=replace(self.config.render, table=self.table))
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Arrays of a rendered batch, on the host."""
+
+    color: np.ndarray
+    depth: np.ndarray
+    instance: np.ndarray
+    amodal: np.ndarray
+    pixels: np.ndarray
+    boxes: np.ndarray
+    exact_depth: np.ndarray
+    """What the pixels' rays met, before rounding [m]."""
+    radiance: np.ndarray
+    mix: np.ndarray
+    """Whose radiance a pixel shows (B, H, W) uint32."""
+
+
+def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
+    """The device arrays of a toy scene; light 0 everywhere."""
+    worlds = len(toy.placed)
+    entries = np.full((worlds, toy.room), -1)
+    poses = np.zeros((worlds, toy.room, 7), np.float32)
+    for world, placed in enumerate(toy.placed):
+        for i, (which, pose) in enumerate(placed):
+            entries[world, i] = which
+            poses[world, i] = pose
+    made = allocate(Snapshot, {"world": worlds, "instance": toy.room, "fixture": 3}, device)
+    made.entry.assign(entries)
+    made.pose.assign(poses)
+    made.fixture_pose.assign(np.tile(np.array(toy.fixture_poses, np.float32), (worlds, 1, 1)))
+    made.fixture_visible.assign(np.tile(np.array(toy.fixtures_visible), (worlds, 1)))
+    made.light_turn.fill_(toy.light_turn)
+    made.light_exposure.fill_(toy.light_exposure)
+    return made
+
+
+def render(toy: ToyScene, device: wp.Device) -> Picture:
+    """Render every world by every camera: view = world x cameras + camera."""
+    config = toy.settings()
+    scene = build_render_scene(config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+    worlds, cameras = len(toy.placed), len(toy.cameras)
+    views = worlds * cameras
+    renderer = Renderer(config, scene, toy.room, views)
+    sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
+    out = allocate(ViewBuffers, sizes, device)
+    view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
+    view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
+    renderer.render(snapshot(toy, device), view_world, view_camera, views, out)
+    images = {name: getattr(out, name).numpy() for name in ("color", "depth", "instance", "amodal", "pixels", "boxes")}
+    shown = renderer.picture
+    return Picture(**images, exact_depth=renderer.hits.depth.numpy(), radiance=shown.radiance.numpy(), mix=shown.mix.numpy())
+
+
+def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
+    """Primary hits alone: what world 0 shows to camera 0."""
+    scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+    renderer = Renderer(toy.settings(), scene, toy.room, 1)
+    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
+    out = allocate(ViewBuffers, sizes, device)
+    zero = wp.zeros(1, dtype=wp.int32, device=device)
+    renderer.prepare_bodies(snapshot(toy, device), zero, zero, 1)
+    renderer.find_hits(zero, 1, out)
+    return out, renderer

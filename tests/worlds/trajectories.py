@@ -1,0 +1,89 @@
+"""Ticks with all that physics records, of numbers that follow from episode and frame, and the store that a test makes of them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synpick_warp.codes import Ending
+from synpick_warp.configs.schema import Config, Trajectory
+from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, Quantity
+from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
+from synpick_warp.frames import EpisodeEnd, TickBatch
+from tests.harness.exporter_contract import exporting, finish
+from tests.worlds import box_views
+
+STEP_COUNT = 4
+COMPUTED = ("time",)
+ATTEMPT = {
+    "episode": 0, "attempt": 0, "mode": "pick", "frame": 1, "end_frame": 5, "outcome": "target_picked", "sentence": "the target hung",
+    "target": 2, "object_id": 7, "point": [0.1, 0.2, 0.3], "normal": [0.0, 0.0, 1.0], "yaw": 0.25, "tilt": -0.5, "rays": 10, "hits": 9,
+    "good_seal": False, "caught": [2], "picked": [2, 3], "load": [0.0, 3.25], "sight": {"resolution": [4, 3], "instances": [], "votes": []},
+}  # fmt: skip
+UNSEEN = ATTEMPT | {
+    "attempt": 1, "frame": 6, "end_frame": 7, "outcome": "nothing_seen", "hits": 0, "caught": [], "picked": [], "load": [],
+    **dict.fromkeys(("target", "object_id", "point", "normal", "yaw", "tilt")),
+}  # fmt: skip
+
+
+def config(**trajectory: Any) -> Config:
+    """Small chunks, so that a few frames fill several files."""
+    base = box_views.config()
+    physics = dataclasses.replace(base.physics, steps_per_tick=STEP_COUNT)
+    arrangement = dataclasses.replace(base.arrangement, max_objects=box_views.ROOM)
+    return dataclasses.replace(
+        base, physics=physics, arrangement=arrangement, trajectory=Trajectory(**({"chunk_ticks": 2, "shard_chunks": 3} | trajectory))
+    )
+
+
+def ticks(episodes: tuple[int, ...], frames: int, steps: bool = True) -> Iterator[TickBatch]:
+    """As `box_views.ticks`, all episodes side by side, with the arrays of physics."""
+    for batch in box_views.ticks(len(episodes), episodes, frames):
+        rows = [_physics(int(episode), int(frame), steps) for episode, frame in zip(batch.episode, batch.frame, strict=True)]
+        parts = [{name: np.stack([row[part][name] for row in rows]) for name in rows[0][part]} for part in range(2)]
+        yield dataclasses.replace(batch, tick=parts[0], steps=parts[1])
+
+
+def _physics(episode: int, frame: int, steps: bool) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    numbers = np.random.default_rng((episode, frame))
+    own = {item.name for item in dataclasses.fields(TickBatch)}
+    tick = {name: _some(numbers, quantity) for name, quantity in TICKS.arrays.items() if name not in own}
+    drops = np.random.default_rng(episode).normal(size=(box_views.ROOM, 7)).astype(np.float32)
+    tick |= {"mode": np.int32(1), "redrops": np.int32(episode), "drop_pose": drops}
+    made = {name: _some(numbers, quantity) for name, quantity in STEPS.arrays.items() if name not in COMPUTED} if steps else {}
+    return tick, made
+
+
+def _some(numbers: np.random.Generator, quantity: Quantity) -> np.ndarray:
+    shape = quantity.shape({"tick": 1, "step": STEP_COUNT, "instance": box_views.ROOM})
+    shape = shape[1:] if quantity.dims[0] == "tick" else shape
+    kind = np.dtype(quantity.dtype)
+    if kind.kind == "f":
+        return numbers.normal(size=shape).astype(kind)
+    return numbers.integers(0, 2, shape).astype(np.uint8 if kind.kind == "b" else kind)
+
+
+def ends(episodes: tuple[int, ...], frames: int) -> list[EpisodeEnd]:
+    """Each with two attempts, of which the second saw nothing."""
+    made = []
+    for episode in episodes:
+        lines = tuple(json.dumps(record | {"episode": episode}) + "\n" for record in (ATTEMPT, UNSEEN))
+        made.append(EpisodeEnd(episode, 1, frames, int(Ending.EMPTIED), {"episode": episode, "mode": "pick", "picked": 2}, lines))
+    return made
+
+
+def write_set(out: Path, settings: Config, episodes: tuple[int, ...], frames: int, processes: int = 2, steps: bool = True) -> Path:
+    """A finished data set."""
+    with exporting(TrajectoryExporter, out, settings, processes) as exporter:
+        exporter.write_constants()
+        for batch in ticks(episodes, frames, steps):
+            exporter.tick(batch)
+        for end in ends(episodes, frames):
+            exporter.end(end, lambda: None)
+        finish(exporter)
+    return out

@@ -1,0 +1,1 @@
+"""Developer tools: benchmarks, reports, checks. Run as `python -m tools.NAME`."""

@@ -1,0 +1,1 @@
+"""Checks: data sets, trajectories, determinism, device code."""

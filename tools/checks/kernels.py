@@ -1,0 +1,188 @@
+"""Checks the house rules for device code by syntax tree; prints file:line: rule, and exits with 1 if one is broken.
+
+Kernels: named `foo_kernel`; at most 16 parameters, each annotated, none with a default, in groups headed `# Scene:`,
+`# State:`, `# In:`, `# Out:`, in this order; arrays that are written end in `_out` or `_inout`, and no others; a docstring.
+Kernel modules: a docstring, no backward passes, no postponed annotations, no imports but Warp and other kernels.
+Everywhere: `wp.launch` in synpick_warp/stages only.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+MOST_PARAMETERS = 16
+GROUPS = ("Scene", "State", "In", "Out")
+WRITTEN = ("_out", "_inout")
+KERNEL_PACKAGE = "synpick_warp.kernels"
+LAUNCHING = "synpick_warp/stages"
+HOST_FOLDERS = ("synpick_warp", "scenes", "configs", "tools")
+_GROUP = re.compile(rf"\s*#\s*({'|'.join(GROUPS)}):")
+_WRITES_FIRST = re.compile(r"wp\.(atomic_\w+|tile_store|tile_atomic_\w+)")
+
+Fault = tuple[Path, int, str]
+Writes = dict[str, set[int]]
+"""Name of a device function -> positions of the parameters it writes to."""
+
+
+def main(root: Path) -> int:
+    """Check the tree under `root`; return the exit code."""
+    modules = {path: ast.parse(path.read_text()) for path in sorted((root / "kernels").rglob("*.py"))}
+    writes = function_writes(modules)
+    faults = [fault for path, tree in modules.items() for fault in check_module(path, tree, writes)]
+    faults += [fault for folder in HOST_FOLDERS for fault in check_launches(root, folder)]
+    for path, line, rule in faults:
+        print(f"{path.relative_to(root)}:{line}: {rule}")
+    return 1 if faults else 0
+
+
+def check_module(path: Path, tree: ast.Module, writes: Writes) -> Iterator[Fault]:
+    """Faults of one kernel module."""
+    if ast.get_docstring(tree) is None:
+        yield path, 1, "a kernel module needs a docstring"
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    kernels = [function for function in functions if decorated(function, "kernel")]
+    if kernels and not any(switches_backward_off(node) for node in tree.body):
+        yield path, 1, 'missing: wp.set_module_options({"enable_backward": False})'
+    for line, name in imports(tree):
+        if name == "__future__.annotations":
+            yield path, line, "Warp reads annotations: no `from __future__ import annotations` here"
+        elif name.split(".")[0] != "warp" and not name.startswith(KERNEL_PACKAGE):
+            yield path, line, f"kernels import Warp and other kernels only, not {name}"
+    lines = path.read_text().splitlines()
+    for kernel in kernels:
+        for line, rule in check_kernel(kernel, lines, writes):
+            yield path, line, rule
+    for function in functions:
+        if function.name.endswith("_kernel") and function not in kernels:
+            yield path, function.lineno, f"{function.name} is no kernel"
+
+
+def check_kernel(kernel: ast.FunctionDef, lines: list[str], writes: Writes) -> Iterator[tuple[int, str]]:
+    """Faults of one kernel as (line, rule)."""
+    parameters = kernel.args.args
+    if not kernel.name.endswith("_kernel"):
+        yield kernel.lineno, f"the kernel {kernel.name} must end in _kernel"
+    if ast.get_docstring(kernel) is None:
+        yield kernel.lineno, f"{kernel.name} needs a docstring: its law, with units"
+    if len(parameters) > MOST_PARAMETERS:
+        yield kernel.lineno, f"{kernel.name} has {len(parameters)} parameters; at most {MOST_PARAMETERS}: use a struct, or two kernels"
+    others = kernel.args
+    if others.defaults or others.kw_defaults or others.kwonlyargs or others.posonlyargs or others.vararg or others.kwarg:
+        yield kernel.lineno, f"{kernel.name} may have plain parameters without defaults only"
+    yield from check_groups(kernel, lines)
+    surely, perhaps = written_names(kernel, writes)
+    for parameter in parameters:
+        name = parameter.arg
+        if parameter.annotation is None:
+            yield parameter.lineno, f"{name} needs an annotation"
+        if name in surely and not name.endswith(WRITTEN):
+            yield parameter.lineno, f"{kernel.name} writes to {name}; its name must end in _out or _inout"
+        if name.endswith(WRITTEN) and name not in surely | perhaps:
+            yield parameter.lineno, f"{kernel.name} never writes to {name}"
+
+
+def check_groups(kernel: ast.FunctionDef, lines: list[str]) -> Iterator[tuple[int, str]]:
+    """Every parameter stands under a group's comment, groups come in order, and `_out` parameters stand under Out."""
+    group = ""
+    line = kernel.lineno
+    for parameter in kernel.args.args:
+        for number in range(line, parameter.lineno + 1):
+            match = _GROUP.match(lines[number - 1])
+            if match:
+                if group and GROUPS.index(match[1]) <= GROUPS.index(group):
+                    yield number, f"groups come once, in the order {', '.join(GROUPS)}"
+                group = match[1]
+        line = parameter.lineno
+        if not group:
+            yield parameter.lineno, f"{parameter.arg} stands under no group; head it by a comment: # Scene:, # State:, # In: or # Out:"
+        elif parameter.arg.endswith("_out") != (group == "Out") and not parameter.arg.endswith("_inout"):
+            yield parameter.lineno, f"{parameter.arg} stands under # {group}:; what ends in _out belongs under # Out:, and nothing else"
+
+
+def written_names(function: ast.FunctionDef, writes: Writes) -> tuple[set[str], set[str]]:
+    """Names that the function surely writes through, and names that it hands to functions, which may write, too."""
+    surely: set[str] = set()
+    perhaps: set[str] = set()
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign | ast.AugAssign):
+            for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
+                if isinstance(target, ast.Subscript | ast.Attribute):
+                    surely.add(base_name(target))
+        elif isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            if _WRITES_FIRST.fullmatch(called) and node.args:
+                surely.add(base_name(node.args[0]))
+            elif not called.startswith("wp."):
+                perhaps |= {base_name(argument) for argument in node.args}
+                surely |= {base_name(node.args[position]) for position in writes.get(called, ()) if position < len(node.args)}
+    return surely, perhaps
+
+
+def function_writes(modules: dict[Path, ast.Module]) -> Writes:
+    """What each device function writes to, also by way of others."""
+    nodes = [node for tree in modules.values() for node in ast.walk(tree)]
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef) and decorated(node, "func")]
+    writes: Writes = {function.name: set() for function in functions}
+    changed = True
+    while changed:
+        changed = False
+        for function in functions:
+            surely, _ = written_names(function, writes)
+            arrays = {
+                position
+                for position, parameter in enumerate(function.args.args)
+                if parameter.arg in surely and parameter.annotation is not None and "array" in ast.unparse(parameter.annotation)
+            }
+            changed = changed or not arrays <= writes[function.name]
+            writes[function.name] |= arrays
+    return writes
+
+
+def check_launches(root: Path, folder: str) -> Iterator[Fault]:
+    """Launches outside the stages."""
+    for path in sorted((root / folder).rglob("*.py")):
+        if path.relative_to(root).as_posix().startswith(LAUNCHING) or path.is_relative_to(root / "synpick_warp" / "kernels"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and re.fullmatch(r"(wp|warp)\.launch(_tiled)?", ast.unparse(node.func)):
+                yield path, node.lineno, f"kernels are launched in {LAUNCHING} only"
+
+
+def decorated(function: ast.FunctionDef, kind: str) -> bool:
+    """Whether the function carries @wp.KIND, with or without arguments."""
+    return any(ast.unparse(mark).split("(")[0] in (f"wp.{kind}", f"warp.{kind}") for mark in function.decorator_list)
+
+
+def switches_backward_off(node: ast.stmt) -> bool:
+    """Whether the statement is wp.set_module_options({"enable_backward": False, ...})."""
+    if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Call):
+        return False
+    call = node.value
+    if ast.unparse(call.func) != "wp.set_module_options" or not call.args or not isinstance(call.args[0], ast.Dict):
+        return False
+    pairs = zip(call.args[0].keys, call.args[0].values, strict=True)
+    return any(ast.unparse(key) == "'enable_backward'" and ast.unparse(value) == "False" for key, value in pairs if key is not None)
+
+
+def imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """(line, full name) of everything imported."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, name.name) for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from ((node.lineno, f"{node.module}.{name.name}") for name in node.names)
+
+
+def base_name(node: ast.expr) -> str:
+    """The variable at the root of a[i].b[j]; empty if there is none."""
+    while isinstance(node, ast.Subscript | ast.Attribute):
+        node = node.value
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(__file__).resolve().parents[2]))

@@ -1,0 +1,1 @@
+"""Reports: measured behaviour of piles, picking and pictures."""
