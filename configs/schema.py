@@ -34,7 +34,9 @@ class Bake:
     """What to make, and where."""
 
     mode: str = setting(
-        "pick", "", "pick: empty the tote; target: dig for what lies lowest; move: stir; mixed: drawn for each episode.",
+        "pick",
+        "",
+        "pick: empty the tote; target: dig for what lies lowest; move: stir; mixed: drawn for each episode.",
         choices=(*MODES, MIXED),
     )
     mix: tuple[float, float, float] = setting((1.0, 1.0, 1.0), "", "With mode mixed: weights of pick, target and move.", low=0.0, high=1000)
@@ -235,8 +237,11 @@ class Sight:
     """How the gripper's side sees: an image of camera 0 without the gripper, and the rules by which it chooses."""
 
     resolution: tuple[int, int] = setting(
-        (1920, 1080), "px", "Width and height of the image; its field of view is cameras.fov across the width, so a flatter one sees less.",
-        low=16, high=8192,
+        (1920, 1080),
+        "px",
+        "Width and height of the image; its field of view is cameras.fov across the width, so a flatter one sees less.",
+        low=16,
+        high=8192,
     )
     views: int = setting(0, "", "Images worked on at once; 0: chosen by device and resolution.", low=0)
     contour_points: int = setting(8192, "", "Room for the points of one contour; more end the episode.", low=16)
@@ -264,7 +269,9 @@ class Suction:
     radius: float = setting(0.01, "m", "Radius of that circle (released).", above=0.0)
     reach: float = setting(0.03, "m", "Length of the rays (paper).", above=0.0)
     surface: str = setting(
-        "hull", "", "What the rays hit: collision hulls, on which the cup rests, or the visual mesh, where an open pitcher is open.",
+        "hull",
+        "",
+        "What the rays hit: collision hulls, on which the cup rests, or the visual mesh, where an open pitcher is open.",
         choices=("hull", "mesh"),
     )
     tolerated_misses: int = setting(0, "", "A seal is good if no more rays miss (paper: 0; released: 2).", low=0)
@@ -298,12 +305,17 @@ class Render:
         0, "px", "With mode fast: paths start from the middles of cells so wide; 0: as many as leave at least 384 across.", low=0, high=64
     )
     cell_paths: int = setting(
-        0, "", "With mode fast: paths a cell; powers of two are spread most evenly; 0: 2, or 1 if more than 480 cells lie across.",
-        low=0, high=1024,
+        0,
+        "",
+        "With mode fast: paths a cell; powers of two are spread most evenly; 0: 2, or 1 if more than 480 cells lie across.",
+        low=0,
+        high=1024,
     )
     antialias: bool = setting(True, "", "With mode fast: a pixel where surfaces meet mixes their colours; reference always does.")
     tone: str = setting(
-        SHOULDER, "", "shoulder: linear up to 0.6, highlights compressed; linear: cut off at 1; filmic: ACES' curve, middle grey kept.",
+        SHOULDER,
+        "",
+        "shoulder: linear up to 0.6, highlights compressed; linear: cut off at 1; filmic: ACES' curve, middle grey kept.",
         choices=TONES,
     )
     table: bool = setting(True, "", "A table under the tote; without it the light map shows.")

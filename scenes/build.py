@@ -172,10 +172,20 @@ def _add_gripper(world: newton.ModelBuilder, config: Config, shape: newton.Model
     gripper = config.gripper
     dof = newton.ModelBuilder.JointDofConfig
     free = {"limit_lower": -np.inf, "limit_upper": np.inf, "armature": 0.0}
-    finger = world.add_link(mass=gripper.finger_mass, inertia=wp.mat33(np.diag(rod_inertia(gripper.finger_mass, gripper.finger_length))),
-                            com=wp.vec3(0.0, 0.0, gripper.finger_length / 2), lock_inertia=True, label="finger")
-    cup = world.add_link(mass=gripper.cup_mass, inertia=wp.mat33(np.diag(rod_inertia(gripper.cup_mass, gripper.cup_length))),
-                         com=wp.vec3(0.0, 0.0, -gripper.cup_length / 2), lock_inertia=True, label="cup")
+    finger = world.add_link(
+        mass=gripper.finger_mass,
+        inertia=wp.mat33(np.diag(rod_inertia(gripper.finger_mass, gripper.finger_length))),
+        com=wp.vec3(0.0, 0.0, gripper.finger_length / 2),
+        lock_inertia=True,
+        label="finger",
+    )
+    cup = world.add_link(
+        mass=gripper.cup_mass,
+        inertia=wp.mat33(np.diag(rod_inertia(gripper.cup_mass, gripper.cup_length))),
+        com=wp.vec3(0.0, 0.0, -gripper.cup_length / 2),
+        lock_inertia=True,
+        label="cup",
+    )
     axes = [dof(axis=axis, **free) for axis in (newton.Axis.X, newton.Axis.Y, newton.Axis.Z)]
     slide = world.add_joint_d6(-1, finger, linear_axes=axes)
     limit = np.radians(gripper.tilt_limit)

@@ -216,17 +216,19 @@ class AttemptLog:
             raise ValueError(f"attempt {number} of episode {running.episode} ends, but none that is followed has that number")
         seen = outcome is not Outcome.NOTHING_SEEN
         hits = _number(report, "hits", world) if seen else 0
-        running.attempts.append(AttemptRecord(
-            **begun,
-            end_frame=_number(report, "frame", world),
-            outcome=outcome,
-            rays=self.rays,
-            hits=hits,
-            good_seal=self.rays - hits <= self.tolerated_misses,
-            caught=_instances(_number(report, "caught", world)) if seen else (),
-            picked=_instances(_number(report, "held", world)),
-            load=tuple(running.load),
-        ))  # fmt: skip
+        running.attempts.append(
+            AttemptRecord(
+                **begun,
+                end_frame=_number(report, "frame", world),
+                outcome=outcome,
+                rays=self.rays,
+                hits=hits,
+                good_seal=self.rays - hits <= self.tolerated_misses,
+                caught=_instances(_number(report, "caught", world)) if seen else (),
+                picked=_instances(_number(report, "held", world)),
+                load=tuple(running.load),
+            )
+        )
         running.begun = None
 
     def _sight(self, report: TickReport, world: int) -> SightRecord:

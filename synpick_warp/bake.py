@@ -66,9 +66,7 @@ class Factory:
     log: AttemptLog
 
 
-def build_factory(
-    config: Config, progress: Progress, episodes: Sequence[int] | None = None, records_physics: bool = False
-) -> Factory:
+def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | None = None, records_physics: bool = False) -> Factory:
     """Load what the settings name and put it on the device.
 
     Args:
@@ -158,9 +156,14 @@ class _Run:
     """The ticks of a bake."""
 
     def __init__(
-        self, config: Config, factory: Factory, exporters: Exporters, whole: Callable[[EpisodeEnd], None], summary: BakeSummary,
+        self,
+        config: Config,
+        factory: Factory,
+        exporters: Exporters,
+        whole: Callable[[EpisodeEnd], None],
+        summary: BakeSummary,
         progress: Progress,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.config, self.factory, self.exporters = config, factory, exporters
         self.whole, self.summary, self.progress = whole, summary, progress
         self.meter = _Meter(config, summary, progress)
@@ -236,8 +239,12 @@ class _Meter:
             share = summary.views / ((summary.total - summary.resumed) * self.cameras * frames)
             left = (1.0 / share - 1.0) * elapsed if share < 1.0 else None
         self.progress.update(
-            episodes_done=len(summary.episodes), episodes=summary.total, worlds_active=active, views=summary.views,
-            views_per_s=summary.views / elapsed if elapsed > 0.0 else 0.0, seconds_left=left,
+            episodes_done=len(summary.episodes),
+            episodes=summary.total,
+            worlds_active=active,
+            views=summary.views,
+            views_per_s=summary.views / elapsed if elapsed > 0.0 else 0.0,
+            seconds_left=left,
         )
 
 

@@ -97,9 +97,18 @@ def episode_row(config: Config, report: TickReport, world: int, record: EpisodeR
     episode, redraw, frame, ending = (int(report.column(name)[world]) for name in ("episode", "redraw", "frame", "ending"))
     tick = config.physics.step * config.physics.steps_per_tick
     return EpisodeRow(
-        episode, redraw, Ending(ending), frame + 1, round(max(0, frame) * tick, PLACES),
-        record.mode, record.objects, len(record.attempts), record.picked, record.lost, record.left,
-    )  # fmt: skip
+        episode,
+        redraw,
+        Ending(ending),
+        frame + 1,
+        round(max(0, frame) * tick, PLACES),
+        record.mode,
+        record.objects,
+        len(record.attempts),
+        record.picked,
+        record.lost,
+        record.left,
+    )
 
 
 def is_redrawn(config: Config, row: EpisodeRow) -> bool:

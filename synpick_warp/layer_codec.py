@@ -145,31 +145,46 @@ def _decode_scene_flow(image: np.ndarray) -> np.ndarray:
 
 _LAYERS = {
     "normals": _Layer(
-        _encode_normals, _decode_normals, (3,), "uint16",
+        _encode_normals,
+        _decode_normals,
+        (3,),
+        "uint16",
         f"unit normals towards the camera, in its axes; red, green and blue are {_ZERO} + {_NORMAL_STEPS} times x, y and z; 0, 0, 0: no "
         "surface. They are interpolated between vertices, as those of the picture.",
     ),
     "albedo": _Layer(_same, _same, (3,), "uint8", "base colour without light, sRGB; black where no surface is."),
     "nocs": _Layer(
-        _encode_nocs, _decode_nocs, (3,), "uint16",
+        _encode_nocs,
+        _decode_nocs,
+        (3,),
+        "uint16",
         f"where on its object the pixel lies: {_LAST} times ((p - c) / d + 0.5), with p in the model's axes, c = min + size / 2 and "
         "d = |size| from models_info.json; so p = c + d (value - 0.5). 0, 0, 0: no instance.",
     ),
     "classes": _Layer(_same, _same, (), "uint16", "obj_id; 0: no instance."),
     "flow": _Layer(
-        _encode_flow, _decode_flow, (3,), "uint16",
+        _encode_flow,
+        _decode_flow,
+        (3,),
+        "uint16",
         "optical flow to the image before this one, in KITTI's format: the pixel's surface point was then (red - "
         f"{_ZERO}) / {_FLOW_STEPS} columns to the right and (green - {_ZERO}) / {_FLOW_STEPS} rows down, hidden or not. Blue 0: unknown: "
         f"no surface, the scene's first image, what was not in the scene then, or {_ZERO // _FLOW_STEPS} pixels and more.",
     ),
     "scene_flow": _Layer(
-        _encode_scene_flow, _decode_scene_flow, (3,), "uint16",
+        _encode_scene_flow,
+        _decode_scene_flow,
+        (3,),
+        "uint16",
         f"the same as displacement in the camera's axes: red, green and blue minus {_ZERO}, times {1e3 * _SCENE_FLOW_STEP:g} mm; 0, 0, 0: "
         f"unknown, or {_ZERO * _SCENE_FLOW_STEP:.3f} m and more.",
     ),
     "depth_sensor": _Layer(
-        _same, _same, (), "uint16",
+        _same,
+        _same,
+        (),
+        "uint16",
         "what a depth camera might measure (`depth_sensor` in config.toml): noise, steps and holes, which are 0; counts as in `depth/`.",
     ),
-}  # fmt: skip
+}
 """Keys are `configs.schema.LAYERS`, in that order."""

@@ -29,9 +29,27 @@ NAMES = (
 )
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
-    WorldState, AttemptState, SealState, LastFrame, Sighting, Plan, WorldStatus, Snapshot, ViewBuffers, BodyArrays, HitArrays,
-    PictureArrays, EdgeBuffers, EdgeScratch, GuideArrays, GatheredArrays, ShareArrays, ShadowArrays, Edges, MarkArrays,
-]  # fmt: skip
+    WorldState,
+    AttemptState,
+    SealState,
+    LastFrame,
+    Sighting,
+    Plan,
+    WorldStatus,
+    Snapshot,
+    ViewBuffers,
+    BodyArrays,
+    HitArrays,
+    PictureArrays,
+    EdgeBuffers,
+    EdgeScratch,
+    GuideArrays,
+    GatheredArrays,
+    ShareArrays,
+    ShadowArrays,
+    Edges,
+    MarkArrays,
+]
 LOOKING = [LookArrays, SightScratch, VoteArrays, CycleArrays]
 LAYERS = [LayerBuffers, MotionArrays]
 DECLARED = MOVING + LOOKING + LAYERS

@@ -60,12 +60,13 @@ def see_a_pair(world: World) -> None:
 PAIR = SightRecord(
     (64, 48),
     (
-        InstanceSight(1, 21, 120, 0.333333, (10.0, 20.0), (12.3457, 21.0), (11.1728, 20.5), (5.0, 4.47214, 0.0), (11, 21), 1.98765,
-                      (3,), (0, 3)),
+        InstanceSight(
+            1, 21, 120, 0.333333, (10.0, 20.0), (12.3457, 21.0), (11.1728, 20.5), (5.0, 4.47214, 0.0), (11, 21), 1.98765, (3,), (0, 3)
+        ),
         InstanceSight(3, 3, 0, 0.0, (-1.0, -1.0), (-1.0, -1.0), (-1.0, -1.0), (0.0, 0.0, 0.0), (-1, -1), 0.0, (), ()),
     ),
     ((1, 3, 12.3), (3, 1, 0.1)),
-)  # fmt: skip
+)
 
 
 def pick_one(world: World) -> Ticks:
@@ -77,9 +78,14 @@ def pick_one(world: World) -> Ticks:
     see_a_pair(world)
     yield
     yield from world.attempt(
-        0, [0.0, 5.00004, 4.99996, 3.5], outcome=Outcome.TARGET_PICKED, hits=RAYS - 1, caught=bits(1, 3), held=bits(1, 3),
+        0,
+        [0.0, 5.00004, 4.99996, 3.5],
+        outcome=Outcome.TARGET_PICKED,
+        hits=RAYS - 1,
+        caught=bits(1, 3),
+        held=bits(1, 3),
         entry=[-1] * ROOM,
-    )  # fmt: skip
+    )
     world.over(Ending.EMPTIED)
     yield
 
@@ -96,10 +102,26 @@ def picked(device) -> EpisodeRecord:
 def test_a_record_says_all_that_was_seen_and_done(picked):
     (attempt,) = picked.attempts
     assert attempt == AttemptRecord(
-        episode=7, attempt=0, mode="target", frame=0, end_frame=7, outcome=Outcome.TARGET_PICKED, target=1, object_id=21,
-        point=(0.1, -0.2, 0.034568), normal=(0.0, 0.6, 0.8), yaw=-1.23457, tilt=0.0, rays=RAYS, hits=RAYS - 1, good_seal=True,
-        caught=(1, 3), picked=(1, 3), load=(0.0, 5.0, 5.0, 3.5), sight=PAIR,
-    )  # fmt: skip
+        episode=7,
+        attempt=0,
+        mode="target",
+        frame=0,
+        end_frame=7,
+        outcome=Outcome.TARGET_PICKED,
+        target=1,
+        object_id=21,
+        point=(0.1, -0.2, 0.034568),
+        normal=(0.0, 0.6, 0.8),
+        yaw=-1.23457,
+        tilt=0.0,
+        rays=RAYS,
+        hits=RAYS - 1,
+        good_seal=True,
+        caught=(1, 3),
+        picked=(1, 3),
+        load=(0.0, 5.0, 5.0, 3.5),
+        sight=PAIR,
+    )
     assert (picked.mode, picked.objects, picked.picked, picked.lost, picked.left) == ("target", 2, 2, 0, 0)
 
 
@@ -109,9 +131,27 @@ def test_a_line_is_json_with_the_keys_of_the_format(picked):
     assert line.count("\n") == 1
     record = json.loads(line)
     assert list(record) == [
-        "episode", "attempt", "mode", "frame", "end_frame", "outcome", "sentence", "target", "object_id", "point", "normal", "yaw", "tilt",
-        "rays", "hits", "good_seal", "caught", "picked", "load", "sight",
-    ]  # fmt: skip
+        "episode",
+        "attempt",
+        "mode",
+        "frame",
+        "end_frame",
+        "outcome",
+        "sentence",
+        "target",
+        "object_id",
+        "point",
+        "normal",
+        "yaw",
+        "tilt",
+        "rays",
+        "hits",
+        "good_seal",
+        "caught",
+        "picked",
+        "load",
+        "sight",
+    ]
     assert (record["outcome"], record["sentence"]) == ("target_picked", Outcome.TARGET_PICKED.sentence)
     assert (record["point"], record["caught"], record["load"]) == ([0.1, -0.2, 0.034568], [1, 3], [0.0, 5.0, 5.0, 3.5])
     assert record["good_seal"] is True
@@ -119,10 +159,19 @@ def test_a_line_is_json_with_the_keys_of_the_format(picked):
     sight = record["sight"]
     assert (sight["resolution"], sight["votes"]) == ([64, 48], [[1, 3, 12.3], [3, 1, 0.1]])
     assert sight["instances"][0] == {
-        "instance": 1, "object_id": 21, "visible": 120, "share": 0.333333, "pole": [10.0, 20.0], "centroid": [12.3457, 21.0],
-        "middle": [11.1728, 20.5], "distances": [5.0, 4.47214, 0.0], "suction": [11, 21], "depth": 1.98765, "above": [3],
+        "instance": 1,
+        "object_id": 21,
+        "visible": 120,
+        "share": 0.333333,
+        "pole": [10.0, 20.0],
+        "centroid": [12.3457, 21.0],
+        "middle": [11.1728, 20.5],
+        "distances": [5.0, 4.47214, 0.0],
+        "suction": [11, 21],
+        "depth": 1.98765,
+        "above": [3],
         "all_above": [0, 3],
-    }  # fmt: skip
+    }
 
 
 def test_explain_reads_what_is_written(picked, tmp_path):
@@ -243,9 +292,17 @@ def by_number(found: dict[tuple[int, int], EpisodeRecord]) -> dict[int, EpisodeR
 
 def test_every_attempt_has_its_outcome_once(mixed):
     attempts = by_number(mixed)[5].attempts
-    assert [(one.attempt, one.outcome) for one in attempts] == list(enumerate((
-        Outcome.TARGET_PICKED, Outcome.DROPPED, Outcome.OTHER_PICKED, Outcome.NOTHING_CAUGHT, Outcome.NOTHING_SEEN,
-    )))  # fmt: skip
+    assert [(one.attempt, one.outcome) for one in attempts] == list(
+        enumerate(
+            (
+                Outcome.TARGET_PICKED,
+                Outcome.DROPPED,
+                Outcome.OTHER_PICKED,
+                Outcome.NOTHING_CAUGHT,
+                Outcome.NOTHING_SEEN,
+            )
+        )
+    )
     # An attempt begins in the frame in which the one before ended.
     assert [one.frame for one in attempts] == [0, 6, 11, 18, 23]
     assert [one.end_frame for one in attempts] == [6, 11, 18, 23, 24]
@@ -380,8 +437,13 @@ def test_worlds_do_not_disturb_each_other(device, plans):
 
 @pytest.mark.parametrize(
     ("mode", "mix", "expected"),
-    [("pick", [0, 0, 1], True), ("target", [0, 0, 1], True), ("move", [1, 1, 1], False), ("mixed", [0, 0, 1], False),
-     ("mixed", [0, 2, 1], True)],
-)  # fmt: skip
+    [
+        ("pick", [0, 0, 1], True),
+        ("target", [0, 0, 1], True),
+        ("move", [1, 1, 1], False),
+        ("mixed", [0, 0, 1], False),
+        ("mixed", [0, 2, 1], True),
+    ],
+)
 def test_which_bakes_may_pick(mode, mix, expected):
     assert may_pick(settings(bake__mode=mode, bake__mix=mix)) is expected

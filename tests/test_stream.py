@@ -151,7 +151,12 @@ def test_what_a_batch_says_of_its_views(device):
     assert ids.min() == -1
     assert {made[name].dtype.name for name in ("episode", "camera", "frame", "object_id", "pixels", "boxes")} == {"int32"}
     assert [made[name].dtype.name for name in ("time", "pose", "color", "depth", "instance", "amodal")] == [
-        "float64", "float32", "uint8", "uint16", "uint8", "uint32"
+        "float64",
+        "float32",
+        "uint8",
+        "uint16",
+        "uint8",
+        "uint32",
     ]
     assert made["light_name"].tolist() == ["even"] * 3 + ["lamp"] * 3
     np.testing.assert_allclose(made["light_turn"], 0.5 * world)
@@ -170,12 +175,15 @@ def test_what_a_tick_says_of_its_live_worlds():
     known = dataclasses.replace(
         known,
         snapshot=SimpleNamespace(
-            fixture_pose=fixtures, fixture_visible=np.arange(15).reshape(WORLDS, 3), light=numbers, light_turn=numbers / 2,
+            fixture_pose=fixtures,
+            fixture_visible=np.arange(15).reshape(WORLDS, 3),
+            light=numbers,
+            light_turn=numbers / 2,
             light_exposure=-numbers,
         ),
         tick={"speed": numbers[:, None]},
         steps={"force": np.repeat(numbers[:, None], 4, axis=1)},
-    )  # fmt: skip
+    )
     batch = tick_batch(known, OBJECT_IDS, 0.25)
     live = [1, 4]
     assert len(batch) == 2

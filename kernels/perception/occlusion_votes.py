@@ -57,9 +57,7 @@ def beside(point: wp.vec2i, normal: wp.vec2, offset: float, grid: ImageGrid) -> 
 
 
 @wp.func
-def is_in_reach(
-    q: wp.vec2i, reach: float, extent: wp.vec4i, contour: wp.array3d[wp.vec2i], view: int, instance: int, length: int
-) -> bool:
+def is_in_reach(q: wp.vec2i, reach: float, extent: wp.vec4i, contour: wp.array3d[wp.vec2i], view: int, instance: int, length: int) -> bool:
     """Whether max over c of |c - q| ≤ reach [px], c being the points of an instance's contour; true of a contour without points.
 
     A contour touches each side of its box, so its farthest point is no nearer than the farthest side and no farther than the farthest

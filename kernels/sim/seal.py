@@ -206,8 +206,9 @@ def hold_objects_kernel(
             rate = wp.spatial_bottom(body_qd[body])
             slip = velocity - wp.spatial_top(body_qd[body]) - wp.cross(rate, arm)
             turn = seal_turn(wp.transform_get_rotation(tip), wp.transform_get_rotation(caught), suction)
-            wrench = seal_wrench(place - wp.transform_get_translation(caught), turn, slip, spin - rate, sum_responses(own, gripper),
-                                 suction)
+            wrench = seal_wrench(
+                place - wp.transform_get_translation(caught), turn, slip, spin - rate, sum_responses(own, gripper), suction
+            )
             load = seal_load(wrench.force, axis)
             first = dof + layout.gripper_dofs + 6 * s
             if load > limit[world]:

@@ -164,9 +164,12 @@ def tin(ring: np.ndarray, height: float, label_image: np.ndarray, ends: dict[str
     upper = lower[::-1] * (1, 1, -1)
     body = np.stack([lower[-1], *(level(narrow, z) for z in np.linspace(-half, half, 5)[1:-1]), upper[0]])
     patch = join(
-        cap(lower[0], at["bottom"], below=True), loft(lower, at["metal"]), loft(body, at["label"]), loft(upper, at["metal"]),
+        cap(lower[0], at["bottom"], below=True),
+        loft(lower, at["metal"]),
+        loft(body, at["label"]),
+        loft(upper, at["metal"]),
         cap(upper[-1], at["top"]),
-    )  # fmt: skip
+    )
     return patch, texture
 
 

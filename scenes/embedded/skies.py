@@ -24,9 +24,13 @@ def skies() -> tuple[LightMap, ...]:
     """The embedded light maps, sorted by name; always the same."""
     view = directions(HEIGHT)
     makers = {
-        "low_sun": _low_sun, "mixed_lamps": _mixed_lamps, "overcast": _overcast,
-        "softboxes": _softboxes, "warehouse": _warehouse, "window": _window,
-    }  # fmt: skip
+        "low_sun": _low_sun,
+        "mixed_lamps": _mixed_lamps,
+        "overcast": _overcast,
+        "softboxes": _softboxes,
+        "warehouse": _warehouse,
+        "window": _window,
+    }
     return tuple(LightMap(name, np.maximum(make(view), 0.0).astype(np.float32)) for name, make in sorted(makers.items()))
 
 

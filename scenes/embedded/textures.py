@@ -48,9 +48,11 @@ def pack(images: dict[str, np.ndarray], width: int) -> tuple[np.ndarray, dict[st
         sheet[top : top + padded.shape[0], left : left + padded.shape[1]] = padded
         right, bottom = left + padded.shape[1] - PADDING, top + padded.shape[0] - PADDING
         rects[name] = (
-            (left + PADDING) / sheet.shape[1], 1 - bottom / sheet.shape[0],
-            right / sheet.shape[1], 1 - (top + PADDING) / sheet.shape[0],
-        )  # fmt: skip
+            (left + PADDING) / sheet.shape[1],
+            1 - bottom / sheet.shape[0],
+            right / sheet.shape[1],
+            1 - (top + PADDING) / sheet.shape[0],
+        )
     return sheet, rects
 
 

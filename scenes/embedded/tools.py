@@ -49,25 +49,34 @@ def banana() -> Shape:
 def drill() -> Shape:
     """A cordless drill, lying on its side."""
     images = {
-        "motor": _drill_label(), "black": paint.plain(BLACK, 1501), "orange": paint.plain(ORANGE, 1502),
+        "motor": _drill_label(),
+        "black": paint.plain(BLACK, 1501),
+        "orange": paint.plain(ORANGE, 1502),
         "steel": paint.brushed(128, 64, STEEL, 1503),
-    }  # fmt: skip
+    }
     texture, at = paint.pack(images, 1024)
     motor = [(0.0285, -0.078), (0.0285, -0.05), (0.0285, -0.02), (0.0285, 0.0)]
     tail = [(0.014, -0.092), (0.022, -0.0905), (0.027, -0.0850), (0.0285, -0.078)]
     nose = [(0.0285, 0.0), (0.0275, 0.018), (0.0235, 0.034), (0.021, 0.035)]
     parts = [lathe(part, 40) for part in (tail, motor, nose)]
     housing = join(
-        cap(parts[0][0], at["black"], below=True), loft(parts[0], at["black"]), loft(parts[1], at["motor"]),
-        loft(parts[2], at["black"]), cap(parts[2][-1], at["black"]),
-    )  # fmt: skip
+        cap(parts[0][0], at["black"], below=True),
+        loft(parts[0], at["black"]),
+        loft(parts[1], at["motor"]),
+        loft(parts[2], at["black"]),
+        cap(parts[2][-1], at["black"]),
+    )
     chuck = solid(
         lathe([(0.0200, 0.030), (0.0212, 0.033), (0.0212, 0.055), (0.0190, 0.058), (0.0120, 0.087), (0.0085, 0.092)], 40), at["steel"]
     )
     grip = [
-        (-0.040, 0.040, 0.034, -0.072), (-0.037, 0.036, 0.032, -0.050), (-0.035, 0.036, 0.033, -0.020),
-        (-0.033, 0.039, 0.035, 0.010), (-0.031, 0.046, 0.038, 0.032), (-0.030, 0.052, 0.040, 0.052),
-    ]  # fmt: skip
+        (-0.040, 0.040, 0.034, -0.072),
+        (-0.037, 0.036, 0.032, -0.050),
+        (-0.035, 0.036, 0.033, -0.020),
+        (-0.033, 0.039, 0.035, 0.010),
+        (-0.031, 0.046, 0.038, 0.032),
+        (-0.030, 0.052, 0.040, 0.052),
+    ]
     handle = np.stack([at_height(ellipse(width, depth, 32, 2.6) + np.array([x, 0.0]), z) for x, width, depth, z in grip])
     battery = rounded_box((0.114, 0.0565, 0.030), 0.006, dict.fromkeys(BOX_FACES, at["black"])).moved(-0.034, 0.0, -0.0787)
     foot = rounded_box((0.098, 0.050, 0.012), 0.004, dict.fromkeys(BOX_FACES, at["orange"])).moved(-0.036, 0.0, -0.0600)
@@ -126,9 +135,12 @@ def marker() -> Shape:
     lid = [(0.0094, 0.0140), (0.0103, 0.0145), (0.0103, 0.0200), (0.0100, 0.0215), (0.0100, 0.0450), (0.0093, 0.0590), (0.0080, 0.0605)]
     rings = [lathe(part, 32) for part in (plug, barrel, lid)]
     patch = join(
-        cap(rings[0][0], at["plug"], below=True), loft(rings[0], at["plug"]), loft(rings[1], at["bands"]),
-        loft(rings[2], at["cap"]), cap(rings[2][-1], at["cap"]),
-    )  # fmt: skip
+        cap(rings[0][0], at["plug"], below=True),
+        loft(rings[0], at["plug"]),
+        loft(rings[1], at["bands"]),
+        loft(rings[2], at["cap"]),
+        cap(rings[2][-1], at["cap"]),
+    )
     return patch.turned("x", -90.0), texture
 
 
@@ -153,8 +165,12 @@ def _clamp(length: float, width: float, depth: float, seed: int) -> Shape:
     widths = [0.098 * width * share for share in (0.6, 1.0, 1.0, 1.2, 1.15, 0.95, 0.75, 0.6)]
     rings = _bar_rings(spine, 0.0, depths, widths)
     sleeve = len(rings) * 2 // 5
-    arm = join(cap(rings[0], at["orange"], below=True), loft(rings[: sleeve + 1], at["orange"]), loft(rings[sleeve:], at["black"]),
-               cap(rings[-1], at["black"]))  # fmt: skip
+    arm = join(
+        cap(rings[0], at["orange"], below=True),
+        loft(rings[: sleeve + 1], at["orange"]),
+        loft(rings[sleeve:], at["black"]),
+        cap(rings[-1], at["black"]),
+    )
     pad = rounded_box((0.055 * width, 0.11 * length, 0.75 * depth), 0.0022, dict.fromkeys(BOX_FACES, at["orange"]))
     half = join(arm, pad.moved(-0.036 * width, 0.445 * length, 0.0))
     coil = [(0.055 * width, -depth / 2), (0.065 * width, -0.47 * depth), (0.065 * width, 0.47 * depth), (0.055 * width, depth / 2)]

@@ -31,9 +31,13 @@ def bowl() -> Shape:
     texture, at = paint.pack(images, 128)
     rings = [lathe(part, SIDES) for part in (outside, upper, rim, inside)]
     patch = join(
-        cap(rings[0][0], at["dark"], below=True), loft(rings[0], at["red"]), loft(rings[1], at["cream"]),
-        loft(rings[2], at["dark"]), loft(rings[3], at["cream"]), cap(rings[3][-1], at["cream"]),
-    )  # fmt: skip
+        cap(rings[0][0], at["dark"], below=True),
+        loft(rings[0], at["red"]),
+        loft(rings[1], at["cream"]),
+        loft(rings[2], at["dark"]),
+        loft(rings[3], at["cream"]),
+        cap(rings[3][-1], at["cream"]),
+    )
     return patch, texture
 
 
@@ -48,9 +52,13 @@ def mug() -> Shape:
     texture, at = paint.pack(images, 1024)
     rings = [lathe(part, SIDES) for part in (foot, outside, rim, inside)]
     body = join(
-        cap(rings[0][0], at["cream"], below=True), loft(rings[0], at["blue"]), loft(rings[1], at["print"]),
-        loft(rings[2], at["blue"]), loft(rings[3], at["cream"]), cap(rings[3][-1], at["cream"]),
-    )  # fmt: skip
+        cap(rings[0][0], at["cream"], below=True),
+        loft(rings[0], at["blue"]),
+        loft(rings[1], at["print"]),
+        loft(rings[2], at["blue"]),
+        loft(rings[3], at["cream"]),
+        cap(rings[3][-1], at["cream"]),
+    )
     return join(body, _handle((0.0446, 0.0247, 0.0255), (0.013, 0.0085), at["blue"])), texture
 
 
@@ -65,9 +73,13 @@ def pitcher() -> Shape:
     texture, at = paint.pack(images, 1024)
     rings = [_with_spout(lathe(part, SIDES)) for part in (foot, outside, rim, inside)]
     body = join(
-        cap(rings[0][0], at["blue"], below=True), loft(rings[0], at["blue"]), loft(rings[1], at["scale"]),
-        loft(rings[2], at["blue"]), loft(rings[3], at["blue"]), cap(rings[3][-1], at["blue"]),
-    )  # fmt: skip
+        cap(rings[0][0], at["blue"], below=True),
+        loft(rings[0], at["blue"]),
+        loft(rings[1], at["scale"]),
+        loft(rings[2], at["blue"]),
+        loft(rings[3], at["blue"]),
+        cap(rings[3][-1], at["blue"]),
+    )
     along_wall = 2.56  # the wall leans out by this angle [°]
     handle = _handle((0.0597, 0.030, 0.075), (0.024, 0.011), at["blue"]).turned("y", along_wall).moved(0.0, 0.0, 0.012)
     return join(body, handle), texture

@@ -130,9 +130,7 @@ def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
 
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
     columns = ["episode", "mode", "ending", "redraws", "frames", "time"]
-    cells = [
-        [str(row.episode), row.mode, row.ending.sentence, str(row.redraw), str(row.frames), _duration(row.seconds)] for row in rows
-    ]
+    cells = [[str(row.episode), row.mode, row.ending.sentence, str(row.redraw), str(row.frames), _duration(row.seconds)] for row in rows]
     if any(row.attempts for row in rows):
         columns += ["attempts", "picked", "lost"]
         for row, line in zip(rows, cells, strict=True):

@@ -39,7 +39,14 @@ INPUTS = "inputs"
 FORMAT = 1
 """Of these files."""
 FREE = (
-    "bake.worlds", "bake.episodes", "bake.device", "bake.models", "bake.lights", "bake.writers", "render.views_per_batch", "sight.views",
+    "bake.worlds",
+    "bake.episodes",
+    "bake.device",
+    "bake.models",
+    "bake.lights",
+    "bake.writers",
+    "render.views_per_batch",
+    "sight.views",
 )
 """Settings in which a bake may differ from the one that it goes on with: no episode depends on them. Objects and lights are compared by
 what is in them, not by the name of their folder. A device of another kind computes the same episodes to its own last bits."""

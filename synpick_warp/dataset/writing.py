@@ -34,7 +34,7 @@ from synpick_warp.dataset.manifest import (
     read_record,
     recorded_episodes,
     seems_whole,
-)  # fmt: skip
+)
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 from synpick_warp.exporters.base import Exporter
 from synpick_warp.exporters.registry import Exporters, join

@@ -18,9 +18,22 @@ from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
 
 COUPLED = {
-    "bop.split", "bop.color_format", "bop.depth_scale", "move.height", "move.start_height", "pick.near", "pick.appear_height", "pick.speed",
-    "pick.near_speed", "pick.lift_height", "suction.radius", "gripper.cup_width", "suction.rays", "suction.tolerated_misses",
-    "suction.good_force", "suction.poor_force",
+    "bop.split",
+    "bop.color_format",
+    "bop.depth_scale",
+    "move.height",
+    "move.start_height",
+    "pick.near",
+    "pick.appear_height",
+    "pick.speed",
+    "pick.near_speed",
+    "pick.lift_height",
+    "suction.radius",
+    "gripper.cup_width",
+    "suction.rays",
+    "suction.tolerated_misses",
+    "suction.good_force",
+    "suction.poor_force",
 }
 COUPLED_SECTIONS = {"tote", "cameras", "settle", "physics"}
 """Settings that must fit others: drawn freely they mostly would not."""
@@ -136,9 +149,12 @@ def test_whole_numbers_do_for_floats():
         ("cameras.resolution", [0, 0], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
         ("cameras.resolution", [640], "cameras.resolution is [640] on the command line; allowed: 2 whole numbers in a list [px]"),
         ("cameras.ups", [[1, 2]], "cameras.ups is [[1, 2]] on the command line; allowed: a list of lists of 3 numbers"),
-        ("render.layers", ["flow", "normal"],
-         'render.layers is ["flow", "normal"] on the command line; allowed: any of normals, albedo, nocs, classes, flow, scene_flow, '
-         "depth_sensor; did you mean normals?"),
+        (
+            "render.layers",
+            ["flow", "normal"],
+            'render.layers is ["flow", "normal"] on the command line; allowed: any of normals, albedo, nocs, classes, flow, scene_flow, '
+            "depth_sensor; did you mean normals?",
+        ),
         ("render.layers", "flow", 'render.layers is "flow" on the command line; allowed: a list of strings'),
         ("tote.color", [0.5, 0.5, 1.5], "tote.color is [0.5, 0.5, 1.5] on the command line; allowed: each at least 0, at most 1 [sRGB]"),
     ],
@@ -212,8 +228,10 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
         ({"settle.min_time": 20}, r"settle.max_time is [0-9.]+ by default; allowed: at least settle.min_time, 20 \[s\]"),
         ({"settle.rest_ticks": 1000}, "settle.max_time is [0-9.]+ by default; allowed: at least the time of settle.rest_ticks ticks"),
         ({"move.start_height": 0.01}, r"move.start_height is 0.01 on the command line; allowed: at least move.height, 0.02 \[m\]"),
-        ({"bake.mode": "mixed", "bake.mix": [0, 0, 0]},
-         r"bake.mix is \[0.0, 0.0, 0.0\] on the command line; allowed: at least one weight above 0, with the mode mixed"),
+        (
+            {"bake.mode": "mixed", "bake.mix": [0, 0, 0]},
+            r"bake.mix is \[0.0, 0.0, 0.0\] on the command line; allowed: at least one weight above 0, with the mode mixed",
+        ),
         ({"pick.near": 1.5}, r"pick.appear_height is 1.0 by default; allowed: at least pick.near, 1.5 \[m\]"),
         ({"pick.near_speed": 1.5}, r"pick.speed is 1.0 by default; allowed: at least pick.near_speed, 1.5 \[m/s\]"),
         ({"pick.lift_height": 0.1}, r"pick.lift_height is 0.1 on the command line; allowed: at least the inner height of the tote, 0.195"),
@@ -223,8 +241,10 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
         ({"bop.split": "train"}, 'bop.color_format is "jpg" by default; allowed: png with the split train: '),
         ({"bop.color_format": "png"}, 'bop.color_format is "png" on the command line; allowed: jpg with the split train_pbr: '),
         ({"bop.split": "a/b"}, 'bop.split is "a/b" on the command line; allowed: train, val or test'),
-        ({"render.layers": ["flow", "nocs", "flow"]},
-         r'render.layers is \["flow", "nocs", "flow"\] on .*; allowed: each layer once: \["flow", "nocs"\]'),
+        (
+            {"render.layers": ["flow", "nocs", "flow"]},
+            r'render.layers is \["flow", "nocs", "flow"\] on .*; allowed: each layer once: \["flow", "nocs"\]',
+        ),
         ({"bop.depth_scale": 0.01}, "bop.depth_scale is 0.01 on the command line; allowed: at least 0.03"),
     ],
 )

@@ -79,9 +79,13 @@ def test_a_manifest_comes_back(tmp_path):
 
 @pytest.mark.parametrize(
     ("text", "said"),
-    [("{", "is damaged"), ("[]", "it has no object"), ('{"format": 9}', "has the format 9; this version reads 1"),
-     ('{"format": 1, "settings": {}, "settings_checksum": "0"}', "changed by hand")],
-)  # fmt: skip
+    [
+        ("{", "is damaged"),
+        ("[]", "it has no object"),
+        ('{"format": 9}', "has the format 9; this version reads 1"),
+        ('{"format": 1, "settings": {}, "settings_checksum": "0"}', "changed by hand"),
+    ],
+)
 def test_manifests_that_are_none(tmp_path, text, said):
     (tmp_path / manifest.MANIFEST_FILE).write_text(text)
     with pytest.raises(DatasetError, match=said):

@@ -100,6 +100,7 @@ def test_files_and_room_are_those_of_all():
 
 def test_views_and_records_are_asked_for_if_one_exporter_wants_them():
     assert [(together.records, together.views) for together in (Exporters((Fake,), None), Exporters((Fake, Other), None))] == [
-        (False, False), (True, True),
-    ]  # fmt: skip
+        (False, False),
+        (True, True),
+    ]
     assert [kind.views for kind in exporter_kinds(FORMATS)] == [name in ("bop", "shards") for name in registry.EXPORTERS]

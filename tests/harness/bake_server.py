@@ -46,9 +46,13 @@ class BakeServer:
 
     def __enter__(self) -> BakeServer:
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.harness.bake_server"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            cwd=Path(__file__).parents[2], env=os.environ | {"OMP_NUM_THREADS": "1"},
-        )  # fmt: skip
+            [sys.executable, "-m", "tests.harness.bake_server"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=Path(__file__).parents[2],
+            env=os.environ | {"OMP_NUM_THREADS": "1"},
+        )
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -107,9 +107,10 @@ class FlatFilter:
         """Shares (row, column, 3) by name: of the chosen windows, and after softening."""
         shared = [self.cameras, self.cells, self.guide]
         for kernel, source, rules, out in (
-            (sum_blocks_kernel, self.gathered, (), self.blocks), (choose_windows_kernel, self.blocks, (doubt,), self.chosen),
+            (sum_blocks_kernel, self.gathered, (), self.blocks),
+            (choose_windows_kernel, self.blocks, (doubt,), self.chosen),
             (soften_shares_kernel, self.chosen, (), self.shares),
-        ):  # fmt: skip
+        ):
             wp.launch(kernel, self.count, [*shared, source, self.view_camera, *rules, 0], [out], device=self.device)
         made = {name: getattr(self.shares, name).numpy()[0] for name in ("diffuse", "gloss", "between")}
         return made | {f"chosen_{name}": getattr(self.chosen, name).numpy()[0] for name in ("diffuse", "gloss", "between")}

@@ -108,8 +108,17 @@ class Grasps:
         views, instances = len(toy.placed), toy.room
         scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
         renderer = Renderer(toy.settings(), scene, instances, views)
-        sizes = {"view": views, "world": views, "row": scene.height, "column": scene.width, "instance": instances, "count": 3, "box": 2,
-                 "edge": 4, "point": planning.ROOM}
+        sizes = {
+            "view": views,
+            "world": views,
+            "row": scene.height,
+            "column": scene.width,
+            "instance": instances,
+            "count": 3,
+            "box": 2,
+            "edge": 4,
+            "point": planning.ROOM,
+        }
         self.look, self.sighting = allocate(LookArrays, sizes, device), allocate(Sighting, sizes, device)
         self.grasp = allocate(Plan, sizes, device)
         self.look.world.assign(np.arange(views))
@@ -121,13 +130,15 @@ class Grasps:
         self.look.largest.assign(self.found["largest"])
         self.suction = self.found["suction"]
         many = np.ones(len(toy.entries))
-        self.worlds = KernelWorlds(device, views, volume=many, compound=many * 0, radius=many, instances=instances,
-                                   single_slots=instances, compound_slots=0)
+        self.worlds = KernelWorlds(
+            device, views, volume=many, compound=many * 0, radius=many, instances=instances, single_slots=instances, compound_slots=0
+        )
         filled(self.worlds.scene.sight, {**planning.SIGHT, "normal_window": window})
         self.worlds.scene.pick.tilt_limit = tilt_limit
         self.scene = self.worlds.scene
-        self.seen: Any = SimpleNamespace(scene=scene, look=self.look, hits=renderer.hits, bodies=renderer.bodies, cameras=scene.cameras,
-                                         grid=scene.grid)
+        self.seen: Any = SimpleNamespace(
+            scene=scene, look=self.look, hits=renderer.hits, bodies=renderer.bodies, cameras=scene.cameras, grid=scene.grid
+        )
         self.planner = Planner(toy.settings(), self.seen, device)
 
     def frame(self) -> Plan:

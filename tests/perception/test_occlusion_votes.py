@@ -62,8 +62,12 @@ def test_objects_at_the_image_border(device):
 
 
 def test_neighbours_lower_than_the_suction_point_weigh_little(device):
-    steep = paint_shapes([(np.array([(20, 20), (59, 20), (59, 59), (20, 59)]), (0.002, 0.0, 1.9)),
-                          (np.array([(60, 10), (100, 10), (100, 70), (60, 70)]), (0.0, 0.0, 2.0))])
+    steep = paint_shapes(
+        [
+            (np.array([(20, 20), (59, 20), (59, 59), (20, 59)]), (0.002, 0.0, 1.9)),
+            (np.array([(60, 10), (100, 10), (100, 70), (60, 70)]), (0.0, 0.0, 2.0)),
+        ]
+    )
     made = looks(device, steep)
     # At the border the lower one has depth 2.012 or more; the suction point, about column 40, has 1.98.
     for suction, weight in ((1.97, 0.1), (1.985, 1.0), (1.979, 0.1)):
@@ -117,8 +121,9 @@ def test_piles_of_true_masks_keep_every_vote(device):
         turn = np.stack([[np.cos(turns), -np.sin(turns)], [np.sin(turns), np.cos(turns)]]).transpose(2, 0, 1)
         corners = ((square * sides[:, None]) @ turn.transpose(0, 2, 1) + middles[:, None]).round()
         diagonal = np.linalg.norm(sides, axis=1) * depths / planning.FOCAL
-        made = looks(device, paint_shapes([(c, (0.0, 0.0, z)) for c, z in zip(corners, depths, strict=True)]), instances=8,
-                     diagonal=diagonal)
+        made = looks(
+            device, paint_shapes([(c, (0.0, 0.0, z)) for c, z in zip(corners, depths, strict=True)]), instances=8, diagonal=diagonal
+        )
         found = made.votes()[0]
         np.testing.assert_allclose(found, planning.votes(made, np.inf)[0], atol=1e-4)
         for i, j in np.argwhere(found >= planning.SIGHT["min_votes"]):

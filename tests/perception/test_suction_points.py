@@ -218,8 +218,16 @@ def toy(resolution: tuple[int, int]) -> ToyScene:
     gripper = (Fixture(box(0.1, 0.1, 0.3), GREY), Fixture(box(0.04, 0.04, 0.05), GREY))
     poses = ((0.0, 0.0, 0.0, *UPRIGHT), (0.0, 0.0, 0.4, *UPRIGHT), (0.0, 0.0, 0.2, *UPRIGHT))
     cameras = make_cameras(config.cameras)[:1]
-    return ToyScene([entry(box(0.1, 0.06, 0.04)), entry(ball(0.04, 3))], placed, cameras, fixtures=(tote, *gripper),
-                    fixture_poses=poses, fixtures_visible=(1, 0, 0), config=config, table=True)
+    return ToyScene(
+        [entry(box(0.1, 0.06, 0.04)), entry(ball(0.04, 3))],
+        placed,
+        cameras,
+        fixtures=(tote, *gripper),
+        fixture_poses=poses,
+        fixtures_visible=(1, 0, 0),
+        config=config,
+        table=True,
+    )
 
 
 def test_trace_shows_what_the_renderer_shows_without_a_gripper(device):
@@ -228,8 +236,12 @@ def test_trace_shows_what_the_renderer_shows_without_a_gripper(device):
     expected = render(scene, device)
     assert set(np.unique(expected.instance)) == {1, 2, 3, frames.TOTE, frames.TABLE}
     # The gripper stands in the picture, and camera 0 is larger there: neither shows in the look.
-    config = replace(scene.settings(), sight=replace(scene.config.sight, resolution=resolution, views=3),
-                     bake=replace(scene.config.bake, worlds=4), cameras=replace(scene.config.cameras, resolution=(192, 108)))
+    config = replace(
+        scene.settings(),
+        sight=replace(scene.config.sight, resolution=resolution, views=3),
+        bake=replace(scene.config.bake, worlds=4),
+        cameras=replace(scene.config.cameras, resolution=(192, 108)),
+    )
     cameras = make_cameras(config.cameras)
     shared = build_render_scene(config, Catalog(tuple(scene.entries)), scene.fixtures, cameras, scene.lights, device)
     sight = segment.Sight(config, shared, scene.room)

@@ -168,8 +168,16 @@ def needs(config, volume, compound, episodes: int, *, repeats: bool) -> np.ndarr
     taken = []
     for episode in range(episodes):
         drawn = arrangement.draw_objects(
-            0, episode, 0, volume=volume, compound=compound, budget=config.arrangement.volume, repeats=repeats,
-            room=room, single_slots=room, compound_slots=room,
+            0,
+            episode,
+            0,
+            volume=volume,
+            compound=compound,
+            budget=config.arrangement.volume,
+            repeats=repeats,
+            room=room,
+            single_slots=room,
+            compound_slots=room,
         )
         kinds = compound[list(drawn.entries)] == 1
         taken.append(((~kinds).sum(), kinds.sum()))
@@ -183,7 +191,9 @@ def overflows(taken: np.ndarray, slots: tuple[int, int]) -> float:
 
 @hypothesis_settings(max_examples=12)
 @given(
-    seed=st.integers(0, 2**32 - 1), size=st.sampled_from((0.5e-3, 1.5e-3, 6e-3)), share=st.sampled_from((0.2, 0.5)),
+    seed=st.integers(0, 2**32 - 1),
+    size=st.sampled_from((0.5e-3, 1.5e-3, 6e-3)),
+    share=st.sampled_from((0.2, 0.5)),
     mode=st.sampled_from(("pick", "target", "move")),
 )
 def test_slots_hold_all_but_the_accepted_share_of_draws(seed, size, share, mode, objects):

@@ -51,9 +51,7 @@ def test_the_other_two_have_the_tote_above_the_middle():
         assert project(camera, (side * 0.1, 0, 0.16))[0] < 960
 
 
-@given(
-    st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(1, 170)
-)  # fmt: skip
+@given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(1, 170))
 def test_up_is_up_and_the_target_is_in_the_middle(position, target, up, fov):
     forward = np.subtract(target, position)
     if np.linalg.norm(np.cross(forward, up)) < 1e-3 * np.linalg.norm(forward) or np.linalg.norm(forward) < 1e-2:

@@ -20,9 +20,28 @@ from synpick_warp.scenes.types import CatalogEntry
 
 # Litres of the convex hulls, and concave or not, as the README of the real data gives them.
 REAL_HULLS = {
-    1: 1.142, 2: 2.310, 3: 0.661, 4: 0.357, 5: 0.699, 6: 0.187, 7: 0.352, 8: 0.179, 9: 0.420, 10: 0.265, 11: 3.125, 12: 1.067, 13: 0.749,
-    14: 0.525, 15: 1.292, 16: 1.605, 17: 0.129, 18: 0.033, 19: 0.377, 20: 0.601, 21: 0.197,
-}  # fmt: skip
+    1: 1.142,
+    2: 2.310,
+    3: 0.661,
+    4: 0.357,
+    5: 0.699,
+    6: 0.187,
+    7: 0.352,
+    8: 0.179,
+    9: 0.420,
+    10: 0.265,
+    11: 3.125,
+    12: 1.067,
+    13: 0.749,
+    14: 0.525,
+    15: 1.292,
+    16: 1.605,
+    17: 0.129,
+    18: 0.033,
+    19: 0.377,
+    20: 0.601,
+    21: 0.197,
+}
 REAL_CONCAVE = {13, 14, 15}
 
 
@@ -60,11 +79,14 @@ def test_a_bop_folder_in_millimetres(tmp_path):
     write_box(tmp_path / "obj_000007.ply", (0.1, 0.2, 0.3))
     write_box(tmp_path / "obj_000002.ply", (0.1, 0.1, 0.1))
     turn = [-1, 0, 0, 10, 0, -1, 0, 20, 0, 0, 1, 30, 0, 0, 0, 1]
-    write_info(tmp_path, {
-        "2": {"diameter": 173.2, "symmetries_continuous": [{"axis": [0, 0, 2], "offset": [0, 5, 0]}]},
-        "7": {"symmetries_discrete": [turn]},
-        "9": {"diameter": -1},
-    })  # fmt: skip
+    write_info(
+        tmp_path,
+        {
+            "2": {"diameter": 173.2, "symmetries_continuous": [{"axis": [0, 0, 2], "offset": [0, 5, 0]}]},
+            "7": {"symmetries_discrete": [turn]},
+            "9": {"diameter": -1},
+        },
+    )
     two, seven = load(config_for(tmp_path), tmp_path)
     assert (two.obj_id, seven.obj_id) == (2, 7)
     assert two.name == "obj_000002"

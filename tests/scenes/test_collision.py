@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.collision import shapes as collision
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
 from synpick_warp.scenes.collision.hulls import hull_volume, limited_hull, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
-from synpick_warp.scenes.collision import shapes as collision
 from synpick_warp.scenes.meshes import smooth_normals
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
 

@@ -82,9 +82,16 @@ def test_colour_is_srgb_and_multi_makes_a_white_sheet_that_bright(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "lines", ["", "SUNcolor = 9,9,9\n", "SUNu = 0.5\nSUNv = 0.5\n", "SUNu = 0.5\nSUNv = 0.7\n", "SUNu = 0.5\nSUNv = 0.2\nSUNmulti = 0\n",
-              "SUNu = 0.5\nSUNv = 0.2\nSUNcolor = 0, 0, 0\n"],
-)  # fmt: skip
+    "lines",
+    [
+        "",
+        "SUNcolor = 9,9,9\n",
+        "SUNu = 0.5\nSUNv = 0.5\n",
+        "SUNu = 0.5\nSUNv = 0.7\n",
+        "SUNu = 0.5\nSUNv = 0.2\nSUNmulti = 0\n",
+        "SUNu = 0.5\nSUNv = 0.2\nSUNcolor = 0, 0, 0\n",
+    ],
+)
 def test_sets_without_a_sun(tmp_path, lines):
     assert loaded(tmp_path, lines, np.ones((8, 16, 3), np.float32)).sun is None
 
@@ -92,12 +99,19 @@ def test_sets_without_a_sun(tmp_path, lines):
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("SUNu = 1.2", "a number from 0 to 1"), ("SUNv = -0.1", "a number from 0 to 1"), ("SUNu = 0,67", "a number from 0 to 1"),
-        ("SUNv = nan", "a number from 0 to 1"), ("SUNu = left", "a number from 0 to 1"), ("SUNmulti = inf", "a number from 0 to 1e+06"),
-        ("SUNmulti = -1", "a number from 0 to 1e+06"), ("SUNcolor = 255,255", "3 numbers"), ("SUNcolor = 1,2,256", "from 0 to 255"),
-        ("SUNcolor = 1,,2", "3 numbers"), ("SUNcolor = white", "3 numbers"),
+        ("SUNu = 1.2", "a number from 0 to 1"),
+        ("SUNv = -0.1", "a number from 0 to 1"),
+        ("SUNu = 0,67", "a number from 0 to 1"),
+        ("SUNv = nan", "a number from 0 to 1"),
+        ("SUNu = left", "a number from 0 to 1"),
+        ("SUNmulti = inf", "a number from 0 to 1e+06"),
+        ("SUNmulti = -1", "a number from 0 to 1e+06"),
+        ("SUNcolor = 255,255", "3 numbers"),
+        ("SUNcolor = 1,2,256", "from 0 to 255"),
+        ("SUNcolor = 1,,2", "3 numbers"),
+        ("SUNcolor = white", "3 numbers"),
     ],
-)  # fmt: skip
+)
 def test_bad_numbers_are_one_clear_line(tmp_path, line, words):
     with pytest.raises(LightError) as caught:
         loaded(tmp_path, f"SUNu = 0.5\nSUNv = 0.2\n{line}\n", np.ones((8, 16, 3), np.float32))

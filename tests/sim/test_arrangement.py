@@ -44,8 +44,14 @@ def catalogs(draw):
 
 def made(device, worlds: int = WORLDS, mix: tuple[float, float, float] = (0.0, 0.0, 1.0), **sizes) -> KernelWorlds:
     """Worlds whose episodes have modes with these weights of pick, target and move."""
-    default = {"volume": np.array([0.1, 0.2, 0.3]), "compound": np.array([0, 1, 0]), "radius": np.array([0.05, 0.1, 0.2]), "instances": 8,
-               "single_slots": 8, "compound_slots": 8}
+    default = {
+        "volume": np.array([0.1, 0.2, 0.3]),
+        "compound": np.array([0, 1, 0]),
+        "radius": np.array([0.05, 0.1, 0.2]),
+        "instances": 8,
+        "single_slots": 8,
+        "compound_slots": 8,
+    }
     made_worlds = KernelWorlds(device, worlds, **(default | sizes))
     made_worlds.scene.mode.pick_share, made_worlds.scene.mode.pick_or_target_share = np.cumsum(mix)[:2] / np.sum(mix)
     return made_worlds
@@ -61,8 +67,14 @@ def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangemen
     """What the twin draws for each world, in the mode that it has."""
     return [
         arrangement.draw_objects(
-            seed, *map(int, address), volume=worlds.volume, compound=worlds.compound, budget=worlds.scene.drop.volume,
-            repeats=may_repeat(worlds, world), room=worlds.instances, single_slots=worlds.single_slots,
+            seed,
+            *map(int, address),
+            volume=worlds.volume,
+            compound=worlds.compound,
+            budget=worlds.scene.drop.volume,
+            repeats=may_repeat(worlds, world),
+            room=worlds.instances,
+            single_slots=worlds.single_slots,
             compound_slots=worlds.compound_slots,
         )
         for world, address in enumerate(worlds.state.address.numpy())
@@ -198,13 +210,26 @@ def test_each_mode_has_its_own_rule_of_repeating(device):
 def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
     """What scenes.build counts is enough for what the device draws, but for the accepted share."""
     shortfall, episodes = 0.02, 2000
-    config = small_worlds.settings(bake__mode="mixed", bake__mix=list(mix), arrangement__volume=1.2e-3, arrangement__max_objects=12,
-                                   arrangement__slot_shortfall=shortfall)
+    config = small_worlds.settings(
+        bake__mode="mixed",
+        bake__mix=list(mix),
+        arrangement__volume=1.2e-3,
+        arrangement__max_objects=12,
+        arrangement__slot_shortfall=shortfall,
+    )
     objects = small_worlds.catalog()
     single, compound = build.count_slots(config, objects)
-    worlds = made(device, episodes, mix, volume=np.array([entry.volume for entry in objects.entries]),
-                  compound=np.array([len(entry.pieces) > 1 for entry in objects.entries]), instances=12, single_slots=single,
-                  compound_slots=compound, drop={"volume": 1.2e-3, "move_repeats": 1, "pick_repeats": 0})
+    worlds = made(
+        device,
+        episodes,
+        mix,
+        volume=np.array([entry.volume for entry in objects.entries]),
+        compound=np.array([len(entry.pieces) > 1 for entry in objects.entries]),
+        instances=12,
+        single_slots=single,
+        compound_slots=compound,
+        drop={"volume": 1.2e-3, "move_repeats": 1, "pick_repeats": 0},
+    )
     worlds.begin(phases.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     over = (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).mean()
@@ -331,7 +356,10 @@ def test_numbers_are_those_of_the_list(device):
 
 def test_empty_worlds_take_numbers_in_order(device):
     assert take(device, [phases.EMPTY] * 3, 0, -1, 0, episodes=2, tries=1) == (
-        [phases.START, phases.START, phases.IDLE], [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2
+        [phases.START, phases.START, phases.IDLE],
+        [0, 0, 0],
+        [[0, 0], [1, 0], [-1, 0]],
+        2,
     )
 
 
@@ -340,7 +368,10 @@ def test_an_episode_that_delivered_nothing_is_drawn_again_in_its_world_until_it_
     ending = [Ending.UNSETTLED, Ending.FINISHED, Ending.NOT_FINITE, Ending.UNSETTLED]
     address = [[3, 0], [4, 0], [5, 1], [6, 2]]
     assert take(device, over, ending, address, 9, episodes=100, tries=3) == (
-        [phases.START] * 4, [Ending.RUNNING] * 4, [[3, 1], [9, 0], [5, 2], [10, 0]], 11
+        [phases.START] * 4,
+        [Ending.RUNNING] * 4,
+        [[3, 1], [9, 0], [5, 2], [10, 0]],
+        11,
     )
 
 

@@ -34,10 +34,30 @@ class Cups(KernelWorlds):
     """Worlds whose cups press for long enough, with room for four objects."""
 
     def __init__(self, device, worlds: int = 1, surface: str = "hull", **suction) -> None:
-        super().__init__(device, worlds, volume=np.full(3, 0.1), compound=np.array([0, 0, 1]), radius=np.ones(3), instances=4,
-                         single_slots=4, compound_slots=0, pick={"press_steps": PRESS_STEPS})
-        filled(self.scene.suction, {"rays": RAYS, "radius": RADIUS, "reach": REACH, "tolerated_misses": 0, "good_force": GOOD,
-                                    "poor_force": POOR, "tip": TIP, **suction})
+        super().__init__(
+            device,
+            worlds,
+            volume=np.full(3, 0.1),
+            compound=np.array([0, 0, 1]),
+            radius=np.ones(3),
+            instances=4,
+            single_slots=4,
+            compound_slots=0,
+            pick={"press_steps": PRESS_STEPS},
+        )
+        filled(
+            self.scene.suction,
+            {
+                "rays": RAYS,
+                "radius": RADIUS,
+                "reach": REACH,
+                "tolerated_misses": 0,
+                "good_force": GOOD,
+                "poor_force": POOR,
+                "tip": TIP,
+                **suction,
+            },
+        )
         meshes, keep = build_meshes([entry.mesh for entry in ENTRIES.entries], len(ENTRIES), device)
         config = load_config("smoke", {"suction.surface": surface})
         self.suction = Suction(config, ENTRIES, SimpleNamespace(meshes=meshes, keep=keep), device)
@@ -164,8 +184,11 @@ def test_rays_are_cast_when_the_time_to_press_is_up(device, phase, task, steps):
     cups = Cups(device, worlds=2)
     for world in range(2):
         cups.put(world, 0, 0, below(0.001))
-    for array, value, due in ((cups.state.phase, phase, phases.ACT), (cups.attempts.task, task, phases.PRESS),
-                              (cups.attempts.steps, steps, PRESS_STEPS)):
+    for array, value, due in (
+        (cups.state.phase, phase, phases.ACT),
+        (cups.attempts.task, task, phases.PRESS),
+        (cups.attempts.steps, steps, PRESS_STEPS),
+    ):
         cups.set(array, [value, due])
     for array in (cups.attempts.hits, cups.attempts.caught, cups.seals.limit):
         cups.set(array, 7)

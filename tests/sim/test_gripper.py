@@ -28,8 +28,17 @@ TIP = 0.05
 
 def made(device, worlds: int = 1, **move) -> KernelWorlds:
     one = np.array([1.0])
-    result = KernelWorlds(device, worlds, volume=one, compound=np.array([0]), radius=one, instances=1, single_slots=1, compound_slots=0,
-                          move={"corner": wp.vec3(*CORNER), "tip": TIP, **move})
+    result = KernelWorlds(
+        device,
+        worlds,
+        volume=one,
+        compound=np.array([0]),
+        radius=one,
+        instances=1,
+        single_slots=1,
+        compound_slots=0,
+        move={"corner": wp.vec3(*CORNER), "tip": TIP, **move},
+    )
     result.set(result.state.frame, -1)
     return result
 
@@ -40,8 +49,10 @@ def made(device, worlds: int = 1, **move) -> KernelWorlds:
 def forces(device, offset, velocity, law) -> np.ndarray:
     count = len(offset)
     out = wp.zeros(count, dtype=wp.vec3, device=device)
-    inputs = [wp.array(np.asarray(values, np.float32), dtype=dtype, device=device)
-              for values, dtype in ((offset, wp.vec3), (velocity, wp.vec3), (law, float))]
+    inputs = [
+        wp.array(np.asarray(values, np.float32), dtype=dtype, device=device)
+        for values, dtype in ((offset, wp.vec3), (velocity, wp.vec3), (law, float))
+    ]
     wp.launch(force_kernel, dim=count, inputs=inputs, outputs=[out], device=device)
     return out.numpy()
 
@@ -50,8 +61,13 @@ vectors = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
 
 
 @given(
-    offset=vectors, velocity=vectors, stiffness=st.floats(1.0, 1e5), damping=st.floats(0.0, 1e3), limit=st.floats(0.1, 1e3),
-    mass=st.floats(0.05, 50.0), step=st.floats(1e-4, 2e-2),
+    offset=vectors,
+    velocity=vectors,
+    stiffness=st.floats(1.0, 1e5),
+    damping=st.floats(0.0, 1e3),
+    limit=st.floats(0.1, 1e3),
+    mass=st.floats(0.05, 50.0),
+    step=st.floats(1e-4, 2e-2),
 )
 def test_the_force_is_the_twins_and_never_above_the_limit(offset, velocity, stiffness, damping, limit, mass, step, device):
     law = [stiffness, damping, limit, mass, step]

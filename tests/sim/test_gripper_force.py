@@ -57,8 +57,15 @@ def pulled(device) -> dict[str, Pulls]:
     velocity[MEET::3, 2] = np.negative(speeds)
     found = grippers.pull(config, catalog(CUBE), device, law, start, goal, velocity, PULL_STEPS)
     return {
-        mode: Pulls(section, config, speed, found.position[:, part] - start[part], found.velocity[:, part], found.force[:, part],
-                    found.contact[:, :, part])
+        mode: Pulls(
+            section,
+            config,
+            speed,
+            found.position[:, part] - start[part],
+            found.velocity[:, part],
+            found.force[:, part],
+            found.contact[:, :, part],
+        )
         for mode, section, speed, part in zip(SHIFT, sections, speeds, (slice(0, 3), slice(3, 6)), strict=True)
     }
 

@@ -22,8 +22,14 @@ STEPS = 250
 @pytest.fixture(scope="module")
 def turned(device) -> tuple[Physics, np.ndarray, np.ndarray]:
     """Three grippers, turned between two steps; then tilted and pushed. Poses of finger and cup at first, position at last."""
-    config = settings(bake__worlds=3, arrangement__max_objects=1, physics__steps_per_tick=1, physics__gravity=0.0, physics__substeps=1,
-                      physics__guide_height=0.2)
+    config = settings(
+        bake__worlds=3,
+        arrangement__max_objects=1,
+        physics__steps_per_tick=1,
+        physics__gravity=0.0,
+        physics__substeps=1,
+        physics__guide_height=0.2,
+    )
     physics = Physics(config, build.build_model(config, catalog(CUBE), device))
     coordinates = physics.state.joint_q.numpy().reshape(3, -1)
     coordinates[:, : build.GRIPPER_DOFS] = [*PLACE, 0.0]

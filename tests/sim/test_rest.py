@@ -21,8 +21,17 @@ INSIDE = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0])
 
 def made(device, worlds: int = 1, objects: int = 2, **settings) -> KernelWorlds:
     """Worlds in which `objects` instances lie in the tote and rest."""
-    result = KernelWorlds(device, worlds, volume=np.full(3, 0.1), compound=np.array([0, 1, 0]), radius=np.array([0.05, 0.1, 0.2]),
-                          instances=4, single_slots=4, compound_slots=2, **settings)
+    result = KernelWorlds(
+        device,
+        worlds,
+        volume=np.full(3, 0.1),
+        compound=np.array([0, 1, 0]),
+        radius=np.array([0.05, 0.1, 0.2]),
+        instances=4,
+        single_slots=4,
+        compound_slots=2,
+        **settings,
+    )
     entry, slot = np.full((worlds, 4), -1), np.zeros((worlds, 4))
     entry[:, :objects] = (np.arange(objects) % 2) * 2
     slot[:, :objects] = np.arange(objects)
@@ -39,8 +48,15 @@ def made(device, worlds: int = 1, objects: int = 2, **settings) -> KernelWorlds:
 
 def touch(worlds: KernelWorlds, contacts: list[dict], room: int = 8) -> None:
     """Give the pipeline's contacts; what a contact leaves open is zero."""
-    values = {"shape0": (-1, int), "shape1": (-1, int), "point0": ((0, 0, 0), wp.vec3), "point1": ((0, 0, 0), wp.vec3),
-              "normal": ((0, 0, 1), wp.vec3), "margin0": (0, float), "margin1": (0, float)}
+    values = {
+        "shape0": (-1, int),
+        "shape1": (-1, int),
+        "point0": ((0, 0, 0), wp.vec3),
+        "point1": ((0, 0, 0), wp.vec3),
+        "normal": ((0, 0, 1), wp.vec3),
+        "margin0": (0, float),
+        "margin1": (0, float),
+    }
     for name, (default, dtype) in values.items():
         rows = np.array([contact.get(name, default) for contact in contacts] + [default] * (room - len(contacts)))
         setattr(worlds.physics.contacts, f"rigid_contact_{name}", wp.array(rows, dtype=dtype, device=worlds.device))
@@ -84,8 +100,15 @@ def test_depth_of_contacts(device):
     worlds.place(0, 0, pose)
     # In the world the body's point is (0, 0.03, 0.05 - 0.04).
     low = {"shape0": 0, "shape1": 4, "point0": (0, 0, 0.02), "point1": (0.03, 0, -0.04)}
-    thick = {"shape0": 4, "shape1": 0, "normal": (0, 0, -1), "point0": (0, 0, -0.04), "point1": (0, 0, 0.01), "margin0": 0.002,
-             "margin1": 0.003}
+    thick = {
+        "shape0": 4,
+        "shape1": 0,
+        "normal": (0, 0, -1),
+        "point0": (0, 0, -0.04),
+        "point1": (0, 0, 0.01),
+        "margin0": 0.002,
+        "margin1": 0.003,
+    }
     apart = {"shape0": 5, "shape1": 0, "normal": (0, 0, -1), "point1": (0, 0, 0.01)}
     touch(worlds, [low, thick, apart])
     arrange.measure_depth(worlds.state, worlds.physics)

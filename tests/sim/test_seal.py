@@ -218,22 +218,36 @@ def test_held_objects_touch_each_other_and_what_is_not_held_touches_the_cup(pair
 
 # ---- the law ----
 
-LAW = {"stiffness": 2e4, "damping": 100.0, "twist_stiffness": 50.0, "twist_damping": 0.1, "swing_limit": np.radians(5.0),
-       "swing_stiffness": 50.0, "tip": 0.055, "finger_mass": 1.5, "cup_mass": 0.5, "tilt_inertia": 0.4, "step": 2e-3}
+LAW = {
+    "stiffness": 2e4,
+    "damping": 100.0,
+    "twist_stiffness": 50.0,
+    "twist_damping": 0.1,
+    "swing_limit": np.radians(5.0),
+    "swing_stiffness": 50.0,
+    "tip": 0.055,
+    "finger_mass": 1.5,
+    "cup_mass": 0.5,
+    "tilt_inertia": 0.4,
+    "step": 2e-3,
+}
 SLOTS = (3, 0, 2)
 
 
 def scripted(device, bodies: list[twin.Body], anchors: np.ndarray, held: list[int], limit: float) -> KernelWorlds:
     """One world with a moving cup and three moving objects in the slots SLOTS."""
-    worlds = KernelWorlds(device, 1, volume=np.ones(1), compound=np.zeros(1, int), radius=np.ones(1), instances=3, single_slots=4,
-                          compound_slots=0)
+    worlds = KernelWorlds(
+        device, 1, volume=np.ones(1), compound=np.zeros(1, int), radius=np.ones(1), instances=3, single_slots=4, compound_slots=0
+    )
     filled(worlds.scene.suction, LAW)
     rows = [1, *(2 + slot for slot in SLOTS)]
-    columns = {"body_q": (wp.transform, (7,), [body.pose for body in bodies]),
-               "body_qd": (wp.spatial_vector, (6,), [body.velocity for body in bodies]),
-               "body_com": (wp.vec3, (3,), [body.center for body in bodies]),
-               "body_inv_mass": (float, (), [1 / body.mass for body in bodies]),
-               "body_inv_inertia": (wp.mat33, (3, 3), [np.linalg.inv(body.inertia) for body in bodies])}
+    columns = {
+        "body_q": (wp.transform, (7,), [body.pose for body in bodies]),
+        "body_qd": (wp.spatial_vector, (6,), [body.velocity for body in bodies]),
+        "body_com": (wp.vec3, (3,), [body.center for body in bodies]),
+        "body_inv_mass": (float, (), [1 / body.mass for body in bodies]),
+        "body_inv_inertia": (wp.mat33, (3, 3), [np.linalg.inv(body.inertia) for body in bodies]),
+    }
     for name, (dtype, shape, values) in columns.items():
         full = np.zeros((worlds.bodies, *shape), np.float32)
         full[rows] = values
@@ -265,8 +279,14 @@ def drawn(seed: int) -> tuple[list[twin.Body], np.ndarray]:
         pose = np.concatenate([numbers.normal(size=3), quaternion(1.0)])
         if index > 0:
             anchors.append(np.concatenate([numbers.normal(scale=0.05, size=3), quaternion(1.0)]))
-            pose = np.array(_times(_times(_times(bodies[0].pose, [0, 0, -LAW["tip"], 0, 0, 0, 1]),
-                                          [*numbers.normal(scale=5e-4, size=3), *quaternion(0.05)]), anchors[-1]))
+            pose = np.array(
+                _times(
+                    _times(
+                        _times(bodies[0].pose, [0, 0, -LAW["tip"], 0, 0, 0, 1]), [*numbers.normal(scale=5e-4, size=3), *quaternion(0.05)]
+                    ),
+                    anchors[-1],
+                )
+            )
         velocity = np.concatenate([numbers.normal(scale=0.05, size=3), numbers.normal(scale=0.3, size=3)])
         center = numbers.normal(scale=0.02, size=3)
         bodies.append(twin.Body(pose, velocity, mass, inertia, center))

@@ -41,8 +41,15 @@ def track(device, worlds: int, disturb=None, episodes: int = EPISODES) -> dict[t
         for world in range(worlds):
             address = (int(seen.column("episode")[world]), int(seen.column("redraw")[world]))
             full = seen.entry[world] >= 0
-            parts = (seen.status[world], seen.entry[world], seen.pose[world][full], fixtures[world], light[world], turn[world],
-                     exposure[world])
+            parts = (
+                seen.status[world],
+                seen.entry[world],
+                seen.pose[world][full],
+                fixtures[world],
+                light[world],
+                turn[world],
+                exposure[world],
+            )
             ticks[address].append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
         if (seen.column("phase") == phases.IDLE).all():
             return ticks
@@ -169,8 +176,9 @@ def test_something_lies_on_the_floor_in_every_world(resting):
     _, reports, _, _ = resting
     last = reports[-1]
     for world in range(4):
-        lowest = min(corners(entry, pose)[:, 2].min()
-                     for entry, pose in zip(last.entry[world], last.pose[world], strict=True) if entry >= 0)
+        lowest = min(
+            corners(entry, pose)[:, 2].min() for entry, pose in zip(last.entry[world], last.pose[world], strict=True) if entry >= 0
+        )
         assert lowest == pytest.approx(0.0, abs=1e-3)
 
 
@@ -226,8 +234,13 @@ def placed(simulation: Simulation, world: int, entry: int, place, speed=(0, 0, 0
     q[first : first + 7], qd[first_d : first_d + 6] = place, speed
     q[first - build.GRIPPER_DOFS : first - 1] = GRIPPER_HOME
     restarted = np.arange(layout.worlds + 1) == world
-    for array, values in ((state.variant, variant), (state.entry, entries), (state.restarted, restarted), (physics.state.joint_q, q),
-                          (physics.state.joint_qd, qd)):
+    for array, values in (
+        (state.variant, variant),
+        (state.entry, entries),
+        (state.restarted, restarted),
+        (physics.state.joint_q, q),
+        (physics.state.joint_qd, qd),
+    ):
         array.assign(values)
     physics.load(state.variant, state.restarted)
 

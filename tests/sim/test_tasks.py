@@ -17,8 +17,20 @@ from tests.worlds.kernel_worlds import KernelWorlds
 
 STEP, TIP = 2e-3, 0.05
 PICK = {
-    "stiffness": 2500.0, "damping": 200.0, "force": 200.0, "appear_height": 1.0, "speed": 1.0, "near": 0.05, "near_speed": 0.1,
-    "press_steps": 50, "lift_height": 1.0, "lift_speed": 0.5, "failures": 3, "floor": -0.1, "tilt_limit": np.pi / 2, "forgive": 0,
+    "stiffness": 2500.0,
+    "damping": 200.0,
+    "force": 200.0,
+    "appear_height": 1.0,
+    "speed": 1.0,
+    "near": 0.05,
+    "near_speed": 0.1,
+    "press_steps": 50,
+    "lift_height": 1.0,
+    "lift_speed": 0.5,
+    "failures": 3,
+    "floor": -0.1,
+    "tilt_limit": np.pi / 2,
+    "forgive": 0,
     "random_after_failure": 0,
 }
 POINT = (0.1, -0.05, 0.04)
@@ -28,8 +40,16 @@ NORMAL = (0.6, 0.0, 0.8)
 def made(device, worlds: int = 1, **pick) -> KernelWorlds:
     """Worlds of three single objects in three slots, all in the scene, acting in mode PICK."""
     result = KernelWorlds(
-        device=device, worlds=worlds, volume=np.ones(3), compound=np.zeros(3), radius=np.full(3, 0.1), instances=3, single_slots=3,
-        compound_slots=0, pick=PICK | pick, move={"tip": TIP, "step": STEP},
+        device=device,
+        worlds=worlds,
+        volume=np.ones(3),
+        compound=np.zeros(3),
+        radius=np.full(3, 0.1),
+        instances=3,
+        single_slots=3,
+        compound_slots=0,
+        pick=PICK | pick,
+        move={"tip": TIP, "step": STEP},
     )
     result.begin(phases.ACT)
     result.set(result.state.mode, phases.PICK)

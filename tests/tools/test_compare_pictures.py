@@ -14,9 +14,19 @@ from synpick_warp.stages.buffers import ViewBuffers
 from tools.checks import compare_pictures as tool
 
 FEW = (
-    "--set", "arrangement.volume=1e-3", "--set", "arrangement.max_objects=1",
-    "--set", "physics.substeps=1", "--set", "physics.steps_per_tick=10", "--set", "settle.min_time=0.1", "--set", "settle.rest_ticks=2",
-)  # fmt: skip
+    "--set",
+    "arrangement.volume=1e-3",
+    "--set",
+    "arrangement.max_objects=1",
+    "--set",
+    "physics.substeps=1",
+    "--set",
+    "physics.steps_per_tick=10",
+    "--set",
+    "settle.min_time=0.1",
+    "--set",
+    "settle.rest_ticks=2",
+)
 """One object, and as few steps as bring it to rest."""
 
 

@@ -10,9 +10,21 @@ import pytest
 from tools.checks import compare_worlds as tool
 
 FEW = (
-    "--episodes", "2", "--ticks", "12", "--set", "arrangement.volume=1e-3", "--set", "arrangement.max_objects=1", "--set", "bake.mode=move",
-    "--set", "physics.substeps=1", "--set", "physics.steps_per_tick=4",
-)  # fmt: skip
+    "--episodes",
+    "2",
+    "--ticks",
+    "12",
+    "--set",
+    "arrangement.volume=1e-3",
+    "--set",
+    "arrangement.max_objects=1",
+    "--set",
+    "bake.mode=move",
+    "--set",
+    "physics.substeps=1",
+    "--set",
+    "physics.steps_per_tick=4",
+)
 """One object, and few steps."""
 
 

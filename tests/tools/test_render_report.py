@@ -15,9 +15,21 @@ from tools.reports import render as render_report
 from tools.reports import render_checks, render_piles, render_sheet
 
 FEW = (
-    "--device", "cpu", "--set", "arrangement.volume=1e-3", "--set", "arrangement.max_objects=1",
-    "--set", "physics.substeps=1", "--set", "physics.steps_per_tick=10", "--set", "settle.min_time=0.1", "--set", "settle.rest_ticks=2",
-)  # fmt: skip
+    "--device",
+    "cpu",
+    "--set",
+    "arrangement.volume=1e-3",
+    "--set",
+    "arrangement.max_objects=1",
+    "--set",
+    "physics.substeps=1",
+    "--set",
+    "physics.steps_per_tick=10",
+    "--set",
+    "settle.min_time=0.1",
+    "--set",
+    "settle.rest_ticks=2",
+)
 """One object, and as few steps as bring it to rest."""
 
 

@@ -28,18 +28,50 @@ from tools.reports import rest as rest_report
 
 FOLDER = Path(__file__).resolve().parents[2] / "tools"
 FEW = (
-    "--device", "cpu", "--set", "arrangement.volume=1e-3", "--set", "arrangement.max_objects=1",
-    "--set", "physics.substeps=1", "--set", "physics.steps_per_tick=10", "--set", "settle.min_time=0.1", "--set", "settle.rest_ticks=2",
+    "--device",
+    "cpu",
+    "--set",
+    "arrangement.volume=1e-3",
+    "--set",
+    "arrangement.max_objects=1",
+    "--set",
+    "physics.substeps=1",
+    "--set",
+    "physics.steps_per_tick=10",
+    "--set",
+    "settle.min_time=0.1",
+    "--set",
+    "settle.rest_ticks=2",
 )
 """One object a world, and as few steps as bring it to rest."""
 GLANCE = (
-    "--set", "sight.resolution=[160,90]", "--set", "sight.contour_points=512", "--set", "sight.contour_offset=1.5",
-    "--set", "sight.min_votes=2.0", "--set", "sight.normal_window=2",
+    "--set",
+    "sight.resolution=[160,90]",
+    "--set",
+    "sight.contour_points=512",
+    "--set",
+    "sight.contour_offset=1.5",
+    "--set",
+    "sight.min_votes=2.0",
+    "--set",
+    "sight.normal_window=2",
 )
 """Small images to choose by."""
 DASH = (
-    "--set", "pick.appear_height=0.2", "--set", "pick.speed=4.0", "--set", "pick.near_speed=0.5", "--set", "pick.lift_height=0.2",
-    "--set", "pick.lift_speed=2.0", "--set", "pick.failures=1", "--set", "settle.rest_shift=1e-3",
+    "--set",
+    "pick.appear_height=0.2",
+    "--set",
+    "pick.speed=4.0",
+    "--set",
+    "pick.near_speed=0.5",
+    "--set",
+    "pick.lift_height=0.2",
+    "--set",
+    "pick.lift_speed=2.0",
+    "--set",
+    "pick.failures=1",
+    "--set",
+    "settle.rest_shift=1e-3",
 )
 """Episodes of picking that are over soon."""
 
@@ -47,8 +79,15 @@ DASH = (
 def pile(**changes):
     """Two objects at rest, well within all bounds."""
     values = {
-        "episode": 0, "ticks": 30, "redrops": 0, "volume": 6.5, "energy": 0.0, "tick_speed": np.full(2, 0.01), "speed": np.full(2, 0.1),
-        "depth": np.full(2, 0.5), "inside": np.full(2, True),
+        "episode": 0,
+        "ticks": 30,
+        "redrops": 0,
+        "volume": 6.5,
+        "energy": 0.0,
+        "tick_speed": np.full(2, 0.01),
+        "speed": np.full(2, 0.1),
+        "depth": np.full(2, 0.5),
+        "inside": np.full(2, True),
     }
     return rest_report.Pile(**values | changes)
 
@@ -85,8 +124,16 @@ def test_inside_is_the_rims_opening_from_the_floor_to_a_heap_above_the_rim():
     length, width = config.tote.rim_size
     rim = config.tote.outer_size[2] - config.tote.wall
     places = np.array(
-        [[0, 0, 0.01], [0, 0, -0.001], [0.499 * length, 0, 0.1], [0.501 * length, 0, 0.1], [0, -0.501 * width, 0.1],
-         [0, 0, rim + 0.09], [0, 0, rim + 0.11], [np.nan, 0, 0.1]]
+        [
+            [0, 0, 0.01],
+            [0, 0, -0.001],
+            [0.499 * length, 0, 0.1],
+            [0.501 * length, 0, 0.1],
+            [0, -0.501 * width, 0.1],
+            [0, 0, rim + 0.09],
+            [0, 0, rim + 0.11],
+            [np.nan, 0, 0.1],
+        ]
     )
     assert rest_report.is_inside(config, places).tolist() == [True, False, True, False, False, True, False, False]
 
@@ -320,7 +367,10 @@ def test_the_gpu_script_does_what_it_is_told_within_its_time(tmp_path):
     done = subprocess.run(["bash", FOLDER / "gpu_run.sh", tmp_path / "out"], capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 1
     assert [line.partition(" after")[0] for line in done.stdout.splitlines() if line.startswith("==")] == [
-        "== piles at rest", "== piles at rest: exit code 3", "== picking", "== picking: exit code 0",
-    ]  # fmt: skip
+        "== piles at rest",
+        "== piles at rest: exit code 3",
+        "== picking",
+        "== picking: exit code 0",
+    ]
     assert "-m tools.reports.pick --device cuda:0 --episodes 64 --set pick.failures=4" in done.stdout
     assert (tmp_path / "out" / "run.log").read_text() == done.stdout

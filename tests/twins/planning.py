@@ -23,8 +23,15 @@ from tests.worlds import kernel_worlds
 FOCAL = 100.0
 ROOM = 1024
 """Points of a contour."""
-SIGHT = {"contour_offset": 3.0, "deep_distance": 0.02, "deep_weight": 0.1, "min_votes": 5.0, "reach": 1.2, "exact_cycle": 10,
-         "normal_window": 10}
+SIGHT = {
+    "contour_offset": 3.0,
+    "deep_distance": 0.02,
+    "deep_weight": 0.1,
+    "min_votes": 5.0,
+    "reach": 1.2,
+    "exact_cycle": 10,
+    "normal_window": 10,
+}
 
 
 def paint(rectangles: list[tuple[float, ...]], height: int = 90, width: int = 120) -> tuple[np.ndarray, np.ndarray]:
@@ -48,13 +55,27 @@ def paint_shapes(shapes: list[tuple[np.ndarray, tuple[float, float, float]]], he
 class Looks:
     """One view a world: what looking would have found in the images, and a planner for it."""
 
-    def __init__(self, device: Any, ids: list[np.ndarray], depths: list[np.ndarray], instances: int, sight: dict | None = None,
-                 diagonal: float | np.ndarray = 10.0) -> None:
+    def __init__(
+        self,
+        device: Any,
+        ids: list[np.ndarray],
+        depths: list[np.ndarray],
+        instances: int,
+        sight: dict | None = None,
+        diagonal: float | np.ndarray = 10.0,
+    ) -> None:
         ids, depths = np.stack(ids), np.stack(depths)
         self.views, height, width = ids.shape
         self.worlds = kernel_worlds.KernelWorlds(
-            device, self.views, volume=np.full(instances, 0.1), compound=np.zeros(instances, int), radius=np.full(instances, diagonal),
-            instances=instances, single_slots=instances, compound_slots=0)
+            device,
+            self.views,
+            volume=np.full(instances, 0.1),
+            compound=np.zeros(instances, int),
+            radius=np.full(instances, diagonal),
+            instances=instances,
+            single_slots=instances,
+            compound_slots=0,
+        )
         self.worlds.set(self.worlds.state.entry, np.arange(instances))
         kernel_worlds.filled(self.worlds.scene.sight, {**SIGHT, **(sight or {})})
         sizes = {"view": self.views, "world": self.views, "instance": instances, "row": height, "column": width, "point": ROOM}
@@ -64,8 +85,14 @@ class Looks:
         self.hits.code.assign((ids + 1).astype(np.uint8))
         self.hits.depth.assign(depths)
         camera = Camera(width, height, np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1.0]]), np.eye(3), np.zeros(3))
-        self.seen: Any = SimpleNamespace(scene=None, look=self.look, hits=filled(Hits, self.hits), bodies=None,
-                                         cameras=build_cameras((camera,), device), grid=build_grid(width, height))
+        self.seen: Any = SimpleNamespace(
+            scene=None,
+            look=self.look,
+            hits=filled(Hits, self.hits),
+            bodies=None,
+            cameras=build_cameras((camera,), device),
+            grid=build_grid(width, height),
+        )
         self.found = look_at(ids, depths, instances)
         self.look.world.assign(np.arange(self.views))
         for name in ("component", "largest", "contour", "contour_length"):
@@ -100,10 +127,14 @@ def look_at(ids: np.ndarray, depths: np.ndarray, instances: int) -> dict[str, np
     """Components, contours and suction points (the poles) of images (V, H, W), by OpenCV."""
     views, height, width = ids.shape
     found = {
-        "component": np.full(ids.shape, -1, np.int32), "largest": np.full((views, instances), -1, np.int32),
-        "contour": np.zeros((views, instances, ROOM, 2), np.int32), "contour_length": np.zeros((views, instances), np.int32),
-        "visible": np.zeros((views, instances), np.int32), "suction": np.zeros((views, instances, 2), np.int32),
-        "depth": np.zeros((views, instances), np.float32), "share": np.zeros((views, instances), np.float32),
+        "component": np.full(ids.shape, -1, np.int32),
+        "largest": np.full((views, instances), -1, np.int32),
+        "contour": np.zeros((views, instances, ROOM, 2), np.int32),
+        "contour_length": np.zeros((views, instances), np.int32),
+        "visible": np.zeros((views, instances), np.int32),
+        "suction": np.zeros((views, instances, 2), np.int32),
+        "depth": np.zeros((views, instances), np.float32),
+        "share": np.zeros((views, instances), np.float32),
     }
     for view, i in itertools.product(range(views), range(instances)):
         count, labels = cv2.connectedComponents((ids[view] == i).astype(np.uint8), connectivity=8)
@@ -220,5 +251,3 @@ def angles_of(normal: np.ndarray) -> tuple[float, float]:
         if -np.pi / 2 < yaw <= np.pi / 2:
             return yaw, tilt
     raise AssertionError(normal)
-
-

@@ -71,16 +71,33 @@ def nothing_seen(**other: Any) -> dict[str, Any]:
 def attempt(seen: tuple[SeenObject, ...], votes: dict[tuple[int, int], float], target: int | None = None, **other: Any) -> Attempt:
     """An attempt as `read_attempts` returns it, with the graph that is given."""
     values: dict[str, Any] = {
-        "episode": 0, "number": 0, "mode": "pick", "frame": 0, "end_frame": 4, "sentence": "s", "target": target, "tilt": None, "rays": 10,
-        "hits": 10, "good_seal": True, "caught": (), "picked": (), "load": (), "resolution": (96, 72),
-    }  # fmt: skip
+        "episode": 0,
+        "number": 0,
+        "mode": "pick",
+        "frame": 0,
+        "end_frame": 4,
+        "sentence": "s",
+        "target": target,
+        "tilt": None,
+        "rays": 10,
+        "hits": 10,
+        "good_seal": True,
+        "caught": (),
+        "picked": (),
+        "load": (),
+        "resolution": (96, 72),
+    }
     return Attempt(**(values | other), seen=seen, votes=votes)
 
 
 def seen(instance: int, above: frozenset[int] = frozenset(), all_above: frozenset[int] | None = None, **other: Any) -> SeenObject:
     """A seen object as `read_attempts` returns it; its obj_id is its instance plus 1."""
     values: dict[str, Any] = {
-        "object_id": instance + 1, "visible": 100, "share": 0.5, "candidates": ((10.0, 10.0), (18.0, 10.0), (14.0, 10.0)),
-        "distances": (6.0, 3.0, 5.1), "suction": (10.0, 10.0),
-    }  # fmt: skip
+        "object_id": instance + 1,
+        "visible": 100,
+        "share": 0.5,
+        "candidates": ((10.0, 10.0), (18.0, 10.0), (14.0, 10.0)),
+        "distances": (6.0, 3.0, 5.1),
+        "suction": (10.0, 10.0),
+    }
     return SeenObject(instance=instance, above=above, all_above=above if all_above is None else all_above, **(values | other))

@@ -100,8 +100,17 @@ def pull(
         wp.launch(
             pull_kernel,
             dim=layout.worlds,
-            inputs=[layout.dofs_per_world, layout.coords_per_world, mass * config.physics.gravity, config.physics.step, law_array,
-                    velocity_array, current.joint_q, current.joint_qd, goal_array],
+            inputs=[
+                layout.dofs_per_world,
+                layout.coords_per_world,
+                mass * config.physics.gravity,
+                config.physics.step,
+                law_array,
+                velocity_array,
+                current.joint_q,
+                current.joint_qd,
+                goal_array,
+            ],
             outputs=[physics.control.joint_f, force],
             device=device,
         )

@@ -39,8 +39,9 @@ class Hanging:
         room = {"arrangement__max_objects": self.instances, "arrangement__volume": ROOM * self.instances}
         self.config = settings(bake__worlds=self.worlds, **{**COARSE, **room, **overrides})
         boxes = catalog(*[(tuple(size),) for size in self.size.reshape(-1, 3)]).entries
-        entries = tuple(replace(box, mass=mass, inertia=box.inertia * mass / box.mass)
-                        for box, mass in zip(boxes, self.mass.reshape(-1), strict=True))
+        entries = tuple(
+            replace(box, mass=mass, inertia=box.inertia * mass / box.mass) for box, mass in zip(boxes, self.mass.reshape(-1), strict=True)
+        )
         self.inertia = np.stack([entry.inertia for entry in entries]).reshape(self.worlds, self.instances, 3, 3)
         objects = Catalog(entries)
         built = build.build_model(self.config, objects, device)
@@ -109,8 +110,10 @@ class Hanging:
         """Poses (world, body, 7) and velocities (world, body, 6): finger, cup, objects."""
         count = build.GRIPPER_BODIES + self.instances
         state = self.physics.state
-        return tuple(array.numpy().reshape(self.worlds, -1, width)[:, :count].astype(float)
-                     for array, width in ((state.body_q, 7), (state.body_qd, 6)))  # type: ignore[return-value]
+        return tuple(
+            array.numpy().reshape(self.worlds, -1, width)[:, :count].astype(float)
+            for array, width in ((state.body_q, 7), (state.body_qd, 6))
+        )  # type: ignore[return-value]
 
     def swing(self) -> np.ndarray:
         """Angle between each cup's axis and that of its first object, which was upright when it was caught (world) [°]."""

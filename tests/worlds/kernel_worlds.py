@@ -47,21 +47,68 @@ class KernelWorlds:
     def __post_init__(self) -> None:
         self.slots = self.single_slots + self.compound_slots
         self.bodies, self.coords, self.dofs = GRIPPER_BODIES + self.slots, GRIPPER_DOFS + 7 * self.slots, GRIPPER_DOFS + 6 * self.slots
-        drop = {"volume": 1.0, "move_repeats": 1, "pick_repeats": 1, "clearance": 0.01, "spread": 0.5,
-                "rim_length": 0.5, "rim_width": 0.3, "rim_height": 0.2,
-                "gravity": 9.81, "gripper_home": wp.vec3(3.0, 0.0, 1.0), "lights": 5, "turn_lights": 1, "exposure_spread": 0.5,
-                **self.drop}
-        settle = {"min_ticks": 3, "max_ticks": 100, "rest_ticks": 2, "stuck_ticks": 2, "late_ticks": 50, "rest_shift": 1e-4,
-                  "last_shift": 1e-3, "stuck_depth": 0.01, "max_redrops": 8, **self.settle}
-        move = {"waypoints": 8, "corner": wp.vec3(0.2, 0.1, 0.02), "start_height": 0.3, "tip": 0.05, "mass": 2.0, "gravity": 9.81,
-                "step": 2e-3, "stiffness": 1000.0, "damping": 60.0, "force": 30.0, "speed": 0.1, **self.move}
-        self.scene = SceneData(self._layout(), self._catalog(), filled(structs.DropData(), drop), filled(structs.SettleData(), settle),
-                               filled(structs.ModeData(), {"pick_share": 0.0, "pick_or_target_share": 0.0}),
-                               filled(structs.MoveData(), move), filled(structs.PickData(), self.pick),
-                               structs.SightData(), structs.SuctionData(),
-                               wp.array(GUIDES, dtype=int, device=self.device))
-        sizes = {"one": 1, "world": self.worlds, "world_and_global": self.worlds + 1, "instance": self.instances,
-                 "body": self.worlds * self.bodies, "waypoint": move["waypoints"]}
+        drop = {
+            "volume": 1.0,
+            "move_repeats": 1,
+            "pick_repeats": 1,
+            "clearance": 0.01,
+            "spread": 0.5,
+            "rim_length": 0.5,
+            "rim_width": 0.3,
+            "rim_height": 0.2,
+            "gravity": 9.81,
+            "gripper_home": wp.vec3(3.0, 0.0, 1.0),
+            "lights": 5,
+            "turn_lights": 1,
+            "exposure_spread": 0.5,
+            **self.drop,
+        }
+        settle = {
+            "min_ticks": 3,
+            "max_ticks": 100,
+            "rest_ticks": 2,
+            "stuck_ticks": 2,
+            "late_ticks": 50,
+            "rest_shift": 1e-4,
+            "last_shift": 1e-3,
+            "stuck_depth": 0.01,
+            "max_redrops": 8,
+            **self.settle,
+        }
+        move = {
+            "waypoints": 8,
+            "corner": wp.vec3(0.2, 0.1, 0.02),
+            "start_height": 0.3,
+            "tip": 0.05,
+            "mass": 2.0,
+            "gravity": 9.81,
+            "step": 2e-3,
+            "stiffness": 1000.0,
+            "damping": 60.0,
+            "force": 30.0,
+            "speed": 0.1,
+            **self.move,
+        }
+        self.scene = SceneData(
+            self._layout(),
+            self._catalog(),
+            filled(structs.DropData(), drop),
+            filled(structs.SettleData(), settle),
+            filled(structs.ModeData(), {"pick_share": 0.0, "pick_or_target_share": 0.0}),
+            filled(structs.MoveData(), move),
+            filled(structs.PickData(), self.pick),
+            structs.SightData(),
+            structs.SuctionData(),
+            wp.array(GUIDES, dtype=int, device=self.device),
+        )
+        sizes = {
+            "one": 1,
+            "world": self.worlds,
+            "world_and_global": self.worlds + 1,
+            "instance": self.instances,
+            "body": self.worlds * self.bodies,
+            "waypoint": move["waypoints"],
+        }
         self.state = allocate(WorldState, sizes, self.device)
         self.attempts = allocate(AttemptState, sizes, self.device)
         self.seals = allocate(SealState, sizes, self.device)
@@ -70,21 +117,47 @@ class KernelWorlds:
         self.physics = self._physics()
 
     def _layout(self) -> Any:
-        return filled(structs.LayoutData(), {
-            "instances": self.instances, "single_slots": self.single_slots, "slots": self.slots, "gripper_bodies": GRIPPER_BODIES,
-            "gripper_dofs": GRIPPER_DOFS, "bodies": self.bodies, "coords": self.coords, "dofs": self.dofs, "shapes": SHAPES,
-            "finger_shape": 10, "cup_shape": 11})
+        return filled(
+            structs.LayoutData(),
+            {
+                "instances": self.instances,
+                "single_slots": self.single_slots,
+                "slots": self.slots,
+                "gripper_bodies": GRIPPER_BODIES,
+                "gripper_dofs": GRIPPER_DOFS,
+                "bodies": self.bodies,
+                "coords": self.coords,
+                "dofs": self.dofs,
+                "shapes": SHAPES,
+                "finger_shape": 10,
+                "cup_shape": 11,
+            },
+        )
 
     def _catalog(self) -> Any:
         compound = np.asarray(self.compound, np.int32)
         # Position among the entries of its kind, as scenes.build numbers variants.
         variant = np.where(compound == 1, np.cumsum(compound), np.cumsum(1 - compound)) - 1
-        columns = {"volume": (self.volume, float), "radius": (self.radius, float),
-                   "mass": (np.ones_like(self.radius), float), "area": (np.ones_like(self.radius), float), "diagonal": (self.radius, float),
-                   "compound": (compound, int), "variant": (variant, int)}
+        columns = {
+            "volume": (self.volume, float),
+            "radius": (self.radius, float),
+            "mass": (np.ones_like(self.radius), float),
+            "area": (np.ones_like(self.radius), float),
+            "diagonal": (self.radius, float),
+            "compound": (compound, int),
+            "variant": (variant, int),
+        }
         arrays = {name: wp.array(np.asarray(values), dtype=dtype, device=self.device) for name, (values, dtype) in columns.items()}
-        return filled(structs.CatalogData(), {"count": len(compound), **arrays, "empty_single": int((compound == 0).sum()),
-                                              "empty_compound": int(compound.sum()), "empty_mass": 0.1})
+        return filled(
+            structs.CatalogData(),
+            {
+                "count": len(compound),
+                **arrays,
+                "empty_single": int((compound == 0).sum()),
+                "empty_compound": int(compound.sum()),
+                "empty_mass": 0.1,
+            },
+        )
 
     def _physics(self) -> Any:
         def made(per_world: int, dtype: Any = float) -> wp.array:

@@ -50,8 +50,19 @@ class World:
 
     def settle(self, episode: int, redraw: int, mode: int, entry: list[int]) -> None:
         """An arrangement falls."""
-        self.now(phase=phases.SETTLE, episode=episode, redraw=redraw, mode=mode, frame=-1, live=0, task=phases.NO_TASK, outcome=0,
-                 attempt=-1, ending=0, entry=entry)  # fmt: skip
+        self.now(
+            phase=phases.SETTLE,
+            episode=episode,
+            redraw=redraw,
+            mode=mode,
+            frame=-1,
+            live=0,
+            task=phases.NO_TASK,
+            outcome=0,
+            attempt=-1,
+            ending=0,
+            entry=entry,
+        )
 
     def first_frame(self) -> None:
         """The gripper begins to act."""
@@ -105,6 +116,7 @@ def play(script: dict[World, Ticks], log: AttemptLog) -> dict[tuple[int, int], E
 
 def report(side_by_side: list[World]) -> TickReport:
     """The report of one tick."""
+
     def stacked(part: str) -> SimpleNamespace:
         parts = [vars(getattr(world, part)) for world in side_by_side]
         return SimpleNamespace(**{name: np.concatenate([arrays[name] for arrays in parts]) for name in parts[0]})

@@ -64,16 +64,26 @@ def _entry(obj_id: int, sizes: Sequence[tuple[float, float, float]]) -> CatalogE
     whole = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts])
     whole.unmerge_vertices()
     vertices = np.asarray(whole.vertices, np.float32)
-    mesh = TriangleMesh(vertices, np.asarray(whole.faces, np.int32), np.asarray(whole.vertex_normals, np.float32),
-                        np.zeros((len(vertices), 2), np.float32))
+    mesh = TriangleMesh(
+        vertices, np.asarray(whole.faces, np.int32), np.asarray(whole.vertex_normals, np.float32), np.zeros((len(vertices), 2), np.float32)
+    )
     properties = mass_properties(parts)
     mass = DENSITY * properties.volume
     return CatalogEntry(
-        obj_id=obj_id, name=f"boxes_{obj_id}", mesh=mesh, material=Material((0.6, 0.5, 0.4), None, 0.0, 0.5), pieces=parts,
-        volume=properties.volume, radius=float(np.linalg.norm(vertices, axis=1).max()), mass=mass,
-        center_of_mass=properties.center_of_mass, inertia=mass * properties.unit_inertia,
-        diameter=float(np.linalg.norm(vertices[:, None] - vertices[None], axis=2).max()), symmetries_discrete=(),
-        symmetries_continuous=(), source=None,
+        obj_id=obj_id,
+        name=f"boxes_{obj_id}",
+        mesh=mesh,
+        material=Material((0.6, 0.5, 0.4), None, 0.0, 0.5),
+        pieces=parts,
+        volume=properties.volume,
+        radius=float(np.linalg.norm(vertices, axis=1).max()),
+        mass=mass,
+        center_of_mass=properties.center_of_mass,
+        inertia=mass * properties.unit_inertia,
+        diameter=float(np.linalg.norm(vertices[:, None] - vertices[None], axis=2).max()),
+        symmetries_discrete=(),
+        symmetries_continuous=(),
+        source=None,
     )
 
 

@@ -21,14 +21,38 @@ from tests.worlds import box_views
 STEP_COUNT = 4
 COMPUTED = ("time",)
 ATTEMPT = {
-    "episode": 0, "attempt": 0, "mode": "pick", "frame": 1, "end_frame": 5, "outcome": "target_picked", "sentence": "the target hung",
-    "target": 2, "object_id": 7, "point": [0.1, 0.2, 0.3], "normal": [0.0, 0.0, 1.0], "yaw": 0.25, "tilt": -0.5, "rays": 10, "hits": 9,
-    "good_seal": False, "caught": [2], "picked": [2, 3], "load": [0.0, 3.25], "sight": {"resolution": [4, 3], "instances": [], "votes": []},
-}  # fmt: skip
+    "episode": 0,
+    "attempt": 0,
+    "mode": "pick",
+    "frame": 1,
+    "end_frame": 5,
+    "outcome": "target_picked",
+    "sentence": "the target hung",
+    "target": 2,
+    "object_id": 7,
+    "point": [0.1, 0.2, 0.3],
+    "normal": [0.0, 0.0, 1.0],
+    "yaw": 0.25,
+    "tilt": -0.5,
+    "rays": 10,
+    "hits": 9,
+    "good_seal": False,
+    "caught": [2],
+    "picked": [2, 3],
+    "load": [0.0, 3.25],
+    "sight": {"resolution": [4, 3], "instances": [], "votes": []},
+}
 UNSEEN = ATTEMPT | {
-    "attempt": 1, "frame": 6, "end_frame": 7, "outcome": "nothing_seen", "hits": 0, "caught": [], "picked": [], "load": [],
+    "attempt": 1,
+    "frame": 6,
+    "end_frame": 7,
+    "outcome": "nothing_seen",
+    "hits": 0,
+    "caught": [],
+    "picked": [],
+    "load": [],
     **dict.fromkeys(("target", "object_id", "point", "normal", "yaw", "tilt")),
-}  # fmt: skip
+}
 
 
 def config(**trajectory: Any) -> Config:

@@ -63,19 +63,31 @@ def episode_ticks(episode: int, frames: int = FRAMES) -> list[TickBatch]:
             object_id[PICKED] = -1
             pose[PICKED, :] = 0.0  # nobody may look at it
         seen = GRIPPER[0] <= frame < GRIPPER[1]
-        made.append(TickBatch(
-            episode=np.array([episode], np.int32), frame=np.array([frame], np.int32), time=np.array([frame / 15.0]),
-            object_id=object_id[None], pose=pose[None, :4].astype(np.float32), fixture_pose=pose[None, 4:].astype(np.float32),
-            fixture_visible=np.array([[1, seen, seen]], np.int32), light=np.array([LIGHT], np.int32),
-            light_turn=np.array([TURN], np.float32), light_exposure=np.array([STOPS], np.float32),
-        ))  # fmt: skip
+        made.append(
+            TickBatch(
+                episode=np.array([episode], np.int32),
+                frame=np.array([frame], np.int32),
+                time=np.array([frame / 15.0]),
+                object_id=object_id[None],
+                pose=pose[None, :4].astype(np.float32),
+                fixture_pose=pose[None, 4:].astype(np.float32),
+                fixture_visible=np.array([[1, seen, seen]], np.int32),
+                light=np.array([LIGHT], np.int32),
+                light_turn=np.array([TURN], np.float32),
+                light_exposure=np.array([STOPS], np.float32),
+            )
+        )
     return made
 
 
 def write_set(
-    out: Path, config: Config, catalog: Catalog, episodes: Iterable[int] = (0,), lights: tuple[LightMap, ...] | None = None,
+    out: Path,
+    config: Config,
+    catalog: Catalog,
+    episodes: Iterable[int] = (0,),
+    lights: tuple[LightMap, ...] | None = None,
     frames: int = FRAMES,
-) -> Path:  # fmt: skip
+) -> Path:
     """A finished data set, written in this process; returns the folder of its USD files."""
     (out / PARTIAL).mkdir(parents=True)
     with WriterPool(0, 0) as pool:

@@ -76,8 +76,15 @@ def check_labels(episode: zarr.Group, found: dict[str, Measure], where: str) -> 
     found["labels"].see(np.array([lacking]), where)
 
 
-def check_objects(steps: dict[str, np.ndarray], ticks: dict[str, np.ndarray], mass: np.ndarray, root: Any, settings: Any,
-                  found: dict[str, Measure], where: str) -> None:  # fmt: skip
+def check_objects(
+    steps: dict[str, np.ndarray],
+    ticks: dict[str, np.ndarray],
+    mass: np.ndarray,
+    root: Any,
+    settings: Any,
+    found: dict[str, Measure],
+    where: str,
+) -> None:
     """Poses, velocities and contact forces."""
     count, step, gravity = root["steps_per_tick"], root["step"], root["gravity"]
     there = ticks["object_id"] >= 0

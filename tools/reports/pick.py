@@ -75,9 +75,16 @@ def main(arguments: list[str] | None = None) -> int:
     machine = describe_machine(device)
     tables(console, machine, rows, tally, pace)
     if options.json:
-        record = {"machine": dict(machine), "seed": config.bake.seed, "real_objects": bool(options.models), "interrupted": interrupted,
-                  **pace, "redrawn": tally.redrawn, "rows": [row.record() for row in rows],
-                  "sequences": [vars(sequence) for mode in options.modes for sequence in tally.sequences(mode)]}
+        record = {
+            "machine": dict(machine),
+            "seed": config.bake.seed,
+            "real_objects": bool(options.models),
+            "interrupted": interrupted,
+            **pace,
+            "redrawn": tally.redrawn,
+            "rows": [row.record() for row in rows],
+            "sequences": [vars(sequence) for mode in options.modes for sequence in tally.sequences(mode)],
+        }
         options.json.write_text(json.dumps(record, indent=1) + "\n")
     return 130 if interrupted else 0 if all(all(row.holds.values()) for row in rows) and tally.complete() else 1
 

@@ -31,6 +31,7 @@ from tools.reports.render_sheet import contact_sheets, strip
 
 PICTURES = (".png", ".jpg", ".jpeg")
 
+
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print, and return the exit code."""
     options = _parse(arguments)
@@ -55,9 +56,14 @@ def main(arguments: list[str] | None = None) -> int:
     machine = describe_machine(device)
     _print(console, machine, rows, config, time.perf_counter() - started)
     if options.json:
-        record = {"machine": dict(machine), "samples": config.render.samples, "bounces": config.render.bounces,
-                  "real_objects": bool(options.models), "real_lights": bool(options.lights),
-                  "rows": [dataclasses.asdict(row) for row in rows]}  # fmt: skip
+        record = {
+            "machine": dict(machine),
+            "samples": config.render.samples,
+            "bounces": config.render.bounces,
+            "real_objects": bool(options.models),
+            "real_lights": bool(options.lights),
+            "rows": [dataclasses.asdict(row) for row in rows],
+        }
         options.json.write_text(json.dumps(record, indent=1) + "\n")
     return 0 if all(row.holds for row in rows) else 1
 

@@ -94,8 +94,9 @@ def furnaces(config: Config, device: Any) -> list[Row]:
     flat = np.zeros((len(vertices), 2), np.float32)
     mesh = TriangleMesh(vertices, np.asarray(made.faces, dtype=np.int32), vertices / np.float32(0.1), flat)
     kinds = [(metallic, roughness) for metallic in (0.0, 1.0) for roughness in ROUGHNESSES]
-    above = replace(config.cameras, resolution=(64, 64), fov=10.0, positions=((0.0, 0.0, 2.0),), target=(0.0, 0.0, 0.0),
-                    ups=((0.0, 1.0, 0.0),))  # fmt: skip
+    above = replace(
+        config.cameras, resolution=(64, 64), fov=10.0, positions=((0.0, 0.0, 2.0),), target=(0.0, 0.0, 0.0), ups=((0.0, 1.0, 0.0),)
+    )
     rows = []
     for mode in (REFERENCE, FAST):
         studio = _bare_studio(with_mode(config, mode), mesh, kinds, make_cameras(above), _even(), device)
@@ -122,8 +123,14 @@ def planes(config: Config, device: Any) -> list[Row]:
     azimuths = (np.arange(QUADRATURE) + 0.5) / QUADRATURE * 2.0 * np.pi
     places = [2.0 * np.array([np.sqrt(1 - c * c) * np.cos(a), np.sqrt(1 - c * c) * np.sin(a), c]) for c in cosines for a in azimuths]
     shares = np.repeat(weights * cosines, QUADRATURE) / QUADRATURE
-    around = replace(config.cameras, resolution=(32, 32), fov=2.0, positions=tuple(map(tuple, places)), target=(0.0, 0.0, 0.0),
-                     ups=((0.0, 0.0, 1.0),) * len(places))  # fmt: skip
+    around = replace(
+        config.cameras,
+        resolution=(32, 32),
+        fov=2.0,
+        positions=tuple(map(tuple, places)),
+        target=(0.0, 0.0, 0.0),
+        ups=((0.0, 0.0, 1.0),) * len(places),
+    )
     rows = []
     for height in LAMP_HEIGHTS:
         cosine = float(np.sin(np.radians(height)))

@@ -121,9 +121,16 @@ def main(arguments: list[str] | None = None) -> int:
     wall = time.perf_counter() - started
     tables(console, machine, rows, config, wall)
     if options.json:
-        record = {"machine": dict(machine), "arrangements": config.bake.episodes, "worlds": config.bake.worlds, "seed": config.bake.seed,
-                  "real_objects": bool(options.models), "interrupted": interrupted, "seconds": wall,
-                  "rows": [dataclasses.asdict(row) | {"value": row.value if np.isfinite(row.value) else None} for row in rows]}
+        record = {
+            "machine": dict(machine),
+            "arrangements": config.bake.episodes,
+            "worlds": config.bake.worlds,
+            "seed": config.bake.seed,
+            "real_objects": bool(options.models),
+            "interrupted": interrupted,
+            "seconds": wall,
+            "rows": [dataclasses.asdict(row) | {"value": row.value if np.isfinite(row.value) else None} for row in rows],
+        }
         options.json.write_text(json.dumps(record, indent=1) + "\n")
     return 130 if interrupted else 0 if all(row.holds for row in rows) else 1
 
@@ -232,9 +239,11 @@ def place_of(pose: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """World positions (N, 3) of `point` (N, 3), given in the frames that `pose` (N, 7) places, and these frames' rotations (N, 3, 3)."""
     x, y, z, w = pose[:, 3:].astype(np.float64).T
     turn = np.array(
-        [[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]]
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
     ).transpose(2, 0, 1)
     return pose[:, :3] + np.einsum("nij,nj->ni", turn, point), turn
 

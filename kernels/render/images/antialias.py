@@ -223,9 +223,7 @@ def seen_candidates(bodies: Bodies, view: int, tile: int, seen: wp.uint64) -> wp
 
 
 @wp.func
-def like_corner(
-    hits: Hits, grid: ImageGrid, view: int, row: int, column: int, own: int, offset: wp.vec2, hit: Hit, plane: Plane
-) -> int:
+def like_corner(hits: Hits, grid: ImageGrid, view: int, row: int, column: int, own: int, offset: wp.vec2, hit: Hit, plane: Plane) -> int:
     """Which corner of a square shows best what a ray `offset` [px] off the centre of its corner `own` hit: the same body, near the tangent
     plane there, close by. `own`, if none shows that body. `plane` is the hit's, as that pixel sees it."""
     best = own

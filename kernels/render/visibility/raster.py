@@ -49,9 +49,16 @@ class Marks:
 
 @wp.func
 def mark_pixel(
-    marks: Marks, amodal: wp.array3d[wp.uint32], view: int, row: int, column: int, triangle: Triangle, ray: wp.vec3, name: wp.uint64,
+    marks: Marks,
+    amodal: wp.array3d[wp.uint32],
+    view: int,
+    row: int,
+    column: int,
+    triangle: Triangle,
+    ray: wp.vec3,
+    name: wp.uint64,
     bit: wp.uint32,
-):  # fmt: skip
+):
     """Leave a triangle's mark, and its instance's bit, where it meets a pixel's ray. Neither depends on the order of threads."""
     weights = ray_weights(triangle, ray)
     if weights[0] >= 0.0:
@@ -79,9 +86,16 @@ def amodal_bit(body: int, instances: int) -> wp.uint32:
 
 @wp.func
 def mark_pixels(
-    marks: Marks, amodal: wp.array3d[wp.uint32], intrinsics: wp.vec4, view: int, pixels: wp.vec4i, triangle: Triangle,
-    footprint: Footprint, name: wp.uint64, bit: wp.uint32,
-):  # fmt: skip
+    marks: Marks,
+    amodal: wp.array3d[wp.uint32],
+    intrinsics: wp.vec4,
+    view: int,
+    pixels: wp.vec4i,
+    triangle: Triangle,
+    footprint: Footprint,
+    name: wp.uint64,
+    bit: wp.uint32,
+):
     """`mark_pixel` for the pixels of a footprint within a range. One loop for rows and columns: neighbouring threads, whose triangles
     have other rows but about as many pixels, stay together."""
     row = pixels[1] - 1
@@ -180,9 +194,7 @@ def mark_triangles_kernel(
             if columns * rows > SMALL:
                 listed = list_blocks(marks_inout, view, number, k, found)
             if not listed:
-                mark_pixels(
-                    marks_inout, amodal_inout, intrinsics, view, found, triangle, footprint, mark_name(body, k), bit
-                )
+                mark_pixels(marks_inout, amodal_inout, intrinsics, view, found, triangle, footprint, mark_name(body, k), bit)
 
 
 @wp.kernel

@@ -60,11 +60,9 @@ class SceneExporter(ABC):
         self._layers = data_set.config.render.layers
         effects = tuple(name for name, strengths in strength_ranges(data_set.config.effects).items() if any(strengths))
         self._views = tuple(
-            ViewSettings(
-                self._suffix, config.jpeg_quality, effects, config.masks, config.coco, shared_record(camera, config.depth_scale)
-            )
+            ViewSettings(self._suffix, config.jpeg_quality, effects, config.masks, config.coco, shared_record(camera, config.depth_scale))
             for camera in data_set.cameras
-        )  # fmt: skip
+        )
         self._episodes: dict[int, _Episode] = {}
         self._begun = 0
 

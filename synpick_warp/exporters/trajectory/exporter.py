@@ -186,9 +186,15 @@ class TrajectoryExporter:
             raise ValueError(f"episode {number} ended with {end.frames} frames, but {episode.count} came")
         ending = Ending(end.ending)
         attributes = {
-            "episode": end.episode, "redraw": end.redraw, "frames": end.frames, "ending": ending.name.lower(), "sentence": ending.sentence,
-            "seed": self._data_set.config.bake.seed, **end.row, **episode.start,
-        }  # fmt: skip
+            "episode": end.episode,
+            "redraw": end.redraw,
+            "frames": end.frames,
+            "ending": ending.name.lower(),
+            "sentence": ending.sentence,
+            "seed": self._data_set.config.bake.seed,
+            **end.row,
+            **episode.start,
+        }
         facts = EpisodeFacts(attributes, episode.object_id, episode.drop_pose, end.attempts)
         arguments = (episode.folder, episode.rows.dtype, episode.count, self._place(number), facts, self._settings)
         pool.submit(write_episode, (), arguments, path=self._place(number), done=episode.whole)

@@ -97,17 +97,20 @@ def write_constants(store: Path, config: Config, catalog: Catalog, cameras: tupl
             shutil.rmtree(place)
         else:
             place.unlink(missing_ok=True)
-    root = zarr.create_group(store, attributes={
-        "description": "Physics of a synpick-warp data set. SI units; the world's origin is the centre of the tote's inner floor, z up. "
-                       f"Episodes are in {EPISODES}, named by number.",
-        "format": FORMAT,
-        "seed": config.bake.seed,
-        "step": physics.step,
-        "steps_per_tick": physics.steps_per_tick,
-        "gravity": physics.gravity,
-        "units": {"step": "s", "gravity": "m/s²"},
-        "lights": [light.name for light in lights],
-    })  # fmt: skip
+    root = zarr.create_group(
+        store,
+        attributes={
+            "description": "Physics of a synpick-warp data set. SI units; the world's origin is the centre of the tote's inner floor, z up. "
+            f"Episodes are in {EPISODES}, named by number.",
+            "format": FORMAT,
+            "seed": config.bake.seed,
+            "step": physics.step,
+            "steps_per_tick": physics.steps_per_tick,
+            "gravity": physics.gravity,
+            "units": {"step": "s", "gravity": "m/s²"},
+            "lights": [light.name for light in lights],
+        },
+    )
     entries = catalog.entries
     objects = add_group(root, "objects", OBJECTS, {"names": [entry.name for entry in entries]})
     for name, quantity in OBJECTS.arrays.items():

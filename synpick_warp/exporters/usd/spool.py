@@ -45,10 +45,18 @@ class TickSpool:
 
 def tick_type(instances: int) -> np.dtype:
     """A row of the file."""
-    return np.dtype([
-        ("frame", "<i4"), ("object_id", "<i4", instances), ("pose", "<f4", (instances, 7)), ("fixture_pose", "<f4", (3, 7)),
-        ("fixture_visible", "<i4", 3), ("light", "<i4"), ("light_turn", "<f4"), ("light_exposure", "<f4"),
-    ])  # fmt: skip
+    return np.dtype(
+        [
+            ("frame", "<i4"),
+            ("object_id", "<i4", instances),
+            ("pose", "<f4", (instances, 7)),
+            ("fixture_pose", "<f4", (3, 7)),
+            ("fixture_visible", "<i4", 3),
+            ("light", "<i4"),
+            ("light_turn", "<f4"),
+            ("light_exposure", "<f4"),
+        ]
+    )
 
 
 def read_ticks(path: Path, instances: int) -> np.ndarray:

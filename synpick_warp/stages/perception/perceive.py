@@ -19,9 +19,15 @@ class Looker:
     """Looks at worlds in batches until none is left; on a GPU that loop is a node of a graph, and the host does not know its length."""
 
     def __init__(
-        self, config: Config, render_scene: RenderScene, scene: SceneData, state: WorldState, attempts: AttemptState, sighting: Sighting,
+        self,
+        config: Config,
+        render_scene: RenderScene,
+        scene: SceneData,
+        state: WorldState,
+        attempts: AttemptState,
+        sighting: Sighting,
         plan: Plan,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Allocate scratch.
 
         Args:
@@ -83,6 +89,4 @@ class Looker:
         self.sight.trace(snapshot)
         self.sight.find_suction_points(self.scene, snapshot.entry, self.sighting)
         self.planner.plan(self.scene, self.sight, self.state, self.attempts, self.sighting, self.plan, self.seed)
-        wp.launch(
-            worklist.pass_batch_kernel, dim=1, inputs=[views, self._count], outputs=[self._first, self._left], device=self.device
-        )
+        wp.launch(worklist.pass_batch_kernel, dim=1, inputs=[views, self._count], outputs=[self._first, self._left], device=self.device)

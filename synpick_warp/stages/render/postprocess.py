@@ -68,9 +68,7 @@ class Developer:
             sizes = {"view": views, "row": scene.height, "column": scene.width}
             self.spread = allocate(SpreadArrays, sizes, scene.device).radiance
 
-    def develop(
-        self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, picture: Any, out: ViewBuffers
-    ) -> None:
+    def develop(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, picture: Any, out: ViewBuffers) -> None:
         """Colour of the first `count` views.
 
         Args:

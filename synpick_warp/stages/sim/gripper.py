@@ -17,23 +17,40 @@ def begin_moving(scene: SceneData, state: WorldState, physics: Physics, seed: in
     wp.launch(
         gripper.begin_moving_kernel,
         dim=state.phase.shape[0],
-        inputs=[wp.uint64(seed), scene.layout, scene.move, state.address, state.mode, state.phase, state.frame, physics.state.joint_q,
-                physics.state.joint_qd],
+        inputs=[
+            wp.uint64(seed),
+            scene.layout,
+            scene.move,
+            state.address,
+            state.mode,
+            state.phase,
+            state.frame,
+            physics.state.joint_q,
+            physics.state.joint_qd,
+        ],
         outputs=[state.order, state.goal, state.waypoint],
         device=state.phase.device,
     )
 
 
-def begin_picking(
-    scene: SceneData, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, physics: Physics
-) -> None:
+def begin_picking(scene: SceneData, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, physics: Physics) -> None:
     """Where a world begins to pick, let it look; forget the outcomes of the last tick."""
     wp.launch(
         tasks.begin_picking_kernel,
         dim=state.phase.shape[0],
         inputs=[scene.layout, state.phase, state.mode, state.frame],
-        outputs=[attempts.task, attempts.steps, attempts.attempt, attempts.outcome, attempts.failures, plan.target, plan.yaw,
-                 sighting.overflow, attempts.removed, physics.control.joint_target_q],
+        outputs=[
+            attempts.task,
+            attempts.steps,
+            attempts.attempt,
+            attempts.outcome,
+            attempts.failures,
+            plan.target,
+            plan.yaw,
+            sighting.overflow,
+            attempts.removed,
+            physics.control.joint_target_q,
+        ],
         device=state.phase.device,
     )
 
@@ -54,23 +71,41 @@ def set_fingers(scene: SceneData, state: WorldState, physics: Physics) -> None:
     )
 
 
-def drive_gripper(
-    scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics, current: newton.State
-) -> None:
+def drive_gripper(scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics, current: newton.State) -> None:
     """Move the goals on by one step and set the grippers' forces."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
         gripper.move_goals_kernel,
         dim=worlds,
-        inputs=[scene.move, scene.pick, state.phase, state.mode, state.order, plan.point, plan.normal, attempts.task, attempts.steps,
-                state.waypoint, state.goal],
+        inputs=[
+            scene.move,
+            scene.pick,
+            state.phase,
+            state.mode,
+            state.order,
+            plan.point,
+            plan.normal,
+            attempts.task,
+            attempts.steps,
+            state.waypoint,
+            state.goal,
+        ],
         device=device,
     )
     wp.launch(
         gripper.drive_gripper_kernel,
         dim=worlds,
-        inputs=[scene.layout, scene.move, scene.pick, state.phase, state.mode, attempts.task, state.goal, current.joint_q,
-                current.joint_qd],
+        inputs=[
+            scene.layout,
+            scene.move,
+            scene.pick,
+            state.phase,
+            state.mode,
+            attempts.task,
+            state.goal,
+            current.joint_q,
+            current.joint_qd,
+        ],
         outputs=[physics.control.joint_f],
         device=device,
     )
@@ -81,8 +116,17 @@ def remove_lost(scene: SceneData, state: WorldState, attempts: AttemptState, sea
     wp.launch(
         tasks.remove_lost_kernel,
         dim=state.entry.shape,
-        inputs=[scene.layout, scene.drop, scene.settle, scene.pick, state.phase, state.slot, state.shift, physics.state.body_q,
-                state.entry],
+        inputs=[
+            scene.layout,
+            scene.drop,
+            scene.settle,
+            scene.pick,
+            state.phase,
+            state.slot,
+            state.shift,
+            physics.state.body_q,
+            state.entry,
+        ],
         outputs=[attempts.removed, seals.held],
         device=state.phase.device,
     )
@@ -97,8 +141,21 @@ def end_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, se
     wp.launch(
         tasks.advance_tasks_kernel,
         dim=worlds,
-        inputs=[scene.move, scene.pick, state.phase, state.mode, state.goal, plan.point, plan.normal, plan.target, attempts.caught,
-                attempts.hanging, attempts.task, attempts.steps, attempts.failures],
+        inputs=[
+            scene.move,
+            scene.pick,
+            state.phase,
+            state.mode,
+            state.goal,
+            plan.point,
+            plan.normal,
+            plan.target,
+            attempts.caught,
+            attempts.hanging,
+            attempts.task,
+            attempts.steps,
+            attempts.failures,
+        ],
         outputs=[attempts.outcome],
         device=device,
     )

@@ -63,8 +63,12 @@ class Physics:
         self.model.rigid_contact_max = physics.contacts_per_world * worlds
         self.pipeline = newton.CollisionPipeline(
             # Matching contacts with those of the step before sorts them, so their order is the same every time.
-            self.model, broad_phase="nxn", contact_matching="latest", rigid_contact_max=physics.contacts_per_world * worlds,
-            shape_pairs_max=physics.pairs_per_world * worlds, verify_buffers=False,
+            self.model,
+            broad_phase="nxn",
+            contact_matching="latest",
+            rigid_contact_max=physics.contacts_per_world * worlds,
+            shape_pairs_max=physics.pairs_per_world * worlds,
+            verify_buffers=False,
         )
         self.contacts = self.pipeline.contacts()
         self.solver = newton.solvers.SolverSteel(

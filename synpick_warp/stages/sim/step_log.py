@@ -77,9 +77,15 @@ class Recorder:
     """Watches the steps of a tick. It launches the same kernels on the same arrays every time, as they are captured in a graph."""
 
     def __init__(
-        self, config: Config, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics,
+        self,
+        config: Config,
+        scene: SceneData,
+        state: WorldState,
+        attempts: AttemptState,
+        seals: SealState,
+        physics: Physics,
         sizes: dict[str, int],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Allocate what a tick's steps are written into.
 
         Args:
@@ -138,8 +144,13 @@ class Recorder:
         wp.launch(
             step_log.sum_contacts_kernel,
             dim=contacts.rigid_contact_max,
-            inputs=[self._physics.model.shape_body, contacts.rigid_contact_count, contacts.rigid_contact_shape0,
-                    contacts.rigid_contact_shape1, contact_f],
+            inputs=[
+                self._physics.model.shape_body,
+                contacts.rigid_contact_count,
+                contacts.rigid_contact_shape0,
+                contacts.rigid_contact_shape1,
+                contact_f,
+            ],
             outputs=[self._total],
             device=self._device,
         )

@@ -61,8 +61,22 @@ class Suction:
         wp.launch(
             seal.hold_objects_kernel,
             dim=state.phase.shape[0],
-            inputs=[scene.layout, scene.suction, model.body_com, model.body_inv_mass, model.body_inv_inertia, state.slot, seals.anchor,
-                    seals.limit, current.body_q, current.body_qd, seals.held, seals.load, seals.peak, physics.control.joint_f],
+            inputs=[
+                scene.layout,
+                scene.suction,
+                model.body_com,
+                model.body_inv_mass,
+                model.body_inv_inertia,
+                state.slot,
+                seals.anchor,
+                seals.limit,
+                current.body_q,
+                current.body_qd,
+                seals.held,
+                seals.load,
+                seals.peak,
+                physics.control.joint_f,
+            ],
             device=state.phase.device,
         )
 
@@ -72,8 +86,15 @@ class Suction:
         wp.launch(
             seal.ignore_held_contacts_kernel,
             dim=contacts.rigid_contact_max,
-            inputs=[scene.layout, physics.model.shape_body, contacts.rigid_contact_count, state.slot, seals.held,
-                    contacts.rigid_contact_shape0, contacts.rigid_contact_shape1],
+            inputs=[
+                scene.layout,
+                physics.model.shape_body,
+                contacts.rigid_contact_count,
+                state.slot,
+                seals.held,
+                contacts.rigid_contact_shape0,
+                contacts.rigid_contact_shape1,
+            ],
             outputs=[contacts.rigid_contact_margin0],
             device=state.phase.device,
         )

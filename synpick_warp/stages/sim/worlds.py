@@ -13,7 +13,20 @@ from synpick_warp.stages.buffers import FIXTURES
 # Corners of the tote that a round of moving visits.
 CORNERS = 4
 STATUS_COLUMNS = (
-    "phase", "ending", "episode", "redraw", "frame", "live", "mode", "task", "attempt", "outcome", "target", "hits", "caught", "held",
+    "phase",
+    "ending",
+    "episode",
+    "redraw",
+    "frame",
+    "live",
+    "mode",
+    "task",
+    "attempt",
+    "outcome",
+    "target",
+    "hits",
+    "caught",
+    "held",
 )
 """Columns of `WorldStatus.table`; see `WorldState`, `AttemptState` and `Plan`. They tell of the end of the tick, before worlds are looked
 at: attempt, target, hits and caught are the running attempt's, or in a tick with an outcome those of the attempt that ended. held: bit

@@ -67,13 +67,26 @@ def split(dataset) -> Path:
 
 def test_the_tree_is_bops_and_nothing_else(dataset, split):
     assert {path.name for path in dataset.iterdir()} == {
-        "camera.json", "dataset_info.md", "models", "models_eval", "test_targets_bop19.json", "test_targets_bop24.json", "train_pbr",
-    }  # fmt: skip
+        "camera.json",
+        "dataset_info.md",
+        "models",
+        "models_eval",
+        "test_targets_bop19.json",
+        "test_targets_bop24.json",
+        "train_pbr",
+    }
     assert {path.name for path in split.iterdir()} == {f"{scene:06d}" for scene in (0, 1, 2, 6, 7, 8)}
     for scene in split.iterdir():
         assert {path.name for path in scene.iterdir()} == {
-            "rgb", "depth", "mask", "mask_visib", "scene_camera.json", "scene_gt.json", "scene_gt_info.json", "scene_gt_coco.json",
-        }  # fmt: skip
+            "rgb",
+            "depth",
+            "mask",
+            "mask_visib",
+            "scene_camera.json",
+            "scene_gt.json",
+            "scene_gt_info.json",
+            "scene_gt_coco.json",
+        }
         names = [f"{frame:06d}" for frame in range(FRAMES)]
         masks = {f"{name}_{index:06d}.png" for name in names for index in range(3)}
         assert {path.name for path in (scene / "rgb").iterdir()} == {f"{name}.jpg" for name in names}

@@ -90,9 +90,16 @@ def test_what_an_episode_says_of_itself(store):
     assert {name: light[name] for name in ("map", "turn", "exposure")} == {"map": 0, "turn": 2.0, "exposure": 0.25}
     assert light["units"] == {"turn": "rad", "exposure": "stops"}
     assert attributes == {
-        "episode": 4, "redraw": 1, "frames": FRAMES, "ending": "emptied", "sentence": "no object is left in the tote", "seed": 0,
-        "mode": "pick", "picked": 2, "redrops": 4,
-    }  # fmt: skip
+        "episode": 4,
+        "redraw": 1,
+        "frames": FRAMES,
+        "ending": "emptied",
+        "sentence": "no object is left in the tote",
+        "seed": 0,
+        "mode": "pick",
+        "picked": 2,
+        "redrops": 4,
+    }
     np.testing.assert_array_equal(episode["arrangement/object_id"][:], box_views.OBJECT_IDS[:INSTANCES])
     np.testing.assert_array_equal(episode["arrangement/mass"][:], [0.3, np.nan, 0.3, 0.3])
     drops = taken(4)[0].tick["drop_pose"][0, :INSTANCES]

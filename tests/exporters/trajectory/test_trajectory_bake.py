@@ -29,11 +29,22 @@ TOOL = "tools.checks.trajectory"
 @pytest.fixture(scope="module")
 def mixed() -> Config:
     """One episode that picks and others of any mode, in some seconds."""
-    return settings(**SHORT | {
-        "bake__formats": ["zarr"], "bake__mode": "mixed", "bake__episodes": 3, "arrangement__max_objects": 2, "pick__failures": 1,
-        "sight__resolution": [160, 90], "cameras__resolution": [32, 18], "physics__step": 4e-3, "physics__steps_per_tick": 16,
-        "physics__substeps": 1, "physics__iterations": 8,
-    })  # fmt: skip
+    return settings(
+        **SHORT
+        | {
+            "bake__formats": ["zarr"],
+            "bake__mode": "mixed",
+            "bake__episodes": 3,
+            "arrangement__max_objects": 2,
+            "pick__failures": 1,
+            "sight__resolution": [160, 90],
+            "cameras__resolution": [32, 18],
+            "physics__step": 4e-3,
+            "physics__steps_per_tick": 16,
+            "physics__substeps": 1,
+            "physics__iterations": 8,
+        }
+    )
 
 
 @pytest.fixture(scope="module")
@@ -68,11 +79,13 @@ def test_the_laws_of_motion_hold(out, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("array", "what"),
     [
-        ("steps/velocity", "change of momentum"), ("steps/contact_force", "contacts of all objects against their weight"),
-        ("steps/pose", "last step against frame"), ("steps/goal", "gripper: force against its law"),
+        ("steps/velocity", "change of momentum"),
+        ("steps/contact_force", "contacts of all objects against their weight"),
+        ("steps/pose", "last step against frame"),
+        ("steps/goal", "gripper: force against its law"),
         ("steps/seal_load", "largest load of a tick"),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_is_found(out, tmp_path, monkeypatch, capsys, array, what):
     picking = next(episode for episode in synpick_warp.open(out).values() if episode.attributes["mode"] != "move")
     shutil.copytree(out, tmp_path / "set")

@@ -79,10 +79,13 @@ def test_a_file_that_is_cut_short_is_an_error(tmp_path):
 def test_an_episode_is_a_file_and_assets_are_shared(folder):
     names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assert names == {
-        "000000.usdc", "000004.usdc",
+        "000000.usdc",
+        "000004.usdc",
         *(f"assets/{name}.usdc" for name in ("obj_000001", "obj_000002", "obj_000003", "tote", "finger", "cup", "table")),
-        "assets/textures/obj_000002.png", "assets/lights/light_000.exr", "assets/lights/light_001.exr",
-    }  # fmt: skip
+        "assets/textures/obj_000002.png",
+        "assets/lights/light_000.exr",
+        "assets/lights/light_001.exr",
+    }
     assert (folder / "000000.usdc").stat().st_size < 60_000
 
 
@@ -164,7 +167,7 @@ def test_objects_have_their_meshes_and_surfaces(folder, entry):
     np.testing.assert_array_equal(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get(), entry.mesh.uv)
     assert UsdGeom.Mesh.ValidateTopology(
         mesh.GetFaceVertexIndicesAttr().Get(), mesh.GetFaceVertexCountsAttr().Get(), len(entry.mesh.vertices)
-    )[0]  # fmt: skip
+    )[0]
     material, _ = UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()
     shader, _, _ = material.ComputeSurfaceSource()
     assert shader.GetShaderId() == "UsdPreviewSurface"

@@ -29,11 +29,21 @@ NEAR = 0.02
 @pytest.fixture(scope="module")
 def picking() -> Config:
     """Two objects, picked or not, in a second or two."""
-    return settings(**SHORT | {
-        "bake__formats": ["bop", "usd"], "bake__episodes": 1, "arrangement__max_objects": 2, "pick__failures": 1,
-        "sight__resolution": [160, 90], "cameras__resolution": [192, 108], "physics__step": 4e-3, "physics__steps_per_tick": 16,
-        "physics__substeps": 1, "physics__iterations": 6,
-    })  # fmt: skip
+    return settings(
+        **SHORT
+        | {
+            "bake__formats": ["bop", "usd"],
+            "bake__episodes": 1,
+            "arrangement__max_objects": 2,
+            "pick__failures": 1,
+            "sight__resolution": [160, 90],
+            "cameras__resolution": [192, 108],
+            "physics__step": 4e-3,
+            "physics__steps_per_tick": 16,
+            "physics__substeps": 1,
+            "physics__iterations": 6,
+        }
+    )
 
 
 @pytest.fixture(scope="module")

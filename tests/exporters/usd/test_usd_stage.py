@@ -128,9 +128,7 @@ def test_instances_are_named_in_every_way(stage):
         assert prim.GetDisplayName() == {3: "three", 1: "one", 2: "two"}[obj_id]
 
 
-SKEW = Camera(
-    640, 400, np.array([[900.0, 0, 301.5], [0, 850.0, 222.25], [0, 0, 1]]), LENSES[1].rotation, np.array([0.1, -0.2, 1.5])
-)  # fmt: skip
+SKEW = Camera(640, 400, np.array([[900.0, 0, 301.5], [0, 850.0, 222.25], [0, 0, 1]]), LENSES[1].rotation, np.array([0.1, -0.2, 1.5]))
 
 
 @given(

@@ -25,9 +25,15 @@ VIEW = camera(WIDTH, HEIGHT, FOCAL, (0.0, 0.0, TOP))
 COUNT = 1e-4
 """One count [m]."""
 PERFECT: dict[str, Any] = {
-    "noise": 0.0, "noise_growth": 0.0, "noise_angle": 0.0, "lateral_noise": 0.0, "disparity_step": 1e-5, "edge_width": 0, "shadows": False,
+    "noise": 0.0,
+    "noise_growth": 0.0,
+    "noise_angle": 0.0,
+    "lateral_noise": 0.0,
+    "disparity_step": 1e-5,
+    "edge_width": 0,
+    "shadows": False,
     "grazing_angle": 89.0,
-}  # fmt: skip
+}
 """A sensor without faults, but for what a test gives it."""
 
 

@@ -200,8 +200,14 @@ def test_motion_agrees_with_poses_in_float64(device, seed):
     meshes = [box(0.16, 0.07, 0.2), ball(0.06, 3), box(0.2, 0.004, 0.1)]
     now, then = ([random_pose(rng) for _ in meshes] for _ in range(2))
     fixtures_now, fixtures_then = (tuple(random_pose(rng) for _ in range(3)) for _ in range(2))
-    toy = ToyScene([entry(mesh) for mesh in meshes], [list(enumerate(now))], (view,), fixtures=FIXTURES, fixture_poses=fixtures_now,
-                   fixtures_visible=(1, 1, 1))  # fmt: skip
+    toy = ToyScene(
+        [entry(mesh) for mesh in meshes],
+        [list(enumerate(now))],
+        (view,),
+        fixtures=FIXTURES,
+        fixture_poses=fixtures_now,
+        fixtures_visible=(1, 1, 1),
+    )
     drawn = draw(toy, device, Before([list(enumerate(then))], [1], fixtures_then))
     place = points(drawn.depth[0], view)
     centers = np.stack(np.meshgrid(np.arange(160) + 0.5, np.arange(90) + 0.5), axis=-1)

@@ -67,9 +67,11 @@ def developed(radiance: np.ndarray, config: Config, at: Addresses = ONE, stops: 
         return wp.array(values, dtype=kind, device=device)
 
     world = SimpleNamespace(
-        episode=numbers(at.episode), frame=numbers(at.frame), light=numbers([0] * views),
+        episode=numbers(at.episode),
+        frame=numbers(at.frame),
+        light=numbers([0] * views),
         light_exposure=numbers([stops] * views, wp.float32),
-    )  # fmt: skip
+    )
     out = SimpleNamespace(
         color=wp.zeros((views, height, width), dtype=wp.vec3ub, device=device), effects=wp.zeros(views, dtype=Strengths, device=device)
     )
@@ -258,23 +260,36 @@ def resample(values: np.ndarray, center: float, scale: float, sigma: float) -> n
 
 @settings(max_examples=15)
 @given(
-    st.floats(0.0, 1.0), st.floats(-3.0, 3.0), st.sampled_from([0.0, 0.3, 1.0, 2.7]), st.floats(0.0, 1.0), st.integers(0, 2**31 - 1),
-)  # fmt: skip
+    st.floats(0.0, 1.0),
+    st.floats(-3.0, 3.0),
+    st.sampled_from([0.0, 0.3, 1.0, 2.7]),
+    st.floats(0.0, 1.0),
+    st.integers(0, 2**31 - 1),
+)
 def test_lens_and_exposure_are_those_of_the_twin(vignette, aberration, blur, jitter, episode):
     picture = np.random.default_rng(episode).uniform(0.0, 0.6, (HEIGHT, WIDTH, 3))
     config = config_of(
-        vignette=(vignette, vignette), chromatic_aberration=(aberration, aberration), blur=(blur, blur), exposure_jitter=jitter,
+        vignette=(vignette, vignette),
+        chromatic_aberration=(aberration, aberration),
+        blur=(blur, blur),
+        exposure_jitter=jitter,
         white_balance_jitter=jitter,
-    )  # fmt: skip
+    )
     color, effects = developed(picture, config, Addresses([episode], [1], [2]))
     expected = 255.0 * linear_to_srgb(np.clip(twin(picture, effects[0]), 0.0, 1.0))
     np.testing.assert_allclose(color[0], expected, atol=0.52)
 
 
 ALL = {
-    "exposure_jitter": 0.5, "white_balance_jitter": 0.2, "vignette": (0.1, 0.5), "chromatic_aberration": (-1.0, 2.0), "blur": (0.2, 1.5),
-    "shot_noise": (0.01, 0.05), "read_noise": (0.001, 0.01), "jpeg_quality": (40, 95),
-}  # fmt: skip
+    "exposure_jitter": 0.5,
+    "white_balance_jitter": 0.2,
+    "vignette": (0.1, 0.5),
+    "chromatic_aberration": (-1.0, 2.0),
+    "blur": (0.2, 1.5),
+    "shot_noise": (0.01, 0.05),
+    "read_noise": (0.001, 0.01),
+    "jpeg_quality": (40, 95),
+}
 
 
 def test_a_view_follows_from_its_address_alone():
@@ -330,7 +345,7 @@ def test_scratch_is_declared_if_an_effect_needs_it():
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("render.tone", "filmy", "render.tone is \"filmy\" .*allowed: shoulder, linear, filmic; did you mean filmic"),
+        ("render.tone", "filmy", 'render.tone is "filmy" .*allowed: shoulder, linear, filmic; did you mean filmic'),
         ("effects.blur", [2.0, 1.0], r"effects.blur is \[2.0, 1.0\] .*allowed: the lesser first: \[1.0, 2.0\]"),
         ("effects.blur", [-1.0, 1.0], r"effects.blur .*at least 0"),
         ("effects.vignette", 0.5, r"effects.vignette is 0.5 .*2 numbers in a list"),
@@ -342,7 +357,7 @@ def test_scratch_is_declared_if_an_effect_needs_it():
         ("depth_sensor.grazing_angle", 90.0, r"depth_sensor.grazing_angle .*at most 89"),
         ("depth_sensor.baseline", 0.0, r"depth_sensor.baseline .*above 0"),
     ],
-)  # fmt: skip
+)
 def test_settings_that_make_no_sense_are_reported_in_a_line(key, value, message):
     with pytest.raises(ConfigError, match=message) as caught:
         load_config(None, {key: value})

@@ -203,8 +203,11 @@ def test_a_main_lights_shadow_edge_lies_where_geometry_says(device, turn):
     ground = lit.instance[0] == 1
     rows, columns = np.mgrid[:160, :160]
     x, y = (columns + 0.5 - 80.0) / 200.0, -(rows + 0.5 - 80.0) / 200.0
-    offset = -0.1 / direction[2] * np.array([np.cos(turn) * direction[0] - np.sin(turn) * direction[1],
-                                             np.sin(turn) * direction[0] + np.cos(turn) * direction[1]])  # fmt: skip
+    offset = (
+        -0.1
+        / direction[2]
+        * np.array([np.cos(turn) * direction[0] - np.sin(turn) * direction[1], np.sin(turn) * direction[0] + np.cos(turn) * direction[1]])
+    )
     # How far inside the shadow's square, negative outside [m]; the filter blurs the edge by 2 px to either side, the sun by less.
     inside = 0.03 - np.maximum(np.abs(x - offset[0]), np.abs(y - offset[1]))
     value = lit.radiance[0, ..., 0]

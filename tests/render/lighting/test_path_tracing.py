@@ -61,8 +61,11 @@ def test_a_white_ball_vanishes_in_an_even_room(device, metallic, roughness):
 
 def test_white_things_that_light_each_other_vanish_too(device):
     # Light that is reflected many times: roulette and the limit of bounces take none of it away.
-    things = [(sheet(0.6, 0.4), surface()), (box(0.1, 0.1, 0.1), surface(), (0.08, 0.0, 0.055, *UPRIGHT)),
-              (box(0.1, 0.1, 0.1), surface(WHITE, 1.0, 0.5), (-0.08, 0.0, 0.055, *UPRIGHT))]  # fmt: skip
+    things = [
+        (sheet(0.6, 0.4), surface()),
+        (box(0.1, 0.1, 0.1), surface(), (0.08, 0.0, 0.055, *UPRIGHT)),
+        (box(0.1, 0.1, 0.1), surface(WHITE, 1.0, 0.5), (-0.08, 0.0, 0.055, *UPRIGHT)),
+    ]
     even, few = (shown(device, *things, config=settings(bounces=bounces)).radiance for bounces in (32, 1))
     assert even.mean() == pytest.approx(1.0, abs=0.01)
     assert few.mean() < 0.98
@@ -97,8 +100,11 @@ def test_a_plane_under_a_lamp_has_the_irradiance_worked_out_by_hand(device, cosi
 
 
 def test_each_way_of_drawing_light_has_the_same_mean(device, monkeypatch):
-    things = [(sheet(0.6, 0.4), surface((0.7, 0.6, 0.5), 0.0, 0.5)), (ball(0.06, 3), surface((0.9, 0.8, 0.7), 1.0, 0.35),
-              (0.05, 0.0, 0.06, *UPRIGHT)), (box(0.1, 0.1, 0.1), surface((0.3, 0.5, 0.7)), (-0.1, 0.0, 0.05, *UPRIGHT))]  # fmt: skip
+    things = [
+        (sheet(0.6, 0.4), surface((0.7, 0.6, 0.5), 0.0, 0.5)),
+        (ball(0.06, 3), surface((0.9, 0.8, 0.7), 1.0, 0.35), (0.05, 0.0, 0.06, *UPRIGHT)),
+        (box(0.1, 0.1, 0.1), surface((0.3, 0.5, 0.7)), (-0.1, 0.0, 0.05, *UPRIGHT)),
+    ]
     radiance = 0.3 * even_light(1.0, 64).radiance + lamp(0.7, np.radians(12.0), 20.0, 64).radiance
     lights = (LightMap("room", radiance),)
     both = shown(device, *things, lights=lights, config=settings(64), light_turn=0.7).radiance[0]

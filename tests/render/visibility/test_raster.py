@@ -106,8 +106,15 @@ def test_trees_find_the_same(device, seed):
     poses = [(*rng.uniform((-0.2, -0.1, 0.0), (0.2, 0.1, 0.3)), *(q / np.linalg.norm(q))) for q in rng.normal(size=(4, 4))]
     fixtures = (Fixture(box(0.7, 0.5, 0.02), GREY), Fixture(box(0.05, 0.05, 0.3), GREY), Fixture(ball(0.04, 3), GREY))
     placed = ((0.01, 0.0, 0.0, *UPRIGHT), (0.1, 0.1, 0.4, *UPRIGHT), (0.1, 0.1, 0.2, *UPRIGHT))
-    toy = ToyScene([entry(m) for m in meshes], [list(enumerate(poses))], (VIEW,), fixtures=fixtures, fixture_poses=placed,
-                   fixtures_visible=(1, 1, 1), table=True)  # fmt: skip
+    toy = ToyScene(
+        [entry(m) for m in meshes],
+        [list(enumerate(poses))],
+        (VIEW,),
+        fixtures=fixtures,
+        fixture_poses=placed,
+        fixtures_visible=(1, 1, 1),
+        table=True,
+    )
     ours, theirs = hits_of(toy, device), hits_of(toy, device, by_trees=True)
     np.testing.assert_array_equal(ours["code"], theirs["code"])
     assert set(np.unique(ours["code"])) >= {1, 2, 4, frames.TOTE, frames.FINGER}
@@ -163,8 +170,14 @@ def test_the_backdrop_shows_what_the_tote_itself_would(device):
     """The same turn as another quaternion is not the pose of the backdrop: then the tote's own triangles are drawn."""
     fixtures = (Fixture(box(0.5, 0.3, 0.05), GREY), Fixture(box(0.05, 0.05, 0.3), GREY), Fixture(box(0.1, 0.1, 0.1), GREY))
     poses = [(0, (0.05, 0.02, 0.02, 0.1, 0.2, 0.3, 0.927)), (0, (-0.1, 0.0, -0.2, *UPRIGHT))]
-    toy = ToyScene([entry(box(0.1, 0.1, 0.1))], [poses], (VIEW, camera(96, 64, 120.0, (0.1, 0.0, 0.8))), fixtures=fixtures,
-                   fixtures_visible=(1, 1, 0), table=True)  # fmt: skip
+    toy = ToyScene(
+        [entry(box(0.1, 0.1, 0.1))],
+        [poses],
+        (VIEW, camera(96, 64, 120.0, (0.1, 0.0, 0.8))),
+        fixtures=fixtures,
+        fixtures_visible=(1, 1, 0),
+        table=True,
+    )
     other = replace(toy, fixture_poses=((0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0), *toy.fixture_poses[1:]))
     pictures = [render(scene, device) for scene in (toy, other)]
     for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance"):
