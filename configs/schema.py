@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from synpick_warp.codes import Tone, names
 from synpick_warp.configs.fields import setting
-from synpick_warp.configs.sensors import SHOULDER, TONES, DepthSensor, Effects
+from synpick_warp.configs.sensors import DepthSensor, Effects
 
 MODES = ("pick", "target", "move")
 """What the gripper does in an episode."""
@@ -313,10 +314,10 @@ class Render:
     )
     antialias: bool = setting(True, "", "With mode fast: a pixel where surfaces meet mixes their colours; reference always does.")
     tone: str = setting(
-        SHOULDER,
+        "shoulder",
         "",
         "shoulder: linear up to 0.6, highlights compressed; linear: cut off at 1; filmic: ACES' curve, middle grey kept.",
-        choices=TONES,
+        choices=names(Tone),
     )
     table: bool = setting(True, "", "A table under the tote; without it the light map shows.")
     table_color: tuple[float, float, float] = setting((0.45, 0.45, 0.44), "sRGB", "Base colour of the table.", low=0.0, high=1.0)

@@ -6,12 +6,6 @@ from dataclasses import dataclass
 
 from synpick_warp.configs.fields import setting
 
-SHOULDER = "shoulder"
-LINEAR = "linear"
-FILMIC = "filmic"
-TONES = (SHOULDER, LINEAR, FILMIC)
-"""Tone curves; their laws are those of `kernels.render.images.postprocess`."""
-
 
 @dataclass(frozen=True)
 class Effects:
@@ -61,7 +55,7 @@ class Effects:
 
 
 def strength_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
-    """Least and largest strength of every effect, in the order of `frames.EFFECTS`; 0, 0: off."""
+    """Least and largest strength of every effect, in the order of `Effect`; 0, 0: off."""
     exposure, balance = effects.exposure_jitter, effects.white_balance_jitter
     return {
         "exposure": (-exposure, exposure),

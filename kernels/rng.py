@@ -8,19 +8,6 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-# What a stream is for; part of its address.
-OBJECTS = wp.constant(1)
-DROP = wp.constant(2)
-REDROP = wp.constant(3)
-CORNERS = wp.constant(4)
-LIGHT = wp.constant(5)
-MODE = wp.constant(6)
-TARGETS = wp.constant(7)
-PATHS = wp.constant(8)
-EFFECTS = wp.constant(9)
-COLOR_NOISE = wp.constant(10)
-DEPTH_NOISE = wp.constant(11)
-
 # γ and the two multipliers of SplitMix64.
 GAMMA = wp.constant(wp.uint64(0x9E3779B97F4A7C15))
 MIX_A = wp.constant(wp.uint64(0xBF58476D1CE4E5B9))

@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.codes import Ending, Outcome
+from synpick_warp.codes import Ending, Mode, Outcome, Phase, Task
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels import phases
 from synpick_warp.stages.stream import TickReport
 
-MODE_NAMES = {int(phases.MOVE): "move", int(phases.PICK): "pick", int(phases.TARGET): "target"}
 DIGITS, PLACES = 6, 6
 """Significant digits and decimal places of the numbers in a record; more would be noise of single precision."""
 LOAD_PLACES = 4
@@ -165,14 +163,14 @@ class AttemptLog:
         """
         ended = {}
         phase = report.column("phase")
-        for world in np.flatnonzero((phase == phases.ACT) | (phase == phases.OVER)).tolist():
+        for world in np.flatnonzero((phase == Phase.ACT) | (phase == Phase.OVER)).tolist():
             running = self._running.get(world)
             if running is None:
                 running = self._running[world] = _Running(_number(report, "episode", world), int((report.entry[world] >= 0).sum()))
             self._follow(running, report, world)
-            if phase[world] == phases.OVER:
+            if phase[world] == Phase.OVER:
                 ended[running.episode] = self._hand_over(report, world)
-            elif _number(report, "task", world) == phases.LOOK:
+            elif _number(report, "task", world) == Task.LOOK:
                 running.load = []
                 running.begun = self._begin(running.episode, report, world)
         return ended
@@ -181,14 +179,14 @@ class AttemptLog:
         """What the tick adds to the running attempt."""
         outcome = Outcome(_number(report, "outcome", world))
         lifted = outcome not in (Outcome.NONE, Outcome.NOTHING_SEEN)
-        if lifted or _number(report, "task", world) == phases.LIFT:
+        if lifted or _number(report, "task", world) == Task.LIFT:
             running.load.append(round(float(report.measure("load")[world]), LOAD_PLACES))
         if outcome is not Outcome.NONE:
             self._end(running, report, world, outcome)
 
     def _hand_over(self, report: TickReport, world: int) -> EpisodeRecord:
         """The world's episode is over: what it did; nothing if it delivers nothing."""
-        running, mode = self._running.pop(world), MODE_NAMES[_number(report, "mode", world)]
+        running, mode = self._running.pop(world), Mode(_number(report, "mode", world)).name.lower()
         if not Ending(_number(report, "ending", world)).delivers:
             return EpisodeRecord(mode)
         return EpisodeRecord(mode, running.objects, int((report.entry[world] >= 0).sum()), tuple(running.attempts))
@@ -199,7 +197,7 @@ class AttemptLog:
         record = {
             "episode": episode,
             "attempt": _number(report, "attempt", world) + 1,
-            "mode": MODE_NAMES[_number(report, "mode", world)],
+            "mode": Mode(_number(report, "mode", world)).name.lower(),
             "frame": _number(report, "frame", world),
             "sight": self._sight(report, world),
         }

@@ -14,6 +14,7 @@ import warp as wp
 
 from synpick_warp.arrays import memory_table
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
+from synpick_warp.codes import Phase
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.dataset.manifest import digest_inputs, episode_place, read_record
@@ -26,7 +27,6 @@ from synpick_warp.exporters.registry import Exporters, exporter_kinds, slot_byte
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.interrupt import StopRequest
-from synpick_warp.kernels import phases
 from synpick_warp.progress import Progress
 from synpick_warp.scenes import build
 from synpick_warp.scenes.cameras import make_cameras
@@ -184,8 +184,8 @@ class _Run:
                 report = readers[current].wait()
                 self._hand_over(report, simulation.records[current].snapshot)
                 phase = report.column("phase")
-                self.meter.show(int(np.isin(phase, (phases.SETTLE, phases.ACT)).sum()))
-                if (phase == phases.IDLE).all():
+                self.meter.show(int(np.isin(phase, (Phase.SETTLE, Phase.ACT)).sum()))
+                if (phase == Phase.IDLE).all():
                     return
                 current = following
         self.summary.stopped = stop.number
@@ -201,7 +201,7 @@ class _Run:
                 self.exporters.write(views)
                 self.summary.views += len(views)
         records = self.factory.log.see(report)
-        for world in np.flatnonzero(report.column("phase") == phases.OVER).tolist():
+        for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
             self._end(report, world, records[int(report.column("episode")[world])])
 
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:

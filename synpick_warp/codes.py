@@ -1,16 +1,17 @@
-"""How episodes and attempts end. Their codes live in device arrays; the enums' values are sentences for people."""
+"""Enumerations: every integer code that device arrays, host code and files share. Imports nothing else of the project.
+
+Warp resolves members of an `IntEnum` in kernels, so device code, stages and exporters name the same member. The members of a
+`_Described` enum carry a sentence for people.
+"""
 
 from __future__ import annotations
 
 import enum
 from typing import Self
 
-ATTEMPTS_FILE = "attempts.jsonl"
-"""Every attempt to pick, in the data set, by episode and number; a bake that only moves has none."""
 
-
-class _Coded(enum.IntEnum):
-    """An enum that is declared by its sentences; as a number, a member is its place in that order."""
+class _Described(enum.IntEnum):
+    """An enum declared by its sentences; the value of a member is its position in that order."""
 
     sentence: str
 
@@ -21,27 +22,79 @@ class _Coded(enum.IntEnum):
         return member
 
 
-class Ending(_Coded):
-    """Why an episode stopped."""
+class Phase(enum.IntEnum):
+    """Phase of a world."""
+
+    EMPTY = 0
+    """Waits for an episode number."""
+    START = 1
+    """Has an episode number; its objects are to be sampled and dropped."""
+    SETTLE = 2
+    """Objects fall and come to rest."""
+    ACT = 3
+    """The gripper acts; every tick is a frame."""
+    OVER = 4
+    """The episode ended in this tick; an `Ending` says how."""
+    IDLE = 5
+    """No episode is left."""
+
+
+class Mode(enum.IntEnum):
+    """Mode of an episode: what the gripper does in phase ACT."""
+
+    MOVE = 0
+    """Stirs the pile."""
+    PICK = 1
+    """Untargeted picking: takes the object with the fewest others above it in the clutter graph."""
+    TARGET = 2
+    """Targeted picking: takes the object with the most others above it."""
+
+
+class Task(enum.IntEnum):
+    """Task of the gripper in phase ACT of the modes PICK and TARGET. Their order is the order of an attempt."""
+
+    NONE = 0
+    LOOK = 1
+    """Waits beside the tote; a target and a grasp are planned at the end of the tick."""
+    APPROACH = 2
+    """The setpoint moves from far above to a short distance before the grasp point."""
+    DESCEND = 3
+    """The setpoint moves along the surface normal to the grasp point."""
+    PRESS = 4
+    """The setpoint rests at the grasp point until the cup is at rest; suction is switched on at the end of the last tick."""
+    LIFT = 5
+    """The setpoint moves up; attached objects are judged at the end of the tick in which it arrives."""
+
+
+class Removal(enum.IntEnum):
+    """Why an instance has left the scene."""
+
+    NONE = 0
+    PICKED = 1
+    LOST = 2
+
+
+class Ending(_Described):
+    """Why an episode stopped. The endings that deliver are consecutive; device code relies on it."""
 
     RUNNING = "the episode is still running"
     FINISHED = "the gripper has been everywhere it was to go"
     EMPTIED = "no object is left in the tote"
     GAVE_UP = "too many attempts have failed"
-    UNSETTLED = "the objects did not come to rest in time, so the arrangement was drawn again"
-    ARRANGEMENT_OVERFLOW = "more objects of a kind were drawn than a world has room for, so the arrangement was drawn again"
-    SOLVER_OVERFLOW = "more contacts arose than the solver has room for, so the episode was drawn again"
-    NOT_FINITE = "a pose became infinite or not a number, so the episode was drawn again"
-    SIGHT_OVERFLOW = "a contour has more points than there is room for, so the episode was drawn again"
+    UNSETTLED = "the objects did not come to rest in time, so the arrangement was resampled"
+    ARRANGEMENT_OVERFLOW = "more objects of a kind were drawn than a world has body slots for, so the arrangement was resampled"
+    SOLVER_OVERFLOW = "more contacts arose than the solver has capacity for, so the episode was resampled"
+    NOT_FINITE = "a pose became infinite or not a number, so the episode was resampled"
+    SIGHT_OVERFLOW = "a contour has more points than its capacity, so the episode was resampled"
 
     @property
     def delivers(self) -> bool:
         """Whether an episode with this ending becomes part of the data set."""
-        return self in (Ending.FINISHED, Ending.EMPTIED, Ending.GAVE_UP)
+        return Ending.FINISHED <= self <= Ending.GAVE_UP
 
 
-class Outcome(_Coded):
-    """What came of an attempt to pick."""
+class Outcome(_Described):
+    """Result of an attempt to pick."""
 
     NONE = "no attempt has ended"
     TARGET_PICKED = "the target hung on the cup after the lift"
@@ -54,3 +107,91 @@ class Outcome(_Coded):
     def succeeded(self) -> bool:
         """Whether something was picked."""
         return self in (Outcome.TARGET_PICKED, Outcome.OTHER_PICKED)
+
+
+class Status(enum.IntEnum):
+    """Column of a world's status row: integers that the host reads after each tick.
+
+    The row describes the end of the tick, before perception runs: attempt, target, hits and caught belong to the running attempt, or
+    in a tick with an outcome to the attempt that ended.
+    """
+
+    PHASE = 0
+    ENDING = 1
+    EPISODE = 2
+    REDRAW = 3
+    FRAME = 4
+    LIVE = 5
+    MODE = 6
+    TASK = 7
+    ATTEMPT = 8
+    OUTCOME = 9
+    TARGET = 10
+    HITS = 11
+    CAUGHT = 12
+    """Bit i: instance i was engaged by a ray."""
+    HELD = 13
+    """Bit i: instance i is attached to the cup, or was picked in this tick."""
+
+
+class Measure(enum.IntEnum):
+    """Column of a world's row of real numbers that the host reads after each tick."""
+
+    LOAD = 0
+    """Largest seal force in the tick [N]."""
+
+
+class Stream(enum.IntEnum):
+    """Purpose of a random number stream: part of its key, so that draws for different purposes are independent."""
+
+    OBJECTS = 1
+    DROP = 2
+    REDROP = 3
+    CORNERS = 4
+    LIGHT = 5
+    MODE = 6
+    TARGETS = 7
+    PATHS = 8
+    EFFECTS = 9
+    COLOR_NOISE = 10
+    DEPTH_NOISE = 11
+
+
+class Segment(enum.IntEnum):
+    """Segmentation id of a pixel that shows no instance; instances are 1 + instance_id."""
+
+    NOTHING = 0
+    TABLE = 252
+    TOTE = 253
+    FINGER = 254
+    CUP = 255
+
+
+class Tone(enum.IntEnum):
+    """Tone curve."""
+
+    SHOULDER = 0
+    """Linear up to 0.6, highlights compressed."""
+    LINEAR = 1
+    """Clipped at 1."""
+    FILMIC = 2
+    """ACES' filmic curve, middle grey kept."""
+
+
+class Effect(enum.IntEnum):
+    """Parameter of the camera effects of a view; the first three in EV."""
+
+    EXPOSURE = 0
+    RED = 1
+    BLUE = 2
+    VIGNETTE = 3
+    CHROMATIC_ABERRATION = 4
+    BLUR = 5
+    SHOT_NOISE = 6
+    READ_NOISE = 7
+    JPEG_QUALITY = 8
+
+
+def names(kind: type[enum.IntEnum]) -> tuple[str, ...]:
+    """Lower-case names of an enum's members, in order of their values."""
+    return tuple(member.name.lower() for member in sorted(kind))

@@ -8,16 +8,6 @@ from typing import Any
 
 import numpy as np
 
-# Values of FrameBatch.instance that are no instance. Instances are 1 + instance_id.
-NOTHING = 0
-TABLE = 252
-TOTE = 253
-FINGER = 254
-CUP = 255
-
-EFFECTS = ("exposure", "red", "blue", "vignette", "chromatic_aberration", "blur", "shot_noise", "read_noise", "jpeg_quality")
-"""Columns of FrameBatch.effects; the first three in stops, what the others mean says `configs.sensors.Effects`."""
-
 
 @dataclass(frozen=True, eq=False)
 class FrameBatch:
@@ -40,7 +30,7 @@ class FrameBatch:
     depth: np.ndarray
     """Planar depth in counts of the configured depth scale, 0: no surface (B, H, W) uint16."""
     instance: np.ndarray
-    """0 nothing, 1 + instance_id, or TABLE, TOTE, FINGER, CUP (B, H, W) uint8."""
+    """0 nothing, 1 + instance_id, or a `Segment` (B, H, W) uint8."""
     amodal: np.ndarray
     """Bit i set: the ray hits instance i, hidden or not (B, H, W) uint32."""
     object_id: np.ndarray
@@ -52,7 +42,7 @@ class FrameBatch:
     boxes: np.ndarray
     """bbox_obj and bbox_visib as x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty (B, I, 2, 4) int32."""
     effects: np.ndarray
-    """Strengths of what the camera did to colour (B, EFFECTS) float32; zero: off."""
+    """Strengths of what the camera did to colour in the order of `Effect` (B, E) float32; zero: off."""
     light_name: np.ndarray
     """Name of the episode's light map (B) str."""
     light_turn: np.ndarray

@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.attempts import AttemptLog, AttemptRecord, EpisodeRecord, InstanceSight, SightRecord
-from synpick_warp.codes import Ending, Outcome
+from synpick_warp.codes import Ending, Mode, Outcome, Task
 from synpick_warp.configs.modes import may_pick
-from synpick_warp.kernels import phases
 from synpick_warp.viz.explain_record import read_attempts
 from tests.worlds.scripted_worlds import Ticks, World, bits, play, report
 from tests.worlds.small_worlds import settings
@@ -72,7 +71,7 @@ PAIR = SightRecord(
 def pick_one(world: World) -> Ticks:
     """Settle for two ticks; one attempt on instance 1, which comes away with 3 behind it; the tote is empty."""
     for _ in range(2):
-        world.settle(7, 2, phases.TARGET, [-1, 2, -1, 0])
+        world.settle(7, 2, Mode.TARGET, [-1, 2, -1, 0])
         yield
     world.first_frame()
     see_a_pair(world)
@@ -190,7 +189,7 @@ def test_what_is_not_finite_does_not_become_json(device):
     world = new_world(device)
 
     def script() -> Ticks:
-        world.settle(0, 0, phases.PICK, [0, 1, 2, 0])
+        world.settle(0, 0, Mode.PICK, [0, 1, 2, 0])
         world.first_frame()
         world.look(0)
         world.plan.tilt[0] = np.nan
@@ -209,7 +208,7 @@ def test_what_is_not_finite_does_not_become_json(device):
 
 def every_outcome(world: World) -> Ticks:
     """Five attempts; one object is picked with the target, another alone, one is lost on the way, one is left."""
-    world.settle(5, 0, phases.PICK, [2, 0, 1, 1])
+    world.settle(5, 0, Mode.PICK, [2, 0, 1, 1])
     yield
     world.first_frame()
     world.look(1)
@@ -241,7 +240,7 @@ def every_outcome(world: World) -> Ticks:
 
 def redrawn(world: World) -> Ticks:
     """An arrangement that fails in the middle of its second attempt; then one of the same episode that moves on; then another episode."""
-    world.settle(6, 0, phases.PICK, [0, 1, -1, -1])
+    world.settle(6, 0, Mode.PICK, [0, 1, -1, -1])
     yield
     world.first_frame()
     world.look(0)
@@ -249,10 +248,10 @@ def redrawn(world: World) -> Ticks:
     yield from world.attempt(0, [0.0, 6.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, caught=1, held=1, entry=[-1, 1, -1, -1])
     world.look(1)
     yield
-    world.frame(task=phases.APPROACH, attempt=1)
+    world.frame(task=Task.APPROACH, attempt=1)
     world.over(Ending.SOLVER_OVERFLOW)
     yield
-    world.settle(6, 1, phases.PICK, [1, 1, 1, -1])
+    world.settle(6, 1, Mode.PICK, [1, 1, 1, -1])
     yield
     world.first_frame()
     world.look(2)
@@ -260,14 +259,14 @@ def redrawn(world: World) -> Ticks:
     yield from world.attempt(0, [0.0, 4.0], outcome=Outcome.DROPPED, hits=RAYS, caught=bits(2), held=0)
     world.over(Ending.GAVE_UP)
     yield
-    world.settle(9, 19, phases.TARGET, [0, -1, -1, -1])
+    world.settle(9, 19, Mode.TARGET, [0, -1, -1, -1])
     world.over(Ending.UNSETTLED)
     yield
 
 
 def stir(world: World) -> Ticks:
     """A world that moves; an object is thrown out."""
-    world.settle(8, 0, phases.MOVE, [0, 1, 2, 0])
+    world.settle(8, 0, Mode.MOVE, [0, 1, 2, 0])
     yield
     world.first_frame()
     yield
@@ -358,7 +357,7 @@ def test_the_last_of_32_instances_is_a_bit_like_the_others(device):
     world = new_world(device)
 
     def script() -> Ticks:
-        world.settle(0, 0, phases.PICK, [0, 1, 2, 0])
+        world.settle(0, 0, Mode.PICK, [0, 1, 2, 0])
         world.first_frame()
         world.look(0)
         yield
@@ -375,7 +374,7 @@ def test_a_good_seal(device, hits, tolerated, good):
     world = new_world(device)
 
     def script() -> Ticks:
-        world.settle(0, 0, phases.PICK, [0, 1, 2, 0])
+        world.settle(0, 0, Mode.PICK, [0, 1, 2, 0])
         world.first_frame()
         world.look(0)
         yield
@@ -390,11 +389,11 @@ def test_a_good_seal(device, hits, tolerated, good):
 
 def test_missing_reports_are_noticed(device):
     world, log = new_world(device), AttemptLog(CONFIG, OBJECT_IDS)
-    world.settle(3, 0, phases.PICK, [0, 1, 2, 0])
+    world.settle(3, 0, Mode.PICK, [0, 1, 2, 0])
     world.first_frame()
     world.look(0)
     log.see(report([world]))
-    world.frame(task=phases.LOOK, attempt=1, outcome=Outcome.DROPPED)
+    world.frame(task=Task.LOOK, attempt=1, outcome=Outcome.DROPPED)
     with pytest.raises(ValueError, match="attempt 1 of episode 3 ends"):
         log.see(report([world]))
 
@@ -410,7 +409,7 @@ def test_worlds_do_not_disturb_each_other(device, plans):
 
     def script(world: World, episode: int, delay: int, tries: list[tuple[Outcome, list[float]]]) -> Ticks:
         for _ in range(1 + delay):
-            world.settle(episode, 0, phases.PICK, [0, 1, -1, -1])
+            world.settle(episode, 0, Mode.PICK, [0, 1, -1, -1])
             yield
         world.first_frame()
         frame, known = 0, []

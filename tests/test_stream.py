@@ -12,11 +12,10 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import allocate
+from synpick_warp.codes import Effect, Measure, Phase, Status
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.exporters.writing.rle import find_edges, listed_edges
-from synpick_warp.frames import EFFECTS, FrameBatch
-from synpick_warp.kernels import phases
-from synpick_warp.kernels.sim import snapshot as pack
+from synpick_warp.frames import FrameBatch
 from synpick_warp.stages import stream
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.perception.arrays import Plan, Sighting
@@ -64,13 +63,13 @@ def config_of(**overrides: object):
 
 def report_of(live: list[int]) -> TickReport:
     """Worlds as `live` says; world w has episode 20 + w, frame 2 w, entries w mod 4 - 1, ..., and poses of its own."""
-    status = np.zeros((WORLDS, len(worlds.STATUS_COLUMNS)), np.int32)
+    status = np.zeros((WORLDS, len(Status)), np.int32)
     number = np.arange(WORLDS)
     for name, values in {"live": live, "episode": 20 + number, "frame": 2 * number}.items():
-        status[:, worlds.STATUS_COLUMNS.index(name)] = values
+        status[:, Status[name.upper()]] = values
     entry = ((number[:, None] + np.arange(ROOM)) % 4 - 1).astype(np.int32)
     pose = np.arange(WORLDS * ROOM * 7, dtype=np.float32).reshape(WORLDS, ROOM, 7)
-    measures = np.zeros((WORLDS, len(worlds.MEASURE_COLUMNS)), np.float32)
+    measures = np.zeros((WORLDS, len(Measure)), np.float32)
     light = SimpleNamespace(light=number % 2, light_turn=0.5 * number.astype(np.float32), light_exposure=0.1 * number.astype(np.float32))
     return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace(), light)
 
@@ -163,7 +162,7 @@ def test_what_a_batch_says_of_its_views(device):
     np.testing.assert_allclose(made["light_exposure"], 0.1 * world, rtol=1e-6)
     np.testing.assert_allclose(made["light_direction"][3], [0.6 * np.cos(2.0), 0.6 * np.sin(2.0), 0.8], rtol=1e-6)
     assert not made["light_direction"][:3].any()
-    assert made["effects"].shape == (6, len(EFFECTS))
+    assert made["effects"].shape == (6, len(Effect))
     assert made["color"].shape == (6, 6, 8, 3)
     assert made["boxes"].shape == (6, ROOM, 2, 4)
 
@@ -242,12 +241,6 @@ def test_main_lights_are_told_in_the_world_and_maps_without_any_as_zero(device):
 # ---- from the device ----
 
 
-def test_status_columns_are_those_of_the_kernel():
-    assert [int(getattr(pack, f"STATUS_{name.upper()}")) for name in worlds.STATUS_COLUMNS] == list(range(len(worlds.STATUS_COLUMNS)))
-    measures = [int(getattr(pack, f"MEASURE_{name.upper()}")) for name in worlds.MEASURE_COLUMNS]
-    assert measures == list(range(len(worlds.MEASURE_COLUMNS)))
-
-
 def new_record(device) -> TickRecord:
     sizes = worlds.world_sizes(config_of(), 4)
     return TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, worlds.WorldStatus, Sighting, Plan)))
@@ -256,7 +249,7 @@ def new_record(device) -> TickRecord:
 def test_a_report_outlives_the_next_tick(device):
     record = new_record(device)
     record.snapshot.entry.fill_(2)
-    record.status.table.fill_(phases.ACT)
+    record.status.table.fill_(Phase.ACT)
     reader = TickReader(record)
     reader.start()
     report = reader.wait()
@@ -265,7 +258,7 @@ def test_a_report_outlives_the_next_tick(device):
         array.fill_(5)
     record.snapshot.pose.fill_(wp.transform_identity())
     assert (report.entry == 2).all()
-    assert report.column("phase").tolist() == [phases.ACT] * WORLDS
+    assert report.column("phase").tolist() == [Phase.ACT] * WORLDS
     assert (report.pose == 0.0).all()
     assert report.pose.shape == (WORLDS, ROOM, 7)
     assert not report.measures.any()
@@ -279,7 +272,7 @@ def test_a_report_has_every_array_under_its_name(device):
     given = {(part, name): 2 + number for part, arrays in parts.items() for number, name in enumerate(vars(arrays))}
     for (part, name), number in given.items():
         getattr(parts[part], name).fill_(number)
-    for index in range(len(worlds.MEASURE_COLUMNS)):
+    for index in range(len(Measure)):
         values = record.status.measures.numpy()
         values[:, index] = np.arange(WORLDS) + 10 * index
         record.status.measures.assign(values)

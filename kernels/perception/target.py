@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import OUTCOME_DROPPED, TARGET
-from synpick_warp.kernels.rng import TARGETS, stream_key, uniform_index
+from synpick_warp.codes import Mode, Outcome, Stream
+from synpick_warp.kernels.rng import stream_key, uniform_index
 from synpick_warp.kernels.structs import PickData
 
 wp.set_module_options({"enable_backward": False})
@@ -80,10 +80,10 @@ def choose_target_kernel(
     if world < 0:
         return
     chosen = int(-1)
-    if mode[world] != TARGET:
+    if mode[world] != Mode.TARGET:
         chosen = ranked_instance(visible, share, all_above, world, 1.0)
-    elif pick.random_after_failure != 0 and outcome[world] >= OUTCOME_DROPPED:
-        key = stream_key(seed, address[world][0], address[world][1], TARGETS)
+    elif pick.random_after_failure != 0 and outcome[world] >= Outcome.DROPPED:
+        key = stream_key(seed, address[world][0], address[world][1], Stream.TARGETS)
         chosen = drawn_instance(visible, world, key, attempt[world] + 1)
     else:
         chosen = ranked_instance(visible, share, all_above, world, -1.0)

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import ACT, LOOK
+from synpick_warp.codes import Phase, Task
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,7 +23,7 @@ def list_lookers_kernel(
     """List the worlds that LOOK, in order, and begin with the first. One thread walks over the worlds."""
     count = int(0)
     for world in range(worlds):
-        if phase[world] == ACT and task[world] == LOOK:
+        if phase[world] == Phase.ACT and task[world] == Task.LOOK:
             looker_out[count] = world
             count += 1
     count_out[0] = count

@@ -2,20 +2,9 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import (
-    EMPTY,
-    ENDING_ARRANGEMENT_OVERFLOW,
-    ENDING_RUNNING,
-    IDLE,
-    MOVE,
-    OVER,
-    PICK,
-    SETTLE,
-    START,
-    TARGET,
-    delivers,
-)
-from synpick_warp.kernels.rng import DROP, LIGHT, MODE, OBJECTS, TAU, stream_key, uniform, uniform_index, uniform_rotation
+from synpick_warp.codes import Ending, Mode, Phase, Stream
+from synpick_warp.kernels.rng import TAU, stream_key, uniform, uniform_index, uniform_rotation
+from synpick_warp.kernels.sim.endings import delivers
 from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData, ModeData
 
 wp.set_module_options({"enable_backward": False})
@@ -50,20 +39,20 @@ def take_episodes_kernel(
         phase = phase_inout[world]
         episode = address_inout[world][0]
         redraw = address_inout[world][1]
-        again = phase == OVER and not delivers(ending_inout[world]) and redraw + 1 < tries
+        again = phase == Phase.OVER and not delivers(ending_inout[world]) and redraw + 1 < tries
         if again:
             address_inout[world] = wp.vec2i(episode, redraw + 1)
-            phase_inout[world] = START
-        elif phase == OVER or phase == EMPTY:
+            phase_inout[world] = Phase.START
+        elif phase == Phase.OVER or phase == Phase.EMPTY:
             if following < episodes.shape[0]:
                 address_inout[world] = wp.vec2i(episodes[following], 0)
-                phase_inout[world] = START
+                phase_inout[world] = Phase.START
                 following += 1
             else:
                 address_inout[world] = wp.vec2i(-1, 0)
-                phase_inout[world] = IDLE
-        if phase == OVER or phase == EMPTY:
-            ending_inout[world] = ENDING_RUNNING
+                phase_inout[world] = Phase.IDLE
+        if phase == Phase.OVER or phase == Phase.EMPTY:
+            ending_inout[world] = Ending.RUNNING
     next_episode_inout[0] = following
 
 
@@ -80,18 +69,18 @@ def draw_modes_kernel(
 ):
     """Draw the mode of worlds that start an episode: PICK if u < p, else TARGET if u < p + t, else MOVE, with shares p and t of the modes.
 
-    u is the first number of the stream (seed, episode, 0, MODE): another arrangement of the episode has the same mode.
+    u is the first number of the stream (seed, episode, 0, Stream.MODE): another arrangement of the episode has the same mode.
     """
     world = wp.tid()
-    if phase[world] != START:
+    if phase[world] != Phase.START:
         return
-    number = uniform(stream_key(seed, address[world][0], 0, MODE), 0)
+    number = uniform(stream_key(seed, address[world][0], 0, Stream.MODE), 0)
     if number < mode.pick_share:
-        mode_out[world] = PICK
+        mode_out[world] = Mode.PICK
     elif number < mode.pick_or_target_share:
-        mode_out[world] = TARGET
+        mode_out[world] = Mode.TARGET
     else:
-        mode_out[world] = MOVE
+        mode_out[world] = Mode.MOVE
 
 
 @wp.func
@@ -132,13 +121,13 @@ def draw_objects_kernel(
     """
     world = wp.tid()
     phase = phase_inout[world]
-    if phase != START and phase != IDLE:
+    if phase != Phase.START and phase != Phase.IDLE:
         return
     clear_entries(entry_out, world, layout.instances)
-    if phase == IDLE:
+    if phase == Phase.IDLE:
         return
-    key = stream_key(seed, address[world][0], address[world][1], OBJECTS)
-    repeats = wp.where(mode[world] == MOVE, drop.move_repeats, drop.pick_repeats)
+    key = stream_key(seed, address[world][0], address[world][1], Stream.OBJECTS)
+    repeats = wp.where(mode[world] == Mode.MOVE, drop.move_repeats, drop.pick_repeats)
     count = int(0)
     singles = int(0)
     compounds = int(0)
@@ -168,8 +157,8 @@ def draw_objects_kernel(
                 open = False
     if overflow:
         clear_entries(entry_out, world, layout.instances)
-        ending_inout[world] = ENDING_ARRANGEMENT_OVERFLOW
-        phase_inout[world] = OVER
+        ending_inout[world] = Ending.ARRANGEMENT_OVERFLOW
+        phase_inout[world] = Phase.OVER
 
 
 @wp.kernel
@@ -187,12 +176,12 @@ def draw_lights_kernel(
 ):
     """Draw the light map of worlds that start an episode, its turn about the vertical and its exposure.
 
-    With the numbers u_i of the stream (seed, episode, redraw, LIGHT): turn = 2π u_1, exposure = s (2 u_2 - 1) stops for a spread s.
+    With the numbers u_i of the stream (seed, episode, redraw, Stream.LIGHT): turn = 2π u_1, exposure = s (2 u_2 - 1) stops for a spread s.
     """
     world = wp.tid()
-    if phase[world] != START:
+    if phase[world] != Phase.START:
         return
-    key = stream_key(seed, address[world][0], address[world][1], LIGHT)
+    key = stream_key(seed, address[world][0], address[world][1], Stream.LIGHT)
     light_out[world] = uniform_index(key, 0, drop.lights)
     light_turn_out[world] = TAU * uniform(key, 1) * float(drop.turn_lights)
     light_exposure_out[world] = drop.exposure_spread * (2.0 * uniform(key, 2) - 1.0)
@@ -242,7 +231,7 @@ def empty_worlds_kernel(
     A parked body's weight is cancelled by a force m g. Elsewhere variants are -1: nothing changes.
     """
     world = wp.tid()
-    fresh = phase[world] == START or phase[world] == IDLE or phase[world] == OVER
+    fresh = phase[world] == Phase.START or phase[world] == Phase.IDLE or phase[world] == Phase.OVER
     restarted_out[world] = fresh
     body = world * layout.bodies + layout.gripper_bodies
     for s in range(layout.slots):
@@ -295,10 +284,10 @@ def drop_objects_kernel(
     Height of sphere i: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance).
     """
     world = wp.tid()
-    if phase_inout[world] != START:
+    if phase_inout[world] != Phase.START:
         return
     body = world * layout.bodies + layout.gripper_bodies
-    key = stream_key(seed, address[world][0], address[world][1], DROP)
+    key = stream_key(seed, address[world][0], address[world][1], Stream.DROP)
     height = drop.rim_height
     for instance in range(layout.instances):
         e = entry[world, instance]
@@ -310,4 +299,4 @@ def drop_objects_kernel(
             write_body(joint_q_out, joint_qd_out, q, qd, drop_pose(key, instance, catalog.radius[e], height + catalog.radius[e], drop))
             joint_f_out[qd + 2] = 0.0
             height += 2.0 * catalog.radius[e] + drop.clearance
-    phase_inout[world] = SETTLE
+    phase_inout[world] = Phase.SETTLE

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import ACT, PRESS
+from synpick_warp.codes import Phase, Task
 from synpick_warp.kernels.rng import TAU
 from synpick_warp.kernels.structs import LayoutData, PickData, SuctionData
 
@@ -91,7 +91,7 @@ def cast_ray(start: wp.vec3, way: wp.vec3, reach: float, pose: wp.transform, ent
 @wp.func
 def suction_begins(phase: int, task: int, steps: int, pick: PickData) -> bool:
     """Whether the cup's time to press is up."""
-    return phase == ACT and task == PRESS and steps >= pick.press_steps
+    return phase == Phase.ACT and task == Task.PRESS and steps >= pick.press_steps
 
 
 @wp.kernel

@@ -2,24 +2,16 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import (
-    ACT,
-    ENDING_EMPTIED,
-    ENDING_FINISHED,
-    ENDING_GAVE_UP,
-    ENDING_NOT_FINITE,
-    ENDING_RUNNING,
-    ENDING_SIGHT_OVERFLOW,
-    ENDING_SOLVER_OVERFLOW,
-    ENDING_UNSETTLED,
-    LOOK,
-    MOVE,
-    OVER,
-    SETTLE,
-)
+from synpick_warp.codes import Ending, Mode, Phase, Task
 from synpick_warp.kernels.structs import LayoutData, MoveData, PickData, SettleData
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def delivers(ending: int) -> bool:
+    """True if an episode with this `Ending` becomes part of the data set."""
+    return ending >= Ending.FINISHED and ending <= Ending.GAVE_UP
 
 
 @wp.kernel
@@ -40,22 +32,22 @@ def judge_tasks_kernel(
 ):
     """What an episode that goes well ends with: the gripper has been everywhere; no object is left; too many attempts have failed."""
     world = wp.tid()
-    if phase[world] != ACT:
+    if phase[world] != Phase.ACT:
         return
-    if mode[world] == MOVE:
+    if mode[world] == Mode.MOVE:
         if waypoint[world] >= move.waypoints:
-            ending_out[world] = ENDING_FINISHED
+            ending_out[world] = Ending.FINISHED
         return
-    if task[world] != LOOK:
+    if task[world] != Task.LOOK:
         return
     left = int(0)
     for instance in range(layout.instances):
         if entry[world, instance] >= 0:
             left += 1
     if left == 0:
-        ending_out[world] = ENDING_EMPTIED
+        ending_out[world] = Ending.EMPTIED
     elif failures[world] >= pick.failures:
-        ending_out[world] = ENDING_GAVE_UP
+        ending_out[world] = Ending.GAVE_UP
 
 
 @wp.func
@@ -83,23 +75,23 @@ def judge_episodes_kernel(
     """End the episodes that have an ending, and those that failed: a failure counts for more."""
     world = wp.tid()
     phase = phase_inout[world]
-    if phase != SETTLE and phase != ACT:
+    if phase != Phase.SETTLE and phase != Phase.ACT:
         return
     ending = ending_inout[world]
-    if phase == SETTLE and (progress[world][0] >= settle.max_ticks or progress[world][2] > settle.max_redrops):
-        ending = ENDING_UNSETTLED
+    if phase == Phase.SETTLE and (progress[world][0] >= settle.max_ticks or progress[world][2] > settle.max_redrops):
+        ending = Ending.UNSETTLED
     if sight_overflow[world] != 0:
-        ending = ENDING_SIGHT_OVERFLOW
+        ending = Ending.SIGHT_OVERFLOW
     if solver_overflow[world]:
-        ending = ENDING_SOLVER_OVERFLOW
+        ending = Ending.SOLVER_OVERFLOW
     body = world * layout.bodies
     for link in range(layout.gripper_bodies):
         if not is_finite(body_q[body + link]):
-            ending = ENDING_NOT_FINITE
+            ending = Ending.NOT_FINITE
     for instance in range(layout.instances):
         if entry[world, instance] >= 0:
             if not is_finite(body_q[body + layout.gripper_bodies + slot[world, instance]]):
-                ending = ENDING_NOT_FINITE
-    if ending != ENDING_RUNNING:
+                ending = Ending.NOT_FINITE
+    if ending != Ending.RUNNING:
         ending_inout[world] = ending
-        phase_inout[world] = OVER
+        phase_inout[world] = Phase.OVER

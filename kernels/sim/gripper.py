@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import ACT, APPROACH, DESCEND, LIFT, MOVE
-from synpick_warp.kernels.rng import CORNERS, stream_key, uniform_index
+from synpick_warp.codes import Mode, Phase, Stream, Task
+from synpick_warp.kernels.rng import stream_key, uniform_index
 from synpick_warp.kernels.sim.impedance import impedance_force
 from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, PickData
 
@@ -48,13 +48,13 @@ def begin_moving_kernel(
     Each round is a Fisher-Yates shuffle of the four corners.
     """
     world = wp.tid()
-    if phase[world] != ACT:
+    if phase[world] != Phase.ACT:
         frame_inout[world] = -1
         return
     frame_inout[world] = frame_inout[world] + 1
-    if frame_inout[world] > 0 or mode[world] != MOVE:
+    if frame_inout[world] > 0 or mode[world] != Mode.MOVE:
         return
-    key = stream_key(seed, address[world][0], address[world][1], CORNERS)
+    key = stream_key(seed, address[world][0], address[world][1], Stream.CORNERS)
     for visit in range(move.waypoints):
         order_out[world, visit] = visit % ROUND
     for visit in range(move.waypoints):
@@ -94,9 +94,9 @@ def advanced(goal: wp.vec3, target: wp.vec3, stride: float) -> wp.vec3:
 def task_target(task: int, point: wp.vec3, normal: wp.vec3, pick: PickData, tip: float) -> wp.vec3:
     """Where the tilt axis is to be at the end of a task [m]: so that the cup's tip is at the grasp point, before it, or above it."""
     axis = point + tip * normal
-    if task == APPROACH:
+    if task == Task.APPROACH:
         return axis + pick.near * normal
-    if task == LIFT:
+    if task == Task.LIFT:
         return axis + wp.vec3(0.0, 0.0, pick.lift_height)
     return axis
 
@@ -123,10 +123,10 @@ def move_goals_kernel(
     it waits, as after a LIFT; these two are ended by the tick.
     """
     world = wp.tid()
-    if phase[world] != ACT:
+    if phase[world] != Phase.ACT:
         return
     goal = goal_inout[world]
-    if mode[world] == MOVE:
+    if mode[world] == Mode.MOVE:
         if waypoint_inout[world] < move.waypoints:
             target = corner_of(order[world, waypoint_inout[world]], move.corner)
             target = wp.vec3(target[0], target[1], target[2] + move.tip)
@@ -137,17 +137,17 @@ def move_goals_kernel(
         return
     task = task_inout[world]
     steps_inout[world] = steps_inout[world] + 1
-    if task < APPROACH:
+    if task < Task.APPROACH:
         return
     speed = pick.speed
-    if task == DESCEND:
+    if task == Task.DESCEND:
         speed = pick.near_speed
-    elif task == LIFT:
+    elif task == Task.LIFT:
         speed = pick.lift_speed
     target = task_target(task, point[world], normal[world], pick, move.tip)
     goal = advanced(goal, target, speed * move.step)
     goal_inout[world] = goal
-    if goal == target and (task == APPROACH or task == DESCEND):
+    if goal == target and (task == Task.APPROACH or task == Task.DESCEND):
         task_inout[world] = task + 1
         steps_inout[world] = 0
 
@@ -175,10 +175,10 @@ def drive_gripper_kernel(
     offset = goal[world] - wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
     velocity = wp.vec3(joint_qd[qd], joint_qd[qd + 1], joint_qd[qd + 2])
     force = wp.vec3(0.0, 0.0, 0.0)
-    if phase[world] == ACT:
-        if mode[world] == MOVE:
+    if phase[world] == Phase.ACT:
+        if mode[world] == Mode.MOVE:
             force = impedance_force(offset, velocity, move.stiffness, move.damping, move.force, move.mass, move.step)
-        elif task[world] >= APPROACH:
+        elif task[world] >= Task.APPROACH:
             force = impedance_force(offset, velocity, pick.stiffness, pick.damping, pick.force, move.mass, move.step)
     joint_f_out[qd] = force[0]
     joint_f_out[qd + 1] = force[1]

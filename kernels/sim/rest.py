@@ -2,11 +2,8 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import (
-    ACT,
-    SETTLE,
-)
-from synpick_warp.kernels.rng import REDROP, stream_key
+from synpick_warp.codes import Phase, Stream
+from synpick_warp.kernels.rng import stream_key
 from synpick_warp.kernels.sim.arrangement import drop_pose, write_body
 from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData, SettleData
 
@@ -120,10 +117,10 @@ def redrop_objects_kernel(
     redraw).
     """
     world = wp.tid()
-    if phase[world] != SETTLE:
+    if phase[world] != Phase.SETTLE:
         return
     progress = progress_inout[world]
-    key = stream_key(seed, address[world][0], address[world][1], REDROP)
+    key = stream_key(seed, address[world][0], address[world][1], Stream.REDROP)
     height = drop.rim_height
     body = world * layout.bodies + layout.gripper_bodies
     for instance in range(layout.instances):
@@ -160,7 +157,7 @@ def judge_rest_kernel(
     Rest is no object moving by more than `rest_shift` in a tick; from `late_ticks` on, `last_shift` will do.
     """
     world = wp.tid()
-    if phase_inout[world] != SETTLE:
+    if phase_inout[world] != Phase.SETTLE:
         return
     ticks = progress_inout[world][0] + 1
     resting = progress_inout[world][1] + 1
@@ -176,7 +173,7 @@ def judge_rest_kernel(
             guides = 0
             resting = 0
         else:
-            phase_inout[world] = ACT
+            phase_inout[world] = Phase.ACT
     progress_inout[world] = wp.vec4i(ticks, resting, progress_inout[world][2], guides)
 
 

@@ -2,28 +2,11 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import ACT, LOOK, OVER, delivers
+from synpick_warp.codes import Measure, Phase, Status, Task
+from synpick_warp.kernels.sim.endings import delivers
 from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
-
-# Columns of the status table; a test keeps them in step with stages.sim.worlds.STATUS_COLUMNS.
-STATUS_PHASE = wp.constant(0)
-STATUS_ENDING = wp.constant(1)
-STATUS_EPISODE = wp.constant(2)
-STATUS_REDRAW = wp.constant(3)
-STATUS_FRAME = wp.constant(4)
-STATUS_LIVE = wp.constant(5)
-STATUS_MODE = wp.constant(6)
-STATUS_TASK = wp.constant(7)
-STATUS_ATTEMPT = wp.constant(8)
-STATUS_OUTCOME = wp.constant(9)
-STATUS_TARGET = wp.constant(10)
-STATUS_HITS = wp.constant(11)
-STATUS_CAUGHT = wp.constant(12)
-STATUS_HELD = wp.constant(13)
-# Columns of the table of measures.
-MEASURE_LOAD = wp.constant(0)
 
 
 @wp.kernel
@@ -54,7 +37,7 @@ def take_snapshot_kernel(
     """
     world = wp.tid()
     live = int(0)
-    if phase[world] == ACT or (phase[world] == OVER and delivers(ending[world])):
+    if phase[world] == Phase.ACT or (phase[world] == Phase.OVER and delivers(ending[world])):
         live = 1
     live_out[world] = live
     episode_out[world] = address[world][0]
@@ -64,7 +47,7 @@ def take_snapshot_kernel(
         entry_out[world, instance] = entry[world, instance]
         if entry[world, instance] >= 0:
             pose_out[world, instance] = body_q[body + layout.gripper_bodies + slot[world, instance]]
-    gripper = wp.where(task[world] == LOOK, 0, 1)
+    gripper = wp.where(task[world] == Task.LOOK, 0, 1)
     fixture_pose_out[world, 0] = wp.transform_identity()
     fixture_visible_out[world, 0] = 1
     for link in range(2):
@@ -147,21 +130,21 @@ def pack_status_kernel(
 ):
     """Gather the few numbers of each world that the host reads."""
     world = wp.tid()
-    status_out[world, STATUS_PHASE] = phase[world]
-    status_out[world, STATUS_ENDING] = ending[world]
-    status_out[world, STATUS_EPISODE] = address[world][0]
-    status_out[world, STATUS_REDRAW] = address[world][1]
-    status_out[world, STATUS_FRAME] = frame[world]
-    status_out[world, STATUS_LIVE] = live[world]
-    status_out[world, STATUS_MODE] = mode[world]
-    status_out[world, STATUS_TASK] = task[world]
-    status_out[world, STATUS_ATTEMPT] = attempt[world]
-    status_out[world, STATUS_OUTCOME] = outcome[world]
-    status_out[world, STATUS_TARGET] = target[world]
-    status_out[world, STATUS_HITS] = 0
-    status_out[world, STATUS_CAUGHT] = 0
+    status_out[world, Status.PHASE] = phase[world]
+    status_out[world, Status.ENDING] = ending[world]
+    status_out[world, Status.EPISODE] = address[world][0]
+    status_out[world, Status.REDRAW] = address[world][1]
+    status_out[world, Status.FRAME] = frame[world]
+    status_out[world, Status.LIVE] = live[world]
+    status_out[world, Status.MODE] = mode[world]
+    status_out[world, Status.TASK] = task[world]
+    status_out[world, Status.ATTEMPT] = attempt[world]
+    status_out[world, Status.OUTCOME] = outcome[world]
+    status_out[world, Status.TARGET] = target[world]
+    status_out[world, Status.HITS] = 0
+    status_out[world, Status.CAUGHT] = 0
     if attempt[world] >= 0:
-        status_out[world, STATUS_HITS] = hits[world]
-        status_out[world, STATUS_CAUGHT] = int(caught[world])
-    status_out[world, STATUS_HELD] = int(hanging[world])
-    measure_out[world, MEASURE_LOAD] = peak[world]
+        status_out[world, Status.HITS] = hits[world]
+        status_out[world, Status.CAUGHT] = int(caught[world])
+    status_out[world, Status.HELD] = int(hanging[world])
+    measure_out[world, Measure.LOAD] = peak[world]

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import ACT, APPROACH, MOVE, NO_TASK, SETTLE
+from synpick_warp.codes import Mode, Phase, Task
 from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
@@ -169,11 +169,11 @@ def record_gripper_kernel(
 ):
     """What the gripper did in a step: its task, its goal, which is NaN where it has none, and the force towards it."""
     world = wp.tid()
-    doing = int(NO_TASK)
-    if phase[world] == ACT:
+    doing = int(Task.NONE)
+    if phase[world] == Phase.ACT:
         doing = task[world]
     place = wp.vec3(wp.nan, wp.nan, wp.nan)
-    if phase[world] == ACT and (mode[world] == MOVE or doing >= APPROACH):
+    if phase[world] == Phase.ACT and (mode[world] == Mode.MOVE or doing >= Task.APPROACH):
         place = goal[world]
     goal_out[world, step] = place
     force_out[world, step] = force[world]
@@ -195,5 +195,5 @@ def keep_drops_kernel(
 ):
     """Where a world's objects begin to fall: their poses before its first tick."""
     world, instance = wp.tid()
-    if phase[world] == SETTLE and progress[world][0] == 0 and entry[world, instance] >= 0:
+    if phase[world] == Phase.SETTLE and progress[world][0] == 0 and entry[world, instance] >= 0:
         drop_out[world, instance] = body_q[world * layout.bodies + layout.gripper_bodies + slot[world, instance]]

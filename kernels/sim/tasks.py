@@ -2,22 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.phases import (
-    ACT,
-    APPROACH,
-    LIFT,
-    LOOK,
-    MOVE,
-    NO_TASK,
-    OUTCOME_DROPPED,
-    OUTCOME_NONE,
-    OUTCOME_NOTHING_CAUGHT,
-    OUTCOME_NOTHING_SEEN,
-    OUTCOME_OTHER_PICKED,
-    OUTCOME_TARGET_PICKED,
-    PRESS,
-    TARGET,
-)
+from synpick_warp.codes import Mode, Outcome, Phase, Task
 from synpick_warp.kernels.sim.arrangement import PARKED_HEIGHT, write_body
 from synpick_warp.kernels.sim.gripper import place_gripper, task_target
 from synpick_warp.kernels.sim.rest import is_outside, shape_place
@@ -56,12 +41,12 @@ def begin_picking_kernel(
 ):
     """Worlds that do not act have no task and a straight gripper; those that begin to act in a mode of picking LOOK."""
     world = wp.tid()
-    outcome_out[world] = OUTCOME_NONE
-    if phase[world] == ACT and frame[world] > 0:
+    outcome_out[world] = Outcome.NONE
+    if phase[world] == Phase.ACT and frame[world] > 0:
         return
-    task_out[world] = NO_TASK
-    if phase[world] == ACT and mode[world] != MOVE:
-        task_out[world] = LOOK
+    task_out[world] = Task.NONE
+    if phase[world] == Phase.ACT and mode[world] != Mode.MOVE:
+        task_out[world] = Task.LOOK
     steps_out[world] = 0
     attempt_out[world] = -1
     failures_out[world] = 0
@@ -82,7 +67,7 @@ def forget_seals_kernel(
 ):
     """Nothing hangs on the cup of a world that does not act: not even where the last episode broke off in a lift."""
     world, instance = wp.tid()
-    if phase[world] != ACT:
+    if phase[world] != Phase.ACT:
         held_out[world, instance] = 0
 
 
@@ -105,7 +90,7 @@ def remove_lost_kernel(
 ):
     """What fell below the floor, or came to rest beside the tote, leaves the scene while the gripper acts."""
     world, instance = wp.tid()
-    if phase[world] != ACT or entry_inout[world, instance] < 0:
+    if phase[world] != Phase.ACT or entry_inout[world, instance] < 0:
         return
     position = wp.transform_get_translation(body_q[world * layout.bodies + layout.gripper_bodies + slot[world, instance]])
     beside = is_outside(position, drop) and shift[world, instance] < settle.last_shift
@@ -139,18 +124,18 @@ def judge_attempt(target: int, caught: wp.uint32, hanging: wp.uint32) -> int:
     """Outcome of an attempt from the target and from what was caught and what still hangs, as bits of instances."""
     if hanging != wp.uint32(0):
         if target >= 0 and (hanging & (wp.uint32(1) << wp.uint32(target))) != wp.uint32(0):
-            return OUTCOME_TARGET_PICKED
-        return OUTCOME_OTHER_PICKED
+            return Outcome.TARGET_PICKED
+        return Outcome.OTHER_PICKED
     if caught != wp.uint32(0):
-        return OUTCOME_DROPPED
-    return OUTCOME_NOTHING_CAUGHT
+        return Outcome.DROPPED
+    return Outcome.NOTHING_CAUGHT
 
 
 @wp.func
 def failures_after(failures: int, outcome: int, mode: int, pick: PickData) -> int:
     """Count of failed attempts after one more has ended."""
-    if outcome == OUTCOME_TARGET_PICKED or outcome == OUTCOME_OTHER_PICKED:
-        if mode == TARGET and pick.forgive != 0:
+    if outcome == Outcome.TARGET_PICKED or outcome == Outcome.OTHER_PICKED:
+        if mode == Mode.TARGET and pick.forgive != 0:
             return 0
         return failures
     return failures + 1
@@ -178,21 +163,21 @@ def advance_tasks_kernel(
 ):
     """At the end of a tick: after PRESS, LIFT; after LIFT, or when a look has found nothing, the outcome, and LOOK again."""
     world = wp.tid()
-    if phase[world] != ACT or mode[world] == MOVE:
+    if phase[world] != Phase.ACT or mode[world] == Mode.MOVE:
         return
     task = task_inout[world]
-    outcome = int(OUTCOME_NONE)
-    if task == PRESS and steps_inout[world] >= pick.press_steps:
-        task_inout[world] = LIFT
+    outcome = int(Outcome.NONE)
+    if task == Task.PRESS and steps_inout[world] >= pick.press_steps:
+        task_inout[world] = Task.LIFT
         steps_inout[world] = 0
-    elif task == LIFT and wp.length(goal[world] - task_target(LIFT, point[world], normal[world], pick, move.tip)) < ARRIVED:
+    elif task == Task.LIFT and wp.length(goal[world] - task_target(Task.LIFT, point[world], normal[world], pick, move.tip)) < ARRIVED:
         outcome = judge_attempt(target[world], caught[world], hanging[world])
-    elif task == LOOK and target[world] < 0 and steps_inout[world] > 0:
-        outcome = OUTCOME_NOTHING_SEEN
-    if outcome != OUTCOME_NONE:
+    elif task == Task.LOOK and target[world] < 0 and steps_inout[world] > 0:
+        outcome = Outcome.NOTHING_SEEN
+    if outcome != Outcome.NONE:
         outcome_out[world] = outcome
         failures_inout[world] = failures_after(failures_inout[world], outcome, mode[world], pick)
-        task_inout[world] = LOOK
+        task_inout[world] = Task.LOOK
         steps_inout[world] = 0
 
 
@@ -215,7 +200,7 @@ def end_attempts_kernel(
 ):
     """Worlds that LOOK: what hangs on the cup leaves the scene, and the gripper waits at home, upright and out of the picture."""
     world = wp.tid()
-    if phase[world] != ACT or task[world] != LOOK:
+    if phase[world] != Phase.ACT or task[world] != Task.LOOK:
         return
     for instance in range(layout.instances):
         if (hanging[world] & (wp.uint32(1) << wp.uint32(instance))) != wp.uint32(0):
@@ -265,14 +250,14 @@ def begin_attempts_kernel(
 ):
     """Worlds that have looked begin an attempt; with a target, they APPROACH it."""
     world = wp.tid()
-    if phase[world] != ACT or task_inout[world] != LOOK:
+    if phase[world] != Phase.ACT or task_inout[world] != Task.LOOK:
         return
     attempt_inout[world] = attempt_inout[world] + 1
     steps_out[world] = 0
     hits_out[world] = 0
     caught_out[world] = wp.uint32(0)
     if target[world] >= 0:
-        task_inout[world] = APPROACH
+        task_inout[world] = Task.APPROACH
 
 
 @wp.kernel
@@ -296,7 +281,7 @@ def place_grippers_kernel(
 ):
     """Where an APPROACH begins, the gripper appears far above the grasp, its cup tilted."""
     world = wp.tid()
-    if phase[world] != ACT or task[world] != APPROACH or steps[world] != 0:
+    if phase[world] != Phase.ACT or task[world] != Task.APPROACH or steps[world] != 0:
         return
     goal = point[world] + move.tip * normal[world] + wp.vec3(0.0, 0.0, pick.appear_height)
     goal_out[world] = goal
@@ -315,4 +300,4 @@ def set_fingers_kernel(
 ):
     """The finger collides when moving, where the gripper is one rigid body, and not when picking."""
     world = wp.tid()
-    shape_transform_out[world * layout.shapes + layout.finger_shape] = shape_place(mode[world] == MOVE)
+    shape_transform_out[world * layout.shapes + layout.finger_shape] = shape_place(mode[world] == Mode.MOVE)

@@ -34,6 +34,8 @@ CONFIG_FILE = "config.toml"
 """The resolved settings, in the data set; those of the last bake that went on with it."""
 EPISODES_FILE = "episodes.jsonl"
 """How every episode ended, in the data set."""
+ATTEMPTS_FILE = "attempts.jsonl"
+"""List of all attempts to pick, ordered by episode and index; absent from bakes without picking."""
 INPUTS = "inputs"
 """Key in the manifest: checksums of what is in the objects and in the lights."""
 FORMAT = 1

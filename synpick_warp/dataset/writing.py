@@ -12,12 +12,12 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from synpick_warp.codes import ATTEMPTS_FILE
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.manifest import (
+    ATTEMPTS_FILE,
     CONFIG_FILE,
     CONSTANTS,
     EPISODES_FILE,

@@ -75,7 +75,7 @@ class ViewBuffers:
     boxes: wp.array = device_array("view", "instance", "box", "edge", dtype=wp.int32, unit="px")
     """bbox_obj and bbox_visib: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty."""
     effects: wp.array = device_array("view", dtype=Strengths)
-    """Strengths of the camera's effects, in the order of `frames.EFFECTS`; zero: off."""
+    """Strengths of the camera's effects, in the order of `Effect`; zero: off."""
 
 
 @dataclass(frozen=True, eq=False)

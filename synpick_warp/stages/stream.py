@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate, memory_table
+from synpick_warp.codes import Measure, Status, names
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
@@ -18,7 +19,6 @@ from synpick_warp.stages.render.mask_runs import EdgeBuffers, EdgeScratch, edge_
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
-from synpick_warp.stages.sim.worlds import MEASURE_COLUMNS, STATUS_COLUMNS
 
 # Bytes of one batch's images on a GPU: large enough to fill it, small enough that several batches are in flight.
 BATCH_BYTES = 512 << 20
@@ -62,9 +62,9 @@ class TickReport:
     """What the host knows of one tick."""
 
     status: np.ndarray
-    """(world, status) int32; columns as STATUS_COLUMNS."""
+    """(world, status) int32; columns: `Status`."""
     measures: np.ndarray
-    """(world, measure) float32; columns as MEASURE_COLUMNS."""
+    """(world, measure) float32; columns: `Measure`."""
     entry: np.ndarray
     """Catalog index (world, instance) int32."""
     pose: np.ndarray
@@ -82,11 +82,11 @@ class TickReport:
 
     def column(self, name: str) -> np.ndarray:
         """One column of the status table (world) int32."""
-        return self.status[:, STATUS_COLUMNS.index(name)]
+        return self.status[:, Status[name.upper()]]
 
     def measure(self, name: str) -> np.ndarray:
         """One column of the table of measures (world) float32."""
-        return self.measures[:, MEASURE_COLUMNS.index(name)]
+        return self.measures[:, Measure[name.upper()]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +163,7 @@ class TickReader:
         if not self.physics:
             return report
         tick, steps = host_record(copied[last:], report.entry.shape[1])
-        columns = dict(zip(STATUS_COLUMNS, report.status.T, strict=True)) | dict(zip(MEASURE_COLUMNS, report.measures.T, strict=True))
+        columns = dict(zip(names(Status), report.status.T, strict=True)) | dict(zip(names(Measure), report.measures.T, strict=True))
         return replace(report, tick=tick | tick_measures(columns, report.entry.shape[1]), steps=steps)
 
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.codes import ATTEMPTS_FILE
 from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.manifest import ATTEMPTS_FILE
 from synpick_warp.errors import DatasetError
 
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}

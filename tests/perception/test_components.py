@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp import frames
+from synpick_warp.codes import Segment
 from synpick_warp.kernels.perception.components import STRIP
 from tests.twins import perception
 from tests.twins.perception import Look
@@ -28,7 +28,7 @@ def empty() -> np.ndarray:
 def drawn(seed: int, scale: float, instances: int = 4) -> np.ndarray:
     """Random codes (H, W); `scale` [px] is the size of their features: noise at 0, large patches at 8."""
     rng = np.random.default_rng(seed)
-    codes = rng.choice(np.array([0, *range(1, instances + 1), frames.TOTE], np.uint8), size=(HEIGHT, WIDTH))
+    codes = rng.choice(np.array([0, *range(1, instances + 1), Segment.TOTE], np.uint8), size=(HEIGHT, WIDTH))
     if scale > 0.0:
         rows, columns = np.mgrid[:HEIGHT, :WIDTH]
         wave = [(np.sin(columns / scale + a) * 2, np.cos(rows / scale + b) * 2) for a, b in rng.uniform(0, 6, (2, 2))]
@@ -80,7 +80,7 @@ def test_instances_that_touch_stay_apart(look):
 
 def test_fixtures_and_codes_beyond_the_room_are_no_instances(look):
     codes = empty()
-    codes[:8], codes[8:16], codes[16:] = frames.TOTE, frames.TABLE, 5
+    codes[:8], codes[8:16], codes[16:] = Segment.TOTE, Segment.TABLE, 5
     look.see(codes)
     assert (look.image("component") == -1).all()
     assert (look.image("area") == 0).all()

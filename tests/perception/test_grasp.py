@@ -12,7 +12,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from synpick_warp.arrays import allocate
-from synpick_warp.kernels import phases
+from synpick_warp.codes import Mode
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.perception.arrays import LookArrays, Plan, Sighting
@@ -258,7 +258,7 @@ def test_all_of_planning_in_one_go(device):
     for name in ("visible", "share", "suction", "depth"):
         getattr(made.sighting, name).assign(made.found[name])
     made.grasp.target.fill_(7)
-    worlds.state.mode.assign(np.array([phases.PICK, phases.TARGET, phases.PICK, phases.PICK]))
+    worlds.state.mode.assign(np.array([Mode.PICK, Mode.TARGET, Mode.PICK, Mode.PICK]))
     made.planner.plan(made.scene, made.seen, worlds.state, attempts, made.sighting, made.grasp, 0)
     assert made.sighting.above.numpy().tolist() == [[0b10, 0, 0, 0], [0, 0b01, 0, 0], [0] * 4, [0] * 4]
     assert made.grasp.target.numpy().tolist() == [1, 1, -1, 7]

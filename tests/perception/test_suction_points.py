@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp import frames
+from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Catalog, Fixture
@@ -234,7 +234,7 @@ def test_trace_shows_what_the_renderer_shows_without_a_gripper(device):
     resolution = (96, 54)
     scene = toy(resolution)
     expected = render(scene, device)
-    assert set(np.unique(expected.instance)) == {1, 2, 3, frames.TOTE, frames.TABLE}
+    assert set(np.unique(expected.instance)) == {1, 2, 3, Segment.TOTE, Segment.TABLE}
     # The gripper stands in the picture, and camera 0 is larger there: neither shows in the look.
     config = replace(
         scene.settings(),

@@ -10,8 +10,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Ending
-from synpick_warp.kernels import phases
+from synpick_warp.codes import Ending, Mode, Phase
 from synpick_warp.kernels.sim import arrangement as kernels
 from synpick_warp.scenes import build
 from synpick_warp.stages.constants import make_scene_data
@@ -60,7 +59,7 @@ def made(device, worlds: int = WORLDS, mix: tuple[float, float, float] = (0.0, 0
 def may_repeat(worlds: KernelWorlds, world: int) -> bool:
     """Whether objects may come several times in the mode that this world has."""
     drop = worlds.scene.drop
-    return bool(drop.move_repeats if worlds.state.mode.numpy()[world] == phases.MOVE else drop.pick_repeats)
+    return bool(drop.move_repeats if worlds.state.mode.numpy()[world] == Mode.MOVE else drop.pick_repeats)
 
 
 def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangement]:
@@ -84,7 +83,7 @@ def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangemen
 @given(sizes=catalogs(), seed=st.integers(0, 2**63 - 1), first=st.integers(0, 2**30), redraw=st.integers(0, 20))
 def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, redraw, device):
     worlds = made(device, **sizes)
-    worlds.begin(phases.START, first + np.arange(WORLDS), redraw)
+    worlds.begin(Phase.START, first + np.arange(WORLDS), redraw)
     worlds.set(worlds.state.entry, 99)
     arrange.draw_objects(worlds.scene, worlds.state, seed)
     entry, slot = worlds.state.entry.numpy(), worlds.state.slot.numpy()
@@ -94,7 +93,7 @@ def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, redraw, device
         assert (entry[world, count:] == -1).all()
         assert tuple(slot[world, :count]) == expected.slots
         state = (worlds.state.phase.numpy()[world], worlds.state.ending.numpy()[world])
-        assert state == ((phases.OVER, Ending.ARRANGEMENT_OVERFLOW) if expected.overflow else (phases.START, Ending.RUNNING))
+        assert state == ((Phase.OVER, Ending.ARRANGEMENT_OVERFLOW) if expected.overflow else (Phase.START, Ending.RUNNING))
         check_law(worlds, world, entry[world, :count], slot[world, :count])
 
 
@@ -121,13 +120,13 @@ def modes(built, device, mode: str, mix: tuple[float, float, float], episodes: n
     worlds = made(device, worlds=len(episodes))
     scene = make_scene_data(config, small_worlds.catalog(), built, 1, device)
     worlds.scene = dataclasses.replace(worlds.scene, mode=scene.mode)
-    worlds.begin(phases.START, episodes, redraw)
+    worlds.begin(Phase.START, episodes, redraw)
     worlds.set(worlds.state.mode, 99)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     return worlds.state.mode.numpy()
 
 
-@pytest.mark.parametrize(("mode", "code"), [("pick", phases.PICK), ("target", phases.TARGET), ("move", phases.MOVE)])
+@pytest.mark.parametrize(("mode", "code"), [("pick", Mode.PICK), ("target", Mode.TARGET), ("move", Mode.MOVE)])
 def test_a_single_mode_is_every_episodes(built, device, mode, code):
     assert (modes(built, device, mode, (1.0, 2.0, 3.0), np.arange(500)) == code).all()
 
@@ -143,7 +142,7 @@ def test_shares_of_modes_are_the_weights(built, device, mix):
     """Within four standard deviations; a mode of weight 0 never comes, on whichever side it stands."""
     episodes = 4000
     found = modes(built, device, "mixed", mix, np.arange(episodes))
-    for code, share in zip((phases.PICK, phases.TARGET, phases.MOVE), np.array(mix) / sum(mix), strict=True):
+    for code, share in zip((Mode.PICK, Mode.TARGET, Mode.MOVE), np.array(mix) / sum(mix), strict=True):
         assert (found == code).mean() == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / episodes))
 
 
@@ -163,7 +162,7 @@ def test_modes_are_drawn_apart_from_objects(device):
     episodes, objects = np.arange(WORLDS), []
     for mix in ((1.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
         worlds = made(device, mix=mix, drop={"move_repeats": 1, "pick_repeats": 1})
-        worlds.begin(phases.START, episodes)
+        worlds.begin(Phase.START, episodes)
         arrange.draw_objects(worlds.scene, worlds.state, SEED)
         objects.append((worlds.state.entry.numpy(), worlds.state.light_turn.numpy()))
     for pick, mixed in zip(*objects, strict=True):
@@ -172,7 +171,7 @@ def test_modes_are_drawn_apart_from_objects(device):
 
 def test_a_budget_for_everything_draws_everything_without_repeats(device):
     worlds = made(device, drop={"volume": 10.0, "move_repeats": 0})
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     assert (np.sort(worlds.state.entry.numpy(), axis=1)[:, -3:] == [0, 1, 2]).all()
     assert len(np.unique(worlds.state.entry.numpy(), axis=0)) == 6
@@ -180,14 +179,14 @@ def test_a_budget_for_everything_draws_everything_without_repeats(device):
 
 def test_the_budget_may_be_met_exactly(device):
     worlds = made(device, volume=np.array([0.25]), compound=np.array([0]), radius=np.array([0.1]), drop={"volume": 1.0})
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     assert ((worlds.state.entry.numpy() == 0).sum(axis=1) == 4).all()
 
 
 def test_an_object_that_never_fits_is_never_drawn(device):
     worlds = made(device, drop={"volume": 0.25})
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     entry = worlds.state.entry.numpy()
     assert (entry[:, 0] >= 0).all()
@@ -197,9 +196,9 @@ def test_an_object_that_never_fits_is_never_drawn(device):
 def test_each_mode_has_its_own_rule_of_repeating(device):
     """One bake: episodes of picking without repeats, episodes of moving with them."""
     worlds = made(device, worlds=200, mix=(1.0, 1.0, 1.0), drop={"volume": 10.0, "move_repeats": 1, "pick_repeats": 0})
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
-    moving = worlds.state.mode.numpy() == phases.MOVE
+    moving = worlds.state.mode.numpy() == Mode.MOVE
     assert 0 < moving.sum() < 200
     count = (worlds.state.entry.numpy() >= 0).sum(axis=1)
     # Three entries, room for eight instances, a budget for all.
@@ -230,14 +229,14 @@ def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
         compound_slots=compound,
         drop={"volume": 1.2e-3, "move_repeats": 1, "pick_repeats": 0},
     )
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     over = (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).mean()
     assert over <= shortfall + 4 * np.sqrt(shortfall / episodes)
     assert (single, compound) == (2, 1) if mix[2] == 0.0 else over > 0.0
 
 
-@pytest.mark.parametrize("phase", [phases.EMPTY, phases.SETTLE, phases.ACT, phases.OVER])
+@pytest.mark.parametrize("phase", [Phase.EMPTY, Phase.SETTLE, Phase.ACT, Phase.OVER])
 def test_worlds_at_work_keep_their_objects(device, phase):
     worlds = made(device)
     worlds.begin(phase)
@@ -251,7 +250,7 @@ def test_worlds_at_work_keep_their_objects(device, phase):
     assert (worlds.state.entry.numpy() == 2).all()
     assert (worlds.state.light.numpy() == 7).all()
     assert (worlds.state.mode.numpy() == 9).all()
-    if phase != phases.OVER:
+    if phase != Phase.OVER:
         assert (worlds.state.variant.numpy().reshape(WORLDS, -1)[:, 2:] == -1).all()
         assert (joints.numpy() == 0.5).all()
         assert not worlds.state.restarted.numpy().any()
@@ -261,11 +260,11 @@ def test_worlds_at_work_keep_their_objects(device, phase):
 def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance, episode, device):
     sizes["drop"] |= {"spread": spread, "clearance": clearance}
     worlds = made(device, **sizes)
-    worlds.begin(phases.START, episode + np.arange(WORLDS))
+    worlds.begin(Phase.START, episode + np.arange(WORLDS))
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
-    over = worlds.state.phase.numpy() == phases.OVER
+    over = worlds.state.phase.numpy() == Phase.OVER
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
-    np.testing.assert_array_equal(worlds.state.phase.numpy(), np.where(over, phases.OVER, phases.SETTLE))
+    np.testing.assert_array_equal(worlds.state.phase.numpy(), np.where(over, Phase.OVER, Phase.SETTLE))
     drop = worlds.scene.drop
     rim = (drop.rim_length, drop.rim_width, drop.rim_height)
     for world in range(WORLDS):
@@ -285,7 +284,7 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
 
 def test_the_drop_uses_the_whole_spread(device):
     worlds = made(device, worlds=500, radius=np.full(3, 0.05), drop={"spread": 1.0})
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     full = worlds.coordinates()[worlds.forces()[:, :, 2] == 0.0]
@@ -295,7 +294,7 @@ def test_the_drop_uses_the_whole_spread(device):
 
 def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device):
     worlds = made(device)
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     worlds.set(worlds.physics.state.joint_qd, 1.0)
     worlds.set(worlds.physics.control.joint_f, 7.0)
     worlds.set(worlds.state.stuck, 5)
@@ -325,7 +324,7 @@ def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device)
 
 def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
     worlds = made(device, compound_slots=0)
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     over = worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW
@@ -348,15 +347,15 @@ def take(device, phase, ending, address, following: int, *, episodes: int, tries
 
 def test_numbers_are_those_of_the_list(device):
     worlds = made(device, worlds=3)
-    worlds.begin(phases.EMPTY, -1)
+    worlds.begin(Phase.EMPTY, -1)
     arrange.take_episodes(worlds.state, wp.array([7, 2], dtype=wp.int32, device=device), 1)
     assert worlds.state.address.numpy().tolist() == [[7, 0], [2, 0], [-1, 0]]
-    assert worlds.state.phase.numpy().tolist() == [phases.START, phases.START, phases.IDLE]
+    assert worlds.state.phase.numpy().tolist() == [Phase.START, Phase.START, Phase.IDLE]
 
 
 def test_empty_worlds_take_numbers_in_order(device):
-    assert take(device, [phases.EMPTY] * 3, 0, -1, 0, episodes=2, tries=1) == (
-        [phases.START, phases.START, phases.IDLE],
+    assert take(device, [Phase.EMPTY] * 3, 0, -1, 0, episodes=2, tries=1) == (
+        [Phase.START, Phase.START, Phase.IDLE],
         [0, 0, 0],
         [[0, 0], [1, 0], [-1, 0]],
         2,
@@ -364,11 +363,11 @@ def test_empty_worlds_take_numbers_in_order(device):
 
 
 def test_an_episode_that_delivered_nothing_is_drawn_again_in_its_world_until_it_is_given_up(device):
-    over = [phases.OVER] * 4
+    over = [Phase.OVER] * 4
     ending = [Ending.UNSETTLED, Ending.FINISHED, Ending.NOT_FINITE, Ending.UNSETTLED]
     address = [[3, 0], [4, 0], [5, 1], [6, 2]]
     assert take(device, over, ending, address, 9, episodes=100, tries=3) == (
-        [phases.START] * 4,
+        [Phase.START] * 4,
         [Ending.RUNNING] * 4,
         [[3, 1], [9, 0], [5, 2], [10, 0]],
         11,
@@ -376,7 +375,7 @@ def test_an_episode_that_delivered_nothing_is_drawn_again_in_its_world_until_it_
 
 
 def test_worlds_at_work_keep_their_numbers(device):
-    phase = [phases.SETTLE, phases.ACT, phases.IDLE]
+    phase = [Phase.SETTLE, Phase.ACT, Phase.IDLE]
     assert take(device, phase, 0, [[0, 0], [1, 0], [-1, 0]], 2, episodes=9, tries=3) == (phase, [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2)
 
 
@@ -386,24 +385,24 @@ def test_every_episode_ends_once(worlds, episodes, tries, seed, device):
     numbers = np.random.default_rng(seed)
     made_worlds = made(device, worlds=worlds)
     state = made_worlds.state
-    made_worlds.begin(phases.EMPTY, -1)
+    made_worlds.begin(Phase.EMPTY, -1)
     started, ended = [], []
     listed = wp.array(np.arange(episodes), dtype=wp.int32, device=device)
     for _ in range(8 * episodes * tries):
         arrange.take_episodes(state, listed, tries)
         phase, ending, address = state.phase.numpy(), state.ending.numpy(), state.address.numpy()
-        started += [tuple(address[world]) for world in np.flatnonzero(phase == phases.START)]
-        for world in np.flatnonzero(phase != phases.IDLE):
-            phase[world], ending[world] = phases.ACT, Ending.RUNNING
+        started += [tuple(address[world]) for world in np.flatnonzero(phase == Phase.START)]
+        for world in np.flatnonzero(phase != Phase.IDLE):
+            phase[world], ending[world] = Phase.ACT, Ending.RUNNING
             if numbers.uniform() < 0.5:
-                phase[world], ending[world] = phases.OVER, numbers.choice([Ending.FINISHED, Ending.UNSETTLED])
+                phase[world], ending[world] = Phase.OVER, numbers.choice([Ending.FINISHED, Ending.UNSETTLED])
                 if ending[world] == Ending.FINISHED or address[world, 1] == tries - 1:
                     ended.append(int(address[world, 0]))
-        if (phase == phases.IDLE).all():
+        if (phase == Phase.IDLE).all():
             break
         made_worlds.set(state.phase, phase)
         made_worlds.set(state.ending, ending)
-    assert (state.phase.numpy() == phases.IDLE).all()
+    assert (state.phase.numpy() == Phase.IDLE).all()
     assert sorted(ended) == list(range(episodes))
     assert len(set(started)) == len(started)
     assert [episode for episode, redraw in started if redraw == 0] == list(range(episodes))

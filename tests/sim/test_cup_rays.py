@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from synpick_warp.codes import Phase, Task
 from synpick_warp.configs.load import load_config
-from synpick_warp.kernels import phases
 from synpick_warp.scenes.collision.hull_planes import hull_planes
 from synpick_warp.stages.render.scene import build_meshes
 from synpick_warp.stages.sim.suction import Suction
@@ -61,11 +61,11 @@ class Cups(KernelWorlds):
         meshes, keep = build_meshes([entry.mesh for entry in ENTRIES.entries], len(ENTRIES), device)
         config = load_config("smoke", {"suction.surface": surface})
         self.suction = Suction(config, ENTRIES, SimpleNamespace(meshes=meshes, keep=keep), device)
-        self.begin(phases.ACT)
+        self.begin(Phase.ACT)
         self.set(self.state.entry, -1)
         # Slots in an order of their own.
         self.set(self.state.slot, [2, 0, 3, 1])
-        self.set(self.attempts.task, phases.PRESS)
+        self.set(self.attempts.task, Task.PRESS)
         self.set(self.attempts.steps, PRESS_STEPS)
         for world in range(worlds):
             self.put_cup(world, PLACE, UPRIGHT)
@@ -178,15 +178,15 @@ def test_the_notch_of_an_angle_is_open(device, x, y, count):
 
 @pytest.mark.parametrize(
     ("phase", "task", "steps"),
-    [(phases.SETTLE, phases.PRESS, 5), (phases.ACT, phases.DESCEND, 5), (phases.ACT, phases.LIFT, 9), (phases.ACT, phases.PRESS, 4)],
+    [(Phase.SETTLE, Task.PRESS, 5), (Phase.ACT, Task.DESCEND, 5), (Phase.ACT, Task.LIFT, 9), (Phase.ACT, Task.PRESS, 4)],
 )
 def test_rays_are_cast_when_the_time_to_press_is_up(device, phase, task, steps):
     cups = Cups(device, worlds=2)
     for world in range(2):
         cups.put(world, 0, 0, below(0.001))
     for array, value, due in (
-        (cups.state.phase, phase, phases.ACT),
-        (cups.attempts.task, task, phases.PRESS),
+        (cups.state.phase, phase, Phase.ACT),
+        (cups.attempts.task, task, Task.PRESS),
         (cups.attempts.steps, steps, PRESS_STEPS),
     ):
         cups.set(array, [value, due])

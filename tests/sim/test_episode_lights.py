@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from synpick_warp.kernels import phases
+from synpick_warp.codes import Phase, Stream
 from synpick_warp.stages.sim import arrange
 from tests.twins import rng
 from tests.worlds.kernel_worlds import KernelWorlds
@@ -21,32 +21,32 @@ def made(device, worlds: int = 24, **drop) -> KernelWorlds:
 
 def test_lights_are_even_and_turn(device):
     worlds = made(device, worlds=2000)
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     counts = np.bincount(worlds.state.light.numpy(), minlength=5)
     assert counts.min() > 330
     assert len(counts) == 5
-    keys = [rng.stream_key(SEED, episode, 0, rng.LIGHT) for episode in range(2000)]
+    keys = [rng.stream_key(SEED, episode, 0, Stream.LIGHT) for episode in range(2000)]
     np.testing.assert_allclose(worlds.state.light_turn.numpy(), [2 * np.pi * rng.uniform(key, 1) for key in keys], rtol=1e-6)
 
 
 def test_exposures_are_even_within_their_spread_and_the_episodes_own(device):
     """Half a stop either way: mean 0 and deviation 0.5 / √3, within four standard errors; other worlds draw the same."""
     worlds = made(device, worlds=2000)
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     drawn = worlds.state.light_exposure.numpy()
     assert np.abs(drawn).max() <= 0.5
     assert drawn.mean() == pytest.approx(0.0, abs=4 * 0.5 / np.sqrt(3 * 2000))
     np.testing.assert_allclose(np.quantile(drawn, (0.05, 0.25, 0.5, 0.75, 0.95)), (-0.45, -0.25, 0.0, 0.25, 0.45), atol=0.05)
-    keys = [rng.stream_key(SEED, episode, 0, rng.LIGHT) for episode in range(2000)]
+    keys = [rng.stream_key(SEED, episode, 0, Stream.LIGHT) for episode in range(2000)]
     np.testing.assert_allclose(drawn, [rng.uniform(key, 2) - 0.5 for key in keys], atol=1e-6)
     few = made(device, worlds=3)
-    few.begin(phases.START, np.array([1999, 7, 300]))
+    few.begin(Phase.START, np.array([1999, 7, 300]))
     arrange.draw_objects(few.scene, few.state, SEED)
     np.testing.assert_array_equal(few.state.light_exposure.numpy(), drawn[[1999, 7, 300]])
     wide = made(device, worlds=2000, exposure_spread=2.0)
-    wide.begin(phases.START)
+    wide.begin(Phase.START)
     arrange.draw_objects(wide.scene, wide.state, SEED)
     np.testing.assert_allclose(wide.state.light_exposure.numpy(), 4.0 * drawn, rtol=1e-6)
     np.testing.assert_array_equal(wide.state.light_turn.numpy(), worlds.state.light_turn.numpy())
@@ -55,7 +55,7 @@ def test_exposures_are_even_within_their_spread_and_the_episodes_own(device):
 @pytest.mark.parametrize("setting", ["turn_lights", "exposure_spread"])
 def test_what_is_not_to_be_drawn_is_zero(device, setting):
     worlds = made(device, **{setting: 0})
-    worlds.begin(phases.START)
+    worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
     drawn = {"turn_lights": worlds.state.light_turn, "exposure_spread": worlds.state.light_exposure}
     for name, array in drawn.items():

@@ -11,7 +11,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.kernels import phases
+from synpick_warp.codes import Phase
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import arrange
 from synpick_warp.stages.sim import gripper as act
@@ -104,7 +104,7 @@ def test_the_law_is_stable_for_every_mass(device, mass, step):
 @pytest.mark.parametrize("rounds", [1, 3])
 def test_every_round_visits_every_corner_in_the_twins_order(device, rounds):
     worlds = made(device, worlds=200, waypoints=4 * rounds)
-    worlds.begin(phases.ACT, 1000 + np.arange(200), 2)
+    worlds.begin(Phase.ACT, 1000 + np.arange(200), 2)
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
     order = worlds.state.order.numpy()
     assert (np.sort(order.reshape(200, rounds, 4), axis=2) == np.arange(4)).all()
@@ -116,7 +116,7 @@ def test_every_round_visits_every_corner_in_the_twins_order(device, rounds):
 
 def test_the_gripper_starts_above_the_first_corner_at_rest(device):
     worlds = made(device, worlds=50, start_height=0.3)
-    worlds.begin(phases.ACT)
+    worlds.begin(Phase.ACT)
     worlds.set(worlds.physics.state.joint_qd, 1.0)
     worlds.set(worlds.state.waypoint, 3)
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
@@ -133,7 +133,7 @@ def test_the_gripper_starts_above_the_first_corner_at_rest(device):
 def test_frames_count_while_the_gripper_acts(device):
     worlds = made(device, worlds=2)
     seen = []
-    for phase in (phases.SETTLE, phases.ACT, phases.ACT, phases.ACT, phases.OVER, phases.SETTLE, phases.ACT):
+    for phase in (Phase.SETTLE, Phase.ACT, Phase.ACT, Phase.ACT, Phase.OVER, Phase.SETTLE, Phase.ACT):
         worlds.begin(phase)
         act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
         seen.append(int(worlds.state.frame.numpy()[1]))
@@ -142,11 +142,11 @@ def test_frames_count_while_the_gripper_acts(device):
 
 def test_an_order_once_drawn_is_kept(device):
     worlds = made(device)
-    worlds.begin(phases.ACT)
+    worlds.begin(Phase.ACT)
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
     before = worlds.state.order.numpy().copy()
     worlds.set(worlds.state.goal, 7.0)
-    worlds.begin(phases.ACT, [99])
+    worlds.begin(Phase.ACT, [99])
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
     np.testing.assert_array_equal(worlds.state.order.numpy(), before)
     assert (worlds.state.goal.numpy() == 7.0).all()
@@ -154,7 +154,7 @@ def test_an_order_once_drawn_is_kept(device):
 
 def test_the_goal_walks_from_corner_to_corner_at_constant_speed(device):
     worlds = made(device, waypoints=4, speed=0.5, step=0.01, start_height=0.1)
-    worlds.begin(phases.ACT)
+    worlds.begin(Phase.ACT)
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
     goals, waypoints = [worlds.state.goal.numpy()[0].copy()], [0]
     while waypoints[-1] < 4 and len(goals) < 1000:
@@ -176,8 +176,8 @@ def test_the_goal_walks_from_corner_to_corner_at_constant_speed(device):
 
 def test_only_an_acting_gripper_is_pulled_but_every_gripper_is_carried(device):
     worlds = made(device, worlds=2)
-    worlds.begin(phases.ACT)
-    worlds.set(worlds.state.phase, [phases.ACT, phases.SETTLE])
+    worlds.begin(Phase.ACT)
+    worlds.set(worlds.state.phase, [Phase.ACT, Phase.SETTLE])
     worlds.set(worlds.state.goal, [1.0, 0.0, 0.0])
     worlds.set(worlds.physics.control.joint_f, 3.0)
     act.drive_gripper(worlds.scene, worlds.state, worlds.attempts, worlds.plan, worlds.physics, worlds.physics.state)
@@ -218,7 +218,7 @@ def run(device):
     waypoint = np.full(worlds, simulation.scene.move.waypoints)
     waypoint[FOLLOW] = 0
     order = np.tile([1, 0, 1, 0], (worlds, 1))
-    values = {"phase": np.full(worlds, phases.ACT), "waypoint": waypoint, "order": order, "goal": goal.astype(np.float32)}
+    values = {"phase": np.full(worlds, Phase.ACT), "waypoint": waypoint, "order": order, "goal": goal.astype(np.float32)}
     for name, value in values.items():
         getattr(state, name).assign(value)
     arrange.set_guides(simulation.scene, state, physics)

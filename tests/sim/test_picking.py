@@ -8,8 +8,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from synpick_warp.codes import Ending, Outcome
-from synpick_warp.kernels import phases
+from synpick_warp.codes import Ending, Outcome, Phase, Task
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReport
 from tests.worlds.sights import SHORT, picking
@@ -27,7 +26,7 @@ def run(simulation: Simulation) -> list[TickReport]:
         record = simulation.records[tick % 2]
         simulation.tick(record)
         reports.append(report(record))
-        if (reports[-1].column("phase") == phases.IDLE).all():
+        if (reports[-1].column("phase") == Phase.IDLE).all():
             return reports
     raise AssertionError("the worlds did not come to an end")
 
@@ -49,7 +48,7 @@ def test_a_pick_episode_runs_to_its_end(emptied):
     reports, objects = emptied
     outcomes = column(reports, "outcome")
     assert [Outcome(code) for code in outcomes[outcomes > 0]] == [Outcome.TARGET_PICKED] * len(objects)
-    last = np.flatnonzero(column(reports, "phase") == phases.OVER)
+    last = np.flatnonzero(column(reports, "phase") == Phase.OVER)
     assert len(last) == 1
     assert Ending(column(reports, "ending")[last[0]]) is Ending.EMPTIED
     assert column(reports, "live")[last[0]] == 1, "the picture of the empty tote belongs to the episode"
@@ -73,8 +72,8 @@ def test_tasks_come_in_order(emptied):
     reports, objects = emptied
     tasks = column(reports, "task")[column(reports, "live") == 1]
     changes = tasks[np.insert(np.diff(tasks) != 0, 0, True)].tolist()
-    once = [phases.LOOK, phases.APPROACH, phases.DESCEND, phases.PRESS, phases.LIFT]
-    assert changes == once * len(objects) + [phases.LOOK]
+    once = [Task.LOOK, Task.APPROACH, Task.DESCEND, Task.PRESS, Task.LIFT]
+    assert changes == once * len(objects) + [Task.LOOK]
 
 
 def test_the_seal_bears_the_weight_at_the_end_of_the_lift(emptied):

@@ -8,8 +8,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Ending
-from synpick_warp.kernels import phases
+from synpick_warp.codes import Ending, Phase, Stream
 from synpick_warp.kernels.sim import rest
 from synpick_warp.stages.sim import arrange
 from tests.twins import rng
@@ -35,7 +34,7 @@ def made(device, worlds: int = 1, objects: int = 2, **settings) -> KernelWorlds:
     entry, slot = np.full((worlds, 4), -1), np.zeros((worlds, 4))
     entry[:, :objects] = (np.arange(objects) % 2) * 2
     slot[:, :objects] = np.arange(objects)
-    result.begin(phases.SETTLE)
+    result.begin(Phase.SETTLE)
     result.set(result.state.entry, entry)
     result.set(result.state.slot, slot)
     result.set(result.state.progress, [0, 0, 0, 1])
@@ -177,12 +176,12 @@ def test_guides_fall_after_some_ticks_at_rest_and_then_the_gripper_acts(device):
     worlds = made(device)
     settle = worlds.scene.settle
     seen = []
-    while state_of(worlds)[0] == phases.SETTLE and len(seen) < 20:
+    while state_of(worlds)[0] == Phase.SETTLE and len(seen) < 20:
         judge(worlds)
         seen.append(state_of(worlds))
     until = max(settle.min_ticks, settle.rest_ticks)
     assert [progress[3] for _, _, progress in seen] == [1] * (until - 1) + [0] * (settle.rest_ticks + 1)
-    assert [phase for phase, _, _ in seen] == [phases.SETTLE] * (until + settle.rest_ticks - 1) + [phases.ACT]
+    assert [phase for phase, _, _ in seen] == [Phase.SETTLE] * (until + settle.rest_ticks - 1) + [Phase.ACT]
     assert [progress[0] for _, _, progress in seen] == list(range(1, len(seen) + 1))
 
 
@@ -211,19 +210,19 @@ def test_an_empty_tote_is_at_rest(device):
     worlds = made(device, objects=0)
     for _ in range(10):
         judge(worlds)
-    assert state_of(worlds)[0] == phases.ACT
+    assert state_of(worlds)[0] == Phase.ACT
 
 
 def test_a_pile_that_never_rests_ends_its_episode(device):
     worlds = made(device, settle={"max_ticks": 7})
     for _ in range(6):
         judge(worlds, 0.01)
-        assert state_of(worlds)[:2] == (phases.SETTLE, Ending.RUNNING)
+        assert state_of(worlds)[:2] == (Phase.SETTLE, Ending.RUNNING)
     judge(worlds, 0.01)
-    assert state_of(worlds)[:2] == (phases.OVER, Ending.UNSETTLED)
+    assert state_of(worlds)[:2] == (Phase.OVER, Ending.UNSETTLED)
 
 
-@pytest.mark.parametrize("phase", [phases.EMPTY, phases.ACT, phases.OVER, phases.IDLE])
+@pytest.mark.parametrize("phase", [Phase.EMPTY, Phase.ACT, Phase.OVER, Phase.IDLE])
 def test_only_settling_worlds_are_judged_for_rest(device, phase):
     worlds = made(device)
     worlds.begin(phase)
@@ -280,7 +279,7 @@ def test_what_leaves_the_tote_is_dropped_again(device, place, outside):
         return
     assert state_of(worlds)[2] == [6, 0, 1, 1]
     pose, drop, radius = worlds.coordinates()[0, 1], worlds.scene.drop, worlds.radius[2]
-    key = rng.stream_key(SEED, 0, 0, rng.REDROP)
+    key = rng.stream_key(SEED, 0, 0, Stream.REDROP)
     share = 2 * rng.uniform(key, np.arange(2)) - 1
     free = np.maximum(0.0, np.array([drop.rim_length, drop.rim_width]) / 2 - radius)
     np.testing.assert_allclose(pose[:3], [*(share * drop.spread * free), drop.rim_height + radius], atol=1e-6)
@@ -321,7 +320,7 @@ def test_a_stuck_object_is_dropped_again_after_some_time(device):
 def test_too_many_redrops_end_the_episode(device):
     worlds = made(device, settle={"max_redrops": 2})
     worlds.place(0, 0, [0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0])
-    for expected in (phases.SETTLE, phases.SETTLE, phases.OVER):
+    for expected in (Phase.SETTLE, Phase.SETTLE, Phase.OVER):
         judge(worlds)
         assert state_of(worlds)[0] == expected
     assert state_of(worlds)[1] == Ending.UNSETTLED
@@ -330,7 +329,7 @@ def test_too_many_redrops_end_the_episode(device):
 # ---- ends ----
 
 
-@pytest.mark.parametrize("phase", [phases.SETTLE, phases.ACT])
+@pytest.mark.parametrize("phase", [Phase.SETTLE, Phase.ACT])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_pose_that_is_no_number_ends_the_episode(device, phase, value, axis):
@@ -341,30 +340,30 @@ def test_a_pose_that_is_no_number_ends_the_episode(device, phase, value, axis):
     worlds.place(1, 1, pose)
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
     assert state_of(worlds, 0)[:2] == (phase, Ending.RUNNING)
-    assert state_of(worlds, 1)[:2] == (phases.OVER, Ending.NOT_FINITE)
+    assert state_of(worlds, 1)[:2] == (Phase.OVER, Ending.NOT_FINITE)
 
 
-@pytest.mark.parametrize("phase", [phases.SETTLE, phases.ACT])
+@pytest.mark.parametrize("phase", [Phase.SETTLE, Phase.ACT])
 def test_a_solver_overflow_ends_the_episode(device, phase):
     worlds = made(device, worlds=2)
     worlds.begin(phase)
     worlds.set(worlds.physics.solver.constraint_overflow, [True, False])
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
-    assert state_of(worlds, 0)[:2] == (phases.OVER, Ending.SOLVER_OVERFLOW)
+    assert state_of(worlds, 0)[:2] == (Phase.OVER, Ending.SOLVER_OVERFLOW)
     assert state_of(worlds, 1)[:2] == (phase, Ending.RUNNING)
 
 
 def test_a_gripper_that_has_been_everywhere_ends_the_episode(device):
     worlds = made(device, worlds=2)
-    worlds.begin(phases.ACT)
+    worlds.begin(Phase.ACT)
     worlds.set(worlds.state.waypoint, [worlds.scene.move.waypoints - 1, worlds.scene.move.waypoints])
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
-    assert state_of(worlds, 0)[:2] == (phases.ACT, Ending.RUNNING)
-    assert state_of(worlds, 1)[:2] == (phases.OVER, Ending.FINISHED)
+    assert state_of(worlds, 0)[:2] == (Phase.ACT, Ending.RUNNING)
+    assert state_of(worlds, 1)[:2] == (Phase.OVER, Ending.FINISHED)
 
 
 def test_worlds_without_an_episode_end_none(device):
-    for phase in (phases.EMPTY, phases.IDLE, phases.OVER):
+    for phase in (Phase.EMPTY, Phase.IDLE, Phase.OVER):
         worlds = made(device)
         worlds.begin(phase)
         worlds.set(worlds.physics.solver.constraint_overflow, True)

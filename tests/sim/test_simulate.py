@@ -9,8 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from synpick_warp.codes import Ending
-from synpick_warp.kernels import phases
+from synpick_warp.codes import Ending, Phase
 from synpick_warp.scenes import build
 from synpick_warp.stages.constants import GRIPPER_HOME
 from synpick_warp.stages.sim import arrange
@@ -51,7 +50,7 @@ def track(device, worlds: int, disturb=None, episodes: int = EPISODES) -> dict[t
                 exposure[world],
             )
             ticks[address].append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
-        if (seen.column("phase") == phases.IDLE).all():
+        if (seen.column("phase") == Phase.IDLE).all():
             return ticks
     raise AssertionError("the worlds did not come to an end")
 
@@ -104,14 +103,14 @@ def test_a_world_that_was_not_finite_is_as_good_as_new(device):
 
     def end(simulation: Simulation, tick: int) -> None:
         if tick == 3:
-            for array, value in ((simulation.state.phase, phases.OVER), (simulation.state.ending, Ending.UNSETTLED)):
+            for array, value in ((simulation.state.phase, Phase.OVER), (simulation.state.ending, Ending.UNSETTLED)):
                 values = array.numpy()
                 values[0] = value
                 array.assign(values)
 
     poisoned, ended = track(device, 2, poison, episodes=2), track(device, 2, end, episodes=2)
     last = np.frombuffer(poisoned[0, 0][-1][:8], np.int32)
-    assert last.tolist() == [phases.OVER, Ending.NOT_FINITE]
+    assert last.tolist() == [Phase.OVER, Ending.NOT_FINITE]
     assert poisoned[0, 1] == ended[0, 1]
     assert poisoned[1, 0] == ended[1, 0]
 
@@ -127,8 +126,8 @@ def resting(device):
     reports, energies = [], []
     for _ in range(LONGEST):
         reports += run_ticks(simulation, 1)
-        energies.append(np.where(reports[-1].column("phase") == phases.SETTLE, energy(simulation, reports[-1]), np.nan))
-        if (reports[-1].column("phase") != phases.SETTLE).all():
+        energies.append(np.where(reports[-1].column("phase") == Phase.SETTLE, energy(simulation, reports[-1]), np.nan))
+        if (reports[-1].column("phase") != Phase.SETTLE).all():
             break
     return config, reports, np.array(energies), simulation
 
@@ -162,7 +161,7 @@ def corners(entry: int, pose: np.ndarray) -> np.ndarray:
 def test_piles_come_to_rest_on_the_floor(resting):
     config, reports, _, _ = resting
     last = reports[-1]
-    assert (last.column("phase") == phases.ACT).any()
+    assert (last.column("phase") == Phase.ACT).any()
     assert not last.column("ending").any()
     for world, instance in zip(*np.nonzero(last.entry >= 0), strict=True):
         low = corners(last.entry[world, instance], last.pose[world, instance])
@@ -205,7 +204,7 @@ def test_the_gripper_waits_outside_and_then_stands_above_the_first_corner(device
     for _ in range(LONGEST):
         simulation.tick(simulation.records[0])
         seen.append((report(simulation.records[0]), simulation.records[0].snapshot.fixture_pose.numpy()[0].copy()))
-        if seen[-1][0].column("phase")[0] == phases.IDLE:
+        if seen[-1][0].column("phase")[0] == Phase.IDLE:
             break
     live = [bool(row.column("live")[0]) for row, _ in seen]
     frames = [int(row.column("frame")[0]) for row, _ in seen]
@@ -323,12 +322,12 @@ def test_a_pile_without_time_is_unsettled(device):
     config = settings(settle__max_time=0.1, settle__tries=2, bake__episodes=1, **COARSE)
     seen = run_ticks(Simulation(config, catalog(ANGLE), 1, device), 6)
     rows = [(int(row.column("phase")[0]), int(row.column("ending")[0]), int(row.column("redraw")[0])) for row in seen]
-    settle = (phases.SETTLE, Ending.RUNNING)
-    over = (phases.OVER, Ending.UNSETTLED)
+    settle = (Phase.SETTLE, Ending.RUNNING)
+    over = (Phase.OVER, Ending.UNSETTLED)
     ticks = int(np.ceil(0.1 / (config.physics.step * config.physics.steps_per_tick)))
     expected = [(*settle, 0)] * (ticks - 1) + [(*over, 0)] + [(*settle, 1)] * (ticks - 1) + [(*over, 1)]
     assert rows[: 2 * ticks] == expected
-    assert [row[0] for row in rows[2 * ticks :]] == [phases.IDLE] * (6 - 2 * ticks)
+    assert [row[0] for row in rows[2 * ticks :]] == [Phase.IDLE] * (6 - 2 * ticks)
 
 
 @pytest.mark.parametrize(("cuda", "asked", "made"), [(True, 1, 8), (True, 7, 8), (True, 8, 8), (True, 64, 64), (False, 1, 1)])

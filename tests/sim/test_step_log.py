@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.kernels import phases
+from synpick_warp.codes import Phase, Task
 from synpick_warp.kernels.sim import step_log
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog
@@ -36,7 +36,7 @@ class Log:
             self.reports.append(made)
             self.steps.append({name: values.copy() for name, values in made.steps.items()})
             self.ticks.append({name: values.copy() for name, values in made.tick.items()})
-            if (made.column("phase") == phases.IDLE).all():
+            if (made.column("phase") == Phase.IDLE).all():
                 return
 
     def column(self, name: str) -> np.ndarray:
@@ -86,7 +86,7 @@ def test_what_is_not_there_is_not_a_number(run, request):
     log, _ = request.getfixturevalue(run)
     names = [name for name, values in log.steps[0].items() if values.dtype.kind == "f"]
     for row, steps, before in zip(log.reports[1:], log.steps[1:], log.reports[:-1], strict=True):
-        there = (before.entry[0] >= 0) if before.column("phase")[0] in (phases.SETTLE, phases.ACT) else (row.entry[0] >= 0)
+        there = (before.entry[0] >= 0) if before.column("phase")[0] in (Phase.SETTLE, Phase.ACT) else (row.entry[0] >= 0)
         for name in names:
             values = steps[name][0]
             if name.startswith("gripper") or values.shape[1:2] != there.shape or name in ("goal", "impedance_force"):
@@ -108,7 +108,7 @@ def test_momentum_changes_by_contacts_and_weight(run, request):
     velocity, force, held = log.all("velocity").astype(float), log.all("contact_force").astype(float), log.all("held").astype(bool)
     phase = np.repeat(log.column("phase"), simulation.config.physics.steps_per_tick)
     change = weights[1:, :, None] * (np.diff(velocity, axis=0) / step + [0.0, 0.0, GRAVITY]) - force[1:]
-    free = ~held[1:] & ~held[:-1] & (phase[1:] == phases.ACT)[:, None] & np.isfinite(change).all(axis=2)
+    free = ~held[1:] & ~held[:-1] & (phase[1:] == Phase.ACT)[:, None] & np.isfinite(change).all(axis=2)
     assert free.sum() > 500
     assert force[1:][free].max() > 0.5
     np.testing.assert_allclose(change[free], 0.0, atol=2e-4)
@@ -198,8 +198,8 @@ def test_seal_loads_are_those_of_the_attempts(picked):
     assert peak.max() > 0.5
     held = log.all("held").astype(bool)
     assert not log.all("seal_load")[~held & ~np.isnan(log.all("seal_load"))].any()
-    assert {phases.LIFT, phases.PRESS, phases.DESCEND, phases.APPROACH} <= set(log.all("task").tolist())
-    assert set(log.all("task")[held.any(axis=1)].tolist()) == {phases.LIFT}
+    assert {Task.LIFT, Task.PRESS, Task.DESCEND, Task.APPROACH} <= set(log.all("task").tolist())
+    assert set(log.all("task")[held.any(axis=1)].tolist()) == {Task.LIFT}
 
 
 def test_ticks_say_what_the_status_says(picked):
@@ -237,7 +237,7 @@ def episodes(device, worlds: int, recorded: bool) -> dict[tuple[int, int], bytes
             parts = [batch.pose[world][there], *(values[world] for values in batch.steps.values())]
             parts += [values[world][there] if name == "drop_pose" else values[world] for name, values in batch.tick.items()]
             made[int(batch.episode[world]), int(batch.frame[world])] = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
-        if (row.column("phase") == phases.IDLE).all():
+        if (row.column("phase") == Phase.IDLE).all():
             return made
     raise AssertionError("the worlds did not come to an end")
 

@@ -8,8 +8,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Ending, Outcome
-from synpick_warp.kernels import phases
+from synpick_warp.codes import Ending, Mode, Outcome, Phase, Task
 from synpick_warp.kernels.perception import worklist
 from synpick_warp.kernels.sim import tasks
 from synpick_warp.stages.sim import arrange, gripper
@@ -51,8 +50,8 @@ def made(device, worlds: int = 1, **pick) -> KernelWorlds:
         pick=PICK | pick,
         move={"tip": TIP, "step": STEP},
     )
-    result.begin(phases.ACT)
-    result.set(result.state.mode, phases.PICK)
+    result.begin(Phase.ACT)
+    result.set(result.state.mode, Mode.PICK)
     result.set(result.state.entry, [0, 1, 2])
     result.set(result.state.slot, [0, 1, 2])
     result.set(result.plan.point, POINT)
@@ -81,12 +80,12 @@ def begin_attempt(worlds: KernelWorlds) -> None:
 
 def test_who_begins_to_pick_looks(device):
     worlds = made(device, worlds=4)
-    worlds.set(worlds.state.phase, [phases.ACT, phases.ACT, phases.ACT, phases.SETTLE])
-    worlds.set(worlds.state.mode, [phases.PICK, phases.TARGET, phases.MOVE, phases.PICK])
+    worlds.set(worlds.state.phase, [Phase.ACT, Phase.ACT, Phase.ACT, Phase.SETTLE])
+    worlds.set(worlds.state.mode, [Mode.PICK, Mode.TARGET, Mode.MOVE, Mode.PICK])
     for array in (worlds.attempts.failures, worlds.attempts.removed, worlds.plan.yaw, worlds.sighting.overflow):
         worlds.set(array, 2)
     begin(worlds)
-    assert worlds.attempts.task.numpy().tolist() == [phases.LOOK, phases.LOOK, phases.NO_TASK, phases.NO_TASK]
+    assert worlds.attempts.task.numpy().tolist() == [Task.LOOK, Task.LOOK, Task.NONE, Task.NONE]
     assert worlds.attempts.attempt.numpy().tolist() == [-1] * 4
     for array in (worlds.attempts.failures, worlds.attempts.removed, worlds.plan.yaw, worlds.sighting.overflow):
         assert not array.numpy().any()
@@ -94,7 +93,7 @@ def test_who_begins_to_pick_looks(device):
 
 def test_nothing_hangs_where_nobody_acts(device):
     worlds = made(device, worlds=2)
-    worlds.set(worlds.state.phase, [phases.ACT, phases.SETTLE])
+    worlds.set(worlds.state.phase, [Phase.ACT, Phase.SETTLE])
     worlds.set(worlds.seals.held, 1)
     gripper.forget_seals(worlds.state, worlds.seals)
     assert worlds.seals.held.numpy().tolist() == [[1, 1, 1], [0, 0, 0]]
@@ -103,11 +102,11 @@ def test_nothing_hangs_where_nobody_acts(device):
 def test_who_acts_already_keeps_its_task(device):
     worlds = made(device)
     worlds.set(worlds.state.frame, 7)
-    worlds.set(worlds.attempts.task, phases.LIFT)
+    worlds.set(worlds.attempts.task, Task.LIFT)
     worlds.set(worlds.attempts.outcome, Outcome.DROPPED)
     worlds.set(worlds.seals.held, 1)
     begin(worlds)
-    assert worlds.attempts.task.numpy()[0] == phases.LIFT
+    assert worlds.attempts.task.numpy()[0] == Task.LIFT
     assert worlds.attempts.outcome.numpy()[0] == Outcome.NONE
     assert worlds.seals.held.numpy().all()
 
@@ -118,7 +117,7 @@ def test_an_attempt_begins_above_the_grasp(device):
     worlds.set(worlds.plan.target, [1, -1])
     worlds.set(worlds.plan.tilt, 0.3)
     begin_attempt(worlds)
-    assert worlds.attempts.task.numpy().tolist() == [phases.APPROACH, phases.LOOK]
+    assert worlds.attempts.task.numpy().tolist() == [Task.APPROACH, Task.LOOK]
     assert worlds.attempts.attempt.numpy().tolist() == [0, 0]
     axis = np.add(POINT, np.multiply(TIP, NORMAL)) + np.array([0.0, 0.0, PICK["appear_height"]])
     joints = worlds.physics.state.joint_q.numpy().reshape(2, -1)
@@ -142,16 +141,16 @@ def test_the_goal_goes_down_slowly_at_the_end_and_up_again(device):
     counts = {task: order.count(task) for task in set(order)}
     way = np.linalg.norm(axis + np.array([0.0, 0.0, PICK["appear_height"]]) - before)
     # The step in which the goal arrives already belongs to the next task.
-    assert counts[phases.APPROACH] == int(np.ceil(way / (PICK["speed"] * STEP))) - 1
-    assert abs(counts[phases.DESCEND] - PICK["near"] / (PICK["near_speed"] * STEP)) < 1.5
-    assert set(order) == {phases.APPROACH, phases.DESCEND, phases.PRESS}
-    places = np.array([goal for task, goal in seen if task == phases.DESCEND])
+    assert counts[Task.APPROACH] == int(np.ceil(way / (PICK["speed"] * STEP))) - 1
+    assert abs(counts[Task.DESCEND] - PICK["near"] / (PICK["near_speed"] * STEP)) < 1.5
+    assert set(order) == {Task.APPROACH, Task.DESCEND, Task.PRESS}
+    places = np.array([goal for task, goal in seen if task == Task.DESCEND])
     np.testing.assert_allclose(places[0], before, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), PICK["near_speed"] * STEP, atol=1e-6)
     np.testing.assert_allclose(seen[-1][1], axis, atol=1e-6)
-    assert worlds.attempts.steps.numpy()[0] == counts[phases.PRESS] - 1
+    assert worlds.attempts.steps.numpy()[0] == counts[Task.PRESS] - 1
     end(worlds)
-    assert worlds.attempts.task.numpy()[0] == phases.LIFT
+    assert worlds.attempts.task.numpy()[0] == Task.LIFT
     heights = []
     for _ in range(round(PICK["lift_height"] / (PICK["lift_speed"] * STEP)) + 3):
         step(worlds)
@@ -165,10 +164,10 @@ def test_the_goal_goes_down_slowly_at_the_end_and_up_again(device):
 
 def test_the_cup_rests_before_it_sucks(device):
     worlds = made(device)
-    worlds.set(worlds.attempts.task, phases.PRESS)
+    worlds.set(worlds.attempts.task, Task.PRESS)
     worlds.set(worlds.attempts.steps, PICK["press_steps"] - 1)
     end(worlds)
-    assert worlds.attempts.task.numpy()[0] == phases.PRESS
+    assert worlds.attempts.task.numpy()[0] == Task.PRESS
 
 
 LIFTED = np.add(POINT, np.multiply(TIP, NORMAL)).astype(np.float32) + np.array([0.0, 0.0, PICK["lift_height"]], np.float32)
@@ -181,10 +180,10 @@ JUDGED = [
 ]
 
 
-def lifted(device, target: int, caught: int, held: tuple[int, ...], mode: int = phases.PICK, **pick) -> KernelWorlds:
+def lifted(device, target: int, caught: int, held: tuple[int, ...], mode: int = Mode.PICK, **pick) -> KernelWorlds:
     worlds = made(device, **pick)
     worlds.set(worlds.state.mode, mode)
-    worlds.set(worlds.attempts.task, phases.LIFT)
+    worlds.set(worlds.attempts.task, Task.LIFT)
     worlds.set(worlds.plan.target, target)
     worlds.set(worlds.attempts.caught, caught)
     worlds.set(worlds.seals.held, held)
@@ -199,7 +198,7 @@ def test_what_hangs_after_the_lift_leaves_the_scene(device, target, caught, held
     end(worlds)
     assert worlds.attempts.outcome.numpy()[0] == outcome
     assert worlds.attempts.failures.numpy()[0] == failures
-    assert worlds.attempts.task.numpy()[0] == phases.LOOK
+    assert worlds.attempts.task.numpy()[0] == Task.LOOK
     assert worlds.attempts.hanging.numpy()[0] == sum(bit << i for i, bit in enumerate(held))
     assert worlds.attempts.removed.numpy()[0].tolist() == [tasks.PICKED * bit for bit in held]
     assert worlds.state.entry.numpy()[0].tolist() == [-1 if bit else i for i, bit in enumerate(held)]
@@ -207,7 +206,7 @@ def test_what_hangs_after_the_lift_leaves_the_scene(device, target, caught, held
     np.testing.assert_allclose(worlds.physics.state.joint_q.numpy()[:4], [3.0, 0.0, 1.0, 0.0])
 
 
-@pytest.mark.parametrize(("mode", "forgive", "failures"), [(phases.TARGET, 1, 0), (phases.TARGET, 0, 2), (phases.PICK, 1, 2)])
+@pytest.mark.parametrize(("mode", "forgive", "failures"), [(Mode.TARGET, 1, 0), (Mode.TARGET, 0, 2), (Mode.PICK, 1, 2)])
 def test_a_success_may_be_forgiving(device, mode, forgive, failures):
     worlds = lifted(device, 1, 2, (0, 1, 0), mode=mode, forgive=forgive)
     worlds.set(worlds.attempts.failures, 2)
@@ -269,11 +268,11 @@ def test_what_has_left_is_parked_apart_and_weightless_no_more(device):
 @pytest.mark.parametrize(
     ("task", "entry", "failures", "ending"),
     [
-        (phases.LOOK, [0, 1, 2], 2, Ending.RUNNING),
-        (phases.LOOK, [0, 1, 2], 3, Ending.GAVE_UP),
-        (phases.LOOK, [-1, -1, -1], 0, Ending.EMPTIED),
-        (phases.LOOK, [-1, -1, -1], 3, Ending.EMPTIED),
-        (phases.LIFT, [-1, -1, -1], 3, Ending.RUNNING),
+        (Task.LOOK, [0, 1, 2], 2, Ending.RUNNING),
+        (Task.LOOK, [0, 1, 2], 3, Ending.GAVE_UP),
+        (Task.LOOK, [-1, -1, -1], 0, Ending.EMPTIED),
+        (Task.LOOK, [-1, -1, -1], 3, Ending.EMPTIED),
+        (Task.LIFT, [-1, -1, -1], 3, Ending.RUNNING),
     ],
 )
 def test_when_picking_ends(device, task, entry, failures, ending):
@@ -285,12 +284,12 @@ def test_when_picking_ends(device, task, entry, failures, ending):
     worlds.set(worlds.state.entry, entry)
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
     assert worlds.state.ending.numpy()[0] == ending
-    assert worlds.state.phase.numpy()[0] == (phases.ACT if ending == Ending.RUNNING else phases.OVER)
+    assert worlds.state.phase.numpy()[0] == (Phase.ACT if ending == Ending.RUNNING else Phase.OVER)
 
 
 def test_a_contour_without_room_ends_the_episode(device):
     worlds = made(device)
-    worlds.set(worlds.attempts.task, phases.LIFT)
+    worlds.set(worlds.attempts.task, Task.LIFT)
     worlds.set(worlds.sighting.overflow, 1)
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
     assert worlds.state.ending.numpy()[0] == Ending.SIGHT_OVERFLOW
@@ -310,8 +309,8 @@ def test_a_gripper_that_is_nowhere_ends_the_episode(device, link):
 @settings(deadline=None, max_examples=25)
 def test_everybody_who_looks_is_looked_at_once(looking, views, device):
     worlds = len(looking)
-    phase = wp.full(worlds, phases.ACT, dtype=int, device=device)
-    task = wp.array([phases.LOOK if looks else phases.PRESS for looks in looking], dtype=int, device=device)
+    phase = wp.full(worlds, Phase.ACT, dtype=int, device=device)
+    task = wp.array([Task.LOOK if looks else Task.PRESS for looks in looking], dtype=int, device=device)
     looker, world = wp.zeros(worlds, dtype=int, device=device), wp.zeros(views, dtype=int, device=device)
     count, first, left = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
     wp.launch(worklist.list_lookers_kernel, dim=1, inputs=[worlds, phase, task], outputs=[looker, count, first, left], device=device)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from synpick_warp import frames
+from synpick_warp.codes import Segment
 from synpick_warp.scenes.types import Catalog, Fixture
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, render, sheet, snapshot
 from tools.bench import sensor as bench_sensor
@@ -44,7 +44,7 @@ def views(device):
 
 def test_an_independent_renderer_hits_the_same(views):
     scene, index, depth, ours = views
-    assert set(np.unique(ours.instance)) == {1, 2, 3, frames.TABLE, frames.TOTE, frames.FINGER}
+    assert set(np.unique(ours.instance)) == {1, 2, 3, Segment.TABLE, Segment.TOTE, Segment.FINGER}
     same, close, most = (row.value for row in bench_sensor.agreement(scene, index, depth, ours.instance, ours.depth, 0.1))
     # Rays that graze an edge may fall to either side of it.
     assert same >= 99.9
@@ -55,7 +55,7 @@ def test_an_independent_renderer_hits_the_same(views):
 def test_what_differs_is_counted(views):
     scene, index, depth, ours = views
     code, counts = ours.instance.copy(), ours.depth.copy()
-    code[0, :30] = frames.CUP
+    code[0, :30] = Segment.CUP
     counts[0, 30:] += 100
     same, close, most = (row.value for row in bench_sensor.agreement(scene, index, depth, code, counts, 0.1))
     assert same == pytest.approx(87.5, abs=0.2)

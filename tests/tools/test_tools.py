@@ -12,10 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from synpick_warp.codes import Ending, Outcome
+from synpick_warp.codes import Ending, Mode, Outcome, Phase, Status, Task, names
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels import phases
-from synpick_warp.stages.sim.worlds import STATUS_COLUMNS
 from synpick_warp.stages.stream import TickReport
 from tests.worlds.small_worlds import catalog
 from tools.bench import __main__ as bench
@@ -166,13 +164,13 @@ HOME = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0])
 
 def tick_report(*worlds: dict) -> TickReport:
     """What a tick tells of worlds that act, three objects each; keys: status columns, load, `gone` instances, `poses` by instance."""
-    status = np.zeros((len(worlds), len(STATUS_COLUMNS)), np.int32)
+    status = np.zeros((len(worlds), len(Status)), np.int32)
     entry, pose = np.zeros((len(worlds), ROOM), np.int32), np.tile(HOME, (len(worlds), ROOM, 1))
-    acting = {"phase": phases.ACT, "live": 1, "mode": phases.PICK, "task": phases.LIFT}
+    acting = {"phase": Phase.ACT, "live": 1, "mode": Mode.PICK, "task": Task.LIFT}
     for world, values in enumerate(worlds):
         for name, value in (acting | values).items():
-            if name in STATUS_COLUMNS:
-                status[world, STATUS_COLUMNS.index(name)] = int(value)
+            if name in names(Status):
+                status[world, Status[name.upper()]] = int(value)
         entry[world, list(values.get("gone", ()))] = -1
         for instance, moved in values.get("poses", {}).items():
             pose[world, instance] = moved
@@ -188,16 +186,16 @@ def tallied(*ticks: TickReport, modes=("pick",)):
 
 
 PICKED = {"outcome": Outcome.TARGET_PICKED}
-OVER = {"phase": phases.OVER, "ending": Ending.GAVE_UP}
+OVER = {"phase": Phase.OVER, "ending": Ending.GAVE_UP}
 
 
 def test_a_sequence_is_counted_frame_by_frame():
     tally = tallied(
-        tick_report({"task": phases.LOOK}),
-        tick_report({"task": phases.LIFT, "held": 0b110, "caught": 0b110, "load": 7.0}),
-        tick_report({**PICKED, "task": phases.LOOK, "caught": 0b110, "hits": 9, "held": 0b100, "gone": [2], "load": 3.0}),
-        tick_report({"task": phases.LIFT, "gone": [0, 2], "held": 0b001, "load": 5.0}),
-        tick_report({**OVER, "task": phases.LOOK, "gone": [0, 2], "outcome": Outcome.NOTHING_CAUGHT}),
+        tick_report({"task": Task.LOOK}),
+        tick_report({"task": Task.LIFT, "held": 0b110, "caught": 0b110, "load": 7.0}),
+        tick_report({**PICKED, "task": Task.LOOK, "caught": 0b110, "hits": 9, "held": 0b100, "gone": [2], "load": 3.0}),
+        tick_report({"task": Task.LIFT, "gone": [0, 2], "held": 0b001, "load": 5.0}),
+        tick_report({**OVER, "task": Task.LOOK, "gone": [0, 2], "outcome": Outcome.NOTHING_CAUGHT}),
     )
     (found,) = tally.sequences("pick")
     assert (found.frames, found.objects, found.left, found.picked, found.lost) == (5, 3, 1, 1, 1)
@@ -222,7 +220,7 @@ def test_the_first_sequences_by_number_count_not_the_first_to_end():
 
 
 def test_each_mode_has_its_own_sequences():
-    pick, target, move = ({"episode": number, "mode": mode} for number, mode in enumerate((phases.PICK, phases.TARGET, phases.MOVE)))
+    pick, target, move = ({"episode": number, "mode": mode} for number, mode in enumerate((Mode.PICK, Mode.TARGET, Mode.MOVE)))
     ticks = [tick_report(pick, target, move), tick_report(pick | OVER, target, move | OVER)]
     tally = tallied(*ticks, modes=("pick", "target"))
     assert [len(tally.sequences(mode)) for mode in ("pick", "target")] == [1, 0]
@@ -232,7 +230,7 @@ def test_each_mode_has_its_own_sequences():
 
 
 def test_what_is_drawn_again_is_forgotten_and_at_last_given_up():
-    failed = {"phase": phases.OVER, "live": 0, "ending": Ending.SOLVER_OVERFLOW}
+    failed = {"phase": Phase.OVER, "live": 0, "ending": Ending.SOLVER_OVERFLOW}
     again = [tick_report({}), tick_report(failed), tick_report({"redraw": 1}), tick_report({"redraw": 1} | OVER)]
     tally = tallied(*again)
     assert tally.redrawn == {"solver_overflow": 1}

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from synpick_warp.codes import Stream
 from tests.twins import rng
 
 MOST_DRAWS = 4096
@@ -24,7 +25,7 @@ class Arrangement:
 
 def draw_modes(seed: int, episodes: np.ndarray, weights: tuple[float, float, float]) -> np.ndarray:
     """Mode of each episode: the first whose cumulative share of the weights exceeds the episode's number."""
-    number = rng.uniform(rng.stream_key(seed, episodes, 0, rng.MODE), 0)
+    number = rng.uniform(rng.stream_key(seed, episodes, 0, Stream.MODE), 0)
     share = (np.cumsum(weights) / np.sum(weights)).astype(np.float32)
     return np.array(DRAWN_MODES)[np.searchsorted(share, number, side="right")]
 
@@ -43,7 +44,7 @@ def draw_objects(
     compound_slots: int,
 ) -> Arrangement:
     """Draw until the next object would exceed the budget; sums in float32, as on the device."""
-    key = rng.stream_key(seed, episode, redraw, rng.OBJECTS)
+    key = rng.stream_key(seed, episode, redraw, Stream.OBJECTS)
     sequence = rng.uniform_index(key, np.arange(MOST_DRAWS), len(volume))
     entries: list[int] = []
     slots: list[int] = []
@@ -72,7 +73,7 @@ def drop_poses(
 ) -> np.ndarray:
     """Poses (instance, 7) of the drop column of bounding spheres: z_i = rim + r_i + sum over j < i of (2 r_j + clearance)."""
     count = len(radius)
-    key = rng.stream_key(seed, episode, redraw, rng.DROP)
+    key = rng.stream_key(seed, episode, redraw, Stream.DROP)
     poses = np.zeros((count, 7))
     for axis in range(2):
         side = 2.0 * rng.uniform(key, 5 * np.arange(count) + axis).astype(np.float64) - 1.0

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from synpick_warp.codes import Stream
 from tests.twins import rng
 
 
 def corner_order(seed: int, episode: int, redraw: int, rounds: int) -> list[int]:
     """A Fisher-Yates shuffle of the four corners for each round."""
-    key = rng.stream_key(seed, episode, redraw, rng.CORNERS)
+    key = rng.stream_key(seed, episode, redraw, Stream.CORNERS)
     order: list[int] = []
     for visit in range(4 * rounds):
         if visit % 4 == 0:

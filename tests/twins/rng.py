@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-OBJECTS, DROP, REDROP, CORNERS, LIGHT, MODE, TARGETS = range(1, 8)
 GAMMA = np.uint64(0x9E3779B97F4A7C15)
 
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import trimesh
 
-from synpick_warp.codes import Ending
+from synpick_warp.codes import Effect, Ending, Segment
 from synpick_warp.configs.schema import Bop, Cameras, Config, Render
-from synpick_warp.frames import EFFECTS, FINGER, TABLE, EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material, TriangleMesh
 
 ROOM = 5
@@ -96,7 +96,7 @@ def batches(
 def _layers(view: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Layers that differ between views; no truth of the boxes."""
     number = int(100 * view["episode"] + 10 * view["camera"] + view["frame"])
-    flow = np.stack([view["instance"] - np.float32(number), np.where(view["instance"] == TABLE, np.nan, 0.25)], axis=-1)
+    flow = np.stack([view["instance"] - np.float32(number), np.where(view["instance"] == Segment.TABLE, np.nan, 0.25)], axis=-1)
     return {"classes": (view["instance"] + np.uint16(number)).astype(np.uint16), "flow": flow.astype(np.float32)}
 
 
@@ -139,7 +139,7 @@ def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: flo
     table = _table(camera)
     nearest = np.argmin(np.concatenate((inner, finger[None], table[None])), axis=0)
     depth = np.min(np.concatenate((inner, finger[None], table[None])), axis=0)
-    codes = np.array([*range(1, ROOM + 1), FINGER, TABLE], np.uint8)
+    codes = np.array([*range(1, ROOM + 1), Segment.FINGER, Segment.TABLE], np.uint8)
     instance = codes[nearest]
     pixels, boxes = np.zeros((ROOM, 3), np.int32), np.tile(np.array([0, 0, -1, -1], np.int32), (ROOM, 2, 1))
     for i in range(ROOM):
@@ -161,7 +161,7 @@ def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: flo
         "pose": pose,
         "pixels": pixels,
         "boxes": boxes,
-        "effects": np.arange(len(EFFECTS), dtype=np.float32) + np.float32(10 * index + frame),
+        "effects": np.arange(len(Effect), dtype=np.float32) + np.float32(10 * index + frame),
         "light_name": np.str_(f"map {episode}"),
         "light_turn": np.float32(0.5 * episode),
         "light_exposure": np.float32(-0.25),

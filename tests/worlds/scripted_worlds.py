@@ -11,9 +11,8 @@ import numpy as np
 
 from synpick_warp.arrays import allocate
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
-from synpick_warp.codes import Ending, Outcome
+from synpick_warp.codes import Ending, Measure, Mode, Outcome, Phase, Status, Task
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels import phases
 from synpick_warp.stages.perception.arrays import Plan, Sighting
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.stream import TickReport
@@ -29,35 +28,35 @@ class World:
         sizes = worlds.world_sizes(config, 1) | {"world": 1}
         self.room = sizes["instance"]
         self.sighting, self.plan = (_host(allocate(kind, sizes, device)) for kind in (Sighting, Plan))
-        self.status = np.zeros((1, len(worlds.STATUS_COLUMNS)), np.int32)
-        self.measures = np.zeros((1, len(worlds.MEASURE_COLUMNS)), np.float32)
+        self.status = np.zeros((1, len(Status)), np.int32)
+        self.measures = np.zeros((1, len(Measure)), np.float32)
         self.entry = np.full((1, self.room), -1, np.int32)
 
     def now(self, *, load: float | None = None, entry: list[int] | None = None, **columns: int) -> None:
         """Change columns; the rest stays."""
         for name, value in columns.items():
             # As the device writes bits of 32 instances.
-            self.status[0, worlds.STATUS_COLUMNS.index(name)] = np.uint32(value).astype(np.int32) if value > 2**31 - 1 else value
+            self.status[0, Status[name.upper()]] = np.uint32(value).astype(np.int32) if value > 2**31 - 1 else value
         if load is not None:
-            self.measures[0, worlds.MEASURE_COLUMNS.index("load")] = load
+            self.measures[0, Measure.LOAD] = load
         if entry is not None:
             self.entry[0] = entry
 
     def frame(self, **columns: object) -> None:
         """As `now`, in the next frame, in which no attempt has ended unless `columns` say so."""
-        following = int(self.status[0, worlds.STATUS_COLUMNS.index("frame")]) + 1
+        following = int(self.status[0, Status.FRAME]) + 1
         self.now(**{"frame": following, "outcome": 0, **columns})
 
     def settle(self, episode: int, redraw: int, mode: int, entry: list[int]) -> None:
         """An arrangement falls."""
         self.now(
-            phase=phases.SETTLE,
+            phase=Phase.SETTLE,
             episode=episode,
             redraw=redraw,
             mode=mode,
             frame=-1,
             live=0,
-            task=phases.NO_TASK,
+            task=Task.NONE,
             outcome=0,
             attempt=-1,
             ending=0,
@@ -66,8 +65,8 @@ class World:
 
     def first_frame(self) -> None:
         """The gripper begins to act."""
-        move = self.status[0, worlds.STATUS_COLUMNS.index("mode")] == phases.MOVE
-        self.frame(phase=phases.ACT, live=1, task=phases.NO_TASK if move else phases.LOOK, attempt=-1)
+        move = self.status[0, Status.MODE] == Mode.MOVE
+        self.frame(phase=Phase.ACT, live=1, task=Task.NONE if move else Task.LOOK, attempt=-1)
 
     def look(self, target: int) -> None:
         """A look chooses; what is not set by the test is some number."""
@@ -79,21 +78,21 @@ class World:
 
     def attempt(self, number: int, loads: list[float], **columns: object) -> Ticks:
         """All ticks from the one after the look to the one before the end; then sets what tells of the end."""
-        for task in (phases.APPROACH, phases.DESCEND, phases.PRESS):
+        for task in (Task.APPROACH, Task.DESCEND, Task.PRESS):
             self.frame(task=task, attempt=number, load=0.0)
             yield
         for load in loads[:-1]:
-            self.frame(task=phases.LIFT, load=load)
+            self.frame(task=Task.LIFT, load=load)
             yield
-        self.frame(task=phases.LOOK, load=loads[-1], **columns)
+        self.frame(task=Task.LOOK, load=loads[-1], **columns)
 
     def nothing_seen(self, number: int) -> None:
         """The tick after a look that found nothing."""
-        self.frame(task=phases.LOOK, attempt=number, outcome=Outcome.NOTHING_SEEN, held=0)
+        self.frame(task=Task.LOOK, attempt=number, outcome=Outcome.NOTHING_SEEN, held=0)
 
     def over(self, ending: Ending) -> None:
         """The current tick is the episode's last."""
-        self.now(phase=phases.OVER, ending=ending, live=int(ending.delivers))
+        self.now(phase=Phase.OVER, ending=ending, live=int(ending.delivers))
 
 
 def _host(arrays: Sighting | Plan) -> SimpleNamespace:
@@ -109,7 +108,7 @@ def play(script: dict[World, Ticks], log: AttemptLog) -> dict[tuple[int, int], E
             return found
         for world, runs in zip(script, running, strict=True):
             if not runs:
-                world.now(phase=phases.IDLE, live=0, outcome=0)
+                world.now(phase=Phase.IDLE, live=0, outcome=0)
         found |= {(tick, episode): record for episode, record in log.see(report(list(script))).items()}
     raise AssertionError("a script does not end")
 

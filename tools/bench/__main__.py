@@ -30,6 +30,7 @@ from rich.console import Console
 from synpick_warp.bake import Factory, build_factory, run_bake
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import GIB, describe_machine
+from synpick_warp.codes import Status
 from synpick_warp.configs.load import load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
@@ -41,7 +42,7 @@ from synpick_warp.stages.render.annotate import annotate
 from synpick_warp.stages.render.denoised import FastPicture
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import STATUS_COLUMNS, FrameStream, TickReader, TickReport
+from synpick_warp.stages.stream import FrameStream, TickReader, TickReport
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
 from tools.bench.sensor import measure_sensor
 from tools.bench.write import measure_writing
@@ -179,7 +180,7 @@ def _all_live(simulation: Simulation, worlds: int) -> TickReport:
     reader = TickReader(simulation.records[0])
     reader.start()
     report = reader.wait()
-    report.status[:, STATUS_COLUMNS.index("live")] = np.arange(simulation.layout.worlds) < worlds
+    report.status[:, Status.LIVE] = np.arange(simulation.layout.worlds) < worlds
     return report
 
 

@@ -15,7 +15,7 @@ import newton
 import warp as wp
 
 from synpick_warp.bake import Factory
-from synpick_warp.kernels import phases
+from synpick_warp.codes import Phase, Task
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader
 
@@ -134,7 +134,7 @@ def measure_simulation(factory: Factory, least: float, parts: tuple[str, ...]) -
         if {"physics", "sight"} & set(parts):
             yield from (row for row in _picking(simulation, bare) if row.part in parts)
     if thorough:
-        acting = float((simulation.state.phase.numpy() == int(phases.ACT)).mean())
+        acting = float((simulation.state.phase.numpy() == Phase.ACT).mean())
         yield Row("physics", "worlds that act", 100.0 * acting, "%")
         contacts = int(simulation.physics.contacts.rigid_contact_count.numpy()[0])
         yield Row("physics", "contacts a world", contacts / simulation.layout.worlds, "")
@@ -210,10 +210,10 @@ def _picking(simulation: Simulation, bare: float) -> Iterator[Row]:
             simulation.tick(simulation.records[0])
             reader.start()
             report = reader.wait()
-            picks = report.column("phase") == phases.ACT
+            picks = report.column("phase") == Phase.ACT
             acting += int(picks.sum())
             held += int((picks & (report.column("held") != 0)).sum())
-            looks += int((picks & (report.column("task") == phases.LOOK)).sum())
+            looks += int((picks & (report.column("task") == Task.LOOK)).sum())
     wp.synchronize_device(device)
     whole, steps, look = ((time.perf_counter() - started) / PICK_TICKS, *(watch.seconds(name) / PICK_TICKS for name in ("steps", "looks")))
     yield from _pace(simulation, whole, "picking")
@@ -231,8 +231,8 @@ def _looks(simulation: Simulation, least: float) -> Iterator[Row]:
     """Time of a look, by what it consists of, in full batches."""
     looker, snapshot = simulation.looker, simulation.records[0].snapshot
     assert looker is not None  # There are worlds that pick.
-    simulation.state.phase.fill_(int(phases.ACT))
-    simulation.attempts.task.fill_(int(phases.LOOK))
+    simulation.state.phase.fill_(Phase.ACT)
+    simulation.attempts.task.fill_(Task.LOOK)
     parts = (
         (looker.sight, "trace", "trace"),
         (looker.sight, "find_suction_points", "components, distances, contours, suction points"),

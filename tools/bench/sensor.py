@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.arrays import allocate
 from synpick_warp.bake import Factory
+from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Config
-from synpick_warp.frames import NOTHING, TABLE, TOTE
 from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
 from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
@@ -106,7 +106,7 @@ def build_sensor_scene(
         rays,
         wp.array(transforms, dtype=wp.transformf, device=device),
         wp.array(view // len(cameras), dtype=wp.int32, device=device),
-        np.array([*codes, NOTHING]),
+        np.array([*codes, Segment.NOTHING]),
     )
 
 
@@ -131,10 +131,10 @@ def _build_model(
         for number, visible in enumerate(host["fixture_visible"][world]):
             if visible:
                 _add_body(builder, things[number], fixtures[number].material, host["fixture_pose"][world, number], shape)
-                codes.append(TOTE + number)
+                codes.append(Segment.TOTE + number)
         if config.render.table:
             builder.add_shape_plane((0.0, 0.0, 1.0, -table), width=0.0, length=0.0, cfg=shape, color=config.render.table_color)
-            codes.append(TABLE)
+            codes.append(Segment.TABLE)
         builder.end_world()
     return builder.finalize(device=device), codes
 

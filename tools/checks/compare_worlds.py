@@ -26,11 +26,11 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp.bake import build_factory
+from synpick_warp.codes import Phase
 from synpick_warp.configs.load import load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
-from synpick_warp.kernels import phases
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.stream import TickReader
 
@@ -155,11 +155,11 @@ def _note(reader: TickReader, ticks: Ticks) -> bool:
     reader.start()
     report = reader.wait()
     episode, redraw, phase = (report.column(name) for name in ("episode", "redraw", "phase"))
-    for world in np.flatnonzero(phase != phases.IDLE):
+    for world in np.flatnonzero(phase != Phase.IDLE):
         full = report.entry[world] >= 0
         poses = np.concatenate((report.pose[world][full], report.snapshot.fixture_pose[world]))
         ticks[int(episode[world]), int(redraw[world])].append((report.entry[world], poses))
-    return bool((phase == phases.IDLE).all())
+    return bool((phase == Phase.IDLE).all())
 
 
 def compare(reference: Ticks, other: Ticks) -> tuple[int, int, int, float]:

@@ -18,6 +18,7 @@ MOST_PARAMETERS = 16
 GROUPS = ("Scene", "State", "In", "Out")
 WRITTEN = ("_out", "_inout")
 KERNEL_PACKAGE = "synpick_warp.kernels"
+CODES = "synpick_warp.codes"
 LAUNCHING = "synpick_warp/stages"
 HOST_FOLDERS = ("synpick_warp", "scenes", "configs", "tools")
 _GROUP = re.compile(rf"\s*#\s*({'|'.join(GROUPS)}):")
@@ -50,8 +51,8 @@ def check_module(path: Path, tree: ast.Module, writes: Writes) -> Iterator[Fault
     for line, name in imports(tree):
         if name == "__future__.annotations":
             yield path, line, "Warp reads annotations: no `from __future__ import annotations` here"
-        elif name.split(".")[0] != "warp" and not name.startswith(KERNEL_PACKAGE):
-            yield path, line, f"kernels import Warp and other kernels only, not {name}"
+        elif name.split(".")[0] != "warp" and not name.startswith((KERNEL_PACKAGE, CODES)):
+            yield path, line, f"kernels import Warp, codes and other kernels only, not {name}"
     lines = path.read_text().splitlines()
     for kernel in kernels:
         for line, rule in check_kernel(kernel, lines, writes):

@@ -24,12 +24,12 @@ from rich.table import Table
 from synpick_warp.bake import Factory, build_factory
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import describe_machine
+from synpick_warp.codes import Phase
 from synpick_warp.configs.load import load_config, parse_assignment
 from synpick_warp.configs.schema import MIXED, Config
 from synpick_warp.configs.schema import MODES as MIX
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
-from synpick_warp.kernels import phases
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.annotate import annotate
@@ -216,7 +216,7 @@ def simulate(factory: Factory, eyes: Eyes | None, tally: Tally) -> Iterator[None
         waiting = now
         ticks += 1
         yield
-        if (now.column("phase") == phases.IDLE).all():
+        if (now.column("phase") == Phase.IDLE).all():
             tally.see(now, eyes.wait() if eyes is not None else {})
             return
 

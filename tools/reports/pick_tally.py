@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.codes import Ending, Outcome
+from synpick_warp.codes import Ending, Mode, Outcome, Phase, Task
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels import phases
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.stream import TickReport
 from tools.reports.rest import is_inside, place_of
 
-MODES = {"pick": int(phases.PICK), "target": int(phases.TARGET)}
-TASKS = {int(getattr(phases, name)): name.lower() for name in ("LOOK", "APPROACH", "DESCEND", "PRESS", "LIFT")}
+MODES = {"pick": Mode.PICK, "target": Mode.TARGET}
+TASKS = {int(task): task.name.lower() for task in Task if task is not Task.NONE}
 PAPER = {
     "frames a sequence": {"pick": 573.0, "target": 687.0},
     "visibility, mean": {"pick": 0.77, "target": 0.77},
@@ -120,7 +119,7 @@ class Tally:
         names = {code: name for name, code in MODES.items()}
         for world, phase in enumerate(status["phase"]):
             mode, number = names.get(status["mode"][world]), status["episode"][world]
-            if mode not in self.modes or number < 0 or phase not in (phases.SETTLE, phases.ACT, phases.OVER):
+            if mode not in self.modes or number < 0 or phase not in (Phase.SETTLE, Phase.ACT, Phase.OVER):
                 continue
             self.numbers[mode].add(number)
             if status["live"][world]:
@@ -132,7 +131,7 @@ class Tally:
                 sequence.visible_share += share
                 sequence.instances += instances
                 sequence.views += views
-            if phase == phases.OVER:
+            if phase == Phase.OVER:
                 self._end(world, number, Ending(status["ending"][world]), status["redraw"][world])
         self._before = report
 

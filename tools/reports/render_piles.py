@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.errors import SynpickError
-from synpick_warp.kernels import phases
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
@@ -157,7 +157,7 @@ def settled(config: Config, catalog: Catalog, lights: int, device: Any) -> Snaps
     for _ in range(MOST_TICKS):
         simulation.tick(record)
         host = {item.name: getattr(record.snapshot, item.name).numpy() for item in fields(Snapshot)}
-        for world in np.flatnonzero(simulation.state.phase.numpy() == phases.ACT):
+        for world in np.flatnonzero(simulation.state.phase.numpy() == Phase.ACT):
             piles.setdefault(int(world), {name: array[world].copy() for name, array in host.items()})
         if len(piles) == wanted:
             break

@@ -23,12 +23,11 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp.cli.doctor import describe_machine
-from synpick_warp.codes import Ending
+from synpick_warp.codes import Ending, Phase
 from synpick_warp.configs.load import load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
-from synpick_warp.kernels import phases
 from synpick_warp.scenes import build
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.types import Catalog
@@ -173,15 +172,15 @@ def settle(simulation: Simulation, catalog: Catalog, findings: Findings, say: Ca
         reader.start()
         report = reader.wait()
         phase = report.column("phase")
-        for world in np.flatnonzero(phase == phases.OVER):
+        for world in np.flatnonzero(phase == Phase.OVER):
             findings.redrawn[Ending(int(report.column("ending")[world])).name.lower()] += 1
             findings.given_up += int(report.column("redraw")[world]) + 1 == config.settle.tries
-        resting = np.flatnonzero(phase == phases.ACT)
+        resting = np.flatnonzero(phase == Phase.ACT)
         if len(resting):
             assert before is not None  # A pile rests for several ticks before it counts as settled.
             findings.piles += _measure(simulation, catalog, before, report, resting)
             _finish(simulation, resting)
-        if (phase == phases.IDLE).all():
+        if (phase == Phase.IDLE).all():
             return
         if time.perf_counter() - said >= SAY_EVERY:
             said = time.perf_counter()
@@ -192,7 +191,7 @@ def settle(simulation: Simulation, catalog: Catalog, findings: Findings, say: Ca
 def _finish(simulation: Simulation, worlds: np.ndarray) -> None:
     """End the episodes of these worlds as if the gripper had done its work, so that the next tick hands out new ones."""
     state = simulation.state
-    for array, value in ((state.phase, phases.OVER), (state.ending, phases.ENDING_FINISHED)):
+    for array, value in ((state.phase, Phase.OVER), (state.ending, Ending.FINISHED)):
         host = array.numpy()
         host[worlds] = int(value)
         array.assign(host)

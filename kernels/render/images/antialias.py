@@ -7,12 +7,11 @@ ray costs no light; what textures show is filtered already.
 
 import warp as wp
 
+from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, off_plane, pixel_plane
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
-    NOTHING,
     RAY_REGISTERS,
-    TABLE,
     Bodies,
     Hit,
     Hits,
@@ -129,7 +128,7 @@ def is_edge(hits: Hits, grid: ImageGrid, intrinsics: wp.vec4, view: int, top: in
     code = hits.code[view, top, left]
     if hits.code[view, top, right] != code or hits.code[view, bottom, left] != code or hits.code[view, bottom, right] != code:
         return True
-    if int(code) == NOTHING or int(code) == TABLE:
+    if int(code) == Segment.NOTHING or int(code) == Segment.TABLE:
         return False
     if left < right:
         if bends(hits, grid, intrinsics[0], view, top, left, 0, 1) or bends(hits, grid, intrinsics[0], view, bottom, left, 0, 1):
@@ -202,7 +201,7 @@ def seen_bodies(hits: Hits, grid: ImageGrid, view: int, row: int, column: int, i
         c = corner_column(column, corner)
         if is_pixel(grid, r, c):
             code = int(hits.code[view, r, c])
-            if code != NOTHING and code != TABLE:
+            if code != Segment.NOTHING and code != Segment.TABLE:
                 seen = seen | (wp.uint64(1) << wp.uint64(body_of(code, instances)))
     return seen
 
@@ -236,7 +235,7 @@ def like_corner(hits: Hits, grid: ImageGrid, view: int, row: int, column: int, o
                 down = corner // 2 - own // 2
                 right = corner % 2 - own % 2
                 apart = NEARNESS * wp.length(wp.vec2(float(right) - offset[0], float(down) - offset[1]))
-                if hit.code != NOTHING:
+                if hit.code != Segment.NOTHING:
                     apart += off_plane(plane, down, right, hits.depth[view, r, c]) / plane.width
                 if apart < least:
                     least = apart
@@ -288,7 +287,7 @@ def mix_edges_kernel(
             hit = trace_candidates(meshes, bodies, view, candidates, ray, instances)
             hit = hit_table(table, cameras, camera, ray, hit)
             normal = wp.vec3(0.0, 0.0, 0.0)
-            if hit.code != NOTHING:
+            if hit.code != Segment.NOTHING:
                 normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, view, hit, instances)
             plane = pixel_plane(intrinsics, r, c, wp.uint8(hit.code), hit.depth, normal)
             plane.height = hit.depth * wp.dot(normal, ray)

@@ -2,20 +2,10 @@
 
 import warp as wp
 
-from synpick_warp.kernels.rng import EFFECTS, normal_pair, pixel_key, uniform, view_key
+from synpick_warp.codes import Effect, Stream
+from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
 
 wp.set_module_options({"enable_backward": False})
-
-# Places of the strengths in `Strengths`; a test keeps them in step with frames.EFFECTS.
-EXPOSURE = wp.constant(0)
-RED = wp.constant(1)
-BLUE = wp.constant(2)
-VIGNETTE = wp.constant(3)
-CHROMATIC_ABERRATION = wp.constant(4)
-BLUR = wp.constant(5)
-SHOT_NOISE = wp.constant(6)
-READ_NOISE = wp.constant(7)
-JPEG_QUALITY = wp.constant(8)
 
 Strengths = wp.types.vector(length=9, dtype=float)
 """A view's effects: exposure, red, blue [stops], vignette, chromatic aberration [px], blur [px], shot noise, read noise, JPEG quality."""
@@ -50,13 +40,13 @@ def draw_effects_kernel(
     """
     view = wp.tid()
     world = view_world[view]
-    key = view_key(rules.seed, episode[world], frame[world], view_camera[view], EFFECTS)
+    key = view_key(rules.seed, episode[world], frame[world], view_camera[view], Stream.EFFECTS)
     strengths = Strengths()
-    for index in range(JPEG_QUALITY):
+    for index in range(wp.static(int(Effect.JPEG_QUALITY))):
         strengths[index] = rules.low[index] + (rules.high[index] - rules.low[index]) * uniform(key, index)
-    lowest = rules.low[JPEG_QUALITY]
-    highest = rules.high[JPEG_QUALITY]
-    strengths[JPEG_QUALITY] = wp.min(lowest + wp.floor((highest - lowest + 1.0) * uniform(key, JPEG_QUALITY)), highest)
+    lowest = rules.low[Effect.JPEG_QUALITY]
+    highest = rules.high[Effect.JPEG_QUALITY]
+    strengths[Effect.JPEG_QUALITY] = wp.min(lowest + wp.floor((highest - lowest + 1.0) * uniform(key, Effect.JPEG_QUALITY)), highest)
     effects_out[view] = strengths
 
 
@@ -81,8 +71,8 @@ def vignette_factor(loss: float, ray: wp.vec3, corner: wp.vec2) -> float:
 @wp.func
 def gains(strengths: Strengths) -> wp.vec3:
     """Factors on red, green and blue: exposure and white balance."""
-    exposure = strengths[EXPOSURE]
-    return wp.vec3(wp.pow(2.0, exposure + strengths[RED]), wp.pow(2.0, exposure), wp.pow(2.0, exposure + strengths[BLUE]))
+    exposure = strengths[Effect.EXPOSURE]
+    return wp.vec3(wp.pow(2.0, exposure + strengths[Effect.RED]), wp.pow(2.0, exposure), wp.pow(2.0, exposure + strengths[Effect.BLUE]))
 
 
 @wp.func
@@ -94,8 +84,8 @@ def magnification(channel: int, aberration: float, corner: float) -> float:
 @wp.func
 def noisy(value: wp.vec3, strengths: Strengths, key: wp.uint64, pixel: int) -> wp.vec3:
     """What a sensor reads: Gaussian about the value x with variance shot² x + read², in shares of full scale, each channel on its own."""
-    shot = strengths[SHOT_NOISE]
-    read = strengths[READ_NOISE]
+    shot = strengths[Effect.SHOT_NOISE]
+    read = strengths[Effect.READ_NOISE]
     if shot == 0.0 and read == 0.0:
         return value
     numbers = pixel_key(key, pixel)

@@ -2,11 +2,12 @@
 
 import warp as wp
 
+from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.images.layers import hit_surface
 from synpick_warp.kernels.render.lighting.materials import Surfaces
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, NOTHING, Bodies, Hits, Meshes
-from synpick_warp.kernels.rng import DEPTH_NOISE, normal_pair, pixel_key, view_key
+from synpick_warp.kernels.render.visibility.gbuffer import MAX_COUNTS, Bodies, Hits, Meshes
+from synpick_warp.kernels.rng import normal_pair, pixel_key, view_key
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,7 +40,7 @@ class SensorRules:
 @wp.func
 def disparity_at(hits: Hits, gain: float, view: int, row: int, column: int) -> float:
     """Disparity of what a pixel sees [px], 0 where it sees nothing; `gain` is focal length times baseline [px m]."""
-    if int(hits.code[view, row, column]) == NOTHING:
+    if int(hits.code[view, row, column]) == Segment.NOTHING:
         return 0.0
     return gain / hits.depth[view, row, column]
 
@@ -139,11 +140,11 @@ def draw_depth_sensor_kernel(
     depth_sensor_out[view, row, column] = wp.uint16(0)
     camera = view_camera[view]
     world = view_world[view]
-    key = pixel_key(view_key(sensor.seed, episode[world], frame[world], camera, DEPTH_NOISE), row * grid.width + column)
+    key = pixel_key(view_key(sensor.seed, episode[world], frame[world], camera, Stream.DEPTH_NOISE), row * grid.width + column)
     shift = sensor.lateral_noise * normal_pair(key, 0)
     at_row = wp.clamp(row + int(wp.rint(shift[0])), 0, grid.height - 1)
     at_column = wp.clamp(column + int(wp.rint(shift[1])), 0, grid.width - 1)
-    if int(hits.code[view, at_row, at_column]) == NOTHING:
+    if int(hits.code[view, at_row, at_column]) == Segment.NOTHING:
         return
     intrinsics = cameras.intrinsics[camera]
     gain = intrinsics[0] * sensor.baseline

@@ -2,10 +2,11 @@
 
 import warp as wp
 
+from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.materials import Surface, Surfaces, base_color, mesh_surface, table_surface
 from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, Cameras, ImageGrid, camera_ray, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import NOTHING, TABLE, Bodies, Hits, Meshes, body_of
+from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Hits, Meshes, body_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -102,7 +103,7 @@ def hit_surface(
     """Surface that a pixel's ray hit, which must have hit something."""
     to_camera = -wp.normalize(cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0)))
     code = int(hits.code[view, row, column])
-    if code == TABLE:
+    if code == Segment.TABLE:
         return table_surface(meshes, to_camera)
     triangle = hits.triangle[view, row, column]
     barycentric = hits.barycentric[view, row, column]
@@ -135,7 +136,7 @@ def draw_normals_kernel(
         return
     camera = view_camera[view]
     normal = wp.vec3(0.0, 0.0, 0.0)
-    if int(hits.code[view, row, column]) != NOTHING:
+    if int(hits.code[view, row, column]) != Segment.NOTHING:
         surface = hit_surface(meshes, surfaces, cameras, bodies, hits, view, row, column, camera, instances)
         normal = wp.transpose(cameras.to_world[camera]) * surface.normal
     normals_out[view, row, column] = normal
@@ -165,7 +166,7 @@ def draw_albedo_kernel(
     if row >= grid.height or column >= grid.width:
         return
     color = wp.vec3(0.0, 0.0, 0.0)
-    if int(hits.code[view, row, column]) != NOTHING:
+    if int(hits.code[view, row, column]) != Segment.NOTHING:
         surface = hit_surface(meshes, surfaces, cameras, bodies, hits, view, row, column, view_camera[view], instances)
         color = base_color(surfaces, surface)
     albedo_out[view, row, column] = wp.vec3ub(srgb_byte(color[0]), srgb_byte(color[1]), srgb_byte(color[2]))
@@ -196,7 +197,7 @@ def draw_nocs_kernel(
         return
     code = int(hits.code[view, row, column])
     place = wp.vec3(0.0, 0.0, 0.0)
-    if code != NOTHING and code <= instances:
+    if code != Segment.NOTHING and code <= instances:
         mesh = bodies.mesh[view, code - 1]
         lower = meshes.lower[mesh]
         upper = meshes.upper[mesh]
@@ -228,7 +229,7 @@ def draw_classes_kernel(
         return
     code = int(hits.code[view, row, column])
     number = int(0)
-    if code != NOTHING and code <= instances:
+    if code != Segment.NOTHING and code <= instances:
         number = obj_id[bodies.mesh[view, code - 1]]
     classes_out[view, row, column] = wp.uint16(number)
 
@@ -238,9 +239,9 @@ def motion_at(motions: Motions, hits: Hits, view: int, row: int, column: int, ra
     """From the point that a pixel's ray met to where it was in the frame before, in the camera's axes [m]; NaN if unknown."""
     unknown = wp.vec3(wp.NAN, wp.NAN, wp.NAN)
     code = int(hits.code[view, row, column])
-    if code == NOTHING or follows == 0:
+    if code == Segment.NOTHING or follows == 0:
         return unknown
-    if code == TABLE:
+    if code == Segment.TABLE:
         return wp.vec3(0.0, 0.0, 0.0)
     body = body_of(code, instances)
     if motions.known[view, body] == 0:

@@ -2,12 +2,10 @@
 
 import warp as wp
 
+from synpick_warp.codes import Effect, Stream, Tone
 from synpick_warp.kernels.render.images.antialias import Picture, pixel_radiance
 from synpick_warp.kernels.render.images.camera_effects import (
-    BLUR,
     BLUR_REACH,
-    CHROMATIC_ABERRATION,
-    VIGNETTE,
     Strengths,
     corner_slope,
     gains,
@@ -18,14 +16,10 @@ from synpick_warp.kernels.render.images.camera_effects import (
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, Cameras, ImageGrid, camera_ray, tile_pixel
-from synpick_warp.kernels.rng import COLOR_NOISE, view_key
+from synpick_warp.kernels.rng import view_key
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-# Tone curves; a test keeps them in step with configs.sensors.TONES.
-SHOULDER = wp.constant(0)
-LINEAR = wp.constant(1)
-FILMIC = wp.constant(2)
 LINEAR_PART = wp.constant(0.6)
 """SHOULDER leaves values below this untouched, so that colours keep their ratio."""
 FILMIC_GAIN = wp.constant(0.7232)
@@ -46,9 +40,9 @@ def display_value(linear: float, tone: int) -> wp.uint8:
     SHOULDER: untouched up to LINEAR_PART, then a shoulder that reaches 1 at infinity, slope 1 where they meet. LINEAR: cut off at 1.
     """
     x = wp.max(linear, 0.0)
-    if tone == FILMIC:
+    if tone == Tone.FILMIC:
         x = filmic_value(x)
-    elif tone == SHOULDER:
+    elif tone == Tone.SHOULDER:
         if x > LINEAR_PART:
             rest = 1.0 - LINEAR_PART
             x = LINEAR_PART + rest * (1.0 - wp.exp((LINEAR_PART - x) / rest))
@@ -108,13 +102,13 @@ def spread_value(
         size = grid.width
         center = intrinsics[2]
         place = float(column) + PIXEL_CENTER
-        loss = strengths[VIGNETTE]
+        loss = strengths[Effect.VIGNETTE]
     slope = corner_slope(intrinsics, grid.width, grid.height)
     radius = wp.length(wp.vec2(slope[0] * intrinsics[0], slope[1] * intrinsics[1]))
-    place = center + (place - center) / magnification(channel, strengths[CHROMATIC_ABERRATION], radius) - PIXEL_CENTER
+    place = center + (place - center) / magnification(channel, strengths[Effect.CHROMATIC_ABERRATION], radius) - PIXEL_CENTER
     low = int(wp.floor(place))
     share = place - float(low)
-    sigma = strengths[BLUR]
+    sigma = strengths[Effect.BLUR]
     reach = int(wp.ceil(BLUR_REACH * sigma))
     total = float(0.0)
     weights = float(0.0)
@@ -200,7 +194,7 @@ def develop_effects_kernel(
     """As `develop_kernel`, with all effects: lens (unless done), exposure and white balance, noise of the sensor, tone and transfer curve.
 
     If `spread_rows_kernel` made `picture.radiance`, its `mix` counts no more. Noise is that of the stream (seed, episode, frame, camera,
-    COLOR_NOISE).
+    Stream.COLOR_NOISE).
     """
     pixel = tile_pixel(grid, wp.tid() + first)
     view = pixel[0]
@@ -218,10 +212,10 @@ def develop_effects_kernel(
             value[channel] = spread_value(picture, strengths, intrinsics, grid, view, row, column, channel, 0)
     else:
         corner = corner_slope(intrinsics, grid.width, grid.height)
-        value *= vignette_factor(strengths[VIGNETTE], camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)), corner)
+        value *= vignette_factor(strengths[Effect.VIGNETTE], camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)), corner)
     value *= lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world])
     value = wp.cw_mul(value, gains(strengths))
-    key = view_key(rules.seed, episode[world], frame[world], camera, COLOR_NOISE)
+    key = view_key(rules.seed, episode[world], frame[world], camera, Stream.COLOR_NOISE)
     value = noisy(value, strengths, key, row * grid.width + column)
     color_out[view, row, column] = wp.vec3ub(
         display_value(value[0], rules.tone), display_value(value[1], rules.tone), display_value(value[2], rules.tone)

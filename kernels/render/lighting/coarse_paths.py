@@ -7,6 +7,7 @@ each pixel multiplies it by its own unhindered light (after Heitz, Hill and McGu
 
 import warp as wp
 
+from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.lighting.brdf import even_gloss
 from synpick_warp.kernels.render.lighting.coarse_grid import CellGrid, Guide, cell_number, cell_pixel, spread_cell
 from synpick_warp.kernels.render.lighting.color import LEAST_LIGHT
@@ -23,8 +24,8 @@ from synpick_warp.kernels.render.lighting.path_tracing import (
 )
 from synpick_warp.kernels.render.lighting.unoccluded import Light, even_light
 from synpick_warp.kernels.render.visibility.camera import Cameras, camera_ray, hit_position
-from synpick_warp.kernels.render.visibility.gbuffer import NOTHING, Bodies, Hits, read_hit
-from synpick_warp.kernels.rng import PATHS, stream_key
+from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Hits, read_hit
+from synpick_warp.kernels.rng import stream_key
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -73,7 +74,7 @@ def paths_place(
     place.light = light
     place.first_light = light + scene.lights.maps
     place.turn = turn
-    place.key = stream_key(rules.seed, episode, 0, PATHS)
+    place.key = stream_key(rules.seed, episode, 0, Stream.PATHS)
     place.shift = wp.vec2(PHASES * float(row) / float(cells.cells.height), PHASES * float(column) / float(cells.cells.width))
     return place
 
@@ -150,7 +151,7 @@ def gather_kernel(
     pixel = cell_pixel(cells, row, column)
     hit = read_hit(hits, view, pixel[0], pixel[1])
     guide_out.code[view, row, column] = wp.uint8(hit.code)
-    if hit.code == NOTHING:
+    if hit.code == Segment.NOTHING:
         return
     camera = view_camera[view]
     world = view_world[view]

@@ -2,13 +2,13 @@
 
 import warp as wp
 
+from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.coarse_grid import LEAST_WEIGHT, SAME_SURFACE, CellGrid, Guide, cell_pixel, cell_place
 from synpick_warp.kernels.render.lighting.coarse_paths import Gathered
 from synpick_warp.kernels.render.lighting.color import LEAST_LIGHT, luminance
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, off_plane, pixel_plane
 from synpick_warp.kernels.render.lighting.unoccluded import Light, ratio
 from synpick_warp.kernels.render.visibility.camera import Cameras, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import NOTHING
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -110,7 +110,7 @@ def sum_blocks_kernel(
     column = cell[2]
     if row >= cells.cells.height or column >= cells.cells.width:
         return
-    if int(guide.code[view, row, column]) == NOTHING:
+    if int(guide.code[view, row, column]) == Segment.NOTHING:
         return
     plane = plane_at(cells, guide, cameras.intrinsics[view_camera[view]], view, row, column)
     window = Window()
@@ -178,7 +178,7 @@ def choose_windows_kernel(
     column = cell[2]
     if row >= cells.cells.height or column >= cells.cells.width:
         return
-    if int(guide.code[view, row, column]) == NOTHING:
+    if int(guide.code[view, row, column]) == Segment.NOTHING:
         return
     plane = plane_at(cells, guide, cameras.intrinsics[view_camera[view]], view, row, column)
     wide = Window()
@@ -237,7 +237,7 @@ def soften_shares_kernel(
     column = cell[2]
     if row >= cells.cells.height or column >= cells.cells.width:
         return
-    if int(guide.code[view, row, column]) == NOTHING:
+    if int(guide.code[view, row, column]) == Segment.NOTHING:
         return
     plane = plane_at(cells, guide, cameras.intrinsics[view_camera[view]], view, row, column)
     diffuse = wp.vec3(0.0, 0.0, 0.0)
@@ -264,7 +264,7 @@ def soften_shares_kernel(
 def cell_likeness(guide: Guide, cells: CellGrid, plane: Plane, view: int, row: int, column: int, r: int, c: int) -> float:
     """1 if the cell (r, c) is on the surface that the pixel (row, column) shows, LEAST_WEIGHT if on another, 0 if on none."""
     code = guide.code[view, r, c]
-    if int(code) == NOTHING:
+    if int(code) == Segment.NOTHING:
         return 0.0
     pixel = cell_pixel(cells, r, c)
     apart = off_plane(plane, pixel[0] - row, pixel[1] - column, guide.depth[view, r, c])

@@ -7,6 +7,7 @@ w_l = p_l² / (p_l² + p_s²). Nothing in the scene glows but the map.
 
 import warp as wp
 
+from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.lighting.brdf import Brdf, Reflection, brdf_at, density, evaluate_parts, scatter
 from synpick_warp.kernels.render.lighting.environment import Lights, background_radiance, turned
 from synpick_warp.kernels.render.lighting.materials import Surfaces, base_color, mesh_surface, table_surface
@@ -14,9 +15,7 @@ from synpick_warp.kernels.render.lighting.sampling import Chances, LightSample, 
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray, hit_position, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
-    NOTHING,
     RAY_OFFSET,
-    TABLE,
     Bodies,
     Hit,
     Meshes,
@@ -27,7 +26,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import (
     is_blocked,
     trace_camera_ray,
 )
-from synpick_warp.kernels.rng import PATHS, mix, stream_key
+from synpick_warp.kernels.rng import mix, stream_key
 
 wp.set_module_options({"enable_backward": False})
 
@@ -137,11 +136,11 @@ class Path:
 def nearest_hit(scene: PathScene, bodies: Bodies, view: int, instances: int, origin: wp.vec3, direction: wp.vec3) -> Hit:
     """The nearest hit of a ray along a unit vector, all in the world; `depth` is the distance [m]. The companion of `is_blocked`."""
     best = Hit()
-    best.code = NOTHING
+    best.code = Segment.NOTHING
     best.depth = FAR
     height = origin[2] - scene.table.height
     if scene.table.visible != 0 and direction[2] * height < 0.0:
-        best.code = TABLE
+        best.code = Segment.TABLE
         best.depth = -height / direction[2]
     for number in range(bodies.present[view]):
         body = bodies.order[view, number]
@@ -176,7 +175,7 @@ def vertex_at(
     """The surface at a hit; `width` [m] is the path's there, across it."""
     surface = table_surface(scene.meshes, outgoing)
     at = position
-    if hit.code == TABLE:
+    if hit.code == Segment.TABLE:
         # Far away, rounding would lift or sink it by more than the rays' offset.
         at = wp.vec3(position[0], position[1], scene.table.height)
     else:
@@ -308,7 +307,7 @@ def scattered(scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, 
     through.diffuse = through.diffuse * scale
     through.gloss = through.gloss * scale
     hit = nearest_hit(scene, bodies, place.view, rules.instances, path.vertex.origin, direction)
-    if hit.code == NOTHING:
+    if hit.code == Segment.NOTHING:
         made.found = lit(made.found, through, escaped_light(scene, rules, place, light, direction, drawn_density), bounce)
         return made
     if bounce + 1 == rules.bounces:
@@ -358,7 +357,7 @@ def trace_paths_kernel(
     place.light = light[world]
     place.turn = light_turn[world]
     address = (camera * grid.height + row) * grid.width + column
-    place.key = mix(stream_key(rules.seed, episode[world], 0, PATHS) ^ wp.uint64(address))
+    place.key = mix(stream_key(rules.seed, episode[world], 0, Stream.PATHS) ^ wp.uint64(address))
     footprint = 1.0 / (cameras.intrinsics[camera][0] * wp.sqrt(float(rules.samples)))
     total = wp.vec3(0.0, 0.0, 0.0)
     for number in range(rules.samples):
@@ -367,7 +366,7 @@ def trace_paths_kernel(
         hit = trace_camera_ray(scene.meshes, bodies, view, tile_of(grid, row, column), ray, rules.instances)
         hit = hit_table(scene.table, cameras, camera, ray, hit)
         direction = wp.normalize(cameras.to_world[camera] * ray)
-        if hit.code == NOTHING:
+        if hit.code == Segment.NOTHING:
             total += background_radiance(scene.lights, place.light, turned(direction, -place.turn))
         else:
             start = hit_position(cameras, camera, ray, hit.depth)

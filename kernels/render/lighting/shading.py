@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import Brdf, Gloss, brdf_at, evaluate_disc
 from synpick_warp.kernels.render.lighting.coarse_grid import CellGrid, Guide
 from synpick_warp.kernels.render.lighting.denoise import Shares, gathered_share
@@ -12,7 +13,7 @@ from synpick_warp.kernels.render.lighting.plane_distance import pixel_plane
 from synpick_warp.kernels.render.lighting.shadows import lit_share
 from synpick_warp.kernels.render.lighting.unoccluded import Light, even_light
 from synpick_warp.kernels.render.visibility.camera import Cameras, camera_ray, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import NOTHING, TABLE, Bodies, Hits, body_of
+from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Hits, body_of
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -70,12 +71,12 @@ def shade_kernel(
     ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
     outgoing = -wp.normalize(cameras.to_world[camera] * ray)
     code = int(hits.code[view, row, column])
-    if code == NOTHING:
+    if code == Segment.NOTHING:
         radiance_out[view, row, column] = background_radiance(scene.lights, which, turned(-outgoing, -turn))
         return
     depth = hits.depth[view, row, column]
     surface = table_surface(scene.meshes, outgoing)
-    if code != TABLE:
+    if code != Segment.TABLE:
         triangle = hits.triangle[view, row, column]
         barycentric = hits.barycentric[view, row, column]
         body = body_of(code, instances)

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.coarse_grid import LEAST_WEIGHT, SAME_SURFACE, CellGrid, cell_number, cell_pixel, cell_place
 from synpick_warp.kernels.render.lighting.environment import Lights, turned
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, off_plane, pixel_plane
@@ -9,7 +10,6 @@ from synpick_warp.kernels.render.lighting.sampling import around, sobol_point
 from synpick_warp.kernels.render.visibility.camera import Cameras, camera_ray, hit_position, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
-    NOTHING,
     RAY_OFFSET,
     RAY_REGISTERS,
     Bodies,
@@ -55,7 +55,7 @@ def cast_shadow_rays_kernel(
     which = light[view_world[view]]
     pixel = cell_pixel(cells, row, column)
     lit = float(1.0)
-    if wp.max(lights.main_irradiance[which]) > 0.0 and int(hits.code[view, pixel[0], pixel[1]]) != NOTHING:
+    if wp.max(lights.main_irradiance[which]) > 0.0 and int(hits.code[view, pixel[0], pixel[1]]) != Segment.NOTHING:
         camera = view_camera[view]
         ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
         normal = face_normal(meshes, bodies, view, read_hit(hits, view, pixel[0], pixel[1]), instances)
@@ -105,7 +105,7 @@ def filter_shadows_kernel(
     code = hits.code[view, pixel[0], pixel[1]]
     if wp.max(lights.main_irradiance[light[view_world[view]]]) <= 0.0:
         return
-    if int(code) == NOTHING:
+    if int(code) == Segment.NOTHING:
         # What is smaller than a cell may have no other about it.
         lit_out[view, row, column] = 1.0
         return

@@ -2,16 +2,13 @@
 
 import warp as wp
 
+from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray, tile_of, tile_pixel
 
 wp.set_module_options({"enable_backward": False})
 
 RAY_REGISTERS = 64
 """Most registers of a thread that casts rays: with more, too few threads are in flight to hide how long a tree's nodes take to come."""
-NOTHING = wp.constant(0)
-TABLE = wp.constant(252)
-FIRST_FIXTURE = wp.constant(253)
-"""Codes of `frames`: 0 nothing, 1 + instance_id, 252 table, 253 tote, 254 finger, 255 cup."""
 FIXTURES = wp.constant(3)
 """Tote, finger and cup, in this order, come after a world's instances, and their meshes after the catalog's."""
 FAR = wp.constant(1.0e30)
@@ -150,8 +147,8 @@ def misses_tote(hollow: Hollow, start: wp.vec3, direction: wp.vec3, reach: float
 @wp.func
 def body_of(code: int, instances: int) -> int:
     """Row of `Bodies` for a hit's code, which is neither nothing nor the table."""
-    if code >= FIRST_FIXTURE:
-        return instances + code - FIRST_FIXTURE
+    if code >= Segment.TOTE:
+        return instances + code - Segment.TOTE
     return code - 1
 
 
@@ -159,7 +156,7 @@ def body_of(code: int, instances: int) -> int:
 def code_of(body: int, instances: int) -> int:
     """A hit's code for a row of `Bodies`."""
     if body >= instances:
-        return FIRST_FIXTURE + body - instances
+        return Segment.TOTE + body - instances
     return body + 1
 
 
@@ -188,7 +185,7 @@ def trace_candidates(
 ) -> Hit:
     """Nearest hit among these bodies, as in `Bodies.candidates`."""
     best = Hit()
-    best.code = NOTHING
+    best.code = Segment.NOTHING
     best.depth = FAR
     left = candidates
     number = int(0)
@@ -228,7 +225,7 @@ def hit_table(table: Table, cameras: Cameras, camera: int, ray: wp.vec3, best: H
         if fall * height < 0.0:
             depth = -height / fall
             if depth < best.depth:
-                result.code = TABLE
+                result.code = Segment.TABLE
                 result.depth = depth
     return result
 
@@ -263,7 +260,7 @@ def triangle_normal(meshes: Meshes, mesh: int, triangle: int) -> wp.vec3:
 @wp.func
 def face_normal(meshes: Meshes, bodies: Bodies, view: int, hit: Hit, instances: int) -> wp.vec3:
     """Unit normal, in the world, of the triangle or table that a ray hit; either side."""
-    if hit.code == TABLE:
+    if hit.code == Segment.TABLE:
         return wp.vec3(0.0, 0.0, 1.0)
     body = body_of(hit.code, instances)
     return wp.transpose(bodies.world_turn[view, body]) * triangle_normal(meshes, bodies.mesh[view, body], hit.triangle)

@@ -2,11 +2,11 @@
 
 import warp as wp
 
+from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
     MAX_COUNTS,
-    NOTHING,
     Bodies,
     Hit,
     Hits,
@@ -279,14 +279,14 @@ def read_marks_kernel(
     camera = view_camera[view]
     ray = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
     hit = Hit()
-    hit.code = NOTHING
+    hit.code = Segment.NOTHING
     hit.depth = FAR
     mark = marks.nearest[view, row, column]
     if mark != UNMARKED:
         hit = marked_hit(meshes, bodies, view, instances, mark, ray)
     if bodies.backdrop[view] != 0:
         behind = read_hit(backdrop, camera, row, column)
-        if behind.code != NOTHING and behind.depth < hit.depth:
+        if behind.code != Segment.NOTHING and behind.depth < hit.depth:
             hit = behind
     else:
         hit = hit_table(table, cameras, camera, ray, hit)

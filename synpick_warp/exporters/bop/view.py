@@ -14,10 +14,11 @@ import cv2
 import numpy as np
 import orjson
 
+from synpick_warp.codes import Effect, names
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
 from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
 from synpick_warp.exporters.writing.rle import Runs, find_edges, listed_edges
-from synpick_warp.frames import EFFECTS, FrameBatch
+from synpick_warp.frames import FrameBatch
 from synpick_warp.layer_codec import encode_layer, layer_path
 from synpick_warp.scenes.types import Camera
 
@@ -38,7 +39,7 @@ _WHOLE, _SEEN = 0, 1
 _DIGITS = 6
 """Decimal places of what is told of light and camera."""
 JPEG_QUALITY = "jpeg_quality"
-"""The one of EFFECTS that is the writer's to make."""
+"""The `Effect` that is the writer's to make."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class ViewSettings:
     jpeg_quality: int
     """Unless the view has its own, see `effects`."""
     effects: tuple[str, ...]
-    """Those of EFFECTS that are on."""
+    """The effects that are on."""
     masks: bool
     coco: bool
     camera: dict[str, Any]
@@ -113,7 +114,7 @@ def view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSettings) 
     boxes = batch.boxes[view][present]
     edges = _edges(batch, view)
     rows, columns = (slice(0, 0), slice(0, 0)) if edges else _shown(boxes, *batch.depth.shape[1:])
-    strengths: dict[str, float] = dict(zip(EFFECTS, batch.effects[view].tolist(), strict=True))
+    strengths: dict[str, float] = dict(zip(names(Effect), batch.effects[view].tolist(), strict=True))
     truth = ViewTruth(
         scene=scene,
         frame=int(batch.frame[view]),

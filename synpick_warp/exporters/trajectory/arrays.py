@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from synpick_warp.codes import Outcome, Phase, Task, names
+
 STORE = Path("trajectory.zarr")
 """In the data set."""
 EPISODES = "episodes"
@@ -20,11 +22,6 @@ LABELS = {
     "link": ("finger", "cup"),
 }
 """Dimensions whose places have names."""
-MODES = ("move", "pick", "target")
-PHASES = ("empty", "start", "settle", "act", "over", "idle")
-TASKS = ("none", "look", "approach", "descend", "press", "lift")
-OUTCOMES = ("none", "target_picked", "other_picked", "dropped", "nothing_caught", "nothing_seen")
-"""Names of codes; a test keeps them in step with the kernels' and with `Outcome`."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +64,10 @@ TICKS = GroupDoc(
         "pose": Quantity(("tick", "instance", "pose"), "<f4", "m", f"Object to world: {_POSE}{_GONE}"),
         "fixture_pose": Quantity(("tick", "fixture", "pose"), "<f4", "m", f"Tote, finger and cup to world: {_POSE}"),
         "fixture_visible": Quantity(("tick", "fixture"), "|b1", "1", "Whether it is in the pictures."),
-        "phase": Quantity(("tick",), "<i4", "1", "What the episode is at.", PHASES),
-        "task": Quantity(("tick",), "<i4", "1", "What the gripper is at when the frame is taken.", TASKS),
+        "phase": Quantity(("tick",), "<i4", "1", "What the episode is at.", names(Phase)),
+        "task": Quantity(("tick",), "<i4", "1", "What the gripper is at when the frame is taken.", names(Task)),
         "attempt": Quantity(("tick",), "<i4", "1", "Number of the running attempt, or of the one that ended in this tick; -1: none yet."),
-        "outcome": Quantity(("tick",), "<i4", "1", "What came of the attempt that ended in this tick.", OUTCOMES),
+        "outcome": Quantity(("tick",), "<i4", "1", "What came of the attempt that ended in this tick.", names(Outcome)),
         "target": Quantity(("tick",), "<i4", "1", "Instance that the attempt was to pick; -1: none."),
         "hits": Quantity(("tick",), "<i4", "1", "Rays of the cup that hit an object when the suction of the attempt was switched on."),
         "caught": Quantity(("tick", "instance"), "|b1", "1", "Whether one of them hit the instance."),
@@ -103,7 +100,7 @@ STEPS = GroupDoc(
         "impedance_force": Quantity(
             ("step", "axis"), "<f4", "N", "Force on the gripper towards the goal, held for the step; its weight is borne besides."
         ),
-        "task": Quantity(("step",), "|i1", "1", "What the gripper was at.", TASKS),
+        "task": Quantity(("step",), "|i1", "1", "What the gripper was at.", names(Task)),
     },
 )
 ARRANGEMENT = GroupDoc(
@@ -120,7 +117,7 @@ ATTEMPTS = GroupDoc(
     {
         "frame": Quantity(("attempt",), "<i4", "1", "Frame from which was chosen."),
         "end_frame": Quantity(("attempt",), "<i4", "1", "Frame at which it was judged."),
-        "outcome": Quantity(("attempt",), "<i4", "1", "What came of it.", OUTCOMES),
+        "outcome": Quantity(("attempt",), "<i4", "1", "What came of it.", names(Outcome)),
         "target": Quantity(("attempt",), "<i4", "1", f"Instance that was chosen; -1: {_UNSEEN}."),
         "object_id": Quantity(("attempt",), "<i4", "1", f"Its obj_id; -1: {_UNSEEN}."),
         "point": Quantity(("attempt", "axis"), "<f8", "m", f"Where the cup's tip was to touch. NaN: {_UNSEEN}."),

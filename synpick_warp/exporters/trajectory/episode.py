@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import zarr
 
+from synpick_warp.codes import Outcome
 from synpick_warp.configs.schema import Trajectory
-from synpick_warp.exporters.trajectory.arrays import ARRANGEMENT, ATTEMPTS, EPISODE, OUTCOMES
+from synpick_warp.exporters.trajectory.arrays import ARRANGEMENT, ATTEMPTS, EPISODE
 from synpick_warp.exporters.trajectory.spool import field_name, read_rows
 from synpick_warp.exporters.trajectory.store import add_array, add_group, shard_rows
 from synpick_warp.exporters.writing.files import flush_file, flush_folder
@@ -149,7 +150,7 @@ def attempt_arrays(records: Sequence[Mapping[str, Any]], instances: int) -> dict
         for row, record in enumerate(records):
             value = record[name]
             if name == "outcome":
-                column[row] = OUTCOMES.index(value)
+                column[row] = Outcome[value.upper()]
             elif name == "load":
                 column[row, : len(value)] = value
             elif name in ("caught", "picked"):

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from synpick_warp.codes import Ending
+from synpick_warp.codes import Ending, Mode
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import DataSet
-from synpick_warp.exporters.trajectory.arrays import EPISODES, MODES, STORE
+from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.exporters.trajectory.episode import ROWS, EpisodeFacts, EpisodeSettings, drop_episode, write_episode
 from synpick_warp.exporters.trajectory.spool import SPOOL_TICKS, batch_type, fill_row, present, spool_bytes, write_rows
 from synpick_warp.exporters.trajectory.store import write_constants
@@ -149,7 +149,7 @@ class TrajectoryExporter:
             }
         }
         if "mode" in batch.tick:
-            start["mode"] = MODES[int(batch.tick["mode"][world])]
+            start["mode"] = Mode(int(batch.tick["mode"][world])).name.lower()
         if "redrops" in batch.tick:
             start["redrops"] = int(batch.tick["redrops"][world])
         drop_pose = batch.tick["drop_pose"][world, :instances].copy() if "drop_pose" in batch.tick else None

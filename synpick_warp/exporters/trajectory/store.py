@@ -100,8 +100,8 @@ def write_constants(store: Path, config: Config, catalog: Catalog, cameras: tupl
     root = zarr.create_group(
         store,
         attributes={
-            "description": "Physics of a synpick-warp data set. SI units; the world's origin is the centre of the tote's inner floor, z up. "
-            f"Episodes are in {EPISODES}, named by number.",
+            "description": "Physics of a synpick-warp data set. SI units; the world's origin is the centre of the tote's inner floor, z up."
+            f" Episodes are in {EPISODES}, named by number.",
             "format": FORMAT,
             "seed": config.bake.seed,
             "step": physics.step,

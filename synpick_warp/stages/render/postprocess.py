@@ -8,8 +8,9 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
+from synpick_warp.codes import Tone
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import TONES, strength_ranges
+from synpick_warp.configs.sensors import strength_ranges
 from synpick_warp.kernels.render.images.antialias import Picture
 from synpick_warp.kernels.render.images.camera_effects import EffectRules, Strengths, draw_effects_kernel
 from synpick_warp.kernels.render.images.postprocess import DevelopRules, develop_effects_kernel, develop_kernel, spread_rows_kernel
@@ -61,7 +62,7 @@ class Developer:
         self.effects = effect_rules(config) if has_effects(config) else None
         self.rules = DevelopRules()
         self.rules.seed = config.bake.seed
-        self.rules.tone = TONES.index(config.render.tone)
+        self.rules.tone = Tone[config.render.tone.upper()]
         self.rules.spread = int(has_spread(config))
         self.spread: wp.array | None = None
         if has_spread(config):

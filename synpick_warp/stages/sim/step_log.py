@@ -41,7 +41,7 @@ class StepArrays:
     impedance_force: wp.array = device_array("world", "step", dtype=wp.vec3f, unit="N")
     """The force that drew it, without the gripper's weight, which is borne."""
     task: wp.array = device_array("world", "step", dtype=wp.int8)
-    """A task of `kernels.phases`, at the step's end."""
+    """A `Task`, at the step's end."""
 
 
 @dataclass(frozen=True, eq=False)

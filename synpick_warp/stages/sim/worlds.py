@@ -7,32 +7,12 @@ from dataclasses import dataclass
 import warp as wp
 
 from synpick_warp.arrays import device_array
+from synpick_warp.codes import Measure, Status
 from synpick_warp.configs.schema import Config
 from synpick_warp.stages.buffers import FIXTURES
 
 # Corners of the tote that a round of moving visits.
 CORNERS = 4
-STATUS_COLUMNS = (
-    "phase",
-    "ending",
-    "episode",
-    "redraw",
-    "frame",
-    "live",
-    "mode",
-    "task",
-    "attempt",
-    "outcome",
-    "target",
-    "hits",
-    "caught",
-    "held",
-)
-"""Columns of `WorldStatus.table`; see `WorldState`, `AttemptState` and `Plan`. They tell of the end of the tick, before worlds are looked
-at: attempt, target, hits and caught are the running attempt's, or in a tick with an outcome those of the attempt that ended. held: bit
-i, instance i hangs on the cup, or was picked in this tick."""
-MEASURE_COLUMNS = ("load",)
-"""Columns of `WorldStatus.measures`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +22,11 @@ class WorldState:
     address: wp.array = device_array("world", dtype=wp.vec2i)
     """Episode number and redraw; episode -1: none."""
     phase: wp.array = device_array("world", dtype=wp.int32)
-    """A phase of `kernels.phases`."""
+    """A `Phase`."""
     ending: wp.array = device_array("world", dtype=wp.int32)
     """An `Ending`."""
     mode: wp.array = device_array("world", dtype=wp.int32)
-    """A mode of `kernels.phases`."""
+    """A `Mode`."""
     next_episode: wp.array = device_array("one", dtype=wp.int32)
     """How many of the bake's episode numbers worlds have taken."""
     progress: wp.array = device_array("world", dtype=wp.vec4i, unit="ticks")
@@ -88,7 +68,7 @@ class AttemptState:
     """What each world's gripper tries to pick, and how far it has come."""
 
     task: wp.array = device_array("world", dtype=wp.int32)
-    """A task of `kernels.phases`."""
+    """A `Task`."""
     steps: wp.array = device_array("world", dtype=wp.int32, unit="steps")
     """Time since the task began."""
     attempt: wp.array = device_array("world", dtype=wp.int32)
@@ -128,9 +108,9 @@ class WorldStatus:
     """The few numbers of each world that the host reads."""
 
     table: wp.array = device_array("world", "status", dtype=wp.int32)
-    """Columns as STATUS_COLUMNS."""
+    """Columns: `Status`."""
     measures: wp.array = device_array("world", "measure", dtype=wp.float32)
-    """Columns as MEASURE_COLUMNS: largest load of any seal in the tick [N]."""
+    """Columns: `Measure`."""
 
 
 def world_sizes(config: Config, bodies_per_world: int) -> dict[str, int]:
@@ -143,7 +123,7 @@ def world_sizes(config: Config, bodies_per_world: int) -> dict[str, int]:
         "instance": config.arrangement.max_objects,
         "body": worlds * bodies_per_world,
         "waypoint": CORNERS * config.move.rounds,
-        "status": len(STATUS_COLUMNS),
-        "measure": len(MEASURE_COLUMNS),
+        "status": len(Status),
+        "measure": len(Measure),
         "fixture": len(FIXTURES),
     }

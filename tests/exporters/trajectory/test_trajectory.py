@@ -17,7 +17,6 @@ from synpick_warp.exporters.trajectory.episode import attempt_arrays
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
 from synpick_warp.exporters.trajectory.spool import SPOOL_TICKS, spool_bytes
 from synpick_warp.exporters.trajectory.store import shard_rows
-from synpick_warp.kernels import phases
 from tests.harness.exporter_contract import ExporterContract, digests, exporting
 from tests.worlds import box_views, trajectories
 from tests.worlds.trajectories import ATTEMPT, STEP_COUNT, UNSEEN, config, ends, ticks, write_set
@@ -223,13 +222,6 @@ def test_files_are_whole_chunks_of_whole_ticks_and_no_larger_than_needed(ticks, 
     assert shard % made == 0
     assert shard <= chunks * made
     assert shard - made < max(1, ticks * rows)
-
-
-def test_names_of_codes_are_those_of_kernels_and_outcomes():
-    tasks = ("no_task", *tables.TASKS[1:])
-    for names in (tables.PHASES, tables.MODES, tasks):
-        assert [int(getattr(phases, name.upper())) for name in names] == list(range(len(names)))
-    assert list(tables.OUTCOMES) == [outcome.name.lower() for outcome in Outcome]
 
 
 def test_an_episode_without_instances_has_empty_axes(tmp_path):

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
-from synpick_warp.frames import NOTHING
 from synpick_warp.kernels.render.images import antialias
 from synpick_warp.scenes.appearance import srgb_to_linear
 from synpick_warp.scenes.types import Material, TriangleMesh
@@ -161,7 +161,7 @@ def test_even_surfaces_and_the_background_have_no_edges(device):
     assert not shown(device, (sheet(4.0, 9.0), tilted, (0.9, 0.9, 0.9))).mix.any()
     empty = shown(device)
     assert not empty.mix.any()
-    assert (empty.instance == NOTHING).all()
+    assert (empty.instance == Segment.NOTHING).all()
     assert not shown(device, table=True).mix.any()
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from synpick_warp import frames
+from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.types import Fixture, Material
@@ -58,7 +58,7 @@ def test_normals_of_a_ball_point_from_its_centre(device):
     assert np.abs(normals[seen] - expected).max() < 2e-3
     np.testing.assert_allclose(np.linalg.norm(normals[seen], axis=1), 1.0, atol=1e-6)
     assert not normals[~seen].any()
-    assert (drawn.code[0] == frames.NOTHING).any()
+    assert (drawn.code[0] == Segment.NOTHING).any()
 
 
 @pytest.mark.parametrize("flip", [False, True])
@@ -76,7 +76,7 @@ def test_normals_of_a_sheet_face_the_camera_from_either_side(device, flip):
 
 def test_the_table_faces_a_camera_above_it(device):
     drawn = draw(crowded(), device)
-    table = drawn.code[0] == frames.TABLE
+    table = drawn.code[0] == Segment.TABLE
     assert table.any()
     np.testing.assert_array_equal(drawn["normals"][0][table], np.broadcast_to(np.array([0, 0, -1], np.float32), (table.sum(), 3)))
 
@@ -89,7 +89,7 @@ def test_albedo_is_the_base_colour_whatever_the_light(device):
     toy.entries = [entry(box(0.1, 0.05, 0.04), Material((0.2, 0.4, 1.0), None, 1.0, 0.3))]
     toy.config = replace(toy.config, render=replace(toy.config.render, table_color=(0.1, 0.0, 1.0)))
     drawn = draw(toy, device)
-    for code, color in ((1, (51, 102, 255)), (frames.TABLE, (26, 0, 255)), (frames.TOTE, (178, 178, 178))):
+    for code, color in ((1, (51, 102, 255)), (Segment.TABLE, (26, 0, 255)), (Segment.TOTE, (178, 178, 178))):
         found = drawn["albedo"][0][drawn.code[0] == code].astype(int)
         assert len(found)
         # 0.7 and 0.1 lie half-way between two bytes.
@@ -154,7 +154,7 @@ def test_classes_are_obj_ids(device):
     drawn = draw(toy, device)
     expected = np.zeros(256, int)
     expected[1:4] = 7, 65535, 7
-    assert set(np.unique(drawn.code)) >= {1, 2, 3, frames.TABLE, frames.TOTE, frames.FINGER}
+    assert set(np.unique(drawn.code)) >= {1, 2, 3, Segment.TABLE, Segment.TOTE, Segment.FINGER}
     np.testing.assert_array_equal(drawn["classes"], expected[drawn.code])
 
 
@@ -212,7 +212,7 @@ def test_motion_agrees_with_poses_in_float64(device, seed):
     place = points(drawn.depth[0], view)
     centers = np.stack(np.meshgrid(np.arange(160) + 0.5, np.arange(90) + 0.5), axis=-1)
     poses = {1: (now[0], then[0]), 2: (now[1], then[1]), 3: (now[2], then[2])}
-    poses |= {frames.TOTE + i: (fixtures_now[i], fixtures_then[i]) for i in range(3)}
+    poses |= {Segment.TOTE + i: (fixtures_now[i], fixtures_then[i]) for i in range(3)}
     assert len(np.unique(drawn.code)) >= 5
     for code, (pose, before) in poses.items():
         seen = drawn.code[0] == code
@@ -225,7 +225,7 @@ def test_motion_agrees_with_poses_in_float64(device, seed):
 def test_what_stands_still_does_not_move_at_all(device):
     toy = crowded()
     drawn = draw(toy, device, Before(toy.placed, [1]))
-    seen = drawn.code[0] != frames.NOTHING
+    seen = drawn.code[0] != Segment.NOTHING
     # To far less than float32 could tell of the positions themselves.
     assert np.abs(drawn["scene_flow"][0][seen]).max() < 1e-15
     assert np.abs(drawn["flow"][0][seen]).max() < 1e-12
@@ -253,8 +253,8 @@ def test_what_was_not_there_has_no_motion(device):
     # Instance 0 stays, instance 1 was another object, instance 2 was none; finger and cup were out of the picture.
     before = Before([[(1, poses[0]), (1, poses[1]), (-1, poses[2])]], [1], fixtures_visible=(1, 0, 0))
     drawn = draw(toy, device, before)
-    assert set(np.unique(drawn.code)) >= {1, 2, 3, frames.TABLE, frames.TOTE, frames.FINGER}
-    np.testing.assert_array_equal(known(drawn), np.isin(drawn.code, (1, frames.TABLE, frames.TOTE)))
+    assert set(np.unique(drawn.code)) >= {1, 2, 3, Segment.TABLE, Segment.TOTE, Segment.FINGER}
+    np.testing.assert_array_equal(known(drawn), np.isin(drawn.code, (1, Segment.TABLE, Segment.TOTE)))
 
 
 def test_a_point_that_was_behind_the_camera_has_no_place_in_its_image(device):

@@ -13,14 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.bake import describe_arrays
+from synpick_warp.codes import Effect, Tone, names
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import TONES, Effects, strength_ranges
+from synpick_warp.configs.sensors import Effects, strength_ranges
 from synpick_warp.device import pick_device
 from synpick_warp.errors import ConfigError
-from synpick_warp.frames import EFFECTS
-from synpick_warp.kernels.render.images import camera_effects as effect_kernels
-from synpick_warp.kernels.render.images import postprocess as develop_kernels
 from synpick_warp.kernels.render.images.antialias import Picture
 from synpick_warp.kernels.render.images.camera_effects import Strengths
 from synpick_warp.kernels.render.lighting.environment import Lights
@@ -53,7 +51,7 @@ def config_of(tone: str = "linear", seed: int = 7, **effects: Any) -> Config:
 
 
 def developed(radiance: np.ndarray, config: Config, at: Addresses = ONE, stops: float = 0.0, lens=LENS) -> tuple[np.ndarray, np.ndarray]:
-    """Bytes (B, H, W, 3) and strengths (B, EFFECTS) of pictures whose radiance is (H, W, 3); each view has a world of its own."""
+    """Bytes (B, H, W, 3) and strengths (B, E) of pictures whose radiance is (H, W, 3); each view has a world of its own."""
     device = pick_device("cpu")
     views = len(at.episode)
     lights = Lights()
@@ -91,16 +89,14 @@ def even(value: float | tuple[float, float, float], width: int = WIDTH, height: 
 
 
 def strength(effects: np.ndarray, name: str) -> Any:
-    return effects[..., EFFECTS.index(name)]
+    return effects[..., Effect[name.upper()]]
 
 
 # ---- tone ----
 
 
 def test_names_are_those_of_the_kernels():
-    assert [int(getattr(effect_kernels, name.upper())) for name in EFFECTS] == list(range(len(EFFECTS)))
-    assert [int(getattr(develop_kernels, name.upper())) for name in TONES] == list(range(len(TONES)))
-    assert tuple(strength_ranges(Effects())) == EFFECTS
+    assert tuple(strength_ranges(Effects())) == names(Effect)
 
 
 def curve(x: np.ndarray, tone: str) -> np.ndarray:
@@ -111,7 +107,7 @@ def curve(x: np.ndarray, tone: str) -> np.ndarray:
     return np.where(x > 0.6, 1.0 - 0.4 * np.exp((0.6 - x) / 0.4), x) if tone == "shoulder" else x
 
 
-@pytest.mark.parametrize("tone", TONES)
+@pytest.mark.parametrize("tone", names(Tone))
 def test_tone_curves_are_those_of_their_laws(tone):
     values = np.linspace(0.0, 4.0, WIDTH * HEIGHT * 3).reshape(HEIGHT, WIDTH, 3)
     color, effects = developed(values, config_of(tone), stops=0.5)
@@ -121,7 +117,7 @@ def test_tone_curves_are_those_of_their_laws(tone):
 
 
 def test_all_tone_curves_keep_middle_grey_and_shoulder_is_the_default():
-    grey = {tone: developed(even(0.18), config_of(tone))[0] for tone in TONES}
+    grey = {tone: developed(even(0.18), config_of(tone))[0] for tone in names(Tone)}
     assert all((color == np.rint(255.0 * linear_to_srgb(0.18))).all() for color in grey.values())
     assert Config().render.tone == "shoulder"
 
@@ -229,7 +225,7 @@ def test_read_noise_does_not_depend_on_light_and_shot_noise_vanishes_without():
 
 def twin(picture: np.ndarray, strengths: np.ndarray, lens=LENS) -> np.ndarray:
     """What comes before noise, in float64: vignette, exposure, blur, chromatic aberration, one after the other."""
-    get = dict(zip(EFFECTS, strengths.astype(np.float64), strict=True))
+    get = dict(zip(names(Effect), strengths.astype(np.float64), strict=True))
     height, width = picture.shape[:2]
     (fx, _, cx), (_, fy, cy) = lens.matrix[:2]
     rows, columns = np.mgrid[:height, :width] + 0.5
@@ -333,7 +329,7 @@ def test_strengths_fill_their_ranges_evenly():
         np.testing.assert_allclose(values.mean(), (low + high) / 2.0, atol=0.03 * (high - low))
     quality = strength(effects, "jpeg_quality")
     assert set(quality) == set(range(40, 96))
-    assert np.abs(np.corrcoef(effects.T) - np.eye(len(EFFECTS))).max() < 0.08
+    assert np.abs(np.corrcoef(effects.T) - np.eye(len(Effect))).max() < 0.08
 
 
 def test_scratch_is_declared_if_an_effect_needs_it():

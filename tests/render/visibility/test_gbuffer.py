@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from synpick_warp import frames
+from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.render.visibility import gbuffer
 from synpick_warp.scenes.meshes import read_mesh
@@ -29,9 +29,8 @@ def random_quaternion(rng):
     return tuple(q / np.linalg.norm(q))
 
 
-def test_codes_are_those_of_the_frames():
-    codes = [gbuffer.NOTHING, gbuffer.TABLE, gbuffer.FIRST_FIXTURE, gbuffer.FIRST_FIXTURE + 1, gbuffer.FIRST_FIXTURE + 2]
-    assert [int(code) for code in codes] == [frames.NOTHING, frames.TABLE, frames.TOTE, frames.FINGER, frames.CUP]
+def test_the_fixtures_segments_follow_each_other():
+    assert [Segment.TOTE + i for i in range(gbuffer.FIXTURES)] == [Segment.TOTE, Segment.FINGER, Segment.CUP]
     assert len(buffers.FIXTURES) == gbuffer.FIXTURES
 
 
@@ -43,7 +42,7 @@ def test_a_ball_shows_its_area_and_its_nearest_depth(device):
     assert picture.depth[0, 45, 80] == 9000
     assert picture.amodal[0, 45, 80] == 1
     assert picture.depth[0, 0, 0] == 0
-    assert picture.instance[0, 0, 0] == frames.NOTHING
+    assert picture.instance[0, 0, 0] == Segment.NOTHING
 
 
 def test_pixel_centres_lie_at_half(device):
@@ -88,12 +87,12 @@ def test_fixtures_and_table_are_seen_but_have_no_bits(device):
     toy.fixtures_visible = (1, 1, 0)
     picture = render(toy, device)
     instance, depth = picture.instance[0], picture.depth[0]
-    assert set(np.unique(instance)) == {1, frames.TABLE, frames.TOTE, frames.FINGER}
+    assert set(np.unique(instance)) == {1, Segment.TABLE, Segment.TOTE, Segment.FINGER}
     assert set(np.unique(picture.amodal[0])) == {0, 1}
-    assert instance[45, 80] == frames.FINGER
+    assert instance[45, 80] == Segment.FINGER
     assert picture.amodal[0][45, 80] == 1
     assert depth[45, 80] == 17000
-    assert (depth[instance == frames.TOTE].min(), depth[instance == 1].min()) == (19500, 19300)
+    assert (depth[instance == Segment.TOTE].min(), depth[instance == 1].min()) == (19500, 19300)
     assert depth[0, 0] == round((2.0 + toy.config.tote.wall) * 1e4)
 
 

@@ -10,7 +10,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp import frames
+from synpick_warp.codes import Segment
 from synpick_warp.device import pick_device
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
@@ -117,8 +117,8 @@ def test_trees_find_the_same(device, seed):
     )
     ours, theirs = hits_of(toy, device), hits_of(toy, device, by_trees=True)
     np.testing.assert_array_equal(ours["code"], theirs["code"])
-    assert set(np.unique(ours["code"])) >= {1, 2, 4, frames.TOTE, frames.FINGER}
-    met = (ours["code"] != frames.NOTHING) & (ours["code"] != frames.TABLE)
+    assert set(np.unique(ours["code"])) >= {1, 2, 4, Segment.TOTE, Segment.FINGER}
+    met = (ours["code"] != Segment.NOTHING) & (ours["code"] != Segment.TABLE)
     same = met & (ours["triangle"] == theirs["triangle"])
     assert same.sum() > 0.99 * met.sum()
     np.testing.assert_allclose(ours["depth"], theirs["depth"], rtol=3e-6)
@@ -182,7 +182,7 @@ def test_the_backdrop_shows_what_the_tote_itself_would(device):
     pictures = [render(scene, device) for scene in (toy, other)]
     for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance"):
         np.testing.assert_array_equal(getattr(pictures[0], name), getattr(pictures[1], name))
-    assert {1, frames.TABLE, frames.TOTE, frames.FINGER} <= set(np.unique(pictures[0].instance))
+    assert {1, Segment.TABLE, Segment.TOTE, Segment.FINGER} <= set(np.unique(pictures[0].instance))
     # Who lies under the tote keeps its bits, and only those.
     assert ((pictures[0].amodal & 2) != 0).any()
     assert not (pictures[0].instance == 2).any()
@@ -191,8 +191,8 @@ def test_the_backdrop_shows_what_the_tote_itself_would(device):
 def test_a_tote_that_stands_elsewhere_or_is_gone_leaves_the_backdrop(device):
     fixtures = (Fixture(box(0.5, 0.3, 0.05), GREY),) * 3
     toy = ToyScene([entry(box(0.1, 0.1, 0.1))], [[]], (VIEW,), fixtures=fixtures, fixtures_visible=(1, 0, 0))
-    home = hits_of(toy, device)["code"] == frames.TOTE
-    moved = hits_of(replace(toy, fixture_poses=((0.1, 0.0, 0.0, *UPRIGHT),) * 3), device)["code"] == frames.TOTE
+    home = hits_of(toy, device)["code"] == Segment.TOTE
+    moved = hits_of(replace(toy, fixture_poses=((0.1, 0.0, 0.0, *UPRIGHT),) * 3), device)["code"] == Segment.TOTE
     gone = hits_of(replace(toy, fixtures_visible=(0, 0, 0)), device)["code"]
     assert home.sum() > 1000
     np.testing.assert_array_equal(np.roll(home, 15, axis=1)[:, 15:], moved[:, 15:])
