@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Stream
-from synpick_warp.kernels import rng as kernels
 from tests.harness.probes import draw_kernel
 from tests.twins import rng
 

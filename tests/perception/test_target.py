@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Mode, Outcome, Phase
-from synpick_warp.kernels import rng as device_draws
+from synpick_warp.codes import Mode, Outcome, Phase, Stream
 from tests.twins import planning, rng
 from tests.twins.planning import Looks
 
@@ -89,7 +88,7 @@ def test_draws_have_their_address_and_are_even(device):
     made = failed(device, worlds, Outcome.DROPPED, 1)
     redraw = np.arange(worlds) % 2
     made.worlds.begin(Phase.ACT, redraw=redraw)
-    key = rng.stream_key(SEED, np.arange(worlds), redraw, int(device_draws.TARGETS))
+    key = rng.stream_key(SEED, np.arange(worlds), redraw, Stream.TARGETS)
     index = rng.uniform_index(key, np.arange(worlds) % 3 + 1, 4)
     found = np.array(chosen(made, Mode.TARGET))
     np.testing.assert_array_equal(found, np.array([0, 1, 3, 4])[index])
