@@ -1,13 +1,16 @@
-"""What all tests share."""
+"""Configuration of pytest: devices, hypothesis profile, real data."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
+import warp as wp
 from hypothesis import settings
 
 from synpick_warp.device import pick_device, start_warp
+from tests.harness.devices import VARIABLE
 
 ROOT = Path(__file__).resolve().parent.parent
 REAL_DATA = ROOT.parent / "shared" / "data"
@@ -18,15 +21,36 @@ settings.register_profile("house", deadline=None, derandomize=True, max_examples
 settings.load_profile("house")
 
 
-def pytest_configure() -> None:
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """`--device cuda:0` runs all tests that simulate or render on that device."""
+    parser.addoption(
+        "--device",
+        action="append",
+        help="device under test; may be repeated (default: cpu, and cuda:0 where there is one for tests with the fixture `device`)",
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
     """Start Warp before the first test, so that its messages stay out of captured output."""
+    os.environ[VARIABLE] = devices(config)[0]
     start_warp()
 
 
+def devices(config: pytest.Config) -> list[str]:
+    """Names of the devices under test; the first is the default device of settings in tests."""
+    return config.getoption("--device") or ["cpu", *(["cuda:0"] if wp.get_cuda_device_count() else [])]
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Parametrize the fixture `device`."""
+    if "device" in metafunc.fixturenames:
+        metafunc.parametrize("device", devices(metafunc.config), indirect=True, scope="session")
+
+
 @pytest.fixture(scope="session")
-def device():
-    """The processor: tests must pass on machines without a GPU, and to the bit."""
-    return pick_device("cpu")
+def device(request: pytest.FixtureRequest) -> wp.Device:
+    """Device under test. On the CPU results must agree to the bit; a GPU may round differently where a test says so."""
+    return pick_device(request.param)
 
 
 @pytest.fixture(scope="session")

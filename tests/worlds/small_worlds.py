@@ -13,6 +13,7 @@ from synpick_warp.scenes.collision.hulls import limited_hull, mass_properties
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, Material, TriangleMesh
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.stream import TickReader, TickReport
+from tests.harness.devices import default_device
 
 BOX = ((0.08, 0.06, 0.04),)
 CUBE = ((0.05, 0.05, 0.05),)
@@ -23,7 +24,7 @@ DENSITY = 500.0
 QUICK = {
     "bake.worlds": 1,
     "bake.episodes": 1,
-    "bake.device": "cpu",
+    "bake.device": default_device(),
     "bake.writers": 1,
     "arrangement.max_objects": 3,
     "arrangement.volume": 6e-4,
