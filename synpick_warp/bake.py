@@ -22,8 +22,8 @@ from synpick_warp.dataset.writing import Output, complete
 from synpick_warp.device import pick_device
 from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_redrawn
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.base import DataSet, Exporter
-from synpick_warp.exporters.registry import Exporters, exporter_kinds, slot_bytes
+from synpick_warp.exporters.base import ExportContext, Exporter
+from synpick_warp.exporters.registry import Exporters, load_exporter_classes, slot_bytes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.interrupt import StopRequest
@@ -107,7 +107,7 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
     Raises:
         SynpickError: Something a user can mend; whole episodes stay, and the same bake goes on with them.
     """
-    kinds = exporter_kinds(config.bake.formats)
+    kinds = load_exporter_classes(config.bake.formats)
     with Output(out, config, range(shard[0], config.bake.episodes, shard[1])) as output:
         summary = BakeSummary(len(output.episodes))
         for episode in output.before:
@@ -130,13 +130,13 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
 
 def _fill(config: Config, output: Output, kinds: tuple[type[Exporter], ...], summary: BakeSummary, progress: Progress) -> None:
     """Make the episodes that are left, and the lists."""
-    records = any(kind.records for kind in kinds)
-    factory = build_factory(config, progress, output.left, records) if output.left else None
+    needs_physics = any(kind.needs_physics for kind in kinds)
+    factory = build_factory(config, progress, output.left, needs_physics) if output.left else None
     writers = config.bake.writers or len(os.sched_getaffinity(0))
     with WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
-            exporters = Exporters(kinds, DataSet(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
+            exporters = Exporters(kinds, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
             try:
                 output.begin(exporters, digest_inputs(factory.catalog, factory.lights), pool)
                 _Run(config, factory, exporters, partial(output.record, exporters, pool), summary, progress).run()
@@ -195,10 +195,10 @@ class _Run:
         physics = self.config.physics
         batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
         if len(batch):
-            self.exporters.tick(batch)
-        if self.exporters.views:
+            self.exporters.write_ticks(batch)
+        if self.exporters.needs_views:
             for views in self.factory.stream.render(snapshot, report):
-                self.exporters.write(views)
+                self.exporters.write_views(views)
                 self.summary.views += len(views)
         records = self.factory.log.see(report)
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
@@ -210,10 +210,10 @@ class _Run:
         if is_redrawn(self.config, row):
             self.summary.take_redraw(row.ending)
             self.progress.note(f"episode {row.episode}, arrangement {row.redraw + 1}: {row.ending.sentence}")
-            self.exporters.end(end, lambda: None)
+            self.exporters.end_episode(end, lambda: None)
         else:
             self.summary.take_episode(row, record)
-            self.exporters.end(end, partial(self.whole, end))
+            self.exporters.end_episode(end, partial(self.whole, end))
 
 
 class _Meter:
@@ -267,7 +267,7 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
     pixels = mark_sizes(views["view"], *config.cameras.resolution)
     groups += [(MarkArrays, pixels, 1), (HitArrays, pixels | {"view": len(config.cameras.positions)}, 1)]
-    if any(kind.records for kind in exporter_kinds(config.bake.formats)):
+    if any(kind.needs_physics for kind in load_exporter_classes(config.bake.formats)):
         groups += [(kind, record_sizes(config, worlds), 1 + RECORDS) for kind in record_kinds(config)]
     if MOVING.intersection(config.render.layers):
         groups += [(MotionArrays, views, 1)]

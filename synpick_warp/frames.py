@@ -45,7 +45,7 @@ class FrameBatch:
     """Strengths of what the camera did to colour in the order of `Effect` (B, E) float32; zero: off."""
     light_name: np.ndarray
     """Name of the episode's light map (B) str."""
-    light_turn: np.ndarray
+    light_yaw: np.ndarray
     """The map is turned counter-clockwise about +z by this angle [rad] (B) float32."""
     light_exposure: np.ndarray
     """How much longer than the automatic exposure the episode's pictures are exposed [stops] (B) float32."""
@@ -85,7 +85,7 @@ class TickBatch:
     """0: not in the picture (W, 3) int32."""
     light: np.ndarray
     """Index of the episode's light map (W) int32."""
-    light_turn: np.ndarray
+    light_yaw: np.ndarray
     """The light map is turned counter-clockwise about +z by this angle [rad] (W) float32."""
     light_exposure: np.ndarray
     """How much longer than the automatic exposure the episode's pictures are exposed [stops] (W) float32."""

@@ -265,7 +265,7 @@ def test_a_bake_that_grows_lists_the_attempts_of_both(picked, tmp_path):
 def test_an_error_leaves_whole_scenes_only(tmp_path, monkeypatch, baked, share):
     """The first batch cannot be written, one in the middle, or the last."""
     left = [int(share * (baked.summary.views // CAMERAS - 1))]
-    write = BopExporter.write
+    write = BopExporter.write_views
 
     def failing(self, batch):
         if left[0] == 0:
@@ -273,7 +273,7 @@ def test_an_error_leaves_whole_scenes_only(tmp_path, monkeypatch, baked, share):
         left[0] -= 1
         write(self, batch)
 
-    monkeypatch.setattr(BopExporter, "write", failing)
+    monkeypatch.setattr(BopExporter, "write_views", failing)
     out = tmp_path / "set"
     with pytest.raises(OutputError, match="no more"):
         run_bake(tiny(), out, SilentProgress())
@@ -344,7 +344,7 @@ def test_a_full_disk_is_one_line_and_exit_code_2(small_disk, capsys):
 
 def test_a_worker_that_fails_ends_the_bake_with_one_line(tmp_path, capsys, monkeypatch):
     """As with a full disk, where no small file system can be had: a file stands where a folder must be made."""
-    begin = BopExporter.write
+    begin = BopExporter.write_views
 
     def blocked(self, batch):
         split = out / "train"
@@ -354,7 +354,7 @@ def test_a_worker_that_fails_ends_the_bake_with_one_line(tmp_path, capsys, monke
         begin(self, batch)
 
     out = tmp_path / "set"
-    monkeypatch.setattr(BopExporter, "write", blocked)
+    monkeypatch.setattr(BopExporter, "write_views", blocked)
     assert commands.main(["bake", "--out", str(out), *arguments()]) == commands.EXIT_MISTAKE
     said = capsys.readouterr().err.strip().splitlines()
     assert said[-1].startswith("synpick-warp: error: cannot write ")

@@ -14,7 +14,7 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.codes import Effect, Measure, Phase, Status
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.exporters.writing.rle import find_edges, listed_edges
+from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.frames import FrameBatch
 from synpick_warp.stages import stream
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
@@ -70,7 +70,7 @@ def report_of(live: list[int]) -> TickReport:
     entry = ((number[:, None] + np.arange(ROOM)) % 4 - 1).astype(np.int32)
     pose = np.arange(WORLDS * ROOM * 7, dtype=np.float32).reshape(WORLDS, ROOM, 7)
     measures = np.zeros((WORLDS, len(Measure)), np.float32)
-    light = SimpleNamespace(light=number % 2, light_turn=0.5 * number.astype(np.float32), light_exposure=0.1 * number.astype(np.float32))
+    light = SimpleNamespace(light=number % 2, light_yaw=0.5 * number.astype(np.float32), light_exposure=0.1 * number.astype(np.float32))
     return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace(), light)
 
 
@@ -158,7 +158,7 @@ def test_what_a_batch_says_of_its_views(device):
         "uint32",
     ]
     assert made["light_name"].tolist() == ["even"] * 3 + ["lamp"] * 3
-    np.testing.assert_allclose(made["light_turn"], 0.5 * world)
+    np.testing.assert_allclose(made["light_yaw"], 0.5 * world)
     np.testing.assert_allclose(made["light_exposure"], 0.1 * world, rtol=1e-6)
     np.testing.assert_allclose(made["light_direction"][3], [0.6 * np.cos(2.0), 0.6 * np.sin(2.0), 0.8], rtol=1e-6)
     assert not made["light_direction"][:3].any()
@@ -177,7 +177,7 @@ def test_what_a_tick_says_of_its_live_worlds():
             fixture_pose=fixtures,
             fixture_visible=np.arange(15).reshape(WORLDS, 3),
             light=numbers,
-            light_turn=numbers / 2,
+            light_yaw=numbers / 2,
             light_exposure=-numbers,
         ),
         tick={"speed": numbers[:, None]},
@@ -191,7 +191,7 @@ def test_what_a_tick_says_of_its_live_worlds():
     np.testing.assert_array_equal(batch.object_id, np.where(known.entry >= 0, OBJECT_IDS[known.entry], -1)[live])
     np.testing.assert_array_equal(batch.fixture_pose, fixtures[live])
     assert batch.fixture_visible.tolist() == [[3, 4, 5], [12, 13, 14]]
-    assert (batch.light.tolist(), batch.light_turn.tolist(), batch.light_exposure.tolist()) == ([1, 4], [0.5, 2.0], [-1, -4])
+    assert (batch.light.tolist(), batch.light_yaw.tolist(), batch.light_exposure.tolist()) == ([1, 4], [0.5, 2.0], [-1, -4])
     assert batch.tick["speed"].tolist() == [[1.0], [4.0]]
     assert batch.steps["force"].tolist() == [[1.0] * 4, [4.0] * 4]
 
@@ -306,7 +306,7 @@ def test_edges_are_those_of_the_batchs_own_images(device):
     for made in batches:
         for view in range(made["length"]):
             for kind, image in enumerate((made["instance"][view], made["amodal"][view])):
-                edges = listed_edges(made["edges"][view, kind, :, : made["edge_count"][view, kind]], len(image))
+                edges = unpack_run_boundaries(made["edges"][view, kind, :, : made["edge_count"][view, kind]], len(image))
                 assert len(edges.column) == 2 * image.shape[1]
-                for name, values in vars(find_edges(image)).items():
+                for name, values in vars(find_run_boundaries(image)).items():
                     np.testing.assert_array_equal(getattr(edges, name), values)

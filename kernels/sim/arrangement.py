@@ -171,7 +171,7 @@ def draw_lights_kernel(
     phase: wp.array[int],
     # Out:
     light_out: wp.array[int],
-    light_turn_out: wp.array[float],
+    light_yaw_out: wp.array[float],
     light_exposure_out: wp.array[float],
 ):
     """Draw the light map of worlds that start an episode, its turn about the vertical and its exposure.
@@ -183,7 +183,7 @@ def draw_lights_kernel(
         return
     key = stream_key(seed, address[world][0], address[world][1], Stream.LIGHT)
     light_out[world] = uniform_index(key, 0, drop.lights)
-    light_turn_out[world] = TAU * uniform(key, 1) * float(drop.turn_lights)
+    light_yaw_out[world] = TAU * uniform(key, 1) * float(drop.turn_lights)
     light_exposure_out[world] = drop.exposure_spread * (2.0 * uniform(key, 2) - 1.0)
 
 

@@ -266,7 +266,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:
     """Check everything that can be checked cheaply, then bake."""
     from synpick_warp.cli.display import make_console, make_progress, print_summary
     from synpick_warp.device import pick_device
-    from synpick_warp.exporters.writing.files import prepare_output
+    from synpick_warp.exporters.writing.files import check_output_folder
 
     pick_device(config.bake.device)
     models, lights = config.bake.models, config.bake.lights
@@ -274,7 +274,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:
         raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes")
     if lights and not os.path.isdir(lights):
         raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets")
-    prepare_output(out)
+    check_output_folder(out)
     from synpick_warp.bake import run_bake
 
     console = make_console()

@@ -25,8 +25,8 @@ from synpick_warp.dataset.manifest import (
 )
 from synpick_warp.dataset.writing import complete, lock_folder
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.registry import exporter_kinds, slot_bytes
-from synpick_warp.exporters.writing.files import MANIFEST_FILE, output_error, prepare_output, write_whole
+from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
+from synpick_warp.exporters.writing.files import MANIFEST_FILE, check_output_folder, output_error, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 
 
@@ -56,7 +56,7 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
             raise DatasetError(f"{part} was made with other settings than {parts[0]}: {said}; only parts of one data set can be joined")
     sources = _sources(parts)
     config = _config(parts)
-    prepare_output(out)
+    check_output_folder(out)
     if (out / MANIFEST_FILE).exists():
         raise DatasetError(f"{out} is a data set already; --out takes a new or an empty folder")
     locks = [lock_folder(part) for part in parts]
@@ -93,7 +93,7 @@ def _config(parts: Sequence[Path]) -> Config:
 
 def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes) -> None:
     """Link all files, then all records; the manifest makes it a data set, and a bake can go on from there."""
-    kinds = exporter_kinds(config.bake.formats)
+    kinds = load_exporter_classes(config.bake.formats)
     new = not out.exists()
     out.mkdir(parents=True, exist_ok=True)
     lock = lock_folder(out)
@@ -105,11 +105,11 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
                     _link(part / name, out / name)
                 for suffix in (".sha256", ".json"):
                     _link(part / f"{place}{suffix}", out / f"{place}{suffix}")
-            write_whole(out / CONFIG_FILE, config_to_toml(config).encode())
+            write_atomically(out / CONFIG_FILE, config_to_toml(config).encode())
         except BaseException:
             _empty(out, new)
             raise
-        write_whole(out / MANIFEST_FILE, manifest)
+        write_atomically(out / MANIFEST_FILE, manifest)
         writers = config.bake.writers or len(os.sched_getaffinity(0))
         with WriterPool(writers, slot_bytes(kinds, config), lock) as pool:
             complete(out, config, kinds, pool)

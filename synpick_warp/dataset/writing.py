@@ -37,9 +37,9 @@ from synpick_warp.dataset.manifest import (
 )
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 from synpick_warp.exporters.base import Exporter
-from synpick_warp.exporters.registry import Exporters, join
-from synpick_warp.exporters.writing.checksums import write_record
-from synpick_warp.exporters.writing.files import PARTIAL, flush_folder, output_error, prepare_output, write_whole
+from synpick_warp.exporters.registry import Exporters, finalize
+from synpick_warp.exporters.writing.checksums import write_manifest_entry
+from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, sync_folder, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 
@@ -71,7 +71,7 @@ class Output:
         """
         self.out, self.config, self.episodes = out, config, list(episodes)
         self._manifest = make_manifest(config)
-        prepare_output(out)
+        check_output_folder(out)
         self._made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -132,7 +132,7 @@ class Output:
         try:
             shutil.rmtree(self.out / PARTIAL, ignore_errors=True)
             if not self._known:
-                write_whole(self.out / MANIFEST_FILE, encode_manifest({**self._manifest, INPUTS: inputs}))
+                write_atomically(self.out / MANIFEST_FILE, encode_manifest({**self._manifest, INPUTS: inputs}))
             (self.out / RECORDS).mkdir(exist_ok=True)
             # Lists that will not be true any longer, and episodes that are not whole.
             self._remove_files(JOINED)
@@ -140,12 +140,12 @@ class Output:
                 self._remove_record(episode_place(episode))
                 for path in exporters.files(episode):
                     _remove(self.out / path)
-            write_whole(self.out / CONFIG_FILE, config_to_toml(self.config).encode())
+            write_atomically(self.out / CONFIG_FILE, config_to_toml(self.config).encode())
             (self.out / PARTIAL).mkdir()
             if not seems_whole(self.out, CONSTANTS):
                 self._remove_record(CONSTANTS)
                 paths = self._write_constants(exporters)
-                pool.submit(write_record, (), (self.out, CONSTANTS, paths, {}), path=self.out / CONSTANTS)
+                pool.submit(write_manifest_entry, (), (self.out, CONSTANTS, paths, {}), path=self.out / CONSTANTS)
                 pool.wait()
         except OSError as error:
             raise output_error(self.out, error) from error
@@ -175,7 +175,7 @@ class Output:
         """All files of an episode are in their place: have their checksums noted, by which it is whole."""
         content = {"episode": end.episode, "row": dict(end.row), "attempts": [json.loads(line) for line in end.attempts]}
         place = episode_place(end.episode)
-        pool.submit(write_record, (), (self.out, place, exporters.files(end.episode), content), path=self.out / place)
+        pool.submit(write_manifest_entry, (), (self.out, place, exporters.files(end.episode), content), path=self.out / place)
 
     def close(self) -> None:
         """Remove what is not whole, after success or after an error. Of a data set without a whole episode nothing stays."""
@@ -200,8 +200,8 @@ def complete(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: W
     try:
         shutil.rmtree(out / PARTIAL, ignore_errors=True)
         (out / PARTIAL).mkdir()
-        paths = join_lists(out, config) + join(kinds, out, config, pool)
-        write_record(out, JOINED, paths, {"episodes": recorded_episodes(out)})
+        paths = join_lists(out, config) + finalize(kinds, out, config, pool)
+        write_manifest_entry(out, JOINED, paths, {"episodes": recorded_episodes(out)})
         shutil.rmtree(out / PARTIAL)
     except OSError as error:
         raise output_error(out, error) from error
@@ -219,7 +219,7 @@ def join_lists(out: Path, config: Config) -> list[Path]:
             file.flush()
             os.fsync(file.fileno())
         (out / PARTIAL / path).replace(out / path)
-    flush_folder(out)
+    sync_folder(out)
     return paths
 
 

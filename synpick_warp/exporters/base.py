@@ -19,7 +19,7 @@ LAYER_BYTES = 12
 
 
 @dataclass(frozen=True, eq=False)
-class DataSet:
+class ExportContext:
     """What every exporter of a bake is given."""
 
     out: Path
@@ -46,7 +46,7 @@ class Exporter(Protocol):
     views: ClassVar[bool]
     """Whether there must be views; where no exporter asks for any, none are rendered."""
 
-    def __init__(self, data_set: DataSet) -> None:
+    def __init__(self, context: ExportContext) -> None:
         """Writes nothing yet."""
         ...
 
@@ -56,7 +56,7 @@ class Exporter(Protocol):
         ...
 
     @staticmethod
-    def join(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
         """Write the lists that span episodes, from the whole episodes that are there, and wait for them.
 
         Returns:
@@ -74,21 +74,21 @@ class Exporter(Protocol):
         """
         ...
 
-    def write(self, batch: FrameBatch) -> None:
+    def write_views(self, batch: FrameBatch) -> None:
         """Take views; copies what it needs. Waits while the writers are behind.
 
         The frames of an episode come in order, all before its end.
         """
         ...
 
-    def tick(self, batch: TickBatch) -> None:
+    def write_ticks(self, batch: TickBatch) -> None:
         """Take the frames of a tick; copies what it needs. Waits while the writers are behind.
 
         The frames of an episode come in order, all before its end; whether a frame's views come before is open.
         """
         ...
 
-    def end(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
+    def end_episode(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
         """Finish the episode's files, or drop them if its ending delivers nothing: it may then come again from frame 0.
 
         Args:

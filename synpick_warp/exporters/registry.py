@@ -8,7 +8,7 @@ from pathlib import Path
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
-from synpick_warp.exporters.base import DataSet, Exporter
+from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 
@@ -21,7 +21,7 @@ EXPORTERS = {
 """Format -> (module in this package, class in it). Modules are imported when their format is asked for."""
 
 
-def exporter_kinds(names: Iterable[str]) -> tuple[type[Exporter], ...]:
+def load_exporter_classes(names: Iterable[str]) -> tuple[type[Exporter], ...]:
     """The classes that write these formats, each once, in the order of EXPORTERS.
 
     Raises:
@@ -42,26 +42,26 @@ def _kind(name: str) -> type[Exporter]:
 class Exporters:
     """All exporters of a bake as one; see `Exporter`."""
 
-    def __init__(self, kinds: Iterable[type[Exporter]], data_set: DataSet) -> None:
-        self._all = tuple(kind(data_set) for kind in kinds)
-        self.records = any(exporter.records for exporter in self._all)
-        self.views = any(exporter.views for exporter in self._all)
+    def __init__(self, kinds: Iterable[type[Exporter]], context: ExportContext) -> None:
+        self._all = tuple(kind(context) for kind in kinds)
+        self.needs_physics = any(exporter.needs_physics for exporter in self._all)
+        self.needs_views = any(exporter.needs_views for exporter in self._all)
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`; formats may share constants, which then are the same."""
         return list(dict.fromkeys(path for exporter in self._all for path in exporter.write_constants()))
 
-    def write(self, batch: FrameBatch) -> None:
+    def write_views(self, batch: FrameBatch) -> None:
         """See `Exporter`."""
         for exporter in self._all:
-            exporter.write(batch)
+            exporter.write_views(batch)
 
-    def tick(self, batch: TickBatch) -> None:
+    def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""
         for exporter in self._all:
-            exporter.tick(batch)
+            exporter.write_ticks(batch)
 
-    def end(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
+    def end_episode(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
         """See `Exporter`; `whole` is called when the last exporter is done with the episode."""
         left = [len(self._all)]
 
@@ -71,7 +71,7 @@ class Exporters:
                 whole()
 
         for exporter in self._all:
-            exporter.end(end, count)
+            exporter.end_episode(end, count)
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
@@ -93,6 +93,6 @@ def slot_bytes(kinds: Iterable[type[Exporter]], config: Config) -> int:
     return max(kind.slot_bytes(config) for kind in kinds)
 
 
-def join(kinds: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool) -> list[Path]:
+def finalize(kinds: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool) -> list[Path]:
     """Have every format's lists that span episodes written; returns these files, relative to the data set."""
-    return sorted(path for kind in kinds for path in kind.join(out, config, pool))
+    return sorted(path for kind in kinds for path in kind.finalize(out, config, pool))

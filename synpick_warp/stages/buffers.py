@@ -33,7 +33,7 @@ class Snapshot:
     """0: not in the picture."""
     light: wp.array = device_array("world", dtype=wp.int32)
     """Index of the episode's light map."""
-    light_turn: wp.array = device_array("world", dtype=wp.float32, unit="rad")
+    light_yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
     """The light map is turned counter-clockwise about +z by this angle."""
     light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="stops")
     """How much longer than the automatic exposure the episode's pictures are exposed."""

@@ -25,7 +25,7 @@ BATCH_BYTES = 512 << 20
 # Colour, depth, instance id and amodal bits of one pixel.
 PIXEL_BYTES = 3 + 2 + 1 + 4
 # What a report has of a snapshot, besides objects and their poses.
-_SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_turn", "light_exposure")
+_SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
 # Batches in flight: one is rendered while another is copied and a third is read.
 RING = 3
 
@@ -261,7 +261,7 @@ class FrameStream:
         arrays = {name: array[:count] for name, array in zip(self.images + self.layers, self.copies[slot].wait(), strict=True)}
         worlds = world[part]
         frame = report.column("frame")[worlds]
-        light, turn = report.snapshot.light[worlds], report.snapshot.light_turn[worlds]
+        light, turn = report.snapshot.light[worlds], report.snapshot.light_yaw[worlds]
         return FrameBatch(
             episode=report.column("episode")[worlds],
             camera=camera[part],
@@ -270,7 +270,7 @@ class FrameStream:
             object_id=self.object_ids[report.entry[worlds]],
             pose=report.pose[worlds],
             light_name=self.lights.name[light],
-            light_turn=turn,
+            light_yaw=turn,
             light_exposure=report.snapshot.light_exposure[worlds],
             light_direction=self.lights.directions(light, turn),
             **{name: arrays[name] for name in self.images},

@@ -13,7 +13,7 @@ from synpick_warp.configs.load import load_config, settings_of
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset import manifest
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing.checksums import files_below, write_record
+from synpick_warp.exporters.writing.checksums import files_below, write_manifest_entry
 from synpick_warp.scenes.embedded.skies import skies
 from tests.worlds.small_worlds import catalog, settings
 
@@ -112,7 +112,7 @@ def test_a_record_has_every_file_once_and_is_whole_while_they_are_there(tmp_path
     given = [manifest.Path("three"), manifest.Path("a"), manifest.Path("a/one")]
     assert [str(path) for path in files_below(tmp_path, given)] == ["a/deep/two", "a/one", "three"]
     assert not manifest.seems_whole(tmp_path, place)
-    write_record(tmp_path, place, given, {"row": {"frames": 3}})
+    write_manifest_entry(tmp_path, place, given, {"row": {"frames": 3}})
     record = manifest.read_record(tmp_path, place)
     assert record is not None
     assert (record["row"], record["files"], record["bytes"]) == ({"frames": 3}, 3, 20)
@@ -129,7 +129,7 @@ def test_a_list_that_does_not_fit_its_record(tmp_path):
     (tmp_path / "manifest").mkdir()
     (tmp_path / "file").write_text("x")
     place = manifest.CONSTANTS
-    write_record(tmp_path, place, [manifest.Path("file")], {})
+    write_manifest_entry(tmp_path, place, [manifest.Path("file")], {})
     path = tmp_path / "manifest" / "constants.sha256"
     path.write_text(path.read_text().replace("file", "elif"))
     with pytest.raises(DatasetError, match="does not fit"):

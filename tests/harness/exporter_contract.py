@@ -16,7 +16,7 @@ import pytest
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.base import DataSet, Exporter
+from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
@@ -44,7 +44,7 @@ def exporting(
     (out / PARTIAL).mkdir(parents=True, exist_ok=True)
     with WriterPool(processes, kind.slot_bytes(config)) as pool:
         try:
-            yield kind(DataSet(out, config, catalog(), lenses, skies(), pool))
+            yield kind(ExportContext(out, config, catalog(), lenses, skies(), pool))
         finally:
             shutil.rmtree(out / PARTIAL, ignore_errors=True)
 
@@ -71,18 +71,18 @@ def feed(
 ) -> list[int]:
     """Episodes side by side, in batches whose buffers are used again; returns a list to which each whole episode will be added."""
     whole: list[int] = []
-    lenses = exporter_data_set(exporter).cameras
+    lenses = export_context(exporter).cameras
     room = len(lenses) * len(episodes)
     given = list(batches(views, episodes, frames, lenses))
     for number, tick in enumerate(ticks(len(episodes), episodes, frames)):
-        exporter.tick(tick)
+        exporter.write_ticks(tick)
         wipe(tick)
         first, last = -(-number * room // views), -(-(number + 1) * room // views)
         for batch in given[first:last]:
-            exporter.write(batch)
+            exporter.write_views(batch)
             wipe(batch)
     for end in ends(episodes, frames, ending):
-        exporter.end(end, lambda number=end.episode: whole.append(number))
+        exporter.end_episode(end, lambda number=end.episode: whole.append(number))
     return whole
 
 
@@ -96,15 +96,15 @@ def wipe(batch: FrameBatch | TickBatch) -> None:
 
 def finish(exporter: Exporter) -> list[Path]:
     """As a bake ends: wait, close, join."""
-    data_set = exporter_data_set(exporter)
-    data_set.pool.wait()
+    context = export_context(exporter)
+    context.pool.wait()
     exporter.close()
-    return exporter.join(data_set.out, data_set.config, data_set.pool)
+    return exporter.finalize(context.out, context.config, context.pool)
 
 
-def exporter_data_set(exporter: Exporter) -> DataSet:
+def export_context(exporter: Exporter) -> ExportContext:
     """Every exporter keeps what it was given under this name."""
-    return exporter._data_set  # type: ignore[attr-defined]
+    return exporter._context  # type: ignore[attr-defined]
 
 
 def below(out: Path, paths: list[Path]) -> set[str]:
@@ -147,7 +147,7 @@ class ExporterContract:
         with exporting(self.kind, tmp_path, self.config()) as exporter:
             constants = below(tmp_path, exporter.write_constants())
             whole = feed(exporter, (0, 2))
-            exporter_data_set(exporter).pool.wait()
+            export_context(exporter).pool.wait()
             assert sorted(whole) == [0, 2]
             first, none, second = (exporter.files(episode) for episode in (0, 1, 2))
             assert none == []
@@ -163,7 +163,7 @@ class ExporterContract:
             exporter.write_constants()
             dropped = feed(exporter, (0, 2), frames=2, ending=Ending.NOT_FINITE)
             unseen: list[int] = []
-            exporter.end(EpisodeEnd(2, 1, 0, int(Ending.UNSETTLED)), lambda: unseen.append(2))
+            exporter.end_episode(EpisodeEnd(2, 1, 0, int(Ending.UNSETTLED)), lambda: unseen.append(2))
             feed(exporter, (0, 2))
             finish(exporter)
         assert (sorted(dropped), unseen) == ([0, 2], [2])
@@ -174,13 +174,13 @@ class ExporterContract:
             exporter.write_constants()
             whole = feed(exporter, (0,))
             for batch in batches(4, (2,), 2, LENSES):
-                exporter.write(batch)
+                exporter.write_views(batch)
             for tick in ticks(1, (2,), 2):
-                exporter.tick(tick)
-            exporter_data_set(exporter).pool.wait()
+                exporter.write_ticks(tick)
+            export_context(exporter).pool.wait()
             assert whole == [0]
             assert exporter.files(2) == []
-            exporter_data_set(exporter).pool.abort()
+            export_context(exporter).pool.abort()
             exporter.abort()
         kept = digests(tmp_path)
         assert kept.items() <= reference.items()
@@ -203,11 +203,11 @@ class ExporterContract:
             shutil.rmtree(out)
             with pytest.raises(OutputError):
                 _feed_and_wait(exporter)
-            exporter_data_set(exporter).pool.abort()
+            export_context(exporter).pool.abort()
             exporter.abort()
         assert not out.exists()
 
 
 def _feed_and_wait(exporter: Exporter) -> None:
     feed(exporter, (0, 2))
-    exporter_data_set(exporter).pool.wait()
+    export_context(exporter).pool.wait()

@@ -25,8 +25,8 @@ from synpick_warp.configs.schema import FORMATS, Config
 from synpick_warp.dataset.manifest import episode_place, read_record
 from synpick_warp.dataset.writing import Output
 from synpick_warp.episodes import EpisodeRow
-from synpick_warp.exporters.base import DataSet
-from synpick_warp.exporters.registry import Exporters, exporter_kinds, slot_bytes
+from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.registry import Exporters, load_exporter_classes, slot_bytes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.embedded.skies import skies
@@ -82,22 +82,22 @@ def sample(pool: WriterPool) -> tuple[int, int]:
 def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
     """Samples of memory and of open files."""
     config, lenses = settings()
-    kinds = exporter_kinds(config.bake.formats)
+    kinds = load_exporter_classes(config.bake.formats)
     frames = frames_of(lenses)
     memory, files = [], []
     with Output(out, config, ()) as output, WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
-        exporters = Exporters(kinds, DataSet(out, config, box_views.catalog(), lenses, skies(), pool))
+        exporters = Exporters(kinds, ExportContext(out, config, box_views.catalog(), lenses, skies(), pool))
         output.begin(exporters, {}, pool)
         for tick in range(ticks):
             first, frame = divmod(tick, FRAMES)
             episodes = np.arange(WORLDS) + WORLDS * first
             views, worlds = frames[frame % SEEN]
-            exporters.tick(renamed(worlds, episodes, frame))
-            exporters.write(renamed(views, episodes, frame))
+            exporters.write_ticks(renamed(worlds, episodes, frame))
+            exporters.write_views(renamed(views, episodes, frame))
             if frame == FRAMES - 1:
                 for episode in episodes.tolist():
                     end = end_of(episode)
-                    exporters.end(end, partial(output.record, exporters, pool, end))
+                    exporters.end_episode(end, partial(output.record, exporters, pool, end))
                 _forget(out, exporters, WORLDS * (first - KEPT))
             if (tick + 1) % max(1, ticks // SAMPLES) == 0:
                 pool.wait()

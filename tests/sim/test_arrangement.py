@@ -164,7 +164,7 @@ def test_modes_are_drawn_apart_from_objects(device):
         worlds = made(device, mix=mix, drop={"move_repeats": 1, "pick_repeats": 1})
         worlds.begin(Phase.START, episodes)
         arrange.draw_objects(worlds.scene, worlds.state, SEED)
-        objects.append((worlds.state.entry.numpy(), worlds.state.light_turn.numpy()))
+        objects.append((worlds.state.entry.numpy(), worlds.state.light_yaw.numpy()))
     for pick, mixed in zip(*objects, strict=True):
         np.testing.assert_array_equal(pick, mixed)
 

@@ -27,7 +27,7 @@ def test_lights_are_even_and_turn(device):
     assert counts.min() > 330
     assert len(counts) == 5
     keys = [rng.stream_key(SEED, episode, 0, Stream.LIGHT) for episode in range(2000)]
-    np.testing.assert_allclose(worlds.state.light_turn.numpy(), [2 * np.pi * rng.uniform(key, 1) for key in keys], rtol=1e-6)
+    np.testing.assert_allclose(worlds.state.light_yaw.numpy(), [2 * np.pi * rng.uniform(key, 1) for key in keys], rtol=1e-6)
 
 
 def test_exposures_are_even_within_their_spread_and_the_episodes_own(device):
@@ -49,7 +49,7 @@ def test_exposures_are_even_within_their_spread_and_the_episodes_own(device):
     wide.begin(Phase.START)
     arrange.draw_objects(wide.scene, wide.state, SEED)
     np.testing.assert_allclose(wide.state.light_exposure.numpy(), 4.0 * drawn, rtol=1e-6)
-    np.testing.assert_array_equal(wide.state.light_turn.numpy(), worlds.state.light_turn.numpy())
+    np.testing.assert_array_equal(wide.state.light_yaw.numpy(), worlds.state.light_yaw.numpy())
 
 
 @pytest.mark.parametrize("setting", ["turn_lights", "exposure_spread"])
@@ -57,6 +57,6 @@ def test_what_is_not_to_be_drawn_is_zero(device, setting):
     worlds = made(device, **{setting: 0})
     worlds.begin(Phase.START)
     arrange.draw_objects(worlds.scene, worlds.state, SEED)
-    drawn = {"turn_lights": worlds.state.light_turn, "exposure_spread": worlds.state.light_exposure}
+    drawn = {"turn_lights": worlds.state.light_yaw, "exposure_spread": worlds.state.light_exposure}
     for name, array in drawn.items():
         assert (array.numpy() == 0.0).all() == (name == setting)

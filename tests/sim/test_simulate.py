@@ -35,7 +35,7 @@ def track(device, worlds: int, disturb=None, episodes: int = EPISODES) -> dict[t
         record = simulation.records[tick % 2]
         simulation.tick(record)
         seen, snapshot = report(record), record.snapshot
-        fixtures, light, turn = snapshot.fixture_pose.numpy(), snapshot.light.numpy(), snapshot.light_turn.numpy()
+        fixtures, light, turn = snapshot.fixture_pose.numpy(), snapshot.light.numpy(), snapshot.light_yaw.numpy()
         exposure = snapshot.light_exposure.numpy()
         for world in range(worlds):
             address = (int(seen.column("episode")[world]), int(seen.column("redraw")[world]))

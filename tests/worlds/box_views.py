@@ -121,7 +121,7 @@ def _tick(episode: int, frame: int) -> dict[str, np.ndarray]:
         "fixture_pose": fixtures,
         "fixture_visible": np.array([1, frame > 0, frame > 0], np.int32),
         "light": np.int32(0),
-        "light_turn": np.float32(0.5 * episode),
+        "light_yaw": np.float32(0.5 * episode),
         "light_exposure": np.float32(0.25),
     }
 
@@ -163,7 +163,7 @@ def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: flo
         "boxes": boxes,
         "effects": np.arange(len(Effect), dtype=np.float32) + np.float32(10 * index + frame),
         "light_name": np.str_(f"map {episode}"),
-        "light_turn": np.float32(0.5 * episode),
+        "light_yaw": np.float32(0.5 * episode),
         "light_exposure": np.float32(-0.25),
         "light_direction": np.array([0.0, 0.6, 0.8] if episode else [0.0, 0.0, 0.0], np.float32),
     }

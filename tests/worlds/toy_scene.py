@@ -117,7 +117,7 @@ class ToyScene:
     fixture_poses: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, *UPRIGHT),) * 3
     fixtures_visible: tuple[int, int, int] = (0, 0, 0)
     room: int = 4
-    light_turn: float = 0.0
+    light_yaw: float = 0.0
     light_exposure: float = 0.0
     table: bool = False
     config: Config = field(default_factory=Config)
@@ -157,7 +157,7 @@ def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
     made.pose.assign(poses)
     made.fixture_pose.assign(np.tile(np.array(toy.fixture_poses, np.float32), (worlds, 1, 1)))
     made.fixture_visible.assign(np.tile(np.array(toy.fixtures_visible), (worlds, 1)))
-    made.light_turn.fill_(toy.light_turn)
+    made.light_yaw.fill_(toy.light_yaw)
     made.light_exposure.fill_(toy.light_exposure)
     return made
 

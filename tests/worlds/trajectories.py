@@ -106,8 +106,8 @@ def write_set(out: Path, settings: Config, episodes: tuple[int, ...], frames: in
     with exporting(TrajectoryExporter, out, settings, processes) as exporter:
         exporter.write_constants()
         for batch in ticks(episodes, frames, steps):
-            exporter.tick(batch)
+            exporter.write_ticks(batch)
         for end in ends(episodes, frames):
-            exporter.end(end, lambda: None)
+            exporter.end_episode(end, lambda: None)
         finish(exporter)
     return out

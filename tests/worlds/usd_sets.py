@@ -11,7 +11,7 @@ import numpy as np
 from synpick_warp.codes import Ending
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import DataSet
+from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.usd.exporter import UsdExporter
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -73,7 +73,7 @@ def episode_ticks(episode: int, frames: int = FRAMES) -> list[TickBatch]:
                 fixture_pose=pose[None, 4:].astype(np.float32),
                 fixture_visible=np.array([[1, seen, seen]], np.int32),
                 light=np.array([LIGHT], np.int32),
-                light_turn=np.array([TURN], np.float32),
+                light_yaw=np.array([TURN], np.float32),
                 light_exposure=np.array([STOPS], np.float32),
             )
         )
@@ -91,11 +91,11 @@ def write_set(
     """A finished data set, written in this process; returns the folder of its USD files."""
     (out / PARTIAL).mkdir(parents=True)
     with WriterPool(0, 0) as pool:
-        exporter = UsdExporter(DataSet(out, config, catalog, make_cameras(config.cameras), lights or skies()[:2], pool))
+        exporter = UsdExporter(ExportContext(out, config, catalog, make_cameras(config.cameras), lights or skies()[:2], pool))
         assert exporter.write_constants() == [Path("usd/assets")]
         for episode in episodes:
             for batch in episode_ticks(episode, frames):
-                exporter.tick(batch)
-            exporter.end(EpisodeEnd(episode, 0, frames, int(Ending.EMPTIED)), lambda: None)
+                exporter.write_ticks(batch)
+            exporter.end_episode(EpisodeEnd(episode, 0, frames, int(Ending.EMPTIED)), lambda: None)
         exporter.close()
     return out / "usd"

@@ -35,7 +35,7 @@ from synpick_warp.configs.load import load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
-from synpick_warp.exporters.registry import Exporters, exporter_kinds
+from synpick_warp.exporters.registry import Exporters, load_exporter_classes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.render.annotate import annotate
@@ -59,7 +59,7 @@ BAKE_METHODS = (
     (TickReader, "wait", "wait for ticks"),
     (FrameStream, "_launch", "launch views"),
     (FrameStream, "_collect", "wait for views"),
-    (Exporters, "write", "hand views to writers"),
+    (Exporters, "write_views", "hand views to writers"),
     (WriterPool, "wait", "wait for writers, finish files"),
 )
 """Where the main process of a bake spends its time; on the CPU, launching is computing."""
@@ -134,7 +134,7 @@ def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Ro
     """All numbers of the parts, as they come. `least` is the time a measurement is repeated [s]."""
     if set(parts) - {"bake"}:
         started = time.perf_counter()
-        records = "write" in parts and any(kind.records for kind in exporter_kinds(config.bake.formats))
+        records = "write" in parts and any(kind.needs_physics for kind in load_exporter_classes(config.bake.formats))
         factory = build_factory(config, SilentProgress(), records_physics=records)
         wp.synchronize_device(factory.simulation.device)
         yield Row("setup", "load and build", time.perf_counter() - started, "s")

@@ -15,10 +15,10 @@ import numpy as np
 from synpick_warp.bake import Factory
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import DataSet, Exporter
-from synpick_warp.exporters.registry import exporter_kinds
+from synpick_warp.exporters.base import ExportContext, Exporter
+from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL
-from synpick_warp.exporters.writing.pool import QUEUE, WriterPool
+from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.stages.stream import TickReport, tick_batch
 from tools.bench.physics import Row
@@ -69,7 +69,7 @@ def measure_writing(config: Config, factory: Factory, report: TickReport, least:
 
 def _measure_format(name: str, config: Config, factory: Factory, given: _Given, least: float, folder: Path) -> Iterator[Row]:
     """Numbers of a format by processes, and the end of episodes with all of them."""
-    (kind,) = exporter_kinds((name,))
+    (kind,) = load_exporter_classes((name,))
     cores = len(os.sched_getaffinity(0))
     written = _Written(0.0, {}, 0.0, 0, 0.0, 0.0, 0.0)
     for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
@@ -114,17 +114,17 @@ def _write(kind: type[Exporter], config: Config, factory: Factory, given: _Given
     """Write into a folder that is not there yet, for at least so long [s]."""
     (out / PARTIAL).mkdir(parents=True)
     with WriterPool(processes, kind.slot_bytes(config)) as pool:
-        exporter = kind(DataSet(out, config, factory.catalog, factory.cameras, factory.lights, pool))
+        exporter = kind(ExportContext(out, config, factory.catalog, factory.cameras, factory.lights, pool))
         exporter.write_constants()
-        for batch in (given.of(COPIES, 0)[0] for _ in range(-(-processes * QUEUE // len(given.views)))):
-            exporter.write(batch)
+        for batch in (given.of(COPIES, 0)[0] for _ in range(-(-processes * QUEUE_DEPTH // len(given.views)))):
+            exporter.write_views(batch)
         pool.wait()
         cpu, frame, started = _cpu_seconds(pool), 0, time.perf_counter()
         while frame == 0 or (frame < MOST_FRAMES and time.perf_counter() - started < least):
             for copy in range(COPIES):
                 views, frames = given.of(copy, frame)
-                exporter.tick(frames)
-                exporter.write(views)
+                exporter.write_ticks(frames)
+                exporter.write_views(views)
             frame += 1
         pool.wait()
         seconds = time.perf_counter() - started
@@ -132,7 +132,7 @@ def _write(kind: type[Exporter], config: Config, factory: Factory, given: _Given
         cpu = {part: max(0.0, spent - cpu[part]) for part, spent in _cpu_seconds(pool).items()}
         episodes = given.episodes()
         for episode in episodes:
-            exporter.end(EpisodeEnd(episode, 0, frame, int(Ending.FINISHED)), lambda: None)
+            exporter.end_episode(EpisodeEnd(episode, 0, frame, int(Ending.FINISHED)), lambda: None)
         pool.wait()
         finish = time.perf_counter() - started - seconds
         places = [out / path for episode in episodes for path in exporter.files(episode)]

@@ -125,7 +125,7 @@ def gather_kernel(
     # State:
     episode: wp.array[int],
     light: wp.array[int],
-    light_turn: wp.array[float],
+    light_yaw: wp.array[float],
     # In:
     bodies: Bodies,
     hits: Hits,
@@ -161,7 +161,7 @@ def gather_kernel(
     width = float(cells.size) * hit.depth / cameras.intrinsics[camera][0]
     vertex = vertex_at(scene, bodies, view, rules.instances, hit, position, outgoing, width, 0.0)
 
-    place = paths_place(scene, cells, rules, view, row, column, episode[world], light[world], light_turn[world])
+    place = paths_place(scene, cells, rules, view, row, column, episode[world], light[world], light_yaw[world])
     even = even_light(scene.lights, place.light, place.turn, vertex.brdf)
     number = cell_number(PERIOD, row, column) * rules.samples
     found = mean_light(scene, bodies, rules, place, number, vertex, width, even, most_share)

@@ -329,7 +329,7 @@ def trace_paths_kernel(
     # State:
     episode: wp.array[int],
     light: wp.array[int],
-    light_turn: wp.array[float],
+    light_yaw: wp.array[float],
     # In:
     bodies: Bodies,
     view_world: wp.array[int],
@@ -355,7 +355,7 @@ def trace_paths_kernel(
     place.view = view
     place.first_light = light[world]
     place.light = light[world]
-    place.turn = light_turn[world]
+    place.turn = light_yaw[world]
     address = (camera * grid.height + row) * grid.width + column
     place.key = mix(stream_key(rules.seed, episode[world], 0, Stream.PATHS) ^ wp.uint64(address))
     footprint = 1.0 / (cameras.intrinsics[camera][0] * wp.sqrt(float(rules.samples)))

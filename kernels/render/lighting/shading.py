@@ -43,7 +43,7 @@ def shade_kernel(
     shadow_cells: CellGrid,
     # State:
     light: wp.array[int],
-    light_turn: wp.array[float],
+    light_yaw: wp.array[float],
     # In:
     bodies: Bodies,
     hits: Hits,
@@ -66,7 +66,7 @@ def shade_kernel(
         return
     camera = view_camera[view]
     which = light[view_world[view]]
-    turn = light_turn[view_world[view]]
+    turn = light_yaw[view_world[view]]
     intrinsics = cameras.intrinsics[camera]
     ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
     outgoing = -wp.normalize(cameras.to_world[camera] * ray)

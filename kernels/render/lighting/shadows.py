@@ -34,7 +34,7 @@ def cast_shadow_rays_kernel(
     lights: Lights,
     # State:
     light: wp.array[int],
-    light_turn: wp.array[float],
+    light_yaw: wp.array[float],
     # In:
     bodies: Bodies,
     hits: Hits,
@@ -61,7 +61,7 @@ def cast_shadow_rays_kernel(
         normal = face_normal(meshes, bodies, view, read_hit(hits, view, pixel[0], pixel[1]), instances)
         if wp.dot(normal, cameras.to_world[camera] * ray) > 0.0:
             normal = -normal
-        middle = turned(lights.main_direction[which], light_turn[view_world[view]])
+        middle = turned(lights.main_direction[which], light_yaw[view_world[view]])
         # A surface that faces away gets no main light anyhow; calling it lit keeps the filter from darkening edges.
         if wp.dot(normal, middle) > 0.0:
             point = sobol_point(cell_number(cells.window, row, column))

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import DataSet
+from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.bop.scene import SceneSettings, finish_episode, make_scene
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
 from synpick_warp.exporters.bop.targets import BOP19, BOP24, join_targets, write_scene_targets
@@ -24,10 +24,10 @@ class BopExporter(SceneExporter):
     hidden = "bop"
     write_view = staticmethod(write_view)
 
-    def __init__(self, data_set: DataSet) -> None:
+    def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
-        super().__init__(data_set)
-        self._object_ids = tuple(entry.obj_id for entry in data_set.catalog.entries)
+        super().__init__(context)
+        self._object_ids = tuple(entry.obj_id for entry in context.catalog.entries)
 
     @staticmethod
     def split(config: Config) -> str:
@@ -35,7 +35,7 @@ class BopExporter(SceneExporter):
         return config.bop.split
 
     @staticmethod
-    def join(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
         """See `Exporter`: the targets of an evaluation."""
         parts = out / PARTIAL / BopExporter.hidden / "targets"
         try:
@@ -53,7 +53,7 @@ class BopExporter(SceneExporter):
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the folders of the scenes."""
-        places = (self._place(self.scene_number(episode, camera)) for camera in range(len(self._cameras)))
+        places = (self._place(self.scene_id(episode, camera)) for camera in range(len(self._cameras)))
         return [place.relative_to(self._out) for place in places if os.path.lexists(place)]
 
     def _make_scene(self, scene: Path) -> None:

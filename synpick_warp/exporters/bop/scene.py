@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.bop.view import RECORDS
-from synpick_warp.exporters.writing.files import flush_folder
+from synpick_warp.exporters.bop.view import ANNOTATIONS
+from synpick_warp.exporters.writing.files import sync_folder
 
 DATE = "1970-01-01 00:00:00"
 """Where COCO asks for a date: constant, so that the same seed gives the same bytes."""
@@ -55,7 +55,7 @@ def finish_episode(scenes: tuple[tuple[Path, Path], ...], settings: SceneSetting
     for scene, place in scenes:
         scene.rename(place)
     for folder in {place.parent for _, place in scenes}:
-        flush_folder(folder)
+        sync_folder(folder)
 
 
 def drop_scenes(scenes: tuple[Path, ...]) -> None:
@@ -65,7 +65,7 @@ def drop_scenes(scenes: tuple[Path, ...]) -> None:
 
 
 def _finish_scene(scene: Path, settings: SceneSettings) -> None:
-    with (scene / RECORDS).open("rb") as file:
+    with (scene / ANNOTATIONS).open("rb") as file:
         records = _Records(file)
         if records.frames != list(range(settings.frames)):
             raise OutputError(
@@ -76,13 +76,13 @@ def _finish_scene(scene: Path, settings: SceneSettings) -> None:
             _write_lines(scene / name, _keyed(records, record))
         if settings.coco:
             _write_lines(scene / "scene_gt_coco.json", _coco(records, len(names), settings))
-    (scene / RECORDS).unlink()
+    (scene / ANNOTATIONS).unlink()
     for folder in (*(entry for entry in sorted(scene.iterdir()) if entry.is_dir()), scene):
-        flush_folder(folder)
+        sync_folder(folder)
 
 
 class _Records:
-    """A file of `records_block`s, read by frame and record: whole, they would fill the memory."""
+    """A file of `annotation_block`s, read by frame and record: whole, they would fill the memory."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file

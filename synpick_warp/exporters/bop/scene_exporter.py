@@ -12,12 +12,12 @@ from typing import Any, ClassVar
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import strength_ranges
-from synpick_warp.exporters.base import DataSet, view_bytes
+from synpick_warp.exporters.base import ExportContext, view_bytes
 from synpick_warp.exporters.bop.models import write_constants
 from synpick_warp.exporters.bop.scene import drop_scenes
-from synpick_warp.exporters.bop.view import ViewSettings, shared_record, view_task
+from synpick_warp.exporters.bop.view import ViewSettings, make_view_task, shared_record
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
-from synpick_warp.exporters.writing.pool import Order
+from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 
 
@@ -40,28 +40,28 @@ class SceneExporter(ABC):
     A scene grows in a hidden folder, and moves to its place when it is whole: if the bake is killed, whole scenes stay.
     """
 
-    records = False
-    views = True
+    needs_physics = False
+    needs_views = True
     hidden: ClassVar[str]
     """Folder in `PARTIAL`."""
     write_view: ClassVar[Callable[..., None]]
-    """Task that writes a view: the arrays of `view_task`, hidden folder of the scene, `ViewSettings`, `ViewTruth`."""
+    """Task that writes a view: the arrays of `make_view_task`, hidden folder of the scene, `ViewSettings`, `ViewTruth`."""
 
-    def __init__(self, data_set: DataSet) -> None:
+    def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
-        config = data_set.config.bop
-        self._data_set = data_set
-        self._out = data_set.out
+        config = context.config.bop
+        self._context = context
+        self._out = context.out
         self._config = config
-        self._cameras = data_set.cameras
-        self._pool = data_set.pool
-        self._split = self._out / self.split(data_set.config)
+        self._cameras = context.cameras
+        self._pool = context.pool
+        self._split = self._out / self.split(context.config)
         self._suffix = f".{config.color_format}"
-        self._layers = data_set.config.render.layers
-        effects = tuple(name for name, strengths in strength_ranges(data_set.config.effects).items() if any(strengths))
+        self._layers = context.config.render.layers
+        effects = tuple(name for name, strengths in strength_ranges(context.config.effects).items() if any(strengths))
         self._views = tuple(
             ViewSettings(self._suffix, config.jpeg_quality, effects, config.masks, config.coco, shared_record(camera, config.depth_scale))
-            for camera in data_set.cameras
+            for camera in context.cameras
         )
         self._episodes: dict[int, _Episode] = {}
         self._begun = 0
@@ -96,34 +96,34 @@ class SceneExporter(ABC):
         """See `Exporter`: models, camera and notes."""
         try:
             self._split.mkdir(exist_ok=True)
-            return write_constants(self._out, self._data_set.config, self._data_set.catalog, self._cameras)
+            return write_constants(self._out, self._context.config, self._context.catalog, self._cameras)
         except OSError as error:
             raise output_error(self._out, error) from error
 
-    def write(self, batch: FrameBatch) -> None:
+    def write_views(self, batch: FrameBatch) -> None:
         """See `Exporter`."""
         self._pool.submit_all(self._orders(batch))
 
-    def _orders(self, batch: FrameBatch) -> Iterator[Order]:
+    def _orders(self, batch: FrameBatch) -> Iterator[WriteTask]:
         """A task for each view, and for each of its layers."""
         for view in range(len(batch)):
             number, camera = int(batch.episode[view]), int(batch.camera[view])
             episode = self._episodes.get(number) or self._begin(number)
             scene = episode.scenes[camera]
-            images, truth = view_task(batch, view, self.scene_number(number, camera), self._views[camera])
+            images, truth = make_view_task(batch, view, self.scene_id(number, camera), self._views[camera])
             tasks = [(type(self).write_view, images, (scene, self._views[camera], truth))]
             for name in self._layers:
                 function, arguments = self._layer_task(scene, truth.scene, name, truth.frame)
                 tasks.append((function, (batch.layers[name][view],), arguments))
             episode.pending += len(tasks)
             for function, arrays, arguments in tasks:
-                yield Order(function, arrays, arguments, self._split / scene.name, partial(self._part_done, number, episode))
+                yield WriteTask(function, arrays, arguments, self._split / scene.name, partial(self._part_done, number, episode))
 
-    def tick(self, batch: TickBatch) -> None:
+    def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`: what BOP has of a tick comes with its views."""
         return
 
-    def end(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
+    def end_episode(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
         """See `Exporter`."""
         episode = self._episodes.pop(end.episode, None)
         if episode is None:
@@ -141,7 +141,7 @@ class SceneExporter(ABC):
         """See `Exporter`."""
         self._episodes.clear()
 
-    def scene_number(self, episode: int, camera: int) -> int:
+    def scene_id(self, episode: int, camera: int) -> int:
         """Number of the scene that a camera sees of an episode."""
         return len(self._cameras) * episode + camera
 
@@ -149,7 +149,7 @@ class SceneExporter(ABC):
         # A number of its own for every arrangement: the last one's folders may not be removed yet.
         self._begun += 1
         hidden = self._out / PARTIAL / self.hidden
-        names = (f"{self.scene_number(number, camera):06d}-{self._begun}" for camera in range(len(self._cameras)))
+        names = (f"{self.scene_id(number, camera):06d}-{self._begun}" for camera in range(len(self._cameras)))
         episode = _Episode(tuple(hidden / name for name in names))
         try:
             hidden.mkdir(exist_ok=True)
@@ -168,8 +168,8 @@ class SceneExporter(ABC):
         if episode.end is None or episode.pending:
             return
         if Ending(episode.end.ending).delivers:
-            scenes = tuple((scene, self.scene_number(number, camera)) for camera, scene in enumerate(episode.scenes))
+            scenes = tuple((scene, self.scene_id(number, camera)) for camera, scene in enumerate(episode.scenes))
             function, arguments = self._finish_task(scenes, episode.end.frames)
         else:
             function, arguments = drop_scenes, (episode.scenes,)
-        self._pool.submit(function, (), arguments, path=self._split / f"{self.scene_number(number, 0):06d}", done=episode.whole)
+        self._pool.submit(function, (), arguments, path=self._split / f"{self.scene_id(number, 0):06d}", done=episode.whole)

@@ -20,21 +20,21 @@ from synpick_warp.exporters.bop.view import (
     ViewTruth,
     camera_record,
     encode_color,
+    extract_masks,
     gt_records,
     info_records,
     run_length_record,
     to_json,
-    view_masks,
 )
-from synpick_warp.exporters.writing.files import flush_folder
+from synpick_warp.exporters.writing.files import sync_folder
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.rle import Runs
 from synpick_warp.layer_codec import encode_layer
 
-MOST_VIEWS = 1000
+MAX_SHARD_VIEWS = 1000
 """Of a shard, as the toolkit has them (convert_imagewise_to_webdataset.py)."""
-FURTHER = 1_000_000
+SHARD_STRIDE = 1_000_000
 """The shards of a scene are numbered scene, scene + this, scene + twice this, ...; scenes have six digits."""
 _END = bytes(2 * tarfile.BLOCKSIZE)
 """How a tar file ends (POSIX.1-1988, section 10.1.1)."""
@@ -43,8 +43,8 @@ _COPY_BYTES = 1 << 20
 
 
 def shard_name(scene: int, part: int) -> str:
-    """File of the views `MOST_VIEWS · part` and following of a scene."""
-    return f"shard-{scene + FURTHER * part:06d}.tar"
+    """File of the views `MAX_SHARD_VIEWS · part` and following of a scene."""
+    return f"shard-{scene + SHARD_STRIDE * part:06d}.tar"
 
 
 def write_shard_view(
@@ -60,7 +60,7 @@ def write_shard_view(
         ("gt_info.json", to_json(info_records(truth))),
     ]
     if settings.masks:
-        masks = view_masks(first, second, truth, height)
+        masks = extract_masks(first, second, truth, height)
         entries.append(("mask.json", _mask_json((mask.whole for mask in masks), height, width)))
         entries.append(("mask_visib.json", _mask_json((mask.seen for mask in masks), height, width)))
     key = _key(truth.scene, truth.frame)
@@ -105,13 +105,13 @@ def finish_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int
         names = {path.name for path in scene.iterdir()}
         if names != {name for view in views for name in view}:
             raise OutputError(f"{scene} does not have {frames} whole frames; this is an error of synpick-warp, please report it")
-        for part, begin in enumerate(range(0, frames, MOST_VIEWS)):
+        for part, begin in enumerate(range(0, frames, MAX_SHARD_VIEWS)):
             shard = scene / shard_name(number, part)
-            _join(shard, [scene / name for view in views[begin : begin + MOST_VIEWS] for name in view])
+            _join(shard, [scene / name for view in views[begin : begin + MAX_SHARD_VIEWS] for name in view])
             whole.append((shard, split / shard.name))
     for shard, place in whole:
         shard.rename(place)
-    flush_folder(split)
+    sync_folder(split)
     for scene, _ in scenes:
         shutil.rmtree(scene)
 

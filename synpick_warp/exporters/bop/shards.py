@@ -10,7 +10,7 @@ from typing import Any
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
 from synpick_warp.exporters.bop.shard_parts import finish_shards, list_keys, shard_number, shards_of, write_shard_layer, write_shard_view
-from synpick_warp.exporters.writing.files import PARTIAL, output_error, write_whole
+from synpick_warp.exporters.writing.files import PARTIAL, output_error, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 
 KEYS_FILE = "key_to_shard.json"
@@ -32,7 +32,7 @@ class ShardsExporter(SceneExporter):
         return f"{config.bop.split}_web"
 
     @staticmethod
-    def join(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
         """See `Exporter`: which view is in which shard."""
         split, parts = out / ShardsExporter.split(config), out / PARTIAL / ShardsExporter.hidden / "keys"
         try:
@@ -43,14 +43,14 @@ class ShardsExporter(SceneExporter):
                 pool.submit(list_keys, (), (shard, parts), path=shard)
             pool.wait()
             lines = [line for part in sorted(parts.iterdir(), key=shard_number) for line in part.read_bytes().splitlines()]
-            write_whole(split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
+            write_atomically(split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
         except OSError as error:
             raise output_error(split, error) from error
         return [(split / KEYS_FILE).relative_to(out)]
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the shards of its scenes."""
-        scenes = (self.scene_number(episode, camera) for camera in range(len(self._cameras)))
+        scenes = (self.scene_id(episode, camera) for camera in range(len(self._cameras)))
         return sorted(path.relative_to(self._out) for scene in scenes for path in shards_of(scene, self._split))
 
     def _make_scene(self, scene: Path) -> None:

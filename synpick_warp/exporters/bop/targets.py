@@ -6,7 +6,7 @@ import json
 from collections import Counter
 from pathlib import Path
 
-from synpick_warp.exporters.writing.files import write_whole
+from synpick_warp.exporters.writing.files import write_atomically
 
 BOP19, BOP24 = "test_targets_bop19.json", "test_targets_bop24.json"
 
@@ -36,4 +36,4 @@ def join_targets(folder: Path, out: Path) -> None:
     for name in (BOP19, BOP24):
         parts = sorted((folder / name).iterdir(), key=lambda path: int(path.name))
         lines = [line for part in parts for line in part.read_bytes().splitlines()]
-        write_whole(out / name, b"[\n" + b",\n".join(lines) + b"\n]\n")
+        write_atomically(out / name, b"[\n" + b",\n".join(lines) + b"\n]\n")

@@ -17,13 +17,13 @@ import orjson
 from synpick_warp.codes import Effect, names
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
 from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
-from synpick_warp.exporters.writing.rle import Runs, find_edges, listed_edges
+from synpick_warp.exporters.writing.rle import Runs, find_run_boundaries, unpack_run_boundaries
 from synpick_warp.frames import FrameBatch
 from synpick_warp.layer_codec import encode_layer, layer_path
 from synpick_warp.scenes.types import Camera
 
-RECORDS = "records"
-"""File of views' records, in a scene that is not whole yet, in the order in which they came; see `records_block`. It is one file, not
+ANNOTATIONS = "records"
+"""File of views' records, in a scene that is not whole yet, in the order in which they came; see `annotation_block`. It is one file, not
 one a view, because ext4 without a journal walks over the inodes that were freed in the last minutes whenever it makes a file.
 """
 MILLIMETERS = 1000.0
@@ -105,7 +105,7 @@ def shared_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
     }
 
 
-def view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSettings) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
+def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSettings) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
     """What a task on one view needs: color, depth, two arrays that hold where masks begin and end, and the truth.
 
     The two are the lists of edges of the images instance and amodal, or else the images themselves, cut to where objects are.
@@ -138,7 +138,7 @@ def _circumstances(batch: FrameBatch, view: int, effects: dict[str, float]) -> d
     direction = batch.light_direction[view]
     light = {
         "map": str(batch.light_name[view]),
-        "turn": round(float(batch.light_turn[view]), _DIGITS),
+        "turn": round(float(batch.light_yaw[view]), _DIGITS),
         "exposure": round(float(batch.light_exposure[view]), _DIGITS),
         "direction": [round(part, _DIGITS) for part in direction.tolist()] if direction.any() else None,
     }
@@ -162,16 +162,19 @@ def _shown(boxes: np.ndarray, height: int, width: int) -> tuple[slice, slice]:
     return slice(top, max(top, bottom)), slice(left, max(left, right))
 
 
-def view_masks(first: np.ndarray, second: np.ndarray, truth: ViewTruth, height: int) -> list[Masks]:
-    """Masks of all instances, in their order, from the last two arrays of `view_task`. Every instance picks its own of all edges."""
-    seen, whole = (listed_edges(array, height) if truth.listed else find_edges(array, truth.top, truth.left) for array in (first, second))
+def extract_masks(first: np.ndarray, second: np.ndarray, truth: ViewTruth, height: int) -> list[Masks]:
+    """Masks of all instances, in their order, from the last two arrays of `make_view_task`. Every instance picks its own of all edges."""
+    seen, whole = (
+        unpack_run_boundaries(array, height) if truth.listed else find_run_boundaries(array, truth.top, truth.left)
+        for array in (first, second)
+    )
     return [Masks(whole.runs_with(number), seen.runs_of(1 + number)) for number in truth.instance_id.tolist()]
 
 
 def write_view(
     color: np.ndarray, depth: np.ndarray, first: np.ndarray, second: np.ndarray, scene: Path, settings: ViewSettings, truth: ViewTruth
 ) -> None:
-    """Write what `view_task` gave: pictures into the folders of a scene, and records into `RECORDS`.
+    """Write what `make_view_task` gave: pictures into the folders of a scene, and records into `ANNOTATIONS`.
 
     Lines: scene_camera, scene_gt, scene_gt_info, then one COCO annotation each, without its id.
     """
@@ -180,7 +183,7 @@ def write_view(
     with open_folder(scene) as folder:
         folder.write(f"rgb/{name}{settings.color_suffix}", encode_color(color, settings, truth.jpeg_quality))
         folder.write(f"depth/{name}.png", encode_png(depth))
-        masks = view_masks(first, second, truth, height) if settings.masks or settings.coco else []
+        masks = extract_masks(first, second, truth, height) if settings.masks or settings.coco else []
         if settings.masks:
             for index, mask in enumerate(masks):
                 whole, seen = encode_masks(mask, height, width)
@@ -190,11 +193,11 @@ def write_view(
         lines = [camera_record(truth, settings), gt_records(truth, settings.camera), infos]
         if settings.coco:
             lines += coco_records(truth, infos, masks, height, width)
-        folder.append(RECORDS, records_block(truth.frame, map(to_json, lines)))
+        folder.append(ANNOTATIONS, annotation_block(truth.frame, map(to_json, lines)))
 
 
-def records_block(frame: int, records: Iterable[bytes]) -> bytes:
-    """A view's records as `RECORDS` has them: a line with the frame and the length of each record [B], then the records, one a line."""
+def annotation_block(frame: int, records: Iterable[bytes]) -> bytes:
+    """A view's records as `ANNOTATIONS` has them: a line with the frame and the length of each record [B], then the records, one a line."""
     lines = tuple(records)
     return b"\n".join((b" ".join(b"%d" % number for number in (frame, *map(len, lines))), *lines, b""))
 

@@ -17,7 +17,7 @@ from synpick_warp.configs.schema import Trajectory
 from synpick_warp.exporters.trajectory.arrays import ARRANGEMENT, ATTEMPTS, EPISODE
 from synpick_warp.exporters.trajectory.spool import field_name, read_rows
 from synpick_warp.exporters.trajectory.store import add_array, add_group, shard_rows
-from synpick_warp.exporters.writing.files import flush_file, flush_folder
+from synpick_warp.exporters.writing.files import sync_file, sync_folder
 
 GROUP, ROWS = "group", "rows"
 """In an episode's hidden folder."""
@@ -73,12 +73,12 @@ def write_episode(folder: Path, kind: np.dtype, count: int, place: Path, facts: 
     del rows
     for path in sorted((folder / GROUP).rglob("*")):
         if path.is_dir():
-            flush_folder(path)
+            sync_folder(path)
         else:
-            flush_file(path)
-    flush_folder(folder / GROUP)
+            sync_file(path)
+    sync_folder(folder / GROUP)
     (folder / GROUP).rename(place)
-    flush_folder(place.parent)
+    sync_folder(place.parent)
     shutil.rmtree(folder)
 
 

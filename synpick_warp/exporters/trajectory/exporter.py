@@ -13,7 +13,7 @@ import numpy as np
 
 from synpick_warp.codes import Ending, Mode
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import DataSet
+from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.exporters.trajectory.episode import ROWS, EpisodeFacts, EpisodeSettings, drop_episode, write_episode
 from synpick_warp.exporters.trajectory.spool import SPOOL_TICKS, batch_type, fill_row, present, spool_bytes, write_rows
@@ -52,21 +52,21 @@ class TrajectoryExporter:
     Ticks gather in a hidden file a few at a time, out of which a writer process makes the group when the episode has ended.
     """
 
-    records = True
-    views = False
+    needs_physics = True
+    needs_views = False
 
-    def __init__(self, data_set: DataSet) -> None:
+    def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
-        config = data_set.config
-        self._data_set = data_set
-        self._hidden = data_set.out / PARTIAL / _FOLDER
+        config = context.config
+        self._context = context
+        self._hidden = context.out / PARTIAL / _FOLDER
         self._episodes: dict[int, _Episode] = {}
         self._begun = 0
         self._settings = EpisodeSettings(
             trajectory=config.trajectory,
             step=config.physics.step,
             steps_per_tick=config.physics.steps_per_tick,
-            masses={entry.obj_id: entry.mass for entry in data_set.catalog.entries},
+            masses={entry.obj_id: entry.mass for entry in context.catalog.entries},
         )
 
     @staticmethod
@@ -75,25 +75,25 @@ class TrajectoryExporter:
         return shared_bytes((spool_bytes(config),))
 
     @staticmethod
-    def join(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
         """See `Exporter`: nothing spans episodes."""
         return []
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: the store, with objects and cameras."""
-        data_set, store = self._data_set, self._data_set.out / STORE
+        context, store = self._context, self._context.out / STORE
         try:
             store.mkdir(exist_ok=True)
             (store / EPISODES).mkdir(exist_ok=True)
-            written = write_constants(store, data_set.config, data_set.catalog, data_set.cameras, data_set.lights)
+            written = write_constants(store, context.config, context.catalog, context.cameras, context.lights)
         except OSError as error:
             raise output_error(store, error) from error
-        return [path.relative_to(data_set.out) for path in written]
+        return [path.relative_to(context.out) for path in written]
 
-    def write(self, batch: FrameBatch) -> None:
+    def write_views(self, batch: FrameBatch) -> None:
         """See `Exporter`: pictures are not for trajectories."""
 
-    def tick(self, batch: TickBatch) -> None:
+    def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""
         for world in range(len(batch)):
             number = int(batch.episode[world])
@@ -103,7 +103,7 @@ class TrajectoryExporter:
             if episode.count % SPOOL_TICKS == 0:
                 self._spool(number, episode, SPOOL_TICKS)
 
-    def end(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
+    def end_episode(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
         """See `Exporter`."""
         episode = self._episodes.pop(end.episode, None)
         if episode is None:
@@ -113,12 +113,12 @@ class TrajectoryExporter:
                 self._spool(end.episode, episode, episode.count % SPOOL_TICKS)
             episode.end, episode.whole = end, whole
             self._finish_if_spooled(end.episode, episode)
-        self._data_set.pool.poll()
+        self._context.pool.poll()
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the group."""
         place = self._place(episode)
-        return [place.relative_to(self._data_set.out)] if os.path.lexists(place) else []
+        return [place.relative_to(self._context.out)] if os.path.lexists(place) else []
 
     def close(self) -> None:
         """See `Exporter`."""
@@ -142,8 +142,8 @@ class TrajectoryExporter:
         start: dict[str, Any] = {
             "light": {
                 "map": light,
-                "name": self._data_set.lights[light].name,
-                "turn": float(batch.light_turn[world]),
+                "name": self._context.lights[light].name,
+                "turn": float(batch.light_yaw[world]),
                 "exposure": float(batch.light_exposure[world]),
                 "units": {"turn": "rad", "exposure": "stops"},
             }
@@ -163,7 +163,7 @@ class TrajectoryExporter:
     def _spool(self, number: int, episode: _Episode, count: int) -> None:
         """Hand over the last `count` rows."""
         episode.pending += 1
-        self._data_set.pool.submit(
+        self._context.pool.submit(
             write_rows,
             (episode.rows[:count].view(np.uint8),),
             (episode.folder / ROWS, (episode.count - count) * episode.rows.itemsize),
@@ -176,7 +176,7 @@ class TrajectoryExporter:
         self._finish_if_spooled(number, episode)
 
     def _finish_if_spooled(self, number: int, episode: _Episode) -> None:
-        end, pool = episode.end, self._data_set.pool
+        end, pool = episode.end, self._context.pool
         if end is None or episode.pending:
             return
         if not Ending(end.ending).delivers:
@@ -191,7 +191,7 @@ class TrajectoryExporter:
             "frames": end.frames,
             "ending": ending.name.lower(),
             "sentence": ending.sentence,
-            "seed": self._data_set.config.bake.seed,
+            "seed": self._context.config.bake.seed,
             **end.row,
             **episode.start,
         }
@@ -200,4 +200,4 @@ class TrajectoryExporter:
         pool.submit(write_episode, (), arguments, path=self._place(number), done=episode.whole)
 
     def _place(self, episode: int) -> Path:
-        return self._data_set.out / STORE / EPISODES / f"{episode:06d}"
+        return self._context.out / STORE / EPISODES / f"{episode:06d}"

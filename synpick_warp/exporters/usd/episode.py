@@ -12,7 +12,7 @@ from synpick_warp.codes import Ending
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.usd.lights import StageLight
 from synpick_warp.exporters.usd.spool import read_ticks
-from synpick_warp.exporters.writing.files import flush_file, flush_folder
+from synpick_warp.exporters.writing.files import sync_file, sync_folder
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.scenes.types import Camera
 
@@ -67,9 +67,9 @@ def write_episode(spool: Path, instances: int, place: Path, facts: EpisodeFacts,
         raise OutputError(f"{place} has {len(ticks)} of {facts.frames} frames; this is an error of synpick-warp, please report it")
     hidden = spool.with_name(f"{spool.name}.usdc")
     save_layer(episode_layer(ticks, facts, settings), hidden)
-    flush_file(hidden)
+    sync_file(hidden)
     hidden.rename(place)
-    flush_folder(place.parent)
+    sync_folder(place.parent)
     spool.unlink()
 
 

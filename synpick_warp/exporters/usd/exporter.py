@@ -9,7 +9,7 @@ from pathlib import Path
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import DataSet
+from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.usd.episode import EpisodeFacts, EpisodeSettings, drop_episode, write_episode
 from synpick_warp.exporters.usd.lights import stage_light
 from synpick_warp.exporters.usd.spool import TickSpool
@@ -28,13 +28,13 @@ class UsdExporter:
     An episode's ticks gather in a hidden file, out of which a writer process makes the episode's file when it has ended.
     """
 
-    records = False
-    views = False
+    needs_physics = False
+    needs_views = False
 
-    def __init__(self, data_set: DataSet) -> None:
+    def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
-        self._data_set = data_set
-        self._hidden = data_set.out / PARTIAL / FOLDER
+        self._context = context
+        self._hidden = context.out / PARTIAL / FOLDER
         self._spools: dict[int, TickSpool] = {}
         self._begun = 0
 
@@ -44,7 +44,7 @@ class UsdExporter:
         return 0
 
     @staticmethod
-    def join(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
         """See `Exporter`: nothing spans episodes but the assets."""
         return []
 
@@ -52,20 +52,20 @@ class UsdExporter:
         """See `Exporter`: the asset library."""
         from synpick_warp.exporters.usd.assets import write_library  # pxr takes a while to load, and this is its only use here
 
-        data_set = self._data_set
-        library = data_set.out / LIBRARY
+        context = self._context
+        library = context.out / LIBRARY
         try:
             for folder in (library.parent, library):
                 folder.mkdir(exist_ok=True)
-            write_library(library, data_set.config, data_set.catalog, data_set.lights)
+            write_library(library, context.config, context.catalog, context.lights)
         except OSError as error:
             raise output_error(library, error) from error
         return [LIBRARY]
 
-    def write(self, batch: FrameBatch) -> None:
+    def write_views(self, batch: FrameBatch) -> None:
         """See `Exporter`: pictures are not for USD."""
 
-    def tick(self, batch: TickBatch) -> None:
+    def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""
         for world in range(len(batch)):
             number = int(batch.episode[world])
@@ -75,9 +75,9 @@ class UsdExporter:
             except OSError as error:
                 raise output_error(spool.path, error) from error
 
-    def end(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
+    def end_episode(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
         """See `Exporter`."""
-        pool, spool = self._data_set.pool, self._spools.pop(end.episode, None)
+        pool, spool = self._context.pool, self._spools.pop(end.episode, None)
         if spool is None:
             whole()
         elif not Ending(end.ending).delivers:
@@ -95,7 +95,7 @@ class UsdExporter:
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the one file."""
         place = self._place(episode)
-        return [place.relative_to(self._data_set.out)] if os.path.lexists(place) else []
+        return [place.relative_to(self._context.out)] if os.path.lexists(place) else []
 
     def close(self) -> None:
         """See `Exporter`."""
@@ -116,16 +116,16 @@ class UsdExporter:
         return spool
 
     def _place(self, episode: int) -> Path:
-        return self._data_set.out / FOLDER / f"{episode:06d}.usdc"
+        return self._context.out / FOLDER / f"{episode:06d}.usdc"
 
     @cached_property
     def _settings(self) -> EpisodeSettings:
-        data_set = self._data_set
-        config = data_set.config
+        context = self._context
+        config = context.config
         return EpisodeSettings(
             tick_rate=1.0 / (config.physics.step * config.physics.steps_per_tick),
             gravity=config.physics.gravity,
-            cameras=data_set.cameras,
-            lights=tuple(stage_light(index, light, config.render.exposure) for index, light in enumerate(data_set.lights)),
-            names={entry.obj_id: entry.name for entry in data_set.catalog.entries},
+            cameras=context.cameras,
+            lights=tuple(stage_light(index, light, config.render.exposure) for index, light in enumerate(context.lights)),
+            names={entry.obj_id: entry.name for entry in context.catalog.entries},
         )

@@ -17,7 +17,7 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdShade, Vt
 
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.writing.files import write_flushed
+from synpick_warp.exporters.writing.files import write_synced
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.appearance import srgb_to_linear
 from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
@@ -133,7 +133,7 @@ def write_texture(library: Path, name: str, material: Material) -> str | None:
     if material.texture is None:
         return None
     file = f"{TEXTURES}/{name}.png"
-    write_flushed(library / file, encode_png(material.texture))
+    write_synced(library / file, encode_png(material.texture))
     return file
 
 

@@ -10,7 +10,7 @@ from synpick_warp.frames import TickBatch
 
 TICKS = 64
 """Ticks of an episode that are kept in memory: about 50 kB a world."""
-_FIELDS = ("frame", "object_id", "pose", "fixture_pose", "fixture_visible", "light", "light_turn", "light_exposure")
+_FIELDS = ("frame", "object_id", "pose", "fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
 """Of `TickBatch`, with its shapes."""
 
 
@@ -53,7 +53,7 @@ def tick_type(instances: int) -> np.dtype:
             ("fixture_pose", "<f4", (3, 7)),
             ("fixture_visible", "<i4", 3),
             ("light", "<i4"),
-            ("light_turn", "<f4"),
+            ("light_yaw", "<f4"),
             ("light_exposure", "<f4"),
         ]
     )

@@ -52,7 +52,7 @@ def episode_layer(ticks: np.ndarray, facts: EpisodeFacts, settings: EpisodeSetti
     for index, camera in enumerate(settings.cameras):
         _add_camera(stage, index, camera)
     first = ticks[0]
-    _add_light(stage, settings.lights[first["light"]], float(first["light_turn"]), float(first["light_exposure"]))
+    _add_light(stage, settings.lights[first["light"]], float(first["light_yaw"]), float(first["light_exposure"]))
     # References come last and without a stage: nothing need be resolved from a file that is not in its place yet.
     del stage, pair
     for path, asset in assets.items():

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.exporters.writing.files import write_whole
+from synpick_warp.exporters.writing.files import write_atomically
 
 
 def checksum(path: Path) -> str:
@@ -34,7 +34,7 @@ def _files(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def write_record(out: Path, place: Path, paths: Sequence[Path], content: dict[str, Any]) -> None:
+def write_manifest_entry(out: Path, place: Path, paths: Sequence[Path], content: dict[str, Any]) -> None:
     """Note files as whole: write `place`.sha256 with their checksums, then `place`.json, which says by being there that all is.
 
     Args:
@@ -47,5 +47,5 @@ def write_record(out: Path, place: Path, paths: Sequence[Path], content: dict[st
     lines = "".join(f"{checksum(out / path)}  {path}\n" for path in files).encode()
     size = sum((out / path).stat().st_size for path in files)
     record = {**content, "files": len(files), "bytes": size, "checksum": hashlib.sha256(lines).hexdigest()}
-    write_whole(out / f"{place}.sha256", lines)
-    write_whole(out / f"{place}.json", (json.dumps(record, allow_nan=False) + "\n").encode())
+    write_atomically(out / f"{place}.sha256", lines)
+    write_atomically(out / f"{place}.json", (json.dumps(record, allow_nan=False) + "\n").encode())

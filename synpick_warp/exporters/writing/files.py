@@ -16,7 +16,7 @@ MANIFEST_FILE = "manifest.json"
 _ALLOWED = "--out takes a new or an empty folder"
 
 
-def prepare_output(out: Path) -> None:
+def check_output_folder(out: Path) -> None:
     """Make sure that a data set can be written to a folder, and leave nothing behind.
 
     Raises:
@@ -47,20 +47,20 @@ def output_error(path: Path | str, error: OSError) -> OutputError:
     return OutputError(f"cannot write {error.filename or path}: {reason}; free space or rights there, or name another folder with --out")
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes) -> None:
     """Write a file so that it is there entirely or not at all, even after a power cut."""
     beside = path.with_name(f".{path.name}.new")
     try:
-        write_flushed(beside, data)
+        write_synced(beside, data)
         beside.replace(path)
     except OSError:
         with contextlib.suppress(OSError):
             beside.unlink()
         raise
-    flush_folder(path.parent)
+    sync_folder(path.parent)
 
 
-def write_flushed(path: Path, data: bytes) -> None:
+def write_synced(path: Path, data: bytes) -> None:
     """Write a file through to the disk."""
     with path.open("wb") as file:
         file.write(data)
@@ -68,13 +68,13 @@ def write_flushed(path: Path, data: bytes) -> None:
         os.fsync(file.fileno())
 
 
-def flush_file(path: Path) -> None:
+def sync_file(path: Path) -> None:
     """Write through to the disk what somebody else wrote into a file."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
 
 
-def flush_folder(folder: Path) -> None:
+def sync_folder(folder: Path) -> None:
     """Write a folder's list of names through to the disk."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:

@@ -27,7 +27,7 @@ from synpick_warp.exporters.writing.worker import Failure, SharedImage, Task, ru
 
 _WORKER = "from synpick_warp.exporters.writing.worker import main; main()"
 """Program of a writer process: imported, not run as `__main__`, so that pickled tasks name the module's own classes."""
-QUEUE = 4
+QUEUE_DEPTH = 4
 """Tasks that a process has at hand, with the one it runs: enough to bridge the time in which the bake makes the next batch."""
 PROCESSES_PER_COPIER = 4
 """So many processes for a thread that copies images into shared memory: one core alone cannot copy as fast as many cores write."""
@@ -40,7 +40,7 @@ _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR
 
 
 @dataclass(frozen=True, eq=False)
-class Order:
+class WriteTask:
     """A task to be done: `function(*images, *arguments)` in a process."""
 
     function: Callable[..., None]
@@ -96,7 +96,7 @@ class WriterPool:
             OutputError: There is no memory or no process to be had.
         """
         self._slot_bytes = -(-max(slot_bytes, 1) // mmap.PAGESIZE) * mmap.PAGESIZE
-        slots = max(1, processes * QUEUE)
+        slots = max(1, processes * QUEUE_DEPTH)
         self._free = list(range(slots))
         self._waiting: deque[_Job] = deque()
         self._workers: list[_Worker] = []
@@ -130,10 +130,10 @@ class WriterPool:
         path: Path,
         done: Callable[[], None] | None = None,
     ) -> None:
-        """Have one `Order` done, which has these parts; see `submit_all`."""
-        self.submit_all((Order(function, images, arguments, path, done),))
+        """Have one `WriteTask` done, which has these parts; see `submit_all`."""
+        self.submit_all((WriteTask(function, images, arguments, path, done),))
 
-    def submit_all(self, orders: Iterable[Order]) -> None:
+    def submit_all(self, orders: Iterable[WriteTask]) -> None:
         """Have tasks done, and return when all their images are copied. Tasks with images wait until there is room for these.
 
         Threads copy the images of some orders while the next one is made, so give orders that take work to make by a generator.
@@ -260,7 +260,7 @@ class WriterPool:
         while self._waiting:
             worker = min(self._workers, key=lambda candidate: len(candidate.jobs))
             copying = self._waiting[0].copying
-            if len(worker.jobs) == QUEUE or not (waits or copying is None or copying.done()):
+            if len(worker.jobs) == QUEUE_DEPTH or not (waits or copying is None or copying.done()):
                 return
             job = self._waiting.popleft()
             _await_copy(job)

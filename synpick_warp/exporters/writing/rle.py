@@ -45,7 +45,7 @@ class Runs:
 
 
 @dataclass(frozen=True, eq=False)
-class Edges:
+class RunBoundaries:
     """Where an image's values change down its columns, in order of columns, then rows. Above and below the image, values are 0."""
 
     column: np.ndarray
@@ -73,26 +73,26 @@ class Edges:
         return Runs(self.column[index[::2]], row[::2], row[1::2])
 
 
-def listed_edges(edges: np.ndarray, height: int) -> Edges:
+def unpack_run_boundaries(edges: np.ndarray, height: int) -> RunBoundaries:
     """The edges that a device listed, (3, N) as in `FrameBatch.edges`, of images so high."""
     column, row = np.divmod(edges[0].astype(np.int64), height + 1)
-    return Edges(column, row, edges[1], edges[2])
+    return RunBoundaries(column, row, edges[1], edges[2])
 
 
-def find_edges(image: np.ndarray, top: int = 0, left: int = 0) -> Edges:
+def find_run_boundaries(image: np.ndarray, top: int = 0, left: int = 0) -> RunBoundaries:
     """The edges of an image that is 0 outside of a part (h, w), whose first pixel is at row `top` and column `left`."""
     rows, columns = image.shape
     if not image.size:
         nothing = np.zeros(0, np.int64)
-        return Edges(nothing, nothing, nothing.astype(image.dtype), nothing.astype(image.dtype))
+        return RunBoundaries(nothing, nothing, nothing.astype(image.dtype), nothing.astype(image.dtype))
     changes = np.empty((rows + 1, columns), bool)
     np.not_equal(image[0], 0, out=changes[0])
     np.not_equal(image[1:], image[:-1], out=changes[1:-1])
     np.not_equal(image[-1], 0, out=changes[-1])
-    # Edges are few: to find them row by row and to sort them is faster than to transpose the image.
+    # RunBoundaries are few: to find them row by row and to sort them is faster than to transpose the image.
     row, column = np.divmod(np.flatnonzero(changes), columns)
     column, row = np.divmod(np.sort(column * (rows + 1) + row), rows + 1)
     above, below = image[row - 1, column], image[np.minimum(row, rows - 1), column]
     above[row == 0] = 0
     below[row == rows] = 0
-    return Edges(left + column, top + row, above, below)
+    return RunBoundaries(left + column, top + row, above, below)

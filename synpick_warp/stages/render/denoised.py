@@ -196,7 +196,7 @@ class FastPicture:
     def gather(self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int) -> None:
         """Trace the cells' paths."""
         scene = self.scene
-        inputs = [scene.paths, scene.cameras, self.cells, snapshot.episode, snapshot.light, snapshot.light_turn, bodies, hits]
+        inputs = [scene.paths, scene.cameras, self.cells, snapshot.episode, snapshot.light, snapshot.light_yaw, bodies, hits]
         inputs += [view_world, view_camera, self.rules, self.most_share]
         launch_pixels(gather_kernel, count * spread_threads(self.cells), inputs, [self.guide, self.gathered], scene.device)
 
@@ -211,7 +211,7 @@ class FastPicture:
     def cast_shadows(self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int) -> None:
         """Visible shares of the main light."""
         scene, cells, shadows = self.scene, self.shadow_cells, self.shadows
-        inputs = [scene.meshes, scene.table, scene.cameras, cells, scene.lights, snapshot.light, snapshot.light_turn, bodies, hits]
+        inputs = [scene.meshes, scene.table, scene.cameras, cells, scene.lights, snapshot.light, snapshot.light_yaw, bodies, hits]
         inputs += [view_world, view_camera, self.rules.instances]
         self._launch(cast_shadow_rays_kernel, cells.cells, count, inputs, [shadows.cast])
         inputs = [scene.meshes, scene.cameras, cells, scene.lights, snapshot.light, bodies, hits, shadows.cast]
@@ -230,7 +230,7 @@ class FastPicture:
     ) -> None:
         """Radiance of each pixel from the light around it."""
         scene = self.scene
-        inputs = [scene.paths, scene.cameras, self.cells, self.shadow_cells, snapshot.light, snapshot.light_turn, bodies, hits]
+        inputs = [scene.paths, scene.cameras, self.cells, self.shadow_cells, snapshot.light, snapshot.light_yaw, bodies, hits]
         inputs += [self.guide, self.shares, self.shadows.smooth, view_world, view_camera, self.rules.instances]
         self._launch(shade_kernel, scene.grid, count, inputs, [radiance])
 

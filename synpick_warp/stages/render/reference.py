@@ -57,6 +57,6 @@ class ReferencePicture:
             picture: The struct `Picture`; its `radiance` is written, which is that of whole pixels.
         """
         scene = self.scene
-        inputs = [scene.paths, scene.cameras, scene.grid, snapshot.episode, snapshot.light, snapshot.light_turn]
+        inputs = [scene.paths, scene.cameras, scene.grid, snapshot.episode, snapshot.light, snapshot.light_yaw]
         inputs += [bodies, view_world, view_camera, self.rules]
         launch_pixels(trace_paths_kernel, count * scene.grid.tiles * int(TILE_PIXELS), inputs, [picture.radiance], scene.device)

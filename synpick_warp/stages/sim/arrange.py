@@ -42,7 +42,7 @@ def draw_objects(scene: SceneData, state: WorldState, seed: int) -> None:
         arrangement.draw_lights_kernel,
         dim=worlds,
         inputs=[wp.uint64(seed), scene.drop, state.address, state.phase],
-        outputs=[state.light, state.light_turn, state.light_exposure],
+        outputs=[state.light, state.light_yaw, state.light_exposure],
         device=device,
     )
 

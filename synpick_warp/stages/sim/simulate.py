@@ -201,7 +201,7 @@ class Simulation:
         outputs += [snapshot.last_fixture_visible]
         wp.launch(pack.link_frames_kernel, dim=self.layout.worlds, inputs=[_frame_poses(snapshot)], outputs=outputs, device=device)
         wp.copy(snapshot.light, state.light)
-        wp.copy(snapshot.light_turn, state.light_turn)
+        wp.copy(snapshot.light_yaw, state.light_yaw)
         wp.copy(snapshot.light_exposure, state.light_exposure)
 
 

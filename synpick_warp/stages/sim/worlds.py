@@ -57,7 +57,7 @@ class WorldState:
     """Goal of the finger's tilt axis."""
     light: wp.array = device_array("world", dtype=wp.int32)
     """Light map of the episode."""
-    light_turn: wp.array = device_array("world", dtype=wp.float32, unit="rad")
+    light_yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
     """Its turn about +z."""
     light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="stops")
     """Exposure against the automatic one."""

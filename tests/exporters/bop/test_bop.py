@@ -22,12 +22,12 @@ from synpick_warp.errors import CatalogError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.models import encode_model, write_models
 from synpick_warp.exporters.bop.scene import SceneSettings, finish_episode, make_scene
-from synpick_warp.exporters.bop.view import RECORDS, records_block
-from synpick_warp.exporters.writing.files import prepare_output
+from synpick_warp.exporters.bop.view import ANNOTATIONS, annotation_block
+from synpick_warp.exporters.writing.files import check_output_folder
 from synpick_warp.exporters.writing.folder import open_folder
 from synpick_warp.scenes.types import Catalog
 from tests.exporters.writing.test_rle import decode
-from tests.harness.exporter_contract import ExporterContract, digests, export, exporter_data_set, exporting, feed, finish
+from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, feed, finish
 from tests.worlds.box_views import OBJECT_IDS, SIZES, batches, cameras, catalog, config, ends, poses
 
 EPISODES = (0, 2)
@@ -251,7 +251,7 @@ def test_an_episode_that_never_ended_is_left_out(tmp_path):
     with exporting(BopExporter, tmp_path / "set", config()) as exporter:
         exporter.write_constants()
         for batch in batches(5, (1,), 2, LENSES):
-            exporter.write(batch)
+            exporter.write_views(batch)
         finish(exporter)
     assert list((tmp_path / "set/train_pbr").iterdir()) == []
     assert load(tmp_path / "set/test_targets_bop19.json") == load(tmp_path / "set/test_targets_bop24.json") == []
@@ -260,7 +260,7 @@ def test_an_episode_that_never_ended_is_left_out(tmp_path):
 def lose_a_writer(out: Path) -> None:
     with exporting(BopExporter, out, config()) as exporter:
         exporter.write_constants()
-        pool = exporter_data_set(exporter).pool
+        pool = export_context(exporter).pool
         feed(exporter, (0,))
         pool.wait()
         os.kill(pool._workers[0].process.pid, signal.SIGKILL)
@@ -278,8 +278,8 @@ def lose_a_frame(out: Path) -> None:
     with exporting(BopExporter, out, config()) as exporter:
         exporter.write_constants()
         for batch in batches(5, (0,), 3, LENSES):
-            exporter.write(batch)
-        exporter.end(ends((0,), 4)[0], lambda: None)
+            exporter.write_views(batch)
+        exporter.end_episode(ends((0,), 4)[0], lambda: None)
         finish(exporter)
 
 
@@ -291,7 +291,7 @@ def test_records_come_in_any_order_and_each_frame_once(tmp_path):
         with open_folder(scene) as folder:
             for frame in frames:
                 annotations = [b'{"of": %d}' % frame] * frame
-                folder.append(RECORDS, records_block(frame, (b'{"view": %d}' % frame, b"[]", b"[1]", *annotations)))
+                folder.append(ANNOTATIONS, annotation_block(frame, (b'{"view": %d}' % frame, b"[]", b"[1]", *annotations)))
         if frames != (2, 0, 1):
             with pytest.raises(OutputError, match=f"has {len(frames)} of 3 frames"):
                 finish_episode(((scene, place),), settings)
@@ -303,7 +303,7 @@ def test_records_come_in_any_order_and_each_frame_once(tmp_path):
         assert load(place / "scene_gt_coco.json")["annotations"] == [
             {"id": number, "of": frame} for number, frame in ((1, 1), (2, 2), (3, 2))
         ]
-        assert not (place / RECORDS).exists()
+        assert not (place / ANNOTATIONS).exists()
 
 
 def test_a_missing_frame_is_no_whole_scene(tmp_path):
@@ -336,20 +336,20 @@ def test_output_folders_that_cannot_be_used(tmp_path):
     (tmp_path / "full" / "note").write_text("")
     before = digests(tmp_path)
     with pytest.raises(OutputError, match="is not empty; --out takes a new or an empty folder"):
-        prepare_output(tmp_path / "full")
+        check_output_folder(tmp_path / "full")
     with pytest.raises(OutputError, match="is a file; --out takes a new or an empty folder"):
-        prepare_output(tmp_path / "file")
+        check_output_folder(tmp_path / "file")
     for bad in (tmp_path / "file" / "below", Path("/dev/null/x")):
         with pytest.raises(OutputError, match="cannot write"):
-            prepare_output(bad)
+            check_output_folder(bad)
     assert digests(tmp_path) == before
 
 
 def test_preparing_leaves_nothing_behind(tmp_path):
-    prepare_output(tmp_path / "a" / "b")
+    check_output_folder(tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "c").mkdir()
-    prepare_output(tmp_path / "c")
+    check_output_folder(tmp_path / "c")
     assert list((tmp_path / "c").iterdir()) == []
 
 

@@ -20,7 +20,7 @@ from synpick_warp.exporters.bop import shard_parts
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.exporters.registry import Exporters
-from tests.harness.exporter_contract import ExporterContract, digests, export, exporter_data_set, exporting, finish
+from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, finish
 from tests.worlds.box_views import batches, cameras, config, ends
 
 EPISODES = (0, 2)
@@ -155,8 +155,9 @@ def test_a_view_without_objects_is_there(tmp_path):
     with exporting(ShardsExporter, tmp_path, config()) as exporter:
         exporter.write_constants()
         for batch in batches(5, (1,), 1, LENSES):
-            exporter.write(dataclasses.replace(batch, object_id=np.full_like(batch.object_id, -1), instance=np.zeros_like(batch.instance)))
-        exporter.end(ends((1,), 1)[0], lambda: None)
+            nothing = {"object_id": np.full_like(batch.object_id, -1), "instance": np.zeros_like(batch.instance)}
+            exporter.write_views(dataclasses.replace(batch, **nothing))
+        exporter.end_episode(ends((1,), 1)[0], lambda: None)
         finish(exporter)
     views = samples(tmp_path / "train_pbr_web")
     assert list(views) == ["000003_000000", "000004_000000", "000005_000000"]
@@ -175,13 +176,13 @@ def test_png_colour_without_masks(tmp_path):
 
 
 def test_a_long_scene_has_several_shards(tmp_path, dataset, monkeypatch):
-    monkeypatch.setattr(shard_parts, "MOST_VIEWS", 2)
+    monkeypatch.setattr(shard_parts, "MAX_SHARD_VIEWS", 2)
     out = tmp_path / "set"
     with exporting(ShardsExporter, out, config(), processes=0) as exporter:
         exporter.write_constants()
         for batch in batches(4, (2,), FRAMES, LENSES):
-            exporter.write(batch)
-        exporter.end(ends((2,), FRAMES)[0], lambda: None)
+            exporter.write_views(batch)
+        exporter.end_episode(ends((2,), FRAMES)[0], lambda: None)
         finish(exporter)
         names = [f"train_pbr_web/shard-{number:06d}.tar" for number in (6, 7, 8, 1_000_006, 1_000_007, 1_000_008)]
         assert sorted(names) == [str(path) for path in exporter.files(2)]
@@ -207,5 +208,5 @@ def test_an_empty_data_set_has_an_empty_list(tmp_path):
 
 def test_constants_that_bop_has_as_well_are_named_once(tmp_path):
     with exporting(ShardsExporter, tmp_path, config()) as exporter:
-        constants = Exporters((BopExporter, ShardsExporter), exporter_data_set(exporter)).write_constants()
+        constants = Exporters((BopExporter, ShardsExporter), export_context(exporter)).write_constants()
     assert sorted(map(str, constants)) == ["camera.json", "dataset_info.md", "models", "models_eval"]

@@ -125,10 +125,10 @@ def test_an_episode_without_attempts_has_empty_columns(tmp_path):
     with exporting(TrajectoryExporter, tmp_path, config()) as exporter:
         exporter.write_constants()
         for batch in ticks((0,), 1):
-            exporter.tick(batch)
+            exporter.write_ticks(batch)
         (end,) = box_views.ends((0,), 1)
-        exporter.end(end, lambda: None)
-        exporter._data_set.pool.wait()
+        exporter.end_episode(end, lambda: None)
+        exporter._context.pool.wait()
     attempts = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000" / "attempts", mode="r")
     assert {array.shape[0] for array in arrays(attempts).values()} == {0}
     assert set(attempts.array_keys()) == set(tables.ATTEMPTS.arrays)
@@ -202,16 +202,16 @@ def test_without_steps_there_are_ticks_alone(tmp_path):
 def test_missing_frames_are_an_error(tmp_path):
     with exporting(TrajectoryExporter, tmp_path, config(), processes=0) as exporter:
         for batch in ticks((0,), 2):
-            exporter.tick(batch)
+            exporter.write_ticks(batch)
         with pytest.raises(ValueError, match="ended with 3 frames, but 2 came"):
-            exporter.end(ends((0,), 3)[0], lambda: None)
+            exporter.end_episode(ends((0,), 3)[0], lambda: None)
 
 
 def test_an_array_that_nothing_describes_is_an_error(tmp_path):
     (batch,) = ticks((0,), 1)
     batch.steps["magic"] = batch.steps["goal"]
     with exporting(TrajectoryExporter, tmp_path, config()) as exporter, pytest.raises(ValueError, match="magic"):
-        exporter.tick(batch)
+        exporter.write_ticks(batch)
 
 
 @given(ticks=st.integers(0, 5000), chunk=st.integers(1, 64), chunks=st.integers(1, 64), rows=st.integers(1, 40))
@@ -229,8 +229,8 @@ def test_an_episode_without_instances_has_empty_axes(tmp_path):
     batch.object_id.fill(-1)
     with exporting(TrajectoryExporter, tmp_path, config(), processes=0) as exporter:
         exporter.write_constants()
-        exporter.tick(batch)
-        exporter.end(box_views.ends((0,), 1)[0], lambda: None)
+        exporter.write_ticks(batch)
+        exporter.end_episode(box_views.ends((0,), 1)[0], lambda: None)
     episode = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000", mode="r")
     assert episode["steps/pose"].shape == (STEP_COUNT, 0, 7)
     assert episode["steps/goal"].shape == (STEP_COUNT, 3)

@@ -15,7 +15,7 @@ from PIL import Image
 
 from synpick_warp.exporters.writing import png
 from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
-from synpick_warp.exporters.writing.rle import find_edges
+from synpick_warp.exporters.writing.rle import find_run_boundaries
 
 SIDE = st.integers(1, 40)
 GREY = st.tuples(SIDE, SIDE)
@@ -74,7 +74,7 @@ def test_a_mask_is_written_at_its_place(data):
     mask = data.draw(hnp.arrays(bool, (rows, columns)))
     full = np.zeros((height, width), np.uint8)
     full[top : top + rows, left : left + columns] = np.where(mask, 255, 0)
-    runs = find_edges(mask.view(np.uint8), top, left).runs_of(1)
+    runs = find_run_boundaries(mask.view(np.uint8), top, left).runs_of(1)
     stream = encode_mask_png(runs, height, width)
     np.testing.assert_array_equal(read(stream), full)
     # OpenCV reads on where a checksum is wrong.

@@ -17,7 +17,7 @@ import pytest
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing import pool as pool_module
-from synpick_warp.exporters.writing.pool import QUEUE, Order, WriterPool, shared_bytes
+from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool, WriteTask, shared_bytes
 from synpick_warp.exporters.writing.worker import NICENESS
 
 SIZE = 1 << 16
@@ -126,15 +126,15 @@ def test_threads_copy_large_images(tmp_path, monkeypatch):
 def test_many_orders_are_taken_at_once_each_with_its_own_images(tmp_path, monkeypatch):
     """More than there are slots, made one by one, while threads copy the images of those before."""
     monkeypatch.setattr(pool_module, "PROCESSES_PER_COPIER", 1)
-    count, side = 5 * QUEUE, 700
+    count, side = 5 * QUEUE_DEPTH, 700
     ring = np.empty((count, side, side), np.uint8)
     made, done = [], []
 
-    def orders(first: int) -> Iterator[Order]:
+    def orders(first: int) -> Iterator[WriteTask]:
         for value in range(first, first + count):
             made.append(value)
             ring[value - first] = value
-            yield Order(save, (ring[value - first],), (tmp_path / f"{value}.npy",), tmp_path, lambda value=value: done.append(value))
+            yield WriteTask(save, (ring[value - first],), (tmp_path / f"{value}.npy",), tmp_path, lambda value=value: done.append(value))
 
     with WriterPool(2, side * side) as pool:
         for first in (0, count):
@@ -148,15 +148,15 @@ def test_many_orders_are_taken_at_once_each_with_its_own_images(tmp_path, monkey
 def test_a_failure_ends_the_orders(tmp_path):
     made = []
 
-    def orders() -> Iterator[Order]:
+    def orders() -> Iterator[WriteTask]:
         while True:
             made.append(None)
-            yield Order(stumble_on, (np.zeros(4),), (tmp_path,), tmp_path)
+            yield WriteTask(stumble_on, (np.zeros(4),), (tmp_path,), tmp_path)
 
     pool = WriterPool(2, SIZE)
     with pytest.raises(OutputError, match="ValueError: two lines"):
         pool.submit_all(orders())
-    assert len(made) <= 1 + 2 * QUEUE
+    assert len(made) <= 1 + 2 * QUEUE_DEPTH
     pool.abort()
 
 
@@ -215,7 +215,7 @@ def test_many_tasks_without_images_do_not_block(tmp_path):
 def test_a_full_queue_makes_the_caller_wait(tmp_path):
     gate = tmp_path / "gate"
     with WriterPool(1, SIZE) as pool:
-        for _ in range(QUEUE):
+        for _ in range(QUEUE_DEPTH):
             pool.submit(wait_for, (np.zeros(4),), (gate,), path=tmp_path)
         threading.Timer(0.1, gate.touch).start()
         pool.submit(wait_for, (np.zeros(4),), (gate,), path=tmp_path)  # Returns when there is room, so not before the gate opens.

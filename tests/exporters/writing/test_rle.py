@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pycocotools import mask as coco
 
-from synpick_warp.exporters.writing.rle import Runs, find_edges
+from synpick_warp.exporters.writing.rle import Runs, find_run_boundaries
 
 SIDE = st.integers(1, 12)
 
@@ -42,7 +42,7 @@ def placed(part: np.ndarray, top: int, left: int, height: int, width: int) -> np
 
 
 def of_mask(mask: object) -> Runs:
-    return find_edges(np.array(mask, np.uint8)).runs_of(1)
+    return find_run_boundaries(np.array(mask, np.uint8)).runs_of(1)
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_known_run_lengths(mask, counts):
 
 @pytest.mark.parametrize("shape", [(0, 3), (3, 0), (0, 0), (2, 3)])
 def test_a_part_without_pixels_has_no_runs(shape):
-    runs = find_edges(np.zeros(shape, np.uint32), 2, 1).runs_with(31)
+    runs = find_run_boundaries(np.zeros(shape, np.uint32), 2, 1).runs_with(31)
     assert runs.counts(4, 5).tolist() == [20]
     assert runs.box() is None
     assert runs.count == 0
@@ -71,7 +71,7 @@ def test_a_part_without_pixels_has_no_runs(shape):
 def test_values_become_runs_and_run_lengths(image, value, data):
     part, top, left, height, width = cut(image, data)
     expected = placed(part, top, left, height, width) == value
-    runs = find_edges(part, top, left).runs_of(value)
+    runs = find_run_boundaries(part, top, left).runs_of(value)
     np.testing.assert_array_equal(painted(runs, height, width), expected)
     counts = runs.counts(height, width).tolist()
     assert sum(counts) == height * width
@@ -90,7 +90,7 @@ def test_values_become_runs_and_run_lengths(image, value, data):
 def test_bits_become_runs(bits, instance, data):
     part, top, left, height, width = cut(bits, data)
     expected = placed((bits >> np.uint32(instance)) & 1 == 1, top, left, height, width)
-    np.testing.assert_array_equal(painted(find_edges(part, top, left).runs_with(instance), height, width), expected)
+    np.testing.assert_array_equal(painted(find_run_boundaries(part, top, left).runs_with(instance), height, width), expected)
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")

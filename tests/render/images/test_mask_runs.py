@@ -11,8 +11,8 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import ShardsExporter
-from synpick_warp.exporters.bop.view import ViewSettings, view_masks, view_task
-from synpick_warp.exporters.writing.rle import find_edges, listed_edges
+from synpick_warp.exporters.bop.view import ViewSettings, extract_masks, make_view_task
+from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.render import mask_runs as edges_module
 from synpick_warp.stages.render.mask_runs import EdgeBuffers, EdgeScratch, edge_sizes, list_edges
@@ -51,7 +51,7 @@ def test_the_device_lists_the_edges_that_numpy_finds(device, shape):
     assert (counts[-1] == -1).all()
     for view in range(2):
         for kind, image in enumerate(images):
-            expected, found = find_edges(image[view]), listed_edges(edges[view, kind, :, : counts[view, kind]], shape[0])
+            expected, found = find_run_boundaries(image[view]), unpack_run_boundaries(edges[view, kind, :, : counts[view, kind]], shape[0])
             for name in ("column", "row", "above", "below"):
                 np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
@@ -77,12 +77,12 @@ def test_masks_are_the_same_from_lists_and_from_images(device):
     for batch in batches(4, (0, 2), 3, LENSES):
         lists = with_edges(batch, device)
         for view in range(len(batch)):
-            (*_, first, second), truth = view_task(lists, view, 0, SETTINGS)
+            (*_, first, second), truth = make_view_task(lists, view, 0, SETTINGS)
             assert truth.listed
             assert first.nbytes < batch.instance[view].nbytes
-            (*_, instance, amodal), plain = view_task(batch, view, 0, SETTINGS)
+            (*_, instance, amodal), plain = make_view_task(batch, view, 0, SETTINGS)
             height = batch.depth.shape[1]
-            pairs = zip(view_masks(first, second, truth, height), view_masks(instance, amodal, plain, height), strict=True)
+            pairs = zip(extract_masks(first, second, truth, height), extract_masks(instance, amodal, plain, height), strict=True)
             for found, expected in pairs:
                 for part in ("whole", "seen"):
                     for name in ("column", "first", "past"):
@@ -91,11 +91,11 @@ def test_masks_are_the_same_from_lists_and_from_images(device):
 
 def test_lists_that_overflowed_or_are_large_are_not_used(device):
     batch = with_edges(next(batches(1, (0,), 1, LENSES)), device)
-    assert view_task(batch, 0, 0, SETTINGS)[1].listed
+    assert make_view_task(batch, 0, 0, SETTINGS)[1].listed
     short = dataclasses.replace(batch, edges=batch.edges[..., : batch.edge_count.max() - 1])
     noise = np.random.default_rng(0).integers(0, 256, batch.instance.shape).astype(np.uint8)
     for other in (short, with_edges(dataclasses.replace(batch, instance=noise), device)):
-        images, truth = view_task(other, 0, 0, SETTINGS)
+        images, truth = make_view_task(other, 0, 0, SETTINGS)
         assert not truth.listed
         assert images[2].dtype == np.uint8
 
@@ -107,8 +107,8 @@ def test_files_are_the_same_from_lists_and_from_images(tmp_path, device, kind):
         with exporting(kind, tmp_path / name, config(), processes=0) as exporter:
             exporter.write_constants()
             for batch in batches(4, (0,), 3, LENSES):
-                exporter.write(change(batch))
-            exporter.end(ends((0,), 3)[0], lambda: None)
+                exporter.write_views(change(batch))
+            exporter.end_episode(ends((0,), 3)[0], lambda: None)
             finish(exporter)
         found.append(digests(tmp_path / name))
     assert found[0] == found[1]

@@ -199,7 +199,7 @@ def test_a_main_lights_shadow_edge_lies_where_geometry_says(device, turn):
     found = light_table(light, None)
     direction = found.main_direction
     assert found.main_irradiance.max() > 0.0
-    lit = shown(device, *things, lights=(light,), view=view, light_turn=turn, config=settings(cell_paths=16))
+    lit = shown(device, *things, lights=(light,), view=view, light_yaw=turn, config=settings(cell_paths=16))
     ground = lit.instance[0] == 1
     rows, columns = np.mgrid[:160, :160]
     x, y = (columns + 0.5 - 80.0) / 200.0, -(rows + 0.5 - 80.0) / 200.0

@@ -107,11 +107,11 @@ def test_each_way_of_drawing_light_has_the_same_mean(device, monkeypatch):
     ]
     radiance = 0.3 * even_light(1.0, 64).radiance + lamp(0.7, np.radians(12.0), 20.0, 64).radiance
     lights = (LightMap("room", radiance),)
-    both = shown(device, *things, lights=lights, config=settings(64), light_turn=0.7).radiance[0]
+    both = shown(device, *things, lights=lights, config=settings(64), light_yaw=0.7).radiance[0]
     noise = {}
     for strategy in (BY_LIGHT, BY_SURFACE):
         monkeypatch.setattr(reference, "BOTH", strategy)
-        alone = shown(device, *things, lights=lights, config=settings(128), light_turn=0.7).radiance[0]
+        alone = shown(device, *things, lights=lights, config=settings(128), light_yaw=0.7).radiance[0]
         np.testing.assert_allclose(alone.mean(axis=(0, 1)), both.mean(axis=(0, 1)), rtol=0.01)
         noise[strategy] = np.abs(alone - both).mean()
     assert noise[BY_LIGHT] < noise[BY_SURFACE]

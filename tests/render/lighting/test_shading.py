@@ -126,7 +126,7 @@ def shadow_scene(direction, turn=0.0, hidden=True):
     """A large sheet and, if anything is to be hidden, a small one 0.1 m above its middle, under a sun."""
     above = [(1, (0.0, 0.0, 0.1, *UPRIGHT))] if hidden else []
     toy = ToyScene([entry(sheet(0.6, 0.4)), entry(sheet(0.08, 0.08))], [[(0, FLAT), *above]], (VIEW,))
-    toy.lights, toy.light_turn, toy.config = (sun(direction),), turn, with_render(cell_paths=32)
+    toy.lights, toy.light_yaw, toy.config = (sun(direction),), turn, with_render(cell_paths=32)
     return toy
 
 
