@@ -20,7 +20,7 @@ MIXED = "mixed"
 
 FAST = "fast"
 REFERENCE = "reference"
-SHADINGS = (FAST, REFERENCE)
+RENDER_MODES = (FAST, REFERENCE)
 """How colour is made."""
 LAYERS = ("normals", "albedo", "nocs", "classes", "flow", "scene_flow", "depth_sensor")
 """What a picture can have besides colour, depth and instances; `synpick_warp.layers` says what each is."""
@@ -293,7 +293,7 @@ class Render:
     """Light and picture."""
 
     mode: str = setting(
-        FAST, "", "fast: few paths and a filter; reference: many paths, slow. Depth, masks and boxes are the same.", choices=SHADINGS
+        FAST, "", "fast: few paths and a filter; reference: many paths, slow. Depth, masks and boxes are the same.", choices=RENDER_MODES
     )
     samples: int = setting(64, "", "Paths a pixel with mode reference; powers of two are spread most evenly.", low=1, high=65536)
     bounces: int = setting(4, "", "Most surfaces that a path meets; 1: direct light alone.", low=1, high=64)

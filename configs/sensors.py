@@ -54,7 +54,7 @@ class Effects:
     jpeg_quality: tuple[int, int] = setting((0, 0), "", "Least and largest JPEG quality; 0, 0: bop.jpeg_quality.", low=0, high=100)
 
 
-def strength_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
+def effect_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
     """Least and largest strength of every effect, in the order of `Effect`; 0, 0: off."""
     exposure, balance = effects.exposure_jitter, effects.white_balance_jitter
     return {

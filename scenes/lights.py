@@ -10,8 +10,9 @@ import numpy as np
 
 from synpick_warp.errors import LightError
 from synpick_warp.scenes.appearance import srgb_to_linear
-from synpick_warp.scenes.embedded.skies import directions, skies
-from synpick_warp.scenes.types import LightMap, Sun
+from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.scenes.environment import map_directions
+from synpick_warp.scenes.types import EnvironmentMap, Sun
 
 MAX_HEIGHT = 512
 """Maps with more rows are reduced to this many: half the map's 0.35° is finer than any shading here resolves."""
@@ -25,7 +26,7 @@ MAX_SUN_GAIN = 1e6
 """Largest SUNmulti; no sun outshines its sky by more."""
 
 
-def load_lights(folder: str) -> tuple[LightMap, ...]:
+def load_lights(folder: str) -> tuple[EnvironmentMap, ...]:
     """All light maps of a folder and its direct subfolders, sorted by name.
 
     A folder that holds an .ibl file is an sIBL set (hdrlabs.com/sibl): its reflection map and its sun count, its other maps do not.
@@ -55,16 +56,16 @@ def load_lights(folder: str) -> tuple[LightMap, ...]:
     return tuple(sorted(maps, key=lambda light: light.name))
 
 
-def _read_place(place: Path) -> list[LightMap]:
+def _read_place(place: Path) -> list[EnvironmentMap]:
     """The maps that lie directly in a folder."""
     files = sorted(path for path in place.iterdir() if path.is_file())
     sets = [path for path in files if path.suffix.lower() == ".ibl"]
     if sets:
         return [_read_set(path) for path in sets]
-    return [LightMap(path.stem, _finish(_read_image(path, gamma=1.0), path)) for path in files if path.suffix.lower() == ".hdr"]
+    return [EnvironmentMap(path.stem, _finish(_read_image(path, gamma=1.0), path)) for path in files if path.suffix.lower() == ".hdr"]
 
 
-def _read_set(path: Path) -> LightMap:
+def _read_set(path: Path) -> EnvironmentMap:
     """The reflection map of an sIBL set, times its REFmulti, and its sun. Set files are INI; notes in them begin with two dashes.
 
     The reflection map serves for everything, diffuse light and background as well: the environment map is a blurred copy of it.
@@ -91,7 +92,7 @@ def _read_set(path: Path) -> LightMap:
         image = image * np.float32(gain)
     sun = _read_sun(parser, path)
     radiance = _finish(image, picture)
-    return LightMap(path.stem, radiance, sun if sun is not None and _shines(radiance, sun.direction) else None)
+    return EnvironmentMap(path.stem, radiance, sun if sun is not None and _shines(radiance, sun.direction) else None)
 
 
 def _read_sun(parser: configparser.ConfigParser, path: Path) -> Sun | None:
@@ -138,7 +139,7 @@ def _shines(radiance: np.ndarray, direction: np.ndarray) -> bool:
     """
     height = min(radiance.shape[0], SUN_ROWS)
     bright = cv2.resize(radiance, (2 * height, height), interpolation=cv2.INTER_AREA).sum(axis=2)
-    cosine = directions(height) @ direction
+    cosine = map_directions(height)[0] @ direction
     # In coarse maps even the nearest texel may lie farther away than the angle.
     near = cosine >= min(np.cos(np.radians(SUN_ANGLE)), cosine.max())
     return bool(bright[near].max() >= SUN_BRIGHTNESS * bright.max())

@@ -140,7 +140,7 @@ class Sun:
 
 
 @dataclass(frozen=True, eq=False)
-class LightMap:
+class EnvironmentMap:
     """An equirectangular environment. Row 0 looks up (+z); azimuth atan2(y, x) lies at column share u = azimuth / 2π + 0.5."""
 
     name: str

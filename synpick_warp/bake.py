@@ -31,10 +31,9 @@ from synpick_warp.progress import Progress
 from synpick_warp.scenes import build
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
+from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.tote import tote_fixture
-from synpick_warp.scenes.types import Camera, Catalog, LightMap
+from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.perception.arrays import Plan, Sighting
 from synpick_warp.stages.perception.plan import CycleArrays, VoteArrays, plan_sizes
@@ -60,7 +59,7 @@ class Factory:
 
     catalog: Catalog
     cameras: tuple[Camera, ...]
-    lights: tuple[LightMap, ...]
+    lights: tuple[EnvironmentMap, ...]
     simulation: Simulation
     stream: FrameStream
     log: AttemptLog
@@ -82,7 +81,7 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
     config = with_enough_worlds(config, device)
     progress.stage("loading objects and lights")
     cameras = make_cameras(config.cameras)
-    fixtures = (tote_fixture(config.tote), finger_fixture(config.gripper), cup_fixture(config.gripper))
+    fixtures = make_fixtures(config.tote, config.gripper)
     catalog = load_catalog(config, report=progress.note)
     lights = load_lights(config.bake.lights)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")

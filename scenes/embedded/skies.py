@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from synpick_warp.scenes.types import LightMap
+from synpick_warp.scenes.environment import map_directions
+from synpick_warp.scenes.types import EnvironmentMap
 
 HEIGHT = 128
 """Rows of an embedded map; it has twice as many columns."""
@@ -12,17 +13,9 @@ HEIGHT = 128
 Rgb = tuple[float, float, float]
 
 
-def directions(height: int) -> np.ndarray:
-    """Unit vectors (height, 2 * height, 3) of an equirectangular map's pixels: row 0 is up, column u is azimuth / 2π + 0.5."""
-    polar = (np.arange(height) + 0.5) / height * np.pi
-    azimuth = ((np.arange(2 * height) + 0.5) / (2 * height) - 0.5) * 2 * np.pi
-    sine = np.sin(polar)[:, None]
-    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), np.broadcast_to(np.cos(polar)[:, None], (height, 2 * height))], axis=2)
-
-
-def skies() -> tuple[LightMap, ...]:
+def skies() -> tuple[EnvironmentMap, ...]:
     """The embedded light maps, sorted by name; always the same."""
-    view = directions(HEIGHT)
+    view, _ = map_directions(HEIGHT)
     makers = {
         "low_sun": _low_sun,
         "mixed_lamps": _mixed_lamps,
@@ -31,7 +24,7 @@ def skies() -> tuple[LightMap, ...]:
         "warehouse": _warehouse,
         "window": _window,
     }
-    return tuple(LightMap(name, np.maximum(make(view), 0.0).astype(np.float32)) for name, make in sorted(makers.items()))
+    return tuple(EnvironmentMap(name, np.maximum(make(view), 0.0).astype(np.float32)) for name, make in sorted(makers.items()))
 
 
 def _overcast(view: np.ndarray) -> np.ndarray:

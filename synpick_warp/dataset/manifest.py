@@ -25,7 +25,7 @@ from synpick_warp import __version__
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import MANIFEST_FILE
-from synpick_warp.scenes.types import Catalog, LightMap
+from synpick_warp.scenes.types import Catalog, EnvironmentMap
 
 RECORDS = Path("manifest")
 """Folder of the records, in the data set."""
@@ -79,7 +79,7 @@ def binding_settings(config: Config) -> dict[str, Any]:
     return settings
 
 
-def digest_inputs(catalog: Catalog, lights: tuple[LightMap, ...]) -> dict[str, str]:
+def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> dict[str, str]:
     """Checksums of all that is in objects and lights, but for the names of their files: the manifest's INPUTS."""
     return {"objects": _digest_data(catalog), "lights": _digest_data(lights)}
 

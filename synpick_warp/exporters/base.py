@@ -10,7 +10,7 @@ from typing import ClassVar, Protocol
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.writing.pool import WriterPool, shared_bytes
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
-from synpick_warp.scenes.types import Camera, Catalog, LightMap
+from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 
 PIXEL_BYTES = (3, 2, 1, 4)
 """Of `FrameBatch`'s color, depth, instance and amodal."""
@@ -27,7 +27,7 @@ class ExportContext:
     config: Config
     catalog: Catalog
     cameras: tuple[Camera, ...]
-    lights: tuple[LightMap, ...]
+    lights: tuple[EnvironmentMap, ...]
     pool: WriterPool
     """Writes all files of episodes. An exporter neither closes nor aborts it."""
 

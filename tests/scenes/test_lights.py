@@ -8,7 +8,8 @@ import pytest
 
 from synpick_warp.errors import LightError
 from synpick_warp.scenes import lights
-from synpick_warp.scenes.embedded.skies import HEIGHT, directions, skies
+from synpick_warp.scenes.embedded.skies import HEIGHT, skies
+from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.lights import load_lights
 
 IBL = """[Header]
@@ -54,7 +55,7 @@ def refused(folder, *words):
 
 
 def test_directions_follow_the_convention():
-    view = directions(64)
+    view = map_directions(64)[0]
     assert np.allclose(np.linalg.norm(view, axis=2), 1)
     assert view[0, :, 2].min() > 0.99
     assert view[-1, :, 2].max() < -0.99
@@ -87,7 +88,7 @@ def test_embedded_skies_are_light_from_above():
 def test_the_low_sun_stands_where_it_is_put():
     sun = next(light for light in skies() if light.name == "low_sun")
     row, column = np.unravel_index(sun.radiance.sum(axis=2).argmax(), sun.radiance.shape[:2])
-    x, y, z = directions(HEIGHT)[row, column]
+    x, y, z = map_directions(HEIGHT)[0][row, column]
     assert np.degrees(np.arctan2(y, x)) == pytest.approx(35, abs=2)
     assert np.degrees(np.arcsin(z)) == pytest.approx(22, abs=2)
 
@@ -109,7 +110,7 @@ def test_a_file_keeps_its_colours_and_up_and_turns_right_to_negative_azimuth(tmp
     row, column = np.unravel_index(light.radiance[..., 0].argmax(), (8, 16))
     assert np.allclose(light.radiance[row, column], (64, 32, 8), rtol=0.01)
     assert (row, column) == (4, 4)
-    x, y, z = directions(8)[row, column]
+    x, y, z = map_directions(8)[0][row, column]
     assert x > 0
     assert y < 0
     assert z < 0

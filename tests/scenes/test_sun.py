@@ -10,21 +10,10 @@ from hypothesis import strategies as st
 
 from synpick_warp.errors import LightError
 from synpick_warp.scenes.appearance import srgb_to_linear
-from synpick_warp.scenes.embedded.skies import directions
+from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.sun import (
-    BACKGROUND_ROWS,
-    LUMINANCE,
-    MAIN_LIGHT_SPREAD,
-    SUN_SPREAD,
-    WHITE_VALUE,
-    map_directions,
-    replace_sun,
-    resized,
-    split_main_light,
-    sun_disc,
-)
-from synpick_warp.scenes.types import LightMap, Sun
+from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS, SOLAR_ANGULAR_RADIUS, draw_sun_disc, extract_sun, replace_sun
+from synpick_warp.scenes.types import EnvironmentMap, Sun
 from synpick_warp.stages.render.light_tables import harmonics, light_table
 from tests.worlds import toy_scene
 
@@ -38,7 +27,7 @@ def bright_picture(u: float, v: float, value: float = 200.0) -> np.ndarray:
     return image
 
 
-def loaded(folder, lines: str, image: np.ndarray) -> LightMap:
+def loaded(folder, lines: str, image: np.ndarray) -> EnvironmentMap:
     """A set with these lines in its section Sun, as `load_lights` has it."""
     assert cv2.imwrite(str(folder / "ref.hdr"), image[..., ::-1].copy())
     (folder / "room.ibl").write_text(f'[Reflection]\nREFfile = "ref.hdr"\n[Sun]\n{lines}')
@@ -70,7 +59,7 @@ def test_a_set_and_its_map_agree_where_the_sun_is(u, v, tmp_path_factory):
     brightest = np.unravel_index(light.radiance.sum(axis=2).argmax(), light.radiance.shape[:2])
     assert light.sun is not None
     # Half a texel's diagonal.
-    assert directions(ROWS)[brightest] @ light.sun.direction >= np.cos(np.pi / ROWS / np.sqrt(2.0)) - 1e-6
+    assert map_directions(ROWS)[0][brightest] @ light.sun.direction >= np.cos(np.pi / ROWS / np.sqrt(2.0)) - 1e-6
 
 
 def test_colour_is_srgb_and_multi_makes_a_white_sheet_that_bright(tmp_path):
@@ -148,11 +137,11 @@ def test_the_real_set(real_lights):
     assert light.name == "Kiara_Dawn"
     assert light.sun is not None
     brightest = np.unravel_index((light.radiance @ LUMINANCE).argmax(), light.radiance.shape[:2])
-    assert light.sun.direction @ directions(512)[brightest] > np.cos(np.radians(3.0))
+    assert light.sun.direction @ map_directions(512)[0][brightest] > np.cos(np.radians(3.0))
     np.testing.assert_allclose(light.sun.irradiance / np.pi, 1.5 * srgb_to_linear(np.array((255, 214, 170)) / 255))
-    table, alone = light_table(light, None), light_table(LightMap("kiara", light.radiance), None)
+    table, alone = light_table(light, None), light_table(EnvironmentMap("kiara", light.radiance), None)
     # The glow around it is wide: no main light, all stays in the map, and facing it is as bright as the set says.
-    assert table.main_spread > MAIN_LIGHT_SPREAD
+    assert table.main_spread > MAX_SUN_ANGULAR_RADIUS
     assert not table.main_irradiance.any()
     assert table.rest.tobytes() == table.background.tobytes()
     rest = replace_sun(alone.background.astype(np.float64), light.sun)[0]
@@ -178,11 +167,11 @@ SUN = Sun(np.array([0.48, -0.64, 0.6]), np.array([30.0, 20.0, 10.0]))
 
 def test_a_plane_that_faces_the_sun_gets_the_sun_and_the_rest_alone():
     """The clipped disc is gone from diffuse light, reflections and background; the sun stands there instead."""
-    light = LightMap("set", clipped(SUN.direction), SUN)
+    light = EnvironmentMap("set", clipped(SUN.direction), SUN)
     table = light_table(light, None)
     np.testing.assert_allclose(table.main_direction, SUN.direction, rtol=1e-6)
     np.testing.assert_allclose(table.main_irradiance, SUN.irradiance, rtol=1e-6)
-    rest, _, taken, _ = split_main_light(light.radiance.astype(np.float64))
+    rest, _, taken, _ = extract_sun(light.radiance.astype(np.float64))
     assert taken.min() > 0.1
     np.testing.assert_allclose(harmonics(SUN.direction) @ table.irradiance, facing(rest, SUN.direction), rtol=0.03)
     total = harmonics(SUN.direction) @ table.irradiance + table.main_irradiance
@@ -192,7 +181,7 @@ def test_a_plane_that_faces_the_sun_gets_the_sun_and_the_rest_alone():
 
 
 def test_exposure_and_table_know_the_sun():
-    light = LightMap("set", clipped(SUN.direction), SUN)
+    light = EnvironmentMap("set", clipped(SUN.direction), SUN)
     upward = facing(light_table(light, None).background, np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(light_table(light, None).exposure, WHITE_VALUE * np.pi / (upward @ LUMINANCE), rtol=0.01)
     # From below comes what the table sends back; a downward plane sees nothing else.
@@ -203,25 +192,25 @@ def test_exposure_and_table_know_the_sun():
 
 def test_a_map_that_holds_its_sun_whole_keeps_its_light():
     weak = Sun(SUN.direction, SUN.irradiance * 1e-4)
-    light = LightMap("set", clipped(SUN.direction, value=4000.0), weak)
-    taken = split_main_light(resized(light.radiance, BACKGROUND_ROWS))[2]
+    light = EnvironmentMap("set", clipped(SUN.direction, value=4000.0), weak)
+    taken = extract_sun(resize_map(light.radiance, BACKGROUND_ROWS))[2]
     table = light_table(light, None)
     np.testing.assert_allclose(table.main_irradiance @ LUMINANCE, taken @ LUMINANCE, rtol=1e-4)
     np.testing.assert_allclose(table.main_irradiance / table.main_irradiance[0], weak.irradiance / weak.irradiance[0], rtol=1e-5)
 
 
 def test_a_sun_over_an_even_map_is_as_wide_as_the_sun():
-    table = light_table(LightMap("set", np.ones((64, 128, 3), np.float32), SUN), None)
-    assert table.main_spread == pytest.approx(SUN_SPREAD)
+    table = light_table(EnvironmentMap("set", np.ones((64, 128, 3), np.float32), SUN), None)
+    assert table.main_spread == pytest.approx(SOLAR_ANGULAR_RADIUS)
     np.testing.assert_allclose(harmonics(SUN.direction) @ table.irradiance, np.pi, rtol=1e-3)
-    assert 0.05 < light_table(LightMap("set", clipped(SUN.direction), SUN), None).main_spread < 0.09
+    assert 0.05 < light_table(EnvironmentMap("set", clipped(SUN.direction), SUN), None).main_spread < 0.09
 
 
 @given(z=st.floats(1e-3, 1.0), azimuth=st.floats(-np.pi, np.pi), spread=st.floats(0.0, 0.5))
 def test_a_disc_gives_its_irradiance_and_stays_above_the_horizon(z, azimuth, spread):
     across = np.sqrt(1.0 - z * z)
     direction = np.array([across * np.cos(azimuth), across * np.sin(azimuth), z])
-    disc = sun_disc(np.zeros((ROWS, 2 * ROWS), bool), direction, SUN.irradiance, spread)
+    disc = draw_sun_disc(np.zeros((ROWS, 2 * ROWS), bool), direction, SUN.irradiance, spread)
     np.testing.assert_allclose(facing(disc, direction), SUN.irradiance)
     assert not disc[ROWS // 2 :].any()
     towards = map_directions(ROWS)[0][disc[..., 0] > 0.0] @ direction
@@ -232,18 +221,18 @@ def test_hills_hide_their_part_of_the_disc():
     """The half of the map on the +y side is dark: all light comes from the other, and as much as before."""
     direction = np.array([0.8, 0.0, 0.6])
     bright = map_directions(ROWS)[0][..., 1] < 0.0
-    disc = sun_disc(bright, direction, SUN.irradiance, 0.2)
+    disc = draw_sun_disc(bright, direction, SUN.irradiance, 0.2)
     np.testing.assert_allclose(facing(disc, direction), SUN.irradiance)
     assert not disc[~bright].any()
-    whole = sun_disc(np.ones_like(bright), direction, SUN.irradiance, 0.2)
+    whole = draw_sun_disc(np.ones_like(bright), direction, SUN.irradiance, 0.2)
     assert (disc[..., 0] > 0.0).sum() == (whole[..., 0] > 0.0).sum() / 2
     # A sun wholly behind them is believed all the same.
-    np.testing.assert_allclose(sun_disc(np.zeros_like(bright), direction, SUN.irradiance, 0.2), whole)
+    np.testing.assert_allclose(draw_sun_disc(np.zeros_like(bright), direction, SUN.irradiance, 0.2), whole)
 
 
 def test_maps_without_a_sun_are_as_before():
-    light = LightMap("map", clipped(SUN.direction))
-    rest, direction, irradiance, _ = split_main_light(resized(light.radiance, BACKGROUND_ROWS))
+    light = EnvironmentMap("map", clipped(SUN.direction))
+    rest, direction, irradiance, _ = extract_sun(resize_map(light.radiance, BACKGROUND_ROWS))
     table = light_table(light, None)
     np.testing.assert_allclose(table.main_direction, direction, rtol=1e-6)
     np.testing.assert_allclose(table.main_irradiance, irradiance, rtol=1e-6)
@@ -258,7 +247,7 @@ def test_the_sets_sun_throws_the_shadow_in_its_colour(device):
     flat, above = (0.0, 0.0, 0.0, *toy_scene.UPRIGHT), (0.0, 0.0, 0.1, *toy_scene.UPRIGHT)
     entries = [toy_scene.entry(toy_scene.sheet(0.6, 0.4)), toy_scene.entry(toy_scene.sheet(0.04, 0.04))]
     sun = Sun(np.array([1.0, 0.0, 1.0]) / np.sqrt(2.0), np.array([4.0, 0.0, 0.0]))
-    lights = (LightMap("set", np.ones((64, 128, 3), np.float32), sun),)
+    lights = (EnvironmentMap("set", np.ones((64, 128, 3), np.float32), sun),)
     lit = toy_scene.render(toy_scene.ToyScene(entries, [[(0, flat), (1, above)]], (view,), lights=lights), device).radiance[0]
     assert lit[24, 22, 0] < 0.7 * lit[24, 42, 0]
     np.testing.assert_allclose(lit[24, 22, 1:], lit[24, 42, 1:], rtol=0.1)

@@ -6,9 +6,8 @@ from typing import Any
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
+from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.simulate import Simulation
@@ -28,7 +27,7 @@ SHORT = {
 
 def render_scene(config: Config, objects: Catalog, device: Any) -> RenderScene:
     """The scene of a bake, under one light."""
-    fixtures = (tote_fixture(config.tote), finger_fixture(config.gripper), cup_fixture(config.gripper))
+    fixtures = make_fixtures(config.tote, config.gripper)
     return build_render_scene(config, objects, fixtures, make_cameras(config.cameras), load_lights("")[:LIGHTS], device)
 
 

@@ -10,7 +10,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config
-from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Fixture, LightMap, Material, TriangleMesh
+from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Fixture, Material, TriangleMesh
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
@@ -90,18 +90,18 @@ def camera(width: int, height: int, focal: float, center: tuple[float, float, fl
     return Camera(width, height, matrix, rotation, -rotation @ np.asarray(center, dtype=np.float64))
 
 
-def even_light(radiance: float = 1.0, rows: int = 16) -> LightMap:
+def even_light(radiance: float = 1.0, rows: int = 16) -> EnvironmentMap:
     """The same white light from everywhere."""
-    return LightMap("even", np.full((rows, 2 * rows, 3), radiance, np.float32))
+    return EnvironmentMap("even", np.full((rows, 2 * rows, 3), radiance, np.float32))
 
 
-def sun(direction: tuple[float, float, float], sky: float = 0.3, strength: float = 2000.0, rows: int = 128) -> LightMap:
+def sun(direction: tuple[float, float, float], sky: float = 0.3, strength: float = 2000.0, rows: int = 128) -> EnvironmentMap:
     """An even sky with one bright texel."""
     x, y, z = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     radiance = np.full((rows, 2 * rows, 3), sky, np.float32)
     column = int((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * 2 * rows) % (2 * rows)
     radiance[min(int(np.arccos(z) / np.pi * rows), rows - 1), column] = strength
-    return LightMap("sun", radiance)
+    return EnvironmentMap("sun", radiance)
 
 
 @dataclass
@@ -112,7 +112,7 @@ class ToyScene:
     placed: list[list[tuple[int, tuple[float, ...]]]]
     """For every world, (entry, pose) of its instances."""
     cameras: tuple[Camera, ...]
-    lights: tuple[LightMap, ...] = (even_light(),)
+    lights: tuple[EnvironmentMap, ...] = (even_light(),)
     fixtures: tuple[Fixture, Fixture, Fixture] = (Fixture(box(1, 1, 0.1), GREY),) + (Fixture(box(0.1, 0.1, 0.1), GREY),) * 2
     fixture_poses: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, *UPRIGHT),) * 3
     fixtures_visible: tuple[int, int, int] = (0, 0, 0)

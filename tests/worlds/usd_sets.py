@@ -18,7 +18,7 @@ from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, TickBatch
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.embedded.skies import skies
-from synpick_warp.scenes.types import Catalog, LightMap, Material
+from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
 
 FRAMES = 70
 """More than are kept in memory at once."""
@@ -85,7 +85,7 @@ def write_set(
     config: Config,
     catalog: Catalog,
     episodes: Iterable[int] = (0,),
-    lights: tuple[LightMap, ...] | None = None,
+    lights: tuple[EnvironmentMap, ...] | None = None,
     frames: int = FRAMES,
 ) -> Path:
     """A finished data set, written in this process; returns the folder of its USD files."""

@@ -18,8 +18,7 @@ from synpick_warp.arrays import allocate
 from synpick_warp.bake import Factory
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Config
-from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
-from synpick_warp.scenes.tote import tote_fixture
+from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot
 from synpick_warp.stages.render.layers import LayerPainter
@@ -217,7 +216,7 @@ def measure_sensor(config: Config, factory: Factory, least: float) -> Iterator[R
     device, snapshot = simulation.device, simulation.records[0].snapshot
     count = min(factory.stream.batch, simulation.layout.worlds * len(factory.cameras))
     started = time.perf_counter()
-    fixtures = (tote_fixture(config.tote), finger_fixture(config.gripper), cup_fixture(config.gripper))
+    fixtures = make_fixtures(config.tote, config.gripper)
     table = float(renderer.scene.table.height)
     scene = build_sensor_scene(config, factory.catalog, fixtures, factory.cameras, table, snapshot, count, device)
     wp.synchronize_device(device)

@@ -28,9 +28,8 @@ from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
+from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
@@ -188,7 +187,7 @@ def compare_devices(config: Config, devices: list[Any], console: Console) -> lis
     lights = load_lights(config.bake.lights)
     snapshot = following(settled(config, catalog, len(lights), devices[0]), CREEP)
     cameras = make_cameras(config.cameras)
-    fixtures = (tote_fixture(config.tote), finger_fixture(config.gripper), cup_fixture(config.gripper))
+    fixtures = make_fixtures(config.tote, config.gripper)
     differences = []
     for mode in (FAST, REFERENCE):
         kind = with_mode(config, mode)

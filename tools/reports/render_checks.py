@@ -13,10 +13,9 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.scenes.gripper import cup_fixture, finger_fixture
-from synpick_warp.scenes.sun import map_directions
-from synpick_warp.scenes.tote import tote_fixture
-from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, LightMap, Material, TriangleMesh
+from synpick_warp.scenes.environment import map_directions
+from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Material, TriangleMesh
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
@@ -59,8 +58,10 @@ class Shot:
 class Studio:
     """A scene and a renderer for one view at a time."""
 
-    def __init__(self, config: Config, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[LightMap, ...], device: Any) -> None:
-        fixtures = (tote_fixture(config.tote), finger_fixture(config.gripper), cup_fixture(config.gripper))
+    def __init__(
+        self, config: Config, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...], device: Any
+    ) -> None:
+        fixtures = make_fixtures(config.tote, config.gripper)
         scene = build_render_scene(config, catalog, fixtures, cameras, lights, device)
         self.device = device
         self.renderer = Renderer(config, scene, config.arrangement.max_objects, 1)
@@ -142,20 +143,20 @@ def planes(config: Config, device: Any) -> list[Row]:
     return rows
 
 
-def _even() -> LightMap:
-    return LightMap("even", np.ones((16, 32, 3), np.float32))
+def _even() -> EnvironmentMap:
+    return EnvironmentMap("even", np.ones((16, 32, 3), np.float32))
 
 
-def _lamp(cosine: float) -> LightMap:
+def _lamp(cosine: float) -> EnvironmentMap:
     """A disc of radiance 1, its edge one texel soft, in a black map."""
     directions, _ = map_directions(LAMP_ROWS)
     angle = np.arccos(np.clip(directions @ np.array([np.sqrt(1.0 - cosine**2), 0.0, cosine]), -1.0, 1.0))
     share = np.clip((LAMP_RADIUS - angle) / (np.pi / LAMP_ROWS) + 0.5, 0.0, 1.0)
-    return LightMap("lamp", np.repeat(share[..., None], 3, axis=2).astype(np.float32))
+    return EnvironmentMap("lamp", np.repeat(share[..., None], 3, axis=2).astype(np.float32))
 
 
 def _bare_studio(
-    config: Config, mesh: TriangleMesh, kinds: list[tuple[float, float]], cameras: tuple[Camera, ...], light: LightMap, device: Any
+    config: Config, mesh: TriangleMesh, kinds: list[tuple[float, float]], cameras: tuple[Camera, ...], light: EnvironmentMap, device: Any
 ) -> Studio:
     """A studio for a white mesh, one catalog entry for each (metallic, roughness), with nothing around."""
     config = replace(config, render=replace(config.render, table=False))

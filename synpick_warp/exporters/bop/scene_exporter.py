@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import strength_ranges
+from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.exporters.base import ExportContext, view_bytes
 from synpick_warp.exporters.bop.models import write_constants
 from synpick_warp.exporters.bop.scene import drop_scenes
@@ -58,7 +58,7 @@ class SceneExporter(ABC):
         self._split = self._out / self.split(context.config)
         self._suffix = f".{config.color_format}"
         self._layers = context.config.render.layers
-        effects = tuple(name for name, strengths in strength_ranges(context.config.effects).items() if any(strengths))
+        effects = tuple(name for name, strengths in effect_ranges(context.config.effects).items() if any(strengths))
         self._views = tuple(
             ViewSettings(self._suffix, config.jpeg_quality, effects, config.masks, config.coco, shared_record(camera, config.depth_scale))
             for camera in context.cameras

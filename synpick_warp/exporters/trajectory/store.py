@@ -13,7 +13,7 @@ from zarr.codecs import ZstdCodec
 
 from synpick_warp.configs.schema import Config, Trajectory
 from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANTS, EPISODES, FORMAT, LABELS, OBJECTS, GroupDoc, Quantity
-from synpick_warp.scenes.types import Camera, Catalog, LightMap
+from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 
 # The writers are the parallelism.
 zarr.config.set({"async.concurrency": 1, "threading.max_workers": 1})
@@ -77,7 +77,9 @@ def shard_rows(settings: Trajectory, ticks: int, rows_per_tick: int) -> tuple[in
     return chunk, chunks * chunk
 
 
-def write_constants(store: Path, config: Config, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[LightMap, ...]) -> list[Path]:
+def write_constants(
+    store: Path, config: Config, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...]
+) -> list[Path]:
     """Write what all episodes share, in place of what is there of it.
 
     Args:

@@ -27,13 +27,13 @@ from synpick_warp.exporters.usd.parts import (
 )
 from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture, rod_inertia
 from synpick_warp.scenes.tote import TABLE_SIZE, tote_colliders, tote_fixture
-from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, Fixture, LightMap, Material, TriangleMesh
+from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
 
 TABLE_ROUGHNESS = 0.8
 """The table is matt, as in the pictures."""
 
 
-def write_library(library: Path, config: Config, catalog: Catalog, lights: tuple[LightMap, ...]) -> None:
+def write_library(library: Path, config: Config, catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> None:
     """Write all assets into an existing folder, in place of what may be there.
 
     Raises:

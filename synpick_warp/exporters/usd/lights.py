@@ -9,18 +9,9 @@ import cv2
 import numpy as np
 
 from synpick_warp.exporters.usd.exr import encode_exr
-from synpick_warp.scenes.sun import (
-    BACKGROUND_ROWS,
-    LUMINANCE,
-    MAIN_LIGHT_SPREAD,
-    WHITE_VALUE,
-    light_share,
-    map_directions,
-    replace_sun,
-    resized,
-    sun_disc,
-)
-from synpick_warp.scenes.types import LightMap
+from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
+from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS, draw_sun_disc, replace_sun, sun_fraction
+from synpick_warp.scenes.types import EnvironmentMap
 
 
 @dataclass(frozen=True)
@@ -47,7 +38,7 @@ def light_file(index: int) -> str:
     return f"lights/light_{index:03d}.exr"
 
 
-def stage_light(index: int, light: LightMap, exposure: float) -> StageLight:
+def stage_light(index: int, light: EnvironmentMap, exposure: float) -> StageLight:
     """What a stage needs to know of a light map.
 
     Args:
@@ -71,7 +62,7 @@ def stage_light(index: int, light: LightMap, exposure: float) -> StageLight:
     return StageLight(light.name, light_file(index), float(factor), float(azimuth), float(polar), sun, angle)
 
 
-def write_light_maps(library: Path, lights: tuple[LightMap, ...]) -> None:
+def write_light_maps(library: Path, lights: tuple[EnvironmentMap, ...]) -> None:
     """Write all maps into the asset library; `lights/` must exist.
 
     As in OpenEXR, longitude grows to the left as seen in the picture, and is 0 in its middle: it is the azimuth here.
@@ -81,7 +72,7 @@ def write_light_maps(library: Path, lights: tuple[LightMap, ...]) -> None:
         (library / light_file(index)).write_bytes(encode_exr(picture))
 
 
-def part_sun(light: LightMap) -> tuple[np.ndarray, np.ndarray, float]:
+def part_sun(light: EnvironmentMap) -> tuple[np.ndarray, np.ndarray, float]:
     """Part a map and its sun so that no light counts twice, by the rule of the pictures.
 
     The sun has the set's colour, and the set's luminance or that of the bright place for which it stands, whichever is more.
@@ -94,14 +85,14 @@ def part_sun(light: LightMap) -> tuple[np.ndarray, np.ndarray, float]:
     if sun is None:
         return light.radiance, np.zeros(3), 0.0
     radiance = light.radiance.astype(np.float64)
-    coarse = resized(radiance, BACKGROUND_ROWS)
+    coarse = resize_map(radiance, BACKGROUND_ROWS)
     _, direction, irradiance, spread = replace_sun(coarse, sun)
     # The same share of all texels for which one of the coarse map stands: so the same light is taken.
-    share = light_share(coarse, direction).astype(np.float32)
+    share = sun_fraction(coarse, direction).astype(np.float32)
     rows = len(radiance)
     method = cv2.INTER_AREA if rows <= BACKGROUND_ROWS else cv2.INTER_NEAREST
     fine = cv2.resize(share, (2 * rows, rows), interpolation=method).astype(np.float64)
     rest = radiance * (1.0 - fine)[..., None]
-    if spread > MAIN_LIGHT_SPREAD:
-        return rest + sun_disc(fine > 0.0, direction, irradiance, spread), np.zeros(3), spread
+    if spread > MAX_SUN_ANGULAR_RADIUS:
+        return rest + draw_sun_disc(fine > 0.0, direction, irradiance, spread), np.zeros(3), spread
     return rest, irradiance, spread

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.sampling import Chances
-from synpick_warp.scenes.sun import LUMINANCE, map_directions
+from synpick_warp.scenes.environment import LUMINANCE, map_directions
 
 LOW_SHARE = 0.15
 """How much light from the horizon counts; light from the zenith counts 1 more."""

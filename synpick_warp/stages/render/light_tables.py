@@ -7,18 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from synpick_warp.kernels.render.lighting.environment import REFLECTION_LEVELS
-from synpick_warp.scenes.sun import (
-    BACKGROUND_ROWS,
-    LUMINANCE,
-    MAIN_LIGHT_SPREAD,
-    WHITE_VALUE,
-    map_directions,
-    replace_sun,
-    resized,
-    split_main_light,
-    sun_disc,
-)
-from synpick_warp.scenes.types import LightMap
+from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
+from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS, draw_sun_disc, extract_sun, replace_sun
+from synpick_warp.scenes.types import EnvironmentMap
 
 REFLECTION_ROWS = 32
 """Rows of the blurred reflections: the sharpest lobe kept is wider than a texel of 5.6°."""
@@ -91,19 +82,19 @@ def blurred_reflections(radiance: np.ndarray) -> np.ndarray:
     return np.maximum(np.stack(levels), 0.0)
 
 
-def light_table(light: LightMap, ground: np.ndarray | None) -> LightTable:
+def light_table(light: EnvironmentMap, ground: np.ndarray | None) -> LightTable:
     """Analyse one light map.
 
     Args:
         light: The map.
         ground: Linear albedo (3) of the table, which takes the place of the map below the horizon; None: no table.
     """
-    background = resized(light.radiance, BACKGROUND_ROWS)
+    background = resize_map(light.radiance, BACKGROUND_ROWS)
     directions, solid = map_directions(BACKGROUND_ROWS)
-    rest, direction, irradiance, spread = split_main_light(background) if light.sun is None else replace_sun(background, light.sun)
+    rest, direction, irradiance, spread = extract_sun(background) if light.sun is None else replace_sun(background, light.sun)
     if light.sun is not None:
-        background = rest + sun_disc((rest < background).any(axis=2), direction, irradiance, spread)
-    if spread > MAIN_LIGHT_SPREAD:
+        background = rest + draw_sun_disc((rest < background).any(axis=2), direction, irradiance, spread)
+    if spread > MAX_SUN_ANGULAR_RADIUS:
         rest, irradiance = background, np.zeros(3)
     upward = np.maximum(directions[..., 2], 0.0) * solid
     upward_irradiance = (background * upward[..., None]).sum(axis=(0, 1))
@@ -114,7 +105,7 @@ def light_table(light: LightMap, ground: np.ndarray | None) -> LightTable:
     return LightTable(
         background=background.astype(np.float32),
         rest=rest.astype(np.float32),
-        reflection=blurred_reflections(resized(even, REFLECTION_ROWS)).astype(np.float32),
+        reflection=blurred_reflections(resize_map(even, REFLECTION_ROWS)).astype(np.float32),
         irradiance=coefficients.astype(np.float32),
         main_direction=direction.astype(np.float32),
         main_irradiance=irradiance.astype(np.float32),

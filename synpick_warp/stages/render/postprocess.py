@@ -10,7 +10,7 @@ import warp as wp
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.codes import Tone
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import strength_ranges
+from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.kernels.render.images.antialias import Picture
 from synpick_warp.kernels.render.images.camera_effects import EffectRules, Strengths, draw_effects_kernel
 from synpick_warp.kernels.render.images.postprocess import DevelopRules, develop_effects_kernel, develop_kernel, spread_rows_kernel
@@ -30,7 +30,7 @@ class SpreadArrays:
 
 def has_effects(config: Config) -> bool:
     """Whether the settings ask for any effect."""
-    return any(any(strengths) for strengths in strength_ranges(config.effects).values())
+    return any(any(strengths) for strengths in effect_ranges(config.effects).values())
 
 
 def has_spread(config: Config) -> bool:
@@ -40,7 +40,7 @@ def has_spread(config: Config) -> bool:
 
 def effect_rules(config: Config) -> Any:
     """The struct `EffectRules`."""
-    low, high = zip(*strength_ranges(config.effects).values(), strict=True)
+    low, high = zip(*effect_ranges(config.effects).values(), strict=True)
     rules = EffectRules()
     rules.seed = config.bake.seed
     rules.low, rules.high = Strengths(*low), Strengths(*high)

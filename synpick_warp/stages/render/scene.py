@@ -16,7 +16,7 @@ from synpick_warp.kernels.render.lighting.path_tracing import PathScene
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
-from synpick_warp.scenes.types import Camera, Catalog, Fixture, Hollow, LightMap, Material, TriangleMesh
+from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Hollow, Material, TriangleMesh
 from synpick_warp.stages.render.chances import build_chances
 from synpick_warp.stages.render.gloss import measure_gloss
 from synpick_warp.stages.render.light_tables import light_table
@@ -180,7 +180,7 @@ def build_grid(width: int, height: int) -> Any:
     return grid
 
 
-def build_lights(maps: tuple[LightMap, ...], ground: np.ndarray | None, exposure: float, device: wp.Device) -> Any:
+def build_lights(maps: tuple[EnvironmentMap, ...], ground: np.ndarray | None, exposure: float, device: wp.Device) -> Any:
     """The struct `Lights`; `exposure` multiplies the automatic exposure, `ground` is the table's linear albedo."""
     tables = [light_table(light, ground) for light in maps]
     lights = Lights()
@@ -201,7 +201,7 @@ def build_render_scene(
     catalog: Catalog,
     fixtures: tuple[Fixture, Fixture, Fixture],
     cameras: tuple[Camera, ...],
-    lights: tuple[LightMap, ...],
+    lights: tuple[EnvironmentMap, ...],
     device: wp.Device,
 ) -> RenderScene:
     """Put all constant data of the renderer on the device.

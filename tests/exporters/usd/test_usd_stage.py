@@ -15,10 +15,11 @@ from synpick_warp.exporters.usd.episode import EpisodeFacts, EpisodeSettings
 from synpick_warp.exporters.usd.lights import part_sun, stage_light, write_light_maps
 from synpick_warp.exporters.usd.spool import TickSpool, read_ticks
 from synpick_warp.exporters.usd.stage import FIXTURES, episode_layer
-from synpick_warp.scenes import sun as main_light
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.scenes.embedded.skies import directions, skies
-from synpick_warp.scenes.types import Camera, LightMap, Sun
+from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.scenes.environment import map_directions, resize_map
+from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS
+from synpick_warp.scenes.types import Camera, EnvironmentMap, Sun
 from synpick_warp.stages.render import light_tables
 from tests.exporters.usd.test_exr import decode
 from tests.worlds import usd_sets
@@ -38,7 +39,7 @@ def spooled(folder, ticks=TICKS) -> np.ndarray:
     return read_ticks(spool.path, spool.instances)
 
 
-def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[LightMap, ...] = skies()[:2]) -> Usd.Stage:
+def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[EnvironmentMap, ...] = skies()[:2]) -> Usd.Stage:
     """The stage of an episode, without its assets."""
     made = tuple(stage_light(index, light, 1.0) for index, light in enumerate(lights))
     facts = EpisodeFacts(0, 0, len(rows), "emptied")
@@ -172,12 +173,12 @@ def test_films_are_36_mm_wide_and_products_know_the_resolution(stage):
         assert product.GetCameraRel().GetTargets() == [lens.GetPath()]
 
 
-def sunny(azimuth: float, polar: float, irradiance: float = 3.0, sharpness: float = 3000.0, rows: int = ROWS) -> LightMap:
+def sunny(azimuth: float, polar: float, irradiance: float = 3.0, sharpness: float = 3000.0, rows: int = ROWS) -> EnvironmentMap:
     """A dim map with a bright place, and a sun that stands for it. A sharpness of 100 is too wide for a light of its own."""
     a, p = np.radians(azimuth), np.radians(polar)
     toward = np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
-    radiance = 0.2 + 30.0 * np.exp(sharpness * (directions(rows) @ toward - 1.0))[..., None] * np.array([1.0, 0.9, 0.7])
-    return LightMap("sunny", radiance.astype(np.float32), Sun(toward, irradiance * np.array([1.0, 0.8, 0.5])))
+    radiance = 0.2 + 30.0 * np.exp(sharpness * (map_directions(rows)[0] @ toward - 1.0))[..., None] * np.array([1.0, 0.9, 0.7])
+    return EnvironmentMap("sunny", radiance.astype(np.float32), Sun(toward, irradiance * np.array([1.0, 0.8, 0.5])))
 
 
 @pytest.mark.parametrize(("azimuth", "polar"), [(0.0, 60.0), (90.0, 45.0), (-130.0, 20.0), (170.0, 75.0)])
@@ -240,12 +241,12 @@ def test_no_light_counts_twice(irradiance, rows, sharpness):
     rest, beam, spread = part_sun(light)
     table = light_tables.light_table(light, None)
     assert spread == pytest.approx(table.main_spread, rel=1e-4)
-    assert (spread > main_light.MAIN_LIGHT_SPREAD) == (not beam.any()) == (sharpness == 100.0)
+    assert (spread > MAX_SUN_ANGULAR_RADIUS) == (not beam.any()) == (sharpness == 100.0)
     np.testing.assert_allclose(beam, table.main_irradiance, rtol=1e-5)
-    near = directions(256) @ light.sun.direction > np.cos(np.radians(15.0))
-    found, expected = main_light.resized(rest, 256), table.rest
+    near = map_directions(256)[0] @ light.sun.direction > np.cos(np.radians(15.0))
+    found, expected = resize_map(rest, 256), table.rest
     np.testing.assert_allclose(found[~near], expected[~near], rtol=1e-4)
-    solid = main_light.map_directions(256)[1]
+    solid = map_directions(256)[1]
     parts = [(image * solid[..., None])[near].sum(axis=0) for image in (found, expected)]
     np.testing.assert_allclose(*parts, rtol=5e-3)
     if beam.any():

@@ -16,7 +16,7 @@ from synpick_warp.bake import describe_arrays
 from synpick_warp.codes import Effect, Tone, names
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import Effects, strength_ranges
+from synpick_warp.configs.sensors import Effects, effect_ranges
 from synpick_warp.device import pick_device
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.render.images.antialias import Picture
@@ -96,7 +96,7 @@ def strength(effects: np.ndarray, name: str) -> Any:
 
 
 def test_names_are_those_of_the_kernels():
-    assert tuple(strength_ranges(Effects())) == names(Effect)
+    assert tuple(effect_ranges(Effects())) == names(Effect)
 
 
 def curve(x: np.ndarray, tone: str) -> np.ndarray:
@@ -322,7 +322,7 @@ def test_strengths_fill_their_ranges_evenly():
     views = 2000
     at = Addresses(list(range(views)), [0] * views, [0] * views)
     _, effects = developed(np.zeros((1, 1, 3)), config_of(**ALL), at)
-    for name, (low, high) in strength_ranges(Effects(**ALL)).items():
+    for name, (low, high) in effect_ranges(Effects(**ALL)).items():
         values = strength(effects, name)
         assert low <= values.min() < low + 0.02 * (high - low)
         assert high - 0.02 * (high - low) < values.max() <= high

@@ -12,8 +12,9 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.scenes.appearance import linear_to_srgb
-from synpick_warp.scenes.sun import MAIN_LIGHT_SPREAD, map_directions
-from synpick_warp.scenes.types import Catalog, LightMap, Material
+from synpick_warp.scenes.environment import map_directions
+from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS
+from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.render.gloss import measure_gloss
 from synpick_warp.stages.render.light_tables import light_table
@@ -44,12 +45,12 @@ def shown(device, *placed, lights=(EVEN,), view=VIEW, config=None, **more):
     return render(ToyScene(entries, [world], (view,), lights=lights, config=config or settings(), **more), device)
 
 
-def lamp(cosine: float, radius: float, radiance: float, sky: float = 0.0, rows: int = 256) -> LightMap:
+def lamp(cosine: float, radius: float, radiance: float, sky: float = 0.0, rows: int = 256) -> EnvironmentMap:
     """An even sky with a disc of angular radius `radius` [rad] at azimuth 0, its edge one texel soft."""
     directions, _ = map_directions(rows)
     angle = np.arccos(np.clip(directions @ toward(cosine), -1.0, 1.0))
     share = np.clip((radius - angle) / (np.pi / rows) + 0.5, 0.0, 1.0)
-    return LightMap("lamp", np.repeat(sky + radiance * share[..., None], 3, axis=2).astype(np.float32))
+    return EnvironmentMap("lamp", np.repeat(sky + radiance * share[..., None], 3, axis=2).astype(np.float32))
 
 
 def clutter() -> list:
@@ -106,7 +107,7 @@ def test_wide_lamps_are_not_split(degrees, split):
     light = lamp(0.7, np.radians(degrees), 200.0, 0.2)
     table = light_table(light, None)
     assert (table.main_irradiance.max() > 0.0) == split
-    assert (table.main_spread <= MAIN_LIGHT_SPREAD) == split
+    assert (table.main_spread <= MAX_SUN_ANGULAR_RADIUS) == split
     assert (table.rest.max() < 10.0) == split
     # Split or not, no light is lost or counts twice.
     directions, solid = map_directions(len(table.rest))
@@ -119,7 +120,7 @@ def test_wide_lamps_are_not_split(degrees, split):
 
 def test_a_cluttered_scene_is_that_of_the_reference(device):
     view = camera(160, 120, 700.0, (0.0, 0.0, 1.5))
-    lights = (LightMap("room", 0.4 * even_light(1.0, 64).radiance + lamp(0.8, np.radians(14.0), 8.0, rows=64).radiance),)
+    lights = (EnvironmentMap("room", 0.4 * even_light(1.0, 64).radiance + lamp(0.8, np.radians(14.0), 8.0, rows=64).radiance),)
     path = shown(device, *clutter(), lights=lights, view=view, config=settings(REFERENCE, samples=256)).radiance[0]
     near = {}
     for paths in (1, 4, 16):

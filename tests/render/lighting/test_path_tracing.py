@@ -11,8 +11,8 @@ import warp as wp
 from synpick_warp.configs.schema import REFERENCE, Config
 from synpick_warp.kernels.render.lighting.path_tracing import BY_LIGHT, BY_SURFACE
 from synpick_warp.scenes.appearance import linear_to_srgb
-from synpick_warp.scenes.sun import map_directions
-from synpick_warp.scenes.types import LightMap, Material
+from synpick_warp.scenes.environment import map_directions
+from synpick_warp.scenes.types import EnvironmentMap, Material
 from synpick_warp.stages.render import reference
 from synpick_warp.stages.render.chances import build_chances, chance_table
 from synpick_warp.stages.render.gloss import measure_gloss
@@ -47,7 +47,7 @@ def lamp(cosine, radius, radiance, rows=256):
     directions, _ = map_directions(rows)
     angle = np.arccos(np.clip(directions @ toward(cosine), -1.0, 1.0))
     share = np.clip((radius - angle) / (np.pi / rows) + 0.5, 0.0, 1.0)
-    return LightMap("lamp", np.repeat(radiance * share[..., None], 3, axis=2).astype(np.float32))
+    return EnvironmentMap("lamp", np.repeat(radiance * share[..., None], 3, axis=2).astype(np.float32))
 
 
 @pytest.mark.parametrize("metallic", [0.0, 1.0])
@@ -106,7 +106,7 @@ def test_each_way_of_drawing_light_has_the_same_mean(device, monkeypatch):
         (box(0.1, 0.1, 0.1), surface((0.3, 0.5, 0.7)), (-0.1, 0.0, 0.05, *UPRIGHT)),
     ]
     radiance = 0.3 * even_light(1.0, 64).radiance + lamp(0.7, np.radians(12.0), 20.0, 64).radiance
-    lights = (LightMap("room", radiance),)
+    lights = (EnvironmentMap("room", radiance),)
     both = shown(device, *things, lights=lights, config=settings(64), light_yaw=0.7).radiance[0]
     noise = {}
     for strategy in (BY_LIGHT, BY_SURFACE):

@@ -9,8 +9,9 @@ import pytest
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
-from synpick_warp.scenes.sun import map_directions, split_main_light
-from synpick_warp.scenes.types import Catalog, LightMap, Material
+from synpick_warp.scenes.environment import map_directions
+from synpick_warp.scenes.sun import extract_sun
+from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
 from synpick_warp.stages import launch
 from synpick_warp.stages.render.light_tables import blurred_reflections, harmonics, light_table
 from synpick_warp.stages.render.renderer import Renderer
@@ -184,7 +185,7 @@ def test_harmonics_give_the_irradiance_of_a_gradient():
     # Radiance 1 + z: E(n) = π + 2π/3 n_z.
     directions, _ = map_directions(64)
     radiance = np.repeat((1.0 + directions[..., 2:]).astype(np.float32), 3, axis=2)
-    coefficients = light_table(LightMap("gradient", radiance), None).irradiance
+    coefficients = light_table(EnvironmentMap("gradient", radiance), None).irradiance
     np.testing.assert_allclose(harmonics(np.array([0.6, 0.0, 0.8])) @ coefficients, np.pi + 2 * np.pi / 3 * 0.8, rtol=2e-3)
 
 
@@ -192,7 +193,7 @@ def test_harmonics_give_the_irradiance_of_a_gradient():
 def test_the_main_light_is_where_the_sun_is_and_energy_is_kept(direction):
     light = sun(direction).radiance.astype(np.float64)
     _, solid = map_directions(len(light))
-    rest, found, irradiance, spread = split_main_light(light)
+    rest, found, irradiance, spread = extract_sun(light)
     assert found @ np.array(direction) / np.linalg.norm(direction) > np.cos(np.radians(2.0))
     np.testing.assert_allclose(irradiance + (rest * solid[..., None]).sum(axis=(0, 1)), (light * solid[..., None]).sum(axis=(0, 1)))
     assert 0.0 <= spread < 0.03
@@ -200,7 +201,7 @@ def test_the_main_light_is_where_the_sun_is_and_energy_is_kept(direction):
 
 
 def test_an_even_map_has_no_main_light():
-    assert not split_main_light(np.ones((32, 64, 3)))[2].any()
+    assert not extract_sun(np.ones((32, 64, 3)))[2].any()
 
 
 def test_reflections_of_an_even_map_are_even_and_those_of_a_spot_lie_where_it_is():

@@ -1,0 +1,33 @@
+"""HDR environment maps: the equirectangular parameterization that all of them share, and resampling.
+
+Row 0 looks up (+z); azimuth atan2(y, x) lies at the fraction u = azimuth / 2π + 0.5 of the width.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+BACKGROUND_ROWS = 256
+"""Rows of the background, which cameras see out of focus; 0.7° a texel is fine enough to tell lamps apart."""
+WHITE_VALUE = 1.25
+"""Auto-exposure target: display value (linear) of a white diffuse surface that faces up, under the unoccluded map."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Luminance weights of linear RGB (Rec. 709)."""
+
+
+def map_directions(rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions (rows, 2 rows, 3) of a map's texel centres and their solid angles (rows, 2 rows) [sr]."""
+    polar = (np.arange(rows) + 0.5) / rows * np.pi
+    azimuth = ((np.arange(2 * rows) + 0.5) / (2 * rows) - 0.5) * 2.0 * np.pi
+    polar, azimuth = np.meshgrid(polar, azimuth, indexing="ij")
+    directions = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
+    edges = np.cos(np.arange(rows + 1) / rows * np.pi)
+    solid_angles = np.repeat((edges[:-1] - edges[1:])[:, None], 2 * rows, axis=1) * (2.0 * np.pi / (2 * rows))
+    return directions, solid_angles
+
+
+def resize_map(radiance: np.ndarray, rows: int) -> np.ndarray:
+    """Resample a map to `rows` rows and twice as many columns: by area where it shrinks, so that energy is kept; float64."""
+    method = cv2.INTER_AREA if rows <= radiance.shape[0] else cv2.INTER_LINEAR
+    return cv2.resize(radiance.astype(np.float32), (2 * rows, rows), interpolation=method).astype(np.float64)
