@@ -8,8 +8,8 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import allocate, device_array, memory_table
-from synpick_warp.bake import describe_arrays
 from synpick_warp.device import pick_device
+from synpick_warp.pipeline import describe_arrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.perception.arrays import LookArrays, Plan, Sighting
 from synpick_warp.stages.perception.plan import CycleArrays, VoteArrays

@@ -275,7 +275,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:
     if lights and not os.path.isdir(lights):
         raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets")
     check_output_folder(out)
-    from synpick_warp.bake import run_bake
+    from synpick_warp.pipeline import run_bake
 
     console = make_console()
     with make_progress(console) as progress:

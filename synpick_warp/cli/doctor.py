@@ -42,7 +42,7 @@ def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
 
 def memory_report(config: Config) -> Table:
     """Shape, unit and size of every declared array of a bake with these settings, and their sum."""
-    from synpick_warp.bake import describe_arrays
+    from synpick_warp.pipeline import describe_arrays
     from synpick_warp.stages.sim.physics import with_enough_worlds
 
     config = with_enough_worlds(config, pick_device(config.bake.device))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -21,8 +20,6 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.episodes import BakeSummary, EpisodeRow
 from synpick_warp.errors import OutputError
 
-needs_bake = pytest.mark.skipif(importlib.util.find_spec("synpick_warp.bake") is None, reason="there is no bake yet")
-
 
 def finished(number: int) -> BakeSummary:
     rows = [EpisodeRow(episode, 0, Ending.FINISHED, 10, 1.0, "move", 9, 0, 0, 0, 9) for episode in range(number)]
@@ -31,8 +28,8 @@ def finished(number: int) -> BakeSummary:
 
 @pytest.fixture
 def bakes(monkeypatch):
-    """Stand-in for bake.py; collects what it was called with. `result` may be set to a summary or an error."""
-    module = types.ModuleType("synpick_warp.bake")
+    """Stand-in for pipeline.py; collects the arguments of each call. `result` may be set to a summary or an error."""
+    module = types.ModuleType("synpick_warp.pipeline")
     calls = []
 
     def run_bake(config, out, progress, shard):
@@ -48,7 +45,7 @@ def bakes(monkeypatch):
     module.calls = calls
     module.run_bake = run_bake
     module.describe_arrays = lambda config: [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
-    monkeypatch.setitem(sys.modules, "synpick_warp.bake", module)
+    monkeypatch.setitem(sys.modules, "synpick_warp.pipeline", module)
     return module
 
 
@@ -245,7 +242,7 @@ def test_doctor(capsys, bakes):
     assert all(word in text for word in ("16 worlds, 640x360", "Snapshot.pose", "16 x 24", "2.00"))
 
 
-COMMAND = [sys.executable, "-c", "import sys; from synpick_warp.cli import main; sys.exit(main())"]
+COMMAND = [sys.executable, "-m", "synpick_warp"]
 
 
 def test_version():
@@ -264,7 +261,6 @@ def test_a_reader_that_leaves_is_no_fault():
 PLY_HEAD = "ply\nformat ascii 1.0\n{comment}element vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
 
 
-@needs_bake
 @pytest.mark.parametrize(
     "ply",
     [
@@ -292,7 +288,6 @@ def boxes(folder: Path, *sides: float) -> None:
         (folder / f"cube_{number}.obj").write_bytes(trimesh.creation.box((side, side, side)).export(file_type="obj").encode())
 
 
-@needs_bake
 @pytest.mark.parametrize(
     ("sides", "settings", "said"),
     [

@@ -98,10 +98,10 @@ def arguments(request: dict) -> list[str]:
 
 
 def _serve() -> None:
-    from synpick_warp import bake
+    from synpick_warp import pipeline
     from synpick_warp.cli import commands
 
-    bake.load_catalog = lambda config, report: catalog()
+    pipeline.load_catalog = lambda config, report: catalog()
     answer = os.dup(1)
     os.dup2(2, 1)
     with open(os.devnull, "w") as nowhere:
@@ -127,7 +127,7 @@ def _serve() -> None:
 
 def _prepare(request: dict) -> None:
     """What is to go wrong in a bake."""
-    from synpick_warp import bake
+    from synpick_warp import pipeline
     from synpick_warp.exporters.writing.pool import WriterPool
 
     if "alone" in request:
@@ -138,7 +138,7 @@ def _prepare(request: dict) -> None:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (request["most_bytes"],) * 2)
             return pool
 
-        bake.WriterPool = alone
+        pipeline.WriterPool = alone
     if "kill_at" in request:
         _kill_at(request["kill_at"], request["out"])
     if "count" in request:

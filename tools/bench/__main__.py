@@ -27,7 +27,6 @@ import numpy as np
 import warp as wp
 from rich.console import Console
 
-from synpick_warp.bake import Factory, build_factory, run_bake
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import GIB, describe_machine
 from synpick_warp.codes import Status
@@ -37,6 +36,7 @@ from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.pipeline import Factory, build_factory, run_bake
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.render.annotate import annotate
 from synpick_warp.stages.render.denoised import FastPicture

@@ -14,8 +14,8 @@ from unittest import mock
 import newton
 import warp as wp
 
-from synpick_warp.bake import Factory
 from synpick_warp.codes import Phase, Task
+from synpick_warp.pipeline import Factory
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader
 

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 
-from synpick_warp.bake import Factory
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import ExportContext, Exporter
@@ -20,6 +19,7 @@ from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.pipeline import Factory
 from synpick_warp.stages.stream import TickReport, tick_batch
 from tools.bench.physics import Row
 

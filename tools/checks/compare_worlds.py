@@ -25,12 +25,12 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from synpick_warp.bake import build_factory
 from synpick_warp.codes import Phase
 from synpick_warp.configs.load import load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
+from synpick_warp.pipeline import build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.stream import TickReader
 

@@ -21,7 +21,6 @@ import warp as wp
 from rich.console import Console
 from rich.table import Table
 
-from synpick_warp.bake import Factory, build_factory
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.codes import Phase
@@ -30,6 +29,7 @@ from synpick_warp.configs.schema import MIXED, Config
 from synpick_warp.configs.schema import MODES as MIX
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
+from synpick_warp.pipeline import Factory, build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.annotate import annotate

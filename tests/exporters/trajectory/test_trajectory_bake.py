@@ -14,9 +14,9 @@ import pytest
 import zarr
 
 import synpick_warp
-from synpick_warp import bake
-from synpick_warp.bake import run_bake
+from synpick_warp import pipeline
 from synpick_warp.configs.schema import Config
+from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.stream import FrameStream
 from tests.harness.exporter_contract import digests
@@ -52,7 +52,7 @@ def out(tmp_path_factory, mixed) -> Path:
     """A finished bake of boxes; beside it one of another number of worlds."""
     folder = tmp_path_factory.mktemp("bake") / "set"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(bake, "load_catalog", lambda config, report: catalog())
+        patch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
         # Nobody asks for pictures.
         patch.setattr(FrameStream, "render", lambda *_: pytest.fail("views were rendered"))
         run_bake(mixed, folder, SilentProgress())
@@ -123,7 +123,7 @@ def test_what_is_opened_is_what_was_baked(out, mixed):
 
 def test_the_table_of_memory_counts_what_is_recorded(mixed):
     """What a tick is written into, and two records; none for formats that ask for none."""
-    rows = [row for row in bake.describe_arrays(mixed) if row[0] == "StepArrays.pose"]
+    rows = [row for row in pipeline.describe_arrays(mixed) if row[0] == "StepArrays.pose"]
     assert rows == [("StepArrays.pose", (1, 16, 4), "m", 16 * 4 * 28)] * 3
     without = replace(mixed, bake=replace(mixed.bake, formats=("bop",)))
-    assert not any(row[0].startswith("StepArrays") for row in bake.describe_arrays(without))
+    assert not any(row[0].startswith("StepArrays") for row in pipeline.describe_arrays(without))

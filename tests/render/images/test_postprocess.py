@@ -12,7 +12,6 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.bake import describe_arrays
 from synpick_warp.codes import Effect, Tone, names
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
@@ -22,6 +21,7 @@ from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.render.images.antialias import Picture
 from synpick_warp.kernels.render.images.camera_effects import Strengths
 from synpick_warp.kernels.render.lighting.environment import Lights
+from synpick_warp.pipeline import describe_arrays
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.stages.render.postprocess import Developer
 from synpick_warp.stages.render.scene import build_cameras, build_grid

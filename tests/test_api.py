@@ -1,0 +1,84 @@
+"""The Python API: names that `import synpick_warp` offers, and modules that it does not load."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+import types
+from pathlib import Path
+
+import pytest
+
+import synpick_warp
+from synpick_warp.configs.load import load_config
+from synpick_warp.progress import SilentProgress
+
+ROOT = Path(__file__).resolve().parent.parent
+HEAVY = ("warp", "newton", "numpy", "cv2", "zarr", "pxr", "trimesh", "scipy", "coacd", "rich", "cyclopts")
+
+
+@pytest.fixture
+def calls(monkeypatch) -> list:
+    """A stand-in for the pipeline collects the arguments of each bake."""
+    module, calls = types.ModuleType("synpick_warp.pipeline"), []
+    module.run_bake = lambda *arguments: calls.append(arguments)
+    monkeypatch.setitem(sys.modules, "synpick_warp.pipeline", module)
+    return calls
+
+
+def test_everything_offered_exists():
+    assert all(hasattr(synpick_warp, name) for name in synpick_warp.__all__)
+    errors = [getattr(synpick_warp, name) for name in synpick_warp.__all__ if name.endswith("Error")]
+    assert all(issubclass(error, synpick_warp.SynpickError) for error in errors)
+    assert len(errors) == 7
+
+
+def test_no_module_takes_the_name_of_a_function():
+    """Importing a submodule sets an attribute of its package, which would replace the function."""
+    functions = [name for name in synpick_warp.__all__ if isinstance(getattr(synpick_warp, name), types.FunctionType)]
+    assert functions == ["bake", "load_config", "open"]
+    modules = {path.stem for path in (ROOT / "synpick_warp").iterdir()}
+    assert modules.isdisjoint(functions)
+
+
+def test_importing_and_reading_settings_load_nothing_heavy():
+    code = f"import sys, synpick_warp; synpick_warp.load_config('smoke'); print([name for name in {HEAVY!r} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert done.stdout == "[]\n"
+
+
+def test_the_version_stands_in_one_place():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    assert "version" not in project["project"]
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "synpick_warp.__version__"}
+
+
+def test_the_type_marker_is_packaged():
+    data = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    assert data["synpick_warp"] == ["py.typed"]
+    assert (ROOT / "synpick_warp" / "py.typed").is_file()
+
+
+def test_settings_of_a_preset_are_overridden(tmp_path, calls):
+    synpick_warp.bake("smoke", str(tmp_path / "set"), {"bake.mode": "move"}, shard=(1, 2))
+    [(config, out, progress, shard)] = calls
+    assert config == load_config("smoke", {"bake.mode": "move"}) == synpick_warp.load_config("smoke", {"bake.mode": "move"})
+    assert (out, shard) == (tmp_path / "set", (1, 2))
+    assert isinstance(progress, SilentProgress)
+
+
+def test_a_config_is_taken_as_it_is(tmp_path, calls):
+    config, progress = synpick_warp.load_config("smoke"), SilentProgress()
+    synpick_warp.bake(config, tmp_path, progress=progress)
+    assert calls == [(config, tmp_path, progress, (0, 1))]
+    with pytest.raises(TypeError, match="pass them to load_config"):
+        synpick_warp.bake(config, tmp_path, {"bake.mode": "move"})
+
+
+def test_the_default_preset_and_a_file(tmp_path):
+    (tmp_path / "my.toml").write_text('preset = "smoke"\n[bake]\nseed = 7\n')
+    assert synpick_warp.load_config() == load_config(None, {})
+    assert synpick_warp.load_config(tmp_path / "my.toml").bake.seed == 7
+    with pytest.raises(synpick_warp.ConfigError, match=r"did you mean bake\.seed"):
+        synpick_warp.load_config("smoke", {"seed": 1})
