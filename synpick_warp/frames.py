@@ -53,10 +53,10 @@ class FrameBatch:
     """Unit vector towards the map's main light, the sun or a lamp, in the world; zero: none stands out (B, 3) float32."""
     layers: dict[str, np.ndarray] = field(default_factory=dict)
     """The layers that the settings name (B, H, W[, C]); see `synpick_warp.layers`."""
-    edge_count: np.ndarray | None = None
-    """How many edges down their columns `instance` and `amodal` have (B, 2) int32; more than E: they are not all in `edges`."""
-    edges: np.ndarray | None = None
-    """These edges: column · (H + 1) + row of the pixel below, value above, value below, by the first (B, 2, 3, E) uint32."""
+    boundary_count: np.ndarray | None = None
+    """Run boundaries of `instance` and `amodal`: changes of the value down a column (B, 2) int32; above R: `boundaries` is cut."""
+    boundaries: np.ndarray | None = None
+    """Per run boundary column · (H + 1) + row of the pixel below, value above, value below; sorted by the first (B, 2, 3, R) uint32."""
 
     def __len__(self) -> int:
         return len(self.episode)

@@ -40,7 +40,7 @@ from synpick_warp.stages.perception.plan import CycleArrays, VoteArrays, plan_si
 from synpick_warp.stages.perception.segment import SCRATCH, count_views, sight_sizes
 from synpick_warp.stages.render.denoised import FAST_SCRATCH, cell_sizes
 from synpick_warp.stages.render.layers import MOVING, MotionArrays
-from synpick_warp.stages.render.mask_runs import EdgeBuffers, EdgeScratch, edge_sizes
+from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
 from synpick_warp.stages.render.postprocess import SpreadArrays, has_spread
 from synpick_warp.stages.render.raster import MarkArrays, mark_sizes
 from synpick_warp.stages.render.renderer import PictureArrays, Renderer
@@ -262,7 +262,7 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     groups = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState, LastFrame)]
     groups += [(kind, worlds, 1 + RECORDS) for kind in (Sighting, Plan)]
     groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
-    groups += [(EdgeBuffers, edge_sizes(views), ring), (EdgeScratch, edge_sizes(views), 1)]
+    groups += [(BoundaryBuffers, boundary_sizes(views), ring), (BoundaryScratch, boundary_sizes(views), 1)]
     groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
     pixels = mark_sizes(views["view"], *config.cameras.resolution)
     groups += [(MarkArrays, pixels, 1), (HitArrays, pixels | {"view": len(config.cameras.positions)}, 1)]

@@ -16,7 +16,7 @@ from synpick_warp.stages.perception.plan import CycleArrays, VoteArrays
 from synpick_warp.stages.perception.segment import SightScratch, count_views
 from synpick_warp.stages.render.denoised import Edges, GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_paths, cell_sizes
 from synpick_warp.stages.render.layers import MotionArrays
-from synpick_warp.stages.render.mask_runs import EdgeBuffers, EdgeScratch
+from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch
 from synpick_warp.stages.render.raster import MarkArrays
 from synpick_warp.stages.render.renderer import PictureArrays
 from synpick_warp.stages.render.view_setup import BodyArrays, HitArrays
@@ -24,8 +24,8 @@ from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, 
 from tests.worlds.small_worlds import settings
 
 NAMES = (
-    "one world world_and_global instance body waypoint status measure fixture view row column count box edge point kind subset part tile "
-    "cell_row cell_column shadow_row shadow_column segment segment_square block"
+    "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
+    "image field boundary cell_row cell_column shadow_row shadow_column segment segment_square block"
 )
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
@@ -41,8 +41,8 @@ MOVING = [
     BodyArrays,
     HitArrays,
     PictureArrays,
-    EdgeBuffers,
-    EdgeScratch,
+    BoundaryBuffers,
+    BoundaryScratch,
     GuideArrays,
     GatheredArrays,
     ShareArrays,

@@ -300,13 +300,14 @@ def test_on_the_processor_a_host_copy_is_the_array_itself(device):
     assert seen.tolist() == [3.0] * 4
 
 
-def test_edges_are_those_of_the_batchs_own_images(device):
+def test_run_boundaries_are_those_of_the_batchs_own_images(device):
     batches, _ = rendered(device, [1, 1, 0, 1, 1], 5)
     assert sum(made["length"] for made in batches) == 12
     for made in batches:
         for view in range(made["length"]):
-            for kind, image in enumerate((made["instance"][view], made["amodal"][view])):
-                edges = unpack_run_boundaries(made["edges"][view, kind, :, : made["edge_count"][view, kind]], len(image))
-                assert len(edges.column) == 2 * image.shape[1]
+            for which, image in enumerate((made["instance"][view], made["amodal"][view])):
+                count = made["boundary_count"][view, which]
+                boundaries = unpack_run_boundaries(made["boundaries"][view, which, :, :count], len(image))
+                assert len(boundaries.column) == 2 * image.shape[1]
                 for name, values in vars(find_run_boundaries(image)).items():
-                    np.testing.assert_array_equal(getattr(edges, name), values)
+                    np.testing.assert_array_equal(getattr(boundaries, name), values)

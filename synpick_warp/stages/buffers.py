@@ -72,7 +72,7 @@ class ViewBuffers:
     """Bit i: the ray hits instance i."""
     pixels: wp.array = device_array("view", "instance", "count", dtype=wp.int32, unit="px")
     """px_count_all, px_count_valid, px_count_visib."""
-    boxes: wp.array = device_array("view", "instance", "box", "edge", dtype=wp.int32, unit="px")
+    boxes: wp.array = device_array("view", "instance", "box", "side", dtype=wp.int32, unit="px")
     """bbox_obj and bbox_visib: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty."""
     effects: wp.array = device_array("view", dtype=Strengths)
     """Strengths of the camera's effects, in the order of `Effect`; zero: off."""

@@ -15,7 +15,7 @@ from synpick_warp.codes import Measure, Status, names
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.render.mask_runs import EdgeBuffers, EdgeScratch, edge_sizes, list_edges
+from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
@@ -53,7 +53,7 @@ def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
         "instance": config.arrangement.max_objects,
         "count": 3,
         "box": 2,
-        "edge": 4,
+        "side": 4,
     }
 
 
@@ -211,19 +211,19 @@ class FrameStream:
         self.batch = sizes["view"]
         self.device = device
         self.copy_stream = wp.Stream(device) if device.is_cuda else None
-        self.images = [item.name for kind in (ViewBuffers, EdgeBuffers) for item in fields(kind)]
+        self.images = [item.name for kind in (ViewBuffers, BoundaryBuffers) for item in fields(kind)]
         self.layers = [item.name for item in fields(LayerBuffers) if item.name in config.render.layers]
         ring = range(RING if device.is_cuda else 1)
         self.buffers = [allocate(ViewBuffers, sizes, device) for _ in ring]
-        self.edges = [allocate(EdgeBuffers, edge_sizes(sizes), device) for _ in ring]
-        self.edge_scratch = allocate(EdgeScratch, edge_sizes(sizes), device)
+        self.boundaries = [allocate(BoundaryBuffers, boundary_sizes(sizes), device) for _ in ring]
+        self.boundary_scratch = allocate(BoundaryScratch, boundary_sizes(sizes), device)
         self.layer_buffers = [allocate(LayerBuffers, sizes, device, self.layers) for _ in ring]
         self.copies = [
             HostCopy(
-                [getattr(part, item.name) for part in (images, edges) for item in fields(part)]
+                [getattr(part, item.name) for part in (images, boundaries) for item in fields(part)]
                 + [getattr(layers, name) for name in self.layers]
             )
-            for images, edges, layers in zip(self.buffers, self.edges, self.layer_buffers, strict=True)
+            for images, boundaries, layers in zip(self.buffers, self.boundaries, self.layer_buffers, strict=True)
         ]
         self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.buffers]
 
@@ -252,7 +252,7 @@ class FrameStream:
         padded[:, : len(world)] = world, camera
         views.assign(padded)
         self.renderer.render(snapshot, views[0], views[1], len(world), self.buffers[slot], self.layer_buffers[slot])
-        list_edges(self.edge_scratch, len(world), self.buffers[slot], self.edges[slot])
+        list_boundaries(self.boundary_scratch, len(world), self.buffers[slot], self.boundaries[slot])
         self.copies[slot].start(self.copy_stream)
 
     def _collect(self, waiting: tuple[int, slice], world: np.ndarray, camera: np.ndarray, report: TickReport) -> FrameBatch:

@@ -71,7 +71,7 @@ def albedo(material: Material, rows: int, columns: int, device) -> np.ndarray:
     toy = ToyScene([entry(sheet(TEXEL * columns, TEXEL * rows), material)], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (view,))
     config = replace(Config(), render=replace(Config().render, table=False, layers=("albedo",)))
     scene = build_render_scene(config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
-    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
+    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
     layers = allocate(LayerBuffers, sizes, device, ("albedo",))
     zero = wp.zeros(1, dtype=wp.int32, device=device)
     Renderer(config, scene, toy.room, 1).render(snapshot(toy, device), zero, zero, 1, allocate(ViewBuffers, sizes, device), layers)

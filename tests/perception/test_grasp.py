@@ -116,7 +116,7 @@ class Grasps:
             "instance": instances,
             "count": 3,
             "box": 2,
-            "edge": 4,
+            "side": 4,
             "point": planning.ROOM,
         }
         self.look, self.sighting = allocate(LookArrays, sizes, device), allocate(Sighting, sizes, device)

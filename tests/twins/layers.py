@@ -55,7 +55,7 @@ def draw(toy: ToyScene, device: wp.Device, before: Before | None = None, names: 
             wp.copy(getattr(made, f"last_{name}"), getattr(last, name))
         made.follows.assign(np.array(before.follows))
     renderer = Renderer(config, scene, toy.room, views)
-    sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
+    sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
     out = allocate(LayerBuffers, sizes, device, names)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)

@@ -169,7 +169,7 @@ def render(toy: ToyScene, device: wp.Device) -> Picture:
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
     renderer = Renderer(config, scene, toy.room, views)
-    sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
+    sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
     out = allocate(ViewBuffers, sizes, device)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
@@ -183,7 +183,7 @@ def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
     """Primary hits alone: what world 0 shows to camera 0."""
     scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
     renderer = Renderer(toy.settings(), scene, toy.room, 1)
-    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
+    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
     out = allocate(ViewBuffers, sizes, device)
     zero = wp.zeros(1, dtype=wp.int32, device=device)
     renderer.prepare_bodies(snapshot(toy, device), zero, zero, 1)

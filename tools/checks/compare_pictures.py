@@ -209,7 +209,7 @@ def render_views(config: Config, scene: Any, snapshot: Snapshot) -> dict[str, np
     """All outputs of all worlds seen by all cameras, by name."""
     worlds, cameras, device = config.bake.worlds, scene.camera_count, scene.device
     sizes = {"view": worlds * cameras, "row": scene.height, "column": scene.width, "instance": config.arrangement.max_objects}
-    sizes |= {"count": 3, "box": 2, "edge": 4}
+    sizes |= {"count": 3, "box": 2, "side": 4}
     renderer = Renderer(config, scene, config.arrangement.max_objects, worlds * cameras)
     out, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, LAYERS)
     view = np.arange(worlds * cameras, dtype=np.int32)

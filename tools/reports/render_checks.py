@@ -66,7 +66,7 @@ class Studio:
         self.device = device
         self.renderer = Renderer(config, scene, config.arrangement.max_objects, 1)
         sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": config.arrangement.max_objects}
-        self.out = allocate(ViewBuffers, sizes | {"count": 3, "box": 2, "edge": 4}, device)
+        self.out = allocate(ViewBuffers, sizes | {"count": 3, "box": 2, "side": 4}, device)
 
     def shoot(self, snapshot: Snapshot, world: int, camera: int) -> Shot:
         """Picture of a world by a camera."""

@@ -78,7 +78,7 @@ class ViewTruth:
     boxes: np.ndarray
     """(N, 2, 4)"""
     listed: bool
-    """The last two arrays of the view's task are lists of edges, not images."""
+    """The last two arrays of the view's task are lists of run boundaries, not images."""
     top: int
     """Row of the picture with which these images begin."""
     left: int
@@ -108,12 +108,12 @@ def shared_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
 def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSettings) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
     """What a task on one view needs: color, depth, two arrays that hold where masks begin and end, and the truth.
 
-    The two are the lists of edges of the images instance and amodal, or else the images themselves, cut to where objects are.
+    The two are the lists of run boundaries of the images instance and amodal, or else the images themselves, cut to where objects are.
     """
     present = np.flatnonzero(batch.object_id[view] >= 0)
     boxes = batch.boxes[view][present]
-    edges = _edges(batch, view)
-    rows, columns = (slice(0, 0), slice(0, 0)) if edges else _shown(boxes, *batch.depth.shape[1:])
+    boundaries = _boundaries(batch, view)
+    rows, columns = (slice(0, 0), slice(0, 0)) if boundaries else _shown(boxes, *batch.depth.shape[1:])
     strengths: dict[str, float] = dict(zip(names(Effect), batch.effects[view].tolist(), strict=True))
     truth = ViewTruth(
         scene=scene,
@@ -125,11 +125,11 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
         pose=batch.pose[view][present],
         pixels=batch.pixels[view][present],
         boxes=boxes,
-        listed=bool(edges),
+        listed=bool(boundaries),
         top=rows.start,
         left=columns.start,
     )
-    masks = edges or tuple(image[view, rows, columns] for image in (batch.instance, batch.amodal))
+    masks = boundaries or tuple(image[view, rows, columns] for image in (batch.instance, batch.amodal))
     return (batch.color[view], batch.depth[view], *masks), truth
 
 
@@ -145,13 +145,14 @@ def _circumstances(batch: FrameBatch, view: int, effects: dict[str, float]) -> d
     return {"light": light} | ({"effects": {name: round(value, _DIGITS) for name, value in effects.items()}} if effects else {})
 
 
-def _edges(batch: FrameBatch, view: int) -> tuple[np.ndarray, ...]:
-    """Lists of the edges of instance and amodal, if they are there, whole, and not larger than the images."""
-    if batch.edges is None or batch.edge_count is None or (batch.edge_count[view] > batch.edges.shape[-1]).any():
+def _boundaries(batch: FrameBatch, view: int) -> tuple[np.ndarray, ...]:
+    """Lists of the run boundaries of instance and amodal, if they are there, complete, and not larger than the images."""
+    if batch.boundaries is None or batch.boundary_count is None or (batch.boundary_count[view] > batch.boundaries.shape[-1]).any():
         return ()
-    lists = tuple(edges[:, :count] for edges, count in zip(batch.edges[view], batch.edge_count[view].tolist(), strict=True))
+    counts = batch.boundary_count[view].tolist()
+    lists = tuple(packed[:, :count] for packed, count in zip(batch.boundaries[view], counts, strict=True))
     images = batch.instance[view], batch.amodal[view]
-    return lists if all(edges.nbytes <= image.nbytes for edges, image in zip(lists, images, strict=True)) else ()
+    return lists if all(packed.nbytes <= image.nbytes for packed, image in zip(lists, images, strict=True)) else ()
 
 
 def _shown(boxes: np.ndarray, height: int, width: int) -> tuple[slice, slice]:
@@ -163,7 +164,7 @@ def _shown(boxes: np.ndarray, height: int, width: int) -> tuple[slice, slice]:
 
 
 def extract_masks(first: np.ndarray, second: np.ndarray, truth: ViewTruth, height: int) -> list[Masks]:
-    """Masks of all instances, in their order, from the last two arrays of `make_view_task`. Every instance picks its own of all edges."""
+    """Masks of all instances, in their order, from the last two arrays of `make_view_task`."""
     seen, whole = (
         unpack_run_boundaries(array, height) if truth.listed else find_run_boundaries(array, truth.top, truth.left)
         for array in (first, second)

@@ -46,16 +46,16 @@ class Runs:
 
 @dataclass(frozen=True, eq=False)
 class RunBoundaries:
-    """Where an image's values change down its columns, in order of columns, then rows. Above and below the image, values are 0."""
+    """Run boundaries of a label image: changes of its value down a column, in order of columns, then rows; 0 above and below the image."""
 
     column: np.ndarray
     """(N) int64."""
     row: np.ndarray
-    """Row of the pixel below the edge (N) int64."""
+    """Row of the pixel below the boundary (N) int64."""
     above: np.ndarray
-    """Value of the pixel above the edge (N)."""
+    """Value of the pixel above the boundary (N)."""
     below: np.ndarray
-    """Value of the pixel below the edge (N)."""
+    """Value of the pixel below the boundary (N)."""
 
     def runs_of(self, value: int) -> Runs:
         """Pixels with a value other than 0."""
@@ -67,20 +67,20 @@ class RunBoundaries:
         return self._runs((self.above ^ self.below) & self.above.dtype.type(1 << bit) != 0)
 
     def _runs(self, chosen: np.ndarray) -> Runs:
-        """A pixel's value differs from both neighbours': of the chosen edges, each second is an end."""
+        """A pixel's value differs from both neighbours': of the chosen boundaries, each second is an end."""
         index = np.flatnonzero(chosen)
         row = self.row[index]
         return Runs(self.column[index[::2]], row[::2], row[1::2])
 
 
-def unpack_run_boundaries(edges: np.ndarray, height: int) -> RunBoundaries:
-    """The edges that a device listed, (3, N) as in `FrameBatch.edges`, of images so high."""
-    column, row = np.divmod(edges[0].astype(np.int64), height + 1)
-    return RunBoundaries(column, row, edges[1], edges[2])
+def unpack_run_boundaries(packed: np.ndarray, height: int) -> RunBoundaries:
+    """Unpack run boundaries that the device listed, (3, N) as in `FrameBatch.boundaries`, of images of this height [px]."""
+    column, row = np.divmod(packed[0].astype(np.int64), height + 1)
+    return RunBoundaries(column, row, packed[1], packed[2])
 
 
 def find_run_boundaries(image: np.ndarray, top: int = 0, left: int = 0) -> RunBoundaries:
-    """The edges of an image that is 0 outside of a part (h, w), whose first pixel is at row `top` and column `left`."""
+    """Run boundaries of an image that is 0 outside of a part (h, w), whose first pixel is at row `top` and column `left`."""
     rows, columns = image.shape
     if not image.size:
         nothing = np.zeros(0, np.int64)
@@ -89,7 +89,7 @@ def find_run_boundaries(image: np.ndarray, top: int = 0, left: int = 0) -> RunBo
     np.not_equal(image[0], 0, out=changes[0])
     np.not_equal(image[1:], image[:-1], out=changes[1:-1])
     np.not_equal(image[-1], 0, out=changes[-1])
-    # RunBoundaries are few: to find them row by row and to sort them is faster than to transpose the image.
+    # Boundaries are few: to find them row by row and to sort them is faster than to transpose the image.
     row, column = np.divmod(np.flatnonzero(changes), columns)
     column, row = np.divmod(np.sort(column * (rows + 1) + row), rows + 1)
     above, below = image[row - 1, column], image[np.minimum(row, rows - 1), column]

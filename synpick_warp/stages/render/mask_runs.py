@@ -1,4 +1,4 @@
-"""Lists of the edges in a batch's instance and amodal images, from which writers make masks without the images."""
+"""Run boundaries of a batch's instance and amodal images, from which writers build RLE and PNG masks without the images."""
 
 from __future__ import annotations
 
@@ -7,41 +7,42 @@ from dataclasses import dataclass
 import warp as wp
 
 from synpick_warp.arrays import device_array
-from synpick_warp.kernels.render.images.mask_runs import count_edges_kernel, list_edges_kernel
+from synpick_warp.kernels.render.images.mask_runs import count_boundaries_kernel, list_boundaries_kernel
 from synpick_warp.stages.buffers import ViewBuffers
 
-EDGES_PER_COLUMN = 24
-"""Room for edges, as a mean over the columns of an image: three times what a tote of 14 objects has."""
-KINDS, PARTS = 2, 3
-"""Images; numbers of an edge."""
+BOUNDARIES_PER_COLUMN = 24
+"""Capacity of a list, as a mean over the columns of an image: three times the run boundaries of a tote with 14 objects."""
+IMAGES, FIELDS = 2, 3
+"""Extents: the instance and the amodal image; position, value above and value below of a boundary."""
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeBuffers:
-    """The edges of one batch of views; see `FrameBatch`."""
+class BoundaryBuffers:
+    """Run boundaries of one batch of views; see `FrameBatch`."""
 
-    edge_count: wp.array = device_array("view", "kind", dtype=wp.int32)
-    """How many edges the instance and the amodal image have."""
-    edges: wp.array = device_array("view", "kind", "part", "edge", dtype=wp.uint32)
-    """Place, value above, value below of each."""
+    boundary_count: wp.array = device_array("view", "image", dtype=wp.int32)
+    """Run boundaries of the instance and the amodal image, including those beyond the capacity of `boundaries`."""
+    boundaries: wp.array = device_array("view", "image", "field", "boundary", dtype=wp.uint32)
+    """Position, value above, value below of each."""
 
 
 @dataclass(frozen=True, eq=False)
-class EdgeScratch:
-    """What finding edges needs meanwhile."""
+class BoundaryScratch:
+    """Scratch of the two passes over the images."""
 
-    column_count: wp.array = device_array("view", "kind", "column", dtype=wp.int32)
-    """Edges of each column."""
+    column_count: wp.array = device_array("view", "image", "column", dtype=wp.int32)
+    """Run boundaries of each column."""
 
 
-def edge_sizes(view_sizes: dict[str, int]) -> dict[str, int]:
-    """Extents of the dimensions that `EdgeBuffers` and `EdgeScratch` name, from those that `ViewBuffers` names."""
+def boundary_sizes(view_sizes: dict[str, int]) -> dict[str, int]:
+    """Extents of the dimensions of `BoundaryBuffers` and `BoundaryScratch`, from those of `ViewBuffers`."""
     columns = view_sizes["column"]
-    return {"view": view_sizes["view"], "kind": KINDS, "part": PARTS, "column": columns, "edge": EDGES_PER_COLUMN * columns}
+    sizes = {"view": view_sizes["view"], "image": IMAGES, "field": FIELDS, "column": columns}
+    return sizes | {"boundary": BOUNDARIES_PER_COLUMN * columns}
 
 
-def list_edges(scratch: EdgeScratch, count: int, images: ViewBuffers, out: EdgeBuffers) -> None:
-    """List the edges of the first `count` views' images.
+def list_boundaries(scratch: BoundaryScratch, count: int, images: ViewBuffers, out: BoundaryBuffers) -> None:
+    """List the run boundaries of the first `count` views' images.
 
     Args:
         scratch: Overwritten.
@@ -51,11 +52,11 @@ def list_edges(scratch: EdgeScratch, count: int, images: ViewBuffers, out: EdgeB
     """
     dim = (count, *scratch.column_count.shape[1:])
     device = scratch.column_count.device
-    wp.launch(count_edges_kernel, dim=dim, inputs=[images.instance, images.amodal], outputs=[scratch.column_count], device=device)
+    wp.launch(count_boundaries_kernel, dim=dim, inputs=[images.instance, images.amodal], outputs=[scratch.column_count], device=device)
     wp.launch(
-        list_edges_kernel,
+        list_boundaries_kernel,
         dim=dim,
         inputs=[images.instance, images.amodal, scratch.column_count],
-        outputs=[out.edge_count, out.edges],
+        outputs=[out.boundary_count, out.boundaries],
         device=device,
     )

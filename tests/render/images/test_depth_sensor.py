@@ -61,7 +61,7 @@ def measure(toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, fi
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
     renderer = Renderer(config, scene, toy.room, views)
-    sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
+    sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
     images, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, ("depth_sensor",))
     world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     lens = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)

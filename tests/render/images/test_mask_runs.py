@@ -1,4 +1,4 @@
-"""Edges that the device lists against those that NumPy finds, and what writers make of them."""
+"""Run boundaries listed on the device against those that NumPy finds, and the masks that writers build from them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.exporters.bop.view import ViewSettings, extract_masks, make_view_task
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.stages.buffers import ViewBuffers
-from synpick_warp.stages.render import mask_runs as edges_module
-from synpick_warp.stages.render.mask_runs import EdgeBuffers, EdgeScratch, edge_sizes, list_edges
+from synpick_warp.stages.render import mask_runs
+from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from tests.harness.exporter_contract import digests, exporting, finish
 from tests.worlds.box_views import batches, cameras, config, ends
 
@@ -23,21 +23,21 @@ LENSES = cameras()
 SETTINGS = ViewSettings(".jpg", 95, (), masks=True, coco=True, camera={})
 
 
-def listed(instance: np.ndarray, amodal: np.ndarray, device: wp.Device) -> tuple[np.ndarray, np.ndarray]:
-    """Counts and lists of images (B, H, W), of which the last view is not in use."""
+def list_on_device(instance: np.ndarray, amodal: np.ndarray, device: wp.Device) -> tuple[np.ndarray, np.ndarray]:
+    """Counts and lists of run boundaries of images (B, H, W), of which the last view is not in use."""
     views, rows, columns = instance.shape
-    sizes = {"view": views, "row": rows, "column": columns, "instance": 1, "count": 3, "box": 2, "edge": 4}
+    sizes = {"view": views, "row": rows, "column": columns, "instance": 1, "count": 3, "box": 2, "side": 4}
     images = allocate(ViewBuffers, sizes, device)
     images.instance.assign(instance)
     images.amodal.assign(amodal)
-    scratch, out = (allocate(kind, edge_sizes(sizes), device) for kind in (EdgeScratch, EdgeBuffers))
-    out.edge_count.fill_(-1)
-    list_edges(scratch, views - 1, images, out)
-    return out.edge_count.numpy(), out.edges.numpy()
+    scratch, out = (allocate(kind, boundary_sizes(sizes), device) for kind in (BoundaryScratch, BoundaryBuffers))
+    out.boundary_count.fill_(-1)
+    list_boundaries(scratch, views - 1, images, out)
+    return out.boundary_count.numpy(), out.boundaries.numpy()
 
 
-def draw(rows: int, columns: int, views: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Blocks of a few values, up to the borders."""
+def sample_blocks(rows: int, columns: int, views: int = 3) -> tuple[np.ndarray, np.ndarray]:
+    """Instance and amodal images (B, H, W) of random blocks with a few values, up to the borders."""
     random = np.random.default_rng(7)
     small = random.integers(0, 4, (views, -(-rows // 3), -(-columns // 2)))
     blocks = np.repeat(np.repeat(small, 3, axis=1), 2, axis=2)[:, :rows, :columns]
@@ -45,37 +45,38 @@ def draw(rows: int, columns: int, views: int = 3) -> tuple[np.ndarray, np.ndarra
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (9, 1), (14, 11)])
-def test_the_device_lists_the_edges_that_numpy_finds(device, shape):
-    images = draw(*shape)
-    counts, edges = listed(*images, device)
+def test_device_lists_the_same_boundaries_as_numpy(device, shape):
+    images = sample_blocks(*shape)
+    counts, boundaries = list_on_device(*images, device)
     assert (counts[-1] == -1).all()
     for view in range(2):
-        for kind, image in enumerate(images):
-            expected, found = find_run_boundaries(image[view]), unpack_run_boundaries(edges[view, kind, :, : counts[view, kind]], shape[0])
+        for which, image in enumerate(images):
+            packed = boundaries[view, which, :, : counts[view, which]]
+            expected, found = find_run_boundaries(image[view]), unpack_run_boundaries(packed, shape[0])
             for name in ("column", "row", "above", "below"):
                 np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
-def test_edges_without_room_are_counted(device, monkeypatch):
-    images = draw(14, 11)
-    whole, edges = listed(*images, device)
-    monkeypatch.setattr(edges_module, "EDGES_PER_COLUMN", 1)
-    counts, cut = listed(*images, device)
-    np.testing.assert_array_equal(counts, whole)
+def test_boundaries_beyond_the_capacity_are_counted(device, monkeypatch):
+    images = sample_blocks(14, 11)
+    complete, boundaries = list_on_device(*images, device)
+    monkeypatch.setattr(mask_runs, "BOUNDARIES_PER_COLUMN", 1)
+    counts, cut = list_on_device(*images, device)
+    np.testing.assert_array_equal(counts, complete)
     assert (counts[:2] > cut.shape[-1]).all()
-    np.testing.assert_array_equal(cut[:2], edges[:2, ..., : cut.shape[-1]])
+    np.testing.assert_array_equal(cut[:2], boundaries[:2, ..., : cut.shape[-1]])
 
 
-def with_edges(batch, device):
-    """The same views, with lists."""
+def with_boundaries(batch, device):
+    """The same views, with lists of run boundaries."""
     padded = [np.concatenate((image, image[:1])) for image in (batch.instance, batch.amodal)]
-    counts, edges = listed(*padded, device)
-    return dataclasses.replace(batch, edge_count=counts[:-1], edges=edges[:-1])
+    counts, boundaries = list_on_device(*padded, device)
+    return dataclasses.replace(batch, boundary_count=counts[:-1], boundaries=boundaries[:-1])
 
 
 def test_masks_are_the_same_from_lists_and_from_images(device):
     for batch in batches(4, (0, 2), 3, LENSES):
-        lists = with_edges(batch, device)
+        lists = with_boundaries(batch, device)
         for view in range(len(batch)):
             (*_, first, second), truth = make_view_task(lists, view, 0, SETTINGS)
             assert truth.listed
@@ -90,11 +91,11 @@ def test_masks_are_the_same_from_lists_and_from_images(device):
 
 
 def test_lists_that_overflowed_or_are_large_are_not_used(device):
-    batch = with_edges(next(batches(1, (0,), 1, LENSES)), device)
+    batch = with_boundaries(next(batches(1, (0,), 1, LENSES)), device)
     assert make_view_task(batch, 0, 0, SETTINGS)[1].listed
-    short = dataclasses.replace(batch, edges=batch.edges[..., : batch.edge_count.max() - 1])
+    short = dataclasses.replace(batch, boundaries=batch.boundaries[..., : batch.boundary_count.max() - 1])
     noise = np.random.default_rng(0).integers(0, 256, batch.instance.shape).astype(np.uint8)
-    for other in (short, with_edges(dataclasses.replace(batch, instance=noise), device)):
+    for other in (short, with_boundaries(dataclasses.replace(batch, instance=noise), device)):
         images, truth = make_view_task(other, 0, 0, SETTINGS)
         assert not truth.listed
         assert images[2].dtype == np.uint8
@@ -103,7 +104,7 @@ def test_lists_that_overflowed_or_are_large_are_not_used(device):
 @pytest.mark.parametrize("kind", [BopExporter, ShardsExporter])
 def test_files_are_the_same_from_lists_and_from_images(tmp_path, device, kind):
     found = []
-    for name, change in (("images", lambda batch: batch), ("lists", lambda batch: with_edges(batch, device))):
+    for name, change in (("images", lambda batch: batch), ("lists", lambda batch: with_boundaries(batch, device))):
         with exporting(kind, tmp_path / name, config(), processes=0) as exporter:
             exporter.write_constants()
             for batch in batches(4, (0,), 3, LENSES):

@@ -142,7 +142,7 @@ def test_two_frames_of_a_still_scene_are_identical(device):
     toy.config = settings(cell=4)
     scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
     renderer = Renderer(toy.settings(), scene, toy.room, 1)
-    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "edge": 4}
+    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
     out = allocate(ViewBuffers, sizes, device)
     state, camera_zero, made = snapshot(toy, device), wp.zeros(1, dtype=wp.int32, device=device), []
     for world in (0, 1, 0, 0):
