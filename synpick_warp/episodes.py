@@ -67,6 +67,8 @@ class BakeSummary:
     """Arrangements that ended in a way that delivers nothing, and were drawn again."""
     redrawn: dict[Ending, int] = field(default_factory=dict)
     """The same, by ending."""
+    remedies: dict[Ending, str] = field(default_factory=dict)
+    """Advice against these endings, where a setting cures them; see `remedy`."""
     outcomes: Counter[Outcome] = field(default_factory=Counter)
     """Attempts, by outcome."""
     resumed: int = 0
@@ -114,6 +116,21 @@ def episode_row(config: Config, report: TickReport, world: int, record: EpisodeR
 def is_redrawn(config: Config, row: EpisodeRow) -> bool:
     """Whether the episode will come again, with another arrangement."""
     return not row.ending.delivers and row.redraw + 1 < config.settle.tries
+
+
+def remedy(config: Config, ending: Ending) -> str:
+    """Advice against an ending that is caused by a setting, with the current values; empty: no setting cures it."""
+    physics, sight, settle = config.physics, config.sight, config.settle
+    if ending is Ending.SOLVER_OVERFLOW:
+        capacities = ("contacts_per_world", "pairs_per_world", "rows_per_world", "gripper_rows_per_world")
+        return "raise " + " or ".join(f"physics.{name} ({getattr(physics, name)})" for name in capacities)
+    if ending is Ending.SIGHT_OVERFLOW:
+        return f"raise sight.contour_points ({sight.contour_points})"
+    if ending is Ending.ARRANGEMENT_OVERFLOW:
+        return f"lower arrangement.slot_shortfall ({config.arrangement.slot_shortfall:g})"
+    if ending is Ending.UNSETTLED:
+        return f"raise settle.max_time ({settle.max_time:g}) or settle.max_redrops ({settle.max_redrops})"
+    return ""
 
 
 def episode_end(config: Config, row: EpisodeRow, record: EpisodeRecord) -> EpisodeEnd:

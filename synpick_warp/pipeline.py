@@ -20,7 +20,7 @@ from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.dataset.manifest import digest_inputs, episode_place, read_record
 from synpick_warp.dataset.writing import Output, complete
 from synpick_warp.device import pick_device
-from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_redrawn
+from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_redrawn, remedy
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes, slot_bytes
@@ -206,9 +206,13 @@ class _Run:
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
         row = episode_row(self.config, report, world, record)
         end = episode_end(self.config, row, record)
+        advice = remedy(self.config, row.ending)
+        if advice:
+            self.summary.remedies[row.ending] = advice
         if is_redrawn(self.config, row):
             self.summary.take_redraw(row.ending)
-            self.progress.note(f"episode {row.episode}, arrangement {row.redraw + 1}: {row.ending.sentence}")
+            note = f"episode {row.episode}, arrangement {row.redraw + 1}: {row.ending.sentence}"
+            self.progress.note(note + (f"; {advice}" if advice else ""))
             self.exporters.end_episode(end, lambda: None)
         else:
             self.summary.take_episode(row, record)

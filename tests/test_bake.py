@@ -315,7 +315,9 @@ def test_drawn_again_and_counted(tmp_path):
     summary = run_bake(config, tmp_path / "set", Notes())
     assert (summary.redraws, summary.redrawn) == (1, {Ending.UNSETTLED: 1})
     assert [(row.episode, row.redraw, row.ending) for row in summary.episodes] == [(0, 1, Ending.UNSETTLED)]
-    assert noted == [f"episode 0, arrangement 1: {Ending.UNSETTLED.sentence}"]
+    advice = "raise settle.max_time (0.1) or settle.max_redrops (8)"
+    assert noted == [f"episode 0, arrangement 1: {Ending.UNSETTLED.sentence}; {advice}"]
+    assert summary.remedies == {Ending.UNSETTLED: advice}
 
 
 @pytest.fixture

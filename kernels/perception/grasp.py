@@ -32,12 +32,6 @@ def gripper_angles(normal: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def axis_position(point: wp.vec3, normal: wp.vec3, tip: float) -> wp.vec3:
-    """Where the tilt axis is when the cup's tip, `tip` [m] from it, touches `point` along `normal`."""
-    return point + tip * normal
-
-
-@wp.func
 def limited_normal(normal: wp.vec3, limit: float) -> wp.vec3:
     """A normal of any length as a unit vector, turned up to an angle of at most `limit` [rad] with the vertical; zero: the vertical."""
     length = wp.length(normal)

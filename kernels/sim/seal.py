@@ -137,10 +137,9 @@ def seal_load(force: wp.vec3, axis: wp.vec3) -> float:
 
 
 @wp.func
-def release_seal(held: wp.array2d[int], load: wp.array2d[float], joint_f: wp.array[float], world: int, instance: int, first_dof: int):
+def release_seal(held: wp.array2d[int], joint_f: wp.array[float], world: int, instance: int, first_dof: int):
     """Let go of an instance whose six degrees of freedom begin at `first_dof`."""
     held[world, instance] = 0
-    load[world, instance] = 0.0
     for axis in range(6):
         joint_f[first_dof + axis] = 0.0
 
@@ -183,6 +182,7 @@ def hold_objects_kernel(
     seals = int(0)
     for instance in range(layout.instances):
         seals += held_inout[world, instance]
+        load_inout[world, instance] = 0.0
     if seals == 0:
         return
     cup = world * layout.bodies + CUP
@@ -211,11 +211,11 @@ def hold_objects_kernel(
             )
             load = seal_load(wrench.force, axis)
             first = dof + layout.gripper_dofs + 6 * s
+            load_inout[world, instance] = load
+            peak_inout[world] = wp.max(peak_inout[world], load)
             if load > limit[world]:
-                release_seal(held_inout, load_inout, joint_f_inout, world, instance, first)
+                release_seal(held_inout, joint_f_inout, world, instance, first)
             else:
-                load_inout[world, instance] = load
-                peak_inout[world] = wp.max(peak_inout[world], load)
                 apply_wrench(wrench, arm, lever, hinge, joint_f_inout, dof, first)
 
 

@@ -143,10 +143,8 @@ def record_forces_kernel(
         bears = float(wp.nan)
         hangs = int(0)
         if body >= 0:
-            bears = 0.0
-            if held[world, place] != 0:
-                bears = load[world, place]
-                hangs = 1
+            bears = load[world, place]
+            hangs = held[world, place]
         seal_load_out[world, step, place] = bears
         held_out[world, step, place] = wp.uint8(hangs)
 

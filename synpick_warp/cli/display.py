@@ -17,7 +17,7 @@ from rich.table import Table
 from synpick_warp.progress import Progress
 
 if TYPE_CHECKING:
-    from synpick_warp.codes import Outcome
+    from synpick_warp.codes import Ending, Outcome
     from synpick_warp.episodes import BakeSummary, EpisodeRow
 
 PLAIN_WIDTH = 120
@@ -125,6 +125,8 @@ def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
     )
     if summary.outcomes:
         console.print(_attempts(summary), markup=False, soft_wrap=True)
+    for ending, advice in sorted(summary.remedies.items()):
+        console.print(f"{_words(ending)}: {advice}", markup=False, soft_wrap=True)
     console.print(f"data set: {out}", markup=False, soft_wrap=True)
 
 
@@ -168,9 +170,9 @@ def _attempts(summary: BakeSummary) -> str:
     return f"{total:,} attempts: {', '.join(shares)}; {picked:,} of {objects:,} objects picked, {lost:,} lost otherwise"
 
 
-def _words(outcome: Outcome) -> str:
-    """Its name: its sentence is too long for a list of shares."""
-    return outcome.name.lower().replace("_", " ")
+def _words(code: Ending | Outcome) -> str:
+    """Name of an ending or outcome in words; its sentence is too long for a list."""
+    return code.name.lower().replace("_", " ")
 
 
 def _detail(worlds_active: int, views: int, views_per_s: float, seconds_left: float | None) -> str:

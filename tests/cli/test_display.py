@@ -50,6 +50,13 @@ def test_a_bake_that_picked_tells_of_attempts():
     assert expected in text.splitlines()
 
 
+def test_a_summary_names_the_settings_that_cure_its_endings():
+    text = printed(
+        BakeSummary(1, [row(0, 1, Ending.FINISHED, 9, 1.0)], remedies={Ending.SIGHT_OVERFLOW: "raise sight.contour_points (16)"})
+    )
+    assert "sight overflow: raise sight.contour_points (16)" in text.splitlines()
+
+
 def test_a_long_bake_lists_counts_and_failures():
     rows = [row(episode, 0, Ending.NOT_FINITE if episode % 4 == 0 else Ending.FINISHED, 5, 1.0) for episode in range(100)]
     text = printed(BakeSummary(len(rows), rows, views=1500, wall_seconds=10.0))

@@ -11,15 +11,11 @@ wp.set_module_options({"enable_backward": False})
 def frame_kernel(
     normal: wp.array[wp.vec3],
     limit: float,
-    point: wp.vec3,
-    tip: float,
     angles_out: wp.array[wp.vec2],
     limited_out: wp.array[wp.vec3],
-    axis_out: wp.array[wp.vec3],
 ):
-    """Limited normal, its angles, and where the tilt axis is."""
+    """Limited normal and its angles."""
     i = wp.tid()
     limited = grasp.limited_normal(normal[i], limit)
     limited_out[i] = limited
     angles_out[i] = grasp.gripper_angles(limited)
-    axis_out[i] = grasp.axis_position(point, limited, tip)

@@ -193,7 +193,7 @@ class Recorder:
 
 
 def record_arrays(made: PhysicsRecord) -> list[wp.array]:
-    """The arrays of a record, in the order in which `host_steps` and `host_drops` take them."""
+    """The arrays of a record, in the order in which `host_record` takes them."""
     return [getattr(part, item.name) for part in (made.steps, made.drops) if part is not None for item in fields(part)]
 
 
