@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from synpick_warp.configs.schema import Gripper
-from synpick_warp.scenes.collision.shapes import limited_hull
+from synpick_warp.scenes.collision.hulls import simplify_hull
 from synpick_warp.scenes.embedded.meshes import join, lathe, make_mesh, solid
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Material
 
@@ -63,7 +63,7 @@ def finger_collider(gripper: Gripper) -> ConvexPiece:
     """The finger's cone."""
     low, high = _finger_radii(gripper)
     rings = lathe([(low, 0.0), (high, gripper.finger_length)], COLLIDER_SIDES)
-    return limited_hull(rings.reshape(-1, 3), 2 * COLLIDER_SIDES)
+    return simplify_hull(rings.reshape(-1, 3), 2 * COLLIDER_SIDES)
 
 
 def cup_collider(gripper: Gripper) -> ConvexPiece:
@@ -72,7 +72,7 @@ def cup_collider(gripper: Gripper) -> ConvexPiece:
     lip = lathe([(radius, -length), (radius, -(1 - LIP) * length)], COLLIDER_SIDES).reshape(-1, 3)
     shaft = lathe([(HINGE * radius, 0.0)], SHOULDER_SIDES)[0]
     points = np.concatenate([lip, shaft])
-    return limited_hull(points, len(points))
+    return simplify_hull(points, len(points))
 
 
 def rod_inertia(mass: float, length: float) -> tuple[float, float, float]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from synpick_warp.configs.schema import Tote
 from synpick_warp.errors import ConfigError
-from synpick_warp.scenes.collision.shapes import limited_hull
+from synpick_warp.scenes.collision.hulls import simplify_hull
 from synpick_warp.scenes.embedded.meshes import Patch, join, loft, make_mesh, rounded_rectangle, solid, strips
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Hollow, Material
 
@@ -182,4 +182,4 @@ def _box(low: tuple[float, float, float], high: tuple[float, float, float]) -> C
 
 
 def _piece(points: list[tuple[float, float, float]]) -> ConvexPiece:
-    return limited_hull(np.array(points), len(points))
+    return simplify_hull(np.array(points), len(points))

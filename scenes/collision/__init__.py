@@ -1,1 +1,1 @@
-"""Collision shapes: convex hulls, convex decomposition, half-spaces."""
+"""Collision shapes: hulls, decompositions, their half-spaces, and the cache."""

@@ -1,4 +1,4 @@
-"""Convex pieces as half-spaces: what rays are clipped against."""
+"""Half-space representation (H-representation) of collision shapes, against which the suction cup's rays are clipped."""
 
 from __future__ import annotations
 
@@ -9,26 +9,29 @@ from scipy.spatial import ConvexHull
 
 from synpick_warp.scenes.types import Catalog, ConvexPiece
 
-# Triangles of one flat face are one half-space: their planes agree to this many decimals (of 1, and of a metre).
+# Coplanar triangles are merged into one half-space if normal and offset [m] agree to this many decimals.
 _DECIMALS = 7
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneTable:
-    """The collision shapes of a catalog's entries. Pieces of entry e: first_piece[e] to first_piece[e + 1]; planes of a piece likewise."""
+    """Planes of all collision shapes of a catalog, in compressed row layout.
+
+    The pieces of entry e are first_piece[e] to first_piece[e + 1] - 1; the planes of piece p are first_plane[p] to first_plane[p + 1] - 1.
+    """
 
     first_piece: np.ndarray
     """(entry + 1) int32."""
     first_plane: np.ndarray
     """(piece + 1) int32."""
     plane: np.ndarray
-    """(plane, 4) float32: outward unit normal n and d [m] in the object's frame; the inside is n·x ≤ d."""
+    """(plane, 4) float32: outward unit normal n and offset d [m] in the object's frame; the inside is n·x ≤ d."""
 
 
 def hull_planes(piece: ConvexPiece) -> np.ndarray:
-    """Half-spaces whose intersection is the piece (plane, 4) float64: outward unit normal, and distance from the origin [m].
+    """H-representation of a piece (plane, 4) float64: outward unit normal n and offset d [m] of each half-space n·x ≤ d.
 
-    From the hull of the vertices, not from the triangles: thin ones have no normal to go by.
+    Computed from the hull of the vertices, not from the triangles: normals of thin triangles are unreliable.
     """
     equations = ConvexHull(piece.vertices.astype(np.float64)).equations
     _, index = np.unique(equations.round(_DECIMALS), axis=0, return_index=True)
@@ -37,7 +40,7 @@ def hull_planes(piece: ConvexPiece) -> np.ndarray:
 
 
 def plane_table(catalog: Catalog) -> PlaneTable:
-    """Half-spaces of all entries' pieces."""
+    """Collect the half-spaces of all entries' pieces."""
     pieces = [[hull_planes(piece) for piece in entry.pieces] for entry in catalog.entries]
     planes = [plane for entry in pieces for plane in entry]
     first_piece = np.cumsum([0] + [len(entry) for entry in pieces])

@@ -1,4 +1,4 @@
-"""Convex hulls of few vertices, and what convex bodies weigh."""
+"""Convex hull simplification, and mass properties of convex polyhedra."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from scipy.spatial import ConvexHull, QhullError
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.types import ConvexPiece
 
-# A hull does not take a vertex that adds less than this share of its volume.
-_LEAST_GAIN = 1e-4
-# A hull is flat if it fills less than this share of the cube over its extent: 0.2 µm on a sheet of 0.2 m.
+# Smallest volume that another vertex must add, as a fraction of the full hull's.
+_MIN_GAIN = 1e-4
+# Points count as coplanar if their hull fills less than this fraction of the cube of their extent: 0.2 µm on a sheet of 0.2 m.
 _FLAT = 1e-6
 
 
 @dataclass(frozen=True)
 class MassProperties:
-    """Of uniform density."""
+    """Volume, centre of mass and inertia tensor of a body of uniform density."""
 
     volume: float
     """[m³]"""
     center_of_mass: np.ndarray
     """(3) float64 [m]"""
     unit_inertia: np.ndarray
-    """About the centre of mass, for 1 kg (3, 3) float64 [m²]."""
+    """Inertia tensor about the centre of mass per mass (3, 3) float64 [m²]."""
 
 
 def hull_volume(points: np.ndarray) -> float:
-    """Volume of the convex hull of points (N, 3) [m³]; 0 if they lie in a plane."""
+    """Volume of the convex hull of points (N, 3) [m³]; 0 if they are coplanar."""
     try:
         hull = ConvexHull(points.astype(np.float64))
     except QhullError:
@@ -38,40 +38,40 @@ def hull_volume(points: np.ndarray) -> float:
     return float(hull.volume) if hull.volume > _FLAT * np.ptp(points, axis=0).max() ** 3 else 0.0
 
 
-def limited_hull(points: np.ndarray, limit: int) -> ConvexPiece:
-    """Convex hull of at most `limit` of the points, chosen one by one so that each adds the most volume.
+def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
+    """Greedy convex hull simplification: at most `max_vertices` of the points, each chosen because it adds the most volume.
 
-    What a point adds is exact: the pyramids over the triangles it sees, V = Σ max(0, n·p + d) A / 3.
+    The gain of a point p is exact: the pyramids over the faces visible from it, V = Σ max(0, n·p + d) A / 3.
 
     Args:
         points: (N, 3) [m].
-        limit: Most vertices, at least 6.
+        max_vertices: At least 6.
 
     Raises:
-        CatalogError: The points lie in a plane.
+        CatalogError: The points are coplanar.
     """
     points = np.unique(points.astype(np.float32), axis=0).astype(np.float64)
     try:
-        whole = ConvexHull(points)
+        full = ConvexHull(points)
     except QhullError as error:
         raise CatalogError("all vertices lie in one plane; a body needs a volume") from error
-    candidates = points[whole.vertices]
+    candidates = points[full.vertices]
     chosen = _extreme_points(candidates)
     hull = ConvexHull(candidates[chosen])
-    while len(chosen) < limit:
+    while len(chosen) < max_vertices:
         corners = hull.points[hull.simplices]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2.0
         gains = np.maximum(candidates @ hull.equations[:, :3].T + hull.equations[:, 3], 0.0) @ areas / 3.0
         best = int(gains.argmax())
-        if gains[best] < _LEAST_GAIN * whole.volume or best in chosen:
+        if gains[best] < _MIN_GAIN * full.volume or best in chosen:
             break
         chosen.append(best)
         hull = ConvexHull(candidates[chosen])
-    return _piece(hull)
+    return _to_piece(hull)
 
 
 def _extreme_points(points: np.ndarray) -> list[int]:
-    """Indices of four to six points that span a volume: the outermost along each axis, then those that add most."""
+    """Initial simplex: indices of four to six points that span a volume, among them the extreme points along the axes."""
     chosen = {int(index) for axis in range(3) for index in (points[:, axis].argmin(), points[:, axis].argmax())}
     first = points[min(chosen)]
     far = int(np.linalg.norm(points - first, axis=1).argmax())
@@ -79,39 +79,39 @@ def _extreme_points(points: np.ndarray) -> list[int]:
     wide = int(np.linalg.norm(np.cross(points - first, line), axis=1).argmax())
     high = int(np.abs((points - first) @ np.cross(line, points[wide] - first)).argmax())
     spanning = [min(chosen), far, wide, high]
-    # The four span a tetrahedron for sure; the axes' extremes alone may not.
+    # The four span a tetrahedron; the extreme points along the axes alone may be coplanar.
     return list(dict.fromkeys([*spanning, *sorted(chosen)]))[:6]
 
 
-def _piece(hull: ConvexHull) -> ConvexPiece:
-    """The hull's vertices and its triangles, turned outward along shared edges: thin triangles have no normal to go by."""
+def _to_piece(hull: ConvexHull) -> ConvexPiece:
+    """The hull's vertices and triangles. Outward orientation spreads over shared edges: normals of thin triangles are unreliable."""
     faces = hull.simplices.copy()
     corners = hull.points[faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     start = int(np.linalg.norm(doubled, axis=1).argmax())
     if doubled[start] @ hull.equations[start, :3] < 0.0:
         faces[start] = faces[start, ::-1]
-    done, waiting = {start}, [start]
+    oriented, waiting = {start}, [start]
     while waiting:
         face = waiting.pop()
         edges = {(int(faces[face, k]), int(faces[face, (k + 1) % 3])) for k in range(3)}
         for neighbor in (int(n) for n in hull.neighbors[face]):
-            if neighbor in done:
+            if neighbor in oriented:
                 continue
             if any((int(faces[neighbor, k]), int(faces[neighbor, (k + 1) % 3])) in edges for k in range(3)):
                 faces[neighbor] = faces[neighbor, ::-1]
-            done.add(neighbor)
+            oriented.add(neighbor)
             waiting.append(neighbor)
     used, index = np.unique(faces, return_inverse=True)
     return ConvexPiece(hull.points[used].astype(np.float32), index.reshape(-1, 3).astype(np.int32))
 
 
 def mass_properties(pieces: Sequence[ConvexPiece]) -> MassProperties:
-    """Volume, centre of mass and inertia of the pieces' sum; where pieces overlap, the overlap counts twice.
+    """Mass properties of the union of convex pieces at uniform density; where pieces overlap, the overlap counts twice.
 
-    Exact for polyhedra: sums over the tetrahedra of each triangle with a point inside. For one with edges a, b, c from that point,
-    V = a·(b x c)/6, ∫x = V s/4, ∫xxᵀ = V (aaᵀ + bbᵀ + ccᵀ + ssᵀ)/20, s = a + b + c; inertia = tr(C) 1 - C of the second moment C.
-    So its eigenvalues keep the triangle inequality as long as C has no negative ones.
+    Exact for polyhedra, as a sum over signed tetrahedra between each triangle and an inner point. With edges a, b, c from that
+    point and s = a + b + c: V = a·(b x c)/6, ∫x = V s/4, ∫xxᵀ = V (aaᵀ + bbᵀ + ccᵀ + ssᵀ)/20. Inertia = tr(C) 1 - C, where C is
+    the covariance (second moment); its eigenvalues satisfy the triangle inequality as long as C is positive semidefinite.
     """
     origin = np.concatenate([piece.vertices for piece in pieces]).mean(axis=0, dtype=np.float64)
     corners = np.concatenate([(piece.vertices - origin)[piece.faces] for piece in pieces])
@@ -120,6 +120,6 @@ def mass_properties(pieces: Sequence[ConvexPiece]) -> MassProperties:
     volume = volumes.sum()
     center = volumes @ sums / (4.0 * volume)
     second = np.einsum("f,fki,fkj->ij", volumes, corners, corners) + np.einsum("f,fi,fj->ij", volumes, sums, sums)
-    spread = second / (20.0 * volume) - np.outer(center, center)
-    spread = (spread + spread.T) / 2.0
-    return MassProperties(float(volume), origin + center, np.trace(spread) * np.eye(3) - spread)
+    covariance = second / (20.0 * volume) - np.outer(center, center)
+    covariance = (covariance + covariance.T) / 2.0
+    return MassProperties(float(volume), origin + center, np.trace(covariance) * np.eye(3) - covariance)

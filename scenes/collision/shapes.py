@@ -1,31 +1,29 @@
-"""Collision shapes of a catalog's objects, kept on disk by content."""
+"""Collision shapes of a catalog's objects, with a disk cache keyed by content (mesh, recipe, CoACD version)."""
 
 from __future__ import annotations
 
 import hashlib
 import importlib.metadata
 import os
-import signal
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
-from synpick_warp.scenes.collision.hulls import limited_hull
+from synpick_warp.scenes.collision.decomposition import ShapeRecipe
+from synpick_warp.scenes.collision.hulls import simplify_hull
+from synpick_warp.scenes.collision.parallel import decompose_all
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
 
-# Part of the cache's key. Raise it with any change to hulls.py or decomposition.py that gives other shapes for the same input.
+# Part of the cache's key, as is the text of ShapeRecipe. Raise it with any change to hulls.py or decomposition.py that gives other shapes
+# for the same input.
 _RECIPE = 1
 
 
 def default_cache_dir() -> Path:
-    """Where shapes are kept unless told otherwise: the user's cache folder (XDG base directory specification)."""
+    """Default cache folder: in the user's cache directory (XDG base directory specification)."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "synpick-warp" / "collision"
 
@@ -33,14 +31,14 @@ def default_cache_dir() -> Path:
 def collision_shapes(
     names: Sequence[str], meshes: Sequence[TriangleMesh], recipes: Sequence[ShapeRecipe], cache_dir: Path, report: Callable[[str], None]
 ) -> list[tuple[ConvexPiece, ...]]:
-    """The collision shape of each mesh, from the cache where it has been made before.
+    """Compute the collision shape of each mesh (convex hull, or convex decomposition), or read it from the cache.
 
     Args:
-        names: Of the objects, for reports and errors.
-        meshes: As long as `names`.
-        recipes: As long as `names`.
-        cache_dir: Folder of the cache; made if it is missing. If it cannot be written, that is reported and shapes are made each time.
-        report: Takes one line of progress at a time.
+        names: Names of the objects, for progress and errors.
+        meshes: One mesh per name.
+        recipes: One recipe per name.
+        cache_dir: Folder of the cache; created if missing. If it cannot be written, that is reported and shapes are computed each time.
+        report: Called with each line of progress.
 
     Raises:
         CatalogError: A mesh has no volume, or its decomposition failed.
@@ -51,37 +49,23 @@ def collision_shapes(
     slow = [index for index in missing if recipes[index].concave]
     if slow:
         report(f"decomposing {len(slow)} concave objects, once, up to a minute each: {', '.join(names[index] for index in slow)}")
-    jobs = [(meshes[index], recipes[index]) for index in slow]
+    jobs = [(names[index], meshes[index], recipes[index]) for index in slow]
     writable = True
-    # Each shape is kept as soon as it is there: a bake that is stopped meanwhile has not worked in vain.
-    for index, shape in zip(slow, _decompose_all(jobs), strict=True):
+    # Each shape is cached as soon as it is computed, so that a stopped bake need not repeat it.
+    for index, shape in zip(slow, decompose_all(jobs), strict=True):
         if not shape:
-            raise CatalogError(f"{names[index]}: no decomposition into convex pieces found; repair the mesh, or set concave = false")
+            raise CatalogError(f"{names[index]}: CoACD found no convex pieces; repair the mesh, or set concave = false")
         report(f"{names[index]}: {len(shape)} convex pieces")
         shapes[index] = shape
         writable = writable and _save(files[index], shape, report)
     for index in (index for index in missing if not recipes[index].concave):
         try:
-            shape = (limited_hull(meshes[index].vertices, recipes[index].hull_vertices),)
+            shape = (simplify_hull(meshes[index].vertices, recipes[index].hull_vertices),)
         except CatalogError as error:
             raise CatalogError(f"{names[index]}: {error}") from error
         shapes[index] = shape
         writable = writable and _save(files[index], shape, report)
     return [shape or () for shape in shapes]
-
-
-def _decompose_all(jobs: list[tuple[TriangleMesh, ShapeRecipe]]) -> Iterator[tuple[ConvexPiece, ...]]:
-    """Decompose in as many processes as there are cores and jobs, in order. CoACD has global state: threads would share it."""
-    if len(jobs) <= 1:
-        yield from (decompose(*job) for job in jobs)
-        return
-    # Spawned, not forked: a copy of a process that has used a GPU cannot run. Ctrl-C ends the children at once, in native code too.
-    stop = {"initializer": signal.signal, "initargs": (signal.SIGINT, signal.SIG_DFL)}
-    with ProcessPoolExecutor(min(len(jobs), os.cpu_count() or 1), mp_context=get_context("spawn"), **stop) as pool:
-        try:
-            yield from pool.map(decompose, *zip(*jobs, strict=True))
-        except BrokenProcessPool as error:
-            raise CatalogError("a process that decomposed concave objects died, perhaps for want of memory; try again") from error
 
 
 def _key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
@@ -93,7 +77,7 @@ def _key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
 
 
 def _load(file: Path) -> tuple[ConvexPiece, ...] | None:
-    """The pieces in a cache file; None if there is none, or a damaged one."""
+    """Read a cache file; None if it is missing or damaged."""
     try:
         # Opened here, because np.load leaves a damaged file open.
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
@@ -101,14 +85,14 @@ def _load(file: Path) -> tuple[ConvexPiece, ...] | None:
         ends = np.cumsum(counts, axis=0)[:-1]
         pairs = zip(np.split(vertices, ends[:, 0]), np.split(faces, ends[:, 1]), strict=True)
         pieces = tuple(ConvexPiece(np.ascontiguousarray(v, np.float32), np.ascontiguousarray(f, np.int32)) for v, f in pairs)
-        sound = all(np.isfinite(p.vertices).all() and p.faces.min() >= 0 and p.faces.max() < len(p.vertices) for p in pieces)
-    except Exception:  # a damaged file raises nearly anything; whatever it is, the shape is made anew
+        valid = all(np.isfinite(p.vertices).all() and p.faces.min() >= 0 and p.faces.max() < len(p.vertices) for p in pieces)
+    except Exception:  # a damaged file raises nearly anything; whatever it is, the shape is computed again
         return None
-    return pieces if sound and pieces else None
+    return pieces if valid and pieces else None
 
 
 def _save(file: Path, pieces: tuple[ConvexPiece, ...], report: Callable[[str], None]) -> bool:
-    """Write a cache file whole or not at all: several bakes may share the folder. False if it cannot be written."""
+    """Write a cache file atomically, since several bakes may share the folder. False if it cannot be written."""
     vertices, faces = (np.concatenate(rows) for rows in zip(*((piece.vertices, piece.faces) for piece in pieces), strict=True))
     counts = np.array([(len(piece.vertices), len(piece.faces)) for piece in pieces])
     try:
@@ -122,6 +106,6 @@ def _save(file: Path, pieces: tuple[ConvexPiece, ...], report: Callable[[str], N
             os.unlink(temporary)
             raise
     except OSError as error:
-        report(f"collision shapes are not kept: {file.parent} cannot be written ({error.strerror})")
+        report(f"collision shapes are not cached: {file.parent} cannot be written ({error.strerror})")
         return False
     return True

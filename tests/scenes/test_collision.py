@@ -1,6 +1,11 @@
+"""Collision shapes: hulls of few vertices, mass properties, convex decomposition and its cache."""
+
 from __future__ import annotations
 
 import collections
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +17,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.collision import parallel
 from synpick_warp.scenes.collision import shapes as collision
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
-from synpick_warp.scenes.collision.hulls import hull_volume, limited_hull, mass_properties
+from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties, simplify_hull
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.meshes import smooth_normals
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
@@ -36,7 +42,7 @@ def bowl(segments: int = 10) -> trimesh.Trimesh:
     return trimesh.creation.revolve(np.concatenate([outer, inner]), sections=segments)
 
 
-def assert_sound(piece: ConvexPiece) -> None:
+def assert_valid(piece: ConvexPiece) -> None:
     """Closed, outward, convex, and no vertex unused."""
     edges = collections.Counter((int(face[k]), int(face[(k + 1) % 3])) for face in piece.faces for k in range(3))
     assert all(count == 1 and edges[end, start] == 1 for (start, end), count in edges.items())
@@ -55,66 +61,66 @@ def never(line: str) -> None:
 
 def test_a_cube_keeps_its_eight_corners():
     grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 6)] * 3), axis=-1).reshape(-1, 3)
-    piece = limited_hull(grid, 64)
-    assert_sound(piece)
+    piece = simplify_hull(grid, 64)
+    assert_valid(piece)
     assert np.array_equal(np.unique(piece.vertices, axis=0), np.unique(np.sign(grid[np.abs(grid).min(axis=1) == 0.5]) / 2, axis=0))
 
 
 def test_mass_properties_of_a_cube_far_from_its_origin():
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     box.apply_translation((3.0, -2.0, 7.0))
-    found = mass_properties([ConvexPiece(box.vertices.astype(np.float32), box.faces.astype(np.int32))])
-    assert found.volume == pytest.approx(1.0)
-    assert found.center_of_mass == pytest.approx((3.0, -2.0, 7.0))
-    assert np.allclose(found.unit_inertia, np.eye(3) / 6)
+    result = mass_properties([ConvexPiece(box.vertices.astype(np.float32), box.faces.astype(np.int32))])
+    assert result.volume == pytest.approx(1.0)
+    assert result.center_of_mass == pytest.approx((3.0, -2.0, 7.0))
+    assert np.allclose(result.unit_inertia, np.eye(3) / 6)
 
 
-def test_mass_properties_of_two_boxes_are_those_of_one():
+def test_mass_properties_of_two_half_boxes_are_those_of_the_whole():
     halves = [trimesh.creation.box(bounds=((left, 0.0, 0.0), (left + 0.1, 0.2, 0.3))) for left in (0.0, 0.1)]
-    found = mass_properties([ConvexPiece(half.vertices.astype(np.float32), half.faces.astype(np.int32)) for half in halves])
-    assert found.volume == pytest.approx(0.012)
-    assert np.allclose(np.diag(found.unit_inertia), np.array((0.2**2 + 0.3**2, 0.2**2 + 0.3**2, 0.2**2 + 0.2**2)) / 12)
+    result = mass_properties([ConvexPiece(half.vertices.astype(np.float32), half.faces.astype(np.int32)) for half in halves])
+    assert result.volume == pytest.approx(0.012)
+    assert np.allclose(np.diag(result.unit_inertia), np.array((0.2**2 + 0.3**2, 0.2**2 + 0.3**2, 0.2**2 + 0.2**2)) / 12)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(5, 60), st.floats(1e-2, 1.0))
 def test_mass_properties_are_physical_and_agree_with_trimesh(seed, count, flatness):
     points = np.random.default_rng(seed).normal(size=(count, 3)) * (0.1, 0.1, 0.1 * flatness)
-    piece = limited_hull(points, 64)
-    found = mass_properties([piece])
+    piece = simplify_hull(points, 64)
+    result = mass_properties([piece])
     twin = trimesh.Trimesh(piece.vertices, piece.faces, process=False)
-    assert found.volume == pytest.approx(twin.volume, rel=1e-4)
-    assert np.allclose(found.center_of_mass, twin.center_mass, atol=1e-5)
-    assert np.allclose(found.unit_inertia, twin.moment_inertia / twin.volume, atol=1e-4 * found.unit_inertia.max())
-    low, middle, high = np.linalg.eigvalsh(found.unit_inertia)
+    assert result.volume == pytest.approx(twin.volume, rel=1e-4)
+    assert np.allclose(result.center_of_mass, twin.center_mass, atol=1e-5)
+    assert np.allclose(result.unit_inertia, twin.moment_inertia / twin.volume, atol=1e-4 * result.unit_inertia.max())
+    low, middle, high = np.linalg.eigvalsh(result.unit_inertia)
     assert low > 0.0
     assert low + middle >= high
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(4, 400), st.integers(8, 64), st.floats(1e-3, 1.0))
-def test_limited_hulls_are_sound_and_inside(seed, count, limit, flatness):
+def test_simplified_hulls_are_valid_and_made_of_the_given_points(seed, count, limit, flatness):
     points = np.random.default_rng(seed).normal(size=(count, 3)) * (0.1, 0.05, 0.1 * flatness)
-    piece = limited_hull(points, limit)
-    assert_sound(piece)
+    piece = simplify_hull(points, limit)
+    assert_valid(piece)
     assert len(piece.vertices) <= limit
     given_rows = {tuple(row) for row in points.astype(np.float32)}
     assert all(tuple(row) in given_rows for row in piece.vertices)
 
 
-def test_a_sphere_keeps_what_64_vertices_can():
+def test_a_sphere_of_64_vertices_keeps_most_of_its_volume():
     # The largest polyhedron of 64 vertices in a sphere fills about 0.89 of it.
     ball = trimesh.creation.icosphere(4, radius=0.05)
-    piece = limited_hull(ball.vertices, 64)
-    assert_sound(piece)
+    piece = simplify_hull(ball.vertices, 64)
+    assert_valid(piece)
     assert len(piece.vertices) == 64
     assert mass_properties([piece]).volume > 0.86 * hull_volume(ball.vertices)
-    assert np.array_equal(limited_hull(ball.vertices, 64).vertices, piece.vertices)
+    assert np.array_equal(simplify_hull(ball.vertices, 64).vertices, piece.vertices)
 
 
 @pytest.mark.parametrize("points", [np.zeros((9, 3)), np.eye(3), np.random.default_rng(0).random((50, 3)) * (1, 1, 0), np.ones((1, 3))])
-def test_flat_points_have_no_hull(points):
+def test_coplanar_points_have_no_hull(points):
     assert hull_volume(points) == 0.0
     with pytest.raises(CatalogError, match="one plane"):
-        limited_hull(points, 64)
+        simplify_hull(points, 64)
 
 
 @pytest.fixture(scope="module")
@@ -126,11 +132,11 @@ def bowl_shape(tmp_path_factory) -> tuple[Path, TriangleMesh, tuple[ConvexPiece,
     return cache, mesh, shape
 
 
-def test_a_bowl_stays_hollow(bowl_shape):
+def test_a_decomposed_bowl_stays_hollow(bowl_shape):
     _, mesh, shape = bowl_shape
     assert 2 <= len(shape) <= CONCAVE.pieces
     for piece in shape:
-        assert_sound(piece)
+        assert_valid(piece)
         assert len(piece.vertices) <= CONCAVE.piece_vertices
     assert mass_properties(shape).volume < 0.7 * hull_volume(mesh.vertices)
     # The middle of the opening is free: it lies outside of every piece.
@@ -141,9 +147,9 @@ def test_a_bowl_stays_hollow(bowl_shape):
         assert np.einsum("fi,fi->f", doubled, middle - corners[:, 0]).max() > 0.0
 
 
-def test_the_cache_answers_the_second_time(bowl_shape, monkeypatch):
+def test_the_second_time_a_shape_comes_from_the_cache(bowl_shape, monkeypatch):
     cache, mesh, shape = bowl_shape
-    monkeypatch.setattr(collision, "decompose", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(parallel, "decompose", lambda *_: pytest.fail("computed again"))
     (again,) = collision_shapes(["bowl"], [mesh], [CONCAVE], cache, never)
     assert len(again) == len(shape)
     for one, two in zip(again, shape, strict=True):
@@ -153,16 +159,16 @@ def test_the_cache_answers_the_second_time(bowl_shape, monkeypatch):
         assert one.faces.dtype == np.int32
 
 
-def test_hulls_are_kept_too_and_no_scrap_is_left(tmp_path, monkeypatch):
+def test_hulls_are_cached_too_and_no_temporary_file_is_left(tmp_path, monkeypatch):
     mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
     (shape,) = collision_shapes(["box"], [mesh], [HULL], tmp_path / "new", never)
     assert [file.suffix for file in (tmp_path / "new").iterdir()] == [".npz"]
-    monkeypatch.setattr(collision, "limited_hull", lambda *_: pytest.fail("made again"))
+    monkeypatch.setattr(collision, "simplify_hull", lambda *_: pytest.fail("computed again"))
     (again,) = collision_shapes(["box"], [mesh], [HULL], tmp_path / "new", never)
     assert np.array_equal(again[0].vertices, shape[0].vertices)
 
 
-def test_other_settings_and_other_meshes_have_other_files(tmp_path):
+def test_other_settings_and_other_meshes_have_cache_files_of_their_own(tmp_path):
     mesh = as_mesh(trimesh.creation.icosphere(3, radius=0.05))
     moved = replace(mesh, vertices=mesh.vertices + np.float32(1e-3))
     shapes = collision_shapes(["a", "b", "c"], [mesh, mesh, moved], [HULL, replace(HULL, hull_vertices=20), HULL], tmp_path, never)
@@ -171,18 +177,18 @@ def test_other_settings_and_other_meshes_have_other_files(tmp_path):
 
 
 @pytest.mark.parametrize("damage", [b"", b"scrap", None])
-def test_a_damaged_file_is_made_anew(tmp_path, damage):
+def test_a_damaged_cache_file_is_computed_again(tmp_path, damage):
     mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
     collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
     (file,) = tmp_path.iterdir()
     whole = file.read_bytes()
     file.write_bytes(whole[: len(whole) // 2] if damage is None else damage)
     (shape,) = collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
-    assert_sound(shape[0])
+    assert_valid(shape[0])
     assert file.read_bytes() == whole
 
 
-def test_a_file_that_names_missing_vertices_is_made_anew(tmp_path):
+def test_a_cache_file_with_vertex_indices_out_of_range_is_computed_again(tmp_path):
     mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
     collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
     (file,) = tmp_path.iterdir()
@@ -190,10 +196,10 @@ def test_a_file_that_names_missing_vertices_is_made_anew(tmp_path):
         arrays = {**data, "faces": data["faces"] + 5}
     np.savez(file, **arrays)
     (shape,) = collision_shapes(["box"], [mesh], [HULL], tmp_path, never)
-    assert_sound(shape[0])
+    assert_valid(shape[0])
 
 
-def test_without_a_writable_cache_shapes_are_made_all_the_same(tmp_path):
+def test_without_a_writable_cache_shapes_are_computed_all_the_same(tmp_path):
     (tmp_path / "file").write_text("")
     mesh = as_mesh(trimesh.creation.box((0.1, 0.1, 0.1)))
     lines: list[str] = []
@@ -203,7 +209,7 @@ def test_without_a_writable_cache_shapes_are_made_all_the_same(tmp_path):
     assert "cannot be written" in lines[0]
 
 
-def test_several_concave_objects_are_made_side_by_side_and_alike(tmp_path, bowl_shape):
+def test_parallel_decomposition_gives_the_same_pieces(tmp_path, bowl_shape):
     _, mesh, shape = bowl_shape
     other = as_mesh(bowl(8))
     first, _ = collision_shapes(["one", "two"], [mesh, other], [CONCAVE, CONCAVE], tmp_path, lambda _: None)
@@ -211,9 +217,64 @@ def test_several_concave_objects_are_made_side_by_side_and_alike(tmp_path, bowl_
     assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(first, shape, strict=True))
 
 
-def test_a_failed_decomposition_is_a_clear_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(collision, "decompose", lambda *_: ())
-    with pytest.raises(CatalogError, match="mug: no decomposition"):
+GUARDLESS = """
+import sys
+from pathlib import Path
+import numpy as np, trimesh
+from synpick_warp.scenes.collision.decomposition import ShapeRecipe
+from synpick_warp.scenes.collision.shapes import collision_shapes
+from synpick_warp.scenes.types import TriangleMesh
+
+def cube(size):
+    box = trimesh.creation.box((size,) * 3)
+    vertices = box.vertices.astype(np.float32)
+    return TriangleMesh(vertices, box.faces.astype(np.int32), vertices, np.zeros((8, 2), np.float32))
+
+recipe = ShapeRecipe(True, 64, 16, 8, 0.2)
+shapes = collision_shapes(["a", "b"], [cube(0.1), cube(0.2)], [recipe, recipe], Path(sys.argv[1]), lambda line: None)
+print([len(shape) for shape in shapes])
+"""
+
+
+def test_a_script_without_main_guard_can_decompose(tmp_path):
+    """Processes of `multiprocessing` would run the script again in each child, and die."""
+    script = tmp_path / "script.py"
+    script.write_text(GUARDLESS)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    result = subprocess.run([sys.executable, script, tmp_path / "cache"], env=environment, capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "[1, 1]\n", "")
+
+
+@pytest.mark.parametrize(
+    ("program", "words"),
+    [
+        ("import os; os.kill(os.getpid(), 9)", "b: the process that decomposes it was killed, probably for lack of memory"),
+        ("import os; os.kill(os.getpid(), 11)", "b: the process that decomposes it was ended by signal 11; repair the mesh"),
+        ("raise SystemExit('no library')", "b: the process that decomposes it ended with status 1: no library; repair the mesh"),
+    ],
+)
+def test_a_process_that_dies_is_named_with_its_cause_and_the_others_are_stopped(monkeypatch, program, words):
+    """The first job's process waits for a minute, unless it is killed."""
+    start = "import pickle, sys, time; first = pickle.load(sys.stdin.buffer)[0]\nif first: time.sleep(60)\n"
+    monkeypatch.setattr(parallel, "_WORKER", start + program)
+    jobs = [("b", False, None), ("a", True, None)]
+    with pytest.raises(CatalogError) as caught:
+        list(parallel.decompose_all(jobs))
+    assert str(caught.value).startswith(words)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_error_in_a_process_is_raised_in_the_caller(monkeypatch):
+    program = "from synpick_warp.scenes.collision import parallel as p; from synpick_warp.errors import CatalogError as E\n"
+    program += "def fail(*_): raise E('all vertices lie in one plane')\np.decompose = fail\np.main()"
+    monkeypatch.setattr(parallel, "_WORKER", program)
+    with pytest.raises(CatalogError, match="all vertices lie in one plane"):
+        list(parallel.decompose_all([("a", None, None), ("b", None, None)]))
+
+
+def test_a_failed_decomposition_is_a_clear_error(tmp_path, monkeypatch):
+    monkeypatch.setattr(parallel, "decompose", lambda *_: ())
+    with pytest.raises(CatalogError, match="mug: CoACD found no convex pieces"):
         collision_shapes(["mug"], [as_mesh(bowl())], [CONCAVE], tmp_path, lambda _: None)
     assert not list(tmp_path.iterdir())
 
@@ -229,7 +290,7 @@ def test_a_failed_decomposition_is_a_clear_line(tmp_path, monkeypatch):
         ("lost", ["off", "auto"]),
     ],
 )
-def test_repair_is_for_open_surfaces_inner_walls_and_lost_parts(monkeypatch, kind, modes):
+def test_only_open_meshes_inner_walls_and_lost_parts_are_preprocessed(monkeypatch, kind, modes):
     shell, asked = bowl(), []
     if kind == "open":
         shell.update_faces(np.arange(len(shell.faces)) > 0)
@@ -248,10 +309,10 @@ def test_repair_is_for_open_surfaces_inner_walls_and_lost_parts(monkeypatch, kin
     monkeypatch.setattr(coacd, "run_coacd", run_coacd)
     (piece,) = decompose(as_mesh(shell), CONCAVE)
     assert asked == modes
-    assert_sound(piece)
+    assert_valid(piece)
 
 
-def test_slivers_are_left_out(monkeypatch):
+def test_slivers_of_a_decomposition_are_dropped(monkeypatch):
     big, flat = trimesh.creation.box((0.1, 0.1, 0.1)).vertices, trimesh.creation.box((0.01, 0.01, 1e-5)).vertices
     monkeypatch.setattr(coacd, "run_coacd", lambda *_, **__: [(big, None), (flat, None), (flat * (1, 1, 0), None)])
     (piece,) = decompose(as_mesh(trimesh.creation.box((0.1, 0.1, 0.1))), CONCAVE)

@@ -9,7 +9,7 @@ import trimesh
 
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.scenes.collision.hulls import limited_hull, mass_properties
+from synpick_warp.scenes.collision.hulls import mass_properties, simplify_hull
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, Material, TriangleMesh
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.stream import TickReader, TickReport
@@ -55,7 +55,7 @@ def pieces(sizes: Sequence[tuple[float, float, float]]) -> tuple[ConvexPiece, ..
     shift = np.zeros(3)
     for size in sizes:
         corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
-        made.append(limited_hull(corners + shift, 8))
+        made.append(simplify_hull(corners + shift, 8))
         shift = np.array([-(sizes[0][0] - sizes[-1][0]) / 2, (sizes[0][1] + sizes[-1][1]) / 2, 0.0])
     return tuple(made)
 
