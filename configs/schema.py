@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from synpick_warp.codes import Tone, names
 from synpick_warp.configs.fields import setting
 from synpick_warp.configs.sensors import DepthSensor, Effects
+from synpick_warp.layers import LAYER_TABLE
 
 MODES = ("pick", "target", "move")
 """What the gripper does in an episode."""
@@ -22,8 +23,8 @@ FAST = "fast"
 REFERENCE = "reference"
 RENDER_MODES = (FAST, REFERENCE)
 """How colour is made."""
-LAYERS = ("normals", "albedo", "nocs", "classes", "flow", "scene_flow", "depth_sensor")
-"""What a picture can have besides colour, depth and instances; `synpick_warp.layers` says what each is."""
+LAYERS = tuple(LAYER_TABLE)
+"""Annotation layers that a view can have besides colour, depth and masks; see `synpick_warp.layers`."""
 
 
 FORMATS = ("bop", "shards", "usd", "zarr")

@@ -1,4 +1,4 @@
-"""Layers as files: what is read is what was kept, within the steps that the notes state."""
+"""PNG codec of annotation layers: values read back equal those written, within the quantization steps that the notes state."""
 
 from __future__ import annotations
 
@@ -12,62 +12,64 @@ from hypothesis.extra import numpy as hnp
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.view import write_layer
-from synpick_warp.layer_codec import decode_layer, encode_layer, layer_notes, layer_path, read_layer
+from synpick_warp.layer_codec import CODECS, decode_layer, encode_layer, layer_notes, layer_path, read_layer
+from synpick_warp.layers import LAYER_TABLE
 
 SIDES = st.tuples(st.integers(1, 6), st.integers(1, 6))
 
 
-def fields(channels: int, low: float, high: float):
-    """Layers of float32 whose pixels are all numbers or all NaN."""
+def motion_layers(channels: int, low: float, high: float):
+    """Strategy for float32 layers (H, W, channels) whose pixels are all finite or all NaN."""
     numbers = st.floats(low, high, width=32)
     shape = SIDES.map(lambda sides: (*sides, channels))
-    return st.tuples(shape.flatmap(lambda s: hnp.arrays(np.float32, s, elements=numbers)), st.integers(0, 2**32 - 1)).map(_with_holes)
+    return st.tuples(shape.flatmap(lambda s: hnp.arrays(np.float32, s, elements=numbers)), st.integers(0, 2**32 - 1)).map(_insert_holes)
 
 
-def _with_holes(drawn: tuple[np.ndarray, int]) -> np.ndarray:
+def _insert_holes(drawn: tuple[np.ndarray, int]) -> np.ndarray:
     values, bits = drawn
     holes = (bits >> (np.arange(values[..., 0].size) % 32)) & 1
     return np.where(holes.reshape(values.shape[:2])[..., None] == 1, np.float32(np.nan), values)
 
 
-def test_every_layer_has_a_way_into_files_and_a_note():
+def test_every_layer_has_a_codec_and_a_note():
+    assert {layer.encoding for layer in LAYER_TABLE.values()} == set(CODECS)
     notes = layer_notes(LAYERS)
     assert [line.split("`")[1] for line in notes.splitlines()] == [f"{name}/" for name in LAYERS]
     assert layer_notes(("flow", "nocs")).count("\n") == 2
     assert layer_notes(()) == ""
 
 
-@given(fields(2, -511.0, 511.0))
-def test_flow_comes_back_to_a_128th_of_a_pixel(values):
+@given(motion_layers(2, -511.0, 511.0))
+def test_flow_round_trips_to_a_128th_of_a_pixel(values):
     back = decode_layer("flow", encode_layer("flow", values))
     assert back.dtype == np.float32
     np.testing.assert_allclose(back, values, atol=1 / 128 + 1e-6)
 
 
-@given(fields(3, -0.625, 0.625))
-def test_scene_flow_comes_back_to_a_hundredth_of_a_millimetre(values):
+@given(motion_layers(3, -0.625, 0.625))
+def test_scene_flow_round_trips_to_a_hundredth_of_a_millimetre(values):
     back = decode_layer("scene_flow", encode_layer("scene_flow", values))
     assert back.dtype == np.float32
     np.testing.assert_allclose(back, values, atol=1e-5 + 1e-7)
 
 
 @given(hnp.arrays(np.float32, SIDES.map(lambda sides: (*sides, 3)), elements=st.floats(-1.0, 1.0, width=32)))
-def test_normals_and_places_come_back(values):
+def test_normals_and_nocs_round_trip_to_half_a_step(values):
     length = np.linalg.norm(values, axis=-1, keepdims=True)
     normals = np.where(length > 0.1, values / np.maximum(length, 1e-9), np.float32(0.0))
     np.testing.assert_allclose(decode_layer("normals", encode_layer("normals", normals)), normals, atol=0.51 / 32767)
-    places = np.abs(values)
-    np.testing.assert_allclose(decode_layer("nocs", encode_layer("nocs", places)), places, atol=0.51 / 65535)
+    nocs = np.abs(values)
+    np.testing.assert_allclose(decode_layer("nocs", encode_layer("nocs", nocs)), nocs, atol=0.51 / 65535)
 
 
-def test_flow_is_kittis():
+def test_flow_image_follows_the_kitti_format():
     """KITTI's development kit: u = (I_1 - 2^15) / 64, v = (I_2 - 2^15) / 64, known where I_3."""
     image = encode_layer("flow", np.array([[(1.5, -2.0), (0.0, 0.0), (np.nan, np.nan)]], np.float32))
     assert image.dtype == np.uint16
     assert image.tolist() == [[[32768 + 96, 32768 - 128, 1], [32768, 32768, 1], [0, 0, 0]]]
 
 
-def test_motion_that_does_not_fit_is_unknown_and_not_cut():
+def test_motion_out_of_range_is_unknown_instead_of_clipped():
     flow = np.array([[(511.98, -512.0), (512.0, 0.0), (0.0, -512.1), (np.inf, 0.0)]], np.float32)
     np.testing.assert_array_equal(np.isfinite(decode_layer("flow", encode_layer("flow", flow))).all(axis=-1), [[True, False, False, False]])
     scene_flow = np.array([[(0.655, -0.655, 0.0), (0.0, 0.0, 0.656), (-0.656, 0.0, 0.0)]], np.float32)
@@ -75,7 +77,7 @@ def test_motion_that_does_not_fit_is_unknown_and_not_cut():
     np.testing.assert_array_equal(np.isfinite(back).all(axis=-1), [[True, False, False]])
 
 
-def test_no_surface_differs_from_every_normal_and_place():
+def test_code_of_no_surface_differs_from_every_normal():
     normals = np.array([[(0, 0, -1), (-1, 0, 0), (0, 0, 0)]], np.float32)
     assert encode_layer("normals", normals).tolist() == [[[32768, 32768, 1], [1, 32768, 32768], [0, 0, 0]]]
     np.testing.assert_array_equal(decode_layer("normals", encode_layer("normals", normals)), normals)
@@ -93,16 +95,17 @@ VALUES = {
 
 
 @pytest.mark.parametrize("name", LAYERS)
-def test_files_are_read_back(tmp_path, name):
+def test_layer_files_round_trip(tmp_path, name):
     (tmp_path / name).mkdir()
     write_layer(VALUES[name], tmp_path, name, 12)
     assert layer_path(tmp_path, name, 12) == tmp_path / name / "000012.png"
     back = read_layer(tmp_path, name, 12)
     assert (back.shape, back.dtype) == (VALUES[name].shape, VALUES[name].dtype)
+    assert (back.dtype.name, back.shape[2:] or (1,)) == (LAYER_TABLE[name].dtype, (LAYER_TABLE[name].components,))
     np.testing.assert_allclose(back, VALUES[name], atol=2e-5)
 
 
-def test_files_that_are_none_are_reported(tmp_path):
+def test_missing_and_invalid_files_are_reported(tmp_path):
     with pytest.raises(DatasetError, match=r"there is no layer depth; layers: normals, "):
         read_layer(tmp_path, "depth", 0)
     with pytest.raises(DatasetError, match=r"there is no .*flow/000003.png; bake with render.layers naming flow"):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, make_dataclass
+from typing import Any
 
 import warp as wp
 
 from synpick_warp.arrays import device_array
 from synpick_warp.kernels.render.images.camera_effects import Strengths
+from synpick_warp.layers import LAYER_TABLE, Layer
 
 FIXTURES = ("tote", "finger", "cup")
 """What `Snapshot.fixture_pose` holds, in order."""
@@ -78,21 +80,13 @@ class ViewBuffers:
     """Strengths of the camera's effects, in the order of `Effect`; zero: off."""
 
 
-@dataclass(frozen=True, eq=False)
-class LayerBuffers:
-    """Layers of one batch of views, in the order of `configs.schema.LAYERS`; None: not asked for."""
+def _declare_layer(layer: Layer) -> Any:
+    return device_array("view", "row", "column", dtype=_LAYER_DTYPES[layer.dtype, layer.components], unit=layer.unit)
 
-    normals: wp.array = device_array("view", "row", "column", dtype=wp.vec3)
-    """Unit normal of the surface in the camera's axes, towards the camera; zero: no surface."""
-    albedo: wp.array = device_array("view", "row", "column", dtype=wp.vec3ub)
-    """Base colour, sRGB, red first; zero: no surface."""
-    nocs: wp.array = device_array("view", "row", "column", dtype=wp.vec3)
-    """Place on the instance: (p - centre of its bounding box) / diagonal of that box + 0.5, in the model's axes; zero: no instance."""
-    classes: wp.array = device_array("view", "row", "column", dtype=wp.uint16)
-    """obj_id; 0: no instance."""
-    flow: wp.array = device_array("view", "row", "column", dtype=wp.vec2, unit="px")
-    """From the pixel to where its surface point was in the frame before: columns, rows; NaN: unknown."""
-    scene_flow: wp.array = device_array("view", "row", "column", dtype=wp.vec3, unit="m")
-    """From the pixel's surface point to where it was in the frame before, in the camera's axes; NaN: unknown."""
-    depth_sensor: wp.array = device_array("view", "row", "column", dtype=wp.uint16, unit="depth_scale")
-    """Planar depth as a depth camera measures it; 0: hole."""
+
+_LAYER_DTYPES = {("float32", 2): wp.vec2, ("float32", 3): wp.vec3, ("uint8", 3): wp.vec3ub, ("uint16", 1): wp.uint16}
+_LAYER_FIELDS = [(name, wp.array, _declare_layer(layer)) for name, layer in LAYER_TABLE.items()]
+
+
+class LayerBuffers(make_dataclass("LayerArrays", _LAYER_FIELDS, frozen=True, eq=False)):
+    """Annotation layers of one batch of views: an array per layer of `LAYER_TABLE`, by its name; None: not in `render.layers`."""

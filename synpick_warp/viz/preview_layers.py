@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from synpick_warp.configs.schema import LAYERS
 from synpick_warp.layer_codec import read_layer
 
 _MOTION_RANGE = 99.0
@@ -25,12 +24,12 @@ Image = np.ndarray
 
 
 def layer_pictures(scene: Path, frame: int) -> list[tuple[str, Image]]:
-    """Caption and picture of each layer that a scene has, in the order of `LAYERS`.
+    """Caption and picture of each layer that a scene has and `_DRAW` can draw.
 
     Raises:
         DatasetError: The scene has a layer, but not of this image.
     """
-    return [_DRAW[name](read_layer(scene, name, frame)) for name in LAYERS if (scene / name).is_dir()]
+    return [draw(read_layer(scene, name, frame)) for name, draw in _DRAW.items() if (scene / name).is_dir()]
 
 
 def _draw_normals(values: np.ndarray) -> tuple[str, Image]:

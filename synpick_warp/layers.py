@@ -1,0 +1,112 @@
+"""Annotation layers (AOVs, "annotators"): one table of the per-pixel ground truth beside colour, depth and masks.
+
+The choices of `render.layers`, the device buffers, the PNG codec and the notes in a data set derive from this table. Imports nothing.
+To add a layer:
+
+1. add a row to `LAYER_TABLE`, and an encoding to `layer_codec.CODECS` if none fits;
+2. write its kernel in `kernels/render/images/`, and name kernel and inputs in `LayerRenderer.render` (`stages/render/layers.py`);
+3. state the tolerance between CPU and GPU in `tools/checks/compare_pictures.py`, and a sample value in `tests/test_layer_codec.py`;
+   tests fail until both are there. A drawing in `viz/preview_layers.py` is optional.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+ZERO_CODE = 32768
+"""Code of 0 in a signed layer."""
+MAX_CODE = 65535
+"""Largest code: PNG images have 16 bits a channel."""
+NORMAL_STEPS = 32767
+"""Steps from 0 to 1 of a normal's component."""
+FLOW_STEPS = 64
+"""Steps per pixel of optical flow, as in KITTI's flow images; they reach 512 px."""
+SCENE_FLOW_STEP = 2e-5
+"""One step of scene flow [m]; 16 bits reach 0.655 m, in a tick of 1/15 s a speed of 9.8 m/s."""
+
+
+@dataclass(frozen=True)
+class Layer:
+    """An annotation layer: its values in memory, and their encoding in PNG files."""
+
+    dtype: str
+    """Type of the values, in device buffers, in `FrameBatch.layers` and as decoded: a NumPy name."""
+    components: int
+    """Components of a pixel's value (C): the values have shape (H, W, C), or (H, W) if 1."""
+    unit: str
+    values: str
+    """Meaning of the values, and of the value that stands for none."""
+    encoding: str
+    """Key of `layer_codec.CODECS`."""
+    note: str
+    """Meaning of the file's codes, for the notes of a data set."""
+
+
+LAYER_TABLE = {
+    "normals": Layer(
+        dtype="float32",
+        components=3,
+        unit="",
+        values="Unit shading normal in the camera's axes, towards the camera; zero: no surface.",
+        encoding="unit_vector",
+        note=f"unit normals towards the camera, in its axes; red, green and blue are {ZERO_CODE} + {NORMAL_STEPS} times x, y and z; "
+        "0, 0, 0: no surface. They are interpolated between vertices, as those of the picture.",
+    ),
+    "albedo": Layer(
+        dtype="uint8",
+        components=3,
+        unit="",
+        values="Base colour, sRGB, red first; zero: no surface.",
+        encoding="raw",
+        note="base colour without light, sRGB; black where no surface is.",
+    ),
+    "nocs": Layer(
+        dtype="float32",
+        components=3,
+        unit="",
+        values="Normalized object coordinates: (p - centre of the bounding box) / its diagonal + 0.5, in the model's axes; "
+        "zero: no instance.",
+        encoding="fraction",
+        note=f"where on its object the pixel lies: {MAX_CODE} times ((p - c) / d + 0.5), with p in the model's axes, c = min + size / 2 "
+        "and d = |size| from models_info.json; so p = c + d (value - 0.5). 0, 0, 0: no instance.",
+    ),
+    "classes": Layer(
+        dtype="uint16",
+        components=1,
+        unit="",
+        values="Class id: obj_id of the visible instance; 0: no instance.",
+        encoding="raw",
+        note="obj_id; 0: no instance.",
+    ),
+    "flow": Layer(
+        dtype="float32",
+        components=2,
+        unit="px",
+        values="Backward optical flow: from the pixel to its surface point's position in the previous frame, columns and rows; "
+        "NaN: unknown.",
+        encoding="flow",
+        note="optical flow to the image before this one, in KITTI's format: the pixel's surface point was then (red - "
+        f"{ZERO_CODE}) / {FLOW_STEPS} columns to the right and (green - {ZERO_CODE}) / {FLOW_STEPS} rows down, hidden or not. Blue 0: "
+        f"unknown: no surface, the scene's first image, what was not in the scene then, or {ZERO_CODE // FLOW_STEPS} pixels and more.",
+    ),
+    "scene_flow": Layer(
+        dtype="float32",
+        components=3,
+        unit="m",
+        values="Backward scene flow: from the pixel's surface point to its position in the previous frame, in the camera's axes; "
+        "NaN: unknown.",
+        encoding="displacement",
+        note=f"the same as displacement in the camera's axes: red, green and blue minus {ZERO_CODE}, times {1e3 * SCENE_FLOW_STEP:g} mm; "
+        f"0, 0, 0: unknown, or {ZERO_CODE * SCENE_FLOW_STEP:.3f} m and more.",
+    ),
+    "depth_sensor": Layer(
+        dtype="uint16",
+        components=1,
+        unit="depth_scale",
+        values="Planar depth as a structured-light depth sensor measures it, in counts of the depth scale; 0: hole.",
+        encoding="raw",
+        note="what a depth camera might measure (`depth_sensor` in config.toml): noise, steps and holes, which are 0; "
+        "counts as in `depth/`.",
+    ),
+}
+"""Layers by name, in the order of files, buffers and notes."""
