@@ -1,4 +1,7 @@
-"""What stages hand to exporters, on the host: views with their images and ground truth, ticks of the worlds, ends of episodes."""
+"""Schema of the host-side batches from stages to exporters: rendered views, simulation frames (ticks), and ends of episodes.
+
+A tick is one output frame of simulated time (`physics.steps_per_tick` physics steps); a view is one camera's image of it.
+"""
 
 from __future__ import annotations
 
@@ -11,50 +14,50 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class FrameBatch:
-    """`B` views. Arrays are views into a ring buffer: valid until the batch is released; exporters copy what they keep.
+    """Batch of `B` rendered views with their ground truth.
 
-    `I` is the room for instances of a world; `instance_id` runs from 0 and is the index along `I`. An instance_id keeps its
-    object for the whole episode.
+    Arrays are slices of a ring buffer, valid until the next batch is requested; exporters copy what they keep. `I` is the instance
+    capacity of a world. An instance's index along `I` is its `instance_id`; it denotes the same object for the whole episode.
     """
 
     episode: np.ndarray
-    """Episode number (B) int32."""
+    """Episode index (B) int32."""
     camera: np.ndarray
     """Camera index (B) int32."""
     frame: np.ndarray
-    """Number of the frame in its episode, from 0, (B) int32."""
+    """Frame index within the episode, from 0, (B) int32."""
     time: np.ndarray
     """Simulated time since the episode's first frame [s] (B) float64."""
     color: np.ndarray
-    """Colour, sRGB (B, H, W, 3) uint8, red first."""
+    """Colour image, sRGB, RGB order (B, H, W, 3) uint8."""
     depth: np.ndarray
-    """Planar depth in counts of the configured depth scale, 0: no surface (B, H, W) uint16."""
+    """Planar depth (along the optical axis) in units of `bop.depth_scale` mm; 0: no surface (B, H, W) uint16."""
     instance: np.ndarray
-    """0 nothing, 1 + instance_id, or a `Segment` (B, H, W) uint8."""
+    """Segmentation id of the nearest surface: 0 none, 1 + instance_id, or a `Segment` (B, H, W) uint8."""
     amodal: np.ndarray
-    """Bit i set: the ray hits instance i, hidden or not (B, H, W) uint32."""
+    """Amodal masks as a bit field: bit i is set where the pixel's ray hits instance i, hidden or not (B, H, W) uint32."""
     object_id: np.ndarray
-    """obj_id of each instance; -1: no such instance in this view's world (B, I) int32."""
+    """obj_id of each instance; -1: the instance is not in the scene (B, I) int32."""
     pose: np.ndarray
-    """Object to world: x, y, z [m], quaternion x, y, z, w (B, I, 7) float32."""
+    """Object-to-world poses: x, y, z [m], quaternion x, y, z, w (B, I, 7) float32."""
     pixels: np.ndarray
-    """px_count_all, px_count_valid, px_count_visib (B, I, 3) int32."""
+    """Pixel counts px_count_all, px_count_valid, px_count_visib of BOP (B, I, 3) int32."""
     boxes: np.ndarray
-    """bbox_obj and bbox_visib as x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty (B, I, 2, 4) int32."""
+    """Amodal and visible bounding boxes x_min, y_min, x_max, y_max [px], inclusive; x_max < x_min: empty (B, I, 2, 4) int32."""
     effects: np.ndarray
-    """Strengths of what the camera did to colour in the order of `Effect` (B, E) float32; zero: off."""
+    """Camera-effect parameters of the view, in the order of `Effect`; 0: off (B, E) float32."""
     light_name: np.ndarray
-    """Name of the episode's light map (B) str."""
+    """Name of the episode's environment map (B) str."""
     light_yaw: np.ndarray
-    """The map is turned counter-clockwise about +z by this angle [rad] (B) float32."""
+    """Environment yaw: rotation of the map about +z, counter-clockwise [rad] (B) float32."""
     light_exposure: np.ndarray
-    """How much longer than the automatic exposure the episode's pictures are exposed [stops] (B) float32."""
+    """Exposure compensation of the episode, relative to the automatic exposure [EV] (B) float32."""
     light_direction: np.ndarray
-    """Unit vector towards the map's main light, the sun or a lamp, in the world; zero: none stands out (B, 3) float32."""
+    """Unit vector towards the sun (the map's dominant light) in the world frame; zero: the map has none (B, 3) float32."""
     layers: dict[str, np.ndarray] = field(default_factory=dict)
-    """The layers that the settings name (B, H, W[, C]); see `synpick_warp.layers`."""
+    """Layers (AOVs) that `render.layers` names, each (B, H, W[, C]); see `synpick_warp.layer_codec`."""
     boundary_count: np.ndarray | None = None
-    """Run boundaries of `instance` and `amodal`: changes of the value down a column (B, 2) int32; above R: `boundaries` is cut."""
+    """Number of run boundaries (value changes down a column) of `instance` and `amodal` (B, 2) int32; above R: `boundaries` is cut."""
     boundaries: np.ndarray | None = None
     """Per run boundary column · (H + 1) + row of the pixel below, value above, value below; sorted by the first (B, 2, 3, R) uint32."""
 
@@ -64,35 +67,36 @@ class FrameBatch:
 
 @dataclass(frozen=True, eq=False)
 class TickBatch:
-    """One frame of each of the `W` worlds that have one in a tick. Arrays are valid until the next tick; exporters copy what they keep.
+    """Batch of one tick: the simulation frame of each of the `W` worlds that recorded one.
 
-    `I` is the room for instances of a world, as in `FrameBatch`, `S` the number of steps in a tick.
+    Arrays are valid until the next tick; exporters copy what they keep. `I` is the instance capacity of a world, as in `FrameBatch`;
+    `S` is the number of physics steps in a tick.
     """
 
     episode: np.ndarray
-    """Episode number (W) int32."""
+    """Episode index (W) int32."""
     frame: np.ndarray
-    """Number of the frame in its episode, from 0, (W) int32."""
+    """Frame index within the episode, from 0, (W) int32."""
     time: np.ndarray
     """Simulated time since the episode's first frame [s] (W) float64."""
     object_id: np.ndarray
-    """obj_id of each instance; -1: no such instance in the scene (W, I) int32."""
+    """obj_id of each instance; -1: the instance is not in the scene (W, I) int32."""
     pose: np.ndarray
-    """Object to world: x, y, z [m], quaternion x, y, z, w (W, I, 7) float32."""
+    """Object-to-world poses: x, y, z [m], quaternion x, y, z, w (W, I, 7) float32."""
     fixture_pose: np.ndarray
-    """The same of tote, finger and cup (W, 3, 7) float32."""
+    """Poses of tote, gripper shaft ("finger") and cup, in the same form (W, 3, 7) float32."""
     fixture_visible: np.ndarray
-    """0: not in the picture (W, 3) int32."""
+    """1 if the fixture is visible in the images, else 0 (W, 3) int32."""
     light: np.ndarray
-    """Index of the episode's light map (W) int32."""
+    """Index of the episode's environment map (W) int32."""
     light_yaw: np.ndarray
-    """The light map is turned counter-clockwise about +z by this angle [rad] (W) float32."""
+    """Environment yaw: rotation of the map about +z, counter-clockwise [rad] (W) float32."""
     light_exposure: np.ndarray
-    """How much longer than the automatic exposure the episode's pictures are exposed [stops] (W) float32."""
+    """Exposure compensation of the episode, relative to the automatic exposure [EV] (W) float32."""
     tick: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Further arrays (W, ...) of the tick; empty unless an exporter records physics."""
+    """Further arrays (W, ...) of the tick, by name; empty unless an exporter needs physics."""
     steps: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Arrays (W, S, ...) of the steps that led to the frame; empty unless an exporter records physics."""
+    """Arrays (W, S, ...) of the physics steps that lead to the frame, by name; empty unless an exporter needs physics."""
 
     def __len__(self) -> int:
         return len(self.episode)
@@ -100,15 +104,17 @@ class TickBatch:
 
 @dataclass(frozen=True)
 class EpisodeEnd:
-    """An episode is over. Exporters finish its files, or drop them if the ending delivers nothing."""
+    """Result of an episode. Exporters commit its files, or discard them if the ending delivers nothing."""
 
     episode: int
+    """Episode index."""
     redraw: int
-    """How often this episode's arrangement was drawn again before."""
+    """Number of arrangements of this episode that were discarded and resampled before this one."""
     frames: int
+    """Number of frames."""
     ending: int
     """Code of an `Ending`."""
     row: Mapping[str, Any] = field(default_factory=dict)
-    """What the data set's list of episodes says of it; empty if the episode will be drawn again."""
+    """The episode's row of episodes.jsonl; empty if the arrangement will be resampled."""
     attempts: tuple[str, ...] = ()
-    """Its lines of the data set's list of attempts: JSON, each with its end."""
+    """The episode's lines of attempts.jsonl: JSON, each with its newline."""

@@ -1,1 +1,1 @@
-"""FrameBatch in, whole episodes on disk out."""
+"""Dataset writers: view and tick batches in, committed episodes on disk out."""

@@ -1,4 +1,4 @@
-"""The contract of all exporters: views and ticks in, whole episodes on disk out."""
+"""Interface of all dataset writers: view and tick batches in, committed episodes on disk out."""
 
 from __future__ import annotations
 
@@ -13,38 +13,42 @@ from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 
 PIXEL_BYTES = (3, 2, 1, 4)
-"""Of `FrameBatch`'s color, depth, instance and amodal."""
+"""Bytes of a pixel of `FrameBatch`'s color, depth, instance and amodal."""
 LAYER_BYTES = 12
-"""Of a pixel of the largest layer."""
+"""Bytes of a pixel of the largest layer."""
 
 
 @dataclass(frozen=True, eq=False)
 class ExportContext:
-    """What every exporter of a bake is given."""
+    """Constructor argument of every exporter: output folder, settings, scene assets and the writer pool."""
 
     out: Path
-    """Folder of the data set; it exists, and `PARTIAL` in it."""
+    """Folder of the data set. It exists and contains the folder `PARTIAL`."""
     config: Config
     catalog: Catalog
     cameras: tuple[Camera, ...]
     lights: tuple[EnvironmentMap, ...]
     pool: WriterPool
-    """Writes all files of episodes. An exporter neither closes nor aborts it."""
+    """Writes all files of episodes. Exporters neither close nor abort it."""
 
 
 class Exporter(Protocol):
-    """Takes every view and every tick of a bake. Calls come from one thread; each may raise `OutputError` for what failed since the last.
+    """Dataset writer of one format. It receives every view and tick of a bake.
 
-    What an exporter writes depends on settings, episode number and frames alone: not on the time, the machine, the order in which
-    episodes end, or the number of worlds and writers. Files of an episode grow in `PARTIAL`, in a folder that is new for each
-    arrangement, and are renamed to their place when they are whole: a bake may be killed at any time, and is then resumed by others.
-    No folder is made with its parents: if somebody removes the data set, the bake must fail.
+    All calls come from one thread. Each may raise `OutputError` for a write that has failed since the previous call.
+
+    Determinism: the output depends on settings, episode index and frames only, not on time, machine, the order in which episodes end,
+    or the number of worlds and writers.
+
+    Atomicity: an episode's files are staged in `PARTIAL`, in a folder that is new for every arrangement, and renamed to their final
+    place when they are complete. So a bake can be killed at any time and resumed by another process. Folders are created without
+    their parents (no `parents=True`): if the data set is removed during a bake, the bake must fail.
     """
 
-    records: ClassVar[bool]
-    """Whether ticks must come with their arrays `tick` and `steps`."""
-    views: ClassVar[bool]
-    """Whether there must be views; where no exporter asks for any, none are rendered."""
+    needs_physics: ClassVar[bool]
+    """Whether tick batches must carry the arrays `tick` and `steps`."""
+    needs_views: ClassVar[bool]
+    """Whether views must be rendered; if no exporter needs them, none are."""
 
     def __init__(self, context: ExportContext) -> None:
         """Writes nothing yet."""
@@ -52,12 +56,12 @@ class Exporter(Protocol):
 
     @staticmethod
     def slot_bytes(config: Config) -> int:
-        """Most room that the images of one task take in the pool's shared memory [B]."""
+        """Maximum size of the images of one task in the pool's shared memory [B]."""
         ...
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
-        """Write the lists that span episodes, from the whole episodes that are there, and wait for them.
+        """Write the index files that span episodes from the committed episodes, and wait for them.
 
         Returns:
             These files, relative to the data set.
@@ -65,55 +69,61 @@ class Exporter(Protocol):
         ...
 
     def write_constants(self) -> list[Path]:
-        """Write what the data set says once, such as models, in place of what may be there of a killed bake.
+        """Write the files that all episodes share, such as models; replaces what a killed bake may have left.
 
-        Called at most once, before all that follows. Needs no rename: the bake notes when all constants are there.
+        Called at most once, before all other calls. Needs no atomic rename: the bake commits them with a manifest entry.
 
         Returns:
-            These files, or folders of nothing else, relative to the data set.
+            These files, or folders that hold nothing else, relative to the data set.
         """
         ...
 
     def write_views(self, batch: FrameBatch) -> None:
-        """Take views; copies what it needs. Waits while the writers are behind.
+        """Enqueue views; copies what it keeps. Blocks while the writers are behind (back-pressure).
 
-        The frames of an episode come in order, all before its end.
+        An episode's frames come in order, all before its end.
         """
         ...
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """Take the frames of a tick; copies what it needs. Waits while the writers are behind.
+        """Enqueue the frames of a tick; copies what it keeps. Blocks while the writers are behind (back-pressure).
 
-        The frames of an episode come in order, all before its end; whether a frame's views come before is open.
+        An episode's frames come in order, all before its end. They may come before or after the views of the same frame.
         """
         ...
 
-    def end_episode(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
-        """Finish the episode's files, or drop them if its ending delivers nothing: it may then come again from frame 0.
+    def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
+        """Complete and commit the episode's files, or discard them if its ending delivers nothing; it may then restart at frame 0.
 
         Args:
-            whole: To be called once, now or from a later call of the pool, when all is in its place or has been dropped.
+            end: Result of the episode.
+            on_committed: Callback; called exactly once, now or by a later call of the pool, when all files are committed or discarded.
         """
         ...
 
     def files(self, episode: int) -> list[Path]:
-        """Files and folders in their place that hold the episode and nothing else, relative to the data set, sorted.
+        """List the committed files and folders that hold this episode and nothing else, relative to the data set, sorted.
 
-        Those that are there: none, some (left by a killed bake) or all. Looks at nothing but names.
+        They may be none, some (left by a killed bake) or all. Looks at names only.
         """
         ...
 
     def close(self) -> None:
-        """All episodes that ended are whole, and the pool has nothing to do: let go of what is left."""
+        """Release resources after success: all ended episodes are committed, and the pool is idle."""
         ...
 
     def abort(self) -> None:
-        """Stop at once; the pool has been ended, and others remove what is not whole. Never raises."""
+        """Release resources after an error. The pool has been aborted, and the bake removes partial files. Never raises."""
         ...
 
 
-def view_bytes(config: Config) -> int:
-    """Room that a view's images, or one of its layers, take at most in the pool's shared memory [B]."""
-    width, height = config.cameras.resolution
-    layer = (height * width * LAYER_BYTES,) if config.render.layers else ()
+def view_bytes(resolution: tuple[int, int], has_layers: bool) -> int:
+    """Maximum size of a view's images, or of one of its layers, in the pool's shared memory [B].
+
+    Args:
+        resolution: Width and height [px].
+        has_layers: Whether layers are rendered.
+    """
+    width, height = resolution
+    layer = (height * width * LAYER_BYTES,) if has_layers else ()
     return max(shared_bytes(height * width * size for size in PIXEL_BYTES), shared_bytes(layer))

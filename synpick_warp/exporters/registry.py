@@ -1,4 +1,16 @@
-"""Exporters by the names of their formats, and all that a bake writes with at once."""
+"""Registry of dataset formats, and all exporters of a bake as one.
+
+How to add a format:
+
+1. Write a class that implements `Exporter` (`base.py`) in a module or subpackage of this package. Write episodes' files through the
+   writer pool, stage them in `PARTIAL`, and commit them by rename; `usd/exporter.py` is the shortest example.
+2. Add a line to EXPORTERS: the format's name, the module and the class.
+3. Allow the name as a value of the setting `bake.formats`: `FORMATS` in configs/schema.py. Settings must not import exporters, so
+   the name stands there once more; a test compares both.
+4. Let its test class inherit `ExporterContract` (tests/harness/exporter_contract.py): determinism, atomic commits, resuming.
+
+A new subpackage also goes into `packages` in pyproject.toml. Nothing else lists formats.
+"""
 
 from __future__ import annotations
 
@@ -18,37 +30,37 @@ EXPORTERS = {
     "usd": ("usd.exporter", "UsdExporter"),
     "zarr": ("trajectory.exporter", "TrajectoryExporter"),
 }
-"""Format -> (module in this package, class in it). Modules are imported when their format is asked for."""
+"""Format -> (module in this package, class in it). Modules are imported when their format is used."""
 
 
 def load_exporter_classes(names: Iterable[str]) -> tuple[type[Exporter], ...]:
-    """The classes that write these formats, each once, in the order of EXPORTERS.
+    """Import the classes that write these formats, each once, in the order of EXPORTERS.
 
     Raises:
         ConfigError: A format's module, or a package that it needs, is not installed.
     """
-    asked = set(names)
-    return tuple(_kind(name) for name in EXPORTERS if name in asked)
+    wanted = set(names)
+    return tuple(_load(name) for name in EXPORTERS if name in wanted)
 
 
-def _kind(name: str) -> type[Exporter]:
-    module, kind = EXPORTERS[name]
+def _load(name: str) -> type[Exporter]:
+    module, class_name = EXPORTERS[name]
     try:
-        return getattr(importlib.import_module(f"{__package__}.{module}"), kind)
+        return getattr(importlib.import_module(f"{__package__}.{module}"), class_name)
     except ImportError as error:
         raise ConfigError(f"bake.formats names {name}, but its writer cannot be loaded: {error}; name other formats") from None
 
 
 class Exporters:
-    """All exporters of a bake as one; see `Exporter`."""
+    """Composite of all exporters of a bake; see `Exporter` for its methods."""
 
-    def __init__(self, kinds: Iterable[type[Exporter]], context: ExportContext) -> None:
-        self._all = tuple(kind(context) for kind in kinds)
+    def __init__(self, classes: Iterable[type[Exporter]], context: ExportContext) -> None:
+        self._all = tuple(exporter_class(context) for exporter_class in classes)
         self.needs_physics = any(exporter.needs_physics for exporter in self._all)
         self.needs_views = any(exporter.needs_views for exporter in self._all)
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`; formats may share constants, which then are the same."""
+        """See `Exporter`. Formats may share files, which are then identical."""
         return list(dict.fromkeys(path for exporter in self._all for path in exporter.write_constants()))
 
     def write_views(self, batch: FrameBatch) -> None:
@@ -61,17 +73,17 @@ class Exporters:
         for exporter in self._all:
             exporter.write_ticks(batch)
 
-    def end_episode(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
-        """See `Exporter`; `whole` is called when the last exporter is done with the episode."""
-        left = [len(self._all)]
+    def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
+        """See `Exporter`; `on_committed` is called when the last exporter has committed the episode."""
+        pending = [len(self._all)]
 
-        def count() -> None:
-            left[0] -= 1
-            if left[0] == 0:
-                whole()
+        def count_down() -> None:
+            pending[0] -= 1
+            if pending[0] == 0:
+                on_committed()
 
         for exporter in self._all:
-            exporter.end_episode(end, count)
+            exporter.end_episode(end, count_down)
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
@@ -88,11 +100,11 @@ class Exporters:
             exporter.abort()
 
 
-def slot_bytes(kinds: Iterable[type[Exporter]], config: Config) -> int:
-    """Most room that the images of any task take in the pool's shared memory [B]."""
-    return max(kind.slot_bytes(config) for kind in kinds)
+def slot_bytes(classes: Iterable[type[Exporter]], config: Config) -> int:
+    """Maximum size of the images of any task in the pool's shared memory [B]."""
+    return max(exporter_class.slot_bytes(config) for exporter_class in classes)
 
 
-def finalize(kinds: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool) -> list[Path]:
-    """Have every format's lists that span episodes written; returns these files, relative to the data set."""
-    return sorted(path for kind in kinds for path in kind.finalize(out, config, pool))
+def finalize(classes: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool) -> list[Path]:
+    """Write the index files that span episodes, of every format; returns them, relative to the data set."""
+    return sorted(path for exporter_class in classes for path in exporter_class.finalize(out, config, pool))

@@ -13,7 +13,7 @@ from synpick_warp.configs.load import load_config, settings_of
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset import manifest
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing.checksums import files_below, write_manifest_entry
+from synpick_warp.exporters.writing.checksums import list_files, write_manifest_entry
 from synpick_warp.scenes.embedded.skies import skies
 from tests.worlds.small_worlds import catalog, settings
 
@@ -110,7 +110,7 @@ def test_a_record_has_every_file_once_and_is_whole_while_they_are_there(tmp_path
         (tmp_path / name).write_text(name)
     place = manifest.episode_place(7)
     given = [manifest.Path("three"), manifest.Path("a"), manifest.Path("a/one")]
-    assert [str(path) for path in files_below(tmp_path, given)] == ["a/deep/two", "a/one", "three"]
+    assert [str(path) for path in list_files(tmp_path, given)] == ["a/deep/two", "a/one", "three"]
     assert not manifest.seems_whole(tmp_path, place)
     write_manifest_entry(tmp_path, place, given, {"row": {"frames": 3}})
     record = manifest.read_record(tmp_path, place)

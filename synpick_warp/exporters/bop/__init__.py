@@ -1,1 +1,1 @@
-"""BOP data sets: scenewise folders and webdataset shards."""
+"""BOP datasets: scenewise folders and webdataset shards."""

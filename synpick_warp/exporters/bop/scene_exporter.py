@@ -172,4 +172,4 @@ class SceneExporter(ABC):
             function, arguments = self._finish_task(scenes, episode.end.frames)
         else:
             function, arguments = drop_scenes, (episode.scenes,)
-        self._pool.submit(function, (), arguments, path=self._split / f"{self.scene_id(number, 0):06d}", done=episode.whole)
+        self._pool.submit(function, (), arguments, path=self._split / f"{self.scene_id(number, 0):06d}", on_done=episode.whole)

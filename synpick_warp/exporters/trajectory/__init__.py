@@ -1,1 +1,1 @@
-"""Trajectories: zarr arrays of physics, one group an episode."""
+"""Physics trajectories in a zarr store: one group per episode."""

@@ -168,7 +168,7 @@ class TrajectoryExporter:
             (episode.rows[:count].view(np.uint8),),
             (episode.folder / ROWS, (episode.count - count) * episode.rows.itemsize),
             path=episode.folder,
-            done=partial(self._spooled, number, episode),
+            on_done=partial(self._spooled, number, episode),
         )
 
     def _spooled(self, number: int, episode: _Episode) -> None:
@@ -180,7 +180,7 @@ class TrajectoryExporter:
         if end is None or episode.pending:
             return
         if not Ending(end.ending).delivers:
-            pool.submit(drop_episode, (), (episode.folder,), path=episode.folder, done=episode.whole)
+            pool.submit(drop_episode, (), (episode.folder,), path=episode.folder, on_done=episode.whole)
             return
         if episode.count != end.frames:
             raise ValueError(f"episode {number} ended with {end.frames} frames, but {episode.count} came")
@@ -197,7 +197,7 @@ class TrajectoryExporter:
         }
         facts = EpisodeFacts(attributes, episode.object_id, episode.drop_pose, end.attempts)
         arguments = (episode.folder, episode.rows.dtype, episode.count, self._place(number), facts, self._settings)
-        pool.submit(write_episode, (), arguments, path=self._place(number), done=episode.whole)
+        pool.submit(write_episode, (), arguments, path=self._place(number), on_done=episode.whole)
 
     def _place(self, episode: int) -> Path:
         return self._context.out / STORE / EPISODES / f"{episode:06d}"

@@ -1,1 +1,1 @@
-"""USD scenes: one layer an episode over a shared asset library."""
+"""USD scenes: one layer per episode that references a shared asset library."""

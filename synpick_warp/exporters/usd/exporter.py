@@ -81,7 +81,7 @@ class UsdExporter:
         if spool is None:
             whole()
         elif not Ending(end.ending).delivers:
-            pool.submit(drop_episode, (), (spool.path,), path=spool.path, done=whole)
+            pool.submit(drop_episode, (), (spool.path,), path=spool.path, on_done=whole)
         else:
             try:
                 spool.flush()
@@ -89,7 +89,7 @@ class UsdExporter:
                 raise output_error(spool.path, error) from error
             place = self._place(end.episode)
             arguments = (spool.path, spool.instances, place, EpisodeFacts.of(end), self._settings)
-            pool.submit(write_episode, (), arguments, path=place, done=whole)
+            pool.submit(write_episode, (), arguments, path=place, on_done=whole)
         pool.poll()
 
     def files(self, episode: int) -> list[Path]:

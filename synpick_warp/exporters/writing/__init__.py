@@ -1,1 +1,1 @@
-"""Writing: the writer process pool, atomic files, checksums, image encoders."""
+"""File writing: a pool of writer processes, atomic renames, checksums, PNG and run-length encoders."""

@@ -1,4 +1,4 @@
-"""Checksums of what lies in a data set, as `sha256sum` writes and checks them. Runs in writer processes."""
+"""Checksums and manifest entries: SHA-256 lists in the format of `sha256sum`. Runs in writer processes."""
 
 from __future__ import annotations
 
@@ -17,35 +17,35 @@ def checksum(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def files_below(out: Path, paths: Sequence[Path]) -> list[Path]:
-    """Every file that these files and folders are or hold, once, relative to the data set, sorted by name."""
-    found: list[Path] = []
+def list_files(out: Path, paths: Sequence[Path]) -> list[Path]:
+    """Expand files and folders into the files they hold, each once, relative to the data set, sorted by name."""
+    files: set[Path] = set()
     for path in paths:
-        place = out / path
-        found += [one.relative_to(out) for one in _files(place)] if place.is_dir() else [path]
-    return sorted(set(found), key=str)
+        absolute = out / path
+        files.update((file.relative_to(out) for file in _walk(absolute)) if absolute.is_dir() else (path,))
+    return sorted(files, key=str)
 
 
-def _files(folder: Path) -> Iterator[Path]:
+def _walk(folder: Path) -> Iterator[Path]:
     for path in folder.iterdir():
         if path.is_dir():
-            yield from _files(path)
+            yield from _walk(path)
         else:
             yield path
 
 
 def write_manifest_entry(out: Path, place: Path, paths: Sequence[Path], content: dict[str, Any]) -> None:
-    """Note files as whole: write `place`.sha256 with their checksums, then `place`.json, which says by being there that all is.
+    """Commit files: write `place`.sha256 with their checksums, then `place`.json, whose presence marks all of them as complete.
 
     Args:
         out: Folder of the data set.
-        place: Where the record goes, relative to it, without suffix.
-        paths: Files, or folders of nothing else, relative to the data set.
-        content: What the record says besides number, size and common checksum of the files.
+        place: Path of the manifest entry, relative to it, without suffix.
+        paths: Files, or folders that hold nothing else, relative to the data set.
+        content: Further keys of the entry, besides file count, size and the SHA-256 of the checksum list.
     """
-    files = files_below(out, paths)
+    files = list_files(out, paths)
     lines = "".join(f"{checksum(out / path)}  {path}\n" for path in files).encode()
     size = sum((out / path).stat().st_size for path in files)
-    record = {**content, "files": len(files), "bytes": size, "checksum": hashlib.sha256(lines).hexdigest()}
+    entry = {**content, "files": len(files), "bytes": size, "checksum": hashlib.sha256(lines).hexdigest()}
     write_atomically(out / f"{place}.sha256", lines)
-    write_atomically(out / f"{place}.json", (json.dumps(record, allow_nan=False) + "\n").encode())
+    write_atomically(out / f"{place}.json", (json.dumps(entry, allow_nan=False) + "\n").encode())

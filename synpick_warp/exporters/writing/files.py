@@ -1,4 +1,4 @@
-"""Files and folders of a data set: written whole, and kept."""
+"""Durable file writes: atomic replacement by rename, fsync, and the check that an output folder is usable."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from pathlib import Path
 from synpick_warp.errors import OutputError
 
 PARTIAL = ".partial"
-"""Folder in the data set for what is not whole yet: on the same file system, so that a rename moves it into place."""
+"""Staging folder in the data set for uncommitted files: on the same file system, so that a rename commits them atomically."""
 MANIFEST_FILE = "manifest.json"
-"""By which a folder is known as a data set."""
+"""Marks a folder as a data set."""
 _ALLOWED = "--out takes a new or an empty folder"
 
 
 def check_output_folder(out: Path) -> None:
-    """Make sure that a data set can be written to a folder, and leave nothing behind.
+    """Check that a data set can be written to a folder; creates nothing that stays.
 
     Raises:
-        OutputError: The folder holds something else than a data set, or cannot be made or written.
+        OutputError: The folder holds something other than a data set, or cannot be created or written.
     """
-    made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
+    created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     try:
         out.mkdir(parents=True, exist_ok=True)
-        # Hidden names are what a bake leaves that was killed before its first file was whole.
+        # A bake killed before its first commit leaves hidden names only.
         if not (out / MANIFEST_FILE).exists() and any(not path.name.startswith(".") for path in out.iterdir()):
             raise OutputError(f"{out} is not empty; {_ALLOWED}, or a data set to go on with")
         probe = out / f".{uuid.uuid4().hex}"
@@ -36,32 +36,35 @@ def check_output_folder(out: Path) -> None:
     except OSError as error:
         raise output_error(out, error) from error
     finally:
-        for folder in made:
+        for folder in created:
             with contextlib.suppress(OSError):
                 folder.rmdir()
 
 
 def output_error(path: Path | str, error: OSError) -> OutputError:
-    """What the operating system said about a file, as one line."""
+    """Convert an operating-system error into an `OutputError` of one line that names the file, the reason and the remedy."""
     reason = error.strerror or str(error) or type(error).__name__
     return OutputError(f"cannot write {error.filename or path}: {reason}; free space or rights there, or name another folder with --out")
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that it is there entirely or not at all, even after a power cut."""
-    beside = path.with_name(f".{path.name}.new")
+    """Replace a file atomically and durably: write a hidden sibling, fsync, rename, fsync the folder.
+
+    Readers find either the old or the new content, even after a power cut.
+    """
+    temporary = path.with_name(f".{path.name}.new")
     try:
-        write_synced(beside, data)
-        beside.replace(path)
+        write_synced(temporary, data)
+        temporary.replace(path)
     except OSError:
         with contextlib.suppress(OSError):
-            beside.unlink()
+            temporary.unlink()
         raise
     sync_folder(path.parent)
 
 
 def write_synced(path: Path, data: bytes) -> None:
-    """Write a file through to the disk."""
+    """Write a file and fsync it."""
     with path.open("wb") as file:
         file.write(data)
         file.flush()
@@ -69,13 +72,13 @@ def write_synced(path: Path, data: bytes) -> None:
 
 
 def sync_file(path: Path) -> None:
-    """Write through to the disk what somebody else wrote into a file."""
+    """fsync a file that other code (USD, zarr) has written."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
 
 
 def sync_folder(folder: Path) -> None:
-    """Write a folder's list of names through to the disk."""
+    """fsync a folder's list of names, so that renames into it are durable."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)

@@ -1,4 +1,4 @@
-"""Many small files in one folder, with as few calls of the operating system as a file needs: open, write, close."""
+"""Writer of many small files in one folder with the fewest system calls: openat relative to the folder's handle, write, close."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ _FLAGS = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC
 
 
 class Folder:
-    """A folder that is open; see `open_folder`."""
+    """An open folder handle; see `open_folder`."""
 
     def __init__(self, path: Path, handle: int) -> None:
         self._path = path
         self._handle = handle
 
     def write(self, name: str, data: Buffer) -> None:
-        """Write a file; `name` is relative to the folder, and folders in it exist."""
+        """Write a file. `name` is relative to the folder; subfolders in it must exist."""
         self._write(name, data, os.O_TRUNC)
 
     def append(self, name: str, data: Buffer) -> None:
-        """Write to a file's end. Processes may do so at once: what each appends stays in one piece."""
+        """Append to a file (O_APPEND). Processes may append at the same time: the bytes of one call stay contiguous."""
         self._write(name, data, os.O_APPEND)
 
     def _write(self, name: str, data: Buffer, flag: int) -> None:
@@ -42,7 +42,7 @@ class Folder:
 
 @contextmanager
 def open_folder(path: Path) -> Iterator[Folder]:
-    """The folder, so that names below it are found without a walk along its own path."""
+    """Open a folder handle, so that the kernel resolves the folder's own path once instead of once a file."""
     handle = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         yield Folder(path, handle)

@@ -1,4 +1,4 @@
-"""Writer processes: bounded queues, images handed over through shared memory, and no failure unheard."""
+"""Writer process pool: bounded queues with back-pressure, images handed over in shared memory, errors raised in the caller."""
 
 from __future__ import annotations
 
@@ -23,96 +23,100 @@ import numpy as np
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import output_error
-from synpick_warp.exporters.writing.worker import Failure, SharedImage, Task, run
+from synpick_warp.exporters.writing.worker import Failure, SharedImage, TaskMessage, run_task
 
 _WORKER = "from synpick_warp.exporters.writing.worker import main; main()"
 """Program of a writer process: imported, not run as `__main__`, so that pickled tasks name the module's own classes."""
 QUEUE_DEPTH = 4
-"""Tasks that a process has at hand, with the one it runs: enough to bridge the time in which the bake makes the next batch."""
-PROCESSES_PER_COPIER = 4
-"""So many processes for a thread that copies images into shared memory: one core alone cannot copy as fast as many cores write."""
+"""Tasks in flight per process, including the running one: enough to bridge the time in which the bake prepares the next batch."""
+PROCESSES_PER_COPY_THREAD = 4
+"""Writer processes per thread that copies images into shared memory: one core cannot copy as fast as many cores write."""
 _ALIGNMENT = 64
-"""Images begin at a multiple of a cache line [B]."""
+"""Images start at a multiple of a cache line [B]."""
 _END_TIMEOUT = 10.0
-"""How long a process may take to end when it has nothing left to do [s]."""
+"""How long an idle process may take to exit [s]."""
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
-"""The processes are the parallelism: no threads within them."""
+"""The processes are the parallelism: libraries start no threads within them."""
 
 
 @dataclass(frozen=True, eq=False)
 class WriteTask:
-    """A task to be done: `function(*images, *arguments)` in a process."""
+    """A task for a writer process: the call `function(*images, *arguments)`."""
 
     function: Callable[..., None]
-    """Stands at the top of a module that imports quickly."""
+    """A top-level function of a module that imports quickly; it is pickled by name."""
     images: Sequence[np.ndarray]
-    """Copied into shared memory before the call that brings the order returns."""
+    """Copied into shared memory before the submitting call returns."""
     arguments: tuple[Any, ...]
     """Pickled; keep them small."""
     path: Path
-    """What the task writes, for error messages."""
-    done: Callable[[], None] | None = None
-    """Called from a later call of the pool, in the caller's thread, once the task succeeded. It may submit tasks without images."""
+    """The file or folder that the task writes, for error messages."""
+    on_done: Callable[[], None] | None = None
+    """Callback after success, run in the caller's thread by a later call of the pool. It may submit tasks without images."""
 
 
 @dataclass(eq=False)
-class _Job:
-    task: Task
+class _QueuedTask:
+    """A submitted task with its slot of shared memory."""
+
+    message: TaskMessage
     path: Path
-    done: Callable[[], None] | None
+    on_done: Callable[[], None] | None
     slot: int | None
+    """Index of the slot that holds its images; None: it has no images."""
     copying: Future[None] | None
-    """A thread's copying of the images; None: they are there."""
+    """The thread's copy of the images in progress; None: they are in place."""
 
 
 @dataclass(eq=False)
 class _Worker:
     process: subprocess.Popen[bytes]
     link: Connection
-    jobs: deque[_Job] = field(default_factory=deque)
+    tasks: deque[_QueuedTask] = field(default_factory=deque)
+    """Tasks sent to the process and not yet answered, in order."""
 
 
 def shared_bytes(sizes: Iterable[int]) -> int:
-    """Room that images of these sizes take in shared memory [B]."""
+    """Shared memory that images of these sizes take, with alignment [B]."""
     return sum(-(-size // _ALIGNMENT) * _ALIGNMENT for size in sizes)
 
 
 class WriterPool:
-    """Processes that write files. Use it as a context manager: it closes after success and aborts after an error.
+    """Pool of writer processes with back-pressure. As a context manager it closes after success and aborts after an error.
 
-    The processes are interpreters of their own: not forked, because CUDA and threads do not survive a fork, and not
-    `multiprocessing`'s spawned ones, because those import the main script again, and with it the whole simulator. The
-    shared memory has no name, so there is nothing to leak however the bake ends.
+    Each process is a fresh interpreter started by `subprocess`: not forked, because CUDA and threads do not survive a fork, and not
+    spawned by `multiprocessing`, which would import the main script again, and with it the whole simulator (and fail for scripts
+    without `if __name__ == "__main__":`). The shared memory is anonymous, so nothing leaks however the bake ends.
     """
 
-    def __init__(self, processes: int, slot_bytes: int, held: int | None = None) -> None:
+    def __init__(self, processes: int, slot_bytes: int, inherited_handle: int | None = None) -> None:
         """
         Args:
-            processes: How many processes; 0: tasks run in this one.
-            slot_bytes: Most room that the images of one task take, see `shared_bytes` [B].
-            held: A file handle that the processes hold open until they end, such as one with a lock.
+            processes: Number of processes; 0: tasks run in the calling process.
+            slot_bytes: Maximum size of the images of one task, see `shared_bytes` [B].
+            inherited_handle: A file handle that the processes keep open until they exit, such as one that holds a lock.
 
         Raises:
-            OutputError: There is no memory or no process to be had.
+            OutputError: Memory or processes cannot be allocated.
         """
         self._slot_bytes = -(-max(slot_bytes, 1) // mmap.PAGESIZE) * mmap.PAGESIZE
         slots = max(1, processes * QUEUE_DEPTH)
         self._free = list(range(slots))
-        self._waiting: deque[_Job] = deque()
+        self._waiting: deque[_QueuedTask] = deque()
         self._workers: list[_Worker] = []
         self._links = selectors.DefaultSelector()
         self._failure: OutputError | None = None
         self._ended = False
-        self._hearing = False
-        self._copiers = ThreadPoolExecutor(max(1, processes // PROCESSES_PER_COPIER))
-        self._copies_here = processes < 2 * PROCESSES_PER_COPIER
+        self._receiving = False
+        self._copy_threads = ThreadPoolExecutor(max(1, processes // PROCESSES_PER_COPY_THREAD))
+        self._copies_inline = processes < 2 * PROCESSES_PER_COPY_THREAD
         try:
-            handle, self._memory = _shared_memory(slots * self._slot_bytes)
+            handle, self._memory = _allocate_shared_memory(slots * self._slot_bytes)
         except OSError as error:
             raise OutputError(f"no shared memory for {processes} writer processes: {error}; set bake.writers lower") from error
         try:
             for _ in range(processes):
-                worker = _start(handle, () if held is None else (held,))
+                worker = _start_worker(handle, () if inherited_handle is None else (inherited_handle,))
                 self._workers.append(worker)
                 self._links.register(worker.link, selectors.EVENT_READ, worker)
         except OSError as error:
@@ -128,49 +132,50 @@ class WriterPool:
         arguments: tuple[Any, ...],
         *,
         path: Path,
-        done: Callable[[], None] | None = None,
+        on_done: Callable[[], None] | None = None,
     ) -> None:
-        """Have one `WriteTask` done, which has these parts; see `submit_all`."""
-        self.submit_all((WriteTask(function, images, arguments, path, done),))
+        """Submit one `WriteTask` made of these parts; see `submit_all`."""
+        self.submit_all((WriteTask(function, images, arguments, path, on_done),))
 
-    def submit_all(self, orders: Iterable[WriteTask]) -> None:
-        """Have tasks done, and return when all their images are copied. Tasks with images wait until there is room for these.
+    def submit_all(self, tasks: Iterable[WriteTask]) -> None:
+        """Submit tasks and return when all their images are copied. Blocks while no slot of shared memory is free (back-pressure).
 
-        Threads copy the images of some orders while the next one is made, so give orders that take work to make by a generator.
+        Threads copy the images of earlier tasks while the next one is prepared, so pass tasks that are costly to prepare as a generator.
 
         Raises:
             OutputError: One of these or an earlier task failed, or a process died.
         """
         self._check()
-        jobs: list[_Job] = []
-        for order in orders:
-            slot = self._take_slot() if order.images else None
-            places, copying = self._share(order.images, slot)
-            jobs.append(_Job(Task(order.function, places, order.arguments), order.path, order.done, slot, copying))
-            self._waiting.append(jobs[-1])
-            self._collect(0.0)
-        for job in jobs:
-            _await_copy(job)
-        self._collect(0.0)
+        submitted: list[_QueuedTask] = []
+        for task in tasks:
+            slot = self._take_slot() if task.images else None
+            places, copying = self._copy_to_slot(task.images, slot)
+            message = TaskMessage(task.function, places, task.arguments)
+            submitted.append(_QueuedTask(message, task.path, task.on_done, slot, copying))
+            self._waiting.append(submitted[-1])
+            self._progress(0.0)
+        for queued in submitted:
+            _await_copy(queued)
+        self._progress(0.0)
 
     def pids(self) -> tuple[int, ...]:
-        """Numbers of the processes."""
+        """Process ids of the writers."""
         return tuple(worker.process.pid for worker in self._workers)
 
     def poll(self) -> None:
-        """Hear from the processes without waiting. Raises like `submit`."""
+        """Dispatch tasks and process results without blocking. Raises like `submit`."""
         self._check()
-        self._collect(0.0)
+        self._progress(0.0)
 
     def wait(self) -> None:
-        """Wait until every task is done. Raises like `submit`."""
+        """Block until every task is done. Raises like `submit`."""
         self._check()
-        self._collect(0.0)
-        while self._waiting or any(worker.jobs for worker in self._workers):
-            self._collect(None)
+        self._progress(0.0)
+        while self._waiting or any(worker.tasks for worker in self._workers):
+            self._progress(None)
 
     def close(self) -> None:
-        """Wait until every task is done, and end the processes. Raises like `submit`; the processes end in any case."""
+        """Wait until every task is done, then stop the processes. Raises like `submit`; the processes stop in any case."""
         if self._ended:
             return
         try:
@@ -185,7 +190,7 @@ class WriterPool:
             self.abort()
 
     def abort(self) -> None:
-        """End the processes at once. Never raises."""
+        """Kill the processes. Never raises."""
         self._ended = True
         for worker in self._workers:
             worker.process.kill()
@@ -194,102 +199,105 @@ class WriterPool:
         self._workers.clear()
         self._waiting.clear()
         self._links.close()
-        self._copiers.shutdown()
+        self._copy_threads.shutdown()
         with contextlib.suppress(BufferError):
             self._memory.close()
 
     def __enter__(self) -> WriterPool:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
+    def __exit__(self, exception: type[BaseException] | None, *_: object) -> None:
+        if exception is None:
             self.close()
         else:
             self.abort()
 
     def _take_slot(self) -> int:
         while not self._free:
-            self._collect(None)
+            self._progress(None)
         return self._free.pop()
 
-    def _share(self, images: Sequence[np.ndarray], slot: int | None) -> tuple[tuple[SharedImage, ...], Future[None] | None]:
-        """Places of the images in a slot, and their copying if it goes on."""
+    def _copy_to_slot(self, images: Sequence[np.ndarray], slot: int | None) -> tuple[tuple[SharedImage, ...], Future[None] | None]:
+        """Copy images into a slot of shared memory; returns their places, and the copy in progress if a thread makes it."""
         if slot is None:
             return (), None
         if (size := shared_bytes(image.nbytes for image in images)) > self._slot_bytes:
-            raise ValueError(f"images of {size} bytes exceed the {self._slot_bytes} that the pool was made for")
+            raise ValueError(f"images of {size} bytes exceed the {self._slot_bytes} of a slot of this pool")
         offset = slot * self._slot_bytes
         places: list[SharedImage] = []
         for image in images:
             places.append(SharedImage(offset, image.shape, image.dtype.str))
             offset += shared_bytes((image.nbytes,))
-        targets = [place.of(self._memory) for place in places]
-        if self._copies_here:
+        targets = [place.map(self._memory) for place in places]
+        if self._copies_inline:
             _copy(targets, images)
             return tuple(places), None
-        return tuple(places), self._copiers.submit(_copy, targets, images)
+        return tuple(places), self._copy_threads.submit(_copy, targets, images)
 
-    def _collect(self, timeout: float | None) -> None:
-        """Hand out tasks and hear about finished ones; `None` waits for at least one."""
+    def _progress(self, timeout: float | None) -> None:
+        """Dispatch tasks and process results; a timeout of None blocks until at least one result arrives."""
         if not self._workers:
-            self._run_here()
+            self._run_inline()
             return
-        self._hand_out(waits=timeout is None)
-        if self._hearing:
-            # Called by a `done`: the caller below has yet to hear from the processes that it found ready, once each.
+        self._dispatch(blocking=timeout is None)
+        if self._receiving:
+            # Reentrant call from `on_done`: the outer call has yet to receive one result from each link it found ready.
             return
-        self._hearing = True
+        self._receiving = True
         try:
-            self._hear(timeout)
+            self._receive_results(timeout)
         finally:
-            self._hearing = False
-        self._hand_out(waits=False)
+            self._receiving = False
+        self._dispatch(blocking=False)
 
-    def _hear(self, timeout: float | None) -> None:
+    def _receive_results(self, timeout: float | None) -> None:
         for key, _ in self._links.select(timeout):
             worker: _Worker = key.data
             try:
                 failure: Failure | None = worker.link.recv()
             except (EOFError, OSError):
-                self._fail_dead(worker)
-            job = worker.jobs.popleft()
-            self._finish(job, failure)
+                self._fail_dead_worker(worker)
+            self._finish(worker.tasks.popleft(), failure)
 
-    def _hand_out(self, waits: bool) -> None:
-        """Hand out tasks, in order, while a process has room for one; `waits`: even if images are still being copied."""
+    def _dispatch(self, blocking: bool) -> None:
+        """Send tasks, in order, while a process has queue capacity; `blocking`: wait for images that are still being copied."""
         while self._waiting:
-            worker = min(self._workers, key=lambda candidate: len(candidate.jobs))
+            worker = min(self._workers, key=lambda candidate: len(candidate.tasks))
             copying = self._waiting[0].copying
-            if len(worker.jobs) == QUEUE_DEPTH or not (waits or copying is None or copying.done()):
+            if len(worker.tasks) == QUEUE_DEPTH or not (blocking or copying is None or copying.done()):
                 return
-            job = self._waiting.popleft()
-            _await_copy(job)
-            worker.jobs.append(job)
+            queued = self._waiting.popleft()
+            _await_copy(queued)
+            worker.tasks.append(queued)
             try:
-                worker.link.send(job.task)
+                worker.link.send(queued.message)
             except OSError:
-                self._fail_dead(worker)
+                self._fail_dead_worker(worker)
 
-    def _run_here(self) -> None:
+    def _run_inline(self) -> None:
         while self._waiting:
-            job = self._waiting.popleft()
-            self._finish(job, run(job.task, self._memory))
+            queued = self._waiting.popleft()
+            self._finish(queued, run_task(queued.message, self._memory))
 
-    def _finish(self, job: _Job, failure: Failure | None) -> None:
+    def _finish(self, queued: _QueuedTask, failure: Failure | None) -> None:
         if failure is not None:
-            self._fail(_describe(failure, job.path), failure.trace)
-        if job.slot is not None:
-            self._free.append(job.slot)
-        if job.done is not None:
-            job.done()
+            self._fail(_to_output_error(failure, queued.path), failure.trace)
+        if queued.slot is not None:
+            self._free.append(queued.slot)
+        if queued.on_done is not None:
+            queued.on_done()
 
-    def _fail_dead(self, worker: _Worker) -> NoReturn:
+    def _fail_dead_worker(self, worker: _Worker) -> NoReturn:
         with contextlib.suppress(subprocess.TimeoutExpired):
             worker.process.wait(_END_TIMEOUT)
         code = worker.process.returncode
+        # The kernel's out-of-memory killer sends SIGKILL; any other end has left its reason on the standard error stream.
+        remedy = "see its message above, if any, and please report it"
+        if code == -signal.SIGKILL:
+            remedy = "if memory ran out, set bake.writers to a smaller number"
         how = f"was ended by {signal.Signals(-code).name}" if code and code < 0 else f"ended with exit code {code}"
-        what = f"while it wrote {worker.jobs[0].path}" if worker.jobs else "while it had nothing to do"
-        self._fail(OutputError(f"a writer process {how} {what}; if memory ran out, set bake.writers to a smaller number"), "")
+        activity = f"while it wrote {worker.tasks[0].path}" if worker.tasks else "while it had nothing to do"
+        self._fail(OutputError(f"a writer process {how} {activity}; {remedy}"), "")
 
     def _fail(self, error: OutputError, trace: str) -> NoReturn:
         if trace:
@@ -304,7 +312,7 @@ class WriterPool:
             raise OutputError("the writer processes have ended; make a new pool")
 
 
-def _describe(failure: Failure, path: Path) -> OutputError:
+def _to_output_error(failure: Failure, path: Path) -> OutputError:
     if failure.system is None:
         return OutputError(f"cannot write {path}: {failure.error}")
     code, reason, name = failure.system
@@ -312,18 +320,18 @@ def _describe(failure: Failure, path: Path) -> OutputError:
 
 
 def _copy(targets: Sequence[np.ndarray], images: Sequence[np.ndarray]) -> None:
-    """Copy images; other threads may run meanwhile."""
+    """Copy images into shared memory; NumPy releases the interpreter lock meanwhile."""
     for target, image in zip(targets, images, strict=True):
         np.copyto(target, image)
 
 
-def _await_copy(job: _Job) -> None:
-    if job.copying is not None:
-        job.copying.result()
+def _await_copy(queued: _QueuedTask) -> None:
+    if queued.copying is not None:
+        queued.copying.result()
 
 
-def _shared_memory(size: int) -> tuple[int, mmap.mmap]:
-    """Memory without a name, as an open file handle and mapped. Unlike /dev/shm, its size is not limited in containers."""
+def _allocate_shared_memory(size: int) -> tuple[int, mmap.mmap]:
+    """Allocate anonymous shared memory (memfd): file handle and mapping. Unlike /dev/shm, containers do not limit its size."""
     if hasattr(os, "memfd_create"):
         handle = os.memfd_create("synpick-warp")
     else:
@@ -333,7 +341,7 @@ def _shared_memory(size: int) -> tuple[int, mmap.mmap]:
     return handle, mmap.mmap(handle, size)
 
 
-def _start(memory: int, held: tuple[int, ...]) -> _Worker:
+def _start_worker(memory: int, inherited: tuple[int, ...]) -> _Worker:
     ours, theirs = socket.socketpair()
     with ours, theirs:
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
@@ -341,7 +349,7 @@ def _start(memory: int, held: tuple[int, ...]) -> _Worker:
             (sys.executable, "-P", "-c", _WORKER, str(theirs.fileno()), str(memory)),
             stdin=subprocess.DEVNULL,
             env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": paths},
-            pass_fds=(theirs.fileno(), memory, *held),
-            process_group=0,  # A terminal's Ctrl-C goes to the bake alone, even before the process can ignore it.
+            pass_fds=(theirs.fileno(), memory, *inherited),
+            process_group=0,  # Ctrl-C in a terminal reaches the bake alone, even before the process ignores it.
         )
         return _Worker(process, Connection(ours.detach()))

@@ -1,4 +1,4 @@
-"""A writer process: runs tasks on images that lie in memory shared with the bake."""
+"""Main loop of a writer process: runs tasks on images in memory shared with the bake."""
 
 from __future__ import annotations
 
@@ -17,24 +17,26 @@ import numpy as np
 from synpick_warp.errors import SynpickError
 
 NICENESS = 10
-"""Added to the processes' own (nice(2)): when they keep all cores busy, the bake, which feeds them and the GPU, goes first."""
+"""Increment of the processes' niceness (nice(2)): when they keep all cores busy, the bake, which feeds them and the GPU, has priority."""
 
 
 @dataclass(frozen=True)
 class SharedImage:
-    """Where an image lies in the shared memory."""
+    """Descriptor of an image in the shared memory."""
 
     offset: int
+    """First byte [B]."""
     shape: tuple[int, ...]
     dtype: str
 
-    def of(self, memory: mmap.mmap) -> np.ndarray:
+    def map(self, memory: mmap.mmap) -> np.ndarray:
+        """View of the image, without a copy."""
         return np.ndarray(self.shape, np.dtype(self.dtype), memory, self.offset)
 
 
 @dataclass(frozen=True)
-class Task:
-    """`function(*images, *arguments)`; the function is sent by name, so it stands at the top of a module."""
+class TaskMessage:
+    """Message to a writer process: call `function(*images, *arguments)`. Functions are pickled by name, so they are top-level ones."""
 
     function: Callable[..., None]
     images: tuple[SharedImage, ...]
@@ -43,20 +45,20 @@ class Task:
 
 @dataclass(frozen=True)
 class Failure:
-    """What went wrong in a task."""
+    """Error of a task, as a picklable answer."""
 
     error: str
-    """One line; empty for an `OSError`, which `system` describes."""
+    """Message in one line; empty for an `OSError`, which `system` describes."""
     system: tuple[int, str, str] | None
     """errno, reason and path of an `OSError`."""
     trace: str
-    """For developers."""
+    """Traceback, for developers."""
 
 
-def run(task: Task, memory: mmap.mmap) -> Failure | None:
-    """Run a task; returns what went wrong."""
+def run_task(task: TaskMessage, memory: mmap.mmap) -> Failure | None:
+    """Run a task; returns its error, or None after success."""
     try:
-        task.function(*(image.of(memory) for image in task.images), *task.arguments)
+        task.function(*(image.map(memory) for image in task.images), *task.arguments)
     except OSError as error:
         system = (error.errno or 0, error.strerror or str(error), str(error.filename or ""))
         return Failure("", system, traceback.format_exc())
@@ -67,13 +69,13 @@ def run(task: Task, memory: mmap.mmap) -> Failure | None:
 
 
 def main() -> None:
-    """Serve the tasks that come through file handle argv[1] on the memory of handle argv[2], until there is `None` or no bake."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the bake's to handle.
+    """Serve tasks from the socket with handle argv[1] on the memory with handle argv[2], until `None` arrives or the bake is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The bake handles Ctrl-C.
     os.nice(NICENESS)
     link = Connection(int(sys.argv[1]))
     memory = mmap.mmap(int(sys.argv[2]), 0)
     try:
         while (task := link.recv()) is not None:
-            link.send(run(task, memory))
+            link.send(run_task(task, memory))
     except (EOFError, ConnectionError):
-        return  # The bake is gone, and whoever ended it knows.
+        return  # The bake has ended; nobody is left to receive an answer.

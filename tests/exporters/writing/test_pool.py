@@ -93,7 +93,7 @@ def test_images_arrive_whole_though_the_callers_buffer_changes(tmp_path, count):
     with WriterPool(count, SIZE) as pool:
         for value in range(30):
             ring[...] = value
-            pool.submit(save, (ring[::2],), (tmp_path / f"{value}.npy",), path=tmp_path, done=lambda value=value: done.append(value))
+            pool.submit(save, (ring[::2],), (tmp_path / f"{value}.npy",), path=tmp_path, on_done=lambda value=value: done.append(value))
     assert sorted(done) == list(range(30))
     for value in range(30):
         np.testing.assert_array_equal(np.load(tmp_path / f"{value}.npy"), np.full((20, 50, 3), value))
@@ -110,7 +110,7 @@ def test_several_images_of_different_types_share_a_slot(tmp_path):
 
 
 def test_threads_copy_large_images(tmp_path, monkeypatch):
-    monkeypatch.setattr(pool_module, "PROCESSES_PER_COPIER", 1)
+    monkeypatch.setattr(pool_module, "PROCESSES_PER_COPY_THREAD", 1)
     draw = np.random.default_rng(0)
     images = (draw.integers(0, 256, (700, 900, 6), np.uint8)[::2, 3:-3], np.zeros((0, 4)), np.arange(5), draw.integers(0, 9, (3, 1 << 20)))
     kept = [image.copy() for image in images]
@@ -125,7 +125,7 @@ def test_threads_copy_large_images(tmp_path, monkeypatch):
 
 def test_many_orders_are_taken_at_once_each_with_its_own_images(tmp_path, monkeypatch):
     """More than there are slots, made one by one, while threads copy the images of those before."""
-    monkeypatch.setattr(pool_module, "PROCESSES_PER_COPIER", 1)
+    monkeypatch.setattr(pool_module, "PROCESSES_PER_COPY_THREAD", 1)
     count, side = 5 * QUEUE_DEPTH, 700
     ring = np.empty((count, side, side), np.uint8)
     made, done = [], []
@@ -171,10 +171,10 @@ def test_a_finished_task_may_have_others_done(tmp_path, count):
 
         def follow() -> None:
             pool.submit(
-                note, (), (tmp_path / "b", "b"), path=tmp_path, done=lambda: pool.submit(note, (), (tmp_path / "c", "c"), path=tmp_path)
+                note, (), (tmp_path / "b", "b"), path=tmp_path, on_done=lambda: pool.submit(note, (), (tmp_path / "c", "c"), path=tmp_path)
             )
 
-        pool.submit(note, (), (tmp_path / "a", "a"), path=tmp_path, done=follow)
+        pool.submit(note, (), (tmp_path / "a", "a"), path=tmp_path, on_done=follow)
         pool.wait()
         assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
 
@@ -187,7 +187,7 @@ def test_answers_that_come_together_are_each_heard_once(tmp_path):
             pool.submit(note, (), (tmp_path / "more", "x"), path=tmp_path)
 
         for _ in range(4):
-            pool.submit(wait_for, (), (gate,), path=gate, done=more)
+            pool.submit(wait_for, (), (gate,), path=gate, on_done=more)
         gate.touch()
         # All four have answered before anybody listens.
         time.sleep(0.5)
