@@ -90,7 +90,7 @@ class SceneExporter(ABC):
     @staticmethod
     def slot_bytes(config: Config) -> int:
         """See `Exporter`."""
-        return view_bytes(config)
+        return view_bytes(config.cameras.resolution, bool(config.render.layers))
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: models, camera and notes."""

@@ -68,9 +68,8 @@ def encode_mask_png(runs: Runs, height: int, width: int) -> bytes:
     begins = runs.first * stride + 1 + runs.column
     ends = (runs.past * stride + 1 + runs.column)[ended]
     if not begins.size:
-        return _assemble(
-            width, height, 8, _GREY, _ZLIB_HEADER + _blank_rows(height, stride) + _FINAL_BLOCK + _adler32(height * stride, 0, 0)
-        )
+        data = _ZLIB_HEADER + _blank_rows(height, stride) + _FINAL_BLOCK + _adler32(height * stride, 0, 0)
+        return _assemble(width, height, 8, _GREY, data)
     top, bottom = int(runs.first.min()), int(runs.past.max())
     rows = min(bottom + 1, height) - top
     canvas = _canvas(height, width)
@@ -82,9 +81,8 @@ def encode_mask_png(runs: Runs, height: int, width: int) -> bytes:
     total = _UP * rows + 255 * begins.size + ends.size
     moment = _UP * stride * (rows * top + rows * (rows - 1) // 2) + 255 * int(begins.sum()) + int(ends.sum())
     above, below = _blank_rows(top, stride), _blank_rows(height - top - rows, stride)
-    return _assemble(
-        width, height, 8, _GREY, b"".join((_ZLIB_HEADER, above, middle, below, _FINAL_BLOCK, _adler32(height * stride, total, moment)))
-    )
+    data = b"".join((_ZLIB_HEADER, above, middle, below, _FINAL_BLOCK, _adler32(height * stride, total, moment)))
+    return _assemble(width, height, 8, _GREY, data)
 
 
 @functools.cache
