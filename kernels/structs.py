@@ -124,8 +124,8 @@ class PickData:
 
 
 @wp.struct
-class SightData:
-    """How the target and the grasp are chosen; see configs.schema.Sight. Lengths in pixels, heights in metres."""
+class PerceptionData:
+    """Parameters of perception and grasp planning, named as in configs.schema.Sight. Lengths in the image [px], heights [m]."""
 
     center_share: float
     heavy_mass: float

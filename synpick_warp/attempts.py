@@ -21,8 +21,9 @@ Vector = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class InstanceSight:
-    """What was concluded of one instance; see `stages.perception.arrays.Sighting` for units and meaning. Pixels are column, row."""
+class InstanceObservation:
+    """Perception result of one instance, with the JSON keys as names: share is `Observation.visible_fraction`, middle `midpoint`,
+    suction `grasp_pixel`, all_above `ancestors`; see `stages.perception.arrays` for units and meaning. Pixels are column, row."""
 
     instance: int
     object_id: int
@@ -41,12 +42,12 @@ class InstanceSight:
 
 
 @dataclass(frozen=True)
-class SightRecord:
-    """What an attempt's look concluded."""
+class ObservationRecord:
+    """Perception result on which an attempt is based."""
 
     resolution: tuple[int, int]
-    """Width and height of the sight image [px]."""
-    instances: tuple[InstanceSight, ...]
+    """Width and height of the perception image [px]."""
+    instances: tuple[InstanceObservation, ...]
     """Those that were in the scene, visible or not."""
     votes: tuple[tuple[int, int, float], ...]
     """(i, j, votes): what the contour of i says for j lying above it; only votes that are not 0."""
@@ -87,7 +88,7 @@ class AttemptRecord:
     """Instances that left the scene on the cup."""
     load: Vector
     """Largest load of any seal [N] in each tick of the lift; in the first the suction was switched on at its end, so that is 0."""
-    sight: SightRecord
+    sight: ObservationRecord
 
     def line(self) -> str:
         """The record as one line of JSON, with its end.
@@ -229,28 +230,29 @@ class AttemptLog:
         )
         running.begun = None
 
-    def _sight(self, report: TickReport, world: int) -> SightRecord:
+    def _sight(self, report: TickReport, world: int) -> ObservationRecord:
         present = np.flatnonzero(report.entry[world] >= 0)
-        votes = report.sighting.votes[world][np.ix_(present, present)]
+        votes = report.observation.votes[world][np.ix_(present, present)]
         lower, upper = np.nonzero(votes)
         pairs = zip(present[lower].tolist(), present[upper].tolist(), _tidy_vector(votes[lower, upper]), strict=True)
-        return SightRecord(self.resolution, tuple(self._instance(report, world, instance) for instance in present.tolist()), tuple(pairs))
+        instances = tuple(self._instance(report, world, instance) for instance in present.tolist())
+        return ObservationRecord(self.resolution, instances, tuple(pairs))
 
-    def _instance(self, report: TickReport, world: int, instance: int) -> InstanceSight:
-        row = {name: values[world, instance] for name, values in vars(report.sighting).items() if name != "overflow"}
-        return InstanceSight(
+    def _instance(self, report: TickReport, world: int, instance: int) -> InstanceObservation:
+        row = {name: values[world, instance] for name, values in vars(report.observation).items() if name != "overflow"}
+        return InstanceObservation(
             instance=instance,
             object_id=self._object_id(report, world, instance),
             visible=int(row["visible"]),
-            share=_tidy(row["share"]),
+            share=_tidy(row["visible_fraction"]),
             pole=_tidy_vector(row["pole"]),
             centroid=_tidy_vector(row["centroid"]),
-            middle=_tidy_vector(row["middle"]),
+            middle=_tidy_vector(row["midpoint"]),
             distances=_tidy_vector(row["distances"]),
-            suction=tuple(row["suction"].tolist()),
+            suction=tuple(row["grasp_pixel"].tolist()),
             depth=_tidy(row["depth"]),
             above=_instances(int(row["above"])),
-            all_above=_instances(int(row["all_above"])),
+            all_above=_instances(int(row["ancestors"])),
         )
 
     def _object_id(self, report: TickReport, world: int, instance: int) -> int:

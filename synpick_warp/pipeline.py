@@ -35,9 +35,9 @@ from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.perception.arrays import Plan, Sighting
+from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.plan import CycleArrays, VoteArrays, plan_sizes
-from synpick_warp.stages.perception.segment import SCRATCH, count_views, sight_sizes
+from synpick_warp.stages.perception.segment import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.render.denoised import FAST_SCRATCH, cell_sizes
 from synpick_warp.stages.render.layers import MOVING, MotionArrays
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
@@ -264,7 +264,7 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     views |= body_sizes(room, *config.cameras.resolution)
     ring = RING if device.is_cuda else 1
     groups = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState, LastFrame)]
-    groups += [(kind, worlds, 1 + RECORDS) for kind in (Sighting, Plan)]
+    groups += [(kind, worlds, 1 + RECORDS) for kind in (Observation, Plan)]
     groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
     groups += [(BoundaryBuffers, boundary_sizes(views), ring), (BoundaryScratch, boundary_sizes(views), 1)]
     groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
@@ -277,9 +277,9 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     if has_spread(config):
         groups += [(SpreadArrays, views, 1)]
     if may_pick(config):
-        looks = count_views(config, room, device)
-        groups += [(kind, sight_sizes(config, room, looks), 1) for kind in SCRATCH]
-        groups += [(kind, plan_sizes(config, room, looks), 1) for kind in (VoteArrays, CycleArrays)]
+        looks = count_views(config.sight, worlds["world"], room, device)
+        groups += [(kind, perception_sizes(config.sight, room, looks), 1) for kind in SCRATCH]
+        groups += [(kind, plan_sizes(config.sight, room, looks), 1) for kind in (VoteArrays, CycleArrays)]
     rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
     if config.render.mode == FAST:
         cells = views | cell_sizes(config, *config.cameras.resolution)

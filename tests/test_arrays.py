@@ -11,9 +11,9 @@ from synpick_warp.arrays import allocate, device_array, memory_table
 from synpick_warp.device import pick_device
 from synpick_warp.pipeline import describe_arrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.perception.arrays import LookArrays, Plan, Sighting
+from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import CycleArrays, VoteArrays
-from synpick_warp.stages.perception.segment import SightScratch, count_views
+from synpick_warp.stages.perception.segment import SegmentationScratch, count_views
 from synpick_warp.stages.render.denoised import Edges, GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_paths, cell_sizes
 from synpick_warp.stages.render.layers import MotionArrays
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch
@@ -33,7 +33,7 @@ MOVING = [
     AttemptState,
     SealState,
     LastFrame,
-    Sighting,
+    Observation,
     Plan,
     WorldStatus,
     Snapshot,
@@ -50,7 +50,7 @@ MOVING = [
     Edges,
     MarkArrays,
 ]
-LOOKING = [LookArrays, SightScratch, VoteArrays, CycleArrays]
+LOOKING = [PerceptionArrays, SegmentationScratch, VoteArrays, CycleArrays]
 LAYERS = [LayerBuffers, MotionArrays]
 DECLARED = MOVING + LOOKING + LAYERS
 
@@ -96,7 +96,7 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
     rows = describe_arrays(config)
     names = [name for name, *_ in rows]
     assert {name.split(".")[0] for name in names} == {kind.__name__ for kind in MOVING}
-    assert names.count("Sighting.votes") == names.count("Plan.target") == 3
+    assert names.count("Observation.votes") == names.count("Plan.target") == 3
     assert names.count("Snapshot.pose") == names.count("WorldStatus.table") == 2
     assert names.count("WorldState.phase") == names.count("ViewBuffers.color") == 1
     by_name = {name: (shape, unit, size) for name, shape, unit, size in rows}
@@ -131,11 +131,11 @@ def test_the_reference_has_no_cells():
 def test_a_bake_that_may_pick_has_the_arrays_of_looking_as_well(mode):
     config = settings(bake__worlds=7, sight__resolution=[64, 48], **mode)
     room = config.arrangement.max_objects
-    looks = count_views(config, room, pick_device("cpu"))
+    looks = count_views(config.sight, config.bake.worlds, room, pick_device("cpu"))
     rows = describe_arrays(config)
     assert {name.split(".")[0] for name, *_ in rows} == {kind.__name__ for kind in MOVING + LOOKING}
     shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in LOOKING}}
-    assert shapes["LookArrays.component"] == shapes["SightScratch.gap"] == (looks, 48, 64)
+    assert shapes["PerceptionArrays.component"] == shapes["SegmentationScratch.gap"] == (looks, 48, 64)
     assert shapes["VoteArrays.count"] == (looks, room, room, 2)
     assert [name for name, *_ in rows].count("HitArrays.depth") == 3
 

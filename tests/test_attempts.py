@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.attempts import AttemptLog, AttemptRecord, EpisodeRecord, InstanceSight, SightRecord
+from synpick_warp.attempts import AttemptLog, AttemptRecord, EpisodeRecord, InstanceObservation, ObservationRecord
 from synpick_warp.codes import Ending, Mode, Outcome, Task
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.viz.explain_record import read_attempts
@@ -35,34 +35,34 @@ def run(*scripts: tuple[World, Ticks]) -> dict[tuple[int, int], EpisodeRecord]:
 
 def see_a_pair(world: World) -> None:
     """Instances 1 and 3 are in the scene, 3 on top of 1, with numbers that need rounding; 0 and 2 have what an earlier pile left."""
-    seen, plan = world.sighting, world.plan
+    seen, plan = world.observation, world.plan
     for arrays in (seen, plan):
         for array in vars(arrays).values():
             array[:] = 7
     seen.visible[0, [1, 3]] = 120, 0
-    seen.share[0, [1, 3]] = 1.0 / 3.0, 0.0
+    seen.visible_fraction[0, [1, 3]] = 1.0 / 3.0, 0.0
     seen.pole[0, [1, 3]] = (10.0, 20.0), (-1.0, -1.0)
     seen.centroid[0, [1, 3]] = (12.3456789, 21.0), (-1.0, -1.0)
-    seen.middle[0, [1, 3]] = (11.17283945, 20.5), (-1.0, -1.0)
+    seen.midpoint[0, [1, 3]] = (11.17283945, 20.5), (-1.0, -1.0)
     seen.distances[0, [1, 3]] = (5.0, 4.4721359, -0.0), (0.0, 0.0, 0.0)
-    seen.suction[0, [1, 3]] = (11, 21), (-1, -1)
+    seen.grasp_pixel[0, [1, 3]] = (11, 21), (-1, -1)
     seen.depth[0, [1, 3]] = 1.98765432, 0.0
     seen.votes[0][np.ix_([1, 3], [1, 3])] = [[0.0, 12.3], [0.1, 0.0]]
     seen.above[0, [1, 3]] = bits(3), 0
-    seen.all_above[0, [1, 3]] = bits(0, 3), 0
+    seen.ancestors[0, [1, 3]] = bits(0, 3), 0
     plan.target[0] = 1
     plan.point[0] = 0.1, -0.2, 0.0345678912
     plan.normal[0] = -3.0e-9, 0.6, 0.8
     plan.yaw[0], plan.tilt[0] = -1.23456789, 0.0
 
 
-PAIR = SightRecord(
+PAIR = ObservationRecord(
     (64, 48),
     (
-        InstanceSight(
+        InstanceObservation(
             1, 21, 120, 0.333333, (10.0, 20.0), (12.3457, 21.0), (11.1728, 20.5), (5.0, 4.47214, 0.0), (11, 21), 1.98765, (3,), (0, 3)
         ),
-        InstanceSight(3, 3, 0, 0.0, (-1.0, -1.0), (-1.0, -1.0), (-1.0, -1.0), (0.0, 0.0, 0.0), (-1, -1), 0.0, (), ()),
+        InstanceObservation(3, 3, 0, 0.0, (-1.0, -1.0), (-1.0, -1.0), (-1.0, -1.0), (0.0, 0.0, 0.0), (-1, -1), 0.0, (), ()),
     ),
     ((1, 3, 12.3), (3, 1, 0.1)),
 )

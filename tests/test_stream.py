@@ -18,7 +18,7 @@ from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_b
 from synpick_warp.frames import FrameBatch
 from synpick_warp.stages import stream
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
-from synpick_warp.stages.perception.arrays import Plan, Sighting
+from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.render.scene import build_lights
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.sim.simulate import TickRecord
@@ -243,7 +243,7 @@ def test_main_lights_are_told_in_the_world_and_maps_without_any_as_zero(device):
 
 def new_record(device) -> TickRecord:
     sizes = worlds.world_sizes(config_of(), 4)
-    return TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, worlds.WorldStatus, Sighting, Plan)))
+    return TickRecord(*(allocate(kind, sizes, device) for kind in (Snapshot, worlds.WorldStatus, Observation, Plan)))
 
 
 def test_a_report_outlives_the_next_tick(device):
@@ -253,7 +253,7 @@ def test_a_report_outlives_the_next_tick(device):
     reader = TickReader(record)
     reader.start()
     report = reader.wait()
-    everything = (record.snapshot.entry, record.status.table, record.status.measures, *vars(record.sighting).values())
+    everything = (record.snapshot.entry, record.status.table, record.status.measures, *vars(record.observation).values())
     for array in (*everything, *vars(record.plan).values()):
         array.fill_(5)
     record.snapshot.pose.fill_(wp.transform_identity())
@@ -262,13 +262,13 @@ def test_a_report_outlives_the_next_tick(device):
     assert (report.pose == 0.0).all()
     assert report.pose.shape == (WORLDS, ROOM, 7)
     assert not report.measures.any()
-    assert not any(array.any() for part in (report.sighting, report.plan) for array in vars(part).values())
+    assert not any(array.any() for part in (report.observation, report.plan) for array in vars(part).values())
 
 
 def test_a_report_has_every_array_under_its_name(device):
     """Each is filled with a number of its own."""
     record = new_record(device)
-    parts = {"sighting": record.sighting, "plan": record.plan}
+    parts = {"observation": record.observation, "plan": record.plan}
     given = {(part, name): 2 + number for part, arrays in parts.items() for number, name in enumerate(vars(arrays))}
     for (part, name), number in given.items():
         getattr(parts[part], name).fill_(number)
@@ -283,10 +283,10 @@ def test_a_report_has_every_array_under_its_name(device):
         array = getattr(getattr(report, part), name)
         assert (array == number).all(), name
         assert len(array) == WORLDS
-    assert report.sighting.distances.shape == (WORLDS, ROOM, 3)
-    assert report.sighting.votes.shape == (WORLDS, ROOM, ROOM)
-    assert report.sighting.suction.dtype == np.int32
-    assert report.sighting.above.dtype == np.uint32
+    assert report.observation.distances.shape == (WORLDS, ROOM, 3)
+    assert report.observation.votes.shape == (WORLDS, ROOM, ROOM)
+    assert report.observation.grasp_pixel.dtype == np.int32
+    assert report.observation.above.dtype == np.uint32
     assert report.plan.point.shape == (WORLDS, 3)
     assert report.measure("load").tolist() == list(range(WORLDS))
 

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.structs import SightData
+from synpick_warp.kernels.structs import PerceptionData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,22 +42,22 @@ def edge_weight(votes: wp.array3d[float], world: int, lower: int, upper: int, le
 
 
 @wp.func
-def close_paths(above: wp.array2d[wp.uint32], world: int, instances: int, all_above: wp.array2d[wp.uint32]):
+def close_paths(above: wp.array2d[wp.uint32], world: int, instances: int, ancestors: wp.array2d[wp.uint32]):
     """Transitive closure of a graph (Warshall, 1962)."""
     for i in range(instances):
-        all_above[world, i] = above[world, i]
+        ancestors[world, i] = above[world, i]
     for k in range(instances):
         for i in range(instances):
-            if (all_above[world, i] & bit(k)) != wp.uint32(0):
-                all_above[world, i] = all_above[world, i] | all_above[world, k]
+            if (ancestors[world, i] & bit(k)) != wp.uint32(0):
+                ancestors[world, i] = ancestors[world, i] | ancestors[world, k]
 
 
 @wp.func
-def gather_cycle(all_above: wp.array2d[wp.uint32], world: int, first: int, instances: int, view: int, cycles: Cycles) -> int:
+def gather_cycle(ancestors: wp.array2d[wp.uint32], world: int, first: int, instances: int, view: int, cycles: Cycles) -> int:
     """List the instances that have paths to `first` and from it; return their number, 0 if there are none or `first` is not the least."""
     size = int(0)
     for i in range(instances):
-        if (all_above[world, first] & bit(i)) != wp.uint32(0) and (all_above[world, i] & bit(first)) != wp.uint32(0):
+        if (ancestors[world, first] & bit(i)) != wp.uint32(0) and (ancestors[world, i] & bit(first)) != wp.uint32(0):
             if i < first:
                 return 0
             cycles.member[view, size] = i
@@ -141,14 +141,14 @@ def rank_greedily(view: int, size: int, cycles: Cycles):
 @wp.kernel
 def order_clutter_kernel(
     # Scene:
-    sight: SightData,
+    sight: PerceptionData,
     # In:
     view_world: wp.array[int],
     votes: wp.array3d[float],
     # Out:
     cycles_out: Cycles,
     above_out: wp.array2d[wp.uint32],
-    all_above_out: wp.array2d[wp.uint32],
+    ancestors_out: wp.array2d[wp.uint32],
 ):
     """The clutter graph of each view's world, without cycles, and its transitive closure.
 
@@ -166,9 +166,9 @@ def order_clutter_kernel(
             if edge_weight(votes, world, i, j, sight.min_votes) > 0.0:
                 edges = edges | bit(j)
         above_out[world, i] = edges
-    close_paths(above_out, world, instances, all_above_out)
+    close_paths(above_out, world, instances, ancestors_out)
     for first in range(instances):
-        size = gather_cycle(all_above_out, world, first, instances, view, cycles_out)
+        size = gather_cycle(ancestors_out, world, first, instances, view, cycles_out)
         if size > 0:
             for a in range(size):
                 for b in range(size):
@@ -183,4 +183,4 @@ def order_clutter_kernel(
                     if cycles_out.weight[view, a, b] > 0.0 and cycles_out.rank[view, b] > cycles_out.rank[view, a]:
                         i = cycles_out.member[view, a]
                         above_out[world, i] = above_out[world, i] ^ bit(cycles_out.member[view, b])
-    close_paths(above_out, world, instances, all_above_out)
+    close_paths(above_out, world, instances, ancestors_out)

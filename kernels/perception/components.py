@@ -12,7 +12,7 @@ STRIP = wp.constant(32)
 """Pixels of a strip."""
 NO_COMPONENT = wp.constant(-1)
 LAST_PIXEL = wp.constant(wp.int64(0x7FFFFFFF))
-"""Larger than the index of any pixel; also the mask of the bits that `ranked` keeps it in."""
+"""Larger than the index of any pixel; also the mask of the bits that `pack_key` keeps it in."""
 PIXEL_BITS = wp.constant(wp.int64(31))
 
 
@@ -25,14 +25,14 @@ def strip_of(index: int, height: int, strips: int) -> wp.vec3i:
 
 
 @wp.func
-def ranked(value: wp.int64, pixel: int) -> wp.int64:
+def pack_key(value: wp.int64, pixel: int) -> wp.int64:
     """A key whose maximum belongs to the largest value and, of equal ones, to the least pixel; positive for values above 0."""
     return (value << PIXEL_BITS) | (LAST_PIXEL - wp.int64(pixel))
 
 
 @wp.func
-def ranked_pixel(key: wp.int64) -> int:
-    """The pixel of a key of `ranked`."""
+def unpack_pixel(key: wp.int64) -> int:
+    """The pixel of a key of `pack_key`."""
     return int(LAST_PIXEL - (key & LAST_PIXEL))
 
 
@@ -203,17 +203,17 @@ def find_largest_kernel(
     # Out:
     largest_key_out: wp.array2d[wp.int64],
 ):
-    """Key of each instance's largest component: the maximum of `ranked(area, root)` over its roots. The keys begin as 0."""
+    """Key of each instance's largest component: the maximum of `pack_key(area, root)` over its roots. The keys begin as 0."""
     view, pixel = wp.tid()
     if view_world[view] < 0:
         return
     size = area[view, pixel]
     if size > 0:
-        wp.atomic_max(largest_key_out, view, int(code[view, pixel]) - 1, ranked(wp.int64(size), pixel))
+        wp.atomic_max(largest_key_out, view, int(code[view, pixel]) - 1, pack_key(wp.int64(size), pixel))
 
 
 @wp.kernel
-def name_largest_kernel(
+def unpack_largest_kernel(
     # In:
     view_world: wp.array[int],
     largest_key: wp.array2d[wp.int64],
@@ -224,4 +224,4 @@ def name_largest_kernel(
     view, instance = wp.tid()
     largest_out[view, instance] = NO_COMPONENT
     if view_world[view] >= 0 and largest_key[view, instance] > wp.int64(0):
-        largest_out[view, instance] = ranked_pixel(largest_key[view, instance])
+        largest_out[view, instance] = unpack_pixel(largest_key[view, instance])

@@ -32,7 +32,7 @@ def gripper_angles(normal: wp.vec3) -> wp.vec2:
 
 
 @wp.func
-def limited_normal(normal: wp.vec3, limit: float) -> wp.vec3:
+def limit_normal(normal: wp.vec3, limit: float) -> wp.vec3:
     """A normal of any length as a unit vector, turned up to an angle of at most `limit` [rad] with the vertical; zero: the vertical."""
     length = wp.length(normal)
     if length == 0.0:
@@ -122,7 +122,7 @@ def frame_grasp_kernel(
     ray = camera_ray(cameras.intrinsics[camera], p[1], p[0], wp.vec2(0.0, 0.0)) * hits.depth[view, p[1], p[0]]
     away = wp.vec3d(wp.float64(ray[0]), wp.float64(ray[1]), wp.float64(ray[2]))
     point_out[world] = wp.vec3(cameras.center[camera] + wp.transpose(cameras.rotation[camera]) * away)
-    normal = limited_normal(normal_inout[world], pick.tilt_limit)
+    normal = limit_normal(normal_inout[world], pick.tilt_limit)
     angles = gripper_angles(normal)
     normal_inout[world] = normal
     yaw_out[world] = angles[0]

@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import Hits
-from synpick_warp.kernels.structs import CatalogData, SightData
+from synpick_warp.kernels.structs import CatalogData, PerceptionData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -83,7 +83,7 @@ def bound_contours_kernel(
     # Scene:
     catalog: CatalogData,
     cameras: Cameras,
-    sight: SightData,
+    sight: PerceptionData,
     # State:
     entry: wp.array2d[int],
     # In:
@@ -120,7 +120,7 @@ def bound_contours_kernel(
 def count_votes_kernel(
     # Scene:
     grid: ImageGrid,
-    sight: SightData,
+    sight: PerceptionData,
     # In:
     hits: Hits,
     view_world: wp.array[int],
@@ -164,7 +164,7 @@ def count_votes_kernel(
 @wp.kernel
 def weigh_votes_kernel(
     # Scene:
-    sight: SightData,
+    sight: PerceptionData,
     # In:
     view_world: wp.array[int],
     count: wp.array4d[int],

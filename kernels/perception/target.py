@@ -33,7 +33,7 @@ def drawn_instance(visible: wp.array2d[int], world: int, key: wp.uint64, index: 
 def ranked_instance(
     visible: wp.array2d[int],
     share: wp.array2d[float],
-    all_above: wp.array2d[wp.uint32],
+    ancestors: wp.array2d[wp.uint32],
     world: int,
     sign: float,
 ) -> int:
@@ -43,7 +43,7 @@ def ranked_instance(
     largest = float(0.0)
     for i in range(visible.shape[1]):
         if visible[world, i] > 0:
-            count = sign * float(wp.bit_count(all_above[world, i]))
+            count = sign * float(wp.bit_count(ancestors[world, i]))
             seen = sign * share[world, i]
             if chosen < 0 or count < least or (count == least and seen > largest):
                 chosen = i
@@ -66,7 +66,7 @@ def choose_target_kernel(
     view_world: wp.array[int],
     visible: wp.array2d[int],
     share: wp.array2d[float],
-    all_above: wp.array2d[wp.uint32],
+    ancestors: wp.array2d[wp.uint32],
     # Out:
     target_out: wp.array[int],
 ):
@@ -81,10 +81,10 @@ def choose_target_kernel(
         return
     chosen = int(-1)
     if mode[world] != Mode.TARGET:
-        chosen = ranked_instance(visible, share, all_above, world, 1.0)
+        chosen = ranked_instance(visible, share, ancestors, world, 1.0)
     elif pick.random_after_failure != 0 and outcome[world] >= Outcome.DROPPED:
         key = stream_key(seed, address[world][0], address[world][1], Stream.TARGETS)
         chosen = drawn_instance(visible, world, key, attempt[world] + 1)
     else:
-        chosen = ranked_instance(visible, share, all_above, world, -1.0)
+        chosen = ranked_instance(visible, share, ancestors, world, -1.0)
     target_out[world] = chosen

@@ -8,7 +8,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def list_lookers_kernel(
+def list_worlds_kernel(
     # Scene:
     worlds: int,
     # State:
@@ -49,7 +49,7 @@ def take_batch_kernel(
 
 
 @wp.kernel
-def pass_batch_kernel(
+def advance_batch_kernel(
     # Scene:
     views: int,
     # State:

@@ -30,7 +30,7 @@ class SceneData:
     mode: structs.ModeData
     move: structs.MoveData
     pick: structs.PickData
-    sight: structs.SightData
+    perception: structs.PerceptionData
     suction: structs.SuctionData
     guide_shapes: wp.array
 
@@ -45,7 +45,7 @@ def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, l
         _mode_data(config),
         _move_data(config),
         _pick_data(config),
-        _sight_data(config),
+        _perception_data(config),
         _suction_data(config),
         wp.array(np.array(built.layout.guide_shapes, dtype=np.int32), device=device),
     )
@@ -159,9 +159,9 @@ def _pick_data(config: Config) -> structs.PickData:
     return data
 
 
-def _sight_data(config: Config) -> structs.SightData:
+def _perception_data(config: Config) -> structs.PerceptionData:
     sight = config.sight
-    data = structs.SightData()
+    data = structs.PerceptionData()
     data.center_share, data.heavy_mass, data.heavy_center_share = sight.center_share, sight.heavy_mass, sight.heavy_center_share
     data.contour_offset, data.deep_distance, data.deep_weight = sight.contour_offset, sight.deep_distance, sight.deep_weight
     data.min_votes, data.reach, data.exact_cycle, data.normal_window = sight.min_votes, sight.reach, sight.exact_cycle, sight.normal_window

@@ -69,8 +69,8 @@ class TickReport:
     """Catalog index (world, instance) int32."""
     pose: np.ndarray
     """Object to world (world, instance, 7) float32."""
-    sighting: SimpleNamespace
-    """Arrays named and shaped as those of `Sighting`; vectors have their components as a last dimension. After the tick's look."""
+    observation: SimpleNamespace
+    """Arrays named and shaped as those of `Observation`; vectors have their components as a last dimension. After the tick's look."""
     plan: SimpleNamespace
     """The same of `Plan`."""
     snapshot: SimpleNamespace = field(default_factory=SimpleNamespace)
@@ -144,7 +144,7 @@ class TickReader:
 
     def __init__(self, record: TickRecord) -> None:
         first = [record.status.table, record.status.measures, record.snapshot.entry, record.snapshot.pose]
-        self.parts = [(part, [item.name for item in fields(part)]) for part in (record.sighting, record.plan)]
+        self.parts = [(part, [item.name for item in fields(part)]) for part in (record.observation, record.plan)]
         self.parts.append((record.snapshot, list(_SNAPSHOT)))
         self.physics = record_arrays(record.physics) if record.physics is not None else []
         self.copy = HostCopy(first + [getattr(part, name) for part, names in self.parts for name in names] + self.physics)

@@ -1,4 +1,4 @@
-"""Kernel that lets tests call the gripper's inverse kinematics."""
+"""Test kernel that evaluates the gripper's inverse kinematics."""
 
 import warp as wp
 
@@ -8,14 +8,16 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def frame_kernel(
-    normal: wp.array[wp.vec3],
+def solve_kinematics_kernel(
+    # In:
+    normal: wp.array[wp.vec3],  # (sample)
     limit: float,
-    angles_out: wp.array[wp.vec2],
-    limited_out: wp.array[wp.vec3],
+    # Out:
+    angles_out: wp.array[wp.vec2],  # (sample) [rad]
+    limited_out: wp.array[wp.vec3],  # (sample)
 ):
-    """Limited normal and its angles."""
+    """Limited normal, and yaw and tilt for it."""
     i = wp.tid()
-    limited = grasp.limited_normal(normal[i], limit)
+    limited = grasp.limit_normal(normal[i], limit)
     limited_out[i] = limited
     angles_out[i] = grasp.gripper_angles(limited)

@@ -1,4 +1,4 @@
-"""Where the cup meets the target: inverse kinematics, grasp points and normals of surfaces that can be worked out by hand."""
+"""Grasp poses: inverse kinematics of the gripper, and grasp points and normals of surfaces with known answers."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from synpick_warp.arrays import allocate
 from synpick_warp.codes import Mode
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.buffers import ViewBuffers
-from synpick_warp.stages.perception.arrays import LookArrays, Plan, Sighting
-from synpick_warp.stages.perception.plan import Planner
+from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
+from synpick_warp.stages.perception.plan import GraspPlanner
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.sim.worlds import AttemptState
-from tests.harness.grasp_probe import frame_kernel
+from tests.harness.grasp_probe import solve_kinematics_kernel
 from tests.twins import planning
 from tests.worlds.kernel_worlds import KernelWorlds, filled
 from tests.worlds.toy_scene import ToyScene, ball, box, camera, entry, flat_shaded, sheet, snapshot
@@ -32,12 +32,12 @@ VIEW = camera(160, 120, 400.0, (0.02, -0.03, 2.0))
 # ---- inverse kinematics ----
 
 
-def framed(device, normals, limit: float = QUARTER) -> tuple[np.ndarray, np.ndarray]:
-    """Yaw and tilt, and limited normal, for normals of any length."""
+def solve(device, normals, limit: float = QUARTER) -> tuple[np.ndarray, np.ndarray]:
+    """Yaw and tilt (n, 2), and limited normals (n, 3), for normals of any length."""
     count = len(normals)
     outputs = [wp.zeros(count, dtype=dtype, device=device) for dtype in (wp.vec2, wp.vec3)]
     inputs = [wp.array(np.asarray(normals, np.float32), dtype=wp.vec3, device=device), limit]
-    wp.launch(frame_kernel, dim=count, inputs=inputs, outputs=outputs, device=device)
+    wp.launch(solve_kinematics_kernel, dim=count, inputs=inputs, outputs=outputs, device=device)
     return tuple(array.numpy() for array in outputs)
 
 
@@ -56,7 +56,7 @@ def framed(device, normals, limit: float = QUARTER) -> tuple[np.ndarray, np.ndar
     ],
 )
 def test_angles_of_known_normals(device, normal, yaw, tilt):
-    angles, _ = framed(device, [normal])
+    angles, _ = solve(device, [normal])
     np.testing.assert_allclose(angles[0], (yaw, tilt), atol=1e-6)
 
 
@@ -64,25 +64,25 @@ directions = st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0, 1)).filt
 
 
 @given(direction=directions)
-def test_angles_lead_back_to_the_normal(direction, device):
-    (yaw, tilt), limited = (array[0] for array in framed(device, [direction]))
+def test_forward_kinematics_returns_the_normal(direction, device):
+    (yaw, tilt), limited = (array[0] for array in solve(device, [direction]))
     normal = np.array(direction) / np.linalg.norm(direction)
     assert -QUARTER < yaw <= np.float32(QUARTER)
     assert abs(tilt) <= QUARTER + 1e-6
     np.testing.assert_allclose(limited, normal, atol=2e-6)
     np.testing.assert_allclose([np.sin(tilt) * np.cos(yaw), np.sin(tilt) * np.sin(yaw), np.cos(tilt)], normal, atol=2e-6)
-    # The tilt axis is perpendicular to the normal.
+    # The wrist axis is perpendicular to the normal.
     assert abs(np.array([-np.sin(yaw), np.cos(yaw), 0.0]) @ normal) < 2e-6
     if abs(tilt) > 1e-2 and abs(abs(yaw) - QUARTER) > 1e-2:
-        np.testing.assert_allclose((yaw, tilt), planning.angles_of(normal), atol=2e-3)
+        np.testing.assert_allclose((yaw, tilt), planning.gripper_angles(normal), atol=2e-3)
 
 
 @given(direction=st.tuples(*[st.floats(-1, 1)] * 3), limit=st.floats(5, 90))
-def test_normals_that_lean_too_far_are_turned_up(direction, limit, device):
+def test_normals_are_limited_to_the_tilt_limit(direction, limit, device):
     length, across = np.linalg.norm(direction), np.linalg.norm(direction[:2])
     assume(length > 1e-2 and across > 1e-3)
     limit = np.radians(limit)
-    (yaw, tilt), limited = (array[0] for array in framed(device, [direction], limit))
+    (yaw, tilt), limited = (array[0] for array in solve(device, [direction], limit))
     assert abs(tilt) <= limit + 1e-5
     lean = min(np.arctan2(across, direction[2]), limit)
     expected = [*(np.sin(lean) / across * np.array(direction[:2])), np.cos(lean)]
@@ -90,16 +90,16 @@ def test_normals_that_lean_too_far_are_turned_up(direction, limit, device):
     assert -QUARTER < yaw <= np.float32(QUARTER)
 
 
-def test_no_normal_and_one_that_points_down_are_vertical(device):
-    _, limited = framed(device, [(0, 0, 0), (0, 0, -3)])
+def test_zero_and_downward_normals_become_vertical(device):
+    _, limited = solve(device, [(0, 0, 0), (0, 0, -3)])
     np.testing.assert_array_equal(limited, [[0, 0, 1]] * 2)
 
 
 # ---- surfaces ----
 
 
-class Grasps:
-    """Worlds seen by one camera; instance 0 of each is the target."""
+class GraspHarness:
+    """Worlds rendered by one camera; instance 0 of each is the target."""
 
     def __init__(self, device, toy: ToyScene, window: int = 10, tilt_limit: float = QUARTER) -> None:
         views, instances = len(toy.placed), toy.room
@@ -114,38 +114,38 @@ class Grasps:
             "count": 3,
             "box": 2,
             "side": 4,
-            "point": planning.ROOM,
+            "point": planning.CAPACITY,
         }
-        self.look, self.sighting = allocate(LookArrays, sizes, device), allocate(Sighting, sizes, device)
+        self.arrays, self.observation = allocate(PerceptionArrays, sizes, device), allocate(Observation, sizes, device)
         self.grasp = allocate(Plan, sizes, device)
-        self.look.world.assign(np.arange(views))
-        renderer.prepare_bodies(snapshot(toy, device), self.look.world, self.look.camera, views)
-        renderer.find_hits(self.look.camera, views, allocate(ViewBuffers, sizes, device))
+        self.arrays.world.assign(np.arange(views))
+        renderer.prepare_bodies(snapshot(toy, device), self.arrays.world, self.arrays.camera, views)
+        renderer.find_hits(self.arrays.camera, views, allocate(ViewBuffers, sizes, device))
         self.ids, self.depth = renderer.hits.code.numpy().astype(int) - 1, renderer.hits.depth.numpy()
-        self.found = planning.look_at(self.ids, self.depth, instances)
-        self.look.component.assign(self.found["component"])
-        self.look.largest.assign(self.found["largest"])
-        self.suction = self.found["suction"]
+        self.expected = planning.segment(self.ids, self.depth, instances)
+        self.arrays.component.assign(self.expected["component"])
+        self.arrays.largest.assign(self.expected["largest"])
+        self.grasp_pixel = self.expected["grasp_pixel"]
         many = np.ones(len(toy.entries))
         self.worlds = KernelWorlds(
             device, views, volume=many, compound=many * 0, radius=many, instances=instances, single_slots=instances, compound_slots=0
         )
-        filled(self.worlds.scene.sight, {**planning.SIGHT, "normal_window": window})
+        filled(self.worlds.scene.perception, {**planning.SETTINGS, "normal_window": window})
         self.worlds.scene.pick.tilt_limit = tilt_limit
         self.scene = self.worlds.scene
-        self.seen: Any = SimpleNamespace(
-            scene=scene, look=self.look, hits=renderer.hits, bodies=renderer.bodies, cameras=scene.cameras, grid=scene.grid
+        self.images: Any = SimpleNamespace(
+            render_scene=scene, arrays=self.arrays, hits=renderer.hits, bodies=renderer.bodies, cameras=scene.cameras, grid=scene.grid
         )
-        self.planner = Planner(toy.settings(), self.seen, device)
+        self.planner = GraspPlanner(toy.settings().sight, self.images, device)
 
-    def frame(self) -> Plan:
-        self.sighting.suction.assign(self.suction)
-        self.planner.smooth_normal(self.scene, self.seen, self.sighting, self.grasp)
-        self.planner.frame_grasp(self.scene, self.seen, self.sighting, self.grasp)
+    def plan_grasps(self) -> Plan:
+        self.observation.grasp_pixel.assign(self.grasp_pixel)
+        self.planner.smooth_normal(self.scene, self.images, self.observation, self.grasp)
+        self.planner.frame_grasp(self.scene, self.images, self.observation, self.grasp)
         return self.grasp
 
 
-def turn(axis: tuple[float, float, float], angle: float) -> tuple[float, ...]:
+def axis_angle(axis: tuple[float, float, float], angle: float) -> tuple[float, ...]:
     return (*(np.sin(angle / 2) * np.array(axis)), np.cos(angle / 2))
 
 
@@ -155,110 +155,111 @@ def rotated(quaternion: tuple[float, ...], vector: tuple[float, ...]) -> np.ndar
 
 
 def test_the_normal_and_the_point_of_tilted_planes(device):
-    """Sheets in five poses: everywhere on each the normal is its z axis, and the grasp point lies on it."""
-    poses = [(0.02 * i, 0.01 * i, 0.1 * i, *turn((np.cos(i), np.sin(i), 0.0), 0.25 * i)) for i in range(5)]
-    made = Grasps(device, ToyScene([entry(sheet(0.2, 0.2))], [[(0, pose)] for pose in poses], (VIEW,)))
-    plan = made.frame()
+    """Sheets in five poses: the normal is the sheet's z axis, and the grasp point lies on the sheet."""
+    poses = [(0.02 * i, 0.01 * i, 0.1 * i, *axis_angle((np.cos(i), np.sin(i), 0.0), 0.25 * i)) for i in range(5)]
+    harness = GraspHarness(device, ToyScene([entry(sheet(0.2, 0.2))], [[(0, pose)] for pose in poses], (VIEW,)))
+    plan = harness.plan_grasps()
     for i, pose in enumerate(poses):
         normal = rotated(pose[3:], (0.0, 0.0, 1.0))
         # A sum of 441 normals in float32.
         np.testing.assert_allclose(plan.normal.numpy()[i], normal, atol=5e-6)
         assert abs((plan.point.numpy()[i] - pose[:3]) @ normal) < 5e-6
-        # The point projects to the centre of the suction pixel.
+        # The point projects to the centre of the grasp pixel.
         x, y, z = plan.point.numpy()[i] - (0.02, -0.03, 2.0)
-        np.testing.assert_allclose((80 - 400 * x / z, 60 + 400 * y / z), made.suction[i, 0] + 0.5, atol=1e-3)
+        np.testing.assert_allclose((80 - 400 * x / z, 60 + 400 * y / z), harness.grasp_pixel[i, 0] + 0.5, atol=1e-3)
         yaw, tilt = plan.yaw.numpy()[i], plan.tilt.numpy()[i]
         np.testing.assert_allclose([np.sin(tilt) * np.cos(yaw), np.sin(tilt) * np.sin(yaw), np.cos(tilt)], normal, atol=5e-6)
 
 
 def test_normals_of_a_ball_are_interpolated_and_point_outward(device):
     center = np.array((0.0, 0.05, 0.2))
-    made = Grasps(device, ToyScene([entry(ball(0.1, 4))], [[(0, (*center, *turn((1, 0, 0), 1.0)))]], (VIEW,)), window=0)
-    made.suction[0, 0] += (6, -5)
-    plan = made.frame()
+    harness = GraspHarness(device, ToyScene([entry(ball(0.1, 4))], [[(0, (*center, *axis_angle((1, 0, 0), 1.0)))]], (VIEW,)), window=0)
+    harness.grasp_pixel[0, 0] += (6, -5)
+    plan = harness.plan_grasps()
     outward = plan.point.numpy()[0] - center
     np.testing.assert_allclose(plan.normal.numpy()[0], outward / np.linalg.norm(outward), atol=2e-3)
-    # Flat triangles of this ball lie up to 2 degrees off; interpolated normals do not.
+    # Face normals of this ball deviate by up to 2 degrees; interpolated normals do not.
     assert outward[2] > 0.09
 
 
 def roof() -> ToyScene:
-    """Two planes that fall off to both sides of the ridge x = 0 by 45 degrees; a camera right above it."""
+    """Two planes that slope down by 45 degrees on both sides of the ridge x = 0, under a camera."""
     corners = np.array([(0, -1, 0), (0, 1, 0), (-1, -1, -1), (-1, 1, -1), (1, -1, -1), (1, 1, -1)]) * 0.1
     mesh = flat_shaded(corners, np.array([(0, 1, 2), (1, 3, 2), (0, 4, 1), (1, 4, 5)]))
     return ToyScene([entry(mesh)], [[(0, (0, 0, 0, 0, 0, 0, 1))]], (camera(160, 120, 400.0, (0.0, 0.0, 2.0)),))
 
 
 def test_the_window_averages_over_a_ridge(device):
-    """Columns 80 and up show the right side. A window of 21 columns about column 83 has 8 on the left and 13 on the right."""
-    made = Grasps(device, roof())
+    """Columns from 80 on show the right side; the window has 21 columns."""
+    harness = GraspHarness(device, roof())
     for column, left, right in ((83, 7, 14), (79, 11, 10), (95, 0, 21)):
-        made.suction[0, 0] = (column, 60)
+        harness.grasp_pixel[0, 0] = (column, 60)
         expected = np.array([right - left, 0.0, right + left])
-        np.testing.assert_allclose(made.frame().normal.numpy()[0], expected / np.linalg.norm(expected), atol=1e-5)
+        np.testing.assert_allclose(harness.plan_grasps().normal.numpy()[0], expected / np.linalg.norm(expected), atol=1e-5)
 
 
-def test_only_the_targets_largest_component_counts(device):
-    """A post covers the right side of the roof, and another one cuts it: neither the post nor the piece behind it has a say."""
+def test_the_window_uses_only_the_targets_largest_component(device):
+    """A post splits the right side of the roof: neither the post nor the component behind it contributes."""
     toy = roof()
     toy.entries.append(entry(box(0.015, 0.3, 0.1)))
     toy.placed[0].append((1, (0.0125, 0.0, 0.05, 0, 0, 0, 1)))
-    made = Grasps(device, toy, window=12)
-    made.suction[0, 0] = (78, 60)
-    shown = made.ids[0, 60, 66:91]
-    pieces = made.found["component"][0, 60, 66:91][shown == 0]
+    harness = GraspHarness(device, toy, window=12)
+    harness.grasp_pixel[0, 0] = (78, 60)
+    shown = harness.ids[0, 60, 66:91]
+    pieces = harness.expected["component"][0, 60, 66:91][shown == 0]
     assert (shown == 1).any()
     assert len(np.unique(pieces)) == 2
-    kept = (pieces == made.found["largest"][0, 0]).sum()
-    right = (np.flatnonzero((shown == 0) & (made.found["component"][0, 60, 66:91] == made.found["largest"][0, 0])) + 66 >= 80).sum()
+    kept = (pieces == harness.expected["largest"][0, 0]).sum()
+    largest = harness.expected["component"][0, 60, 66:91] == harness.expected["largest"][0, 0]
+    right = (np.flatnonzero((shown == 0) & largest) + 66 >= 80).sum()
     expected = np.array([2 * right - kept, 0.0, kept])
-    np.testing.assert_allclose(made.frame().normal.numpy()[0], expected / np.linalg.norm(expected), atol=1e-5)
+    np.testing.assert_allclose(harness.plan_grasps().normal.numpy()[0], expected / np.linalg.norm(expected), atol=1e-5)
 
 
-def test_a_window_that_leaves_the_image(device):
-    made = Grasps(device, ToyScene([entry(sheet(2.0, 2.0))], [[(0, (0, 0, 0, *turn((0, 1, 0), 0.3)))]], (VIEW,)), window=200)
-    made.suction[0, 0] = (159, 0)
-    np.testing.assert_allclose(made.frame().normal.numpy()[0], (np.sin(0.3), 0.0, np.cos(0.3)), atol=1e-4)
+def test_the_window_is_clipped_to_the_image(device):
+    harness = GraspHarness(device, ToyScene([entry(sheet(2.0, 2.0))], [[(0, (0, 0, 0, *axis_angle((0, 1, 0), 0.3)))]], (VIEW,)), window=200)
+    harness.grasp_pixel[0, 0] = (159, 0)
+    np.testing.assert_allclose(harness.plan_grasps().normal.numpy()[0], (np.sin(0.3), 0.0, np.cos(0.3)), atol=1e-4)
 
 
 def test_the_tilt_limit(device):
-    toy = ToyScene([entry(sheet(0.2, 0.2))], [[(0, (0, 0, 0, *turn((0, 1, 0), 1.0)))]], (VIEW,))
-    plan = Grasps(device, toy, tilt_limit=np.radians(30)).frame()
+    toy = ToyScene([entry(sheet(0.2, 0.2))], [[(0, (0, 0, 0, *axis_angle((0, 1, 0), 1.0)))]], (VIEW,))
+    plan = GraspHarness(device, toy, tilt_limit=np.radians(30)).plan_grasps()
     np.testing.assert_allclose(plan.normal.numpy()[0], (0.5, 0.0, np.sqrt(0.75)), atol=1e-6)
     assert plan.tilt.numpy()[0] == pytest.approx(np.radians(30), abs=1e-6)
 
 
 def test_worlds_without_a_target_and_unused_views_keep_their_plan(device):
-    pose = (0, 0, 0, *turn((0, 1, 0), 0.3))
-    made = Grasps(device, ToyScene([entry(sheet(0.2, 0.2))], [[(0, pose)]] * 3, (VIEW,)))
-    made.grasp.target.assign(np.array([-1, 0, 0]))
-    made.look.world.assign(np.array([0, 1, -1]))
-    for array in (made.grasp.normal, made.grasp.point, made.grasp.yaw, made.grasp.tilt):
+    pose = (0, 0, 0, *axis_angle((0, 1, 0), 0.3))
+    harness = GraspHarness(device, ToyScene([entry(sheet(0.2, 0.2))], [[(0, pose)]] * 3, (VIEW,)))
+    harness.grasp.target.assign(np.array([-1, 0, 0]))
+    harness.arrays.world.assign(np.array([0, 1, -1]))
+    for array in (harness.grasp.normal, harness.grasp.point, harness.grasp.yaw, harness.grasp.tilt):
         array.fill_(5.0)
-    plan = made.frame()
+    plan = harness.plan_grasps()
     for array in (plan.normal, plan.point, plan.yaw, plan.tilt):
         assert (array.numpy()[[0, 2]] == 5.0).all()
         assert (array.numpy()[1] != 5.0).all()
 
 
-def test_all_of_planning_in_one_go(device):
-    """A box over the edge of a larger one; a second world has them the other way round, a third is empty, and a view is unused."""
-    lower, upper = (0.0, 0.0, 0.0, 0, 0, 0, 1), (0.08, 0.0, 0.05, *turn((0, 1, 0), 0.1))
+def test_the_whole_planner(device):
+    """A box across the edge of a larger one; the second world has them in reverse order, the third is empty, and one view is unused."""
+    lower, upper = (0.0, 0.0, 0.0, 0, 0, 0, 1), (0.08, 0.0, 0.05, *axis_angle((0, 1, 0), 0.1))
     wide, small = 0, 1
     placed = [[(wide, lower), (small, upper)], [(small, upper), (wide, lower)], [], [(wide, lower)]]
-    made = Grasps(device, ToyScene([entry(box(0.2, 0.15, 0.04)), entry(box(0.12, 0.08, 0.04))], placed, (VIEW,)))
-    made.look.world.assign(np.array([0, 1, 2, -1]))
-    worlds, attempts = made.worlds, allocate(AttemptState, {"world": 4, "instance": 4}, device)
+    harness = GraspHarness(device, ToyScene([entry(box(0.2, 0.15, 0.04)), entry(box(0.12, 0.08, 0.04))], placed, (VIEW,)))
+    harness.arrays.world.assign(np.array([0, 1, 2, -1]))
+    worlds, attempts = harness.worlds, allocate(AttemptState, {"world": 4, "instance": 4}, device)
     worlds.set(worlds.state.entry, [[0, 1, -1, -1], [1, 0, -1, -1], [-1] * 4, [0, -1, -1, -1]])
     for name in ("contour", "contour_length"):
-        getattr(made.look, name).assign(made.found[name])
-    for name in ("visible", "share", "suction", "depth"):
-        getattr(made.sighting, name).assign(made.found[name])
-    made.grasp.target.fill_(7)
+        getattr(harness.arrays, name).assign(harness.expected[name])
+    for name in ("visible", "visible_fraction", "grasp_pixel", "depth"):
+        getattr(harness.observation, name).assign(harness.expected[name])
+    harness.grasp.target.fill_(7)
     worlds.state.mode.assign(np.array([Mode.PICK, Mode.TARGET, Mode.PICK, Mode.PICK]))
-    made.planner.plan(made.scene, made.seen, worlds.state, attempts, made.sighting, made.grasp, 0)
-    assert made.sighting.above.numpy().tolist() == [[0b10, 0, 0, 0], [0, 0b01, 0, 0], [0] * 4, [0] * 4]
-    assert made.grasp.target.numpy().tolist() == [1, 1, -1, 7]
-    np.testing.assert_allclose(made.grasp.normal.numpy()[:2], [(np.sin(0.1), 0, np.cos(0.1)), (0, 0, 1)], atol=1e-5)
-    np.testing.assert_allclose(made.grasp.point.numpy()[1, 2], 0.02, atol=1e-6)
-    assert made.grasp.tilt.numpy()[:2].tolist() == pytest.approx([0.1, 0.0], abs=1e-5)
+    harness.planner.plan(harness.scene, harness.images, worlds.state, attempts, harness.observation, harness.grasp, 0)
+    assert harness.observation.above.numpy().tolist() == [[0b10, 0, 0, 0], [0, 0b01, 0, 0], [0] * 4, [0] * 4]
+    assert harness.grasp.target.numpy().tolist() == [1, 1, -1, 7]
+    np.testing.assert_allclose(harness.grasp.normal.numpy()[:2], [(np.sin(0.1), 0, np.cos(0.1)), (0, 0, 1)], atol=1e-5)
+    np.testing.assert_allclose(harness.grasp.point.numpy()[1, 2], 0.02, atol=1e-6)
+    assert harness.grasp.tilt.numpy()[:2].tolist() == pytest.approx([0.1, 0.0], abs=1e-5)

@@ -1,4 +1,4 @@
-"""Votes along contours: who lies above whom in images made by hand."""
+"""Occlusion votes along contours of synthetic images, and the clutter graphs that follow from them."""
 
 from __future__ import annotations
 
@@ -8,110 +8,110 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.twins import planning
-from tests.twins.planning import Looks, paint, paint_shapes
+from tests.twins.planning import PlannerHarness, paint, paint_shapes
 
 HIGH, LOW, LOWEST = 1.8, 1.9, 2.0
 
 
-def looks(device, *pictures, instances: int = 5, **more) -> Looks:
-    return Looks(device, [ids for ids, _ in pictures], [depth for _, depth in pictures], instances, **more)
+def harness_of(device, *pictures, instances: int = 5, **options) -> PlannerHarness:
+    return PlannerHarness(device, [ids for ids, _ in pictures], [depth for _, depth in pictures], instances, **options)
 
 
 # ---- votes ----
 
 
 def test_a_nearer_neighbour_gets_a_vote_for_every_point_of_the_border(device):
-    """Rows 20 to 59 of the lower one end at the upper one; where it ends at nothing, nobody votes."""
-    votes = looks(device, paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)])).votes()[0]
+    """The lower object borders on the upper one in rows 20 to 59; a border with the background yields no votes."""
+    votes = harness_of(device, paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)])).votes()[0]
     expected = np.zeros((5, 5))
     expected[0, 1] = 40
     np.testing.assert_array_equal(votes, expected)
 
 
 def test_neighbours_on_both_sides_of_a_thin_part_get_their_own_votes(device):
-    """Five pixels wide: the two sides' normals must not be taken for each other."""
-    votes = looks(device, paint([(40, 20, 44, 59, LOW), (45, 10, 80, 69, HIGH), (5, 30, 39, 49, HIGH)])).votes()[0]
+    """At a width of five pixels, the normals of the two sides must not be confused."""
+    votes = harness_of(device, paint([(40, 20, 44, 59, LOW), (45, 10, 80, 69, HIGH), (5, 30, 39, 49, HIGH)])).votes()[0]
     np.testing.assert_array_equal(votes[0, :3], [0, 40, 20])
     assert (votes[1:] == 0).all()
 
 
-def test_too_thin_a_part_has_no_inside(device):
-    """Its four corners, where the normal leans along it, are not enough for an edge."""
-    votes = looks(device, paint([(40, 20, 42, 59, LOW), (43, 10, 80, 69, HIGH)])).votes()[0]
-    assert votes.max() < planning.SIGHT["min_votes"]
+def test_part_thinner_than_the_offset_yields_too_few_votes(device):
+    """Only its four corners, where the normal is oblique, yield votes: too few for an edge."""
+    votes = harness_of(device, paint([(40, 20, 42, 59, LOW), (43, 10, 80, 69, HIGH)])).votes()[0]
+    assert votes.max() < planning.SETTINGS["min_votes"]
 
 
-def test_all_pieces_of_a_neighbour_vote_but_only_the_largest_of_ones_own_is_asked(device):
-    """A bar cuts the lower object in two, and another bar cuts that bar in two."""
+def test_all_components_of_a_neighbour_get_votes_but_only_the_largest_own_contour_gives_them(device):
+    """A bar splits the lower object in two, and another bar splits that bar in two."""
     picture = paint([(10, 30, 90, 60, LOWEST), (60, 10, 66, 80, LOW), (55, 44, 75, 46, HIGH)])
-    made = looks(device, picture)
-    votes = made.votes()[0]
+    harness = harness_of(device, picture)
+    votes = harness.votes()[0]
     left_rows = 31 - 3
-    # The bar's two pieces border on the left, larger piece of the lower one in all its rows but three.
-    assert made.found["contour"][0, 0, :, 0].max() < 60
+    # The bar's two components border on the left, larger component of the lower object in all its rows but three.
+    assert harness.expected["contour"][0, 0, :, 0].max() < 60
     assert left_rows - 2 <= votes[0, 1] <= left_rows
-    np.testing.assert_allclose(votes, planning.votes(made, 10.0)[0], rtol=1e-6)
+    np.testing.assert_allclose(votes, planning.votes(harness, 10.0)[0], rtol=1e-6)
 
 
 def test_objects_at_the_image_border(device):
-    """What lies outside the image votes for nobody."""
-    votes = looks(device, paint([(0, 0, 59, 89, LOW), (60, 0, 119, 89, HIGH)])).votes()[0]
-    # Three rows at each end have a neighbouring pixel outside, or tilted normals.
+    """Contour points at the image border yield no votes."""
+    votes = harness_of(device, paint([(0, 0, 59, 89, LOW), (60, 0, 119, 89, HIGH)])).votes()[0]
+    # Three rows at each end have a compared pixel outside the image, or oblique normals.
     assert 84 <= votes[0, 1] <= 90
     assert votes.sum() == votes[0, 1]
 
 
-def test_neighbours_lower_than_the_suction_point_weigh_little(device):
+def test_votes_for_neighbours_below_the_grasp_point_have_little_weight(device):
     steep = paint_shapes(
         [
             (np.array([(20, 20), (59, 20), (59, 59), (20, 59)]), (0.002, 0.0, 1.9)),
             (np.array([(60, 10), (100, 10), (100, 70), (60, 70)]), (0.0, 0.0, 2.0)),
         ]
     )
-    made = looks(device, steep)
-    # At the border the lower one has depth 2.012 or more; the suction point, about column 40, has 1.98.
-    for suction, weight in ((1.97, 0.1), (1.985, 1.0), (1.979, 0.1)):
-        made.sighting.depth.assign(np.full((1, 5), suction))
-        assert made.votes()[0, 0, 1] == pytest.approx(40 * weight)
+    harness = harness_of(device, steep)
+    # At the border the lower object has a depth of at least 2.012; the grasp point, near column 40, 1.98.
+    for grasp_depth, weight in ((1.97, 0.1), (1.985, 1.0), (1.979, 0.1)):
+        harness.observation.depth.assign(np.full((1, 5), grasp_depth))
+        assert harness.votes()[0, 0, 1] == pytest.approx(40 * weight)
 
 
 # ---- reach ----
 
 
 def reaching(pixels: float, depth: float = HIGH) -> float:
-    """Diagonal [m] of what may reach so many pixels, its suction point having that depth."""
-    return pixels * depth / (planning.SIGHT["reach"] * planning.FOCAL)
+    """Diagonal [m] of an object whose reach is `pixels` at the depth of its grasp point."""
+    return pixels * depth / (planning.SETTINGS["reach"] * planning.FOCAL)
 
 
-def test_a_contour_votes_where_all_of_the_neighbour_is_in_reach(device):
-    """A bar of columns 5 to 115, rows 50 to 60, compared from row 52: x votes if (115 - x)² + 8² and (x - 5)² + 8² are at most 70²."""
+def test_points_vote_if_the_whole_neighbour_is_within_reach(device):
+    """A bar of columns 5 to 115, rows 50 to 60, compared at row 52: column x votes if (115 - x)² + 8² and (x - 5)² + 8² are at most 70²."""
     picture = paint([(10, 20, 110, 49, LOW), (5, 50, 115, 60, HIGH)])
-    assert looks(device, picture).votes()[0, 0, 1] == 101
+    assert harness_of(device, picture).votes()[0, 0, 1] == 101
     columns = np.arange(10, 111)
     expected = (np.hypot(np.maximum(columns - 5, 115 - columns), 8) <= 70).sum()
     assert expected == 29
-    assert looks(device, picture, diagonal=reaching(70)).votes()[0, 0, 1] == expected
+    assert harness_of(device, picture, diagonal=reaching(70)).votes()[0, 0, 1] == expected
 
 
-def test_a_neighbour_too_long_for_its_diagonal_has_no_vote(device):
+def test_neighbour_longer_than_its_reach_gets_no_vote(device):
     """From the middle of the bar its ends are 55 pixels away, 8 rows down."""
     picture = paint([(5, 20, 115, 49, LOW), (5, 50, 115, 60, HIGH)])
     farthest = np.hypot(55, 8)
-    assert looks(device, picture, diagonal=reaching(farthest * 1.001)).votes()[0, 0, 1] == 1
-    assert looks(device, picture, diagonal=reaching(farthest * 0.999)).votes()[0, 0, 1] == 0
+    assert harness_of(device, picture, diagonal=reaching(farthest * 1.001)).votes()[0, 0, 1] == 1
+    assert harness_of(device, picture, diagonal=reaching(farthest * 0.999)).votes()[0, 0, 1] == 0
 
 
-def test_a_small_thing_at_the_end_of_a_long_one_votes(device):
-    """Its diagonal is the one that it shows; from the long one's suction point it is out of reach."""
+def test_small_neighbour_at_the_end_of_a_long_object_gets_votes(device):
+    """Its diagonal is the visible one; the long object's grasp point is out of its reach, but the compared pixels are not."""
     shown = float(np.hypot(15, 40))
-    made = looks(device, paint([(10, 30, 95, 50, LOW), (85, 20, 100, 60, HIGH)]), diagonal=shown * HIGH / planning.FOCAL)
-    column, row = made.found["suction"][0, 0]
-    assert np.hypot(100 - column, max(row - 20, 60 - row)) > planning.SIGHT["reach"] * shown
-    assert made.votes()[0, 0, 1] == 21
+    harness = harness_of(device, paint([(10, 30, 95, 50, LOW), (85, 20, 100, 60, HIGH)]), diagonal=shown * HIGH / planning.FOCAL)
+    column, row = harness.expected["grasp_pixel"][0, 0]
+    assert np.hypot(100 - column, max(row - 20, 60 - row)) > planning.SETTINGS["reach"] * shown
+    assert harness.votes()[0, 0, 1] == 21
 
 
-def test_piles_of_true_masks_keep_every_vote(device):
-    """Turned rectangles with the diagonals that they have, many of them out of reach of a suction point."""
+def test_the_reach_drops_no_vote_of_piles_with_true_masks(device):
+    """Rotated rectangles with their true diagonals; many have a grasp point out of reach."""
     numbers = np.random.default_rng(7)
     far = votes = 0
     for _ in range(8):
@@ -121,15 +121,15 @@ def test_piles_of_true_masks_keep_every_vote(device):
         turn = np.stack([[np.cos(turns), -np.sin(turns)], [np.sin(turns), np.cos(turns)]]).transpose(2, 0, 1)
         corners = ((square * sides[:, None]) @ turn.transpose(0, 2, 1) + middles[:, None]).round()
         diagonal = np.linalg.norm(sides, axis=1) * depths / planning.FOCAL
-        made = looks(
+        harness = harness_of(
             device, paint_shapes([(c, (0.0, 0.0, z)) for c, z in zip(corners, depths, strict=True)]), instances=8, diagonal=diagonal
         )
-        found = made.votes()[0]
-        np.testing.assert_allclose(found, planning.votes(made, np.inf)[0], atol=1e-4)
-        for i, j in np.argwhere(found >= planning.SIGHT["min_votes"]):
-            line = made.found["contour"][0, j, : made.found["contour_length"][0, j]]
-            farthest = np.linalg.norm(line - made.found["suction"][0, i], axis=1).max()
-            far, votes = far + (farthest > planning.SIGHT["reach"] * np.linalg.norm(sides[j])), votes + 1
+        found = harness.votes()[0]
+        np.testing.assert_allclose(found, planning.votes(harness, np.inf)[0], atol=1e-4)
+        for i, j in np.argwhere(found >= planning.SETTINGS["min_votes"]):
+            line = harness.expected["contour"][0, j, : harness.expected["contour_length"][0, j]]
+            farthest = np.linalg.norm(line - harness.expected["grasp_pixel"][0, i], axis=1).max()
+            far, votes = far + (farthest > planning.SETTINGS["reach"] * np.linalg.norm(sides[j])), votes + 1
     assert votes > 60
     assert far > 5
 
@@ -140,25 +140,25 @@ def test_piles_of_true_masks_keep_every_vote(device):
     column=st.integers(10, 110),
     more=st.sampled_from((-0.5, 0.5)),
 )
-def test_votes_in_reach_are_the_twins_whatever_the_contour(device, points, column, more):
-    """The reach is just below or above what one of the compared pixels needs: a box alone cannot tell."""
-    made = looks(device, paint([(10, 20, 110, 49, LOW), (5, 50, 115, 60, HIGH)]))
+def test_votes_within_reach_equal_the_reference_for_any_contour(device, points, column, more):
+    """The reach is just below or above the distance of a compared pixel: the bounding box alone cannot decide."""
+    harness = harness_of(device, paint([(10, 20, 110, 49, LOW), (5, 50, 115, 60, HIGH)]))
     line = np.array(points)
     square = ((line - (column, 52)) ** 2).sum(axis=1).max()
     diagonal = reaching(np.sqrt(max(square + more, 0.0)))
-    made.found["contour"][0, 1, : len(line)], made.found["contour_length"][0, 1] = line, len(line)
-    made.look.contour.assign(made.found["contour"])
-    made.look.contour_length.assign(made.found["contour_length"])
-    made.worlds.scene.catalog.diagonal.fill_(diagonal)
-    assert made.votes()[0, 0, 1] == planning.votes(made, diagonal)[0, 0, 1]
+    harness.expected["contour"][0, 1, : len(line)], harness.expected["contour_length"][0, 1] = line, len(line)
+    harness.arrays.contour.assign(harness.expected["contour"])
+    harness.arrays.contour_length.assign(harness.expected["contour_length"])
+    harness.worlds.scene.catalog.diagonal.fill_(diagonal)
+    assert harness.votes()[0, 0, 1] == planning.votes(harness, diagonal)[0, 0, 1]
 
 
-def test_a_contour_without_points_is_in_reach(device):
-    """What had no room for its contour keeps its votes."""
-    made = looks(device, paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)]), diagonal=1e-3)
-    assert made.votes()[0, 0, 1] == 0
-    made.look.contour_length.assign([[160, 0, 0, 0, 0]])
-    assert made.votes()[0, 0, 1] == 40
+def test_neighbour_without_contour_points_is_within_reach(device):
+    """An instance without a contour keeps its votes."""
+    harness = harness_of(device, paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)]), diagonal=1e-3)
+    assert harness.votes()[0, 0, 1] == 0
+    harness.arrays.contour_length.assign([[160, 0, 0, 0, 0]])
+    assert harness.votes()[0, 0, 1] == 40
 
 
 # ---- which views ----
@@ -166,24 +166,24 @@ def test_a_contour_without_points_is_in_reach(device):
 
 def test_unused_views_write_nothing(device):
     picture = paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)])
-    made = looks(device, picture, picture)
-    made.look.world.assign(np.array([-1, 0]))
-    made.sighting.votes.fill_(7.0)
-    votes = made.votes()
+    harness = harness_of(device, picture, picture)
+    harness.arrays.world.assign(np.array([-1, 0]))
+    harness.observation.votes.fill_(7.0)
+    votes = harness.votes()
     assert votes[0, 0, 1] == 40
     assert (votes[1] == 7.0).all()
-    made.sighting.above.fill_(3)
-    made.planner.order_clutter(made.scene, made.seen, made.sighting)
-    assert made.sighting.above.numpy().tolist() == [[2, 0, 0, 0, 0], [3] * 5]
+    harness.observation.above.fill_(3)
+    harness.planner.order_clutter(harness.scene, harness.images, harness.observation)
+    assert harness.observation.above.numpy().tolist() == [[2, 0, 0, 0, 0], [3] * 5]
 
 
-def test_votes_of_an_earlier_look_are_gone(device):
-    made = looks(device, paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)]))
-    np.testing.assert_array_equal(made.votes().copy(), made.votes())
+def test_votes_of_an_earlier_observation_are_cleared(device):
+    harness = harness_of(device, paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)]))
+    np.testing.assert_array_equal(harness.votes().copy(), harness.votes())
 
 
-def test_votes_are_the_twins(device):
-    """Tilted polygons that pass through each other."""
+def test_votes_equal_the_reference(device):
+    """Tilted, intersecting polygons."""
     numbers = np.random.default_rng(3)
     pictures = []
     for _ in range(12):
@@ -194,64 +194,64 @@ def test_votes_are_the_twins(device):
             slopes = numbers.uniform(-0.002, 0.002, 2)
             shapes.append((corners.round(), (*slopes, 2.0 - slopes @ (60, 45) + numbers.uniform(-0.03, 0.03))))
         pictures.append(paint_shapes(shapes))
-    made = looks(device, *pictures, instances=6, diagonal=0.9)
-    expected = planning.votes(made, 0.9)
-    np.testing.assert_allclose(made.votes(), expected, atol=1e-4)
-    # The draw has full votes, deep votes and votes out of reach.
+    harness = harness_of(device, *pictures, instances=6, diagonal=0.9)
+    expected = planning.votes(harness, 0.9)
+    np.testing.assert_allclose(harness.votes(), expected, atol=1e-4)
+    # The random images have full votes, deep votes and votes out of reach.
     assert (expected > 5).sum() > 30
     assert (expected % 1 > 0).sum() > 5
-    assert (planning.votes(made, 10.0) != expected).sum() > 5
+    assert (planning.votes(harness, 10.0) != expected).sum() > 5
 
 
 # ---- stacks ----
 
 
-def order_of(device, picture, instances: int) -> tuple[Looks, list[set[int]]]:
-    made = looks(device, picture, instances=instances)
-    _, paths = made.graph()
-    return made, [set(np.flatnonzero(row).tolist()) for row in paths[0]]
+def order_of(device, picture, instances: int) -> tuple[PlannerHarness, list[set[int]]]:
+    harness = harness_of(device, picture, instances=instances)
+    _, paths = harness.graph()
+    return harness, [set(np.flatnonzero(row).tolist()) for row in paths[0]]
 
 
-def choices(made: Looks) -> tuple[int, int]:
-    """What picking and targeted picking choose."""
+def choices(harness: PlannerHarness) -> tuple[int, int]:
+    """Targets in the modes PICK and TARGET."""
     chosen = []
     for mode in (1, 2):
-        made.worlds.state.mode.fill_(mode)
-        chosen.append(made.choose()[0])
+        harness.worlds.state.mode.fill_(mode)
+        chosen.append(harness.choose()[0])
     return tuple(chosen)
 
 
 def test_a_stack_of_two(device):
-    made, above = order_of(device, paint([(20, 20, 80, 70, LOW), (40, 30, 60, 80, HIGH)]), 2)
+    harness, above = order_of(device, paint([(20, 20, 80, 70, LOW), (40, 30, 60, 80, HIGH)]), 2)
     assert above == [{1}, set()]
-    assert choices(made) == (1, 0)
+    assert choices(harness) == (1, 0)
 
 
-def test_what_lies_within_an_outline_is_no_obstacle(device):
-    """Outer contours alone are asked, as in the source: an object that lies on the middle of a larger one has no vote."""
-    made, above = order_of(device, paint([(20, 20, 80, 70, LOW), (40, 30, 60, 50, HIGH)]), 2)
+def test_object_inside_the_outer_contour_of_another_gets_no_votes(device):
+    """Only outer contours are followed, as in the paper: an object on the middle of a larger one gets no votes."""
+    harness, above = order_of(device, paint([(20, 20, 80, 70, LOW), (40, 30, 60, 50, HIGH)]), 2)
     assert above == [set(), set()]
-    assert choices(made) == (0, 1)
+    assert choices(harness) == (0, 1)
 
 
 def test_a_stack_of_three_in_a_row(device):
-    """0 on 2 on 1; 0 does not touch 1."""
-    made, above = order_of(device, paint([(70, 30, 100, 60, HIGH), (10, 20, 40, 70, LOWEST), (30, 35, 80, 55, LOW)]), 3)
+    """0 lies on 2, which lies on 1; 0 does not touch 1."""
+    harness, above = order_of(device, paint([(70, 30, 100, 60, HIGH), (10, 20, 40, 70, LOWEST), (30, 35, 80, 55, LOW)]), 3)
     assert above == [set(), {0, 2}, {0}]
-    assert choices(made) == (0, 1)
+    assert choices(harness) == (0, 1)
 
 
 def test_a_stack_of_five(device):
-    """A plate 3, on it 0 and 4 side by side, over its edge; across both of them 2; 1 lies alone, small."""
+    """0 and 4 lie side by side on plate 3, across its edge; 2 lies across both; 1 lies alone and is small."""
     plate, across, alone = (15, 40, 90, 85, LOWEST), (20, 45, 70, 60, HIGH), (95, 10, 110, 20, LOWEST)
-    made, above = order_of(device, paint([(10, 30, 35, 70, LOW), alone, across, plate, (50, 30, 75, 70, LOW)]), 5)
+    harness, above = order_of(device, paint([(10, 30, 35, 70, LOW), alone, across, plate, (50, 30, 75, 70, LOW)]), 5)
     assert above == [{2}, set(), set(), {0, 2, 4}, {2}]
-    # Nothing is above 1 and 2; 2 shows more.
-    assert choices(made) == (2, 3)
+    # Nothing is above 1 and 2; 2 has the larger visible fraction.
+    assert choices(harness) == (2, 3)
 
 
-def test_a_ring_of_three_is_opened_at_its_weakest_border(device):
-    """Each bar passes under the next, the borders being of different lengths."""
+def test_a_cycle_of_three_is_broken_at_its_weakest_edge(device):
+    """Each bar passes under the next; the borders have different lengths."""
     size = {"height": 120, "width": 160}
     ids, depth = np.full(tuple(size.values()), -1), np.full(tuple(size.values()), 2.5, np.float32)
 
@@ -266,8 +266,8 @@ def test_a_ring_of_three_is_opened_at_its_weakest_border(device):
     fill(2, 50, 81, 70, 100, 1.90)
     fill(0, 10, 50, 20, 100, 1.86)
     fill(0, 21, 81, 49, 100, 1.86)
-    made = Looks(device, [ids], [depth], 3)
-    votes = made.votes()[0]
+    harness = PlannerHarness(device, [ids], [depth], 3)
+    votes = harness.votes()[0]
     assert votes[0, 1] > votes[1, 2] > votes[2, 0] >= 5
-    edges, _ = made.graph()
+    edges, _ = harness.graph()
     np.testing.assert_array_equal(edges[0], [[False, True, False], [False, False, True], [False, False, False]])

@@ -72,7 +72,7 @@ def judge(worlds: KernelWorlds, shift: float = 0.0, contacts: list[dict] | None 
         previous[world, 0, 0] += shift
     worlds.set(worlds.state.previous, previous)
     arrange.judge_settling(worlds.scene, worlds.state, worlds.physics, SEED)
-    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
+    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
 
 
 def state_of(worlds: KernelWorlds, world: int = 0) -> tuple[int, int, list[int]]:
@@ -338,7 +338,7 @@ def test_a_pose_that_is_no_number_ends_the_episode(device, phase, value, axis):
     pose = INSIDE.copy()
     pose[axis] = value
     worlds.place(1, 1, pose)
-    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
+    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
     assert state_of(worlds, 0)[:2] == (phase, Ending.RUNNING)
     assert state_of(worlds, 1)[:2] == (Phase.OVER, Ending.NOT_FINITE)
 
@@ -348,7 +348,7 @@ def test_a_solver_overflow_ends_the_episode(device, phase):
     worlds = made(device, worlds=2)
     worlds.begin(phase)
     worlds.set(worlds.physics.solver.constraint_overflow, [True, False])
-    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
+    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
     assert state_of(worlds, 0)[:2] == (Phase.OVER, Ending.SOLVER_OVERFLOW)
     assert state_of(worlds, 1)[:2] == (phase, Ending.RUNNING)
 
@@ -357,7 +357,7 @@ def test_a_gripper_that_has_been_everywhere_ends_the_episode(device):
     worlds = made(device, worlds=2)
     worlds.begin(Phase.ACT)
     worlds.set(worlds.state.waypoint, [worlds.scene.move.waypoints - 1, worlds.scene.move.waypoints])
-    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
+    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
     assert state_of(worlds, 0)[:2] == (Phase.ACT, Ending.RUNNING)
     assert state_of(worlds, 1)[:2] == (Phase.OVER, Ending.FINISHED)
 
@@ -367,7 +367,7 @@ def test_worlds_without_an_episode_end_none(device):
         worlds = made(device)
         worlds.begin(phase)
         worlds.set(worlds.physics.solver.constraint_overflow, True)
-        arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
+        arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
         assert state_of(worlds)[:2] == (phase, Ending.RUNNING)
 
 

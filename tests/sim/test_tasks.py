@@ -60,7 +60,7 @@ def made(device, worlds: int = 1, **pick) -> KernelWorlds:
 
 
 def begin(worlds: KernelWorlds) -> None:
-    gripper.begin_picking(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.plan, worlds.physics)
+    gripper.begin_picking(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.plan, worlds.physics)
 
 
 def end(worlds: KernelWorlds) -> None:
@@ -82,12 +82,12 @@ def test_who_begins_to_pick_looks(device):
     worlds = made(device, worlds=4)
     worlds.set(worlds.state.phase, [Phase.ACT, Phase.ACT, Phase.ACT, Phase.SETTLE])
     worlds.set(worlds.state.mode, [Mode.PICK, Mode.TARGET, Mode.MOVE, Mode.PICK])
-    for array in (worlds.attempts.failures, worlds.attempts.removed, worlds.plan.yaw, worlds.sighting.overflow):
+    for array in (worlds.attempts.failures, worlds.attempts.removed, worlds.plan.yaw, worlds.observation.overflow):
         worlds.set(array, 2)
     begin(worlds)
     assert worlds.attempts.task.numpy().tolist() == [Task.LOOK, Task.LOOK, Task.NONE, Task.NONE]
     assert worlds.attempts.attempt.numpy().tolist() == [-1] * 4
-    for array in (worlds.attempts.failures, worlds.attempts.removed, worlds.plan.yaw, worlds.sighting.overflow):
+    for array in (worlds.attempts.failures, worlds.attempts.removed, worlds.plan.yaw, worlds.observation.overflow):
         assert not array.numpy().any()
 
 
@@ -282,7 +282,7 @@ def test_when_picking_ends(device, task, entry, failures, ending):
     worlds.set(worlds.attempts.task, task)
     worlds.set(worlds.attempts.failures, failures)
     worlds.set(worlds.state.entry, entry)
-    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
+    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
     assert worlds.state.ending.numpy()[0] == ending
     assert worlds.state.phase.numpy()[0] == (Phase.ACT if ending == Ending.RUNNING else Phase.OVER)
 
@@ -290,8 +290,8 @@ def test_when_picking_ends(device, task, entry, failures, ending):
 def test_a_contour_without_room_ends_the_episode(device):
     worlds = made(device)
     worlds.set(worlds.attempts.task, Task.LIFT)
-    worlds.set(worlds.sighting.overflow, 1)
-    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
+    worlds.set(worlds.observation.overflow, 1)
+    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
     assert worlds.state.ending.numpy()[0] == Ending.SIGHT_OVERFLOW
 
 
@@ -301,7 +301,7 @@ def test_a_gripper_that_is_nowhere_ends_the_episode(device, link):
     body_q = worlds.physics.state.body_q.numpy()
     body_q[link, 0] = np.nan
     worlds.physics.state.body_q.assign(body_q)
-    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.sighting, worlds.physics)
+    arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
     assert worlds.state.ending.numpy()[0] == Ending.NOT_FINITE
 
 
@@ -311,15 +311,15 @@ def test_everybody_who_looks_is_looked_at_once(looking, views, device):
     worlds = len(looking)
     phase = wp.full(worlds, Phase.ACT, dtype=int, device=device)
     task = wp.array([Task.LOOK if looks else Task.PRESS for looks in looking], dtype=int, device=device)
-    looker, world = wp.zeros(worlds, dtype=int, device=device), wp.zeros(views, dtype=int, device=device)
+    listed, world = wp.zeros(worlds, dtype=int, device=device), wp.zeros(views, dtype=int, device=device)
     count, first, left = (wp.zeros(1, dtype=int, device=device) for _ in range(3))
-    wp.launch(worklist.list_lookers_kernel, dim=1, inputs=[worlds, phase, task], outputs=[looker, count, first, left], device=device)
+    wp.launch(worklist.list_worlds_kernel, dim=1, inputs=[worlds, phase, task], outputs=[listed, count, first, left], device=device)
     seen: list[int] = []
     batches = 0
     while left.numpy()[0]:
-        wp.launch(worklist.take_batch_kernel, dim=views, inputs=[looker, count, first], outputs=[world], device=device)
+        wp.launch(worklist.take_batch_kernel, dim=views, inputs=[listed, count, first], outputs=[world], device=device)
         seen += [number for number in world.numpy().tolist() if number >= 0]
-        wp.launch(worklist.pass_batch_kernel, dim=1, inputs=[views, count], outputs=[first, left], device=device)
+        wp.launch(worklist.advance_batch_kernel, dim=1, inputs=[views, count], outputs=[first, left], device=device)
         batches += 1
     assert seen == [number for number, looks in enumerate(looking) if looks]
     assert batches == -(-len(seen) // views)

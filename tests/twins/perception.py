@@ -1,9 +1,10 @@
-"""Twins of looking in NumPy and OpenCV, and images of codes to compare them on."""
+"""NumPy and OpenCV reference implementations of segmentation and grasp points, and a harness that feeds synthetic images of ids."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,13 +14,13 @@ from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config, Sight
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.stages.perception.arrays import Sighting
-from synpick_warp.stages.perception.segment import Sight as SightStage
+from synpick_warp.stages.perception.arrays import Observation
+from synpick_warp.stages.perception.segment import Segmenter
 from synpick_warp.stages.sim.worlds import world_sizes
 
 
-class Look:
-    """A sight that is shown images of codes in place of a traced scene. Instance i is catalog entry i."""
+class SegmenterHarness:
+    """A `Segmenter` that gets synthetic images of segmentation ids in place of a rendered G-buffer. Instance i is catalog entry i."""
 
     def __init__(self, device: wp.Device, width: int, height: int, worlds: int = 1, instances: int = 4, **sight) -> None:
         config = Config()
@@ -29,20 +30,21 @@ class Look:
             bake=replace(config.bake, worlds=worlds),
             arrangement=replace(config.arrangement, max_objects=instances),
         )
-        self.stage = SightStage(self.config, SimpleNamespace(device=device, meshes=None, table=None), instances)
+        render_scene: Any = SimpleNamespace(device=device, meshes=None, table=None)
+        self.stage = Segmenter(self.config.sight, config.cameras, render_scene, worlds, instances)
         self.mass, self.area = np.full(instances, 0.1), np.full(instances, 0.01)
-        catalog, rules = structs.CatalogData(), structs.SightData()
+        catalog, rules = structs.CatalogData(), structs.PerceptionData()
         catalog.mass = wp.zeros(instances, dtype=float, device=device)
         catalog.area = wp.zeros(instances, dtype=float, device=device)
         for name in ("center_share", "heavy_mass", "heavy_center_share"):
             setattr(rules, name, getattr(self.config.sight, name))
-        self.scene = SimpleNamespace(catalog=catalog, sight=rules)
+        self.scene = SimpleNamespace(catalog=catalog, perception=rules)
         self.entry = wp.array(np.tile(np.arange(instances), (worlds, 1)), dtype=wp.int32, device=device)
-        self.sighting = allocate(Sighting, world_sizes(self.config, 0), device)
+        self.observation = allocate(Observation, world_sizes(self.config, 0), device)
         self.focal = make_cameras(replace(config.cameras, resolution=(width, height)))[0].matrix[[0, 1], [0, 1]]
 
-    def see(self, *codes: np.ndarray, depth: np.ndarray | float = 2.0, worlds: list[int] | None = None) -> None:
-        """Conclude from images of codes (H, W), one a view, with a depth image or one depth [m]; views are of worlds 0, 1, ..."""
+    def observe(self, *codes: np.ndarray, depth: np.ndarray | float = 2.0, worlds: list[int] | None = None) -> None:
+        """Process images of segmentation ids (H, W), one a view, with a depth image or one depth [m]; by default of worlds 0, 1, ..."""
         stage = self.stage
         images = stage.hit_arrays.code.numpy()
         for view, image in enumerate(codes):
@@ -50,42 +52,42 @@ class Look:
         stage.hit_arrays.code.assign(images)
         stage.hit_arrays.depth.assign(np.broadcast_to(np.float32(depth), images.shape))
         shown = list(range(len(codes))) if worlds is None else worlds
-        stage.look.world.assign(np.array(shown + [-1] * (stage.views - len(shown))))
+        stage.arrays.world.assign(np.array(shown + [-1] * (stage.views - len(shown))))
         self.scene.catalog.mass.assign(self.mass)
         self.scene.catalog.area.assign(self.area)
-        stage.find_suction_points(self.scene, self.entry, self.sighting)  # type: ignore[arg-type]
+        stage.find_grasp_points(self.scene, self.entry, self.observation)  # type: ignore[arg-type]
 
     def image(self, name: str, view: int = 0) -> np.ndarray:
-        """An array of the look, of one view."""
-        return getattr(self.stage.look, name).numpy()[view]
+        """A scratch array of one view."""
+        return getattr(self.stage.arrays, name).numpy()[view]
 
-    def of(self, name: str, instance: int = 0, world: int = 0) -> np.ndarray:
-        """What was concluded of an instance."""
-        return getattr(self.sighting, name).numpy()[world, instance]
+    def result(self, name: str, instance: int = 0, world: int = 0) -> np.ndarray:
+        """A field of an instance's observation."""
+        return getattr(self.observation, name).numpy()[world, instance]
 
     def contour(self, instance: int = 0, view: int = 0) -> np.ndarray:
         """Points (n, 2) of an instance's contour."""
         return self.image("contour", view)[instance, : self.image("contour_length", view)[instance]]
 
 
-def components(codes: np.ndarray, instances: int) -> np.ndarray:
-    """Component of each pixel (H, W): the least row-major index of its pixels; -1: no instance."""
-    named = np.full(codes.shape, -1)
+def label_components(codes: np.ndarray, instances: int) -> np.ndarray:
+    """Connected-component label of each pixel (H, W): the smallest row-major index of the component's pixels; -1: no instance."""
+    result = np.full(codes.shape, -1)
     for instance in range(instances):
         count, labels = cv2.connectedComponents((codes == instance + 1).astype(np.uint8), connectivity=8)
         for label in range(1, count):
-            named[labels == label] = np.flatnonzero(labels == label)[0]
-    return named
+            result[labels == label] = np.flatnonzero(labels == label)[0]
+    return result
 
 
-def largest(named: np.ndarray, codes: np.ndarray, instance: int) -> int:
-    """The name of an instance's largest component, the least of equal ones; -1: it is not visible."""
-    names, sizes = np.unique(named[codes == instance + 1], return_counts=True)
+def largest_label(labels: np.ndarray, codes: np.ndarray, instance: int) -> int:
+    """Label of an instance's largest component; ties go to the smallest label; -1: not visible."""
+    names, sizes = np.unique(labels[codes == instance + 1], return_counts=True)
     return int(names[np.argmax(sizes)]) if len(names) else -1
 
 
 def squared_distance(mask: np.ndarray) -> np.ndarray:
-    """Squared distance [px²] of each pixel of a mask (H, W) to the nearest pixel that is not of it, by trying all; 0 outside."""
+    """Brute-force squared distance transform [px²] of a mask (H, W): distance to the nearest pixel outside; 0 outside the mask."""
     padded = np.pad(mask, 1)
     outside = np.argwhere(~padded)
     result = np.zeros(padded.shape, dtype=int)
@@ -96,21 +98,21 @@ def squared_distance(mask: np.ndarray) -> np.ndarray:
 
 
 def contour(mask: np.ndarray) -> np.ndarray:
-    """Outer contour (n, 2) of the one component of a mask."""
-    (found,) = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
-    return found.reshape(-1, 2)
+    """Outer contour (n, 2) of a mask with one component."""
+    (points,) = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    return points.reshape(-1, 2)
 
 
 def centroid(points: np.ndarray) -> np.ndarray:
-    """Centroid (2) of what a contour encloses; the mean of its points where that is nothing."""
+    """Centroid (2) of the polygon of a contour; the mean of its points where the area is zero."""
     moments = cv2.moments(points.reshape(-1, 1, 2).astype(np.int32))
     if moments["m00"] == 0.0:
         return points.mean(axis=0)
     return np.array([moments["m10"], moments["m01"]]) / moments["m00"]
 
 
-def suction_point(mask: np.ndarray, mass: float, rules: Sight) -> dict[str, np.ndarray]:
-    """Pole, centroid, middle, their distances to the contour, and the chosen point, of the one component of a mask."""
+def choose_grasp_point(mask: np.ndarray, mass: float, rules: Sight) -> dict[str, np.ndarray]:
+    """Pole, centroid, midpoint, their distances to the contour, and the chosen pixel, of a mask with one component."""
     squared = squared_distance(mask)
     row, column = np.unravel_index(np.argmax(squared), mask.shape)
     pole = np.array([column, row], dtype=np.float32)
@@ -118,7 +120,7 @@ def suction_point(mask: np.ndarray, mass: float, rules: Sight) -> dict[str, np.n
     points = [pole, center, np.float32(0.5) * (pole + center)]
     pixels = np.rint(points).astype(int)
     distances = np.sqrt(squared[pixels[:, 1], pixels[:, 0]]).astype(np.float32)
-    share = np.float32(rules.heavy_center_share if mass > rules.heavy_mass else rules.center_share)
+    threshold = np.float32(rules.heavy_center_share if mass > rules.heavy_mass else rules.center_share)
     best = 1 if distances[1] >= distances[2] else 2
-    chosen = pixels[best if distances[best] / distances[0] > share else 0]
-    return {"pole": pole, "centroid": center, "middle": points[2], "distances": distances, "suction": chosen}
+    chosen = pixels[best if distances[best] / distances[0] > threshold else 0]
+    return {"pole": pole, "centroid": center, "midpoint": points[2], "distances": distances, "grasp_pixel": chosen}

@@ -12,7 +12,7 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.kernels import structs
 from synpick_warp.stages.constants import SceneData
-from synpick_warp.stages.perception.arrays import Plan, Sighting
+from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 GRIPPER_BODIES, GRIPPER_DOFS = 2, 4
@@ -39,7 +39,7 @@ class KernelWorlds:
     state: Any = None
     attempts: Any = None
     seals: Any = None
-    sighting: Any = None
+    observation: Any = None
     plan: Any = None
     physics: Any = None
     pick: dict[str, Any] = field(default_factory=dict)
@@ -97,7 +97,7 @@ class KernelWorlds:
             filled(structs.ModeData(), {"pick_share": 0.0, "pick_or_target_share": 0.0}),
             filled(structs.MoveData(), move),
             filled(structs.PickData(), self.pick),
-            structs.SightData(),
+            structs.PerceptionData(),
             structs.SuctionData(),
             wp.array(GUIDES, dtype=int, device=self.device),
         )
@@ -112,7 +112,7 @@ class KernelWorlds:
         self.state = allocate(WorldState, sizes, self.device)
         self.attempts = allocate(AttemptState, sizes, self.device)
         self.seals = allocate(SealState, sizes, self.device)
-        self.sighting = allocate(Sighting, sizes, self.device)
+        self.observation = allocate(Observation, sizes, self.device)
         self.plan = allocate(Plan, sizes, self.device)
         self.physics = self._physics()
 

@@ -13,7 +13,7 @@ from synpick_warp.arrays import allocate
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.codes import Ending, Measure, Mode, Outcome, Phase, Status, Task
 from synpick_warp.configs.schema import Config
-from synpick_warp.stages.perception.arrays import Plan, Sighting
+from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.stream import TickReport
 
@@ -27,7 +27,7 @@ class World:
     def __init__(self, config: Config, device: Any) -> None:
         sizes = worlds.world_sizes(config, 1) | {"world": 1}
         self.room = sizes["instance"]
-        self.sighting, self.plan = (_host(allocate(kind, sizes, device)) for kind in (Sighting, Plan))
+        self.observation, self.plan = (_host(allocate(kind, sizes, device)) for kind in (Observation, Plan))
         self.status = np.zeros((1, len(Status)), np.int32)
         self.measures = np.zeros((1, len(Measure)), np.float32)
         self.entry = np.full((1, self.room), -1, np.int32)
@@ -71,9 +71,9 @@ class World:
     def look(self, target: int) -> None:
         """A look chooses; what is not set by the test is some number."""
         self.plan.target[0] = target
-        for arrays in (self.plan, self.sighting):
+        for arrays in (self.plan, self.observation):
             for name, array in vars(arrays).items():
-                if name not in ("target", "overflow", "votes", "above", "all_above"):
+                if name not in ("target", "overflow", "votes", "above", "ancestors"):
                     array += 1
 
     def attempt(self, number: int, loads: list[float], **columns: object) -> Ticks:
@@ -95,7 +95,7 @@ class World:
         self.now(phase=Phase.OVER, ending=ending, live=int(ending.delivers))
 
 
-def _host(arrays: Sighting | Plan) -> SimpleNamespace:
+def _host(arrays: Observation | Plan) -> SimpleNamespace:
     return SimpleNamespace(**{item.name: getattr(arrays, item.name).numpy().copy() for item in fields(arrays)})
 
 
@@ -122,7 +122,7 @@ def report(side_by_side: list[World]) -> TickReport:
 
     status, measures, entry = (np.concatenate([getattr(world, name) for world in side_by_side]) for name in ("status", "measures", "entry"))
     pose = np.zeros((*entry.shape, 7), np.float32)
-    return TickReport(status, measures, entry, pose, stacked("sighting"), stacked("plan"), SimpleNamespace())
+    return TickReport(status, measures, entry, pose, stacked("observation"), stacked("plan"), SimpleNamespace())
 
 
 def bits(*instances: int) -> int:

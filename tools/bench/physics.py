@@ -123,7 +123,7 @@ def measure_simulation(factory: Factory, least: float, parts: tuple[str, ...]) -
         bare = _bare_steps(simulation, least)
         yield from _pace(simulation, bare, "at rest, without gripper and seals, steps alone")
     settle.rest_ticks = rest_ticks
-    if simulation.looker is None:
+    if simulation.perception is None:
         for _ in range(STIR_TICKS + 2 * rest_ticks):
             tick()
         if thorough:
@@ -138,7 +138,7 @@ def measure_simulation(factory: Factory, least: float, parts: tuple[str, ...]) -
         yield Row("physics", "worlds that act", 100.0 * acting, "%")
         contacts = int(simulation.physics.contacts.rigid_contact_count.numpy()[0])
         yield Row("physics", "contacts a world", contacts / simulation.layout.worlds, "")
-    if simulation.looker is not None and "sight" in parts:
+    if simulation.perception is not None and "sight" in parts:
         yield from _looks(simulation, least)
 
 
@@ -200,12 +200,12 @@ def _bare_steps(simulation: Simulation, least: float) -> float:
 
 def _picking(simulation: Simulation, bare: float) -> Iterator[Row]:
     """Ticks in which worlds pick: world-steps beside those of the bare pile (`bare`: time of its tick's steps [s]), and what looks take."""
-    device, looker, worlds = simulation.device, simulation.looker, simulation.layout.worlds
+    device, perception, worlds = simulation.device, simulation.perception, simulation.layout.worlds
     reader, watch = TickReader(simulation.records[0]), Stopwatch(device)
     looks, held, acting = 0, 0, 0
     wp.synchronize_device(device)
     started = time.perf_counter()
-    with watch.around(simulation.physics, "tick", "steps"), watch.around(looker, "look", "looks"):
+    with watch.around(simulation.physics, "tick", "steps"), watch.around(perception, "perceive", "looks"):
         for _ in range(PICK_TICKS):
             simulation.tick(simulation.records[0])
             reader.start()
@@ -229,29 +229,29 @@ def _picking(simulation: Simulation, bare: float) -> Iterator[Row]:
 
 def _looks(simulation: Simulation, least: float) -> Iterator[Row]:
     """Time of a look, by what it consists of, in full batches."""
-    looker, snapshot = simulation.looker, simulation.records[0].snapshot
-    assert looker is not None  # There are worlds that pick.
+    perception, snapshot = simulation.perception, simulation.records[0].snapshot
+    assert perception is not None  # There are worlds that pick.
     simulation.state.phase.fill_(Phase.ACT)
     simulation.attempts.task.fill_(Task.LOOK)
     parts = (
-        (looker.sight, "trace", "trace"),
-        (looker.sight, "find_suction_points", "components, distances, contours, suction points"),
-        (looker.planner, "plan", "votes, clutter graph, choice, grasp"),
+        (perception.segmenter, "render", "trace"),
+        (perception.segmenter, "find_grasp_points", "components, distances, contours, suction points"),
+        (perception.planner, "plan", "votes, clutter graph, choice, grasp"),
     )
 
-    def look_at_batch() -> None:
-        looker.list_lookers()
-        looker.look_at_batch(snapshot)
+    def perceive_batch() -> None:
+        perception.list_worlds()
+        perception.perceive_batch(snapshot)
 
-    seconds_per_call(look_at_batch, simulation.device, 0.0)
+    seconds_per_call(perceive_batch, simulation.device, 0.0)
     watch, calls = Stopwatch(simulation.device), 0
     with contextlib.ExitStack() as patches:
         for part in parts:
             patches.enter_context(watch.around(*part))
         while calls < LEAST_REPEATS or sum(watch.seconds(name) for _, _, name in parts) < least:
-            look_at_batch()
+            perceive_batch()
             calls += 1
-    views = looker.sight.views
+    views = perception.segmenter.views
     yield Row("sight", "views in a batch", views, "")
     for _, _, name in parts:
         yield Row("sight", f"a look: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")

@@ -1,6 +1,6 @@
-"""Arrays of looking: what one batch of images shows, and what is concluded from it for every world.
+"""Device arrays of perception and grasp planning: scratch of one batch of images, and the results kept for every world.
 
-Pixels are (column, row) indices of the sight image; the centre of a pixel has whole indices here, as in OpenCV's contours.
+Pixels are (column, row) indices of the perception image; pixel centres have integer coordinates here, as in OpenCV's contours.
 """
 
 from __future__ import annotations
@@ -13,69 +13,69 @@ from synpick_warp.arrays import device_array
 
 
 @dataclass(frozen=True, eq=False)
-class LookArrays:
-    """Scratch of one batch of looks; a view is one image of a world that must choose."""
+class PerceptionArrays:
+    """Scratch of one batch: segmentation of each view, which is one image of one world."""
 
     world: wp.array = device_array("view", dtype=wp.int32)
-    """World of each view; -1: the view is not in use."""
+    """World of each view; -1: the view is unused."""
     camera: wp.array = device_array("view", dtype=wp.int32)
-    """Zero: all look through camera 0; -1: the view is not in use."""
+    """Camera of each view: always 0; -1: the view is unused."""
     component: wp.array = device_array("view", "row", "column", dtype=wp.int32)
-    """Connected component of pixels (8 neighbours) of one instance: the least row-major index of its pixels; -1: no instance."""
+    """Connected-component label (8-connectivity, within one instance): the smallest row-major index of its pixels; -1: no instance."""
     area: wp.array = device_array("view", "row", "column", dtype=wp.int32, unit="px")
-    """Size of a component, at the pixel that names it; 0 elsewhere."""
+    """Size of a component, stored at its root, the pixel whose index is the label; 0 elsewhere."""
     largest: wp.array = device_array("view", "instance", dtype=wp.int32)
-    """Largest component of each instance, the one with the least index of equal ones; -1: the instance is not visible."""
+    """Label of each instance's largest component; ties go to the smallest label; -1: the instance is not visible."""
     distance: wp.array = device_array("view", "row", "column", dtype=wp.float32, unit="px")
-    """Distance to the centre of the nearest pixel that is not of the same component; what lies beyond the border is not. 0: no instance,
-    or not the largest component of one."""
+    """Distance transform: distance to the centre of the nearest pixel outside the component; pixels beyond the image border are outside.
+    0 where the pixel does not belong to the largest component of an instance."""
     contour: wp.array = device_array("view", "instance", "point", dtype=wp.vec2i, unit="px")
-    """Outer contour of the largest component, in order, as OpenCV's findContours with CHAIN_APPROX_NONE has it."""
+    """Outer contour of the largest component, in the order of OpenCV's findContours with CHAIN_APPROX_NONE."""
     contour_length: wp.array = device_array("view", "instance", dtype=wp.int32)
-    """Points of the contour."""
+    """Number of contour points."""
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
-    """What was concluded of each instance when its world was last looked at."""
+class Observation:
+    """Perception result of each instance from the last time its world was observed. `attempts.InstanceObservation` maps it to JSON."""
 
     visible: wp.array = device_array("world", "instance", dtype=wp.int32, unit="px")
-    """Pixels of the largest component; 0: not visible."""
-    share: wp.array = device_array("world", "instance", dtype=wp.float32)
-    """Visible area [m²], from depth, over the expected area, the product of the two larger extents."""
+    """Visible pixels: size of the largest component; 0: not visible."""
+    visible_fraction: wp.array = device_array("world", "instance", dtype=wp.float32)
+    """Visible area [m²], measured from depth, divided by the expected area: the product of the two larger sides of the bounding box."""
     pole: wp.array = device_array("world", "instance", dtype=wp.vec2f, unit="px")
-    """Pole of inaccessibility."""
+    """Pole of inaccessibility: the pixel farthest from the contour."""
     centroid: wp.array = device_array("world", "instance", dtype=wp.vec2f, unit="px")
-    """Centroid of what the outer contour encloses."""
-    middle: wp.array = device_array("world", "instance", dtype=wp.vec2f, unit="px")
-    """Half-way between the two."""
+    """Centroid of the polygon that the outer contour encloses."""
+    midpoint: wp.array = device_array("world", "instance", dtype=wp.vec2f, unit="px")
+    """Midpoint of pole and centroid."""
     distances: wp.array = device_array("world", "instance", dtype=wp.vec3f, unit="px")
-    """Distance to the contour of pole, centroid and middle; 0 outside."""
-    suction: wp.array = device_array("world", "instance", dtype=wp.vec2i, unit="px")
-    """Suction point."""
+    """Distance to the contour at pole, centroid and midpoint; 0 outside the component."""
+    grasp_pixel: wp.array = device_array("world", "instance", dtype=wp.vec2i, unit="px")
+    """Suction grasp point in the image: the candidate chosen among pole, centroid and midpoint."""
     depth: wp.array = device_array("world", "instance", dtype=wp.float32, unit="m")
-    """Planar depth of the suction point."""
+    """Planar depth of the grasp point."""
     votes: wp.array = device_array("world", "instance", "instance", dtype=wp.float32)
-    """votes[i, j]: what the contour of i says for j lying above it, before edges are made."""
+    """Occlusion votes: votes[i, j] is the evidence along i's contour that j lies on top of i; not thresholded."""
     above: wp.array = device_array("world", "instance", dtype=wp.uint32)
-    """Bit j: the clutter graph has the edge from j, above, to this instance."""
-    all_above: wp.array = device_array("world", "instance", dtype=wp.uint32)
-    """Bit j: there is a path from j to this instance."""
+    """Edges of the clutter graph. Bit j: edge from j, on top, to this instance."""
+    ancestors: wp.array = device_array("world", "instance", dtype=wp.uint32)
+    """Transitive closure of `above`. Bit j: a path leads from j to this instance."""
     overflow: wp.array = device_array("world", dtype=wp.int32)
-    """1: a contour had no room."""
+    """1: a contour exceeded its capacity."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What was chosen when the world was last looked at."""
+    """Target and grasp pose chosen when the world was last observed. Frame: world."""
 
     target: wp.array = device_array("world", dtype=wp.int32)
-    """The chosen instance; -1: none."""
+    """Chosen instance; -1: none."""
     point: wp.array = device_array("world", dtype=wp.vec3f, unit="m")
     """Grasp point."""
     normal: wp.array = device_array("world", dtype=wp.vec3f)
-    """Unit normal there, out of the object."""
+    """Unit surface normal at the grasp point, pointing out of the object."""
     yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
-    """Turn of the finger about the vertical."""
+    """Rotation of the gripper shaft about the vertical."""
     tilt: wp.array = device_array("world", dtype=wp.float32, unit="rad")
-    """Tilt of the cup about the finger's y axis."""
+    """Rotation of the cup about the wrist axis, the shaft's y axis."""

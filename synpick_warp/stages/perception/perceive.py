@@ -1,92 +1,103 @@
-"""All worlds that must choose are looked at, and get their plan, within a tick, however many they are."""
+"""Batched perception and grasp planning for every world whose task is LOOK, as a conditional graph loop."""
 
 from __future__ import annotations
 
 import warp as wp
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs import schema
 from synpick_warp.kernels.perception import worklist
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData
-from synpick_warp.stages.perception.arrays import Plan, Sighting
-from synpick_warp.stages.perception.plan import Planner
-from synpick_warp.stages.perception.segment import Sight
+from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.plan import GraspPlanner
+from synpick_warp.stages.perception.segment import Segmenter
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 
 
-class Looker:
-    """Looks at worlds in batches until none is left; on a GPU that loop is a node of a graph, and the host does not know its length."""
+class Perception:
+    """Processes a worklist of worlds in batches; on CUDA the loop is a conditional node of a graph, so the host never reads its length."""
 
     def __init__(
         self,
-        config: Config,
+        settings: schema.Sight,
+        cameras: schema.Cameras,
+        seed: int,
         render_scene: RenderScene,
         scene: SceneData,
         state: WorldState,
         attempts: AttemptState,
-        sighting: Sighting,
+        observation: Observation,
         plan: Plan,
     ) -> None:
         """Allocate scratch.
 
         Args:
-            config: Settings.
-            render_scene: What there is to see.
-            scene: Constants.
-            state: Worlds.
-            attempts: Their tasks.
-            sighting: Written: what was seen.
-            plan: Written: what was chosen.
+            settings: Settings of perception.
+            cameras: Settings of the cameras; perception uses camera 0.
+            seed: Seed of the random choices of targets.
+            render_scene: Meshes, materials and table.
+            scene: Constants of the simulation.
+            state: State of the worlds.
+            attempts: State of their attempts; `task` selects the worlds.
+            observation: Written: perception results of the worlds processed.
+            plan: Written: their targets and grasps.
         """
-        self.scene, self.state, self.attempts, self.sighting, self.plan = scene, state, attempts, sighting, plan
-        self.seed = config.bake.seed
+        self.scene, self.state, self.attempts, self.observation, self.plan = scene, state, attempts, observation, plan
+        self.seed = seed
         self.device = state.phase.device
-        self.sight = Sight(config, render_scene, config.arrangement.max_objects)
-        self.planner = Planner(config, self.sight, self.device)
-        self._looker = wp.zeros(state.phase.shape[0], dtype=wp.int32, device=self.device)
-        self._count, self._first, self._left = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(3))
+        worlds, instances = observation.visible.shape
+        self.segmenter = Segmenter(settings, cameras, render_scene, worlds, instances)
+        self.planner = GraspPlanner(settings, self.segmenter, self.device)
+        self._worklist = wp.zeros(worlds, dtype=wp.int32, device=self.device)
+        self._count, self._next, self._remaining = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(3))
         self._graphs: dict[int, wp.Graph] = {}
         self._warm = False
 
-    def look(self, snapshot: Snapshot) -> None:
-        """Look at every world whose task is LOOK, as `snapshot` shows it, and plan its attempt."""
+    def perceive(self, snapshot: Snapshot) -> None:
+        """Observe every world whose task is LOOK, in the state that `snapshot` holds, and plan its next attempt."""
         if not self.device.is_cuda:
-            self._look(snapshot)
+            self._loop(snapshot)
             return
         if not self._warm:
-            # Once eagerly, whether anybody looks or not: it loads the kernels.
-            self.list_lookers()
-            self.look_at_batch(snapshot)
+            # Kernels cannot be loaded during capture; one eager batch loads all of them, even if the worklist is empty.
+            self.list_worlds()
+            self.perceive_batch(snapshot)
             self._warm = True
         if id(snapshot) not in self._graphs:
             with wp.ScopedCapture(device=self.device) as capture:
-                self._look(snapshot)
+                self._loop(snapshot)
             self._graphs[id(snapshot)] = capture.graph
         wp.capture_launch(self._graphs[id(snapshot)])
 
-    def _look(self, snapshot: Snapshot) -> None:
-        self.list_lookers()
-        wp.capture_while(self._left, self.look_at_batch, snapshot=snapshot)
+    def _loop(self, snapshot: Snapshot) -> None:
+        self.list_worlds()
+        wp.capture_while(self._remaining, self.perceive_batch, snapshot=snapshot)
 
-    def list_lookers(self) -> None:
-        """List the worlds that look, and begin with the first."""
+    def list_worlds(self) -> None:
+        """Build the worklist of worlds whose task is LOOK and reset the loop to its begin."""
         wp.launch(
-            worklist.list_lookers_kernel,
+            worklist.list_worlds_kernel,
             dim=1,
             inputs=[self.state.phase.shape[0], self.state.phase, self.attempts.task],
-            outputs=[self._looker, self._count, self._first, self._left],
+            outputs=[self._worklist, self._count, self._next, self._remaining],
             device=self.device,
         )
 
-    def look_at_batch(self, snapshot: Snapshot) -> None:
-        """Look at the next of the worlds listed, as many as there are views, and plan their attempts."""
-        look = self.sight.look
-        views = look.world.shape[0]
+    def perceive_batch(self, snapshot: Snapshot) -> None:
+        """Loop body: observe the next worlds of the worklist, one a view, and plan their attempts."""
+        arrays = self.segmenter.arrays
+        views = arrays.world.shape[0]
         wp.launch(
-            worklist.take_batch_kernel, dim=views, inputs=[self._looker, self._count, self._first], outputs=[look.world], device=self.device
+            worklist.take_batch_kernel,
+            dim=views,
+            inputs=[self._worklist, self._count, self._next],
+            outputs=[arrays.world],
+            device=self.device,
         )
-        self.sight.trace(snapshot)
-        self.sight.find_suction_points(self.scene, snapshot.entry, self.sighting)
-        self.planner.plan(self.scene, self.sight, self.state, self.attempts, self.sighting, self.plan, self.seed)
-        wp.launch(worklist.pass_batch_kernel, dim=1, inputs=[views, self._count], outputs=[self._first, self._left], device=self.device)
+        self.segmenter.render(snapshot)
+        self.segmenter.find_grasp_points(self.scene, snapshot.entry, self.observation)
+        self.planner.plan(self.scene, self.segmenter, self.state, self.attempts, self.observation, self.plan, self.seed)
+        wp.launch(
+            worklist.advance_batch_kernel, dim=1, inputs=[views, self._count], outputs=[self._next, self._remaining], device=self.device
+        )

@@ -1,4 +1,4 @@
-"""From what was seen to what is picked: votes, clutter graph, choice, grasp."""
+"""Grasp planning: occlusion votes, clutter graph, choice of the target, grasp pose."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs import schema
 from synpick_warp.kernels.perception.clutter_graph import Cycles, order_clutter_kernel
 from synpick_warp.kernels.perception.grasp import frame_grasp_kernel, smooth_normal_kernel
 from synpick_warp.kernels.perception.occlusion_votes import (
@@ -20,20 +20,20 @@ from synpick_warp.kernels.perception.occlusion_votes import (
 )
 from synpick_warp.kernels.perception.target import choose_target_kernel
 from synpick_warp.stages.constants import SceneData
-from synpick_warp.stages.perception.arrays import LookArrays, Plan, Sighting
+from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import filled
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 
 VIEW_BLOCK = 32
-"""Threads of a block where a thread works on a whole view: small blocks spread few views over many processors."""
+"""Threads of a block where one thread processes a whole view: small blocks spread few views over many multiprocessors."""
 
 
-class Seen(Protocol):
-    """What planning needs of the images of a batch."""
+class SegmentedViews(Protocol):
+    """Interface to the images of a batch that planning reads; `Segmenter` implements it."""
 
-    scene: RenderScene
-    look: LookArrays
+    render_scene: RenderScene
+    arrays: PerceptionArrays
     hits: Any
     bodies: Any
     cameras: Any
@@ -42,14 +42,14 @@ class Seen(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class VoteArrays:
-    """Scratch of the votes."""
+    """Scratch of the occlusion votes."""
 
     count: wp.array = device_array("view", "instance", "instance", "kind", dtype=wp.int32)
-    """Full and deep votes."""
+    """Number of votes by kind: full, deep."""
     extent: wp.array = device_array("view", "instance", dtype=wp.vec4i, unit="px")
-    """How far a contour extends to the left, up, right and down: greatest -column, -row, column, row."""
+    """Bounding box of each contour as maxima: -column, -row, column, row."""
     reach: wp.array = device_array("view", "instance", dtype=wp.float32, unit="px")
-    """No point of its contour may be farther from where an instance gets a vote."""
+    """Largest distance allowed between a pixel where the instance gets a vote and any point of its contour."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,100 +62,116 @@ class CycleArrays:
     best: wp.array = device_array("view", "subset", dtype=wp.float32)
 
 
-def plan_sizes(config: Config, instances: int, views: int) -> dict[str, int]:
-    """Extents of the dimensions that `VoteArrays` and `CycleArrays` name."""
-    return {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(config.sight.exact_cycle, instances)}
+def plan_sizes(settings: schema.Sight, instances: int, views: int) -> dict[str, int]:
+    """Extents of the dimensions of `VoteArrays` and `CycleArrays`."""
+    return {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(settings.exact_cycle, instances)}
 
 
-class Planner:
-    """Chooses a target and a grasp for the worlds of a batch of looks. Owns its scratch; `plan` only launches."""
+class GraspPlanner:
+    """Chooses a target and its suction grasp for the worlds of a batch. Owns its scratch; `plan` only launches kernels."""
 
-    def __init__(self, config: Config, seen: Seen, device: wp.Device) -> None:
-        """Allocate scratch for as many views and instances as the images have room for.
+    def __init__(self, settings: schema.Sight, images: SegmentedViews, device: wp.Device) -> None:
+        """Allocate scratch for the views and instances of a batch.
 
         Args:
-            config: All settings.
-            seen: Images of a batch; instances at most 32: one bit each.
-            device: Where they are.
+            settings: Settings of perception.
+            images: Images of a batch; at most 32 instances, one bit each.
+            device: Device of the arrays.
         """
-        self.views, instances = seen.look.largest.shape
-        sizes = plan_sizes(config, instances, self.views)
+        self.views, instances = images.arrays.largest.shape
+        sizes = plan_sizes(settings, instances, self.views)
         self.device = device
         self.voting = allocate(VoteArrays, sizes, device)
-        self.arrays = allocate(CycleArrays, sizes, device)
-        self.cycles = filled(Cycles, self.arrays)
+        self.cycles = filled(Cycles, allocate(CycleArrays, sizes, device))
 
     def plan(
-        self, scene: SceneData, seen: Seen, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, seed: int
+        self,
+        scene: SceneData,
+        images: SegmentedViews,
+        state: WorldState,
+        attempts: AttemptState,
+        observation: Observation,
+        plan: Plan,
+        seed: int,
     ) -> None:
-        """Write votes and clutter graph to `sighting`, target and grasp to `plan`, for the worlds that the views name.
+        """Write votes and clutter graph to `observation`, target and grasp to `plan`, for the worlds of the batch.
 
         Args:
             scene: Constants.
-            seen: Images, components and contours; unused views have the world -1.
-            state: The worlds.
-            attempts: Their attempts; the outcome is that of the attempt that ended in this tick.
-            sighting: Visible, share, suction and depth are read.
-            plan: Written; a world in which nothing is visible gets the target -1 and keeps the rest.
-            seed: Of all draws.
+            images: G-buffer, components and contours; unused views have world -1.
+            state: State of the worlds.
+            attempts: State of the attempts; `outcome` belongs to the attempt that ended in this tick.
+            observation: Visibility, grasp points and depths are read.
+            plan: Written; a world without a visible instance gets target -1 and keeps the rest.
+            seed: Seed of the random choice of targets.
         """
-        self.bound_contours(scene, seen, state, sighting)
-        self.count_votes(scene, seen, sighting)
-        self.weigh_votes(scene, seen, sighting)
-        self.order_clutter(scene, seen, sighting)
-        self.choose_target(scene, seen, state, attempts, sighting, plan, seed)
-        self.smooth_normal(scene, seen, sighting, plan)
-        self.frame_grasp(scene, seen, sighting, plan)
+        self.bound_contours(scene, images, state, observation)
+        self.count_votes(scene, images, observation)
+        self.weigh_votes(scene, images, observation)
+        self.order_clutter(scene, images, observation)
+        self.choose_target(scene, images, state, attempts, observation, plan, seed)
+        self.smooth_normal(scene, images, observation, plan)
+        self.frame_grasp(scene, images, observation, plan)
 
-    def bound_contours(self, scene: SceneData, seen: Seen, state: WorldState, sighting: Sighting) -> None:
-        """Box of every contour, and how far it may reach from where its instance gets a vote."""
-        look, (views, instances) = seen.look, seen.look.largest.shape
+    def bound_contours(self, scene: SceneData, images: SegmentedViews, state: WorldState, observation: Observation) -> None:
+        """Compute each contour's bounding box, and its instance's reach."""
+        arrays, (views, instances) = images.arrays, images.arrays.largest.shape
         self.voting.extent.fill_(int(NOWHERE))
-        inputs = [scene.catalog, seen.cameras, scene.sight, state.entry, look.world, look.camera, look.contour, look.contour_length]
-        inputs += [sighting.depth]
+        inputs = [scene.catalog, images.cameras, scene.perception, state.entry, arrays.world, arrays.camera]
+        inputs += [arrays.contour, arrays.contour_length, observation.depth]
         dim = (views, instances, int(CONTOUR_LANES))
         wp.launch(bound_contours_kernel, dim=dim, inputs=inputs, outputs=[self.voting.extent, self.voting.reach], device=self.device)
 
-    def count_votes(self, scene: SceneData, seen: Seen, sighting: Sighting) -> None:
-        """Votes of every contour, by kind."""
-        look, (views, instances) = seen.look, seen.look.largest.shape
+    def count_votes(self, scene: SceneData, images: SegmentedViews, observation: Observation) -> None:
+        """Count the occlusion votes along every contour, by kind."""
+        arrays, (views, instances) = images.arrays, images.arrays.largest.shape
         self.voting.count.zero_()
-        inputs = [seen.grid, scene.sight, seen.hits, look.world, look.component, look.largest, look.contour, look.contour_length]
-        inputs += [sighting.depth, self.voting.extent, self.voting.reach]
+        inputs = [images.grid, scene.perception, images.hits, arrays.world, arrays.component, arrays.largest]
+        inputs += [arrays.contour, arrays.contour_length, observation.depth, self.voting.extent, self.voting.reach]
         dim = (views, instances, int(CONTOUR_LANES))
         wp.launch(count_votes_kernel, dim=dim, inputs=inputs, outputs=[self.voting.count], device=self.device)
 
-    def weigh_votes(self, scene: SceneData, seen: Seen, sighting: Sighting) -> None:
-        """Votes by weight."""
-        views, instances = seen.look.largest.shape
-        inputs = [scene.sight, seen.look.world, self.voting.count]
+    def weigh_votes(self, scene: SceneData, images: SegmentedViews, observation: Observation) -> None:
+        """Sum the votes by weight."""
+        views, instances = images.arrays.largest.shape
+        inputs = [scene.perception, images.arrays.world, self.voting.count]
         dim = (views, instances, instances)
-        wp.launch(weigh_votes_kernel, dim=dim, inputs=inputs, outputs=[sighting.votes], device=self.device)
+        wp.launch(weigh_votes_kernel, dim=dim, inputs=inputs, outputs=[observation.votes], device=self.device)
 
-    def order_clutter(self, scene: SceneData, seen: Seen, sighting: Sighting) -> None:
-        """The clutter graph without cycles."""
-        inputs = [scene.sight, seen.look.world, sighting.votes]
-        self._launch(order_clutter_kernel, inputs, [self.cycles, sighting.above, sighting.all_above])
+    def order_clutter(self, scene: SceneData, images: SegmentedViews, observation: Observation) -> None:
+        """Build the acyclic clutter graph and its transitive closure."""
+        inputs = [scene.perception, images.arrays.world, observation.votes]
+        self._launch(order_clutter_kernel, inputs, [self.cycles, observation.above, observation.ancestors])
 
     def choose_target(
-        self, scene: SceneData, seen: Seen, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, seed: int
+        self,
+        scene: SceneData,
+        images: SegmentedViews,
+        state: WorldState,
+        attempts: AttemptState,
+        observation: Observation,
+        plan: Plan,
+        seed: int,
     ) -> None:
-        """The instance to pick."""
+        """Choose the instance to pick."""
         inputs = [wp.uint64(seed), scene.pick, state.address, state.mode, attempts.attempt, attempts.outcome]
-        inputs += [seen.look.world, sighting.visible, sighting.share, sighting.all_above]
+        inputs += [images.arrays.world, observation.visible, observation.visible_fraction, observation.ancestors]
         self._launch(choose_target_kernel, inputs, [plan.target])
 
-    def smooth_normal(self, scene: SceneData, seen: Seen, sighting: Sighting, plan: Plan) -> None:
-        """Sum of the normals about the target's suction point."""
-        look = seen.look
-        inputs = [seen.scene.meshes, seen.scene.surfaces, seen.cameras, seen.grid, scene.sight.normal_window, seen.bodies, seen.hits]
-        inputs += [look.world, look.camera, look.component, look.largest, sighting.suction, plan.target]
+    def smooth_normal(self, scene: SceneData, images: SegmentedViews, observation: Observation, plan: Plan) -> None:
+        """Sum the normals in the window around the target's grasp point."""
+        arrays, render_scene = images.arrays, images.render_scene
+        inputs = [render_scene.meshes, render_scene.surfaces, images.cameras, images.grid, scene.perception.normal_window]
+        inputs += [images.bodies, images.hits, arrays.world, arrays.camera, arrays.component, arrays.largest]
+        inputs += [observation.grasp_pixel, plan.target]
         self._launch(smooth_normal_kernel, inputs, [plan.normal])
 
-    def frame_grasp(self, scene: SceneData, seen: Seen, sighting: Sighting, plan: Plan) -> None:
-        """Grasp point, normal and the gripper's angles."""
-        inputs = [seen.cameras, scene.pick, plan.normal, seen.hits, seen.look.world, seen.look.camera, sighting.suction, plan.target]
+    def frame_grasp(self, scene: SceneData, images: SegmentedViews, observation: Observation, plan: Plan) -> None:
+        """Compute the grasp point in the world, its unit normal, and the gripper's angles."""
+        arrays = images.arrays
+        inputs = [images.cameras, scene.pick, plan.normal, images.hits, arrays.world, arrays.camera, observation.grasp_pixel, plan.target]
         self._launch(frame_grasp_kernel, inputs, [plan.point, plan.yaw, plan.tilt])
 
     def _launch(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel with one thread a view."""
         wp.launch(kernel, dim=self.views, inputs=inputs, outputs=outputs, device=self.device, block_dim=VIEW_BLOCK)

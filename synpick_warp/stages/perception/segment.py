@@ -1,4 +1,4 @@
-"""Looking: what camera 0 shows of each instance without the gripper, and where each would be sucked. Batches of views, on the device."""
+"""Instance segmentation and suction grasp points, from images of camera 0 without the gripper; batches of views, entirely on the device."""
 
 from __future__ import annotations
 
@@ -8,233 +8,238 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.arrays import allocate, device_array, memory_table
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs import schema
 from synpick_warp.errors import ConfigError
-from synpick_warp.kernels.perception import components, contours, distance_transform, suction_points
+from synpick_warp.kernels.perception import components, contours, distance_transform, grasp_points
 from synpick_warp.kernels.render.visibility import gbuffer, view_setup
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch_pixels
-from synpick_warp.stages.perception.arrays import LookArrays, Sighting
+from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays
 from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
 from synpick_warp.stages.render.view_setup import BodyArrays, HitArrays, body_sizes, filled, place_bodies
 
 CPU_BYTES = 512 * 2**20
 GPU_BYTES = 2 * 2**30
-"""Scratch that views may take if their number is left open."""
+"""Scratch that the views of a batch may take if `sight.views` is 0."""
 CPU_VIEWS = 4
-"""Most views on the processor then: a batch gains nothing there, and views that are not in use still cost a little."""
+"""Maximum number of views on the CPU in that case: larger batches gain nothing there, and unused views still cost a little."""
 CENTER = wp.vec2(0.0, 0.0)
-"""Rays pass the pixels' centres."""
+"""Offset of rays through the pixel centres [px]."""
 
 
 @dataclass(frozen=True, eq=False)
-class SightScratch:
-    """What lies between the arrays of a look. A patch is the largest component of an instance."""
+class SegmentationScratch:
+    """Intermediate images and sums. A patch is the largest component of an instance."""
 
     patch: wp.array = device_array("view", "row", "column", dtype=wp.uint16)
-    """Low byte: 1 + instance, 0: of no patch; bit 8 + d: the neighbour in direction d is of the same."""
+    """Low byte: 1 + instance, 0: no patch; bit 8 + d: the neighbour in direction d belongs to the same patch."""
     gap: wp.array = device_array("view", "row", "column", dtype=wp.int32)
     """256 x distance within the column [px] + low byte of `patch`."""
     largest_key: wp.array = device_array("view", "instance", dtype=wp.int64)
-    """Size and name of the largest component, as `ranked` packs them."""
+    """Size and label of the largest component, packed by `pack_key`."""
     pole_key: wp.array = device_array("view", "instance", dtype=wp.int64)
-    """Squared distance [px²] and pixel of the pole, as `ranked` packs them."""
+    """Squared distance [px²] and pixel of the pole, packed by `pack_key`."""
     square: wp.array = device_array("view", "instance", dtype=wp.int64, unit="2⁻²⁴ m²")
     """Sum of squared depths over the patch."""
 
 
-SCRATCH = (BodyArrays, HitArrays, LookArrays, SightScratch)
+SCRATCH = (BodyArrays, HitArrays, PerceptionArrays, SegmentationScratch)
+"""Dataclasses of all arrays that a `Segmenter` allocates."""
 
 
-def sight_sizes(config: Config, instances: int, views: int) -> dict[str, int]:
-    """Extents of the dimensions that the dataclasses of `SCRATCH` name."""
-    width, height = config.sight.resolution
+def perception_sizes(settings: schema.Sight, instances: int, views: int) -> dict[str, int]:
+    """Extents of the dimensions of the dataclasses in `SCRATCH`."""
+    width, height = settings.resolution
     return {
         "view": views,
         "instance": instances,
         "row": height,
         "column": width,
-        "point": config.sight.contour_points,
+        "point": settings.contour_points,
     } | body_sizes(instances, width, height)
 
 
-def view_bytes(config: Config, instances: int) -> int:
-    """Scratch that one view takes [bytes]."""
-    sizes = sight_sizes(config, instances, 1)
+def view_bytes(settings: schema.Sight, instances: int) -> int:
+    """Scratch of one view [bytes]."""
+    sizes = perception_sizes(settings, instances, 1)
     return sum(row[3] for kind in SCRATCH for row in memory_table(kind, sizes))
 
 
-def count_views(config: Config, instances: int, device: wp.Device) -> int:
-    """Views of a batch: as configured, or as many as fit; never more than there are worlds."""
-    views = config.sight.views
+def count_views(settings: schema.Sight, worlds: int, instances: int, device: wp.Device) -> int:
+    """Views of a batch: the setting, or as many as fit into the memory budget; never more than there are worlds."""
+    views = settings.views
     if views == 0:
-        each = view_bytes(config, instances)
+        each = view_bytes(settings, instances)
         views = GPU_BYTES // each if device.is_cuda else min(CPU_BYTES // each, CPU_VIEWS)
-    return min(max(views, 1), config.bake.worlds)
+    return min(max(views, 1), worlds)
 
 
-class Sight:
-    """Looks at batches of worlds. Owns its scratch; `trace` and `find_suction_points` only launch, so a CUDA graph can capture them.
+class Segmenter:
+    """Renders G-buffers of a batch of worlds, segments them and finds grasp points.
+
+    Owns its scratch; `render` and `find_grasp_points` only launch kernels, so a CUDA graph can capture them.
 
     Attributes:
-        look: Arrays of the batch. Who looks fills `look.world`: the world of each view, each world once; -1: the view is not in use.
+        arrays: Arrays of the batch. The caller fills `arrays.world`: the world of each view, each world once; -1: the view is unused.
         hits: The struct `Hits` of the batch.
-        cameras: The struct `Cameras` of camera 0 alone, at the resolution of sight.
+        cameras: The struct `Cameras` with camera 0 alone, at the resolution of perception.
         grid: The struct `ImageGrid` of its image.
         views: Views of a batch.
     """
 
-    def __init__(self, config: Config, scene: RenderScene, instances: int) -> None:
+    def __init__(self, settings: schema.Sight, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int) -> None:
         """Allocate scratch.
 
         Args:
-            config: All settings.
-            scene: Meshes and table of the renderer; its cameras are not used.
-            instances: Room for instances of a world, at most 32.
+            settings: Settings of perception.
+            cameras: Settings of the cameras; the resolution is that of `settings`.
+            render_scene: Meshes and table of the renderer; its cameras are not used.
+            worlds: Number of worlds.
+            instances: Capacity for instances of a world, at most 32.
 
         Raises:
-            ConfigError: A batch has more pixels than 31 bits count.
+            ConfigError: A batch has more pixels than 31 bits can count.
         """
-        device = scene.device
-        self.scene, self.instances = scene, instances
-        self.views = count_views(config, instances, device)
-        sizes = sight_sizes(config, instances, self.views)
-        self.width, self.height = config.sight.resolution
+        device = render_scene.device
+        self.render_scene, self.instances = render_scene, instances
+        self.views = count_views(settings, worlds, instances, device)
+        sizes = perception_sizes(settings, instances, self.views)
+        self.width, self.height = settings.resolution
         self.grid = build_grid(self.width, self.height)
         self.pixels = self.views * self.grid.tiles * int(TILE_PIXELS)
         if self.pixels >= 2**31:
             raise ConfigError(f"sight.views is {self.views}; of {self.width} x {self.height} px that is more than 2³¹ pixels; take fewer")
-        self.look = allocate(LookArrays, sizes, device)
-        self.look.world.fill_(-1)
-        self.scratch = allocate(SightScratch, sizes, device)
+        self.arrays = allocate(PerceptionArrays, sizes, device)
+        self.arrays.world.fill_(-1)
+        self.scratch = allocate(SegmentationScratch, sizes, device)
         self.hit_arrays = allocate(HitArrays, sizes, device)
         self.hits = filled(gbuffer.Hits, self.hit_arrays)
         self.bodies = filled(gbuffer.Bodies, allocate(BodyArrays, sizes, device))
-        self.cameras = build_cameras(make_cameras(replace(config.cameras, resolution=config.sight.resolution))[:1], device)
+        self.cameras = build_cameras(make_cameras(replace(cameras, resolution=settings.resolution))[:1], device)
         self.strips = -(-self.width // int(components.STRIP))
-        self.fixture_visible = wp.array([[1, 0, 0]] * config.bake.worlds, dtype=wp.int32, device=device)
-        self.flat = _flat(self.hit_arrays, self.look, self.scratch)
+        self.fixture_visible = wp.array([[1, 0, 0]] * worlds, dtype=wp.int32, device=device)
+        self.flat = _flatten(self.hit_arrays, self.arrays, self.scratch)
 
-    def trace(self, snapshot: Snapshot) -> None:
-        """What each pixel shows, without finger and cup. Views that are not in use keep what they had."""
-        scene, look = self.scene, self.look
-        wp.launch(view_setup.aim_views_kernel, dim=self.views, inputs=[look.world], outputs=[look.camera], device=scene.device)
-        place_bodies(scene, self.cameras, self.grid, snapshot, self.fixture_visible, look.world, look.camera, self.views, self.bodies)
-        inputs = [scene.meshes, scene.table, self.cameras, self.grid, self.bodies, look.camera, self.instances, CENTER]
+    def render(self, snapshot: Snapshot) -> None:
+        """Render the G-buffer of each view without gripper shaft and cup. Unused views keep their content."""
+        scene, arrays = self.render_scene, self.arrays
+        wp.launch(view_setup.aim_views_kernel, dim=self.views, inputs=[arrays.world], outputs=[arrays.camera], device=scene.device)
+        place_bodies(scene, self.cameras, self.grid, snapshot, self.fixture_visible, arrays.world, arrays.camera, self.views, self.bodies)
+        inputs = [scene.meshes, scene.table, self.cameras, self.grid, self.bodies, arrays.camera, self.instances, CENTER]
         self._launch_pixels(gbuffer.trace_sample_kernel, inputs, [self.hits])
 
-    def find_suction_points(self, scene: SceneData, entry: wp.array, sighting: Sighting) -> None:
-        """Components, distances, contours and suction points of the traced views.
+    def find_grasp_points(self, scene: SceneData, entry: wp.array, observation: Observation) -> None:
+        """Compute components, distance transforms, contours and grasp points of the rendered views.
 
         Args:
-            scene: Constants; of `catalog` mass and area are read.
-            entry: Catalog index of each instance (N, I) int32.
-            sighting: Rows of the worlds looked at are written, but for votes and what follows from them.
+            scene: Constants; mass and area of `catalog` are read.
+            entry: Catalog index of each instance (world, instance) int32.
+            observation: Written for the worlds of the batch, except votes and clutter graph.
         """
-        self.clear_sums(sighting)
+        self.clear_sums(observation)
         self.label_strips()
         self.merge_strips()
         self.measure_components()
         self.find_largest()
-        self.name_largest()
+        self.unpack_largest()
         self.mark_patches()
         self.measure_columns()
         self.measure_rows()
         self.measure_patches()
-        self.trace_contours(sighting)
-        self.measure_points(scene, entry, sighting)
-        self.choose_suction_points(scene, entry, sighting)
+        self.trace_contours(observation)
+        self.measure_points(scene, entry, observation)
+        self.choose_grasp_points(scene, entry, observation)
 
-    def clear_sums(self, sighting: Sighting) -> None:
-        """Maxima and sums to 0."""
+    def clear_sums(self, observation: Observation) -> None:
+        """Reset maxima, sums and overflow flags to 0."""
         scratch = self.scratch
-        outputs = [scratch.largest_key, scratch.pole_key, scratch.square, sighting.overflow]
-        self._launch(suction_points.clear_sums_kernel, (self.instances,), [], outputs)
+        outputs = [scratch.largest_key, scratch.pole_key, scratch.square, observation.overflow]
+        self._launch(grasp_points.clear_sums_kernel, (self.instances,), [], outputs)
 
     def label_strips(self) -> None:
-        """Name pixels by their runs."""
+        """Label the runs of each strip."""
         flat, count = self.flat, self.views * self.height * self.strips
-        inputs = [self.look.world, flat["code"], self.instances, self.width, self.height, self.strips]
-        launch_pixels(components.label_strips_kernel, count, inputs, [flat["component"], flat["area"]], self.scene.device)
+        inputs = [self.arrays.world, flat["code"], self.instances, self.width, self.height, self.strips]
+        launch_pixels(components.label_strips_kernel, count, inputs, [flat["component"], flat["area"]], self.render_scene.device)
 
     def merge_strips(self) -> None:
-        """Join runs that touch."""
+        """Unite runs that touch."""
         inputs = [self.flat["code"], self.instances, self.width]
         self._launch(components.merge_strips_kernel, (self.height, self.strips), inputs, [self.flat["component"]])
 
     def measure_components(self) -> None:
-        """Name pixels by their components, and count these."""
+        """Replace labels by roots and count the pixels of each component."""
         outputs = [self.flat["component"], self.flat["area"]]
         self._launch(components.measure_components_kernel, (self.height, self.strips), [self.width], outputs)
 
     def find_largest(self) -> None:
-        """Keys of the largest components."""
+        """Find the keys of the largest components."""
         inputs = [self.flat["code"], self.flat["area"]]
         self._launch(components.find_largest_kernel, (self.height * self.width,), inputs, [self.scratch.largest_key])
 
-    def name_largest(self) -> None:
-        """Names of the largest components."""
-        self._launch(components.name_largest_kernel, (self.instances,), [self.scratch.largest_key], [self.look.largest])
+    def unpack_largest(self) -> None:
+        """Unpack the labels of the largest components."""
+        self._launch(components.unpack_largest_kernel, (self.instances,), [self.scratch.largest_key], [self.arrays.largest])
 
     def mark_patches(self) -> None:
-        """Pixels of the largest components and their neighbours."""
+        """Mark the pixels of the largest components and their neighbours."""
         flat = self.flat
-        inputs = [self.grid, self.look.world, flat["code"], flat["component"], self.look.largest]
+        inputs = [self.grid, self.arrays.world, flat["code"], flat["component"], self.arrays.largest]
         self._launch_pixels(distance_transform.mark_patches_kernel, inputs, [flat["patch"]])
 
     def measure_columns(self) -> None:
-        """Distances within columns."""
-        inputs = [self.grid, self.look.world, self.flat["patch"]]
-        dim = (self.views, self.width)
-        wp.launch(distance_transform.measure_columns_kernel, dim=dim, inputs=inputs, outputs=[self.flat["gap"]], device=self.scene.device)
+        """First pass of the distance transform: distances within columns."""
+        inputs = [self.grid, self.arrays.world, self.flat["patch"]]
+        dim, device = (self.views, self.width), self.render_scene.device
+        wp.launch(distance_transform.measure_columns_kernel, dim=dim, inputs=inputs, outputs=[self.flat["gap"]], device=device)
 
     def measure_rows(self) -> None:
-        """Distances."""
-        inputs = [self.grid, self.look.world, self.flat["gap"]]
+        """Second pass of the distance transform: minimum over the columns of a row."""
+        inputs = [self.grid, self.arrays.world, self.flat["gap"]]
         self._launch_pixels(distance_transform.measure_rows_kernel, inputs, [self.flat["distance"]])
 
     def measure_patches(self) -> None:
-        """Poles and visible areas."""
+        """Find the poles of inaccessibility and sum the squared depths."""
         flat, scratch = self.flat, self.scratch
         inputs = [flat["patch"], flat["distance"], flat["depth"], self.width]
-        self._launch(suction_points.measure_patches_kernel, (self.height, self.strips), inputs, [scratch.pole_key, scratch.square])
+        self._launch(grasp_points.measure_patches_kernel, (self.height, self.strips), inputs, [scratch.pole_key, scratch.square])
 
-    def trace_contours(self, sighting: Sighting) -> None:
-        """Contours and their centroids."""
-        look = self.look
-        outputs = [look.contour, look.contour_length, sighting.centroid, sighting.overflow]
-        self._launch(contours.trace_contours_kernel, (self.instances,), [self.flat["patch"], look.largest, self.width], outputs)
+    def trace_contours(self, observation: Observation) -> None:
+        """Follow the outer contours and compute their centroids."""
+        arrays = self.arrays
+        outputs = [arrays.contour, arrays.contour_length, observation.centroid, observation.overflow]
+        self._launch(contours.trace_contours_kernel, (self.instances,), [self.flat["patch"], arrays.largest, self.width], outputs)
 
-    def measure_points(self, scene: SceneData, entry: wp.array, sighting: Sighting) -> None:
-        """Visible shares; distances of pole, centroid and the point half-way."""
-        look, flat, scratch = self.look, self.flat, self.scratch
-        inputs = [scene.catalog, self.cameras.intrinsics, entry, look.world, flat["component"], flat["area"], look.largest]
+    def measure_points(self, scene: SceneData, entry: wp.array, observation: Observation) -> None:
+        """Compute visible fractions, and the distances to the contour at pole, centroid and midpoint."""
+        arrays, flat, scratch = self.arrays, self.flat, self.scratch
+        inputs = [scene.catalog, self.cameras.intrinsics, entry, arrays.world, flat["component"], flat["area"], arrays.largest]
         inputs += [flat["distance"], scratch.pole_key, scratch.square, self.width]
-        outputs = [sighting.visible, sighting.share, sighting.pole, sighting.centroid, sighting.distances]
-        dim = (self.views, self.instances)
-        wp.launch(suction_points.measure_points_kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.scene.device)
+        outputs = [observation.visible, observation.visible_fraction, observation.pole, observation.centroid, observation.distances]
+        dim, device = (self.views, self.instances), self.render_scene.device
+        wp.launch(grasp_points.measure_points_kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
 
-    def choose_suction_points(self, scene: SceneData, entry: wp.array, sighting: Sighting) -> None:
-        """Suction points and their depths."""
-        inputs = [scene.catalog, scene.sight, entry, self.look.world, sighting.visible, sighting.pole, sighting.centroid]
-        inputs += [sighting.distances, self.hit_arrays.depth]
-        outputs = [sighting.middle, sighting.suction, sighting.depth]
-        dim = (self.views, self.instances)
-        wp.launch(suction_points.choose_suction_points_kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.scene.device)
+    def choose_grasp_points(self, scene: SceneData, entry: wp.array, observation: Observation) -> None:
+        """Choose each instance's grasp point among the candidates, and read its depth."""
+        inputs = [scene.catalog, scene.perception, entry, self.arrays.world, observation.visible, observation.pole, observation.centroid]
+        inputs += [observation.distances, self.hit_arrays.depth]
+        outputs = [observation.midpoint, observation.grasp_pixel, observation.depth]
+        dim, device = (self.views, self.instances), self.render_scene.device
+        wp.launch(grasp_points.choose_grasp_points_kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
 
     def _launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch over all views a kernel whose first input is their worlds."""
-        wp.launch(kernel, dim=(self.views, *dim), inputs=[self.look.world, *inputs], outputs=outputs, device=self.scene.device)
+        """Launch a kernel over all views; its first input is the world of each view."""
+        wp.launch(kernel, dim=(self.views, *dim), inputs=[self.arrays.world, *inputs], outputs=outputs, device=self.render_scene.device)
 
     def _launch_pixels(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
-        launch_pixels(kernel, self.pixels, inputs, outputs, self.scene.device)
+        launch_pixels(kernel, self.pixels, inputs, outputs, self.render_scene.device)
 
 
-def _flat(*groups: Any) -> dict[str, wp.array]:
-    """The images among the arrays of dataclasses, with rows and columns as one dimension; they share their memory."""
+def _flatten(*groups: Any) -> dict[str, wp.array]:
+    """Views (view, pixel) of the images (view, row, column) among the arrays of dataclasses; they share memory."""
     flat = {}
     for group in groups:
         for item in fields(group):

@@ -6,7 +6,7 @@ import warp as wp
 
 from synpick_warp.kernels.sim import arrangement, endings, rest
 from synpick_warp.stages.constants import SceneData
-from synpick_warp.stages.perception.arrays import Sighting
+from synpick_warp.stages.perception.arrays import Observation
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 
@@ -137,7 +137,7 @@ def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: 
     )
 
 
-def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, sighting: Sighting, physics: Physics) -> None:
+def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, physics: Physics) -> None:
     """End episodes that failed or are finished."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
@@ -167,7 +167,7 @@ def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, 
             state.slot,
             physics.state.body_q,
             physics.solver.constraint_overflow,
-            sighting.overflow,
+            observation.overflow,
             state.progress,
             state.phase,
             state.ending,

@@ -7,7 +7,7 @@ import warp as wp
 
 from synpick_warp.kernels.sim import gripper, tasks
 from synpick_warp.stages.constants import SceneData
-from synpick_warp.stages.perception.arrays import Plan, Sighting
+from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
@@ -33,7 +33,9 @@ def begin_moving(scene: SceneData, state: WorldState, physics: Physics, seed: in
     )
 
 
-def begin_picking(scene: SceneData, state: WorldState, attempts: AttemptState, sighting: Sighting, plan: Plan, physics: Physics) -> None:
+def begin_picking(
+    scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, physics: Physics
+) -> None:
     """Where a world begins to pick, let it look; forget the outcomes of the last tick."""
     wp.launch(
         tasks.begin_picking_kernel,
@@ -47,7 +49,7 @@ def begin_picking(scene: SceneData, state: WorldState, attempts: AttemptState, s
             attempts.failures,
             plan.target,
             plan.yaw,
-            sighting.overflow,
+            observation.overflow,
             attempts.removed,
             physics.control.joint_target_q,
         ],

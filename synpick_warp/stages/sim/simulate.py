@@ -18,8 +18,8 @@ from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.buffers import LastFrame, Snapshot
 from synpick_warp.stages.constants import SceneData, make_scene_data
-from synpick_warp.stages.perception.arrays import Plan, Sighting
-from synpick_warp.stages.perception.perceive import Looker
+from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.physics import Physics
@@ -37,7 +37,7 @@ class TickRecord:
 
     snapshot: Snapshot
     status: WorldStatus
-    sighting: Sighting
+    observation: Observation
     plan: Plan
     physics: PhysicsRecord | None = None
     """None: nobody asked for it."""
@@ -82,7 +82,7 @@ class Simulation:
         self.state = allocate(WorldState, sizes, device)
         self.attempts = allocate(AttemptState, sizes, device)
         self.seals = allocate(SealState, sizes, device)
-        self.sighting = allocate(Sighting, sizes, device)
+        self.observation = allocate(Observation, sizes, device)
         self.plan = allocate(Plan, sizes, device)
         self.last = allocate(LastFrame, sizes, device)
         self.recorder: Recorder | None = None
@@ -90,16 +90,26 @@ class Simulation:
             self.recorder = Recorder(config, self.scene, self.state, self.attempts, self.seals, self.physics, sizes)
         self.records = tuple(self._make_record(sizes) for _ in range(RECORDS))
         self.suction: Suction | None = None
-        self.looker: Looker | None = None
+        self.perception: Perception | None = None
         if may_pick(config):
             if render_scene is None:
                 raise ValueError("episodes that pick need a render_scene to look at")
             self.suction = Suction(config, catalog, render_scene, device)
-            self.looker = Looker(config, render_scene, self.scene, self.state, self.attempts, self.sighting, self.plan)
+            self.perception = Perception(
+                config.sight,
+                config.cameras,
+                config.bake.seed,
+                render_scene,
+                self.scene,
+                self.state,
+                self.attempts,
+                self.observation,
+                self.plan,
+            )
 
     def _make_record(self, sizes: dict[str, int]) -> TickRecord:
         physics = self.recorder.new_record() if self.recorder is not None else None
-        return TickRecord(*(allocate(kind, sizes, self.device) for kind in (Snapshot, WorldStatus, Sighting, Plan)), physics=physics)
+        return TickRecord(*(allocate(kind, sizes, self.device) for kind in (Snapshot, WorldStatus, Observation, Plan)), physics=physics)
 
     def tick(self, record: TickRecord) -> None:
         """Hand out episodes, simulate one tick, judge, record what came of it in one of `records`, and look where one must choose."""
@@ -117,21 +127,21 @@ class Simulation:
         arrange.judge_settling(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
         gripper.begin_moving(scene, state, physics, seed)
-        gripper.begin_picking(scene, state, self.attempts, self.sighting, self.plan, physics)
+        gripper.begin_picking(scene, state, self.attempts, self.observation, self.plan, physics)
         gripper.remove_lost(scene, state, self.attempts, self.seals, physics)
         if self.suction is not None:
             self.suction.count_seal_rays(scene, state, self.attempts, self.seals, physics)
             gripper.end_attempts(scene, state, self.attempts, self.seals, self.plan, physics)
         gripper.park_removed(scene, state, self.attempts, physics)
         physics.refresh_poses()
-        arrange.judge_episodes(scene, state, self.attempts, self.sighting, physics)
+        arrange.judge_episodes(scene, state, self.attempts, self.observation, physics)
         self._take_snapshot(record)
         if self.recorder is not None and record.physics is not None:
             self.recorder.take(record.physics)
-        if self.looker is not None:
-            self.looker.look(record.snapshot)
+        if self.perception is not None:
+            self.perception.perceive(record.snapshot)
             gripper.begin_attempts(scene, state, self.attempts, self.plan, physics)
-            _copy(record.sighting, self.sighting)
+            _copy(record.observation, self.observation)
             _copy(record.plan, self.plan)
 
     def _drive(self, current: newton.State) -> None:
@@ -213,6 +223,6 @@ def _frame_poses(arrays: Snapshot | LastFrame) -> Any:
     return made
 
 
-def _copy(target: Sighting | Plan, source: Sighting | Plan) -> None:
+def _copy(target: Observation | Plan, source: Observation | Plan) -> None:
     for item in fields(source):
         wp.copy(getattr(target, item.name), getattr(source, item.name))

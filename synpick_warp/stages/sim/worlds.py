@@ -114,7 +114,7 @@ class WorldStatus:
 
 
 def world_sizes(config: Config, bodies_per_world: int) -> dict[str, int]:
-    """Extents of the dimensions that the dataclasses here, `Snapshot` and `Sighting` name."""
+    """Extents of the dimensions that the dataclasses here, `Snapshot` and `Observation` name."""
     worlds = config.bake.worlds
     return {
         "one": 1,

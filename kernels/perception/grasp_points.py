@@ -2,9 +2,9 @@
 
 import warp as wp
 
-from synpick_warp.kernels.perception.components import STRIP, ranked, ranked_pixel
+from synpick_warp.kernels.perception.components import STRIP, pack_key, unpack_pixel
 from synpick_warp.kernels.perception.distance_transform import CODE_MASK
-from synpick_warp.kernels.structs import CatalogData, SightData
+from synpick_warp.kernels.structs import CatalogData, PerceptionData
 
 wp.set_module_options({"enable_backward": False})
 
@@ -43,7 +43,7 @@ def measure_patches_kernel(
     pole_key_out: wp.array2d[wp.int64],
     square_out: wp.array2d[wp.int64],
 ):
-    """Per patch: the maximum of `ranked(d², pixel)` over its pixels, and Σ z² in units of 2⁻²⁴ m². Both begin as 0.
+    """Per patch: the maximum of `pack_key(d², pixel)` over its pixels, and Σ z² in units of 2⁻²⁴ m². Both begin as 0.
 
     d² is a whole number and comes back from its float32 root as long as d < 1600 px; beyond, neighbouring squares may count as equal.
     """
@@ -66,7 +66,7 @@ def measure_patches_kernel(
         if here > 0:
             d = distance[view, pixel]
             z = depth[view, pixel]
-            key = wp.max(key, ranked(wp.int64(wp.rint(d * d)), pixel))
+            key = wp.max(key, pack_key(wp.int64(wp.rint(d * d)), pixel))
             square += wp.int64(wp.rint(z * z * SQUARE_UNITS))
     if run > 0:
         wp.atomic_max(pole_key_out, view, run - 1, key)
@@ -127,7 +127,7 @@ def measure_points_kernel(
         return
     focal = intrinsics[0]
     surface = wp.float64(square[view, instance]) / wp.float64(SQUARE_UNITS * focal[0] * focal[1])
-    pixel = ranked_pixel(pole_key[view, instance])
+    pixel = unpack_pixel(pole_key[view, instance])
     row = pixel // width
     pole = wp.vec2(float(pixel - row * width), float(row))
     centroid = centroid_inout[world, instance]
@@ -142,10 +142,10 @@ def measure_points_kernel(
 
 
 @wp.kernel
-def choose_suction_points_kernel(
+def choose_grasp_points_kernel(
     # Scene:
     catalog: CatalogData,
-    sight: SightData,
+    sight: PerceptionData,
     # State:
     entry: wp.array2d[int],
     # In:
