@@ -32,13 +32,13 @@ def add_kernel(
     # Scene:
     scale: float,
     # State:
-    speed: wp.array[float],
-    place_inout: wp.array[float],
+    speed: wp.array[float],  # (body) [m/s]
+    place_inout: wp.array[float],  # (body)
     # In:
     offset: wp.vec3,
     # Out:
-    sum_out: wp.array[float],
-    total_out: wp.array[float],
+    sum_out: wp.array[float],  # (body)
+    total_out: wp.array2d[float],  # (world, body)
     fields_out: Fields,
 ):
     """x += v."""
@@ -47,7 +47,7 @@ def add_kernel(
     local[0] = speed[i] * scale
     place_inout[i] += local[0] + offset[0]
     put_twice(sum_out, i, 1.0)
-    wp.atomic_add(total_out, 0, 1.0)
+    wp.atomic_add(total_out, 0, 0, 1.0)
     helper(fields_out)
 '''
 
@@ -94,6 +94,31 @@ def test_good_code_passes(tmp_path, capsys):
 def test_each_fault_is_found(tmp_path, capsys, old, new, fault):
     assert old in GOOD
     assert any(found.startswith(fault) for found in check(tmp_path, capsys, GOOD.replace(old, new)))
+
+
+GIVEN = "[scale, state.speed, state.place, wp.vec3(offset)]"
+RESULTS = "[self.out.sum, total, buffers['fields']]"
+
+
+@pytest.mark.parametrize(
+    ("body", "faults"),
+    [
+        (f"wp.launch(add_kernel, dim=1, inputs={GIVEN}, outputs={RESULTS})", []),
+        (f"inputs = [scale, speed, place]; inputs += [offset]\n    launch_pixels(add_kernel, 9, inputs, {RESULTS}, device)", []),
+        (f"some = [state.speed, state.place]\n    launch_pixels(add_kernel, 9, [scale, *some, offset], {RESULTS}, device)", []),
+        (
+            f"wp.launch(add_kernel, dim=1, inputs=[scale, place, speed, offset], outputs={RESULTS})",
+            ["2: add_kernel takes speed where place is given; place belongs elsewhere", "2: add_kernel takes place where speed is given; "],
+        ),
+        (f"wp.launch(add_kernel, dim=1, inputs=[scale, speed], outputs={RESULTS})", ["2: add_kernel takes 7 arguments, not 5"]),
+        ("self._launch(add_kernel, [offset], [total, fields, sum])", ["2: add_kernel takes sum where total is given; total belongs"]),
+    ],
+)
+def test_swapped_and_missing_arguments_are_found(tmp_path, capsys, body, faults):
+    found = check(tmp_path, capsys, GOOD, stage=f"def run():\n    {body}\n")
+    assert len(found) >= len(faults)
+    assert (found == []) == (faults == [])
+    assert all(any(line.startswith(fault) for line in found) for fault in faults)
 
 
 @pytest.mark.parametrize("call", ["wp.launch(add_kernel, dim=1)", "wp.launch_tiled(add_kernel, dim=[1])", "warp.launch(add_kernel, dim=1)"])

