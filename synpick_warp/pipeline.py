@@ -17,7 +17,8 @@ from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.codes import Phase
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import FAST, Config
-from synpick_warp.dataset.manifest import digest_inputs, episode_place, read_record
+from synpick_warp.dataset.digests import digest_inputs
+from synpick_warp.dataset.manifest import episode_place, read_record
 from synpick_warp.dataset.writing import Output, complete
 from synpick_warp.device import pick_device
 from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_redrawn, remedy

@@ -19,13 +19,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from synpick_warp import __version__
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import MANIFEST_FILE
-from synpick_warp.scenes.types import Catalog, EnvironmentMap
 
 RECORDS = Path("manifest")
 """Folder of the records, in the data set."""
@@ -77,35 +74,6 @@ def binding_settings(config: Config) -> dict[str, Any]:
         del settings[section][name]
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     return settings
-
-
-def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> dict[str, str]:
-    """Checksums of all that is in objects and lights, but for the names of their files: the manifest's INPUTS."""
-    return {"objects": _digest_data(catalog), "lights": _digest_data(lights)}
-
-
-def _digest_data(value: object) -> str:
-    state = hashlib.sha256()
-    for part in _parts(value):
-        state.update(part)
-    return state.hexdigest()
-
-
-def _parts(value: object) -> Iterator[bytes]:
-    """Dataclasses, tuples, arrays and plain values as bytes."""
-    if isinstance(value, np.ndarray):
-        yield f"{value.dtype.str}{value.shape}".encode()
-        yield np.ascontiguousarray(value).tobytes()
-    elif isinstance(value, tuple):
-        yield f"({len(value)}".encode()
-        for part in value:
-            yield from _parts(part)
-    elif dataclasses.is_dataclass(value):
-        for item in dataclasses.fields(value):
-            yield item.name.encode()
-            yield from _parts(getattr(value, item.name))
-    elif not isinstance(value, Path):
-        yield repr(value).encode()
 
 
 def _version(name: str) -> str:

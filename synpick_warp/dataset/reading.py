@@ -1,187 +1,292 @@
-"""Reads a data set's trajectories: lazily, as zarr arrays by name. Importing this loads neither simulator nor zarr."""
+"""Data set reader: episodes, views with ground truth, pick attempts and trajectories of what a bake wrote, all loaded lazily.
+
+    data = synpick_warp.open("DATA")
+    view = data[0].view(frame=12, camera=1)
+    view.rgb, view.depth, view.masks, view.object_to_camera
+
+Views come from BOP folders (format bop) or webdataset shards (format shards), arrays by name from the zarr store (format zarr). Reading
+needs no simulator; zarr, NumPy and OpenCV are imported when arrays or images are read.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from synpick_warp.dataset.manifest import CONFIG_FILE, MANIFEST_FILE, RECORDS, episode_place, read_record
+from synpick_warp.dataset.trajectory import (
+    GROUP_FILE,
+    Arrays,
+    CameraInfo,
+    ObjectInfo,
+    read_array,
+    read_attributes,
+    read_cameras,
+    read_objects,
+)
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.trajectory.arrays import CAMERAS, EPISODES, OBJECTS, STORE
+from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 
 if TYPE_CHECKING:
-    import numpy as np
-    import zarr
-
     from synpick_warp.configs.schema import Config
+    from synpick_warp.dataset.view import View
+    from synpick_warp.dataset.view_files import SceneFiles
 
-_GROUP_FILE = "zarr.json"
-_CONFIG_FILE = "config.toml"
-
-
-@dataclass(frozen=True, eq=False)
-class ObjectInfo:
-    """One object of the bake."""
-
-    object_id: int
-    name: str
-    mass: float
-    """[kg]"""
-    center_of_mass: np.ndarray
-    """In the object's frame (3) float64 [m]."""
-    inertia: np.ndarray
-    """About the centre of mass, in the object's axes (3, 3) float64 [kg·m²]."""
-    diameter: float
-    """[m]"""
-    volume: float
-    """Of the collision shape [m³]."""
-
-
-@dataclass(frozen=True, eq=False)
-class CameraInfo:
-    """One camera: x right, y down, z forward; pixel centres at + 0.5."""
-
-    resolution: np.ndarray
-    """Width and height (2) int32 [px]."""
-    matrix: np.ndarray
-    """K (3, 3) float64 [px]."""
-    rotation: np.ndarray
-    """World to camera (3, 3) float64."""
-    translation: np.ndarray
-    """World to camera (3) float64 [m]."""
-
-
-class Arrays(Mapping[str, "zarr.Array"]):
-    """Arrays of one group by name, each opened when it is asked for: `arrays["pose"][10:20]` reads these rows alone."""
-
-    def __init__(self, folder: Path) -> None:
-        """
-        Args:
-            folder: The group, which exists.
-        """
-        self._folder = folder
-
-    def __getitem__(self, name: str) -> zarr.Array:
-        if "/" in name or not (self._folder / name / _GROUP_FILE).is_file():
-            raise KeyError(f"{name}; there are {', '.join(self) or 'no arrays'}")
-        import zarr
-
-        return zarr.open_array(self._folder / name, mode="r")
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(sorted(path.parent.name for path in self._folder.glob(f"*/{_GROUP_FILE}")))
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-    def __repr__(self) -> str:
-        return f"Arrays({', '.join(self)})"
+USD = Path("usd")
+"""Folder of USD episodes in a data set."""
 
 
 class Episode:
-    """One episode. `attributes` say how it ended; `ticks`, `steps`, `arrangement` have arrays; `attempts` are records."""
+    """One episode: row of the episode list, pick attempts, views, and arrays of the trajectory."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, data_set: DataSet, index: int) -> None:
         """
         Args:
-            folder: Its group, which exists.
+            data_set: The data set, which has the episode.
+            index: Index of the episode.
         """
-        self._folder = folder
-        self.number = int(folder.name)
+        self._data_set = data_set
+        self._group = data_set.folder / STORE / EPISODES / f"{index:06d}"
+        self._scenes: dict[int, SceneFiles] = {}
+        self.index = index
+
+    @property
+    def number(self) -> int:
+        """Same as `index`."""
+        return self.index
+
+    @cached_property
+    def _record(self) -> dict[str, Any] | None:
+        return read_record(self._data_set.folder, episode_place(self.index))
+
+    @cached_property
+    def row(self) -> dict[str, Any]:
+        """The episode's line of episodes.jsonl: mode, ending, frames, seconds, counts of objects and attempts."""
+        return self._record["row"] if self._record is not None else self.attributes
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
-        """What the episode is: mode, ending, frames, light, ..."""
-        return _attributes(self._folder)
+        """Attributes in the trajectory store: as `row`, and light.
+
+        Raises:
+            DatasetError: The data set has no trajectories.
+        """
+        self._data_set.require_store()
+        return read_attributes(self._group)
 
     @property
     def ticks(self) -> Arrays:
-        """One row a frame."""
-        return Arrays(self._folder / "ticks")
+        """Arrays with one row per frame; empty without trajectories, as are the following."""
+        return Arrays(self._group / "ticks")
 
     @property
     def steps(self) -> Arrays:
-        """One row a step of physics; empty if steps were not recorded."""
-        return Arrays(self._folder / "steps")
+        """Arrays with one row per physics step; empty if steps were not recorded."""
+        return Arrays(self._group / "steps")
 
     @property
     def arrangement(self) -> Arrays:
-        """Which objects, and how they were dropped."""
-        return Arrays(self._folder / "arrangement")
+        """Arrays of the drawn objects and how they were dropped."""
+        return Arrays(self._group / "arrangement")
 
     @property
     def attempt_arrays(self) -> Arrays:
-        """What `attempts` say, as arrays with one row an attempt."""
-        return Arrays(self._folder / "attempts")
+        """`attempts` as arrays, with one row per attempt."""
+        return Arrays(self._group / "attempts")
 
     @cached_property
     def attempts(self) -> tuple[dict[str, Any], ...]:
-        """Every attempt to pick, as a line of attempts.jsonl has it."""
-        return tuple(json.loads(line) for line in _values(self.attempt_arrays["record"]).tobytes().splitlines())
+        """Pick attempts in order; each is a line of attempts.jsonl."""
+        if self._record is not None:
+            return tuple(self._record["attempts"])
+        return tuple(json.loads(line) for line in read_array(self.attempt_arrays["record"]).tobytes().splitlines())
+
+    @property
+    def usd(self) -> Path:
+        """The episode's USD file; it exists if the data set has the format usd."""
+        return self._data_set.folder / USD / f"{self.index:06d}.usdc"
+
+    def view(self, frame: int, camera: int = 0) -> View:
+        """One rendered view.
+
+        Args:
+            frame: Index of the frame; negative: from the end.
+            camera: Index of the camera.
+
+        Raises:
+            IndexError: There is no such frame or camera.
+            DatasetError: The data set has no images.
+        """
+        from synpick_warp.dataset.view import View
+
+        frames, cameras = len(self), self._data_set.camera_count
+        if not -frames <= frame < frames:
+            raise IndexError(f"episode {self.index} has no frame {frame}; it has {frames} frames")
+        if not 0 <= camera < cameras:
+            raise IndexError(f"there is no camera {camera}; there are {cameras} cameras")
+        if camera not in self._scenes:
+            self._scenes[camera] = self._data_set.scene_files(self.index, camera)
+        return View(self._scenes[camera], self.index, camera, frame % frames)
+
+    def views(self, camera: int | None = None) -> Iterator[View]:
+        """Iterate over the views frame by frame, of one camera or of all."""
+        cameras = range(self._data_set.camera_count) if camera is None else (camera,)
+        for frame in range(len(self)):
+            for each in cameras:
+                yield self.view(frame, each)
 
     def __len__(self) -> int:
-        """Frames."""
-        return int(self.attributes["frames"])
+        """Number of frames."""
+        return int(self.row["frames"])
 
     def __repr__(self) -> str:
-        attributes = self.attributes
-        return f"Episode({self.number}: {attributes['frames']} frames, {attributes['ending']})"
+        return f"Episode({self.index}: {self.row['frames']} frames, {self.row['ending']})"
 
 
 class DataSet(Mapping[int, Episode]):
-    """The episodes of a data set by number, and what they share. Nothing is read before it is asked for."""
+    """Episodes of a data set by index, and what they share. Episodes that another bake commits meanwhile appear on the next access."""
 
     def __init__(self, folder: Path) -> None:
         """
         Args:
-            folder: The data set, which has a store.
+            folder: Folder of the data set.
         """
         self.folder = folder
         self._store = folder / STORE
-
-    @cached_property
-    def attributes(self) -> dict[str, Any]:
-        """Seed, step, steps a tick, names of light maps, ..."""
-        return _attributes(self._store)
 
     @cached_property
     def config(self) -> Config:
         """All settings of the bake.
 
         Raises:
-            ConfigError: They are not there, or not as this version has them.
+            ConfigError: They are missing, or this version cannot read them.
         """
         from synpick_warp.configs.load import load_config
 
-        return load_config(str(self.folder / _CONFIG_FILE), {})
+        return load_config(str(self.folder / CONFIG_FILE), {})
+
+    @cached_property
+    def attributes(self) -> dict[str, Any]:
+        """Attributes of the trajectory store: seed, step, steps per tick, names of light maps, ...
+
+        Raises:
+            DatasetError: The data set has no trajectories.
+        """
+        self.require_store()
+        return read_attributes(self._store)
 
     @cached_property
     def objects(self) -> tuple[ObjectInfo, ...]:
-        """The object table."""
-        names = _attributes(self._store / "objects")["names"]
-        columns = {name: _values(array) for name, array in Arrays(self._store / "objects").items() if name in OBJECTS.arrays}
-        rows = [{name: values[row] for name, values in columns.items()} for row in range(len(names))]
-        return tuple(
-            ObjectInfo(name=name, **{key: _plain(value) for key, value in row.items()}) for name, row in zip(names, rows, strict=True)
-        )
+        """Object table with physical properties, by catalog index; of the trajectory store.
+
+        Raises:
+            DatasetError: The data set has no trajectories; `models_info` has sizes.
+        """
+        self.require_store()
+        return read_objects(self._store)
+
+    @cached_property
+    def models_info(self) -> dict[int, dict[str, Any]]:
+        """Object id -> its entry of BOP's models_info.json: diameter, box and symmetries [mm].
+
+        Raises:
+            DatasetError: The data set has no models, as it has neither the format bop nor shards.
+        """
+        from synpick_warp.dataset.view_files import read_json
+
+        return {int(name): info for name, info in read_json(self.folder / "models" / "models_info.json").items()}
 
     @cached_property
     def cameras(self) -> tuple[CameraInfo, ...]:
-        """The cameras, in the order of the scenes."""
-        columns = {name: _values(array) for name, array in Arrays(self._store / "cameras").items() if name in CAMERAS.arrays}
-        return tuple(CameraInfo(**{name: values[row] for name, values in columns.items()}) for row in range(len(columns["matrix"])))
+        """The cameras by index."""
+        if self.has_store:
+            return read_cameras(self._store)
+        import numpy as np
 
-    def __getitem__(self, number: int) -> Episode:
-        folder = self._store / EPISODES / f"{number:06d}"
-        if not (folder / _GROUP_FILE).is_file():
-            raise KeyError(f"{self.folder} has no episode {number}")
-        return Episode(folder)
+        from synpick_warp.scenes.cameras import make_cameras
+
+        cameras = make_cameras(self.config.cameras)
+        return tuple(CameraInfo(np.array((c.width, c.height), np.int32), c.matrix, c.rotation, c.translation) for c in cameras)
+
+    @cached_property
+    def camera_count(self) -> int:
+        """Number of cameras."""
+        return len(self.config.cameras.positions)
+
+    @property
+    def attempts(self) -> Iterator[dict[str, Any]]:
+        """Pick attempts of all episodes, in order."""
+        return (attempt for episode in self.values() for attempt in episode.attempts)
+
+    def views(self, camera: int | None = None) -> Iterator[View]:
+        """Iterate over the views of all episodes, of one camera or of all."""
+        for episode in self.values():
+            yield from episode.views(camera)
+
+    @property
+    def has_store(self) -> bool:
+        """Whether there is a trajectory store."""
+        return (self._store / EPISODES / GROUP_FILE).is_file()
+
+    def require_store(self) -> None:
+        """Raise DatasetError unless there is a trajectory store."""
+        if not self.has_store:
+            raise DatasetError(f"{self.folder} has no {STORE}; bake with --formats zarr, which can be combined with others, as in bop,zarr")
+
+    @cached_property
+    def _splits(self) -> tuple[Path, ...]:
+        """Folders of BOP scenes and of webdataset shards, which need not exist; none if there are no settings."""
+        if not (self.folder / CONFIG_FILE).is_file():
+            return ()
+        split = self.folder / self.config.bop.split
+        return split, split.with_name(f"{split.name}_web")
+
+    def scene_files(self, episode: int, camera: int) -> SceneFiles:
+        """Files of the scene that a camera recorded in an episode: its folder, or else its shards.
+
+        Raises:
+            DatasetError: The data set has no images.
+        """
+        from synpick_warp.dataset.view_files import SceneFolder, SceneShards
+        from synpick_warp.exporters.bop.shard_parts import shards_of
+
+        scene = self.camera_count * episode + camera
+        folder, web = self._splits
+        if (folder / f"{scene:06d}").is_dir():
+            return SceneFolder(folder / f"{scene:06d}")
+        if shards := list(shards_of(scene, web)):
+            return SceneShards(shards, scene)
+        raise DatasetError(f"{self.folder} has no images of episode {episode}; bake with --formats bop or shards")
+
+    def _has_files(self, index: int) -> bool:
+        """Whether an episode has files in some format."""
+        paths = [self._store / EPISODES / f"{index:06d}" / GROUP_FILE, self.folder / USD / f"{index:06d}.usdc"]
+        if self._splits:
+            scene = self.camera_count * index
+            paths += [self._splits[0] / f"{scene:06d}", self._splits[1] / f"shard-{scene:06d}.tar"]
+        return any(path.exists() for path in paths)
+
+    def _names(self) -> Iterator[int]:
+        """Indices of the episodes that have files in some format; an index can occur several times."""
+        yield from (int(path.name) for path in (self._store / EPISODES).glob("[0-9]*"))
+        yield from (int(path.stem) for path in (self.folder / USD).glob("[0-9]*.usdc"))
+        for split, pattern in zip(self._splits, ("[0-9]*", "shard-??????.tar"), strict=False):
+            yield from (int(path.stem.removeprefix("shard-")) // self.camera_count for path in split.glob(pattern))
+
+    def _is_committed(self, index: int) -> bool:
+        """Whether an episode has its manifest entry; a data set without manifest, such as a lone store, has none to check."""
+        return not (self.folder / RECORDS).is_dir() or (self.folder / f"{episode_place(index)}.json").is_file()
+
+    def __getitem__(self, index: int) -> Episode:
+        if not (self._is_committed(index) and self._has_files(index)):
+            raise KeyError(f"{self.folder} has no episode {index}")
+        return Episode(self, index)
 
     def __iter__(self) -> Iterator[int]:
-        return iter(sorted(int(path.name) for path in (self._store / EPISODES).iterdir() if path.is_dir()))
+        return iter(sorted(index for index in set(self._names()) if self._is_committed(index)))
 
     def __len__(self) -> int:
         return sum(1 for _ in self)
@@ -191,31 +296,15 @@ class DataSet(Mapping[int, Episode]):
 
 
 def open_data_set(folder: Path | str) -> DataSet:
-    """A data set with trajectories; reads nothing yet.
+    """Open a data set; reads nothing yet.
 
     Args:
-        folder: What a bake with the format zarr wrote, or is still writing.
+        folder: Folder that a bake wrote, or is still writing.
 
     Raises:
-        DatasetError: There are no trajectories.
+        DatasetError: The folder is not a data set.
     """
-    folder = Path(folder)
-    if not (folder / STORE / EPISODES / _GROUP_FILE).is_file():
-        raise DatasetError(f"{folder} has no {STORE}; bake with --formats zarr, which may stand beside others, as in bop,zarr")
-    return DataSet(folder)
-
-
-def _attributes(group: Path) -> dict[str, Any]:
-    return json.loads((group / _GROUP_FILE).read_bytes())["attributes"]
-
-
-def _values(array: zarr.Array) -> np.ndarray:
-    """All of an array."""
-    import numpy as np
-
-    return np.asarray(array[...])
-
-
-def _plain(value: Any) -> Any:
-    """A number of NumPy as one of Python; arrays as they are."""
-    return value.item() if value.ndim == 0 else value
+    data_set = DataSet(Path(folder))
+    if not (data_set.folder / MANIFEST_FILE).is_file() and not data_set.has_store:
+        raise DatasetError(f"{folder} is not a data set: it has neither {MANIFEST_FILE} nor {STORE}; name a folder that a bake wrote")
+    return data_set

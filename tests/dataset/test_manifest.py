@@ -12,9 +12,11 @@ import pytest
 from synpick_warp.configs.load import load_config, settings_of
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset import manifest
+from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import list_files, write_manifest_entry
 from synpick_warp.scenes.embedded.skies import skies
+from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, EnvironmentMap, Material, Sun, TriangleMesh
 from tests.worlds.small_worlds import catalog, settings
 
 
@@ -93,14 +95,42 @@ def test_manifests_that_are_none(tmp_path, text, said):
 
 
 def test_inputs_are_known_by_their_content():
-    known = manifest.digest_inputs(catalog(), skies())
-    assert known == manifest.digest_inputs(catalog(), skies())
+    known = digest_inputs(catalog(), skies())
+    assert known == digest_inputs(catalog(), skies())
     entry = catalog().entries[1]
     heavier = dataclasses.replace(catalog(), entries=(*catalog().entries[:1], dataclasses.replace(entry, mass=9.0), *catalog().entries[2:]))
-    assert manifest.digest_inputs(heavier, skies())["objects"] != known["objects"]
+    assert digest_inputs(heavier, skies())["objects"] != known["objects"]
     brighter = (dataclasses.replace(skies()[0], radiance=skies()[0].radiance * np.float32(2)), *skies()[1:])
-    digests = manifest.digest_inputs(catalog(), brighter)
+    digests = digest_inputs(catalog(), brighter)
     assert (digests["objects"], digests["lights"] != known["lights"]) == (known["objects"], True)
+
+
+def test_field_names_that_every_manifest_depends_on():
+    """Digests hash them: renaming one would make every data set refuse to be resumed."""
+    names = {kind.__name__: [item.name for item in dataclasses.fields(kind)] for kind in (CatalogEntry, ConvexPiece, EnvironmentMap)}
+    assert names == {
+        "CatalogEntry": [
+            "obj_id",
+            "name",
+            "mesh",
+            "material",
+            "pieces",
+            "volume",
+            "radius",
+            "mass",
+            "center_of_mass",
+            "inertia",
+            "diameter",
+            "symmetries_discrete",
+            "symmetries_continuous",
+            "source",
+        ],
+        "ConvexPiece": ["vertices", "faces"],
+        "EnvironmentMap": ["name", "radiance", "sun"],
+    }
+    assert [item.name for item in dataclasses.fields(Material)] == ["color", "texture", "metallic", "roughness"]
+    assert [item.name for item in dataclasses.fields(TriangleMesh)] == ["vertices", "faces", "normals", "uv"]
+    assert [item.name for item in dataclasses.fields(Sun)] == ["direction", "irradiance"]
 
 
 def test_a_record_has_every_file_once_and_is_whole_while_they_are_there(tmp_path):

@@ -80,8 +80,8 @@ def test_steps_that_were_not_recorded_are_none(tmp_path):
     assert dict(synpick_warp.open(tmp_path)[0].steps) == {}
 
 
-def test_a_folder_without_trajectories_is_a_clear_error(tmp_path):
-    with pytest.raises(DatasetError, match=r"has no trajectory\.zarr; bake with --formats zarr"):
+def test_a_folder_that_is_not_a_data_set_is_a_clear_error(tmp_path):
+    with pytest.raises(DatasetError, match=r"is not a data set: it has neither manifest\.json nor trajectory\.zarr"):
         synpick_warp.open(tmp_path)
 
 

@@ -1,0 +1,44 @@
+"""Content digests of a bake's inputs: SHA-256 over dataclasses and arrays, by which a resumed bake recognizes other objects or lights.
+
+Names and order of the dataclasses' fields are hashed, too: renaming a field of `Catalog` or `EnvironmentMap` changes every manifest.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from synpick_warp.scenes.types import Catalog, EnvironmentMap
+
+
+def digest_inputs(catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> dict[str, str]:
+    """Digests of the content of objects and lights, without the names of their files: the manifest's INPUTS."""
+    return {"objects": _digest_data(catalog), "lights": _digest_data(lights)}
+
+
+def _digest_data(value: object) -> str:
+    state = hashlib.sha256()
+    for part in _parts(value):
+        state.update(part)
+    return state.hexdigest()
+
+
+def _parts(value: object) -> Iterator[bytes]:
+    """Serialize dataclasses, tuples, arrays and plain values; paths are left out."""
+    if isinstance(value, np.ndarray):
+        yield f"{value.dtype.str}{value.shape}".encode()
+        yield np.ascontiguousarray(value).tobytes()
+    elif isinstance(value, tuple):
+        yield f"({len(value)}".encode()
+        for part in value:
+            yield from _parts(part)
+    elif dataclasses.is_dataclass(value):
+        for item in dataclasses.fields(value):
+            yield item.name.encode()
+            yield from _parts(getattr(value, item.name))
+    elif not isinstance(value, Path):
+        yield repr(value).encode()

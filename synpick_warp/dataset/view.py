@@ -1,0 +1,159 @@
+"""Rendered views of a data set: images, masks, poses and camera of one frame, loaded when they are first used.
+
+Transforms are 4x4 matrices named `A_to_B`: they map points of frame A to frame B [m]. Frames: `object`, the model's axes; `camera`,
+OpenCV's axes (x right, y down, z forward); `world`, the tote's axes (z up). The centre of pixel (row, column) is (column + 0.5, row + 0.5).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from synpick_warp.configs.schema import LAYERS
+from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
+from synpick_warp.layer_codec import decode_layer
+
+MILLIMETERS = 1000.0
+"""In a metre: BOP's files are in millimetres, this module is in metres."""
+
+
+class View:
+    """One camera image with its ground truth. Arrays with N rows have one per instance, in BOP's order of ground-truth indices."""
+
+    def __init__(self, files: SceneFiles, episode: int, camera: int, frame: int) -> None:
+        """
+        Args:
+            files: The scene's files.
+            episode: Index of the episode.
+            camera: Index of the camera.
+            frame: Index of the frame in the episode.
+        """
+        self._files = files
+        self.episode, self.camera, self.frame = episode, camera, frame
+
+    @cached_property
+    def records(self) -> ViewRecords:
+        """Annotations as the files have them: BOP's keys, millimetres; `records.camera` has light and camera effects, too."""
+        return self._files.records(self.frame)
+
+    @cached_property
+    def rgb(self) -> np.ndarray:
+        """Colour image, sRGB (H, W, 3) uint8, red first."""
+        return np.ascontiguousarray(self._files.image("rgb", self.frame)[..., ::-1])
+
+    @cached_property
+    def depth(self) -> np.ndarray:
+        """Planar depth (z in the camera frame) (H, W) float32 [m]; 0: no surface."""
+        scale = np.float32(self.records.camera["depth_scale"] / MILLIMETERS)
+        return self._files.image("depth", self.frame) * scale
+
+    @cached_property
+    def masks(self) -> np.ndarray:
+        """Modal (visible) mask of each instance (N, H, W) bool; they never overlap."""
+        return self._masks("mask_visib")
+
+    @cached_property
+    def amodal_masks(self) -> np.ndarray:
+        """Amodal mask of each instance, visible or hidden (N, H, W) bool."""
+        return self._masks("mask")
+
+    def _masks(self, name: str) -> np.ndarray:
+        masks = self._files.masks(name, self.frame, len(self))
+        return np.stack(masks) if masks else np.zeros((0, *self.depth.shape), bool)
+
+    @cached_property
+    def layers(self) -> tuple[str, ...]:
+        """Names of the layers (AOVs, annotators) that the data set has, in the order of `LAYERS`."""
+        present = self._files.layers()
+        return tuple(name for name in LAYERS if name in present)
+
+    def layer(self, name: str) -> np.ndarray:
+        """Decode a layer; units and shapes as in `synpick_warp.layer_codec.decode_layer`.
+
+        Raises:
+            DatasetError: The data set has no such layer.
+        """
+        image = self._files.image(name, self.frame)
+        return decode_layer(name, image[..., ::-1] if image.ndim == 3 else image)
+
+    @cached_property
+    def intrinsics(self) -> np.ndarray:
+        """Camera matrix K (3, 3) float64 [px]."""
+        return np.reshape(self.records.camera["cam_K"], (3, 3))
+
+    @cached_property
+    def world_to_camera(self) -> np.ndarray:
+        """Camera extrinsics (4, 4) float64 [m]."""
+        camera = self.records.camera
+        return make_transform(camera["cam_R_w2c"], camera["cam_t_w2c"])
+
+    @cached_property
+    def object_to_camera(self) -> np.ndarray:
+        """Pose of each instance in the camera frame (N, 4, 4) float64 [m]."""
+        return np.reshape([make_transform(row["cam_R_m2c"], row["cam_t_m2c"]) for row in self.records.gt], (-1, 4, 4))
+
+    @cached_property
+    def object_to_world(self) -> np.ndarray:
+        """Pose of each instance in the world frame (N, 4, 4) float64 [m]."""
+        return np.linalg.inv(self.world_to_camera) @ self.object_to_camera
+
+    @cached_property
+    def object_ids(self) -> np.ndarray:
+        """BOP object id (class) of each instance (N) int64."""
+        return self._column("gt", "obj_id", np.int64)
+
+    @cached_property
+    def instance_ids(self) -> np.ndarray:
+        """Track id of each instance (N) int64: the same object through its whole episode and in all cameras."""
+        return self._column("gt", "instance_id", np.int64)
+
+    @cached_property
+    def visibility(self) -> np.ndarray:
+        """Visible fraction of each instance's silhouette (N) float64, from 0 to 1."""
+        return self._column("gt_info", "visib_fract", np.float64)
+
+    @cached_property
+    def boxes(self) -> np.ndarray:
+        """Amodal bounding boxes (N, 4) int64 [px]: x, y, width, height, as BOP has them; -1 if nothing is visible."""
+        return self._column("gt_info", "bbox_obj", np.int64).reshape(-1, 4)
+
+    @cached_property
+    def visible_boxes(self) -> np.ndarray:
+        """Bounding boxes of the visible parts (N, 4) int64 [px]; as `boxes`."""
+        return self._column("gt_info", "bbox_visib", np.int64).reshape(-1, 4)
+
+    def _column(self, record: str, key: str, dtype: type) -> np.ndarray:
+        return np.array([row[key] for row in getattr(self.records, record)], dtype=dtype)
+
+    def project(self, points: np.ndarray, transform: np.ndarray | None = None) -> np.ndarray:
+        """Project points by the pinhole model.
+
+        Args:
+            points: (..., 3) [m].
+            transform: Their frame to the camera frame (4, 4), such as a row of `object_to_camera`; None: they are in the camera frame.
+
+        Returns:
+            x to the right and y down (..., 2) [px]; pixel (row, column) covers x from column to column + 1.
+        """
+        points = np.asarray(points, np.float64)
+        if transform is not None:
+            points = points @ transform[:3, :3].T + transform[:3, 3]
+        image = points @ self.intrinsics.T
+        return image[..., :2] / image[..., 2:]
+
+    def __len__(self) -> int:
+        """Number of instances N."""
+        return len(self.records.gt)
+
+    def __repr__(self) -> str:
+        return f"View(episode {self.episode}, camera {self.camera}, frame {self.frame})"
+
+
+def make_transform(rotation: Any, translation: Any) -> np.ndarray:
+    """A rigid transform (4, 4) float64 [m] from BOP's rotation (9, row by row) and translation (3) [mm]."""
+    transform = np.eye(4)
+    transform[:3, :3] = np.reshape(rotation, (3, 3))
+    transform[:3, 3] = np.asarray(translation) / MILLIMETERS
+    return transform
