@@ -1,4 +1,4 @@
-"""BOP data sets, "scenewise": one folder a scene, written by a pool of processes."""
+"""Exporter of scenewise BOP datasets: one folder per scene, with a file for each image and mask."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Bop, Config
 from synpick_warp.exporters.base import ExportContext
-from synpick_warp.exporters.bop.scene import SceneSettings, finish_episode, make_scene
+from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
-from synpick_warp.exporters.bop.targets import BOP19, BOP24, join_targets, write_scene_targets
+from synpick_warp.exporters.bop.targets import BOP19, BOP24, concatenate_targets, write_scene_targets
 from synpick_warp.exporters.bop.view import write_layer, write_view
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
 
 
 class BopExporter(SceneExporter):
-    """An `Exporter` of folders with a file for each picture and mask."""
+    """`Exporter` of scene folders."""
 
-    hidden = "bop"
+    staging = "bop"
     write_view = staticmethod(write_view)
 
     def __init__(self, context: ExportContext) -> None:
@@ -30,14 +30,14 @@ class BopExporter(SceneExporter):
         self._object_ids = tuple(entry.obj_id for entry in context.catalog.entries)
 
     @staticmethod
-    def split(config: Config) -> str:
+    def split(bop: Bop) -> str:
         """See `SceneExporter`."""
-        return config.bop.split
+        return bop.split
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
-        """See `Exporter`: the targets of an evaluation."""
-        parts = out / PARTIAL / BopExporter.hidden / "targets"
+        """See `Exporter`: the lists of evaluation targets."""
+        parts = out / PARTIAL / BopExporter.staging / "targets"
         try:
             parts.parent.mkdir(exist_ok=True)
             shutil.rmtree(parts, ignore_errors=True)
@@ -46,33 +46,33 @@ class BopExporter(SceneExporter):
             for scene in sorted((out / config.bop.split).iterdir()):
                 pool.submit(write_scene_targets, (), (scene, parts, config.bop.target_visibility), path=scene)
             pool.wait()
-            join_targets(parts, out)
+            concatenate_targets(parts, out)
         except OSError as error:
             raise output_error(out, error) from error
         return [Path(BOP19), Path(BOP24)]
 
     def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: the folders of the scenes."""
+        """See `Exporter`: the scene folders."""
         places = (self._place(self.scene_id(episode, camera)) for camera in range(len(self._cameras)))
         return [place.relative_to(self._out) for place in places if os.path.lexists(place)]
 
-    def _make_scene(self, scene: Path) -> None:
-        make_scene(scene, self._config.masks, self._layers)
+    def _stage_scene(self, scene: Path) -> None:
+        create_scene_folders(scene, self._bop.masks, self._layers)
 
-    def _layer_task(self, scene: Path, number: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
         return write_layer, (scene, name, frame)
 
-    def _finish_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
         settings = SceneSettings(
-            split=self._config.split,
+            split=self._bop.split,
             frames=frames,
             width=self._cameras[0].width,
             height=self._cameras[0].height,
             color_suffix=self._suffix,
-            coco=self._config.coco,
+            coco=self._bop.coco,
             object_ids=self._object_ids,
         )
-        return finish_episode, (tuple((scene, self._place(number)) for scene, number in scenes), settings)
+        return commit_scenes, (tuple((scene, self._place(scene_id)) for scene, scene_id in scenes), settings)
 
-    def _place(self, scene: int) -> Path:
-        return self._split / f"{scene:06d}"
+    def _place(self, scene_id: int) -> Path:
+        return self._split / f"{scene_id:06d}"

@@ -1,4 +1,4 @@
-"""What a BOP data set says once: models, their sizes and symmetries, the camera, and notes for people."""
+"""Files of a BOP dataset that all scenes share: models with sizes and symmetries, camera.json, and notes for humans."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
 
 CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
 MODEL_FOLDERS = ("models", "models_eval")
-"""The toolkit renders from the first and evaluates with the second; ours are the same."""
+"""The toolkit renders the first and evaluates with the second; ours are equal."""
 _TEXTURE_COMMENT = b"comment TextureFile "
 _HEADER_END = b"end_header"
 
 
-def write_constants(out: Path, config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> list[Path]:
-    """Write models/, models_eval/, camera.json and dataset_info.md in place of what is there, and name them.
+def write_constants(out: Path, catalog: Catalog, camera: Camera, depth_scale: float, notes: str) -> list[Path]:
+    """Write models/, models_eval/, camera.json and dataset_info.md, replacing existing ones; returns their paths.
 
     Raises:
         CatalogError: A model file lacks its texture file.
@@ -34,13 +34,13 @@ def write_constants(out: Path, config: Config, catalog: Catalog, cameras: tuple[
         if (out / name).exists():
             shutil.rmtree(out / name)
         write_models(out / name, catalog)
-    _write_json(out / CAMERA_FILE, _camera_record(cameras[0], config.bop.depth_scale))
-    (out / NOTES_FILE).write_text(_notes(config, catalog, cameras), encoding="utf-8", newline="\n")
+    _write_json(out / CAMERA_FILE, _make_camera_file(camera, depth_scale))
+    (out / NOTES_FILE).write_text(notes, encoding="utf-8", newline="\n")
     return [Path(name) for name in (*MODEL_FOLDERS, CAMERA_FILE, NOTES_FILE)]
 
 
 def write_models(folder: Path, catalog: Catalog) -> None:
-    """Write every object's PLY file and texture, and models_info.json. Models that came as BOP models are copied byte for byte."""
+    """Write every object's PLY file and texture, and models_info.json. Models loaded from BOP models are copied byte for byte."""
     folder.mkdir()
     infos = {}
     for entry in catalog.entries:
@@ -48,25 +48,25 @@ def write_models(folder: Path, catalog: Catalog) -> None:
         if entry.source is None:
             path.write_bytes(encode_model(entry))
             if entry.material.texture is not None:
-                path.with_suffix(".png").write_bytes(encode_png(_colored(entry.material)))
+                path.with_suffix(".png").write_bytes(encode_png(_tint_texture(entry.material)))
         else:
             _copy_model(entry.source, path)
-        infos[str(entry.obj_id)] = _original_info(entry) or model_info(entry)
+        infos[str(entry.obj_id)] = _read_source_info(entry) or make_model_info(entry)
     _write_json(folder / "models_info.json", infos)
 
 
 def encode_model(entry: CatalogEntry) -> bytes:
-    """An object as binary PLY in millimetres, with the property types that the BOP toolkit reads.
+    """Encode an object as binary PLY in millimetres, with the property types that the BOP toolkit reads.
 
-    With a texture of the same name and texture coordinates, or else with vertex colours.
+    With texture coordinates and a texture of the same name, or else with vertex colours.
     """
     mesh, textured = entry.mesh, entry.material.texture is not None
     names = ["x", "y", "z", "nx", "ny", "nz", *(("texture_u", "texture_v") if textured else ())]
     fields: list[tuple[str, str]] = [(name, "<f4") for name in names]
-    kinds = [f"property float {name}" for name in names]
+    properties = [f"property float {name}" for name in names]
     if not textured:
         fields += [(name, "u1") for name in ("red", "green", "blue")]
-        kinds += [f"property uchar {name}" for name in ("red", "green", "blue")]
+        properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
     vertices = np.empty(len(mesh.vertices), np.dtype(fields))
     columns = np.concatenate((MILLIMETERS * mesh.vertices.astype(np.float64), mesh.normals, mesh.uv), axis=1)
     for index, name in enumerate(names):
@@ -82,7 +82,7 @@ def encode_model(entry: CatalogEntry) -> bytes:
         f"comment {entry.name}, millimetres",
         *((f"comment TextureFile obj_{entry.obj_id:06d}.png",) if textured else ()),
         f"element vertex {len(vertices)}",
-        *kinds,
+        *properties,
         f"element face {len(faces)}",
         "property list uchar int vertex_indices",
         "end_header",
@@ -90,14 +90,14 @@ def encode_model(entry: CatalogEntry) -> bytes:
     return "".join(line + "\n" for line in header).encode() + vertices.tobytes() + faces.tobytes()
 
 
-def model_info(entry: CatalogEntry) -> dict[str, Any]:
+def make_model_info(entry: CatalogEntry) -> dict[str, Any]:
     """An object's entry in models_info.json [mm]."""
-    low, high = (MILLIMETERS * edge(entry.mesh.vertices.astype(np.float64), axis=0) for edge in (np.min, np.max))
+    low, high = (MILLIMETERS * extremum(entry.mesh.vertices.astype(np.float64), axis=0) for extremum in (np.min, np.max))
     info: dict[str, Any] = {"diameter": MILLIMETERS * entry.diameter}
     info |= {f"min_{axis}": float(value) for axis, value in zip("xyz", low, strict=True)}
     info |= {f"size_{axis}": float(value) for axis, value in zip("xyz", high - low, strict=True)}
     if entry.symmetries_discrete:
-        info["symmetries_discrete"] = [_in_millimeters(matrix) for matrix in entry.symmetries_discrete]
+        info["symmetries_discrete"] = [_to_millimeters(matrix) for matrix in entry.symmetries_discrete]
     if entry.symmetries_continuous:
         info["symmetries_continuous"] = [
             {"axis": list(axis), "offset": [MILLIMETERS * value for value in offset]} for axis, offset in entry.symmetries_continuous
@@ -105,11 +105,13 @@ def model_info(entry: CatalogEntry) -> dict[str, Any]:
     return info
 
 
-def _in_millimeters(matrix: tuple[float, ...]) -> list[float]:
+def _to_millimeters(matrix: tuple[float, ...]) -> list[float]:
+    """Scale the translation of a row-major 4 x 4 matrix."""
     return [MILLIMETERS * value if index in (3, 7, 11) else value for index, value in enumerate(matrix)]
 
 
-def _original_info(entry: CatalogEntry) -> dict[str, Any] | None:
+def _read_source_info(entry: CatalogEntry) -> dict[str, Any] | None:
+    """The object's entry in the models_info.json beside its source file; None: there is none."""
     path = entry.source.parent / "models_info.json" if entry.source else None
     if path is None or not path.is_file():
         return None
@@ -117,6 +119,7 @@ def _original_info(entry: CatalogEntry) -> dict[str, Any] | None:
 
 
 def _copy_model(source: Path, path: Path) -> None:
+    """Copy a PLY file and the texture that its header names."""
     shutil.copyfile(source, path)
     with source.open("rb") as file:
         for line in file:
@@ -130,8 +133,8 @@ def _copy_model(source: Path, path: Path) -> None:
                 return
 
 
-def _colored(material: Material) -> np.ndarray:
-    """The texture times the base colour, which BOP has no place for."""
+def _tint_texture(material: Material) -> np.ndarray:
+    """Multiply the texture by the base colour in linear light, as BOP's models have no base colour besides a texture."""
     assert material.texture is not None
     if all(value == 1.0 for value in material.color):
         return material.texture
@@ -141,16 +144,16 @@ def _colored(material: Material) -> np.ndarray:
 
 
 def _to_linear(value: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1."""
+    """sRGB to linear (IEC 61966-2-1)."""
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
 
 
 def _to_srgb(value: np.ndarray) -> np.ndarray:
-    """IEC 61966-2-1."""
+    """Linear to sRGB (IEC 61966-2-1)."""
     return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
-def _camera_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
+def _make_camera_file(camera: Camera, depth_scale: float) -> dict[str, Any]:
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     return {"width": camera.width, "height": camera.height, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": depth_scale}
 
@@ -159,7 +162,8 @@ def _write_json(path: Path, content: object) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
 
 
-def _notes(config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
+def describe_dataset(config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
+    """Text of dataset_info.md: conventions of the ground truth, and the objects."""
     camera, count = cameras[0], len(cameras)
     period = config.physics.step * config.physics.steps_per_tick
     objects = "\n".join(f"| {entry.obj_id} | {entry.name} | {entry.mass:g} |" for entry in catalog.entries)

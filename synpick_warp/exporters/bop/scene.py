@@ -1,4 +1,4 @@
-"""Scenes as BOP has them: a view's records put together into the files of a scene, and the scene moved into place.
+"""Scene folders of BOP: assemble the JSON files of a scene from the annotation blocks of its views, and commit the scene.
 
 Runs in writer processes, so it imports neither Warp nor Newton.
 """
@@ -19,76 +19,78 @@ from synpick_warp.exporters.bop.view import ANNOTATIONS
 from synpick_warp.exporters.writing.files import sync_folder
 
 DATE = "1970-01-01 00:00:00"
-"""Where COCO asks for a date: constant, so that the same seed gives the same bytes."""
+"""Value of COCO's date fields: constant, so that the same seed gives the same bytes."""
 
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """What all scenes share."""
+    """Settings common to all scenes of an episode."""
 
     split: str
+    """Name of the split's folder."""
     frames: int
-    """Frames that each scene must have."""
+    """Number of frames that each scene must have."""
     width: int
     height: int
     color_suffix: str
     coco: bool
     object_ids: tuple[int, ...]
-    """Every object that may come."""
+    """obj_id of every object of the catalog."""
 
 
-def make_scene(scene: Path, masks: bool, layers: tuple[str, ...]) -> None:
-    """Make the folders of a scene that is not whole yet."""
+def create_scene_folders(scene: Path, masks: bool, layers: tuple[str, ...]) -> None:
+    """Create the staging folder of a scene, with a subfolder for each image type."""
     scene.mkdir()
     for name in ("rgb", "depth", *(("mask", "mask_visib") if masks else ()), *layers):
         (scene / name).mkdir()
 
 
-def finish_episode(scenes: tuple[tuple[Path, Path], ...], settings: SceneSettings) -> None:
-    """Complete an episode's scenes, and move each from its hidden folder to its place: (from, to).
+def commit_scenes(scenes: tuple[tuple[Path, Path], ...], settings: SceneSettings) -> None:
+    """Task: complete an episode's scenes, and rename each from its staging folder to its place: (from, to).
 
-    JSON files and folder entries are on the disk before the move. Pictures are in the system's cache at least: they survive
-    the end of this process, whatever ends it.
+    JSON files and folder entries are synced to disk before the rename. Images are at least in the page cache: they survive the end
+    of this process, but not necessarily a power cut.
     """
     for scene, _ in scenes:
-        _finish_scene(scene, settings)
+        _complete_scene(scene, settings)
     for scene, place in scenes:
         scene.rename(place)
     for folder in {place.parent for _, place in scenes}:
         sync_folder(folder)
 
 
-def drop_scenes(scenes: tuple[Path, ...]) -> None:
-    """Remove scenes that will not be delivered."""
+def discard_scenes(scenes: tuple[Path, ...]) -> None:
+    """Task: remove the staging folders of a discarded arrangement."""
     for scene in scenes:
         shutil.rmtree(scene)
 
 
-def _finish_scene(scene: Path, settings: SceneSettings) -> None:
+def _complete_scene(scene: Path, settings: SceneSettings) -> None:
     with (scene / ANNOTATIONS).open("rb") as file:
-        records = _Records(file)
-        if records.frames != list(range(settings.frames)):
+        blocks = _AnnotationBlocks(file)
+        if blocks.frames != list(range(settings.frames)):
             raise OutputError(
-                f"{scene} has {len(records.frames)} of {settings.frames} frames; this is an error of synpick-warp, please report it"
+                f"{scene} has {len(blocks.frames)} of {settings.frames} frames; this is an error of synpick-warp, please report it"
             )
         names = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
-        for record, name in enumerate(names):
-            _write_lines(scene / name, _keyed(records, record))
+        for index, name in enumerate(names):
+            _write_lines(scene / name, _format_keyed(blocks, index))
         if settings.coco:
-            _write_lines(scene / "scene_gt_coco.json", _coco(records, len(names), settings))
+            _write_lines(scene / "scene_gt_coco.json", _format_coco(blocks, len(names), settings))
     (scene / ANNOTATIONS).unlink()
     for folder in (*(entry for entry in sorted(scene.iterdir()) if entry.is_dir()), scene):
         sync_folder(folder)
 
 
-class _Records:
-    """A file of `annotation_block`s, read by frame and record: whole, they would fill the memory."""
+class _AnnotationBlocks:
+    """Random access by frame to a file of `annotation_block`s, which may be too large for the memory."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
         self.frames: list[int] = []
-        """Of each block, sorted."""
+        """Frame of each block, sorted."""
         self._places: dict[int, list[tuple[int, int]]] = {}
+        """Frame -> (offset, size) of each entry [B]."""
         while head := file.readline():
             frame, *sizes = map(int, head.split())
             *begins, end = itertools.accumulate((size + 1 for size in sizes), initial=file.tell())
@@ -97,23 +99,24 @@ class _Records:
             file.seek(end)
         self.frames.sort()
 
-    def texts(self, frame: int, begin: int, end: int | None) -> Iterator[str]:
-        """Records `begin` to `end`, exclusive, of a frame."""
+    def read(self, frame: int, begin: int, end: int | None) -> Iterator[str]:
+        """Read entries `begin` to `end`, exclusive, of a frame."""
         for offset, size in self._places[frame][begin:end]:
             self._file.seek(offset)
             yield self._file.read(size).decode("ascii")
 
 
-def _keyed(records: _Records, record: int) -> Iterator[str]:
-    """One entry a view: `"frame": record`."""
+def _format_keyed(blocks: _AnnotationBlocks, index: int) -> Iterator[str]:
+    """Format entry `index` of all views as a JSON object with a key for each frame."""
     yield "{\n"
-    for index, frame in enumerate(records.frames):
-        (text,) = records.texts(frame, record, record + 1)
-        yield ("" if index == 0 else ",\n") + f'  "{frame}": {text}'
+    for position, frame in enumerate(blocks.frames):
+        (text,) = blocks.read(frame, index, index + 1)
+        yield ("" if position == 0 else ",\n") + f'  "{frame}": {text}'
     yield "\n}\n"
 
 
-def _coco(records: _Records, first: int, settings: SceneSettings) -> Iterator[str]:
+def _format_coco(blocks: _AnnotationBlocks, first: int, settings: SceneSettings) -> Iterator[str]:
+    """Format scene_gt_coco.json; the views' annotations are their entries from `first` on, and get their ids here, from 1."""
     head = {
         "info": {
             "description": f"synpick_{settings.split}",
@@ -125,14 +128,14 @@ def _coco(records: _Records, first: int, settings: SceneSettings) -> Iterator[st
         },
         "licenses": [{"id": 1, "name": "as of the models", "url": ""}],
         "categories": [{"id": obj_id, "name": str(obj_id), "supercategory": "synpick"} for obj_id in settings.object_ids],
-        "images": [_coco_image(frame, settings) for frame in records.frames],
+        "images": [_coco_image(frame, settings) for frame in blocks.frames],
     }
     yield json.dumps(head)[:-1] + ', "annotations": [\n'
-    number = 0
-    for frame in records.frames:
-        for text in records.texts(frame, first, None):
-            number += 1
-            yield ("" if number == 1 else ",\n") + f'{{"id": {number}, {text[1:]}'
+    annotation_id = 0
+    for frame in blocks.frames:
+        for text in blocks.read(frame, first, None):
+            annotation_id += 1
+            yield ("" if annotation_id == 1 else ",\n") + f'{{"id": {annotation_id}, {text[1:]}'
     yield "\n]}\n"
 
 

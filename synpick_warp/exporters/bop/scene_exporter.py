@@ -1,4 +1,4 @@
-"""What exporters of BOP's scenes share: one scene a camera and episode, a task a view, and episodes that are whole or not there."""
+"""Base class of BOP exporters: one scene per camera and episode, one task per view, staged and committed as a whole."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Bop, Config
 from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.exporters.base import ExportContext, view_bytes
-from synpick_warp.exporters.bop.models import write_constants
-from synpick_warp.exporters.bop.scene import drop_scenes
-from synpick_warp.exporters.bop.view import ViewSettings, make_view_task, shared_record
+from synpick_warp.exporters.bop.models import describe_dataset, write_constants
+from synpick_warp.exporters.bop.scene import discard_scenes
+from synpick_warp.exporters.bop.view import ViewSettings, make_camera_constants, make_view_task
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
@@ -26,62 +26,62 @@ class _Episode:
     """An arrangement of an episode whose files are being written."""
 
     scenes: tuple[Path, ...]
-    """Hidden folder of each camera's scene."""
+    """Staging folder of each camera's scene."""
     pending: int = 0
-    """Views and layers of views that are not on the disk yet."""
+    """Number of unfinished tasks: views and layers of views."""
     end: EpisodeEnd | None = None
-    whole: Callable[[], None] | None = None
-    """Comes with the end."""
+    on_committed: Callable[[], None] | None = None
+    """Set together with `end`."""
 
 
 class SceneExporter(ABC):
-    """An `Exporter`. Camera c of episode k becomes scene `cameras · k + c`.
+    """Base of the `Exporter`s of BOP. Camera c of episode k is scene `cameras · k + c`.
 
-    A scene grows in a hidden folder, and moves to its place when it is whole: if the bake is killed, whole scenes stay.
+    A scene is staged in a hidden folder and renamed to its place when it is complete: a killed bake leaves complete scenes only.
     """
 
     needs_physics = False
     needs_views = True
-    hidden: ClassVar[str]
-    """Folder in `PARTIAL`."""
+    staging: ClassVar[str]
+    """Name of the format's folder in `PARTIAL`."""
     write_view: ClassVar[Callable[..., None]]
-    """Task that writes a view: the arrays of `make_view_task`, hidden folder of the scene, `ViewSettings`, `ViewTruth`."""
+    """Task that writes a view: the arrays of `make_view_task`, staging folder of the scene, `ViewSettings`, `ViewTruth`."""
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
-        config = context.config.bop
+        config, bop = context.config, context.config.bop
         self._context = context
         self._out = context.out
-        self._config = config
+        self._bop = bop
         self._cameras = context.cameras
         self._pool = context.pool
-        self._split = self._out / self.split(context.config)
-        self._suffix = f".{config.color_format}"
-        self._layers = context.config.render.layers
-        effects = tuple(name for name, strengths in effect_ranges(context.config.effects).items() if any(strengths))
+        self._split = self._out / self.split(bop)
+        self._suffix = f".{bop.color_format}"
+        self._layers = config.render.layers
+        effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
         self._views = tuple(
-            ViewSettings(self._suffix, config.jpeg_quality, effects, config.masks, config.coco, shared_record(camera, config.depth_scale))
+            ViewSettings(self._suffix, bop.jpeg_quality, effects, bop.masks, bop.coco, make_camera_constants(camera, bop.depth_scale))
             for camera in context.cameras
         )
         self._episodes: dict[int, _Episode] = {}
-        self._begun = 0
+        self._arrangements = 0
 
     @staticmethod
     @abstractmethod
-    def split(config: Config) -> str:
-        """Name of the folder of all scenes in the data set."""
+    def split(bop: Bop) -> str:
+        """Name of the folder that holds all scenes of the data set."""
 
     @abstractmethod
-    def _make_scene(self, scene: Path) -> None:
-        """Make the hidden folder of a scene, and folders in it."""
+    def _stage_scene(self, scene: Path) -> None:
+        """Create the staging folder of a scene, and its subfolders."""
 
     @abstractmethod
-    def _layer_task(self, scene: Path, number: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        """The task, function and further arguments, that writes a view's layer: hidden folder of the scene, its number, layer, frame."""
+    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        """Task that writes a layer of a view: its function, and the arguments after the image."""
 
     @abstractmethod
-    def _finish_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        """The task, function and arguments, that moves whole scenes of so many frames to their places: hidden folders and scene numbers."""
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        """Task that completes scenes of `frames` frames, given as (staging folder, scene_id), and moves them to their places."""
 
     @abstractmethod
     def files(self, episode: int) -> list[Path]:
@@ -94,43 +94,45 @@ class SceneExporter(ABC):
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: models, camera and notes."""
+        context = self._context
         try:
             self._split.mkdir(exist_ok=True)
-            return write_constants(self._out, self._context.config, self._context.catalog, self._cameras)
+            notes = describe_dataset(context.config, context.catalog, self._cameras)
+            return write_constants(self._out, context.catalog, self._cameras[0], self._bop.depth_scale, notes)
         except OSError as error:
             raise output_error(self._out, error) from error
 
     def write_views(self, batch: FrameBatch) -> None:
         """See `Exporter`."""
-        self._pool.submit_all(self._orders(batch))
+        self._pool.submit_all(self._make_tasks(batch))
 
-    def _orders(self, batch: FrameBatch) -> Iterator[WriteTask]:
-        """A task for each view, and for each of its layers."""
+    def _make_tasks(self, batch: FrameBatch) -> Iterator[WriteTask]:
+        """One task for each view, and one for each of its layers."""
         for view in range(len(batch)):
-            number, camera = int(batch.episode[view]), int(batch.camera[view])
-            episode = self._episodes.get(number) or self._begin(number)
+            index, camera = int(batch.episode[view]), int(batch.camera[view])
+            episode = self._episodes.get(index) or self._stage_episode(index)
             scene = episode.scenes[camera]
-            images, truth = make_view_task(batch, view, self.scene_id(number, camera), self._views[camera])
+            images, truth = make_view_task(batch, view, self.scene_id(index, camera), self._views[camera])
             tasks = [(type(self).write_view, images, (scene, self._views[camera], truth))]
             for name in self._layers:
                 function, arguments = self._layer_task(scene, truth.scene, name, truth.frame)
                 tasks.append((function, (batch.layers[name][view],), arguments))
             episode.pending += len(tasks)
             for function, arrays, arguments in tasks:
-                yield WriteTask(function, arrays, arguments, self._split / scene.name, partial(self._part_done, number, episode))
+                yield WriteTask(function, arrays, arguments, self._split / scene.name, partial(self._task_done, index, episode))
 
     def write_ticks(self, batch: TickBatch) -> None:
-        """See `Exporter`: what BOP has of a tick comes with its views."""
+        """See `Exporter`. BOP takes everything from the views."""
         return
 
-    def end_episode(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
+    def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """See `Exporter`."""
         episode = self._episodes.pop(end.episode, None)
         if episode is None:
-            whole()
+            on_committed()
         else:
-            episode.end, episode.whole = end, whole
-            self._finish_if_whole(end.episode, episode)
+            episode.end, episode.on_committed = end, on_committed
+            self._commit_if_complete(end.episode, episode)
         self._pool.poll()
 
     def close(self) -> None:
@@ -142,34 +144,34 @@ class SceneExporter(ABC):
         self._episodes.clear()
 
     def scene_id(self, episode: int, camera: int) -> int:
-        """Number of the scene that a camera sees of an episode."""
+        """BOP scene_id of an episode as seen by a camera."""
         return len(self._cameras) * episode + camera
 
-    def _begin(self, number: int) -> _Episode:
-        # A number of its own for every arrangement: the last one's folders may not be removed yet.
-        self._begun += 1
-        hidden = self._out / PARTIAL / self.hidden
-        names = (f"{self.scene_id(number, camera):06d}-{self._begun}" for camera in range(len(self._cameras)))
-        episode = _Episode(tuple(hidden / name for name in names))
+    def _stage_episode(self, index: int) -> _Episode:
+        # A suffix unique to each arrangement: the discarded one's folders may not be removed yet.
+        self._arrangements += 1
+        staging = self._out / PARTIAL / self.staging
+        names = (f"{self.scene_id(index, camera):06d}-{self._arrangements}" for camera in range(len(self._cameras)))
+        episode = _Episode(tuple(staging / name for name in names))
         try:
-            hidden.mkdir(exist_ok=True)
+            staging.mkdir(exist_ok=True)
             for scene in episode.scenes:
-                self._make_scene(scene)
+                self._stage_scene(scene)
         except OSError as error:
             raise output_error(episode.scenes[0], error) from error
-        self._episodes[number] = episode
+        self._episodes[index] = episode
         return episode
 
-    def _part_done(self, number: int, episode: _Episode) -> None:
+    def _task_done(self, index: int, episode: _Episode) -> None:
         episode.pending -= 1
-        self._finish_if_whole(number, episode)
+        self._commit_if_complete(index, episode)
 
-    def _finish_if_whole(self, number: int, episode: _Episode) -> None:
+    def _commit_if_complete(self, index: int, episode: _Episode) -> None:
         if episode.end is None or episode.pending:
             return
         if Ending(episode.end.ending).delivers:
-            scenes = tuple((scene, self.scene_id(number, camera)) for camera, scene in enumerate(episode.scenes))
-            function, arguments = self._finish_task(scenes, episode.end.frames)
+            scenes = tuple((scene, self.scene_id(index, camera)) for camera, scene in enumerate(episode.scenes))
+            function, arguments = self._commit_task(scenes, episode.end.frames)
         else:
-            function, arguments = drop_scenes, (episode.scenes,)
-        self._pool.submit(function, (), arguments, path=self._split / f"{self.scene_id(number, 0):06d}", on_done=episode.whole)
+            function, arguments = discard_scenes, (episode.scenes,)
+        self._pool.submit(function, (), arguments, path=self._split / f"{self.scene_id(index, 0):06d}", on_done=episode.on_committed)

@@ -1,4 +1,4 @@
-"""The lists of evaluation targets, from the whole scenes of a split: what an evaluation asks of every image."""
+"""Evaluation target lists of BOP (test_targets_bop19.json, test_targets_bop24.json), from the committed scenes of a split."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ BOP19, BOP24 = "test_targets_bop19.json", "test_targets_bop24.json"
 
 
 def write_scene_targets(scene: Path, folder: Path, visibility: float) -> None:
-    """Write a scene's targets, one a line, to `folder/<file name>/<scene name>`; the folders are there.
+    """Task: write a scene's targets, one per line, to `folder/<file name>/<scene name>`; the folders must exist.
 
-    BOP19: for each image and object, how many instances are visible by at least the share `visibility`. BOP24: each image.
+    BOP19: for each image and object, the number of instances whose visible fraction is at least `visibility`. BOP24: every image.
     """
     truth = json.loads((scene / "scene_gt.json").read_bytes())
     infos = json.loads((scene / "scene_gt_info.json").read_bytes())
     scene_id = int(scene.name)
     localize, detect = [], []
     for frame in sorted(truth, key=int):
-        seen = Counter(
-            record["obj_id"] for record, info in zip(truth[frame], infos[frame], strict=True) if info["visib_fract"] >= visibility
+        visible = Counter(
+            entry["obj_id"] for entry, info in zip(truth[frame], infos[frame], strict=True) if info["visib_fract"] >= visibility
         )
-        place = {"im_id": int(frame)}
-        localize += [{**place, "inst_count": count, "obj_id": obj_id, "scene_id": scene_id} for obj_id, count in sorted(seen.items())]
-        detect.append({**place, "scene_id": scene_id})
+        image = {"im_id": int(frame)}
+        localize += [{**image, "inst_count": count, "obj_id": obj_id, "scene_id": scene_id} for obj_id, count in sorted(visible.items())]
+        detect.append({**image, "scene_id": scene_id})
     for name, targets in ((BOP19, localize), (BOP24, detect)):
         (folder / name / scene.name).write_text("".join(json.dumps(target) + "\n" for target in targets), encoding="ascii")
 
 
-def join_targets(folder: Path, out: Path) -> None:
-    """Join what `write_scene_targets` left into the data set's two files."""
+def concatenate_targets(folder: Path, out: Path) -> None:
+    """Concatenate the parts that `write_scene_targets` wrote into the data set's two files, in order of scenes."""
     for name in (BOP19, BOP24):
         parts = sorted((folder / name).iterdir(), key=lambda path: int(path.name))
         lines = [line for part in parts for line in part.read_bytes().splitlines()]

@@ -1,6 +1,6 @@
-"""One view as BOP has it: its picture files, and its records of camera, poses, counts and boxes.
+"""One view in BOP format: image files, and annotations (camera, poses, pixel counts, boxes, COCO masks).
 
-Runs in writer processes, so it imports neither Warp nor Newton. Millimetres exist in the BOP exporter alone.
+Runs in writer processes, so it imports neither Warp nor Newton. Only the BOP exporter uses millimetres.
 """
 
 from __future__ import annotations
@@ -22,81 +22,86 @@ from synpick_warp.frames import FrameBatch
 from synpick_warp.layer_codec import encode_layer, layer_path
 from synpick_warp.scenes.types import Camera
 
-ANNOTATIONS = "records"
-"""File of views' records, in a scene that is not whole yet, in the order in which they came; see `annotation_block`. It is one file, not
-one a view, because ext4 without a journal walks over the inodes that were freed in the last minutes whenever it makes a file.
+ANNOTATIONS = "annotations"
+"""Spool file of a staged scene: the annotation blocks of its views, in order of arrival; see `annotation_block`.
+
+One file instead of one per view, because ext4 without a journal scans the inodes freed in the last minutes whenever it creates a file.
 """
 MILLIMETERS = 1000.0
-"""In a metre."""
+"""Millimetres per metre."""
 IGNORE_VISIBILITY = 0.1
-"""COCO annotations less visible are to be ignored (the toolkit's calc_gt_coco.py)."""
+"""COCO annotations with a lower visible fraction are marked `ignore` (the toolkit's calc_gt_coco.py)."""
 NO_BOX = [-1, -1, -1, -1]
-"""What the toolkit writes for an instance of which nothing is visible (calc_gt_info.py)."""
+"""The toolkit's box of an instance without visible pixels (calc_gt_info.py)."""
 _ALL, _VALID, _VISIBLE = 0, 1, 2
 """Columns of `FrameBatch.pixels`."""
-_WHOLE, _SEEN = 0, 1
+_AMODAL_BOX, _VISIBLE_BOX = 0, 1
 """Rows of `FrameBatch.boxes`."""
 _DIGITS = 6
-"""Decimal places of what is told of light and camera."""
+"""Decimal places of light and camera-effect parameters."""
 JPEG_QUALITY = "jpeg_quality"
-"""The `Effect` that is the writer's to make."""
+"""The camera effect (see `Effect`) that the writer applies."""
 
 
 @dataclass(frozen=True)
 class ViewSettings:
-    """What all views of a camera share."""
+    """Settings common to all views of a camera."""
 
     color_suffix: str
+    """.jpg or .png."""
     jpeg_quality: int
-    """Unless the view has its own, see `effects`."""
+    """Default; a view has its own if `effects` names JPEG quality."""
     effects: tuple[str, ...]
-    """The effects that are on."""
+    """Names of the active camera effects."""
     masks: bool
+    """Whether mask files are written."""
     coco: bool
+    """Whether COCO annotations are written."""
     camera: dict[str, Any]
-    """What all views' records in scene_camera.json share."""
+    """Constant part of the views' entries in scene_camera.json."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewTruth:
-    """Ground truth of a view: its row of `FrameBatch`, of instances that exist."""
+    """Ground truth of a view: its row of `FrameBatch`, reduced to the `N` instances that are in the scene."""
 
     scene: int
-    """Number of the scene."""
+    """BOP scene_id."""
     frame: int
+    """BOP im_id."""
     jpeg_quality: int
-    circumstances: dict[str, Any]
-    """What the view adds to its record in scene_camera.json."""
+    extras: dict[str, Any]
+    """Keys of this view's entry in scene_camera.json besides the camera: light and camera effects."""
     instance_id: np.ndarray
     """(N)"""
     object_id: np.ndarray
     """(N)"""
     pose: np.ndarray
-    """(N, 7)"""
+    """Object-to-world poses (N, 7) [m]."""
     pixels: np.ndarray
-    """(N, 3)"""
+    """Pixel counts (N, 3)."""
     boxes: np.ndarray
-    """(N, 2, 4)"""
+    """Amodal and visible boxes (N, 2, 4) [px]."""
     listed: bool
-    """The last two arrays of the view's task are lists of run boundaries, not images."""
+    """Whether the mask sources of the view's task are lists of run boundaries (True) or image crops (False)."""
     top: int
-    """Row of the picture with which these images begin."""
+    """First row of the crops."""
     left: int
-    """Column of the picture with which they begin."""
+    """First column of the crops."""
 
 
 @dataclass(frozen=True, eq=False)
 class Masks:
-    """Of one instance."""
+    """The two masks of an instance, both clipped to the image."""
 
-    whole: Runs
-    """Its silhouette, hidden or not, inside the picture."""
-    seen: Runs
-    """Its visible part."""
+    amodal: Runs
+    """Silhouette, including hidden parts."""
+    visible: Runs
+    """Visible (modal) part."""
 
 
-def shared_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
-    """What the entries of all views of a camera in scene_camera.json share."""
+def make_camera_constants(camera: Camera, depth_scale: float) -> dict[str, Any]:
+    """Constant part of a camera's entries in scene_camera.json."""
     return {
         "cam_K": camera.matrix.ravel().tolist(),
         "cam_R_w2c": camera.rotation.ravel().tolist(),
@@ -106,20 +111,22 @@ def shared_record(camera: Camera, depth_scale: float) -> dict[str, Any]:
 
 
 def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSettings) -> tuple[tuple[np.ndarray, ...], ViewTruth]:
-    """What a task on one view needs: color, depth, two arrays that hold where masks begin and end, and the truth.
+    """Collect the inputs of the task that writes a view.
 
-    The two are the lists of run boundaries of the images instance and amodal, or else the images themselves, cut to where objects are.
+    Returns:
+        Images color, depth, and two mask sources, of visible and of amodal masks: the device's run boundaries of the images `instance`
+        and `amodal`, or, if these lists are incomplete or larger, the images themselves, cropped to the objects. And the ground truth.
     """
     present = np.flatnonzero(batch.object_id[view] >= 0)
     boxes = batch.boxes[view][present]
-    boundaries = _boundaries(batch, view)
-    rows, columns = (slice(0, 0), slice(0, 0)) if boundaries else _shown(boxes, *batch.depth.shape[1:])
-    strengths: dict[str, float] = dict(zip(names(Effect), batch.effects[view].tolist(), strict=True))
+    boundaries = _select_boundaries(batch, view)
+    rows, columns = (slice(0, 0), slice(0, 0)) if boundaries else _crop_to_boxes(boxes, *batch.depth.shape[1:])
+    parameters: dict[str, float] = dict(zip(names(Effect), batch.effects[view].tolist(), strict=True))
     truth = ViewTruth(
         scene=scene,
         frame=int(batch.frame[view]),
-        jpeg_quality=round(strengths[JPEG_QUALITY]) if JPEG_QUALITY in settings.effects else settings.jpeg_quality,
-        circumstances=_circumstances(batch, view, {name: strengths[name] for name in settings.effects}),
+        jpeg_quality=round(parameters[JPEG_QUALITY]) if JPEG_QUALITY in settings.effects else settings.jpeg_quality,
+        extras=_make_extras(batch, view, {name: parameters[name] for name in settings.effects}),
         instance_id=present,
         object_id=batch.object_id[view][present],
         pose=batch.pose[view][present],
@@ -129,12 +136,12 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
         top=rows.start,
         left=columns.start,
     )
-    masks = boundaries or tuple(image[view, rows, columns] for image in (batch.instance, batch.amodal))
-    return (batch.color[view], batch.depth[view], *masks), truth
+    sources = boundaries or tuple(image[view, rows, columns] for image in (batch.instance, batch.amodal))
+    return (batch.color[view], batch.depth[view], *sources), truth
 
 
-def _circumstances(batch: FrameBatch, view: int, effects: dict[str, float]) -> dict[str, Any]:
-    """A view's light, and what its camera did to colour if that is anything, for scene_camera.json."""
+def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dict[str, Any]:
+    """Extra keys of a view's entry in scene_camera.json: light, and camera effects if any are active."""
     direction = batch.light_direction[view]
     light = {
         "map": str(batch.light_name[view]),
@@ -145,8 +152,8 @@ def _circumstances(batch: FrameBatch, view: int, effects: dict[str, float]) -> d
     return {"light": light} | ({"effects": {name: round(value, _DIGITS) for name, value in effects.items()}} if effects else {})
 
 
-def _boundaries(batch: FrameBatch, view: int) -> tuple[np.ndarray, ...]:
-    """Lists of the run boundaries of instance and amodal, if they are there, complete, and not larger than the images."""
+def _select_boundaries(batch: FrameBatch, view: int) -> tuple[np.ndarray, ...]:
+    """Run boundaries of `instance` and `amodal`; empty unless both lists are present, complete, and no larger than the images."""
     if batch.boundaries is None or batch.boundary_count is None or (batch.boundary_count[view] > batch.boundaries.shape[-1]).any():
         return ()
     counts = batch.boundary_count[view].tolist()
@@ -155,98 +162,104 @@ def _boundaries(batch: FrameBatch, view: int) -> tuple[np.ndarray, ...]:
     return lists if all(packed.nbytes <= image.nbytes for packed, image in zip(lists, images, strict=True)) else ()
 
 
-def _shown(boxes: np.ndarray, height: int, width: int) -> tuple[slice, slice]:
-    """Rows and columns of the picture that hold what all boxes (N, 2, 4) hold of it."""
-    whole = boxes[:, _WHOLE][boxes[:, _WHOLE, 2] >= boxes[:, _WHOLE, 0]]
-    left, top = (min(max(int(whole[:, edge].min(initial=size)), 0), size) for edge, size in ((0, width), (1, height)))
-    right, bottom = (min(1 + int(whole[:, edge].max(initial=-1)), size) for edge, size in ((2, width), (3, height)))
+def _crop_to_boxes(boxes: np.ndarray, height: int, width: int) -> tuple[slice, slice]:
+    """Smallest crop (rows, columns) of the image that contains the in-image part of all boxes (N, 2, 4)."""
+    amodal = boxes[:, _AMODAL_BOX][boxes[:, _AMODAL_BOX, 2] >= boxes[:, _AMODAL_BOX, 0]]
+    left, top = (min(max(int(amodal[:, side].min(initial=size)), 0), size) for side, size in ((0, width), (1, height)))
+    right, bottom = (min(1 + int(amodal[:, side].max(initial=-1)), size) for side, size in ((2, width), (3, height)))
     return slice(top, max(top, bottom)), slice(left, max(left, right))
 
 
-def extract_masks(first: np.ndarray, second: np.ndarray, truth: ViewTruth, height: int) -> list[Masks]:
-    """Masks of all instances, in their order, from the last two arrays of `make_view_task`."""
-    seen, whole = (
-        unpack_run_boundaries(array, height) if truth.listed else find_run_boundaries(array, truth.top, truth.left)
-        for array in (first, second)
+def extract_masks(visible_source: np.ndarray, amodal_source: np.ndarray, truth: ViewTruth, height: int) -> list[Masks]:
+    """Extract the masks of all instances, in their order, from the two mask sources of `make_view_task`."""
+    visible, amodal = (
+        unpack_run_boundaries(source, height) if truth.listed else find_run_boundaries(source, truth.top, truth.left)
+        for source in (visible_source, amodal_source)
     )
-    return [Masks(whole.runs_with(number), seen.runs_of(1 + number)) for number in truth.instance_id.tolist()]
+    return [Masks(amodal.runs_with(index), visible.runs_of(1 + index)) for index in truth.instance_id.tolist()]
 
 
 def write_view(
-    color: np.ndarray, depth: np.ndarray, first: np.ndarray, second: np.ndarray, scene: Path, settings: ViewSettings, truth: ViewTruth
+    color: np.ndarray,
+    depth: np.ndarray,
+    visible_source: np.ndarray,
+    amodal_source: np.ndarray,
+    scene: Path,
+    settings: ViewSettings,
+    truth: ViewTruth,
 ) -> None:
-    """Write what `make_view_task` gave: pictures into the folders of a scene, and records into `ANNOTATIONS`.
+    """Task: write a view's images into the folders of a staged scene, and append its annotation block to `ANNOTATIONS`.
 
-    Lines: scene_camera, scene_gt, scene_gt_info, then one COCO annotation each, without its id.
+    The block holds the entries of scene_camera, scene_gt and scene_gt_info, then the COCO annotations, without their ids.
     """
     name = f"{truth.frame:06d}"
     height, width = depth.shape
     with open_folder(scene) as folder:
         folder.write(f"rgb/{name}{settings.color_suffix}", encode_color(color, settings, truth.jpeg_quality))
         folder.write(f"depth/{name}.png", encode_png(depth))
-        masks = extract_masks(first, second, truth, height) if settings.masks or settings.coco else []
+        masks = extract_masks(visible_source, amodal_source, truth, height) if settings.masks or settings.coco else []
         if settings.masks:
             for index, mask in enumerate(masks):
-                whole, seen = encode_masks(mask, height, width)
-                folder.write(f"mask/{name}_{index:06d}.png", whole)
-                folder.write(f"mask_visib/{name}_{index:06d}.png", seen)
-        infos = info_records(truth)
-        lines = [camera_record(truth, settings), gt_records(truth, settings.camera), infos]
+                amodal, visible = encode_masks(mask, height, width)
+                folder.write(f"mask/{name}_{index:06d}.png", amodal)
+                folder.write(f"mask_visib/{name}_{index:06d}.png", visible)
+        infos = make_gt_info_entries(truth)
+        entries = [make_camera_entry(truth, settings), make_gt_entries(truth, settings.camera), infos]
         if settings.coco:
-            lines += coco_records(truth, infos, masks, height, width)
-        folder.append(ANNOTATIONS, annotation_block(truth.frame, map(to_json, lines)))
+            entries += make_coco_annotations(truth, infos, masks, height, width)
+        folder.append(ANNOTATIONS, annotation_block(truth.frame, map(to_json, entries)))
 
 
-def annotation_block(frame: int, records: Iterable[bytes]) -> bytes:
-    """A view's records as `ANNOTATIONS` has them: a line with the frame and the length of each record [B], then the records, one a line."""
-    lines = tuple(records)
+def annotation_block(frame: int, entries: Iterable[bytes]) -> bytes:
+    """Format a view's block of `ANNOTATIONS`: a header line with the frame and the length of each entry [B], then one entry per line."""
+    lines = tuple(entries)
     return b"\n".join((b" ".join(b"%d" % number for number in (frame, *map(len, lines))), *lines, b""))
 
 
 def write_layer(values: np.ndarray, scene: Path, name: str, frame: int) -> None:
-    """Write a view's layer into the folder of that name."""
+    """Task: write a view's layer into the folder of that name."""
     layer_path(scene, name, frame).write_bytes(encode_png(encode_layer(name, values)))
 
 
 def encode_color(color: np.ndarray, settings: ViewSettings, jpeg_quality: int) -> Buffer:
-    """A picture (H, W, 3) uint8, red first, in the format that the settings name."""
+    """Encode an RGB image (H, W, 3) uint8 in the format that the settings name."""
     if settings.color_suffix == ".png":
         return encode_png(color)
-    done, data = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality))
-    if not done:
-        raise ValueError(f"OpenCV cannot encode a picture of shape {color.shape} as JPEG")
+    encoded, data = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality))
+    if not encoded:
+        raise ValueError(f"OpenCV cannot encode an image of shape {color.shape} as JPEG")
     return data.data
 
 
 def encode_masks(masks: Masks, height: int, width: int) -> tuple[bytes, bytes]:
-    """PNG files of an instance's two masks. Often nothing hides it: then both are the same."""
-    whole = encode_mask_png(masks.whole, height, width)
-    return whole, whole if masks.whole.count == masks.seen.count else encode_mask_png(masks.seen, height, width)
+    """Encode an instance's amodal and visible mask as PNG. They are often equal, as nothing hides the instance; then once."""
+    amodal = encode_mask_png(masks.amodal, height, width)
+    return amodal, amodal if masks.amodal.count == masks.visible.count else encode_mask_png(masks.visible, height, width)
 
 
-def to_json(record: object) -> bytes:
-    """A record in one line of JSON; arrays become lists."""
-    return orjson.dumps(record, option=orjson.OPT_SERIALIZE_NUMPY)
+def to_json(content: object) -> bytes:
+    """Serialise to one line of JSON; arrays become lists."""
+    return orjson.dumps(content, option=orjson.OPT_SERIALIZE_NUMPY)
 
 
-def camera_record(truth: ViewTruth, settings: ViewSettings) -> dict[str, Any]:
-    """A view's entry in scene_camera.json."""
-    return settings.camera | truth.circumstances
+def make_camera_entry(truth: ViewTruth, settings: ViewSettings) -> dict[str, Any]:
+    """The view's entry in scene_camera.json."""
+    return settings.camera | truth.extras
 
 
-def gt_records(truth: ViewTruth, camera: dict[str, Any]) -> list[dict[str, Any]]:
-    """The view's entry in scene_gt.json: model to camera, in float64 from the world pose [mm]."""
+def make_gt_entries(truth: ViewTruth, camera: dict[str, Any]) -> list[dict[str, Any]]:
+    """The view's entry in scene_gt.json: model-to-camera poses [mm], computed in float64 from the world poses."""
     rotation = np.reshape(camera["cam_R_w2c"], (3, 3))
     translation = np.asarray(camera["cam_t_w2c"])
     pose = truth.pose.astype(np.float64)
     model = (rotation @ rotation_matrices(pose[:, 3:])).reshape(-1, 9)
-    place = MILLIMETERS * pose[:, :3] @ rotation.T + translation
-    rows = zip(*(array.tolist() for array in (model, place, truth.object_id, truth.instance_id)), strict=True)
+    position = MILLIMETERS * pose[:, :3] @ rotation.T + translation
+    rows = zip(*(array.tolist() for array in (model, position, truth.object_id, truth.instance_id)), strict=True)
     return [dict(zip(("cam_R_m2c", "cam_t_m2c", "obj_id", "instance_id"), row, strict=True)) for row in rows]
 
 
 def rotation_matrices(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrices (N, 3, 3) of quaternions x, y, z, w (N, 4) float64 of any length but zero."""
+    """Convert quaternions x, y, z, w (N, 4) float64, of any length but zero, to rotation matrices (N, 3, 3)."""
     x, y, z, w = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     rows = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
@@ -256,33 +269,36 @@ def rotation_matrices(quaternion: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def info_records(truth: ViewTruth) -> list[dict[str, Any]]:
+def make_gt_info_entries(truth: ViewTruth) -> list[dict[str, Any]]:
     """The view's entry in scene_gt_info.json. Boxes may exceed the image; a box of one pixel has width and height 0."""
-    return [_info_record(pixels, boxes) for pixels, boxes in zip(truth.pixels.tolist(), truth.boxes.tolist(), strict=True)]
+    return [_make_gt_info(pixels, boxes) for pixels, boxes in zip(truth.pixels.tolist(), truth.boxes.tolist(), strict=True)]
 
 
-def _info_record(pixels: list[int], boxes: list[list[int]]) -> dict[str, Any]:
-    whole, valid, visible = (pixels[column] for column in (_ALL, _VALID, _VISIBLE))
+def _make_gt_info(pixels: list[int], boxes: list[list[int]]) -> dict[str, Any]:
+    total, valid, visible = (pixels[column] for column in (_ALL, _VALID, _VISIBLE))
     return {
-        "bbox_obj": _extent(boxes[_WHOLE]) if visible else NO_BOX,
-        "bbox_visib": _extent(boxes[_SEEN]) if visible else NO_BOX,
-        "px_count_all": whole,
+        "bbox_obj": _bop_box(boxes[_AMODAL_BOX]) if visible else NO_BOX,
+        "bbox_visib": _bop_box(boxes[_VISIBLE_BOX]) if visible else NO_BOX,
+        "px_count_all": total,
         "px_count_valid": valid,
         "px_count_visib": visible,
-        "visib_fract": visible / whole if whole else 0.0,
+        "visib_fract": visible / total if total else 0.0,
     }
 
 
-def _extent(box: list[int]) -> list[int]:
+def _bop_box(box: list[int]) -> list[int]:
+    """x, y, width, height by BOP's convention: width = x_max - x_min, without + 1."""
     x_min, y_min, x_max, y_max = box
     return [x_min, y_min, x_max - x_min, y_max - y_min]
 
 
-def coco_records(truth: ViewTruth, infos: list[dict[str, Any]], masks: list[Masks], height: int, width: int) -> Iterator[dict[str, Any]]:
-    """Annotations of the instances that are visible, without ids: amodal box clipped to the image, visible mask."""
+def make_coco_annotations(
+    truth: ViewTruth, infos: list[dict[str, Any]], masks: list[Masks], height: int, width: int
+) -> Iterator[dict[str, Any]]:
+    """COCO annotations of the visible instances, without ids: amodal box clipped to the image, visible mask."""
     for object_id, info, mask in zip(truth.object_id.tolist(), infos, masks, strict=True):
-        box = mask.whole.box()
-        area = mask.seen.count
+        box = mask.amodal.box()
+        area = mask.visible.count
         if box is not None and area:
             x_min, y_min, x_max, y_max = box
             yield {
@@ -291,13 +307,13 @@ def coco_records(truth: ViewTruth, infos: list[dict[str, Any]], masks: list[Mask
                 "iscrowd": 0,
                 "area": area,
                 "bbox": [x_min, y_min, x_max - x_min + 1, y_max - y_min + 1],
-                "segmentation": run_length_record(mask.seen, height, width),
+                "segmentation": make_rle(mask.visible, height, width),
                 "width": width,
                 "height": height,
                 "ignore": info["visib_fract"] < IGNORE_VISIBILITY,
             }
 
 
-def run_length_record(runs: Runs, height: int, width: int) -> dict[str, Any]:
-    """A mask as COCO's uncompressed run lengths, in which BOP has them as well."""
+def make_rle(runs: Runs, height: int, width: int) -> dict[str, Any]:
+    """A mask as COCO's uncompressed RLE, which BOP uses as well."""
     return {"counts": runs.counts(height, width), "size": [height, width]}

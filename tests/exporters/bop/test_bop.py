@@ -21,7 +21,7 @@ from synpick_warp.configs.sensors import Effects
 from synpick_warp.errors import CatalogError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.models import encode_model, write_models
-from synpick_warp.exporters.bop.scene import SceneSettings, finish_episode, make_scene
+from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
 from synpick_warp.exporters.bop.view import ANNOTATIONS, annotation_block
 from synpick_warp.exporters.writing.files import check_output_folder
 from synpick_warp.exporters.writing.folder import open_folder
@@ -287,17 +287,17 @@ def test_records_come_in_any_order_and_each_frame_once(tmp_path):
     settings = SceneSettings("train_pbr", 3, 4, 3, ".jpg", True, (5,))
     for frames in ((2, 0, 1), (2, 0, 1, 0), (2, 0)):
         scene, place = tmp_path / "hidden", tmp_path / "-".join(map(str, frames))
-        make_scene(scene, True, ())
+        create_scene_folders(scene, True, ())
         with open_folder(scene) as folder:
             for frame in frames:
                 annotations = [b'{"of": %d}' % frame] * frame
                 folder.append(ANNOTATIONS, annotation_block(frame, (b'{"view": %d}' % frame, b"[]", b"[1]", *annotations)))
         if frames != (2, 0, 1):
             with pytest.raises(OutputError, match=f"has {len(frames)} of 3 frames"):
-                finish_episode(((scene, place),), settings)
+                commit_scenes(((scene, place),), settings)
             shutil.rmtree(scene)
             continue
-        finish_episode(((scene, place),), settings)
+        commit_scenes(((scene, place),), settings)
         assert load(place / "scene_camera.json") == {str(frame): {"view": frame} for frame in range(3)}
         assert list(load(place / "scene_gt_info.json").items()) == [(str(frame), [1]) for frame in range(3)]
         assert load(place / "scene_gt_coco.json")["annotations"] == [

@@ -85,7 +85,7 @@ def test_masks_are_the_same_from_lists_and_from_images(device):
             height = batch.depth.shape[1]
             pairs = zip(extract_masks(first, second, truth, height), extract_masks(instance, amodal, plain, height), strict=True)
             for found, expected in pairs:
-                for part in ("whole", "seen"):
+                for part in ("amodal", "visible"):
                     for name in ("column", "first", "past"):
                         np.testing.assert_array_equal(getattr(getattr(found, part), name), getattr(getattr(expected, part), name))
 
