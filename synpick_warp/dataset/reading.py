@@ -251,13 +251,13 @@ class DataSet(Mapping[int, Episode]):
             DatasetError: The data set has no images.
         """
         from synpick_warp.dataset.view_files import SceneFolder, SceneShards
-        from synpick_warp.exporters.bop.shard_parts import shards_of
+        from synpick_warp.exporters.bop.shard_parts import find_shards
 
         scene = self.camera_count * episode + camera
         folder, web = self._splits
         if (folder / f"{scene:06d}").is_dir():
             return SceneFolder(folder / f"{scene:06d}")
-        if shards := list(shards_of(scene, web)):
+        if shards := list(find_shards(scene, web)):
             return SceneShards(shards, scene)
         raise DatasetError(f"{self.folder} has no images of episode {episode}; bake with --formats bop or shards")
 
