@@ -1,1 +1,1 @@
-"""Settings: schema, loading, presets."""
+"""Configuration: schema, presets, loading, validation."""

@@ -1,4 +1,4 @@
-"""Checks one value against its setting: type, length, range, choices."""
+"""Validation of single settings: type, length, range, choices."""
 
 from __future__ import annotations
 
@@ -20,62 +20,62 @@ _NAMES = {
 }
 _BOUNDS = (("above", "above"), ("low", "at least"), ("high", "at most"))
 _SHOWN = 60
-"""Longer values are cut in messages."""
+"""Length to which values are truncated in messages."""
 
 
 class _MismatchError(Exception):
     """The value is not of the setting's type."""
 
 
-def checked(key: str, value: object, item: dataclasses.Field[Any], kind: Any, source: str) -> Any:
-    """Return `value` as the type `kind` of the setting `item`, for instance a list as a tuple.
+def check_value(key: str, value: object, item: dataclasses.Field[Any], annotation: Any, source: str) -> Any:
+    """Validate a value, and convert it to the type of its setting, for instance a list to a tuple.
 
     Args:
-        key: Full name of the setting, for the message.
-        value: As TOML has it.
-        item: Field made by `schema.setting`.
-        kind: The field's resolved annotation.
-        source: Where the value stands, such as "in my.toml".
+        key: Full key of the setting, for messages.
+        value: The value as parsed from TOML.
+        item: The setting's field, declared by `fields.setting`.
+        annotation: The field's resolved type.
+        source: Where the value comes from, for messages, such as "in my.toml".
 
     Raises:
         ConfigError: The value has the wrong type or length, is not finite, or lies outside the setting's range.
     """
     try:
-        result = _converted(value, kind)
+        result = _convert(value, annotation)
     except _MismatchError:
-        raise ConfigError(f"{key} is {shown(value)} {source}; allowed: {describe_kind(kind)}{_unit(item)}") from None
+        raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {describe_type(annotation)}{_unit(item)}") from None
     if not all(_inside(leaf, item) for leaf in _leaves(result)):
         wrong = next(leaf for leaf in _leaves(result) if not _inside(leaf, item))
-        hint = did_you_mean(str(wrong), item.metadata["choices"])
-        raise ConfigError(f"{key} is {shown(value)} {source}; allowed: {allowed(item, kind)}{_unit(item)}{hint}")
+        hint = suggest(str(wrong), item.metadata["choices"])
+        raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {describe_allowed(item, annotation)}{_unit(item)}{hint}")
     return result
 
 
-def allowed(item: dataclasses.Field[Any], kind: Any) -> str:
-    """The range or the choices of a setting in words, or its type if every value of the type will do."""
+def describe_allowed(item: dataclasses.Field[Any], annotation: Any) -> str:
+    """Describe the range or the choices of a setting, or its type if it has neither."""
     rules = item.metadata
     if rules["choices"]:
-        return ("any of " if typing.get_origin(kind) is tuple else "") + ", ".join(rules["choices"])
+        return ("any of " if typing.get_origin(annotation) is tuple else "") + ", ".join(rules["choices"])
     words = [f"{word} {_number(rules[name])}" for name, word in _BOUNDS if rules[name] is not None]
     if not words:
-        return describe_kind(kind)
-    return ("each " if typing.get_origin(kind) is tuple else "") + ", ".join(words)
+        return describe_type(annotation)
+    return ("each " if typing.get_origin(annotation) is tuple else "") + ", ".join(words)
 
 
-def describe_kind(kind: Any, *, plural: bool = False) -> str:
-    """A type in words: "a number", "2 whole numbers", "a list of triples"."""
-    if typing.get_origin(kind) is not tuple:
-        return _NAMES[kind][plural]
-    parts = typing.get_args(kind)
+def describe_type(annotation: Any, *, plural: bool = False) -> str:
+    """Describe a type: "a finite number", "2 whole numbers in a list", "a list of lists of 3 numbers"."""
+    if typing.get_origin(annotation) is not tuple:
+        return _NAMES[annotation][plural]
+    parts = typing.get_args(annotation)
     if parts[-1] is Ellipsis:
-        return f"a list of {describe_kind(parts[0], plural=True)}"
+        return f"a list of {describe_type(parts[0], plural=True)}"
     if plural:
-        return f"lists of {len(parts)} {describe_kind(parts[0], plural=True)}"
-    return f"{len(parts)} {describe_kind(parts[0], plural=True)} in a list"
+        return f"lists of {len(parts)} {describe_type(parts[0], plural=True)}"
+    return f"{len(parts)} {describe_type(parts[0], plural=True)} in a list"
 
 
-def shown(value: object) -> str:
-    """A value as TOML writes it, cut if long, always on one line."""
+def format_value(value: object) -> str:
+    """Format a value as TOML writes it, truncated, on one line."""
     try:
         text = json.dumps(value, ensure_ascii=False)
     except (TypeError, ValueError):
@@ -83,36 +83,36 @@ def shown(value: object) -> str:
     return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
 
 
-def did_you_mean(word: str, known: Sequence[str]) -> str:
-    """A suggestion to append to a message, or nothing."""
+def suggest(word: str, known: Sequence[str]) -> str:
+    """Suggest the most similar known word, as the end of a message; empty if none is similar."""
     near = difflib.get_close_matches(word, known, n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
 
-def _converted(value: object, kind: Any) -> Any:
-    if typing.get_origin(kind) is tuple:
-        return _converted_tuple(value, typing.get_args(kind))
-    if kind is float:
+def _convert(value: object, annotation: Any) -> Any:
+    if typing.get_origin(annotation) is tuple:
+        return _convert_tuple(value, typing.get_args(annotation))
+    if annotation is float:
         if not isinstance(value, int | float) or isinstance(value, bool):
             raise _MismatchError
         return _finite(value)
-    if type(value) is not kind or (kind is str and not _encodable(str(value))):
+    if type(value) is not annotation or (annotation is str and not _encodable(str(value))):
         raise _MismatchError
     return value
 
 
-def _converted_tuple(value: object, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+def _convert_tuple(value: object, parts: tuple[Any, ...]) -> tuple[Any, ...]:
     if not isinstance(value, list | tuple):
         raise _MismatchError
     if parts[-1] is Ellipsis:
-        return tuple(_converted(one, parts[0]) for one in value)
+        return tuple(_convert(one, parts[0]) for one in value)
     if len(value) != len(parts):
         raise _MismatchError
-    return tuple(_converted(one, part) for one, part in zip(value, parts, strict=True))
+    return tuple(_convert(one, part) for one, part in zip(value, parts, strict=True))
 
 
 def _finite(value: float) -> float:
-    """As a float; a whole number may exceed a float's range, and TOML knows inf and nan."""
+    """Convert to a finite float: whole numbers may exceed a float's range, and TOML has inf and nan."""
     try:
         result = float(value)
     except OverflowError:
@@ -123,7 +123,7 @@ def _finite(value: float) -> float:
 
 
 def _encodable(text: str) -> bool:
-    """Whether the text can be stored: arguments whose bytes are no UTF-8 cannot."""
+    """Whether the text can be written as UTF-8: command line arguments with other bytes cannot."""
     try:
         text.encode()
     except UnicodeEncodeError:

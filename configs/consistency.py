@@ -1,4 +1,4 @@
-"""Checks what single settings cannot show: that they fit each other."""
+"""Validation across settings: constraints between several of them."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import math
 import re
 from collections.abc import Iterator
 
-from synpick_warp.configs.check import shown
+from synpick_warp.configs.check import format_value
 from synpick_warp.configs.schema import FORMATS, MIXED, Config
 
 DEPTH_COUNTS = 65535
-"""Largest value of a 16-bit depth image."""
+"""Maximum value of a 16-bit depth image."""
 _PARALLEL = 1e-6
-"""Sine of the angle below which a camera's up direction says nothing about the image's upper edge."""
+"""Sine of the angle below which a camera's up vector counts as parallel to its viewing direction."""
 _SPLIT = re.compile(r"(train|val|test)(_[A-Za-z0-9]+)*")
 
-Complaint = tuple[str, str]
-"""Key at fault, and what is allowed there."""
+Conflict = tuple[str, str]
+"""Key of the wrong setting, and its allowed values."""
 
 
-def complaints(config: Config) -> Iterator[Complaint]:
-    """Everything that does not fit, the most basic first."""
+def find_conflicts(config: Config) -> Iterator[Conflict]:
+    """Find all violated constraints, the most basic first."""
     yield from _mix(config)
     yield from _tote(config)
     yield from _cameras(config)
@@ -34,42 +34,42 @@ def complaints(config: Config) -> Iterator[Complaint]:
     yield from _object_rows(config)
 
 
-def _mix(config: Config) -> Iterator[Complaint]:
+def _mix(config: Config) -> Iterator[Conflict]:
     if config.bake.mode == MIXED and not any(config.bake.mix):
         yield "bake.mix", "at least one weight above 0, with the mode mixed"
     if not config.bake.formats:
         yield "bake.formats", f"at least one of {', '.join(FORMATS)}"
 
 
-def _tote(config: Config) -> Iterator[Complaint]:
+def _tote(config: Config) -> Iterator[Conflict]:
     tote = config.tote
     if any(rim < floor for rim, floor in zip(tote.rim_size, tote.floor_size, strict=True)):
-        yield "tote.rim_size", f"at least tote.floor_size on both sides, {shown(tote.floor_size)} [m]"
+        yield "tote.rim_size", f"at least tote.floor_size on both sides, {format_value(tote.floor_size)} [m]"
     if any(outer < rim + 2 * tote.wall for outer, rim in zip(tote.outer_size[:2], tote.rim_size, strict=True)):
-        least = [round(rim + 2 * tote.wall, 9) for rim in tote.rim_size]
-        yield "tote.outer_size", f"at least tote.rim_size and two walls, {shown(least)} [m]"
+        needed = [round(rim + 2 * tote.wall, 9) for rim in tote.rim_size]
+        yield "tote.outer_size", f"at least tote.rim_size and two walls, {format_value(needed)} [m]"
     if tote.outer_size[2] <= tote.wall:
         yield "tote.wall", f"less than the tote's height, {tote.outer_size[2]:g} [m]"
     if config.move.start_height < config.move.height:
         yield "move.start_height", f"at least move.height, {config.move.height:g} [m]"
 
 
-def _cameras(config: Config) -> Iterator[Complaint]:
+def _cameras(config: Config) -> Iterator[Conflict]:
     cameras = config.cameras
     if not cameras.positions:
         yield "cameras.positions", "at least one position"
     if len(cameras.ups) != len(cameras.positions):
         yield "cameras.ups", f"one direction for each of the {len(cameras.positions)} cameras.positions"
         return
-    for number, (position, up) in enumerate(zip(cameras.positions, cameras.ups, strict=True)):
+    for index, (position, up) in enumerate(zip(cameras.positions, cameras.ups, strict=True)):
         forward = tuple(b - a for a, b in zip(position, cameras.target, strict=True))
         if math.hypot(*forward) == 0.0:
-            yield "cameras.positions", f"positions other than cameras.target, where camera {number} stands"
+            yield "cameras.positions", f"positions other than cameras.target, the position of camera {index}"
         elif math.hypot(*_cross(forward, up)) <= _PARALLEL * math.hypot(*forward) * math.hypot(*up):
-            yield "cameras.ups", f"directions across the line of sight; camera {number} looks along its own, or it is zero"
+            yield "cameras.ups", f"up vectors that are not zero or parallel to the viewing direction, as that of camera {index} is"
 
 
-def _times(config: Config) -> Iterator[Complaint]:
+def _times(config: Config) -> Iterator[Conflict]:
     settle = config.settle
     rest = settle.rest_ticks * config.physics.steps_per_tick * config.physics.step
     if settle.max_time < settle.min_time:
@@ -78,46 +78,46 @@ def _times(config: Config) -> Iterator[Complaint]:
         yield "settle.max_time", f"at least the time of settle.rest_ticks ticks, {rest:g} [s]"
 
 
-def _pick(config: Config) -> Iterator[Complaint]:
+def _pick(config: Config) -> Iterator[Conflict]:
     pick, height = config.pick, config.tote.outer_size[2] - config.tote.wall
     if pick.appear_height < pick.near:
         yield "pick.appear_height", f"at least pick.near, {pick.near:g} [m]"
     if pick.speed < pick.near_speed:
         yield "pick.speed", f"at least pick.near_speed, {pick.near_speed:g} [m/s]"
     if pick.lift_height < height:
-        yield "pick.lift_height", f"at least the inner height of the tote, {height:g}: what hangs on the cup must have left it [m]"
+        yield "pick.lift_height", f"at least the inner height of the tote, {height:g}: attached objects must leave the tote [m]"
 
 
-def _suction(config: Config) -> Iterator[Complaint]:
-    suction, widest = config.suction, config.gripper.cup_width / 2
-    if suction.radius > widest:
-        yield "suction.radius", f"at most half of gripper.cup_width, {widest:g} [m]"
+def _suction(config: Config) -> Iterator[Conflict]:
+    suction, max_radius = config.suction, config.gripper.cup_width / 2
+    if suction.radius > max_radius:
+        yield "suction.radius", f"at most half of gripper.cup_width, {max_radius:g} [m]"
     if suction.tolerated_misses >= suction.rays:
-        yield "suction.tolerated_misses", f"less than suction.rays, {suction.rays}: a ray must hit"
+        yield "suction.tolerated_misses", f"less than suction.rays, {suction.rays}: one ray must hit"
     if suction.poor_force > suction.good_force:
         yield "suction.poor_force", f"at most suction.good_force, {suction.good_force:g} [N]"
 
 
-def _render(config: Config) -> Iterator[Complaint]:
+def _render(config: Config) -> Iterator[Conflict]:
     layers = config.render.layers
     if len(set(layers)) < len(layers):
-        yield "render.layers", f"each layer once: {shown(list(dict.fromkeys(layers)))}"
+        yield "render.layers", f"each layer once: {format_value(list(dict.fromkeys(layers)))}"
 
 
-def _sensors(config: Config) -> Iterator[Complaint]:
+def _sensors(config: Config) -> Iterator[Conflict]:
     for section in ("effects", "depth_sensor"):
         for item in dataclasses.fields(getattr(config, section)):
             value = getattr(getattr(config, section), item.name)
             if isinstance(value, tuple) and value[0] > value[1]:
-                yield f"{section}.{item.name}", f"the lesser first: {shown([value[1], value[0]])}"
-    least, most = config.effects.jpeg_quality
-    if most and not least:
-        yield "effects.jpeg_quality", f"from 1 to 100, or 0, 0: {shown([1, most])}"
-    if most and config.bop.color_format != "jpg":
+                yield f"{section}.{item.name}", f"minimum and maximum in this order: {format_value([value[1], value[0]])}"
+    low, high = config.effects.jpeg_quality
+    if high and not low:
+        yield "effects.jpeg_quality", f"from 1 to 100, or 0, 0: {format_value([1, high])}"
+    if high and config.bop.color_format != "jpg":
         yield "effects.jpeg_quality", f"0, 0 with bop.color_format {config.bop.color_format}"
 
 
-def _bop(config: Config) -> Iterator[Complaint]:
+def _bop(config: Config) -> Iterator[Conflict]:
     bop = config.bop
     if not _SPLIT.fullmatch(bop.split):
         yield "bop.split", "train, val or test, and after an underscore letters and digits, as in train_pbr"
@@ -130,10 +130,10 @@ def _bop(config: Config) -> Iterator[Complaint]:
         yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote from {far:.3g} m [mm]"
 
 
-def _object_rows(config: Config) -> Iterator[Complaint]:
+def _object_rows(config: Config) -> Iterator[Conflict]:
     ids = [row.id for row in config.object_rows]
-    for repeated in sorted({number for number in ids if ids.count(number) > 1}):
-        yield "object_rows", f"one row an id; {repeated} comes {ids.count(repeated)} times"
+    for repeated in sorted({row_id for row_id in ids if ids.count(row_id) > 1}):
+        yield "object_rows", f"one row per id; {repeated} comes {ids.count(repeated)} times"
 
 
 def _cross(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:

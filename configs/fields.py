@@ -1,4 +1,4 @@
-"""How a setting is declared."""
+"""Declaration of a setting."""
 
 from __future__ import annotations
 
@@ -16,9 +16,16 @@ def setting(
     above: float | None = None,
     choices: tuple[str, ...] = (),
 ) -> Any:
-    """A dataclass field that knows its unit, its meaning and what values it takes.
+    """Declare a setting: a dataclass field whose metadata are unit, meaning (one sentence) and allowed values.
 
-    `low` and `high` include their end; `above` excludes it. For tuples the bounds hold for each element.
+    Args:
+        default: Default value.
+        unit: Unit; empty for dimensionless settings.
+        doc: Help text.
+        low: Minimum, inclusive; for tuples of each element, as are the others.
+        high: Maximum, inclusive.
+        above: Minimum, exclusive.
+        choices: Allowed strings; empty: any.
     """
     metadata = {"unit": unit, "doc": doc, "low": low, "high": high, "above": above, "choices": choices}
     return field(default=default, metadata=metadata)

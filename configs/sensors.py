@@ -1,4 +1,4 @@
-"""Settings of what real cameras do to a picture: effects on colour, and a depth camera. None of it is in the paper."""
+"""Settings of sensor models: camera effects on colour images, and a depth camera. None of it is in the paper."""
 
 from __future__ import annotations
 
@@ -9,53 +9,51 @@ from synpick_warp.configs.fields import setting
 
 @dataclass(frozen=True)
 class Effects:
-    """What a real camera does to colour. All are off by default; each view draws its own strengths, evenly, and they are recorded.
+    """Camera effects on colour images, all off by default. Depth, ids and masks are not affected.
 
-    A range is the least and the largest strength; 0, 0: off. Depth, ids and masks stay as they are.
+    Each view draws its own parameters uniformly from these ranges (minimum, maximum; 0, 0: off), and they are recorded. Not in the paper.
     """
 
     exposure_jitter: float = setting(
         0.0,
-        "stops",
-        "A view's exposure is off by up to so much: a camera's automatic exposure changes from picture to picture.",
+        "EV",
+        "Half width of the uniform random exposure offset of each view, as by a camera's automatic exposure.",
         low=0.0,
         high=5.0,
     )
     white_balance_jitter: float = setting(
         0.0,
-        "stops",
-        "Red and blue are off by up to so much, each on its own; 500 K more at 5,500 K are 0.12 more blue and 0.06 less red.",
+        "EV",
+        "Half width of the uniform random gains of red and of blue; 500 K more at 5,500 K are 0.12 EV more blue and 0.06 EV less red.",
         low=0.0,
         high=2.0,
     )
     vignette: tuple[float, float] = setting(
-        (0.0, 0.0), "", "Share of light that is lost in the picture's corner; towards the middle it falls off as cos⁴.", low=0.0, high=1.0
+        (0.0, 0.0), "", "Fraction of light lost in the image corners, with cos⁴ falloff towards the centre.", low=0.0, high=1.0
     )
     chromatic_aberration: tuple[float, float] = setting(
         (0.0, 0.0),
         "px",
-        "In the corner, red lies farther out by so much and blue as much farther in; negative: the reverse.",
+        "Lateral chromatic aberration in the image corners: red is displaced outward and blue inward by this; negative: the reverse.",
         low=-16.0,
         high=16.0,
     )
-    blur: tuple[float, float] = setting(
-        (0.0, 0.0), "px", "Standard deviation of a Gaussian blur: what is out of focus.", low=0.0, high=16.0
-    )
+    blur: tuple[float, float] = setting((0.0, 0.0), "px", "Standard deviation of a Gaussian blur, as by defocus.", low=0.0, high=16.0)
     shot_noise: tuple[float, float] = setting(
         (0.0, 0.0),
         "",
-        "Standard deviation at full scale, as a share of it; a pixel of N electrons has 1/√N: 0.01 with 10,000.",
+        "Standard deviation of shot noise at full scale, relative to it; a full well of N electrons has 1/√N: 0.01 for 10,000.",
         low=0.0,
         high=1.0,
     )
     read_noise: tuple[float, float] = setting(
-        (0.0, 0.0), "", "Standard deviation of the noise that does not depend on light, as a share of full scale.", low=0.0, high=1.0
+        (0.0, 0.0), "", "Standard deviation of signal-independent read noise, relative to full scale.", low=0.0, high=1.0
     )
-    jpeg_quality: tuple[int, int] = setting((0, 0), "", "Least and largest JPEG quality; 0, 0: bop.jpeg_quality.", low=0, high=100)
+    jpeg_quality: tuple[int, int] = setting((0, 0), "", "JPEG quality; 0, 0: bop.jpeg_quality.", low=0, high=100)
 
 
 def effect_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
-    """Least and largest strength of every effect, in the order of `Effect`; 0, 0: off."""
+    """Minimum and maximum of each parameter of the camera effects, in the order of `Effect`; 0, 0: off."""
     exposure, balance = effects.exposure_jitter, effects.white_balance_jitter
     return {
         "exposure": (-exposure, exposure),
@@ -72,33 +70,41 @@ def effect_ranges(effects: Effects) -> dict[str, tuple[float, float]]:
 
 @dataclass(frozen=True)
 class DepthSensor:
-    """A depth camera that finds disparities between the camera and a projector beside it, for the layer depth_sensor.
+    """Structured-light depth camera model for the layer depth_sensor: disparity quantization, noise, lateral noise and holes.
 
-    Noise grows as sigma_z = noise + noise_growth (z - noise_distance)² + noise_angle / √z · (θ / (π/2 - θ))², as Nguyen, Izadi and
-    Lovell (3DIMPVT 2012) measured it of a Kinect, with z in m and θ the angle of incidence.
+    Axial noise is sigma_z = noise + noise_growth (z - noise_distance)² + noise_angle / √z · (θ / (π/2 - θ))², as Nguyen, Izadi and
+    Lovell (3DIMPVT 2012) measured for a Kinect, with z in m and θ the angle of incidence. Not in the paper.
     """
 
-    baseline: float = setting(0.075, "m", "The projector stands so far to the camera's right (Khoshelham and Elberink, 2012).", above=0.0)
+    baseline: float = setting(
+        0.075, "m", "Distance from the camera to the projector at its right (Khoshelham and Elberink, 2012).", above=0.0
+    )
     disparity_step: float = setting(
         0.125,
         "px",
-        "Disparities are multiples of this, so depth is in steps of z² / (f · baseline) times it (Khoshelham and Elberink).",
+        "Disparity quantization, which makes depth steps of z² / (f · baseline) times this (Khoshelham and Elberink, 2012).",
         above=0.0,
         high=16.0,
     )
-    distances: tuple[float, float] = setting((0.4, 5.0), "m", "Nearest and farthest depth that is measured.", above=0.0)
-    noise: float = setting(0.0012, "m", "Noise at noise_distance (Nguyen et al.).", low=0.0)
-    noise_growth: float = setting(0.0019, "1/m", "Growth of noise with the square of depth (Nguyen et al.).", low=0.0)
-    noise_distance: float = setting(0.4, "m", "Depth of least noise (Nguyen et al.).", low=0.0)
-    noise_angle: float = setting(1e-4, "m^1.5", "Growth of noise with the angle of incidence (Nguyen et al.).", low=0.0)
+    distances: tuple[float, float] = setting((0.4, 5.0), "m", "Minimum and maximum depth that is measured.", above=0.0)
+    noise: float = setting(0.0012, "m", "Axial noise at noise_distance, as standard deviation (Nguyen et al., 2012).", low=0.0)
+    noise_growth: float = setting(0.0019, "1/m", "Quadratic growth of axial noise with depth (Nguyen et al., 2012).", low=0.0)
+    noise_distance: float = setting(0.4, "m", "Depth of minimum axial noise (Nguyen et al., 2012).", low=0.0)
+    noise_angle: float = setting(1e-4, "m^1.5", "Growth of axial noise with the angle of incidence (Nguyen et al., 2012).", low=0.0)
     lateral_noise: float = setting(
         0.5,
         "px",
-        "A pixel sees a surface that lies off by so much, as standard deviation: ragged edges (Handa et al., 2014).",
+        "Standard deviation of the pixel offset at which depth is sampled, which makes edges ragged (Handa et al., 2014).",
         low=0.0,
         high=16.0,
     )
-    grazing_angle: float = setting(80.0, "°", "No depth where a ray meets a surface at a larger angle of incidence.", above=0.0, high=89.0)
-    edge_width: int = setting(1, "px", "No depth so near to an edge, where the window that is matched sees two surfaces.", low=0, high=16)
-    edge_step: float = setting(1.0, "px", "An edge is a step of disparity by more.", above=0.0)
-    shadows: bool = setting(True, "", "No depth where something hides the projector.")
+    grazing_angle: float = setting(80.0, "°", "Angle of incidence above which there is no depth.", above=0.0, high=89.0)
+    edge_width: int = setting(
+        1,
+        "px",
+        "Distance to a disparity edge below which there is no depth, since the matching window covers two surfaces.",
+        low=0,
+        high=16,
+    )
+    edge_step: float = setting(1.0, "px", "Disparity difference that makes an edge.", above=0.0)
+    shadows: bool = setting(True, "", "No depth where the projector is occluded.")

@@ -1,32 +1,32 @@
-"""Writes settings as TOML: complete, and readable again by `load_config` to the same settings."""
+"""Configuration serialization to TOML: complete, and `load_config` reads the same configuration back."""
 
 from __future__ import annotations
 
 import json
 from typing import Any
 
-from synpick_warp.configs.check import allowed
+from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import ROWS, sections, settings_of
 from synpick_warp.configs.schema import Config, ObjectRow
 
 _DELETE = "\x7f"
-"""The one control character that JSON leaves as it is and TOML forbids."""
+"""The only control character that JSON does not escape and TOML forbids."""
 
 
 def config_to_toml(config: Config, *, comments: bool = False) -> str:
-    """All settings as TOML, those that nobody set as well.
+    """Write all settings as TOML, including defaults.
 
     Args:
-        config: Settings.
-        comments: Put meaning, unit and range above each.
+        config: The configuration.
+        comments: Precede each setting by its meaning, unit and allowed values.
     """
     lines = [] if config.object_rows else [f"{ROWS} = []", ""]
     for section, kind in sections().items():
         if comments and kind.__doc__:
             lines += [f"# {' '.join(kind.__doc__.split())}"]
         lines += [f"[{section}]", *_table(getattr(config, section), kind, comments), ""]
-    for number, row in enumerate(config.object_rows):
-        lines += [f"[[{ROWS}]]", *_table(row, ObjectRow, comments and number == 0), ""]
+    for index, row in enumerate(config.object_rows):
+        lines += [f"[[{ROWS}]]", *_table(row, ObjectRow, comments and index == 0), ""]
     return "\n".join(lines)
 
 
@@ -35,16 +35,17 @@ def _table(values: Any, kind: type[Any], comments: bool) -> list[str]:
     for name, (item, annotation) in settings_of(kind).items():
         if comments:
             unit = f"[{item.metadata['unit']}] " if item.metadata["unit"] else ""
-            lines.append(f"# {item.metadata['doc']} {unit}Allowed: {allowed(item, annotation)}.")
-        lines.append(f"{name} = {_toml(getattr(values, name))}")
+            lines.append(f"# {item.metadata['doc']} {unit}Allowed: {describe_allowed(item, annotation)}.")
+        lines.append(f"{name} = {format_toml(getattr(values, name))}")
     return lines
 
 
-def _toml(value: Any) -> str:
+def format_toml(value: Any) -> str:
+    """Format a value as TOML."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace(_DELETE, "\\u007f")
     if isinstance(value, tuple):
-        return f"[{', '.join(_toml(one) for one in value)}]"
+        return f"[{', '.join(format_toml(one) for one in value)}]"
     return repr(value)

@@ -13,8 +13,8 @@ import cyclopts
 from cyclopts import App, Parameter
 
 from synpick_warp import __version__
-from synpick_warp.configs.check import allowed
-from synpick_warp.configs.load import DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
+from synpick_warp.configs.check import describe_allowed
+from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
@@ -48,7 +48,7 @@ def _help(key: str, extra: str = "") -> str:
     item, kind = settings_of(sections()[section])[name]
     unit = f" {item.metadata['unit']}" if item.metadata["unit"] else ""
     default = "x".join(map(str, item.default)) if isinstance(item.default, tuple) else str(item.default) or "empty"
-    rule = "" if kind is str and not item.metadata["choices"] else f"{allowed(item, kind)}; "
+    rule = "" if kind is str and not item.metadata["choices"] else f"{describe_allowed(item, kind)}; "
     return f"{item.metadata['doc']}{extra} ({rule}default {default}{unit}; {key})"
 
 
@@ -259,7 +259,7 @@ def _resolve(config: str | None, given: dict[str, object], resolution: str | Non
     overrides |= {key: value for key, value in given.items() if value is not None}
     if resolution is not None:
         overrides["cameras.resolution"] = parse_resolution(resolution)
-    return load_config(config, overrides)
+    return load_config(config, overrides, source=COMMAND_LINE)
 
 
 def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:

@@ -211,7 +211,7 @@ def test_help_shows_units_and_defaults(capsys):
     assert main(["bake", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "default 1920x1080 px; cameras.resolution" in text
-    assert "Totes simulated side by side; a GPU has at least 8. (at least 1, at most 65536; default 4; bake.worlds)" in text
+    assert "Totes simulated in parallel; a GPU simulates at least 8. (at least 1, at most 65536; default 4; bake.worlds)" in text
 
 
 def test_help_says_how_modes_are_mixed(capsys):

@@ -1,4 +1,4 @@
-"""Loading, checking and writing of settings."""
+"""Loading, validation and serialization of the configuration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.configs.load import load_config, parse_assignment, preset_names, sections, settings_of
+from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config, ObjectRow
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
@@ -36,7 +36,7 @@ COUPLED = {
     "suction.poor_force",
 }
 COUPLED_SECTIONS = {"tote", "cameras", "settle", "physics"}
-"""Settings that must fit others: drawn freely they mostly would not."""
+"""Settings with constraints between them: independent random values mostly violate these."""
 
 
 def write(folder: Path, text: str) -> str:
@@ -47,12 +47,12 @@ def write(folder: Path, text: str) -> str:
 
 def message(name: str | None, overrides: dict[str, object]) -> str:
     with pytest.raises(ConfigError) as caught:
-        load_config(name, overrides)
+        load_config(name, overrides, source=COMMAND_LINE)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
 
-def test_the_default_is_the_paper():
+def test_the_default_preset_has_the_papers_values():
     config = load_config(None, {})
     assert config == load_config("synpick", {})
     assert dataclasses.replace(config, object_rows=()) == Config()
@@ -69,7 +69,7 @@ def test_object_rows_have_the_diameters_of_the_real_models(real_models):
         assert row.diameter == pytest.approx(info[str(row.id)]["diameter"] / 1000, abs=1e-4)
 
 
-def test_other_presets_build_on_the_paper():
+def test_other_presets_build_on_the_default_preset():
     assert preset_names() == ["smoke", "synpick", "synpick-released"]
     released = load_config("synpick-released", {})
     assert released.move.damping == 1.0
@@ -95,11 +95,11 @@ def test_the_released_generator_differs_in_exactly_this():
     }
 
 
-def test_the_smoke_preset_stirs_few_objects_in_small_pictures():
+def test_the_smoke_preset_stirs_few_objects_in_small_images():
     paper, smoke = resolved("synpick"), resolved("smoke")
     changed = {key for key, value in smoke.items() if value != paper[key]}
     assert (paper["bake.mode"], smoke["bake.mode"]) == ("pick", "move")
-    # Physics and the rules of picking are the paper's; what is measured in pixels shrinks with the picture.
+    # Physics and the rules of picking are the paper's; settings in pixels shrink with the image.
     assert {key.split(".")[0] for key in changed} == {"bake", "cameras", "arrangement", "move", "sight", "bop"}
     assert {key for key in changed if key.startswith("sight.")} == {
         f"sight.{name}" for name in ("resolution", "contour_points", "contour_offset", "min_votes", "normal_window")
@@ -113,7 +113,7 @@ def test_command_line_wins_over_file_and_file_over_preset(tmp_path):
     assert config.move.rounds == load_config("smoke", {}).move.rounds
 
 
-def test_a_file_without_preset_builds_on_the_paper(tmp_path):
+def test_a_file_without_preset_builds_on_the_default_preset(tmp_path):
     assert load_config(write(tmp_path, ""), {}) == load_config(None, {})
 
 
@@ -122,7 +122,14 @@ def test_object_rows_of_a_file_replace_those_of_the_preset(tmp_path):
     assert config.object_rows == (ObjectRow(id=5, diameter=0.1, name="brick"),)
 
 
-def test_whole_numbers_do_for_floats():
+def test_paths_and_no_arguments_do_as_names_do(tmp_path):
+    assert load_config() == load_config("synpick")
+    assert load_config(Path(write(tmp_path, 'preset = "smoke"\n'))) == load_config("smoke", {})
+    with pytest.raises(ConfigError, match=r"^bake.worlds is 0 in the settings passed; allowed: at least 1, at most 65536$"):
+        load_config("smoke", {"bake.worlds": 0})
+
+
+def test_whole_numbers_are_allowed_for_floats():
     gravity = load_config(None, {"physics.gravity": 10}).physics.gravity
     assert isinstance(gravity, float)
     assert gravity == 10.0
@@ -163,7 +170,7 @@ def test_a_wrong_value_is_reported_with_what_is_allowed(key, value, expected):
     assert message(None, {key: value}) == expected
 
 
-def test_huge_whole_numbers_are_no_floats():
+def test_whole_numbers_beyond_the_range_of_floats_are_refused():
     assert "allowed: a finite number" in message(None, {"physics.gravity": 10**400})
 
 
@@ -208,7 +215,7 @@ def test_files_that_cannot_be_read(tmp_path):
     (tmp_path / "folder.toml").mkdir()
     assert message(str(tmp_path / "folder.toml"), {}) == f"{tmp_path / 'folder.toml'} cannot be read: Is a directory"
     (tmp_path / "latin.toml").write_bytes(b"# \xe9\n")
-    assert message(str(tmp_path / "latin.toml"), {}).endswith("is not valid TOML: byte 2 is no UTF-8")
+    assert message(str(tmp_path / "latin.toml"), {}).endswith("is not valid TOML: byte 2 is not UTF-8")
     assert message("smok", {}).endswith("a file's name ends in .toml; did you mean smoke?")
 
 
@@ -220,7 +227,10 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
     ("overrides", "expected"),
     [
         ({"cameras.ups": [[0, 1, 0]]}, "cameras.ups is [[0.0, 1.0, 0.0]] on the command line; allowed: one direction for each of the 3"),
-        ({"cameras.ups": [[0, 0, 0]] * 3}, "cameras.ups is .*; allowed: directions across the line of sight; camera 0 "),
+        (
+            {"cameras.ups": [[0, 0, 0]] * 3},
+            "cameras.ups is .*; allowed: up vectors that are not zero or parallel to the viewing direction, as that of camera 0 ",
+        ),
         ({"cameras.target": [0, 0, 2]}, "cameras.positions is .* by default; allowed: positions other than cameras.target"),
         ({"cameras.positions": [], "cameras.ups": []}, r"cameras.positions is \[\] on the command line; allowed: at least one position"),
         ({"tote.floor_size": [0.6, 0.3]}, "tote.rim_size is .* by default; allowed: at least tote.floor_size on both sides"),
@@ -248,7 +258,7 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
         ({"bop.depth_scale": 0.01}, "bop.depth_scale is 0.01 on the command line; allowed: at least 0.03"),
     ],
 )
-def test_values_that_do_not_fit_each_other(overrides, expected):
+def test_values_that_contradict_each_other(overrides, expected):
     assert re.match(expected.replace("[[", r"\[\[").replace("]]", r"\]\]"), message(None, overrides))
 
 
@@ -262,14 +272,14 @@ def test_values_that_do_not_fit_each_other(overrides, expected):
         {"sight.resolution": [640, 160]},
     ],
 )
-def test_values_that_just_fit_each_other(overrides):
+def test_values_at_the_limits_of_their_constraints(overrides):
     load_config(None, overrides)
 
 
-def test_object_ids_come_once(tmp_path):
+def test_object_ids_are_unique(tmp_path):
     row = "[[object_rows]]\nid = 4\ndiameter = 0.1\n"
     path = write(tmp_path, row * 2)
-    assert message(path, {}) == f"object_rows has 2 rows in {path}; allowed: one row an id; 4 comes 2 times"
+    assert message(path, {}) == f"object_rows has 2 rows in {path}; allowed: one row per id; 4 comes 2 times"
 
 
 @pytest.mark.parametrize(
@@ -294,7 +304,7 @@ def test_assignments(text, key, value):
 
 
 @pytest.mark.parametrize("text", ["physics.step", "physics.stepp=1", "step=1", "=1", "object_rows.mass=1"])
-def test_assignments_that_are_none(text):
+def test_invalid_assignments(text):
     with pytest.raises(ConfigError):
         parse_assignment(text)
 
@@ -312,12 +322,12 @@ TEXT = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
 
 
 def values(item: dataclasses.Field, kind: object) -> st.SearchStrategy:
-    """Values that a setting takes."""
+    """Strategy for the allowed values of a setting."""
     rules = item.metadata
     if rules["choices"]:
         one = st.sampled_from(rules["choices"])
-        least = 0 if item.default == () else 1
-        return st.lists(one, min_size=least, unique=True).map(tuple) if kind == tuple[str, ...] else one
+        min_size = 0 if item.default == () else 1
+        return st.lists(one, min_size=min_size, unique=True).map(tuple) if kind == tuple[str, ...] else one
     if kind is float:
         low = rules["above"] if rules["above"] is not None else rules["low"]
         return st.floats(low, rules["high"], exclude_min=rules["above"] is not None, allow_nan=False, allow_infinity=False)
@@ -347,7 +357,7 @@ def test_any_settings_survive_writing_and_reading(tmp_path_factory, overrides, r
 
 
 @given(key=WORD, value=ANYTHING)
-def test_whatever_comes_either_loads_or_is_a_mistake(key, value):
+def test_any_value_either_loads_or_is_a_config_error(key, value):
     for full in (key, f"physics.{key}", "physics.step", "cameras.resolution", "bake.models"):
         with contextlib.suppress(ConfigError):
             load_config(None, {full: value})

@@ -30,7 +30,7 @@ from rich.console import Console
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import GIB, describe_machine
 from synpick_warp.codes import Status
-from synpick_warp.configs.load import load_config, parse_assignment
+from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
@@ -127,7 +127,7 @@ def _config(options: argparse.Namespace) -> Config:
         "bake.lights": options.lights,
         "cameras.resolution": parse_resolution(options.resolution),
     }
-    return load_config(None, overrides)
+    return load_config(None, overrides, source=COMMAND_LINE)
 
 
 def measure(config: Config, parts: tuple[str, ...], least: float) -> Iterator[Row]:

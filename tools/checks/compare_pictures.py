@@ -22,7 +22,7 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp.arrays import allocate
-from synpick_warp.configs.load import load_config, parse_assignment
+from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
@@ -174,7 +174,7 @@ def _config(options: argparse.Namespace, device: str) -> Config:
         "render.layers": list(LAYERS),
         "cameras.resolution": [int(part) if part.isdecimal() else part for part in options.size.split("x")],
     }
-    return load_config(None, overrides)
+    return load_config(None, overrides, source=COMMAND_LINE)
 
 
 def compare_devices(config: Config, devices: list[Any], console: Console) -> list[Difference]:

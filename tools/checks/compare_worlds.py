@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp.codes import Phase
-from synpick_warp.configs.load import load_config, parse_assignment
+from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
@@ -101,7 +101,7 @@ def _config(options: argparse.Namespace) -> Config:
     overrides: dict[str, object] = {"cameras.resolution": SIZE} | dict(parse_assignment(text) for text in options.set)
     overrides |= {"bake.device": options.device, "bake.models": options.models, "bake.episodes": options.episodes}
     overrides["bake.formats"] = ["zarr"]
-    return load_config(None, overrides)
+    return load_config(None, overrides, source=COMMAND_LINE)
 
 
 def compare_worlds(config: Config, worlds: tuple[int, ...], most_ticks: int, console: Console) -> list[Run]:

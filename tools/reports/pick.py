@@ -24,7 +24,7 @@ from rich.table import Table
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.codes import Phase
-from synpick_warp.configs.load import load_config, parse_assignment
+from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import MIXED, Config
 from synpick_warp.configs.schema import MODES as MIX
 from synpick_warp.device import pick_device
@@ -126,7 +126,7 @@ def _config(options: argparse.Namespace) -> Config:
         "bake.seed": options.seed,
         "cameras.resolution": parse_resolution(options.visibility_resolution),
     }
-    return load_config(None, overrides)
+    return load_config(None, overrides, source=COMMAND_LINE)
 
 
 class Eyes:

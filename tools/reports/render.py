@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp.cli.doctor import describe_machine
-from synpick_warp.configs.load import load_config, parse_assignment
+from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
@@ -98,7 +98,7 @@ def _config(options: argparse.Namespace) -> Config:
         "render.samples": options.samples,
         "cameras.resolution": [int(part) if part.isdecimal() else part for part in options.size.split("x")],
     }
-    return load_config(None, overrides)
+    return load_config(None, overrides, source=COMMAND_LINE)
 
 
 def _print(console: Console, machine: list[tuple[str, str]], rows: list[Row], config: Config, wall: float) -> None:

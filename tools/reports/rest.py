@@ -24,7 +24,7 @@ from rich.table import Table
 
 from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.codes import Ending, Phase
-from synpick_warp.configs.load import load_config, parse_assignment
+from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
@@ -157,7 +157,7 @@ def _config(options: argparse.Namespace) -> Config:
         "bake.device": options.device,
         "bake.seed": options.seed,
     }
-    return load_config(None, overrides)
+    return load_config(None, overrides, source=COMMAND_LINE)
 
 
 def settle(simulation: Simulation, catalog: Catalog, findings: Findings, say: Callable[[str], None]) -> None:

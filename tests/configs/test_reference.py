@@ -1,0 +1,17 @@
+"""The settings reference in configs/README.md."""
+
+from __future__ import annotations
+
+from synpick_warp.configs.load import preset_names, sections, settings_of
+from tools.docs import SETTINGS_REFERENCE, settings_reference
+
+
+def test_the_committed_settings_reference_is_up_to_date():
+    assert SETTINGS_REFERENCE.read_text(encoding="utf-8") == settings_reference(), "run python -m tools.docs"
+
+
+def test_every_setting_and_every_preset_is_in_the_reference():
+    text = settings_reference()
+    keys = [f"{section}.{name}" for section, kind in sections().items() for name in settings_of(kind)]
+    assert [key for key in keys if f"| `{key}` |" not in text] == []
+    assert [name for name in preset_names() if f"| `{name}` |" not in text] == []
