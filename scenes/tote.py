@@ -30,6 +30,8 @@ GUIDE_THICKNESS = 0.1
 """Thickness of the guide walls [m]."""
 TABLE_SIZE = (10.0, 10.0, 0.1)
 """Half size and half thickness of the table on which the tote stands [m]; large enough for whatever leaves the tote."""
+TABLE_ROUGHNESS = 0.8
+"""Roughness of the table's material: matt. Its only setting is `render.table_color`."""
 
 
 def rim_height(tote: Tote) -> float:

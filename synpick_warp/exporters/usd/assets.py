@@ -1,6 +1,6 @@
-"""The asset library that all USD episodes share: one file an object, and tote, finger, cup and table."""
+"""Asset library shared by all USD episodes: one file per object, and tote, gripper shaft ("finger"), cup and table."""
 
-# pxr's modules fill themselves when they are loaded, where no type checker sees it.
+# pxr's modules are filled when they are loaded, invisible to type checkers.
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Usd, UsdGeom, UsdShade
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Config, Physics
 from synpick_warp.exporters.usd.lights import write_light_maps
 from synpick_warp.exporters.usd.parts import (
     TEXTURES,
@@ -26,81 +26,83 @@ from synpick_warp.exporters.usd.parts import (
     write_texture,
 )
 from synpick_warp.scenes.gripper import cup_collider, cup_fixture, finger_collider, finger_fixture, rod_inertia
-from synpick_warp.scenes.tote import TABLE_SIZE, tote_colliders, tote_fixture
+from synpick_warp.scenes.tote import TABLE_ROUGHNESS, TABLE_SIZE, tote_colliders, tote_fixture
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, EnvironmentMap, Fixture, Material, TriangleMesh
-
-TABLE_ROUGHNESS = 0.8
-"""The table is matt, as in the pictures."""
 
 
 def write_library(library: Path, config: Config, catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> None:
-    """Write all assets into an existing folder, in place of what may be there.
+    """Write all assets into an existing folder, replacing existing ones.
 
     Raises:
         OSError: A file cannot be written.
-        OutputError: Likewise, said by USD.
+        OutputError: A file cannot be written, as reported by USD.
     """
     for name in (TEXTURES, "lights"):
         (library / name).mkdir(exist_ok=True)
     write_light_maps(library, lights)
+    gripper, physics, tote = config.gripper, config.physics, config.tote
     for entry in catalog.entries:
-        _write_object(library, config, entry)
-    gripper = config.gripper
-    _write_fixture(library, config, "tote", tote_fixture(config.tote), tote_colliders(config.tote))
-    finger = _fixture(library, config, "finger", finger_fixture(gripper), (finger_collider(gripper),))
+        _write_object(library, physics, entry)
+    _save(library, "tote", _make_fixture(library, physics, "tote", tote_fixture(tote), tote_colliders(tote)))
+    finger = _make_fixture(library, physics, "finger", finger_fixture(gripper), (finger_collider(gripper),))
     length, mass = gripper.finger_length, gripper.finger_mass
     add_body(finger.GetDefaultPrim(), mass, np.array([0.0, 0.0, length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
-    save_layer(finger.GetRootLayer(), library / "finger.usdc")
-    cup = _fixture(library, config, "cup", cup_fixture(gripper), (cup_collider(gripper),))
+    _save(library, "finger", finger)
+    cup = _make_fixture(library, physics, "cup", cup_fixture(gripper), (cup_collider(gripper),))
     length, mass = gripper.cup_length, gripper.cup_mass
     add_body(cup.GetDefaultPrim(), mass, np.array([0.0, 0.0, -length / 2]), np.diag(rod_inertia(mass, length)), kinematic=True)
-    save_layer(cup.GetRootLayer(), library / "cup.usdc")
-    _write_table(library, config)
+    _save(library, "cup", cup)
+    _write_table(library, physics, -tote.wall, config.render.table_color if config.render.table else None)
 
 
-def _write_object(library: Path, config: Config, entry: CatalogEntry) -> None:
+def _save(library: Path, name: str, stage: Usd.Stage) -> None:
+    save_layer(stage.GetRootLayer(), library / f"{name}.usdc")
+
+
+def _write_object(library: Path, physics: Physics, entry: CatalogEntry) -> None:
     name = object_asset(entry.obj_id)
     stage = new_asset(name, entry.name)
     root = stage.GetDefaultPrim()
     root.SetDisplayName(entry.name)
     root.SetCustomDataByKey("obj_id", entry.obj_id)
-    _dress(stage, config, entry.mesh, entry.material, write_texture(library, name, entry.material), entry.pieces)
+    _add_shapes(stage, physics, entry.mesh, entry.material, write_texture(library, name, entry.material), entry.pieces)
     add_body(root, entry.mass, entry.center_of_mass, entry.inertia, kinematic=False)
-    save_layer(stage.GetRootLayer(), library / f"{name}.usdc")
+    _save(library, name, stage)
 
 
-def _write_fixture(library: Path, config: Config, name: str, fixture: Fixture, pieces: tuple[ConvexPiece, ...]) -> None:
-    stage = _fixture(library, config, name, fixture, pieces)
-    save_layer(stage.GetRootLayer(), library / f"{name}.usdc")
-
-
-def _fixture(library: Path, config: Config, name: str, fixture: Fixture, pieces: tuple[ConvexPiece, ...]) -> Usd.Stage:
+def _make_fixture(library: Path, physics: Physics, name: str, fixture: Fixture, pieces: tuple[ConvexPiece, ...]) -> Usd.Stage:
     stage = new_asset(name, name)
-    _dress(stage, config, fixture.mesh, fixture.material, write_texture(library, name, fixture.material), pieces)
+    _add_shapes(stage, physics, fixture.mesh, fixture.material, write_texture(library, name, fixture.material), pieces)
     return stage
 
 
-def _dress(
-    stage: Usd.Stage, config: Config, mesh: TriangleMesh, material: Material, texture: str | None, pieces: tuple[ConvexPiece, ...]
+def _add_shapes(
+    stage: Usd.Stage, physics: Physics, mesh: TriangleMesh, material: Material, texture: str | None, pieces: tuple[ConvexPiece, ...]
 ) -> None:
-    """Give an asset its mesh, its surface and its collision shapes."""
-    root, friction = _materials(stage, config)
+    """Add an asset's visible mesh with its material, and its collision shapes."""
+    root, friction = _add_contact_material(stage, physics)
     add_mesh(stage, f"{root}/Visual", mesh, add_surface(stage, f"{root}/Materials/Surface", material, texture))
     UsdGeom.Scope.Define(stage, f"{root}/Collision")
     for index, piece in enumerate(pieces):
-        add_collider(stage, f"{root}/Collision/piece_{index:02d}", piece, friction, config.physics.gap)
+        add_collider(stage, f"{root}/Collision/piece_{index:02d}", piece, friction, physics.gap)
 
 
-def _write_table(library: Path, config: Config) -> None:
-    """The table on which the tote stands: a box that collides, and its upper side if it is in the pictures."""
+def _write_table(library: Path, physics: Physics, height: float, color: tuple[float, float, float] | None) -> None:
+    """Write the table under the tote: a collision box, and a visible top side.
+
+    Args:
+        library: Folder of the assets.
+        physics: Friction and contact gap.
+        height: z of the top side [m].
+        color: sRGB base colour of the top side; None: the table is not rendered.
+    """
     stage = new_asset("table", "table")
-    root, friction = _materials(stage, config)
-    half, height = np.array(TABLE_SIZE), -config.tote.wall
-    if config.render.table:
-        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * half + [0.0, 0.0, height]
+    root, friction = _add_contact_material(stage, physics)
+    if color is not None:
+        corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * np.array(TABLE_SIZE) + [0.0, 0.0, height]
         uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
         quad = TriangleMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.tile([0.0, 0.0, 1.0], (4, 1)), uv)
-        material = Material(config.render.table_color, None, 0.0, TABLE_ROUGHNESS)
+        material = Material(color, None, 0.0, TABLE_ROUGHNESS)
         add_mesh(stage, f"{root}/Visual", quad, add_surface(stage, f"{root}/Materials/Surface", material, None))
     UsdGeom.Scope.Define(stage, f"{root}/Collision")
     box = UsdGeom.Cube.Define(stage, f"{root}/Collision/box")
@@ -108,12 +110,12 @@ def _write_table(library: Path, config: Config) -> None:
     box.CreateExtentAttr([Gf.Vec3f(-1.0), Gf.Vec3f(1.0)])
     box.AddTranslateOp().Set(Gf.Vec3d(0.0, 0.0, height - TABLE_SIZE[2]))
     box.AddScaleOp().Set(Gf.Vec3f(*TABLE_SIZE))
-    make_collider(box, friction, config.physics.gap)
-    save_layer(stage.GetRootLayer(), library / "table.usdc")
+    make_collider(box, friction, physics.gap)
+    _save(library, "table", stage)
 
 
-def _materials(stage: Usd.Stage, config: Config) -> tuple[str, UsdShade.Material]:
-    """Path of the asset's root, and the material of its collision shapes."""
+def _add_contact_material(stage: Usd.Stage, physics: Physics) -> tuple[str, UsdShade.Material]:
+    """Add the physics material of the asset's collision shapes; returns the path of the asset's root and the material."""
     root = str(stage.GetDefaultPrim().GetPath())
     UsdGeom.Scope.Define(stage, f"{root}/Materials")
-    return root, add_friction(stage, f"{root}/Materials/Contact", config.physics.friction)
+    return root, add_friction(stage, f"{root}/Materials/Contact", physics.friction)

@@ -1,4 +1,4 @@
-"""USD: one file an episode, and an asset library that all of them reference."""
+"""Exporter of USD scenes: one file per episode, and an asset library that all episodes reference."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from pathlib import Path
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import ExportContext
-from synpick_warp.exporters.usd.episode import EpisodeFacts, EpisodeSettings, drop_episode, write_episode
-from synpick_warp.exporters.usd.lights import stage_light
+from synpick_warp.exporters.usd.episode import discard_episode, write_episode
+from synpick_warp.exporters.usd.lights import make_stage_light
 from synpick_warp.exporters.usd.spool import TickSpool
+from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 
 FOLDER = Path("usd")
-"""In the data set."""
+"""Folder in the data set."""
 LIBRARY = FOLDER / "assets"
 
 
 class UsdExporter:
-    """An `Exporter`. Episode k becomes usd/k.usdc, which references usd/assets.
+    """`Exporter` of USD. Episode k becomes usd/k.usdc, which references usd/assets.
 
-    An episode's ticks gather in a hidden file, out of which a writer process makes the episode's file when it has ended.
+    An episode's ticks are spooled to a hidden file, from which a writer process makes the episode's file when it has ended.
     """
 
     needs_physics = False
@@ -34,23 +35,23 @@ class UsdExporter:
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         self._context = context
-        self._hidden = context.out / PARTIAL / FOLDER
+        self._staging = context.out / PARTIAL / FOLDER
         self._spools: dict[int, TickSpool] = {}
-        self._begun = 0
+        self._arrangements = 0
 
     @staticmethod
     def slot_bytes(config: Config) -> int:
-        """See `Exporter`: no images are handed over."""
+        """See `Exporter`: tasks have no images."""
         return 0
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
-        """See `Exporter`: nothing spans episodes but the assets."""
+        """See `Exporter`: no index files."""
         return []
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: the asset library."""
-        from synpick_warp.exporters.usd.assets import write_library  # pxr takes a while to load, and this is its only use here
+        from synpick_warp.exporters.usd.assets import write_library  # pxr loads slowly, and only this method needs it.
 
         context = self._context
         library = context.out / LIBRARY
@@ -63,33 +64,33 @@ class UsdExporter:
         return [LIBRARY]
 
     def write_views(self, batch: FrameBatch) -> None:
-        """See `Exporter`: pictures are not for USD."""
+        """See `Exporter`: USD holds no images."""
 
     def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""
         for world in range(len(batch)):
-            number = int(batch.episode[world])
-            spool = self._spools.get(number) or self._begin(number, batch.object_id.shape[1])
+            index = int(batch.episode[world])
+            spool = self._spools.get(index) or self._stage_episode(index, batch.object_id.shape[1])
             try:
                 spool.add(batch, world)
             except OSError as error:
                 raise output_error(spool.path, error) from error
 
-    def end_episode(self, end: EpisodeEnd, whole: Callable[[], None]) -> None:
+    def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """See `Exporter`."""
         pool, spool = self._context.pool, self._spools.pop(end.episode, None)
         if spool is None:
-            whole()
+            on_committed()
         elif not Ending(end.ending).delivers:
-            pool.submit(drop_episode, (), (spool.path,), path=spool.path, on_done=whole)
+            pool.submit(discard_episode, (), (spool.path,), path=spool.path, on_done=on_committed)
         else:
             try:
                 spool.flush()
             except OSError as error:
                 raise output_error(spool.path, error) from error
             place = self._place(end.episode)
-            arguments = (spool.path, spool.instances, place, EpisodeFacts.of(end), self._settings)
-            pool.submit(write_episode, (), arguments, path=place, on_done=whole)
+            arguments = (spool.path, spool.instances, place, EpisodeMetadata.from_end(end), self._settings)
+            pool.submit(write_episode, (), arguments, path=place, on_done=on_committed)
         pool.poll()
 
     def files(self, episode: int) -> list[Path]:
@@ -105,14 +106,14 @@ class UsdExporter:
         """See `Exporter`."""
         self._spools.clear()
 
-    def _begin(self, number: int, instances: int) -> TickSpool:
-        # A number of its own for every arrangement: the last one's file may not be removed yet.
-        self._begun += 1
+    def _stage_episode(self, index: int, instances: int) -> TickSpool:
+        # A suffix unique to each arrangement: the discarded one's file may not be removed yet.
+        self._arrangements += 1
         try:
-            self._hidden.mkdir(exist_ok=True)
+            self._staging.mkdir(exist_ok=True)
         except OSError as error:
-            raise output_error(self._hidden, error) from error
-        spool = self._spools[number] = TickSpool(self._hidden / f"{number:06d}-{self._begun}", instances)
+            raise output_error(self._staging, error) from error
+        spool = self._spools[index] = TickSpool(self._staging / f"{index:06d}-{self._arrangements}", instances)
         return spool
 
     def _place(self, episode: int) -> Path:
@@ -126,6 +127,6 @@ class UsdExporter:
             tick_rate=1.0 / (config.physics.step * config.physics.steps_per_tick),
             gravity=config.physics.gravity,
             cameras=context.cameras,
-            lights=tuple(stage_light(index, light, config.render.exposure) for index, light in enumerate(context.lights)),
+            lights=tuple(make_stage_light(index, light, config.render.exposure) for index, light in enumerate(context.lights)),
             names={entry.obj_id: entry.name for entry in context.catalog.entries},
         )

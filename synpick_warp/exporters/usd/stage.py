@@ -1,9 +1,9 @@
-"""The layer of an episode: objects, gripper and cameras over time, and light. Assets are referenced, not copied.
+"""Layer of a USD episode: poses of objects, gripper and cameras over time, and lights. Assets are referenced, not copied.
 
-Every moving thing has its pose of the first frame as its default value as well: physics engines read that, players read the samples.
+Every moving prim also has its first pose as default value: physics engines read the default, players read the time samples.
 """
 
-# pxr's modules fill themselves when they are loaded, where no type checker sees it.
+# pxr's modules are filled when they are loaded, invisible to type checkers.
 # pyright: reportAttributeAccessIssue=false
 
 from __future__ import annotations
@@ -11,33 +11,32 @@ from __future__ import annotations
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 
-from synpick_warp.exporters.usd.episode import EpisodeFacts, EpisodeSettings
-from synpick_warp.exporters.usd.lights import StageLight
 from synpick_warp.exporters.usd.parts import add_label, object_asset, set_units
+from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, StageLight
 from synpick_warp.scenes.types import Camera
 
 APERTURE = 0.36
-"""Width of the cameras' film in tenths of a metre, USD's unit for lenses: 36 mm. Only its ratio to the focal length shows."""
+"""Horizontal aperture (film width) in tenths of a metre, USD's unit for lenses: 36 mm. Only its ratio to the focal length matters."""
 CLIPPING = (0.01, 100.0)
-"""Nearest and farthest distance that viewers draw [m]."""
+"""Near and far clipping distance of viewers [m]."""
 INSTANCE = "instance"
-"""Taxonomy of the labels that tell the objects of an episode apart, and beginning of their prims' names."""
+"""Taxonomy of instance labels, and prefix of the objects' prim names."""
 ROOT = "/Episode"
 FIXTURES = {"tote": f"{ROOT}/Tote", "finger": f"{ROOT}/Gripper/Finger", "cup": f"{ROOT}/Gripper/Cup"}
 """Asset and prim of each row of `TickBatch.fixture_pose`."""
 
 
-def episode_layer(ticks: np.ndarray, facts: EpisodeFacts, settings: EpisodeSettings) -> Sdf.Layer:
-    """Everything about an episode.
+def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: EpisodeSettings) -> Sdf.Layer:
+    """Build the layer of an episode.
 
     Args:
-        ticks: One row a frame, of `usd_spool.tick_type`.
-        facts: What the file says of the episode.
-        settings: What all episodes share.
+        ticks: One row per frame, of `spool.tick_type`.
+        metadata: Custom data of the root prim.
+        settings: Settings common to all episodes.
     """
     layer = Sdf.Layer.CreateAnonymous()
     stage = Usd.Stage.Open(layer)
-    _begin(stage, facts, settings)
+    _add_root(stage, metadata, settings)
     assets = {f"{ROOT}/Table": "table"}
     UsdGeom.Xform.Define(stage, f"{ROOT}/Table")
     for index, (asset, path) in enumerate(FIXTURES.items()):
@@ -53,24 +52,25 @@ def episode_layer(ticks: np.ndarray, facts: EpisodeFacts, settings: EpisodeSetti
         _add_camera(stage, index, camera)
     first = ticks[0]
     _add_light(stage, settings.lights[first["light"]], float(first["light_yaw"]), float(first["light_exposure"]))
-    # References come last and without a stage: nothing need be resolved from a file that is not in its place yet.
+    # References are added last and without a stage, since they cannot be resolved from a file that is not in its place yet.
     del stage, pair
     for path, asset in assets.items():
         layer.GetPrimAtPath(path).referenceList.prependedItems = [Sdf.Reference(f"./assets/{asset}.usdc")]
     return layer
 
 
-def _begin(stage: Usd.Stage, facts: EpisodeFacts, settings: EpisodeSettings) -> None:
+def _add_root(stage: Usd.Stage, metadata: EpisodeMetadata, settings: EpisodeSettings) -> None:
+    """Define units, time codes, root prim with metadata, physics scene and groups."""
     set_units(stage)
     root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
     stage.SetDefaultPrim(root)
     Usd.ModelAPI(root).SetKind(Kind.Tokens.assembly)
     stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(facts.frames - 1)
+    stage.SetEndTimeCode(metadata.frames - 1)
     stage.SetTimeCodesPerSecond(settings.tick_rate)
     stage.SetFramesPerSecond(settings.tick_rate)
     for name in ("episode", "redraw", "frames", "ending"):
-        root.SetCustomDataByKey(name, getattr(facts, name))
+        root.SetCustomDataByKey(name, getattr(metadata, name))
     scene = UsdPhysics.Scene.Define(stage, f"{ROOT}/Physics")
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0.0, 0.0, -1.0))
     scene.CreateGravityMagnitudeAttr(settings.gravity)
@@ -80,7 +80,7 @@ def _begin(stage: Usd.Stage, facts: EpisodeFacts, settings: EpisodeSettings) -> 
 
 
 def _add_object(stage: Usd.Stage, ticks: np.ndarray, instance: int, settings: EpisodeSettings) -> tuple[str, int]:
-    """An instance with its names; returns its path and its obj_id."""
+    """Add an instance with its labels and ids; returns its path and its obj_id."""
     visible = ticks["object_id"][:, instance] >= 0
     obj_id = int(ticks["object_id"][visible.argmax(), instance])
     path = f"{ROOT}/Objects/{INSTANCE}_{instance:02d}"
@@ -96,41 +96,41 @@ def _add_object(stage: Usd.Stage, ticks: np.ndarray, instance: int, settings: Ep
 
 
 def _add_moving(stage: Usd.Stage, path: str, poses: np.ndarray, visible: np.ndarray, frames: np.ndarray) -> Usd.Prim:
-    """Something that moves.
+    """Add a prim with time-sampled pose and visibility; one that never moves gets default values only.
 
     Args:
-        poses: At every frame of the episode (frame, 7).
-        visible: At which frames it is seen (frame).
-        frames: From which to which frame its pose is known. What does not move has no samples.
+        poses: Pose at every frame of the episode (frame, 7).
+        visible: Visibility at every frame (frame).
+        frames: Frames at which its pose is known.
     """
-    made = UsdGeom.Xform.Define(stage, path)
-    places, turns = poses[frames, :3].astype(np.float64), _continuous(poses[frames, 3:])
+    prim = UsdGeom.Xform.Define(stage, path)
+    positions, rotations = poses[frames, :3].astype(np.float64), _make_continuous(poses[frames, 3:])
     moves = len(frames) > 1 and bool((poses[frames] != poses[frames[0]]).any())
-    translate, orient = made.AddTranslateOp(), made.AddOrientOp()
-    values = zip(frames.tolist(), places.tolist(), turns.tolist(), strict=True)
-    for frame, place, (x, y, z, w) in values:
-        where, turn = Gf.Vec3d(*place), Gf.Quatf(w, x, y, z)
+    translate, orient = prim.AddTranslateOp(), prim.AddOrientOp()
+    values = zip(frames.tolist(), positions.tolist(), rotations.tolist(), strict=True)
+    for frame, xyz, (x, y, z, w) in values:
+        position, rotation = Gf.Vec3d(*xyz), Gf.Quatf(w, x, y, z)
         if frame == frames[0]:
-            translate.Set(where)
-            orient.Set(turn)
+            translate.Set(position)
+            orient.Set(rotation)
         if not moves:
             break
-        translate.Set(where, frame)
-        orient.Set(turn, frame)
-    visibility = made.CreateVisibilityAttr(_visibility(visible[0]))
+        translate.Set(position, frame)
+        orient.Set(rotation, frame)
+    visibility = prim.CreateVisibilityAttr(_visibility(visible[0]))
     changes = np.flatnonzero(np.diff(visible.astype(int))) + 1
     for frame in [0, *changes.tolist()] if len(changes) else []:
         visibility.Set(_visibility(visible[frame]), frame)
-    return made.GetPrim()
+    return prim.GetPrim()
 
 
 def _visibility(visible: bool) -> str:
     return UsdGeom.Tokens.inherited if visible else UsdGeom.Tokens.invisible
 
 
-def _continuous(turns: np.ndarray) -> np.ndarray:
-    """Quaternions (frame, 4) of unit length, each with the sign that is nearer to the one before."""
-    unit = turns.astype(np.float64)
+def _make_continuous(quaternions: np.ndarray) -> np.ndarray:
+    """Normalise quaternions (frame, 4), and choose each sign such that its dot product with the one before is positive."""
+    unit = quaternions.astype(np.float64)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     flips = np.where((unit[1:] * unit[:-1]).sum(axis=1) < 0.0, -1.0, 1.0)
     unit[1:] *= np.cumprod(flips)[:, None]
@@ -138,56 +138,56 @@ def _continuous(turns: np.ndarray) -> np.ndarray:
 
 
 def _add_camera(stage: Usd.Stage, index: int, camera: Camera) -> None:
-    """A pinhole. USD's cameras look along -z with y up; lengths on the film are tenths of a metre."""
-    made = UsdGeom.Camera.Define(stage, f"{ROOT}/Cameras/camera_{index}")
+    """Add a pinhole camera and its render product. USD's cameras look along -z with y up; film lengths are tenths of a metre."""
+    lens = UsdGeom.Camera.Define(stage, f"{ROOT}/Cameras/camera_{index}")
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     focal = APERTURE * fx / camera.width
     height = focal * camera.height / fy
-    made.CreateProjectionAttr(UsdGeom.Tokens.perspective)
-    made.CreateFocalLengthAttr(focal)
-    made.CreateHorizontalApertureAttr(APERTURE)
-    made.CreateVerticalApertureAttr(height)
-    made.CreateHorizontalApertureOffsetAttr((0.5 - cx / camera.width) * APERTURE)
-    made.CreateVerticalApertureOffsetAttr((cy / camera.height - 0.5) * height)
-    made.CreateClippingRangeAttr(Gf.Vec2f(*CLIPPING))
+    lens.CreateProjectionAttr(UsdGeom.Tokens.perspective)
+    lens.CreateFocalLengthAttr(focal)
+    lens.CreateHorizontalApertureAttr(APERTURE)
+    lens.CreateVerticalApertureAttr(height)
+    lens.CreateHorizontalApertureOffsetAttr((0.5 - cx / camera.width) * APERTURE)
+    lens.CreateVerticalApertureOffsetAttr((cy / camera.height - 0.5) * height)
+    lens.CreateClippingRangeAttr(Gf.Vec2f(*CLIPPING))
     pose = np.eye(4)
     pose[:3, :3] = camera.rotation.T * [1.0, -1.0, -1.0]
     pose[:3, 3] = -camera.rotation.T @ camera.translation
-    made.AddTransformOp().Set(Gf.Matrix4d(*pose.T.ravel().tolist()))  # vectors are rows there
+    lens.AddTransformOp().Set(Gf.Matrix4d(*pose.T.ravel().tolist()))  # USD multiplies row vectors.
     UsdGeom.Scope.Define(stage, f"{ROOT}/Render")
     product = UsdRender.Product.Define(stage, f"{ROOT}/Render/camera_{index}")
     product.CreateResolutionAttr(Gf.Vec2i(camera.width, camera.height))
     product.CreatePixelAspectRatioAttr(fx / fy)
-    product.CreateCameraRel().SetTargets([made.GetPath()])
+    product.CreateCameraRel().SetTargets([lens.GetPath()])
 
 
-def _add_light(stage: Usd.Stage, light: StageLight, turn: float, stops: float) -> None:
-    """The episode's light map about everything, turned counter-clockwise [rad], and the map's sun if it has one.
+def _add_light(stage: Usd.Stage, light: StageLight, yaw: float, exposure: float) -> None:
+    """Add the episode's environment map as a dome light, and its sun, if it has one, as a distant light.
 
     Args:
-        turn: Of the map about +z [rad].
-        stops: On top of the exposure that the map has by itself.
+        yaw: Rotation of the map about +z, counter-clockwise [rad].
+        exposure: Exposure compensation relative to the automatic exposure [EV].
     """
     dome = UsdLux.DomeLight.Define(stage, f"{ROOT}/Lights/Dome")
     dome.CreateTextureFileAttr(Sdf.AssetPath(f"./assets/{light.file}"))
     dome.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
     dome.CreateIntensityAttr(light.intensity)
-    dome.CreateExposureAttr(stops)
+    dome.CreateExposureAttr(exposure)
     dome.GetPrim().SetDisplayName(light.name)
-    # A dome has its zenith along its +y and longitude 0 along its +z. Raised by 90° about x, the zenith is up and longitude 0 is -y:
-    # a quarter turn brings it to +x, where azimuths begin.
-    dome.AddRotateZOp().Set(float(np.degrees(turn)) + 90.0)
+    # A dome light has its zenith along +y and longitude 0 along +z. Rotated by 90° about x, its zenith is up and longitude 0 is -y;
+    # a rotation by 90° about z brings it to +x, our azimuth 0.
+    dome.AddRotateZOp().Set(float(np.degrees(yaw)) + 90.0)
     dome.AddRotateXOp(UsdGeom.XformOp.PrecisionFloat, UsdLux.Tokens.orientToStageUpAxis).Set(90.0)
     if light.sun_irradiance is None:
         return
     sun = UsdLux.DistantLight.Define(stage, f"{ROOT}/Lights/Sun")
-    most = max(light.sun_irradiance)
+    peak = max(light.sun_irradiance)
     sun.CreateAngleAttr(light.sun_angle)
-    # Normalised, the intensity is the irradiance of what faces the sun, whatever its angle.
+    # With `normalize`, the intensity is the irradiance of a surface that faces the sun, independent of its angular diameter.
     sun.CreateNormalizeAttr(True)
-    sun.CreateIntensityAttr(light.intensity * most)
-    sun.CreateColorAttr(Gf.Vec3f(*(value / most for value in light.sun_irradiance)))
-    sun.CreateExposureAttr(stops)
-    # Distant lights shine along their -z.
-    sun.AddRotateZOp().Set(float(np.degrees(turn)) + light.sun_azimuth)
+    sun.CreateIntensityAttr(light.intensity * peak)
+    sun.CreateColorAttr(Gf.Vec3f(*(value / peak for value in light.sun_irradiance)))
+    sun.CreateExposureAttr(exposure)
+    # A distant light shines along its -z.
+    sun.AddRotateZOp().Set(float(np.degrees(yaw)) + light.sun_azimuth)
     sun.AddRotateYOp().Set(light.sun_polar)

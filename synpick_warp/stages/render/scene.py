@@ -16,13 +16,11 @@ from synpick_warp.kernels.render.lighting.path_tracing import PathScene
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Hollow, Material, TriangleMesh
 from synpick_warp.stages.render.chances import build_chances
 from synpick_warp.stages.render.gloss import measure_gloss
 from synpick_warp.stages.render.light_tables import light_table
-
-TABLE_ROUGHNESS = 0.8
-"""The table is matt; it has no setting of its own but its colour."""
 
 
 @dataclass(frozen=True, eq=False)

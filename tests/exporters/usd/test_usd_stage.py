@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdRender, UsdSemantics
 
-from synpick_warp.exporters.usd.episode import EpisodeFacts, EpisodeSettings
-from synpick_warp.exporters.usd.lights import part_sun, stage_light, write_light_maps
+from synpick_warp.exporters.usd.lights import make_stage_light, separate_sun, write_light_maps
 from synpick_warp.exporters.usd.spool import TickSpool, read_ticks
-from synpick_warp.exporters.usd.stage import FIXTURES, episode_layer
+from synpick_warp.exporters.usd.stage import FIXTURES, make_episode_layer
+from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import map_directions, resize_map
@@ -41,9 +41,9 @@ def spooled(folder, ticks=TICKS) -> np.ndarray:
 
 def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[EnvironmentMap, ...] = skies()[:2]) -> Usd.Stage:
     """The stage of an episode, without its assets."""
-    made = tuple(stage_light(index, light, 1.0) for index, light in enumerate(lights))
-    facts = EpisodeFacts(0, 0, len(rows), "emptied")
-    layer = episode_layer(rows, facts, EpisodeSettings(15.0, 9.81, cameras, made, {1: "one", 2: "two", 3: "three"}))
+    made = tuple(make_stage_light(index, light, 1.0) for index, light in enumerate(lights))
+    facts = EpisodeMetadata(0, 0, len(rows), "emptied")
+    layer = make_episode_layer(rows, facts, EpisodeSettings(15.0, 9.81, cameras, made, {1: "one", 2: "two", 3: "three"}))
     for prim in layer.rootPrims["Episode"].nameChildren.values():
         for each in (prim, *prim.nameChildren.values()):
             each.referenceList.ClearEdits()
@@ -222,9 +222,9 @@ def test_suns_shine_from_where_they_stand(rows, azimuth, polar):
     a, p = np.radians(azimuth) + usd_sets.TURN, np.radians(polar)
     np.testing.assert_allclose(found, -np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)]), atol=1e-6)
     assert sun.GetNormalizeAttr().Get()
-    assert np.radians(sun.GetAngleAttr().Get() / 2) == pytest.approx(np.arctan(part_sun(light)[2]), rel=1e-5)
+    assert np.radians(sun.GetAngleAttr().Get() / 2) == pytest.approx(np.arctan(separate_sun(light)[2]), rel=1e-5)
     irradiance = np.array(sun.GetColorAttr().Get()) * sun.GetIntensityAttr().Get()
-    made = stage_light(0, light, 1.0)
+    made = make_stage_light(0, light, 1.0)
     np.testing.assert_allclose(irradiance, made.intensity * np.array(made.sun_irradiance), rtol=1e-5)
 
 
@@ -238,7 +238,7 @@ def test_maps_without_a_sun_have_none(stage):
 def test_no_light_counts_twice(irradiance, rows, sharpness):
     """Map and sun are those of the pictures, whether the sun is a light of its own or a disc in its map."""
     light = sunny(30.0, 50.0, irradiance, sharpness, rows)
-    rest, beam, spread = part_sun(light)
+    rest, beam, spread = separate_sun(light)
     table = light_tables.light_table(light, None)
     assert spread == pytest.approx(table.main_spread, rel=1e-4)
     assert (spread > MAX_SUN_ANGULAR_RADIUS) == (not beam.any()) == (sharpness == 100.0)
@@ -264,4 +264,4 @@ def test_wide_suns_are_in_the_map_alone(rows):
 )
 def test_brightness_is_that_of_the_pictures(light):
     expected = light_tables.light_table(light, None).exposure
-    assert stage_light(0, light, 1.5).intensity == pytest.approx(1.5 * expected, rel=0.03)
+    assert make_stage_light(0, light, 1.5).intensity == pytest.approx(1.5 * expected, rel=0.03)

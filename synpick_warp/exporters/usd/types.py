@@ -1,0 +1,58 @@
+"""Plain descriptions that the bake sends to the writer processes of USD episodes. Imports neither pxr nor OpenCV."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from synpick_warp.codes import Ending
+from synpick_warp.frames import EpisodeEnd
+from synpick_warp.scenes.types import Camera
+
+
+@dataclass(frozen=True)
+class StageLight:
+    """Environment map as a dome light, and its sun as a distant light."""
+
+    name: str
+    file: str
+    """EXR file, relative to the asset library."""
+    intensity: float
+    """Factor from the map's radiance to display range."""
+    sun_azimuth: float
+    """Direction to the sun in the map's frame, counter-clockwise about +z from +x [°]."""
+    sun_polar: float
+    """Angle between +z and the direction to the sun [°]."""
+    sun_irradiance: tuple[float, float, float] | None
+    """Irradiance of a surface that faces the sun, linear RGB, in the map's units; None: no distant light."""
+    sun_angle: float
+    """Angular diameter of the sun [°]."""
+
+
+@dataclass(frozen=True)
+class EpisodeSettings:
+    """Settings common to all episodes."""
+
+    tick_rate: float
+    """Frames per second of simulated time [1/s]."""
+    gravity: float
+    """[m/s²]"""
+    cameras: tuple[Camera, ...]
+    lights: tuple[StageLight, ...]
+    names: dict[int, str]
+    """obj_id -> name of the object."""
+
+
+@dataclass(frozen=True)
+class EpisodeMetadata:
+    """Custom data of an episode's root prim."""
+
+    episode: int
+    redraw: int
+    """Number of arrangements that were discarded before this one."""
+    frames: int
+    ending: str
+
+    @staticmethod
+    def from_end(end: EpisodeEnd) -> EpisodeMetadata:
+        """Take the metadata from the episode's end."""
+        return EpisodeMetadata(end.episode, end.redraw, end.frames, Ending(end.ending).name.lower())
