@@ -71,8 +71,8 @@ class SettleData:
     rest_ticks: int
     stuck_ticks: int
     late_ticks: int
-    rest_shift: float
-    last_shift: float
+    rest_threshold: float
+    relaxed_rest_threshold: float
     stuck_depth: float
     max_redrops: int
 
@@ -99,7 +99,7 @@ class MoveData:
     mass: float
     gravity: float
     step: float
-    tip: float
+    tcp_offset: float
 
 
 @wp.struct
@@ -158,7 +158,7 @@ class SuctionData:
     twist_damping: float
     swing_limit: float
     swing_stiffness: float
-    tip: float
+    tcp_offset: float
     finger_mass: float
     cup_mass: float
     tilt_inertia: float

@@ -167,7 +167,7 @@ class AttemptLog:
         for world in np.flatnonzero((phase == Phase.ACT) | (phase == Phase.OVER)).tolist():
             running = self._running.get(world)
             if running is None:
-                running = self._running[world] = _Running(_number(report, "episode", world), int((report.entry[world] >= 0).sum()))
+                running = self._running[world] = _Running(_number(report, "episode", world), int((report.catalog_index[world] >= 0).sum()))
             self._follow(running, report, world)
             if phase[world] == Phase.OVER:
                 ended[running.episode] = self._hand_over(report, world)
@@ -190,7 +190,7 @@ class AttemptLog:
         running, mode = self._running.pop(world), Mode(_number(report, "mode", world)).name.lower()
         if not Ending(_number(report, "ending", world)).delivers:
             return EpisodeRecord(mode)
-        return EpisodeRecord(mode, running.objects, int((report.entry[world] >= 0).sum()), tuple(running.attempts))
+        return EpisodeRecord(mode, running.objects, int((report.catalog_index[world] >= 0).sum()), tuple(running.attempts))
 
     def _begin(self, episode: int, report: TickReport, world: int) -> dict[str, Any]:
         """What is known of an attempt when its world has been looked at."""
@@ -231,7 +231,7 @@ class AttemptLog:
         running.begun = None
 
     def _sight(self, report: TickReport, world: int) -> ObservationRecord:
-        present = np.flatnonzero(report.entry[world] >= 0)
+        present = np.flatnonzero(report.catalog_index[world] >= 0)
         votes = report.observation.votes[world][np.ix_(present, present)]
         lower, upper = np.nonzero(votes)
         pairs = zip(present[lower].tolist(), present[upper].tolist(), _tidy_vector(votes[lower, upper]), strict=True)
@@ -256,7 +256,7 @@ class AttemptLog:
         )
 
     def _object_id(self, report: TickReport, world: int, instance: int) -> int:
-        return int(self.object_ids[report.entry[world, instance]])
+        return int(self.object_ids[report.catalog_index[world, instance]])
 
 
 def _number(report: TickReport, name: str, world: int) -> int:

@@ -112,14 +112,15 @@ class Outcome(_Described):
 class Status(enum.IntEnum):
     """Column of a world's status row: integers that the host reads after each tick.
 
-    The row describes the end of the tick, before perception runs: attempt, target, hits and caught belong to the running attempt, or
-    in a tick with an outcome to the attempt that ended.
+    The row describes the end of the tick, before perception runs: attempt, target, hits and engaged instances belong to the running
+    attempt, or in a tick with an outcome to the attempt that ended. Reports and data sets call the columns by `column_names`.
     """
 
     PHASE = 0
     ENDING = 1
     EPISODE = 2
-    REDRAW = 3
+    ARRANGEMENT = 3
+    """Index of the arrangement within its episode: 0, plus 1 each time it was resampled."""
     FRAME = 4
     LIVE = 5
     MODE = 6
@@ -128,17 +129,17 @@ class Status(enum.IntEnum):
     OUTCOME = 9
     TARGET = 10
     HITS = 11
-    CAUGHT = 12
+    ENGAGED = 12
     """Bit i: instance i was engaged by a ray."""
-    HELD = 13
+    ATTACHED = 13
     """Bit i: instance i is attached to the cup, or was picked in this tick."""
 
 
 class Measure(enum.IntEnum):
     """Column of a world's row of real numbers that the host reads after each tick."""
 
-    LOAD = 0
-    """Largest seal force in the tick [N]."""
+    PEAK_FORCE = 0
+    """Largest seal force in the tick [N], that of a seal that broke included."""
 
 
 class Stream(enum.IntEnum):
@@ -190,6 +191,15 @@ class Effect(enum.IntEnum):
     SHOT_NOISE = 6
     READ_NOISE = 7
     JPEG_QUALITY = 8
+
+
+PUBLIC_COLUMNS = {"arrangement": "redraw", "engaged": "caught", "attached": "held", "peak_force": "load"}
+"""Columns of `Status` and `Measure` whose name in reports and data sets differs from the member's."""
+
+
+def column_names(kind: type[enum.IntEnum]) -> dict[str, enum.IntEnum]:
+    """Members of `Status` or `Measure` by their name in reports and data sets, in order of their values."""
+    return {PUBLIC_COLUMNS.get(member.name.lower(), member.name.lower()): member for member in sorted(kind)}
 
 
 def names(kind: type[enum.IntEnum]) -> tuple[str, ...]:

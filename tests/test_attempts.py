@@ -83,7 +83,7 @@ def pick_one(world: World) -> Ticks:
         hits=RAYS - 1,
         caught=bits(1, 3),
         held=bits(1, 3),
-        entry=[-1] * ROOM,
+        catalog_index=[-1] * ROOM,
     )
     world.over(Ending.EMPTIED)
     yield
@@ -214,7 +214,7 @@ def every_outcome(world: World) -> Ticks:
     world.look(1)
     yield
     yield from world.attempt(
-        0, [0.0, 9.0, 8.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, caught=bits(0, 1), held=bits(1), entry=[2, -1, 1, 1]
+        0, [0.0, 9.0, 8.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, caught=bits(0, 1), held=bits(1), catalog_index=[2, -1, 1, 1]
     )
     world.look(0)
     yield
@@ -222,12 +222,12 @@ def every_outcome(world: World) -> Ticks:
     world.look(0)
     yield
     yield from world.attempt(
-        2, [0.0, 2.0, 1.0, 1.0], outcome=Outcome.OTHER_PICKED, hits=1, caught=bits(0, 2), held=bits(2), entry=[2, -1, -1, 1]
+        2, [0.0, 2.0, 1.0, 1.0], outcome=Outcome.OTHER_PICKED, hits=1, caught=bits(0, 2), held=bits(2), catalog_index=[2, -1, -1, 1]
     )
     world.look(3)
     yield
     # Instance 3 falls beside the tote in the meantime.
-    world.entry[0, 3] = -1
+    world.catalog_index[0, 3] = -1
     yield from world.attempt(3, [0.0, 0.0], outcome=Outcome.NOTHING_CAUGHT, hits=0, caught=0, held=0)
     world.look(-1)
     yield
@@ -245,7 +245,7 @@ def redrawn(world: World) -> Ticks:
     world.first_frame()
     world.look(0)
     yield
-    yield from world.attempt(0, [0.0, 6.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, caught=1, held=1, entry=[-1, 1, -1, -1])
+    yield from world.attempt(0, [0.0, 6.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, caught=1, held=1, catalog_index=[-1, 1, -1, -1])
     world.look(1)
     yield
     world.frame(task=Task.APPROACH, attempt=1)
@@ -271,7 +271,7 @@ def stir(world: World) -> Ticks:
     world.first_frame()
     yield
     for entry in ([0, 1, 2, 0], [0, -1, 2, 0], [0, -1, 2, 0]):
-        world.frame(entry=entry, load=0.0)
+        world.frame(catalog_index=entry, load=0.0)
         yield
     world.frame()
     world.over(Ending.FINISHED)

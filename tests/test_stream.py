@@ -145,7 +145,7 @@ def test_what_a_batch_says_of_its_views(device):
     np.testing.assert_array_equal(made["frame"], 2 * world)
     np.testing.assert_allclose(made["time"], 2 * world * tick, rtol=1e-12)
     np.testing.assert_array_equal(made["pose"], known.pose[world])
-    ids = np.where(known.entry >= 0, OBJECT_IDS[known.entry], -1)
+    ids = np.where(known.catalog_index >= 0, OBJECT_IDS[known.catalog_index], -1)
     np.testing.assert_array_equal(made["object_id"], ids[world])
     assert ids.min() == -1
     assert {made[name].dtype.name for name in ("episode", "camera", "frame", "object_id", "pixels", "boxes")} == {"int32"}
@@ -188,7 +188,7 @@ def test_what_a_tick_says_of_its_live_worlds():
     assert len(batch) == 2
     assert (batch.episode.tolist(), batch.frame.tolist(), batch.time.tolist()) == ([21, 24], [2, 8], [0.5, 2.0])
     np.testing.assert_array_equal(batch.pose, known.pose[live])
-    np.testing.assert_array_equal(batch.object_id, np.where(known.entry >= 0, OBJECT_IDS[known.entry], -1)[live])
+    np.testing.assert_array_equal(batch.object_id, np.where(known.catalog_index >= 0, OBJECT_IDS[known.catalog_index], -1)[live])
     np.testing.assert_array_equal(batch.fixture_pose, fixtures[live])
     assert batch.fixture_visible.tolist() == [[3, 4, 5], [12, 13, 14]]
     assert (batch.light.tolist(), batch.light_yaw.tolist(), batch.light_exposure.tolist()) == ([1, 4], [0.5, 2.0], [-1, -4])
@@ -248,16 +248,16 @@ def new_record(device) -> TickRecord:
 
 def test_a_report_outlives_the_next_tick(device):
     record = new_record(device)
-    record.snapshot.entry.fill_(2)
+    record.snapshot.catalog_index.fill_(2)
     record.status.table.fill_(Phase.ACT)
     reader = TickReader(record)
     reader.start()
     report = reader.wait()
-    everything = (record.snapshot.entry, record.status.table, record.status.measures, *vars(record.observation).values())
+    everything = (record.snapshot.catalog_index, record.status.table, record.status.measures, *vars(record.observation).values())
     for array in (*everything, *vars(record.plan).values()):
         array.fill_(5)
     record.snapshot.pose.fill_(wp.transform_identity())
-    assert (report.entry == 2).all()
+    assert (report.catalog_index == 2).all()
     assert report.column("phase").tolist() == [Phase.ACT] * WORLDS
     assert (report.pose == 0.0).all()
     assert report.pose.shape == (WORLDS, ROOM, 7)

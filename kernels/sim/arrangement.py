@@ -11,45 +11,45 @@ wp.set_module_options({"enable_backward": False})
 
 # Draws before an arrangement without repeats is taken as complete; each draw finds a new object with
 # probability 1 / entries at least, so 4,096 miss one with probability e^-8 at 512 entries.
-MAX_DRAWS = wp.constant(4096)
+MAX_SAMPLES = wp.constant(4096)
 # Empty slots wait here, far below everything [m].
 PARKED_HEIGHT = wp.constant(-100.0)
 # Numbers that one drop takes from its stream: x, y and three for the rotation.
-DROP_NUMBERS = wp.constant(5)
+DROP_SAMPLES = wp.constant(5)
 
 
 @wp.kernel
-def take_episodes_kernel(
+def assign_episodes_kernel(
     # Scene:
     worlds: int,
     episodes: wp.array[int],
     tries: int,
     # State:
-    address_inout: wp.array[wp.vec2i],
+    arrangement_id_inout: wp.array[wp.vec2i],
     phase_inout: wp.array[int],
     ending_inout: wp.array[int],
     next_episode_inout: wp.array[int],
 ):
     """Worlds whose episode is over take the next of `episodes`; an episode that delivered nothing is drawn again where it was.
 
-    One thread walks over the worlds, so that numbers go to worlds in order.
+    One thread walks over the worlds, so that numbers go to worlds in corner_order.
     """
     following = next_episode_inout[0]
     for world in range(worlds):
         phase = phase_inout[world]
-        episode = address_inout[world][0]
-        redraw = address_inout[world][1]
+        episode = arrangement_id_inout[world][0]
+        redraw = arrangement_id_inout[world][1]
         again = phase == Phase.OVER and not delivers(ending_inout[world]) and redraw + 1 < tries
         if again:
-            address_inout[world] = wp.vec2i(episode, redraw + 1)
+            arrangement_id_inout[world] = wp.vec2i(episode, redraw + 1)
             phase_inout[world] = Phase.START
         elif phase == Phase.OVER or phase == Phase.EMPTY:
             if following < episodes.shape[0]:
-                address_inout[world] = wp.vec2i(episodes[following], 0)
+                arrangement_id_inout[world] = wp.vec2i(episodes[following], 0)
                 phase_inout[world] = Phase.START
                 following += 1
             else:
-                address_inout[world] = wp.vec2i(-1, 0)
+                arrangement_id_inout[world] = wp.vec2i(-1, 0)
                 phase_inout[world] = Phase.IDLE
         if phase == Phase.OVER or phase == Phase.EMPTY:
             ending_inout[world] = Ending.RUNNING
@@ -57,12 +57,12 @@ def take_episodes_kernel(
 
 
 @wp.kernel
-def draw_modes_kernel(
+def sample_modes_kernel(
     # Scene:
     seed: wp.uint64,
     mode: ModeData,
     # State:
-    address: wp.array[wp.vec2i],
+    arrangement_id: wp.array[wp.vec2i],
     phase: wp.array[int],
     # Out:
     mode_out: wp.array[int],
@@ -74,7 +74,7 @@ def draw_modes_kernel(
     world = wp.tid()
     if phase[world] != Phase.START:
         return
-    number = uniform(stream_key(seed, address[world][0], 0, Stream.MODE), 0)
+    number = uniform(stream_key(seed, arrangement_id[world][0], 0, Stream.MODE), 0)
     if number < mode.pick_share:
         mode_out[world] = Mode.PICK
     elif number < mode.pick_or_target_share:
@@ -84,49 +84,49 @@ def draw_modes_kernel(
 
 
 @wp.func
-def clear_entries(entry: wp.array2d[int], world: int, instances: int):
+def clear_catalog_indices(catalog_index: wp.array2d[int], world: int, instances: int):
     for instance in range(instances):
-        entry[world, instance] = -1
+        catalog_index[world, instance] = -1
 
 
 @wp.func
-def already_drawn(entry: wp.array2d[int], world: int, count: int, candidate: int) -> bool:
+def is_sampled(catalog_index: wp.array2d[int], world: int, count: int, candidate: int) -> bool:
     found = bool(False)
     for instance in range(count):
-        if entry[world, instance] == candidate:
+        if catalog_index[world, instance] == candidate:
             found = True
     return found
 
 
 @wp.kernel
-def draw_objects_kernel(
+def sample_objects_kernel(
     # Scene:
     seed: wp.uint64,
     layout: LayoutData,
     catalog: CatalogData,
     drop: DropData,
     # State:
-    address: wp.array[wp.vec2i],
+    arrangement_id: wp.array[wp.vec2i],
     mode: wp.array[int],
     phase_inout: wp.array[int],
     ending_inout: wp.array[int],
     # Out:
-    entry_out: wp.array2d[int],
-    slot_out: wp.array2d[int],
+    catalog_index_out: wp.array2d[int],
+    body_slot_out: wp.array2d[int],
 ):
     """Draw objects, uniformly, until the next one would exceed the volume budget V: Σ volume ≤ V.
 
-    The first object may be drawn several times, until one fits. Objects take slots of their kind in the order drawn; if a
+    The first object may be drawn several times, until one fits. Objects take slots of their kind in the corner_order drawn; if a
     kind runs out, the episode ends with an overflow and is drawn again.
     """
     world = wp.tid()
     phase = phase_inout[world]
     if phase != Phase.START and phase != Phase.IDLE:
         return
-    clear_entries(entry_out, world, layout.instances)
+    clear_catalog_indices(catalog_index_out, world, layout.instances)
     if phase == Phase.IDLE:
         return
-    key = stream_key(seed, address[world][0], address[world][1], Stream.OBJECTS)
+    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.OBJECTS)
     repeats = wp.where(mode[world] == Mode.MOVE, drop.move_repeats, drop.pick_repeats)
     count = int(0)
     singles = int(0)
@@ -134,40 +134,40 @@ def draw_objects_kernel(
     total = float(0.0)
     overflow = bool(False)
     open = bool(True)
-    for draw in range(MAX_DRAWS):
+    for draw in range(MAX_SAMPLES):
         if open:
             candidate = uniform_index(key, draw, catalog.count)
-            known = repeats == 0 and already_drawn(entry_out, world, count, candidate)
+            known = repeats == 0 and is_sampled(catalog_index_out, world, count, candidate)
             fits = total + catalog.volume[candidate] <= drop.volume
             if not known and not fits and count > 0:
                 open = False
             if not known and fits:
-                slot = singles
+                body_slot = singles
                 if catalog.compound[candidate] == 1:
-                    slot = layout.single_slots + compounds
+                    body_slot = layout.single_slots + compounds
                     compounds += 1
                 else:
                     singles += 1
                 overflow = overflow or singles > layout.single_slots or compounds > layout.slots - layout.single_slots
-                entry_out[world, count] = candidate
-                slot_out[world, count] = slot
+                catalog_index_out[world, count] = candidate
+                body_slot_out[world, count] = body_slot
                 total += catalog.volume[candidate]
                 count += 1
             if overflow or count == layout.instances or (repeats == 0 and count == catalog.count):
                 open = False
     if overflow:
-        clear_entries(entry_out, world, layout.instances)
+        clear_catalog_indices(catalog_index_out, world, layout.instances)
         ending_inout[world] = Ending.ARRANGEMENT_OVERFLOW
         phase_inout[world] = Phase.OVER
 
 
 @wp.kernel
-def draw_lights_kernel(
+def sample_lights_kernel(
     # Scene:
     seed: wp.uint64,
     drop: DropData,
     # State:
-    address: wp.array[wp.vec2i],
+    arrangement_id: wp.array[wp.vec2i],
     phase: wp.array[int],
     # Out:
     light_out: wp.array[int],
@@ -181,7 +181,7 @@ def draw_lights_kernel(
     world = wp.tid()
     if phase[world] != Phase.START:
         return
-    key = stream_key(seed, address[world][0], address[world][1], Stream.LIGHT)
+    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.LIGHT)
     light_out[world] = uniform_index(key, 0, drop.lights)
     light_yaw_out[world] = TAU * uniform(key, 1) * float(drop.turn_lights)
     light_exposure_out[world] = drop.exposure_spread * (2.0 * uniform(key, 2) - 1.0)
@@ -190,7 +190,7 @@ def draw_lights_kernel(
 @wp.func
 def drop_pose(key: wp.uint64, index: int, radius: float, height: float, drop: DropData) -> wp.transform:
     """A random pose at a height: spread over the part of the rim's opening that the bounding sphere can use."""
-    first = index * DROP_NUMBERS
+    first = index * DROP_SAMPLES
     x = (2.0 * uniform(key, first) - 1.0) * drop.spread * wp.max(0.0, 0.5 * drop.rim_length - radius)
     y = (2.0 * uniform(key, first + 1) - 1.0) * drop.spread * wp.max(0.0, 0.5 * drop.rim_width - radius)
     return wp.transform(wp.vec3(x, y, height), uniform_rotation(key, first + 2))
@@ -210,7 +210,7 @@ def write_body(joint_q: wp.array[float], joint_qd: wp.array[float], first_q: int
 
 
 @wp.kernel
-def empty_worlds_kernel(
+def reset_worlds_kernel(
     # Scene:
     layout: LayoutData,
     catalog: CatalogData,
@@ -269,9 +269,9 @@ def drop_objects_kernel(
     catalog: CatalogData,
     drop: DropData,
     # State:
-    address: wp.array[wp.vec2i],
-    entry: wp.array2d[int],
-    slot: wp.array2d[int],
+    arrangement_id: wp.array[wp.vec2i],
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
     phase_inout: wp.array[int],
     # Out:
     variant_out: wp.array[int],
@@ -287,12 +287,12 @@ def drop_objects_kernel(
     if phase_inout[world] != Phase.START:
         return
     body = world * layout.bodies + layout.gripper_bodies
-    key = stream_key(seed, address[world][0], address[world][1], Stream.DROP)
+    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DROP)
     height = drop.rim_height
     for instance in range(layout.instances):
-        e = entry[world, instance]
+        e = catalog_index[world, instance]
         if e >= 0:
-            s = slot[world, instance]
+            s = body_slot[world, instance]
             variant_out[body + s] = catalog.variant[e]
             q = world * layout.coords + layout.gripper_dofs + 7 * s
             qd = world * layout.dofs + layout.gripper_dofs + 6 * s

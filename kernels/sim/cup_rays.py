@@ -1,4 +1,4 @@
-"""What the suction cup catches: rays from its tip against the world's own objects."""
+"""What the suction cup catches: rays from its tcp against the world's own objects."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ CUP = wp.constant(1)
 
 @wp.struct
 class SurfaceData:
-    """What the rays hit, one row a catalog entry. Pieces of entry e: first_piece[e] to first_piece[e + 1]; planes of a piece likewise."""
+    """Surfaces that the rays hit, by catalog index e: convex pieces first_piece[e] to first_piece[e + 1], planes of a piece likewise."""
 
     first_piece: wp.array[int]
     first_plane: wp.array[int]
@@ -30,14 +30,14 @@ class SurfaceData:
 
 
 @wp.func
-def tip_pose(cup: wp.transform, tip: float) -> wp.transform:
-    """Frame at the cup's tip with the cup's axes; the tip lies at (0, 0, -tip) in the cup's frame."""
-    return cup * wp.transform(wp.vec3(0.0, 0.0, -tip), wp.quat_identity())
+def tcp_pose(cup: wp.transform, tcp_offset: float) -> wp.transform:
+    """Frame at the cup's tcp with the cup's axes; the tcp lies at (0, 0, -tcp) in the cup's frame."""
+    return cup * wp.transform(wp.vec3(0.0, 0.0, -tcp_offset), wp.quat_identity())
 
 
 @wp.func
 def ray_start(ray: int, suction: SuctionData) -> wp.vec3:
-    """Start of a ray in the tip's frame [m]: on the circle at angle 2 π ray / rays, the first on +x."""
+    """Start of a ray in the tcp's frame [m]: on the circle at angle 2 π ray / rays, the first on +x."""
     angle = TAU * float(ray) / float(suction.rays)
     return wp.vec3(suction.radius * wp.cos(angle), suction.radius * wp.sin(angle), 0.0)
 
@@ -67,7 +67,7 @@ def clip_piece(start: wp.vec3, way: wp.vec3, reach: float, first: int, last: int
 
 
 @wp.func
-def cast_ray(start: wp.vec3, way: wp.vec3, reach: float, pose: wp.transform, entry: int, surface: SurfaceData) -> float:
+def cast_ray(start: wp.vec3, way: wp.vec3, reach: float, pose: wp.transform, catalog_index: int, surface: SurfaceData) -> float:
     """Distance to an object's surface along a ray given in the world [m], or MISS.
 
     A mesh is hit where the ray first meets a triangle, from either side: a ray that starts inside hits where it leaves.
@@ -77,11 +77,11 @@ def cast_ray(start: wp.vec3, way: wp.vec3, reach: float, pose: wp.transform, ent
     direction = wp.transform_vector(inverse, way)
     nearest = float(MISS)
     if surface.use_mesh != 0:
-        query = wp.mesh_query_ray(surface.mesh[entry], local, direction, reach)
+        query = wp.mesh_query_ray(surface.mesh[catalog_index], local, direction, reach)
         if query.result:
             nearest = query.t
         return nearest
-    for piece in range(surface.first_piece[entry], surface.first_piece[entry + 1]):
+    for piece in range(surface.first_piece[catalog_index], surface.first_piece[catalog_index + 1]):
         distance = clip_piece(local, direction, reach, surface.first_plane[piece], surface.first_plane[piece + 1], surface.plane)
         if distance >= 0.0 and (nearest < 0.0 or distance < nearest):
             nearest = distance
@@ -105,34 +105,34 @@ def count_seal_rays_kernel(
     phase: wp.array[int],
     task: wp.array[int],
     steps: wp.array[int],
-    entry: wp.array2d[int],
-    slot: wp.array2d[int],
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
     # Out:
     hits_out: wp.array[int],
-    caught_out: wp.array[wp.uint32],
+    engaged_bits_out: wp.array[wp.uint32],
 ):
     """Where the suction begins: how many rays hit an object, and the objects hit as bits of instances.
 
-    Rays run from a circle at the tip along the cup's -z, as far as they reach: x_k = tip + r (cos a, sin a, 0), a = 2 π k / rays. Each
+    Rays run from a circle at the tcp along the cup's -z, as far as they reach: x_k = tcp + r (cos a, sin a, 0), a = 2 π k / rays. Each
     catches the nearest object on its way, the first of several at the same distance. Nothing but the world's own objects stops a ray.
     """
     world = wp.tid()
     if not suction_begins(phase[world], task[world], steps[world], pick):
         return
     body = world * layout.bodies
-    tip = tip_pose(body_q[body + CUP], suction.tip)
-    way = wp.transform_vector(tip, wp.vec3(0.0, 0.0, -1.0))
+    tcp = tcp_pose(body_q[body + CUP], suction.tcp_offset)
+    way = wp.transform_vector(tcp, wp.vec3(0.0, 0.0, -1.0))
     hits = int(0)
-    caught = wp.uint32(0)
+    engaged_bits = wp.uint32(0)
     for ray in range(suction.rays):
-        start = wp.transform_point(tip, ray_start(ray, suction))
+        start = wp.transform_point(tcp, ray_start(ray, suction))
         nearest = float(MISS)
         hit = int(-1)
         for instance in range(layout.instances):
-            e = entry[world, instance]
+            e = catalog_index[world, instance]
             if e >= 0:
-                pose = body_q[body + layout.gripper_bodies + slot[world, instance]]
+                pose = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
                 # No point of the ray is farther from its start than it reaches.
                 if wp.length(wp.transform_get_translation(pose) - start) <= surface.radius[e] + suction.reach:
                     distance = cast_ray(start, way, suction.reach, pose, e, surface)
@@ -141,13 +141,13 @@ def count_seal_rays_kernel(
                         hit = instance
         if hit >= 0:
             hits += 1
-            caught = caught | (wp.uint32(1) << wp.uint32(hit))
+            engaged_bits = engaged_bits | (wp.uint32(1) << wp.uint32(hit))
     hits_out[world] = hits
-    caught_out[world] = caught
+    engaged_bits_out[world] = engaged_bits
 
 
 @wp.kernel
-def make_seals_kernel(
+def engage_seals_kernel(
     # Scene:
     layout: LayoutData,
     pick: PickData,
@@ -156,18 +156,18 @@ def make_seals_kernel(
     phase: wp.array[int],
     task: wp.array[int],
     steps: wp.array[int],
-    slot: wp.array2d[int],
+    body_slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
     # In:
     hits: wp.array[int],
-    caught: wp.array[wp.uint32],
+    engaged_bits: wp.array[wp.uint32],
     # Out:
-    held_out: wp.array2d[int],
-    anchor_out: wp.array2d[wp.transform],
-    load_out: wp.array2d[float],
-    limit_out: wp.array[float],
+    attached_out: wp.array2d[int],
+    object_in_tcp_out: wp.array2d[wp.transform],
+    seal_force_out: wp.array2d[float],
+    break_force_out: wp.array[float],
 ):
-    """Where the suction begins: join every object that was caught to the tip as it lies there, anchor = tip⁻¹ object.
+    """Where the suction begins: join every object that was engaged_bits to the tcp as it lies there, object_in_tcp = tcp⁻¹ object.
 
     The seals bear `good_force` if no more rays miss than are tolerated, else `poor_force`.
     """
@@ -175,12 +175,12 @@ def make_seals_kernel(
     if not suction_begins(phase[world], task[world], steps[world], pick):
         return
     if instance == 0:
-        limit_out[world] = wp.where(suction.rays - hits[world] <= suction.tolerated_misses, suction.good_force, suction.poor_force)
-    if (caught[world] & (wp.uint32(1) << wp.uint32(instance))) == wp.uint32(0):
+        break_force_out[world] = wp.where(suction.rays - hits[world] <= suction.tolerated_misses, suction.good_force, suction.poor_force)
+    if (engaged_bits[world] & (wp.uint32(1) << wp.uint32(instance))) == wp.uint32(0):
         return
     body = world * layout.bodies
-    tip = tip_pose(body_q[body + CUP], suction.tip)
-    pose = body_q[body + layout.gripper_bodies + slot[world, instance]]
-    held_out[world, instance] = 1
-    anchor_out[world, instance] = wp.transform_inverse(tip) * pose
-    load_out[world, instance] = 0.0
+    tcp = tcp_pose(body_q[body + CUP], suction.tcp_offset)
+    pose = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
+    attached_out[world, instance] = 1
+    object_in_tcp_out[world, instance] = wp.transform_inverse(tcp) * pose
+    seal_force_out[world, instance] = 0.0

@@ -23,7 +23,7 @@ def judge_tasks_kernel(
     # State:
     phase: wp.array[int],
     mode: wp.array[int],
-    entry: wp.array2d[int],
+    catalog_index: wp.array2d[int],
     waypoint: wp.array[int],
     task: wp.array[int],
     failures: wp.array[int],
@@ -42,7 +42,7 @@ def judge_tasks_kernel(
         return
     left = int(0)
     for instance in range(layout.instances):
-        if entry[world, instance] >= 0:
+        if catalog_index[world, instance] >= 0:
             left += 1
     if left == 0:
         ending_out[world] = Ending.EMPTIED
@@ -63,8 +63,8 @@ def judge_episodes_kernel(
     layout: LayoutData,
     settle: SettleData,
     # State:
-    entry: wp.array2d[int],
-    slot: wp.array2d[int],
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
     solver_overflow: wp.array[wp.bool],
     sight_overflow: wp.array[int],
@@ -89,8 +89,8 @@ def judge_episodes_kernel(
         if not is_finite(body_q[body + link]):
             ending = Ending.NOT_FINITE
     for instance in range(layout.instances):
-        if entry[world, instance] >= 0:
-            if not is_finite(body_q[body + layout.gripper_bodies + slot[world, instance]]):
+        if catalog_index[world, instance] >= 0:
+            if not is_finite(body_q[body + layout.gripper_bodies + body_slot[world, instance]]):
                 ending = Ending.NOT_FINITE
     if ending != Ending.RUNNING:
         ending_inout[world] = ending

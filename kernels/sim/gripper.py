@@ -4,7 +4,6 @@ import warp as wp
 
 from synpick_warp.codes import Mode, Phase, Stream, Task
 from synpick_warp.kernels.rng import stream_key, uniform_index
-from synpick_warp.kernels.sim.impedance import impedance_force
 from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, PickData
 
 wp.set_module_options({"enable_backward": False})
@@ -14,7 +13,7 @@ ROUND = wp.constant(4)
 
 
 @wp.func
-def corner_of(code: int, corner: wp.vec3) -> wp.vec3:
+def tote_corner(code: int, corner: wp.vec3) -> wp.vec3:
     """Corner 0 to 3: bit 0 is the sign of x, bit 1 that of y."""
     x = corner[0]
     y = corner[1]
@@ -32,18 +31,18 @@ def begin_moving_kernel(
     layout: LayoutData,
     move: MoveData,
     # State:
-    address: wp.array[wp.vec2i],
+    arrangement_id: wp.array[wp.vec2i],
     mode: wp.array[int],
     phase: wp.array[int],
     frame_inout: wp.array[int],
     joint_q_inout: wp.array[float],
     joint_qd_inout: wp.array[float],
     # Out:
-    order_out: wp.array2d[int],
-    goal_out: wp.array[wp.vec3],
+    corner_order_out: wp.array2d[int],
+    setpoint_out: wp.array[wp.vec3],
     waypoint_out: wp.array[int],
 ):
-    """Count frames. When a world of mode MOVE begins to act: draw the order of the corners, put the gripper above the first.
+    """Count frames. When a world of mode MOVE begins to act: draw the corner_order of the corners, put the gripper above the first.
 
     Each round is a Fisher-Yates shuffle of the four corners.
     """
@@ -54,20 +53,20 @@ def begin_moving_kernel(
     frame_inout[world] = frame_inout[world] + 1
     if frame_inout[world] > 0 or mode[world] != Mode.MOVE:
         return
-    key = stream_key(seed, address[world][0], address[world][1], Stream.CORNERS)
+    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.CORNERS)
     for visit in range(move.waypoints):
-        order_out[world, visit] = visit % ROUND
+        corner_order_out[world, visit] = visit % ROUND
     for visit in range(move.waypoints):
         left = ROUND - visit % ROUND
         other = visit + uniform_index(key, visit, left)
-        kept = order_out[world, visit]
-        order_out[world, visit] = order_out[world, other]
-        order_out[world, other] = kept
-    goal = corner_of(order_out[world, 0], move.corner)
-    goal = wp.vec3(goal[0], goal[1], move.start_height + move.tip)
-    goal_out[world] = goal
+        kept = corner_order_out[world, visit]
+        corner_order_out[world, visit] = corner_order_out[world, other]
+        corner_order_out[world, other] = kept
+    setpoint = tote_corner(corner_order_out[world, 0], move.corner)
+    setpoint = wp.vec3(setpoint[0], setpoint[1], move.start_height + move.tcp_offset)
+    setpoint_out[world] = setpoint
     waypoint_out[world] = 0
-    place_gripper(layout, world, goal, 0.0, joint_q_inout, joint_qd_inout)
+    place_gripper(layout, world, setpoint, 0.0, joint_q_inout, joint_qd_inout)
 
 
 @wp.func
@@ -81,19 +80,19 @@ def place_gripper(layout: LayoutData, world: int, position: wp.vec3, tilt: float
 
 
 @wp.func
-def advanced(goal: wp.vec3, target: wp.vec3, stride: float) -> wp.vec3:
-    """The goal, moved towards the target by a stride, and no farther than to it."""
-    way = target - goal
+def step_towards(setpoint: wp.vec3, target: wp.vec3, stride: float) -> wp.vec3:
+    """The setpoint, moved towards the target by a stride, and no farther than to it."""
+    way = target - setpoint
     distance = wp.length(way)
     if distance <= stride:
         return target
-    return goal + way * (stride / distance)
+    return setpoint + way * (stride / distance)
 
 
 @wp.func
-def task_target(task: int, point: wp.vec3, normal: wp.vec3, pick: PickData, tip: float) -> wp.vec3:
+def task_setpoint(task: int, point: wp.vec3, normal: wp.vec3, pick: PickData, tcp_offset: float) -> wp.vec3:
     """Where the tilt axis is to be at the end of a task [m]: so that the cup's tip is at the grasp point, before it, or above it."""
-    axis = point + tip * normal
+    axis = point + tcp_offset * normal
     if task == Task.APPROACH:
         return axis + pick.near * normal
     if task == Task.LIFT:
@@ -102,20 +101,20 @@ def task_target(task: int, point: wp.vec3, normal: wp.vec3, pick: PickData, tip:
 
 
 @wp.kernel
-def move_goals_kernel(
+def advance_setpoints_kernel(
     # Scene:
     move: MoveData,
     pick: PickData,
     # State:
     phase: wp.array[int],
     mode: wp.array[int],
-    order: wp.array2d[int],
+    corner_order: wp.array2d[int],
     point: wp.array[wp.vec3],
     normal: wp.array[wp.vec3],
     task_inout: wp.array[int],
     steps_inout: wp.array[int],
     waypoint_inout: wp.array[int],
-    goal_inout: wp.array[wp.vec3],
+    setpoint_inout: wp.array[wp.vec3],
 ):
     """Move the goals on by one step, at constant speed.
 
@@ -125,14 +124,14 @@ def move_goals_kernel(
     world = wp.tid()
     if phase[world] != Phase.ACT:
         return
-    goal = goal_inout[world]
+    setpoint = setpoint_inout[world]
     if mode[world] == Mode.MOVE:
         if waypoint_inout[world] < move.waypoints:
-            target = corner_of(order[world, waypoint_inout[world]], move.corner)
-            target = wp.vec3(target[0], target[1], target[2] + move.tip)
-            goal = advanced(goal, target, move.speed * move.step)
-            goal_inout[world] = goal
-            if goal == target:
+            target = tote_corner(corner_order[world, waypoint_inout[world]], move.corner)
+            target = wp.vec3(target[0], target[1], target[2] + move.tcp_offset)
+            setpoint = step_towards(setpoint, target, move.speed * move.step)
+            setpoint_inout[world] = setpoint
+            if setpoint == target:
                 waypoint_inout[world] = waypoint_inout[world] + 1
         return
     task = task_inout[world]
@@ -144,12 +143,28 @@ def move_goals_kernel(
         speed = pick.near_speed
     elif task == Task.LIFT:
         speed = pick.lift_speed
-    target = task_target(task, point[world], normal[world], pick, move.tip)
-    goal = advanced(goal, target, speed * move.step)
-    goal_inout[world] = goal
-    if goal == target and (task == Task.APPROACH or task == Task.DESCEND):
+    target = task_setpoint(task, point[world], normal[world], pick, move.tcp_offset)
+    setpoint = step_towards(setpoint, target, speed * move.step)
+    setpoint_inout[world] = setpoint
+    if setpoint == target and (task == Task.APPROACH or task == Task.DESCEND):
         task_inout[world] = task + 1
         steps_inout[world] = 0
+
+
+@wp.func
+def impedance_force(
+    offset: wp.vec3, velocity: wp.vec3, stiffness: float, damping: float, max_force: float, mass: float, dt: float
+) -> wp.vec3:
+    """Force of a spring-damper, implicit in the velocity, at most `max_force` in size.
+
+    F = (k (x_goal - x - dt v) - d v) / (1 + (d dt + k dt²) / m): the force that k (x_goal - x') - d v' gives with the
+    velocity v' = v + dt F / m and position x' = x + dt v' at the end of the step. Stable for every mass.
+    """
+    force = (stiffness * (offset - dt * velocity) - damping * velocity) / (1.0 + (damping * dt + stiffness * dt * dt) / mass)
+    size = wp.length(force)
+    if size > max_force:
+        force = force * (max_force / size)
+    return force
 
 
 @wp.kernel
@@ -162,17 +177,17 @@ def drive_gripper_kernel(
     phase: wp.array[int],
     mode: wp.array[int],
     task: wp.array[int],
-    goal: wp.array[wp.vec3],
+    setpoint: wp.array[wp.vec3],
     joint_q: wp.array[float],
     joint_qd: wp.array[float],
     # Out:
     joint_f_out: wp.array[float],
 ):
-    """Pull the gripper after its goal: F = impedance + m g. At home it only bears its weight."""
+    """Pull the gripper after its setpoint: F = impedance + m g. At home it only bears its weight."""
     world = wp.tid()
     q = world * layout.coords
     qd = world * layout.dofs
-    offset = goal[world] - wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
+    offset = setpoint[world] - wp.vec3(joint_q[q], joint_q[q + 1], joint_q[q + 2])
     velocity = wp.vec3(joint_qd[qd], joint_qd[qd + 1], joint_qd[qd + 2])
     force = wp.vec3(0.0, 0.0, 0.0)
     if phase[world] == Phase.ACT:
@@ -184,3 +199,18 @@ def drive_gripper_kernel(
     joint_f_out[qd + 1] = force[1]
     joint_f_out[qd + 2] = force[2] + move.mass * move.gravity
     joint_f_out[qd + TILT] = 0.0
+
+
+@wp.kernel
+def set_yaw_kernel(
+    # Scene:
+    finger_joint: wp.array[int],
+    # In:
+    yaw: wp.array[float],
+    # Out:
+    joint_child_out: wp.array[wp.transform],
+):
+    """Turn each finger by its yaw ψ about z against the axes of its joint: the joint's frame lies in the finger's at R_z(-ψ)."""
+    world = wp.tid()
+    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -yaw[world])
+    joint_child_out[finger_joint[world]] = wp.transform(wp.vec3(0.0, 0.0, 0.0), turn)

@@ -16,7 +16,7 @@ SHAPES_AWAY = wp.constant(1000.0)
 
 
 @wp.kernel
-def measure_depth_kernel(
+def measure_penetration_kernel(
     # State:
     contact_count: wp.array[int],
     shape0: wp.array[int],
@@ -29,7 +29,7 @@ def measure_depth_kernel(
     shape_body: wp.array[int],
     body_q: wp.array[wp.transform],
     # Out:
-    depth_out: wp.array[float],
+    penetration_out: wp.array[float],
 ):
     """Deepest penetration of each body [m]: max over its contacts of margin_0 + margin_1 - n·(p_1 - p_0)."""
     contact = wp.tid()
@@ -47,41 +47,41 @@ def measure_depth_kernel(
         p = wp.transform_point(body_q[a], p)
     if b >= 0:
         q = wp.transform_point(body_q[b], q)
-    depth = margin0[contact] + margin1[contact] - wp.dot(normal[contact], q - p)
+    penetration = margin0[contact] + margin1[contact] - wp.dot(normal[contact], q - p)
     if a >= 0:
-        wp.atomic_max(depth_out, a, depth)
+        wp.atomic_max(penetration_out, a, penetration)
     if b >= 0:
-        wp.atomic_max(depth_out, b, depth)
+        wp.atomic_max(penetration_out, b, penetration)
 
 
 @wp.kernel
-def measure_shift_kernel(
+def measure_displacement_kernel(
     # Scene:
     layout: LayoutData,
     catalog: CatalogData,
     # State:
-    entry: wp.array2d[int],
-    slot: wp.array2d[int],
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
-    previous_inout: wp.array2d[wp.transform],
+    previous_pose_inout: wp.array2d[wp.transform],
     # Out:
-    shift_out: wp.array2d[float],
+    displacement_out: wp.array2d[float],
 ):
     """How far any point of an object moved since the last tick, at most [m]: |Δp| + θ r, with the rotation's angle θ.
 
     Over a tick, not an instant: a solver that has not converged makes a pile buzz about its place without going anywhere.
     """
     world, instance = wp.tid()
-    e = entry[world, instance]
+    e = catalog_index[world, instance]
     if e < 0:
         return
-    pose = body_q[world * layout.bodies + layout.gripper_bodies + slot[world, instance]]
-    turn = wp.transform_inverse(previous_inout[world, instance]) * pose
-    shift = wp.length(wp.transform_get_translation(pose) - wp.transform_get_translation(previous_inout[world, instance]))
+    pose = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
+    turn = wp.transform_inverse(previous_pose_inout[world, instance]) * pose
+    displacement = wp.length(wp.transform_get_translation(pose) - wp.transform_get_translation(previous_pose_inout[world, instance]))
     q = wp.transform_get_rotation(turn)
     angle = 2.0 * wp.atan2(wp.length(wp.vec3(q[0], q[1], q[2])), wp.abs(q[3]))
-    shift_out[world, instance] = shift + angle * catalog.radius[e]
-    previous_inout[world, instance] = pose
+    displacement_out[world, instance] = displacement + angle * catalog.radius[e]
+    previous_pose_inout[world, instance] = pose
 
 
 @wp.func
@@ -100,12 +100,12 @@ def redrop_objects_kernel(
     drop: DropData,
     settle: SettleData,
     # State:
-    address: wp.array[wp.vec2i],
+    arrangement_id: wp.array[wp.vec2i],
     phase: wp.array[int],
-    entry: wp.array2d[int],
-    slot: wp.array2d[int],
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
-    depth: wp.array[float],
+    penetration: wp.array[float],
     stuck_inout: wp.array2d[int],
     progress_inout: wp.array[wp.vec4i],
     joint_q_inout: wp.array[float],
@@ -113,22 +113,22 @@ def redrop_objects_kernel(
 ):
     """Drop again what left the tote, or penetrates something deeply for some time, one above the other; guide walls come back.
 
-    `progress` holds ticks since the drop, ticks at rest, re-drops, and whether the guide walls stand. `address` is (episode,
+    `progress` holds ticks since the drop, ticks at rest, re-drops, and whether the guide walls stand. `arrangement_id` is (episode,
     redraw).
     """
     world = wp.tid()
     if phase[world] != Phase.SETTLE:
         return
     progress = progress_inout[world]
-    key = stream_key(seed, address[world][0], address[world][1], Stream.REDROP)
+    key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.REDROP)
     height = drop.rim_height
     body = world * layout.bodies + layout.gripper_bodies
     for instance in range(layout.instances):
-        e = entry[world, instance]
+        e = catalog_index[world, instance]
         if e >= 0:
-            s = slot[world, instance]
+            s = body_slot[world, instance]
             stuck = stuck_inout[world, instance] + 1
-            if depth[body + s] < settle.stuck_depth:
+            if penetration[body + s] < settle.stuck_depth:
                 stuck = 0
             if stuck > settle.stuck_ticks or is_outside(wp.transform_get_translation(body_q[body + s]), drop):
                 stuck = 0
@@ -147,8 +147,8 @@ def judge_rest_kernel(
     layout: LayoutData,
     settle: SettleData,
     # State:
-    entry: wp.array2d[int],
-    shift: wp.array2d[float],
+    catalog_index: wp.array2d[int],
+    displacement: wp.array2d[float],
     phase_inout: wp.array[int],
     progress_inout: wp.array[wp.vec4i],
 ):
@@ -162,11 +162,11 @@ def judge_rest_kernel(
     ticks = progress_inout[world][0] + 1
     resting = progress_inout[world][1] + 1
     guides = progress_inout[world][3]
-    allowed = settle.rest_shift
+    allowed = settle.rest_threshold
     if ticks > settle.late_ticks:
-        allowed = settle.last_shift
+        allowed = settle.relaxed_rest_threshold
     for instance in range(layout.instances):
-        if entry[world, instance] >= 0 and shift[world, instance] > allowed:
+        if catalog_index[world, instance] >= 0 and displacement[world, instance] > allowed:
             resting = 0
     if resting >= settle.rest_ticks and ticks >= settle.min_ticks:
         if guides == 1:
@@ -193,7 +193,7 @@ def flag_lost_pairs_kernel(
 
 
 @wp.func
-def shape_place(collides: bool) -> wp.transform:
+def shape_pose(collides: bool) -> wp.transform:
     """Where on its body, or in its world, a collision shape is: in place, or far above, where it touches nothing.
 
     Moved, not switched off: Newton's all-pairs broad phase reads a shape's collision flag when it is made, and never again.
@@ -216,4 +216,4 @@ def set_guides_kernel(
 ):
     """Put the guide walls of each world in place, or far above."""
     world, guide = wp.tid()
-    shape_transform_out[world * layout.shapes + guide_shapes[guide]] = shape_place(progress[world][3] == 1)
+    shape_transform_out[world * layout.shapes + guide_shapes[guide]] = shape_pose(progress[world][3] == 1)

@@ -16,17 +16,17 @@ def take_snapshot_kernel(
     # State:
     phase: wp.array[int],
     ending: wp.array[int],
-    address: wp.array[wp.vec2i],
+    arrangement_id: wp.array[wp.vec2i],
     frame: wp.array[int],
     task: wp.array[int],
-    entry: wp.array2d[int],
-    slot: wp.array2d[int],
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
     # Out:
     live_out: wp.array[int],
     episode_out: wp.array[int],
     frame_out: wp.array[int],
-    entry_out: wp.array2d[int],
+    catalog_index_out: wp.array2d[int],
     pose_out: wp.array2d[wp.transform],
     fixture_pose_out: wp.array2d[wp.transform],
     fixture_visible_out: wp.array2d[int],
@@ -40,13 +40,13 @@ def take_snapshot_kernel(
     if phase[world] == Phase.ACT or (phase[world] == Phase.OVER and delivers(ending[world])):
         live = 1
     live_out[world] = live
-    episode_out[world] = address[world][0]
+    episode_out[world] = arrangement_id[world][0]
     frame_out[world] = frame[world]
     body = world * layout.bodies
     for instance in range(layout.instances):
-        entry_out[world, instance] = entry[world, instance]
-        if entry[world, instance] >= 0:
-            pose_out[world, instance] = body_q[body + layout.gripper_bodies + slot[world, instance]]
+        catalog_index_out[world, instance] = catalog_index[world, instance]
+        if catalog_index[world, instance] >= 0:
+            pose_out[world, instance] = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
     gripper = wp.where(task[world] == Task.LOOK, 0, 1)
     fixture_pose_out[world, 0] = wp.transform_identity()
     fixture_visible_out[world, 0] = 1
@@ -62,7 +62,7 @@ class FramePoses:
     live: wp.array[int]
     episode: wp.array[int]
     frame: wp.array[int]
-    entry: wp.array2d[int]
+    catalog_index: wp.array2d[int]
     pose: wp.array2d[wp.transform]
     """Object to world [m]."""
     fixture_pose: wp.array2d[wp.transform]
@@ -77,7 +77,7 @@ def link_frames_kernel(
     # Out:
     last_inout: FramePoses,
     follows_out: wp.array[int],
-    entry_out: wp.array2d[int],
+    catalog_index_out: wp.array2d[int],
     pose_out: wp.array2d[wp.transform],
     fixture_pose_out: wp.array2d[wp.transform],
     fixture_visible_out: wp.array2d[int],
@@ -95,10 +95,10 @@ def link_frames_kernel(
     last_inout.live[world] = now.live[world]
     last_inout.episode[world] = now.episode[world]
     last_inout.frame[world] = now.frame[world]
-    for instance in range(now.entry.shape[1]):
-        entry_out[world, instance] = last_inout.entry[world, instance]
+    for instance in range(now.catalog_index.shape[1]):
+        catalog_index_out[world, instance] = last_inout.catalog_index[world, instance]
         pose_out[world, instance] = last_inout.pose[world, instance]
-        last_inout.entry[world, instance] = now.entry[world, instance]
+        last_inout.catalog_index[world, instance] = now.catalog_index[world, instance]
         last_inout.pose[world, instance] = now.pose[world, instance]
     for fixture in range(now.fixture_pose.shape[1]):
         fixture_pose_out[world, fixture] = last_inout.fixture_pose[world, fixture]
@@ -113,7 +113,7 @@ def pack_status_kernel(
     live: wp.array[int],
     phase: wp.array[int],
     ending: wp.array[int],
-    address: wp.array[wp.vec2i],
+    arrangement_id: wp.array[wp.vec2i],
     frame: wp.array[int],
     mode: wp.array[int],
     task: wp.array[int],
@@ -121,9 +121,9 @@ def pack_status_kernel(
     outcome: wp.array[int],
     target: wp.array[int],
     hits: wp.array[int],
-    caught: wp.array[wp.uint32],
-    hanging: wp.array[wp.uint32],
-    peak: wp.array[float],
+    engaged_bits: wp.array[wp.uint32],
+    attached_bits: wp.array[wp.uint32],
+    peak_force: wp.array[float],
     # Out:
     status_out: wp.array2d[int],
     measure_out: wp.array2d[float],
@@ -132,8 +132,8 @@ def pack_status_kernel(
     world = wp.tid()
     status_out[world, Status.PHASE] = phase[world]
     status_out[world, Status.ENDING] = ending[world]
-    status_out[world, Status.EPISODE] = address[world][0]
-    status_out[world, Status.REDRAW] = address[world][1]
+    status_out[world, Status.EPISODE] = arrangement_id[world][0]
+    status_out[world, Status.ARRANGEMENT] = arrangement_id[world][1]
     status_out[world, Status.FRAME] = frame[world]
     status_out[world, Status.LIVE] = live[world]
     status_out[world, Status.MODE] = mode[world]
@@ -142,9 +142,9 @@ def pack_status_kernel(
     status_out[world, Status.OUTCOME] = outcome[world]
     status_out[world, Status.TARGET] = target[world]
     status_out[world, Status.HITS] = 0
-    status_out[world, Status.CAUGHT] = 0
+    status_out[world, Status.ENGAGED] = 0
     if attempt[world] >= 0:
         status_out[world, Status.HITS] = hits[world]
-        status_out[world, Status.CAUGHT] = int(caught[world])
-    status_out[world, Status.HELD] = int(hanging[world])
-    measure_out[world, Measure.LOAD] = peak[world]
+        status_out[world, Status.ENGAGED] = int(engaged_bits[world])
+    status_out[world, Status.ATTACHED] = int(attached_bits[world])
+    measure_out[world, Measure.PEAK_FORCE] = peak_force[world]

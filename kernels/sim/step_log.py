@@ -7,29 +7,29 @@ from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
 
-# Counts of a newton in sums of contact forces: integers, so that no order of threads changes a sum. A count is 1 µN, the largest sum
+# Counts of a newton in sums of contact forces: integers, so that no corner_order of threads changes a sum. A count is 1 µN, the largest sum
 # 9e12 N.
-COUNTS = wp.constant(1048576.0)
+COUNTS_PER_NEWTON = wp.constant(1048576.0)
 # Columns of these sums: the vector's x, y and z, then the sizes.
-SIZE = wp.constant(3)
+MAGNITUDE = wp.constant(3)
 
 
 @wp.func
-def body_of(layout: LayoutData, world: int, place: int, entry: wp.array2d[int], slot: wp.array2d[int]) -> int:
+def body_of(layout: LayoutData, world: int, place: int, catalog_index: wp.array2d[int], body_slot: wp.array2d[int]) -> int:
     """Index of the body in a place of a record: of an instance, or after these of the finger and the cup; -1: no such instance."""
     if place >= layout.instances:
         return world * layout.bodies + place - layout.instances
-    if entry[world, place] < 0:
+    if catalog_index[world, place] < 0:
         return -1
-    return world * layout.bodies + layout.gripper_bodies + slot[world, place]
+    return world * layout.bodies + layout.gripper_bodies + body_slot[world, place]
 
 
 @wp.func
 def add_force(body: int, force: wp.vec3, total: wp.array2d[wp.int64]):
     """Add a contact's force [N] to a body's sums."""
     for axis in range(3):
-        wp.atomic_add(total, body, axis, wp.int64(wp.rint(force[axis] * COUNTS)))
-    wp.atomic_add(total, body, SIZE, wp.int64(wp.rint(wp.length(force) * COUNTS)))
+        wp.atomic_add(total, body, axis, wp.int64(wp.rint(force[axis] * COUNTS_PER_NEWTON)))
+    wp.atomic_add(total, body, MAGNITUDE, wp.int64(wp.rint(wp.length(force) * COUNTS_PER_NEWTON)))
 
 
 @wp.kernel
@@ -62,7 +62,7 @@ def sum_contacts_kernel(
 
 
 @wp.kernel
-def keep_force_kernel(
+def save_impedance_force_kernel(
     # Scene:
     layout: LayoutData,
     weight: float,
@@ -71,7 +71,7 @@ def keep_force_kernel(
     # Out:
     force_out: wp.array[wp.vec3],
 ):
-    """The force that draws the gripper to its goal, before the seals add theirs: what acts on it but for the weight it bears."""
+    """The force that draws the gripper to its setpoint, before the seals add theirs: what acts on it but for the weight it bears."""
     world = wp.tid()
     first = world * layout.dofs
     force_out[world] = wp.vec3(joint_f[first], joint_f[first + 1], joint_f[first + 2] - weight)
@@ -83,8 +83,8 @@ def record_motion_kernel(
     layout: LayoutData,
     step: int,
     # State:
-    entry: wp.array2d[int],
-    slot: wp.array2d[int],
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
     body_qd: wp.array[wp.spatial_vector],
     # Out:
@@ -94,7 +94,7 @@ def record_motion_kernel(
 ):
     """Where objects, finger and cup are at the end of a step, and how they move; NaN for an instance that is not in the scene."""
     world, place = wp.tid()
-    body = body_of(layout, world, place, entry, slot)
+    body = body_of(layout, world, place, catalog_index, body_slot)
     if body < 0:
         nothing = wp.vec3(wp.nan, wp.nan, wp.nan)
         pose_out[world, step, place] = wp.transform(nothing, wp.quat(wp.nan, wp.nan, wp.nan, wp.nan))
@@ -113,40 +113,40 @@ def record_forces_kernel(
     step: int,
     share: float,
     # State:
-    entry: wp.array2d[int],
-    slot: wp.array2d[int],
-    held: wp.array2d[int],
-    load: wp.array2d[float],
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
+    attached: wp.array2d[int],
+    seal_force: wp.array2d[float],
     # In:
     total: wp.array2d[wp.int64],
     # Out:
     contact_force_out: wp.array3d[wp.vec3],
     contact_load_out: wp.array3d[float],
-    seal_load_out: wp.array3d[float],
-    held_out: wp.array3d[wp.uint8],
+    seal_force_out: wp.array3d[float],
+    attached_out: wp.array3d[wp.uint8],
 ):
     """What acted on objects, finger and cup in a step; NaN for an instance that is not in the scene.
 
     Contact forces are a mean over the step's solver steps, whose forces were summed: `share` is 1 / their number.
     """
     world, place = wp.tid()
-    body = body_of(layout, world, place, entry, slot)
+    body = body_of(layout, world, place, catalog_index, body_slot)
     force = wp.vec3(wp.nan, wp.nan, wp.nan)
     size = float(wp.nan)
     if body >= 0:
-        scale = share / COUNTS
+        scale = share / COUNTS_PER_NEWTON
         force = wp.vec3(scale * float(total[body, 0]), scale * float(total[body, 1]), scale * float(total[body, 2]))
-        size = scale * float(total[body, SIZE])
+        size = scale * float(total[body, MAGNITUDE])
     contact_force_out[world, step, place] = force
     contact_load_out[world, step, place] = size
     if place < layout.instances:
         bears = float(wp.nan)
         hangs = int(0)
         if body >= 0:
-            bears = load[world, place]
-            hangs = held[world, place]
-        seal_load_out[world, step, place] = bears
-        held_out[world, step, place] = wp.uint8(hangs)
+            bears = seal_force[world, place]
+            hangs = attached[world, place]
+        seal_force_out[world, step, place] = bears
+        attached_out[world, step, place] = wp.uint8(hangs)
 
 
 @wp.kernel
@@ -157,41 +157,41 @@ def record_gripper_kernel(
     phase: wp.array[int],
     mode: wp.array[int],
     task: wp.array[int],
-    goal: wp.array[wp.vec3],
+    setpoint: wp.array[wp.vec3],
     # In:
     force: wp.array[wp.vec3],
     # Out:
-    goal_out: wp.array2d[wp.vec3],
+    setpoint_out: wp.array2d[wp.vec3],
     force_out: wp.array2d[wp.vec3],
     task_out: wp.array2d[wp.int8],
 ):
-    """What the gripper did in a step: its task, its goal, which is NaN where it has none, and the force towards it."""
+    """What the gripper did in a step: its task, its setpoint, which is NaN where it has none, and the force towards it."""
     world = wp.tid()
     doing = int(Task.NONE)
     if phase[world] == Phase.ACT:
         doing = task[world]
     place = wp.vec3(wp.nan, wp.nan, wp.nan)
     if phase[world] == Phase.ACT and (mode[world] == Mode.MOVE or doing >= Task.APPROACH):
-        place = goal[world]
-    goal_out[world, step] = place
+        place = setpoint[world]
+    setpoint_out[world, step] = place
     force_out[world, step] = force[world]
     task_out[world, step] = wp.int8(doing)
 
 
 @wp.kernel
-def keep_drops_kernel(
+def save_drop_poses_kernel(
     # Scene:
     layout: LayoutData,
     # State:
     phase: wp.array[int],
     progress: wp.array[wp.vec4i],
-    entry: wp.array2d[int],
-    slot: wp.array2d[int],
+    catalog_index: wp.array2d[int],
+    body_slot: wp.array2d[int],
     body_q: wp.array[wp.transform],
     # Out:
     drop_out: wp.array2d[wp.transform],
 ):
     """Where a world's objects begin to fall: their poses before its first tick."""
     world, instance = wp.tid()
-    if phase[world] == Phase.SETTLE and progress[world][0] == 0 and entry[world, instance] >= 0:
-        drop_out[world, instance] = body_q[world * layout.bodies + layout.gripper_bodies + slot[world, instance]]
+    if phase[world] == Phase.SETTLE and progress[world][0] == 0 and catalog_index[world, instance] >= 0:
+        drop_out[world, instance] = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]

@@ -4,8 +4,8 @@ import warp as wp
 
 from synpick_warp.codes import Mode, Outcome, Phase, Task
 from synpick_warp.kernels.sim.arrangement import PARKED_HEIGHT, write_body
-from synpick_warp.kernels.sim.gripper import place_gripper, task_target
-from synpick_warp.kernels.sim.rest import is_outside, shape_place
+from synpick_warp.kernels.sim.gripper import place_gripper, task_setpoint
+from synpick_warp.kernels.sim.rest import is_outside, shape_pose
 from synpick_warp.kernels.structs import TILT, DropData, LayoutData, MoveData, PickData, SettleData
 
 wp.set_module_options({"enable_backward": False})
@@ -15,7 +15,7 @@ PICKED = wp.constant(1)
 LOST = wp.constant(2)
 # Room between objects that have left and are parked, more than any two of them need [m].
 PARKED_PITCH = wp.constant(5.0)
-# A goal so near to its target has arrived [m]; two kernels may round the target differently.
+# A setpoint so near to its target has arrived [m]; two kernels may round the target differently.
 ARRIVED = wp.constant(1.0e-4)
 
 
@@ -59,16 +59,16 @@ def begin_picking_kernel(
 
 
 @wp.kernel
-def forget_seals_kernel(
+def clear_seals_kernel(
     # State:
     phase: wp.array[int],
     # Out:
-    held_out: wp.array2d[int],
+    attached_out: wp.array2d[int],
 ):
     """Nothing hangs on the cup of a world that does not act: not even where the last episode broke off in a lift."""
     world, instance = wp.tid()
     if phase[world] != Phase.ACT:
-        held_out[world, instance] = 0
+        attached_out[world, instance] = 0
 
 
 @wp.kernel
@@ -80,59 +80,59 @@ def remove_lost_kernel(
     pick: PickData,
     # State:
     phase: wp.array[int],
-    slot: wp.array2d[int],
-    shift: wp.array2d[float],
+    body_slot: wp.array2d[int],
+    displacement: wp.array2d[float],
     body_q: wp.array[wp.transform],
-    entry_inout: wp.array2d[int],
+    catalog_index_inout: wp.array2d[int],
     # Out:
     removed_out: wp.array2d[int],
-    held_out: wp.array2d[int],
+    attached_out: wp.array2d[int],
 ):
     """What fell below the floor, or came to rest beside the tote, leaves the scene while the gripper acts."""
     world, instance = wp.tid()
-    if phase[world] != Phase.ACT or entry_inout[world, instance] < 0:
+    if phase[world] != Phase.ACT or catalog_index_inout[world, instance] < 0:
         return
-    position = wp.transform_get_translation(body_q[world * layout.bodies + layout.gripper_bodies + slot[world, instance]])
-    beside = is_outside(position, drop) and shift[world, instance] < settle.last_shift
+    position = wp.transform_get_translation(body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]])
+    beside = is_outside(position, drop) and displacement[world, instance] < settle.relaxed_rest_threshold
     if beside or position[2] < pick.floor:
-        entry_inout[world, instance] = -1
+        catalog_index_inout[world, instance] = -1
         removed_out[world, instance] = LOST
-        held_out[world, instance] = 0
+        attached_out[world, instance] = 0
 
 
 @wp.kernel
-def count_held_kernel(
+def pack_attached_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    entry: wp.array2d[int],
-    held: wp.array2d[int],
+    catalog_index: wp.array2d[int],
+    attached: wp.array2d[int],
     # Out:
-    hanging_out: wp.array[wp.uint32],
+    attached_bits_out: wp.array[wp.uint32],
 ):
     """Bit i: instance i hangs on the cup."""
     world = wp.tid()
     bits = wp.uint32(0)
     for instance in range(layout.instances):
-        if held[world, instance] != 0 and entry[world, instance] >= 0:
+        if attached[world, instance] != 0 and catalog_index[world, instance] >= 0:
             bits = bits | (wp.uint32(1) << wp.uint32(instance))
-    hanging_out[world] = bits
+    attached_bits_out[world] = bits
 
 
 @wp.func
-def judge_attempt(target: int, caught: wp.uint32, hanging: wp.uint32) -> int:
-    """Outcome of an attempt from the target and from what was caught and what still hangs, as bits of instances."""
-    if hanging != wp.uint32(0):
-        if target >= 0 and (hanging & (wp.uint32(1) << wp.uint32(target))) != wp.uint32(0):
+def judge_attempt(target: int, engaged_bits: wp.uint32, attached_bits: wp.uint32) -> int:
+    """Outcome of an attempt from the target and from what was engaged_bits and what still hangs, as bits of instances."""
+    if attached_bits != wp.uint32(0):
+        if target >= 0 and (attached_bits & (wp.uint32(1) << wp.uint32(target))) != wp.uint32(0):
             return Outcome.TARGET_PICKED
         return Outcome.OTHER_PICKED
-    if caught != wp.uint32(0):
+    if engaged_bits != wp.uint32(0):
         return Outcome.DROPPED
     return Outcome.NOTHING_CAUGHT
 
 
 @wp.func
-def failures_after(failures: int, outcome: int, mode: int, pick: PickData) -> int:
+def count_failures(failures: int, outcome: int, mode: int, pick: PickData) -> int:
     """Count of failed attempts after one more has ended."""
     if outcome == Outcome.TARGET_PICKED or outcome == Outcome.OTHER_PICKED:
         if mode == Mode.TARGET and pick.forgive != 0:
@@ -149,12 +149,12 @@ def advance_tasks_kernel(
     # State:
     phase: wp.array[int],
     mode: wp.array[int],
-    goal: wp.array[wp.vec3],
+    setpoint: wp.array[wp.vec3],
     point: wp.array[wp.vec3],
     normal: wp.array[wp.vec3],
     target: wp.array[int],
-    caught: wp.array[wp.uint32],
-    hanging: wp.array[wp.uint32],
+    engaged_bits: wp.array[wp.uint32],
+    attached_bits: wp.array[wp.uint32],
     task_inout: wp.array[int],
     steps_inout: wp.array[int],
     failures_inout: wp.array[int],
@@ -170,13 +170,16 @@ def advance_tasks_kernel(
     if task == Task.PRESS and steps_inout[world] >= pick.press_steps:
         task_inout[world] = Task.LIFT
         steps_inout[world] = 0
-    elif task == Task.LIFT and wp.length(goal[world] - task_target(Task.LIFT, point[world], normal[world], pick, move.tip)) < ARRIVED:
-        outcome = judge_attempt(target[world], caught[world], hanging[world])
+    elif (
+        task == Task.LIFT
+        and wp.length(setpoint[world] - task_setpoint(Task.LIFT, point[world], normal[world], pick, move.tcp_offset)) < ARRIVED
+    ):
+        outcome = judge_attempt(target[world], engaged_bits[world], attached_bits[world])
     elif task == Task.LOOK and target[world] < 0 and steps_inout[world] > 0:
         outcome = Outcome.NOTHING_SEEN
     if outcome != Outcome.NONE:
         outcome_out[world] = outcome
-        failures_inout[world] = failures_after(failures_inout[world], outcome, mode[world], pick)
+        failures_inout[world] = count_failures(failures_inout[world], outcome, mode[world], pick)
         task_inout[world] = Task.LOOK
         steps_inout[world] = 0
 
@@ -189,11 +192,11 @@ def end_attempts_kernel(
     # State:
     phase: wp.array[int],
     task: wp.array[int],
-    hanging: wp.array[wp.uint32],
+    attached_bits: wp.array[wp.uint32],
     # Out:
-    entry_out: wp.array2d[int],
+    catalog_index_out: wp.array2d[int],
     removed_out: wp.array2d[int],
-    held_out: wp.array2d[int],
+    attached_out: wp.array2d[int],
     joint_q_out: wp.array[float],
     joint_qd_out: wp.array[float],
     tilt_out: wp.array[float],
@@ -203,10 +206,10 @@ def end_attempts_kernel(
     if phase[world] != Phase.ACT or task[world] != Task.LOOK:
         return
     for instance in range(layout.instances):
-        if (hanging[world] & (wp.uint32(1) << wp.uint32(instance))) != wp.uint32(0):
-            entry_out[world, instance] = -1
+        if (attached_bits[world] & (wp.uint32(1) << wp.uint32(instance))) != wp.uint32(0):
+            catalog_index_out[world, instance] = -1
             removed_out[world, instance] = PICKED
-        held_out[world, instance] = 0
+        attached_out[world, instance] = 0
     place_gripper(layout, world, drop.gripper_home, 0.0, joint_q_out, joint_qd_out)
     tilt_out[world * layout.coords + TILT] = 0.0
 
@@ -216,7 +219,7 @@ def park_removed_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    slot: wp.array2d[int],
+    body_slot: wp.array2d[int],
     removed: wp.array2d[int],
     # Out:
     joint_q_out: wp.array[float],
@@ -227,7 +230,7 @@ def park_removed_kernel(
     world, instance = wp.tid()
     if removed[world, instance] == 0:
         return
-    s = slot[world, instance]
+    s = body_slot[world, instance]
     q = world * layout.coords + layout.gripper_dofs + 7 * s
     qd = world * layout.dofs + layout.gripper_dofs + 6 * s
     place = wp.vec3(PARKED_PITCH * float(s + 1), 0.0, PARKED_HEIGHT)
@@ -246,7 +249,7 @@ def begin_attempts_kernel(
     # Out:
     steps_out: wp.array[int],
     hits_out: wp.array[int],
-    caught_out: wp.array[wp.uint32],
+    engaged_bits_out: wp.array[wp.uint32],
 ):
     """Worlds that have looked begin an attempt; with a target, they APPROACH it."""
     world = wp.tid()
@@ -255,7 +258,7 @@ def begin_attempts_kernel(
     attempt_inout[world] = attempt_inout[world] + 1
     steps_out[world] = 0
     hits_out[world] = 0
-    caught_out[world] = wp.uint32(0)
+    engaged_bits_out[world] = wp.uint32(0)
     if target[world] >= 0:
         task_inout[world] = Task.APPROACH
 
@@ -274,7 +277,7 @@ def place_grippers_kernel(
     normal: wp.array[wp.vec3],
     tilt: wp.array[float],
     # Out:
-    goal_out: wp.array[wp.vec3],
+    setpoint_out: wp.array[wp.vec3],
     joint_q_out: wp.array[float],
     joint_qd_out: wp.array[float],
     tilt_out: wp.array[float],
@@ -283,14 +286,14 @@ def place_grippers_kernel(
     world = wp.tid()
     if phase[world] != Phase.ACT or task[world] != Task.APPROACH or steps[world] != 0:
         return
-    goal = point[world] + move.tip * normal[world] + wp.vec3(0.0, 0.0, pick.appear_height)
-    goal_out[world] = goal
-    place_gripper(layout, world, goal, tilt[world], joint_q_out, joint_qd_out)
+    setpoint = point[world] + move.tcp_offset * normal[world] + wp.vec3(0.0, 0.0, pick.appear_height)
+    setpoint_out[world] = setpoint
+    place_gripper(layout, world, setpoint, tilt[world], joint_q_out, joint_qd_out)
     tilt_out[world * layout.coords + TILT] = tilt[world]
 
 
 @wp.kernel
-def set_fingers_kernel(
+def set_shaft_collision_kernel(
     # Scene:
     layout: LayoutData,
     # State:
@@ -300,4 +303,4 @@ def set_fingers_kernel(
 ):
     """The finger collides when moving, where the gripper is one rigid body, and not when picking."""
     world = wp.tid()
-    shape_transform_out[world * layout.shapes + layout.finger_shape] = shape_place(mode[world] == Mode.MOVE)
+    shape_transform_out[world * layout.shapes + layout.finger_shape] = shape_pose(mode[world] == Mode.MOVE)

@@ -25,7 +25,7 @@ class Snapshot:
     """Episode number."""
     frame: wp.array = device_array("world", dtype=wp.int32)
     """Number of the frame in its episode."""
-    entry: wp.array = device_array("world", "instance", dtype=wp.int32)
+    catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
     """Catalog index of each instance; -1: none."""
     pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     """Object to world."""
@@ -41,7 +41,7 @@ class Snapshot:
     """How much longer than the automatic exposure the episode's pictures are exposed."""
     follows: wp.array = device_array("world", dtype=wp.int32)
     """1: the arrays below hold the frame before this one, of the same episode; 0: there is none."""
-    last_entry: wp.array = device_array("world", "instance", dtype=wp.int32)
+    last_catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
     last_pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     last_fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
     last_fixture_visible: wp.array = device_array("world", "fixture", dtype=wp.int32)
@@ -54,7 +54,7 @@ class LastFrame:
     live: wp.array = device_array("world", dtype=wp.int32)
     episode: wp.array = device_array("world", dtype=wp.int32)
     frame: wp.array = device_array("world", dtype=wp.int32)
-    entry: wp.array = device_array("world", "instance", dtype=wp.int32)
+    catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
     pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
     fixture_visible: wp.array = device_array("world", "fixture", dtype=wp.int32)

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate, memory_table
-from synpick_warp.codes import Measure, Status, names
+from synpick_warp.codes import Measure, Status, column_names
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
@@ -65,7 +65,7 @@ class TickReport:
     """(world, status) int32; columns: `Status`."""
     measures: np.ndarray
     """(world, measure) float32; columns: `Measure`."""
-    entry: np.ndarray
+    catalog_index: np.ndarray
     """Catalog index (world, instance) int32."""
     pose: np.ndarray
     """Object to world (world, instance, 7) float32."""
@@ -82,11 +82,11 @@ class TickReport:
 
     def column(self, name: str) -> np.ndarray:
         """One column of the status table (world) int32."""
-        return self.status[:, Status[name.upper()]]
+        return self.status[:, column_names(Status)[name]]
 
     def measure(self, name: str) -> np.ndarray:
         """One column of the table of measures (world) float32."""
-        return self.measures[:, Measure[name.upper()]]
+        return self.measures[:, column_names(Measure)[name]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class TickReader:
     """Brings to the host what a tick left, but for its pictures: some kilobytes a world."""
 
     def __init__(self, record: TickRecord) -> None:
-        first = [record.status.table, record.status.measures, record.snapshot.entry, record.snapshot.pose]
+        first = [record.status.table, record.status.measures, record.snapshot.catalog_index, record.snapshot.pose]
         self.parts = [(part, [item.name for item in fields(part)]) for part in (record.observation, record.plan)]
         self.parts.append((record.snapshot, list(_SNAPSHOT)))
         self.physics = record_arrays(record.physics) if record.physics is not None else []
@@ -162,9 +162,10 @@ class TickReader:
         report = TickReport(*first, *(SimpleNamespace(**{name: next(arrays) for name in names}) for _, names in self.parts))
         if not self.physics:
             return report
-        tick, steps = host_record(copied[last:], report.entry.shape[1])
-        columns = dict(zip(names(Status), report.status.T, strict=True)) | dict(zip(names(Measure), report.measures.T, strict=True))
-        return replace(report, tick=tick | tick_measures(columns, report.entry.shape[1]), steps=steps)
+        tick, steps = host_record(copied[last:], report.catalog_index.shape[1])
+        columns = dict(zip(column_names(Status), report.status.T, strict=True))
+        columns |= dict(zip(column_names(Measure), report.measures.T, strict=True))
+        return replace(report, tick=tick | tick_measures(columns, report.catalog_index.shape[1]), steps=steps)
 
 
 def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> TickBatch:
@@ -181,7 +182,7 @@ def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> 
         episode=report.column("episode")[live],
         frame=frame,
         time=frame * tick_time,
-        object_id=np.append(object_ids, -1).astype(np.int32)[report.entry[live]],
+        object_id=np.append(object_ids, -1).astype(np.int32)[report.catalog_index[live]],
         pose=report.pose[live],
         tick={name: values[live] for name, values in report.tick.items()},
         steps={name: values[live] for name, values in report.steps.items()},
@@ -267,7 +268,7 @@ class FrameStream:
             camera=camera[part],
             frame=frame,
             time=frame * self.tick_time,
-            object_id=self.object_ids[report.entry[worlds]],
+            object_id=self.object_ids[report.catalog_index[worlds]],
             pose=report.pose[worlds],
             light_name=self.lights.name[light],
             light_yaw=turn,

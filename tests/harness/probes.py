@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels import rng
-from synpick_warp.kernels.sim import impedance
+from synpick_warp.kernels.sim import gripper
 
 wp.set_module_options({"enable_backward": False})
 
@@ -36,4 +36,4 @@ def force_kernel(
 ):
     """The gripper's force; law: stiffness, damping, limit, mass, time step."""
     i = wp.tid()
-    force_out[i] = impedance.impedance_force(offset[i], velocity[i], law[i, 0], law[i, 1], law[i, 2], law[i, 3], law[i, 4])
+    force_out[i] = gripper.impedance_force(offset[i], velocity[i], law[i, 0], law[i, 1], law[i, 2], law[i, 3], law[i, 4])

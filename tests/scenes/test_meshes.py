@@ -141,8 +141,8 @@ def test_vertex_colors_become_a_color_or_a_texture(tmp_path):
     height, width = finish.texture.shape[:2]
     column = np.rint(mesh.uv[:, 0] * width - 0.5).astype(int)
     row = np.rint((1 - mesh.uv[:, 1]) * height - 0.5).astype(int)
-    corner_of = [CORNERS.index(tuple(int(x) for x in vertex)) for vertex in mesh.vertices]
-    assert np.array_equal(finish.texture[row, column], [(60 * i, 255 - 60 * i, 7) for i in corner_of])
+    tote_corner = [CORNERS.index(tuple(int(x) for x in vertex)) for vertex in mesh.vertices]
+    assert np.array_equal(finish.texture[row, column], [(60 * i, 255 - 60 * i, 7) for i in tote_corner])
 
 
 @given(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=3, max_size=3), st.tuples(*[st.floats(0.0, 1.0)] * 3))

@@ -65,7 +65,7 @@ def may_repeat(worlds: KernelWorlds, world: int) -> bool:
 def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangement]:
     """What the twin draws for each world, in the mode that it has."""
     return [
-        arrangement.draw_objects(
+        arrangement.sample_objects(
             seed,
             *map(int, address),
             volume=worlds.volume,
@@ -76,7 +76,7 @@ def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangemen
             single_slots=worlds.single_slots,
             compound_slots=worlds.compound_slots,
         )
-        for world, address in enumerate(worlds.state.address.numpy())
+        for world, address in enumerate(worlds.state.arrangement_id.numpy())
     ]
 
 
@@ -84,9 +84,9 @@ def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangemen
 def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, redraw, device):
     worlds = made(device, **sizes)
     worlds.begin(Phase.START, first + np.arange(WORLDS), redraw)
-    worlds.set(worlds.state.entry, 99)
-    arrange.draw_objects(worlds.scene, worlds.state, seed)
-    entry, slot = worlds.state.entry.numpy(), worlds.state.slot.numpy()
+    worlds.set(worlds.state.catalog_index, 99)
+    arrange.sample_objects(worlds.scene, worlds.state, seed)
+    entry, slot = worlds.state.catalog_index.numpy(), worlds.state.body_slot.numpy()
     for world, expected in enumerate(drawn(worlds, seed)):
         count = len(expected.entries)
         assert tuple(entry[world, :count]) == expected.entries
@@ -122,7 +122,7 @@ def modes(built, device, mode: str, mix: tuple[float, float, float], episodes: n
     worlds.scene = dataclasses.replace(worlds.scene, mode=scene.mode)
     worlds.begin(Phase.START, episodes, redraw)
     worlds.set(worlds.state.mode, 99)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
     return worlds.state.mode.numpy()
 
 
@@ -134,7 +134,7 @@ def test_a_single_mode_is_every_episodes(built, device, mode, code):
 @given(mix=st.tuples(*[st.integers(0, 5)] * 3).filter(any), first=st.integers(0, 2**30))
 def test_mixed_modes_are_the_twins(mix, first, built, device):
     episodes = first + np.arange(WORLDS)
-    np.testing.assert_array_equal(modes(built, device, "mixed", mix, episodes), arrangement.draw_modes(SEED, episodes, mix))
+    np.testing.assert_array_equal(modes(built, device, "mixed", mix, episodes), arrangement.sample_modes(SEED, episodes, mix))
 
 
 @pytest.mark.parametrize("mix", [(1.0, 1.0, 1.0), (0.5, 0.3, 0.2), (3.0, 0.0, 1.0), (0.0, 2.0, 0.0), (1e-9, 0.0, 1e3), (1e3, 0.0, 1e-9)])
@@ -163,8 +163,8 @@ def test_modes_are_drawn_apart_from_objects(device):
     for mix in ((1.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
         worlds = made(device, mix=mix, drop={"move_repeats": 1, "pick_repeats": 1})
         worlds.begin(Phase.START, episodes)
-        arrange.draw_objects(worlds.scene, worlds.state, SEED)
-        objects.append((worlds.state.entry.numpy(), worlds.state.light_yaw.numpy()))
+        arrange.sample_objects(worlds.scene, worlds.state, SEED)
+        objects.append((worlds.state.catalog_index.numpy(), worlds.state.light_yaw.numpy()))
     for pick, mixed in zip(*objects, strict=True):
         np.testing.assert_array_equal(pick, mixed)
 
@@ -172,23 +172,23 @@ def test_modes_are_drawn_apart_from_objects(device):
 def test_a_budget_for_everything_draws_everything_without_repeats(device):
     worlds = made(device, drop={"volume": 10.0, "move_repeats": 0})
     worlds.begin(Phase.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
-    assert (np.sort(worlds.state.entry.numpy(), axis=1)[:, -3:] == [0, 1, 2]).all()
-    assert len(np.unique(worlds.state.entry.numpy(), axis=0)) == 6
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    assert (np.sort(worlds.state.catalog_index.numpy(), axis=1)[:, -3:] == [0, 1, 2]).all()
+    assert len(np.unique(worlds.state.catalog_index.numpy(), axis=0)) == 6
 
 
 def test_the_budget_may_be_met_exactly(device):
     worlds = made(device, volume=np.array([0.25]), compound=np.array([0]), radius=np.array([0.1]), drop={"volume": 1.0})
     worlds.begin(Phase.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
-    assert ((worlds.state.entry.numpy() == 0).sum(axis=1) == 4).all()
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    assert ((worlds.state.catalog_index.numpy() == 0).sum(axis=1) == 4).all()
 
 
 def test_an_object_that_never_fits_is_never_drawn(device):
     worlds = made(device, drop={"volume": 0.25})
     worlds.begin(Phase.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
-    entry = worlds.state.entry.numpy()
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    entry = worlds.state.catalog_index.numpy()
     assert (entry[:, 0] >= 0).all()
     assert not (entry == 2).any()
 
@@ -197,10 +197,10 @@ def test_each_mode_has_its_own_rule_of_repeating(device):
     """One bake: episodes of picking without repeats, episodes of moving with them."""
     worlds = made(device, worlds=200, mix=(1.0, 1.0, 1.0), drop={"volume": 10.0, "move_repeats": 1, "pick_repeats": 0})
     worlds.begin(Phase.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
     moving = worlds.state.mode.numpy() == Mode.MOVE
     assert 0 < moving.sum() < 200
-    count = (worlds.state.entry.numpy() >= 0).sum(axis=1)
+    count = (worlds.state.catalog_index.numpy() >= 0).sum(axis=1)
     # Three entries, room for eight instances, a budget for all.
     np.testing.assert_array_equal(count, np.where(moving, 8, 3))
 
@@ -230,7 +230,7 @@ def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
         drop={"volume": 1.2e-3, "move_repeats": 1, "pick_repeats": 0},
     )
     worlds.begin(Phase.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
     over = (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).mean()
     assert over <= shortfall + 4 * np.sqrt(shortfall / episodes)
     assert (single, compound) == (2, 1) if mix[2] == 0.0 else over > 0.0
@@ -240,14 +240,14 @@ def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
 def test_worlds_at_work_keep_their_objects(device, phase):
     worlds = made(device)
     worlds.begin(phase)
-    worlds.set(worlds.state.entry, 2)
+    worlds.set(worlds.state.catalog_index, 2)
     worlds.set(worlds.state.light, 7)
     worlds.set(worlds.state.mode, 9)
     joints = worlds.physics.state.joint_q
     worlds.set(joints, 0.5)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
-    assert (worlds.state.entry.numpy() == 2).all()
+    assert (worlds.state.catalog_index.numpy() == 2).all()
     assert (worlds.state.light.numpy() == 7).all()
     assert (worlds.state.mode.numpy() == 9).all()
     if phase != Phase.OVER:
@@ -261,16 +261,16 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
     sizes["drop"] |= {"spread": spread, "clearance": clearance}
     worlds = made(device, **sizes)
     worlds.begin(Phase.START, episode + np.arange(WORLDS))
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
     over = worlds.state.phase.numpy() == Phase.OVER
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     np.testing.assert_array_equal(worlds.state.phase.numpy(), np.where(over, Phase.OVER, Phase.SETTLE))
     drop = worlds.scene.drop
     rim = (drop.rim_length, drop.rim_width, drop.rim_height)
     for world in range(WORLDS):
-        entry = worlds.state.entry.numpy()[world]
+        entry = worlds.state.catalog_index.numpy()[world]
         entry = entry[entry >= 0]
-        poses = worlds.coordinates()[world, worlds.state.slot.numpy()[world, : len(entry)]]
+        poses = worlds.coordinates()[world, worlds.state.body_slot.numpy()[world, : len(entry)]]
         radius = worlds.radius[entry]
         expected = arrangement.drop_poses(SEED, episode + world, 0, radius, rim=rim, clearance=clearance, spread=spread)
         np.testing.assert_allclose(poses, expected, atol=1e-5)
@@ -285,7 +285,7 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
 def test_the_drop_uses_the_whole_spread(device):
     worlds = made(device, worlds=500, radius=np.full(3, 0.05), drop={"spread": 1.0})
     worlds.begin(Phase.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     full = worlds.coordinates()[worlds.forces()[:, :, 2] == 0.0]
     np.testing.assert_allclose(full[:, :2].min(axis=0), [-0.2, -0.1], atol=5e-3)
@@ -298,13 +298,13 @@ def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device)
     worlds.set(worlds.physics.state.joint_qd, 1.0)
     worlds.set(worlds.physics.control.joint_f, 7.0)
     worlds.set(worlds.state.stuck, 5)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     state, catalog = worlds.state, worlds.scene.catalog
     variant = state.variant.numpy().reshape(WORLDS, -1)
     full = np.zeros((WORLDS, worlds.slots), dtype=bool)
-    for world, instance in zip(*np.nonzero(state.entry.numpy() >= 0), strict=True):
-        slot, entry = state.slot.numpy()[world, instance], state.entry.numpy()[world, instance]
+    for world, instance in zip(*np.nonzero(state.catalog_index.numpy() >= 0), strict=True):
+        slot, entry = state.body_slot.numpy()[world, instance], state.catalog_index.numpy()[world, instance]
         full[world, slot] = True
         assert variant[world, 2 + slot] == catalog.variant.numpy()[entry]
     empty = np.where(np.arange(worlds.slots) < worlds.single_slots, catalog.empty_single, catalog.empty_compound)
@@ -325,12 +325,12 @@ def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device)
 def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
     worlds = made(device, compound_slots=0)
     worlds.begin(Phase.START)
-    arrange.draw_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     over = worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW
     assert over.any()
     assert not over.all()
-    assert (worlds.state.entry.numpy()[over] == -1).all()
+    assert (worlds.state.catalog_index.numpy()[over] == -1).all()
     assert (worlds.coordinates()[over][:, :, 2] == kernels.PARKED_HEIGHT).all()
     assert (worlds.forces()[over][:, :, 2] > 0.0).all()
 
@@ -339,17 +339,22 @@ def take(device, phase, ending, address, following: int, *, episodes: int, tries
     """State after numbers are handed out: phase, ending, address, next number."""
     worlds = made(device, worlds=len(phase))
     state = worlds.state
-    for array, values in ((state.phase, phase), (state.ending, ending), (state.address, address), (state.next_episode, following)):
+    for array, values in ((state.phase, phase), (state.ending, ending), (state.arrangement_id, address), (state.next_episode, following)):
         worlds.set(array, values)
-    arrange.take_episodes(state, wp.array(np.arange(episodes), dtype=wp.int32, device=device), tries)
-    return state.phase.numpy().tolist(), state.ending.numpy().tolist(), state.address.numpy().tolist(), int(state.next_episode.numpy()[0])
+    arrange.assign_episodes(state, wp.array(np.arange(episodes), dtype=wp.int32, device=device), tries)
+    return (
+        state.phase.numpy().tolist(),
+        state.ending.numpy().tolist(),
+        state.arrangement_id.numpy().tolist(),
+        int(state.next_episode.numpy()[0]),
+    )
 
 
 def test_numbers_are_those_of_the_list(device):
     worlds = made(device, worlds=3)
     worlds.begin(Phase.EMPTY, -1)
-    arrange.take_episodes(worlds.state, wp.array([7, 2], dtype=wp.int32, device=device), 1)
-    assert worlds.state.address.numpy().tolist() == [[7, 0], [2, 0], [-1, 0]]
+    arrange.assign_episodes(worlds.state, wp.array([7, 2], dtype=wp.int32, device=device), 1)
+    assert worlds.state.arrangement_id.numpy().tolist() == [[7, 0], [2, 0], [-1, 0]]
     assert worlds.state.phase.numpy().tolist() == [Phase.START, Phase.START, Phase.IDLE]
 
 
@@ -389,8 +394,8 @@ def test_every_episode_ends_once(worlds, episodes, tries, seed, device):
     started, ended = [], []
     listed = wp.array(np.arange(episodes), dtype=wp.int32, device=device)
     for _ in range(8 * episodes * tries):
-        arrange.take_episodes(state, listed, tries)
-        phase, ending, address = state.phase.numpy(), state.ending.numpy(), state.address.numpy()
+        arrange.assign_episodes(state, listed, tries)
+        phase, ending, address = state.phase.numpy(), state.ending.numpy(), state.arrangement_id.numpy()
         started += [tuple(address[world]) for world in np.flatnonzero(phase == Phase.START)]
         for world in np.flatnonzero(phase != Phase.IDLE):
             phase[world], ending[world] = Phase.ACT, Ending.RUNNING
@@ -406,4 +411,4 @@ def test_every_episode_ends_once(worlds, episodes, tries, seed, device):
     assert sorted(ended) == list(range(episodes))
     assert len(set(started)) == len(started)
     assert [episode for episode, redraw in started if redraw == 0] == list(range(episodes))
-    assert (state.address.numpy()[:, 0] == -1).all()
+    assert (state.arrangement_id.numpy()[:, 0] == -1).all()

@@ -54,7 +54,7 @@ class Cups(KernelWorlds):
                 "tolerated_misses": 0,
                 "good_force": GOOD,
                 "poor_force": POOR,
-                "tip": TIP,
+                "tcp_offset": TIP,
                 **suction,
             },
         )
@@ -62,9 +62,9 @@ class Cups(KernelWorlds):
         config = load_config("smoke", {"suction.surface": surface})
         self.suction = Suction(config, ENTRIES, SimpleNamespace(meshes=meshes, keep=keep), device)
         self.begin(Phase.ACT)
-        self.set(self.state.entry, -1)
+        self.set(self.state.catalog_index, -1)
         # Slots in an order of their own.
-        self.set(self.state.slot, [2, 0, 3, 1])
+        self.set(self.state.body_slot, [2, 0, 3, 1])
         self.set(self.attempts.task, Task.PRESS)
         self.set(self.attempts.steps, PRESS_STEPS)
         for world in range(worlds):
@@ -79,18 +79,18 @@ class Cups(KernelWorlds):
 
     def put(self, world: int, instance: int, entry: int, place, quaternion=UPRIGHT) -> None:
         """Put an object somewhere."""
-        entries = self.state.entry.numpy()
+        entries = self.state.catalog_index.numpy()
         entries[world, instance] = entry
-        self.state.entry.assign(entries)
+        self.state.catalog_index.assign(entries)
         self.place(world, instance, [*place, *quaternion])
 
     def cast(self) -> tuple[list[int], list[int]]:
         """Rays that hit, and objects caught as bits, of every world."""
         self.suction.count_seal_rays(self.scene, self.state, self.attempts, self.seals, self.physics)
-        return self.attempts.hits.numpy().tolist(), self.attempts.caught.numpy().tolist()
+        return self.attempts.hits.numpy().tolist(), self.attempts.engaged_bits.numpy().tolist()
 
     def held(self) -> list[list[int]]:
-        return self.seals.held.numpy().tolist()
+        return self.seals.attached.numpy().tolist()
 
 
 def below(distance: float) -> np.ndarray:
@@ -105,12 +105,12 @@ def test_a_plate_is_hit_by_all_rays_and_held_as_it_lies(device):
     cups = Cups(device, worlds=2)
     turned = (0.0, 0.0, np.sin(0.3), np.cos(0.3))
     cups.put(1, 2, 0, below(0.004), turned)
-    cups.set(cups.seals.load, 3.0)
+    cups.set(cups.seals.seal_force, 3.0)
     assert cups.cast() == ([0, RAYS], [0, 0b100])
     assert cups.held() == [[0, 0, 0, 0], [0, 0, 1, 0]]
-    np.testing.assert_allclose(cups.seals.anchor.numpy()[1, 2], [0, 0, -0.004 - THICKNESS / 2, *turned], atol=1e-6)
-    assert cups.seals.limit.numpy().tolist() == [POOR, GOOD]
-    assert cups.seals.load.numpy()[1].tolist() == [3.0, 3.0, 0.0, 3.0]
+    np.testing.assert_allclose(cups.seals.object_in_tcp.numpy()[1, 2], [0, 0, -0.004 - THICKNESS / 2, *turned], atol=1e-6)
+    assert cups.seals.break_force.numpy().tolist() == [POOR, GOOD]
+    assert cups.seals.seal_force.numpy()[1].tolist() == [3.0, 3.0, 0.0, 3.0]
 
 
 # Abscissas of the ten rays: ±1, ±0.809 and ±0.309 twice each.
@@ -119,7 +119,7 @@ def test_over_an_edge_those_rays_hit_that_start_above_the_plate(device, edge, co
     cups = Cups(device)
     cups.put(0, 0, 0, below(0.01) - [0.15 - edge * RADIUS, 0.0, 0.0])
     assert cups.cast() == ([count], [int(count > 0)])
-    assert cups.seals.limit.numpy()[0] == (GOOD if count == RAYS else POOR)
+    assert cups.seals.break_force.numpy()[0] == (GOOD if count == RAYS else POOR)
 
 
 @pytest.mark.parametrize(("tolerated", "limit"), [(2, POOR), (3, GOOD)])
@@ -127,7 +127,7 @@ def test_so_many_misses_are_tolerated(device, tolerated, limit):
     cups = Cups(device, tolerated_misses=tolerated)
     cups.put(0, 0, 0, below(0.01) - [0.15 - 0.5 * RADIUS, 0.0, 0.0])
     assert cups.cast()[0] == [7]
-    assert cups.seals.limit.numpy()[0] == limit
+    assert cups.seals.break_force.numpy()[0] == limit
 
 
 @pytest.mark.parametrize(("distance", "count"), [(0.0299, RAYS), (0.0301, 0), (-0.002, RAYS), (-0.0099, RAYS), (-0.0101, 0)])
@@ -162,7 +162,7 @@ def test_each_ray_catches_what_is_nearest(device):
     cups.put(2, 1, 1, PLACE - [0.0, -0.01, 0.012])
     assert cups.cast() == ([RAYS, RAYS, RAYS], [0b1000, 0b1001, 0b11])
     assert cups.held() == [[0, 0, 0, 1], [1, 0, 0, 1], [1, 1, 0, 0]]
-    assert (cups.seals.limit.numpy() == GOOD).all()
+    assert (cups.seals.break_force.numpy() == GOOD).all()
 
 
 # In the angle's frame: over the bar, the arm, the notch, the arm's edge, and the notch's corner, into whose quarter three rays fall.
@@ -190,11 +190,11 @@ def test_rays_are_cast_when_the_time_to_press_is_up(device, phase, task, steps):
         (cups.attempts.steps, steps, PRESS_STEPS),
     ):
         cups.set(array, [value, due])
-    for array in (cups.attempts.hits, cups.attempts.caught, cups.seals.limit):
+    for array in (cups.attempts.hits, cups.attempts.engaged_bits, cups.seals.break_force):
         cups.set(array, 7)
     assert cups.cast() == ([7, RAYS], [7, 1])
     assert cups.held() == [[0, 0, 0, 0], [1, 0, 0, 0]]
-    assert cups.seals.limit.numpy().tolist() == [7.0, GOOD]
+    assert cups.seals.break_force.numpy().tolist() == [7.0, GOOD]
 
 
 def test_meshes_are_hit_from_both_sides(device):

@@ -17,7 +17,7 @@ from synpick_warp.stages.sim import arrange
 from synpick_warp.stages.sim import gripper as act
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.harness.probes import force_kernel
-from tests.twins import impedance
+from tests.twins import gripper as twin
 from tests.worlds.kernel_worlds import KernelWorlds
 from tests.worlds.small_worlds import CUBE, catalog, settings
 
@@ -37,7 +37,7 @@ def made(device, worlds: int = 1, **move) -> KernelWorlds:
         instances=1,
         single_slots=1,
         compound_slots=0,
-        move={"corner": wp.vec3(*CORNER), "tip": TIP, **move},
+        move={"corner": wp.vec3(*CORNER), "tcp_offset": TIP, **move},
     )
     result.set(result.state.frame, -1)
     return result
@@ -72,7 +72,7 @@ vectors = st.tuples(*[st.floats(-1.0, 1.0)] * 3)
 def test_the_force_is_the_twins_and_never_above_the_limit(offset, velocity, stiffness, damping, limit, mass, step, device):
     law = [stiffness, damping, limit, mass, step]
     found = forces(device, [offset], [velocity], [law])[0]
-    np.testing.assert_allclose(found, impedance.force(offset, velocity, *law), rtol=2e-3, atol=2e-4 * limit)
+    np.testing.assert_allclose(found, twin.force(offset, velocity, *law), rtol=2e-3, atol=2e-4 * limit)
     assert np.linalg.norm(found) <= limit * (1 + 1e-5)
 
 
@@ -106,9 +106,9 @@ def test_every_round_visits_every_corner_in_the_twins_order(device, rounds):
     worlds = made(device, worlds=200, waypoints=4 * rounds)
     worlds.begin(Phase.ACT, 1000 + np.arange(200), 2)
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
-    order = worlds.state.order.numpy()
+    order = worlds.state.corner_order.numpy()
     assert (np.sort(order.reshape(200, rounds, 4), axis=2) == np.arange(4)).all()
-    assert order.tolist() == [impedance.corner_order(SEED, 1000 + world, 2, rounds) for world in range(200)]
+    assert order.tolist() == [twin.corner_order(SEED, 1000 + world, 2, rounds) for world in range(200)]
     _, counts = np.unique(order[:, :4], axis=0, return_counts=True)
     assert len(counts) == 24  # Every order of four comes, about 200 / 24 times.
     assert counts.max() < 25
@@ -120,9 +120,9 @@ def test_the_gripper_starts_above_the_first_corner_at_rest(device):
     worlds.set(worlds.physics.state.joint_qd, 1.0)
     worlds.set(worlds.state.waypoint, 3)
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
-    first = np.stack([impedance.corner_place(code, CORNER) for code in worlds.state.order.numpy()[:, 0]])
+    first = np.stack([twin.corner_place(code, CORNER) for code in worlds.state.corner_order.numpy()[:, 0]])
     first[:, 2] = 0.3 + TIP
-    np.testing.assert_allclose(worlds.state.goal.numpy(), first, atol=1e-6)
+    np.testing.assert_allclose(worlds.state.setpoint.numpy(), first, atol=1e-6)
     np.testing.assert_allclose(worlds.physics.state.joint_q.numpy().reshape(50, -1)[:, :3], first, atol=1e-6)
     speed = worlds.physics.state.joint_qd.numpy().reshape(50, -1)
     assert (speed[:, :4] == 0.0).all()
@@ -144,41 +144,41 @@ def test_an_order_once_drawn_is_kept(device):
     worlds = made(device)
     worlds.begin(Phase.ACT)
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
-    before = worlds.state.order.numpy().copy()
-    worlds.set(worlds.state.goal, 7.0)
+    before = worlds.state.corner_order.numpy().copy()
+    worlds.set(worlds.state.setpoint, 7.0)
     worlds.begin(Phase.ACT, [99])
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
-    np.testing.assert_array_equal(worlds.state.order.numpy(), before)
-    assert (worlds.state.goal.numpy() == 7.0).all()
+    np.testing.assert_array_equal(worlds.state.corner_order.numpy(), before)
+    assert (worlds.state.setpoint.numpy() == 7.0).all()
 
 
 def test_the_goal_walks_from_corner_to_corner_at_constant_speed(device):
     worlds = made(device, waypoints=4, speed=0.5, step=0.01, start_height=0.1)
     worlds.begin(Phase.ACT)
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
-    goals, waypoints = [worlds.state.goal.numpy()[0].copy()], [0]
+    goals, waypoints = [worlds.state.setpoint.numpy()[0].copy()], [0]
     while waypoints[-1] < 4 and len(goals) < 1000:
         act.drive_gripper(worlds.scene, worlds.state, worlds.attempts, worlds.plan, worlds.physics, worlds.physics.state)
-        goals.append(worlds.state.goal.numpy()[0].copy())
+        goals.append(worlds.state.setpoint.numpy()[0].copy())
         waypoints.append(int(worlds.state.waypoint.numpy()[0]))
     strides = np.linalg.norm(np.diff(goals, axis=0), axis=1)
     arrivals = np.flatnonzero(np.diff(waypoints)) + 1
     assert np.delete(strides, arrivals - 1) == pytest.approx(0.005, abs=1e-6)
     assert (strides[arrivals - 1] <= 0.005 + 1e-6).all()
-    places = [impedance.corner_place(code, np.add(CORNER, (0, 0, TIP))) for code in worlds.state.order.numpy()[0]]
+    places = [twin.corner_place(code, np.add(CORNER, (0, 0, TIP))) for code in worlds.state.corner_order.numpy()[0]]
     np.testing.assert_allclose(np.array(goals)[arrivals], places, atol=1e-6)
     legs = [np.linalg.norm(b - a) for a, b in itertools.pairwise([goals[0], *places])]
     # A step more where rounding leaves a sliver of the way.
     assert len(goals) - 1 == pytest.approx(sum(np.ceil(leg / 0.005 - 1e-3) for leg in legs), abs=len(legs))
     act.drive_gripper(worlds.scene, worlds.state, worlds.attempts, worlds.plan, worlds.physics, worlds.physics.state)
-    np.testing.assert_array_equal(worlds.state.goal.numpy()[0], goals[-1])
+    np.testing.assert_array_equal(worlds.state.setpoint.numpy()[0], goals[-1])
 
 
 def test_only_an_acting_gripper_is_pulled_but_every_gripper_is_carried(device):
     worlds = made(device, worlds=2)
     worlds.begin(Phase.ACT)
     worlds.set(worlds.state.phase, [Phase.ACT, Phase.SETTLE])
-    worlds.set(worlds.state.goal, [1.0, 0.0, 0.0])
+    worlds.set(worlds.state.setpoint, [1.0, 0.0, 0.0])
     worlds.set(worlds.physics.control.joint_f, 3.0)
     act.drive_gripper(worlds.scene, worlds.state, worlds.attempts, worlds.plan, worlds.physics, worlds.physics.state)
     force = worlds.physics.control.joint_f.numpy().reshape(2, -1)
@@ -227,7 +227,7 @@ def run(device):
     for _ in range(STEPS):
         physics.tick(drive)
         force = physics.control.joint_f.numpy().reshape(worlds, -1)[:, :3] - [0, 0, simulation.scene.move.mass * config.physics.gravity]
-        rows.append((physics.state.joint_q.numpy().reshape(worlds, -1)[:, :4].copy(), force, state.goal.numpy().copy()))
+        rows.append((physics.state.joint_q.numpy().reshape(worlds, -1)[:, :4].copy(), force, state.setpoint.numpy().copy()))
     position, force, goals = (np.stack(column).astype(float) for column in zip(*rows, strict=True))
     return config, start, position, force, goals
 
@@ -241,7 +241,7 @@ def test_a_free_gripper_follows_the_analytic_step_response(run, world):
     config, start, position, force, _ = run
     assert np.linalg.norm(force[:, world], axis=1).max() < config.move.force
     time = config.physics.step * (1 + np.arange(STEPS))
-    share = impedance.step_response(time, config.move.stiffness, config.move.damping, mass_of(config))
+    share = twin.step_response(time, config.move.stiffness, config.move.damping, mass_of(config))
     offset = np.array(OFFSETS[world])
     error = np.linalg.norm(position[:, world, :3] - start[world] - share[:, None] * offset, axis=1)
     assert error.max() < 0.02 * np.linalg.norm(offset)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.configs.schema import Config, Move, Pick
-from tests.twins import impedance
+from tests.twins import gripper as twin
 from tests.worlds import grippers
 from tests.worlds.small_worlds import CUBE, catalog, settings
 
@@ -77,9 +77,9 @@ def test_the_free_step_response_is_the_analytic_one_within_two_percent(pulled, m
     assert np.linalg.norm(found.force[:, FREE], axis=1).max() < found.section.force
     time = config.physics.step * (1 + np.arange(PULL_STEPS))
     shift = np.array(SHIFT[mode])
-    error = np.linalg.norm(found.position[:, FREE] - impedance.step_response(time, *found.law)[:, None] * shift, axis=1)
+    error = np.linalg.norm(found.position[:, FREE] - twin.step_response(time, *found.law)[:, None] * shift, axis=1)
     assert error.max() < 0.02 * np.linalg.norm(shift)
-    stepped = impedance.stepped_response(PULL_STEPS, *found.law, config.physics.step, config.physics.substeps)
+    stepped = twin.stepped_response(PULL_STEPS, *found.law, config.physics.step, config.physics.substeps)
     np.testing.assert_allclose(found.position[:, FREE], stepped[:, None] * shift, atol=2e-4 * np.linalg.norm(shift))
 
 
@@ -90,8 +90,8 @@ def test_the_step_responses_error_is_proportional_to_the_time_step(pulled, mode)
     errors = []
     for step in config.physics.step / np.array([1, 2, 4]):
         time = np.arange(step, PULL_STEPS * config.physics.step, step)
-        stepped = impedance.stepped_response(len(time), *found.law, step, config.physics.substeps)
-        errors.append(np.abs(stepped - impedance.step_response(time, *found.law)).max())
+        stepped = twin.stepped_response(len(time), *found.law, step, config.physics.substeps)
+        errors.append(np.abs(stepped - twin.step_response(time, *found.law)).max())
     assert errors[0] < 0.02
     assert np.array(errors[:-1]) / errors[1:] == pytest.approx(2.0, rel=0.05)
 

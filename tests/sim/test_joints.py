@@ -36,7 +36,7 @@ def turned(device) -> tuple[Physics, np.ndarray, np.ndarray]:
     physics.refresh_poses()
     force = np.zeros((3, physics.layout.dofs_per_world), np.float32)
     physics.tick(lambda current: None)
-    physics.turn_fingers(wp.array(YAW, dtype=float, device=device))
+    physics.set_yaw(wp.array(YAW, dtype=float, device=device))
     physics.refresh_poses()
     poses = physics.state.body_q.numpy().reshape(3, -1, 7)[:, :2].copy()
     force[:, :3] = FORCE

@@ -59,7 +59,7 @@ def test_a_pick_episode_runs_to_its_end(emptied):
 def test_what_was_picked_is_gone_from_the_next_picture(emptied):
     reports, objects = emptied
     live = [row for row in reports if row.column("live")[0]]
-    present = [(row.entry[0] >= 0).sum() for row in live]
+    present = [(row.catalog_index[0] >= 0).sum() for row in live]
     ended = [row.column("outcome")[0] != 0 for row in live]
     assert present[0] == len(objects)
     assert np.diff(present).tolist() == [-int(end) for end in ended[1:]]
@@ -81,7 +81,7 @@ def test_the_seal_bears_the_weight_at_the_end_of_the_lift(emptied):
     for row, following in itertools.pairwise(reports):
         if following.column("outcome")[0]:
             target = following.column("target")[0]
-            weight = objects.entries[row.entry[0][target]].mass * GRAVITY
+            weight = objects.entries[row.catalog_index[0][target]].mass * GRAVITY
             assert row.measure("load")[0] == pytest.approx(weight, rel=0.03)
             assert row.column("hits")[0] == 10
 
@@ -106,8 +106,8 @@ def track(device, worlds: int, episodes: int = 3) -> dict[tuple[int, int], list[
     for row in run(simulation):
         for world in range(worlds):
             address = (int(row.column("episode")[world]), int(row.column("redraw")[world]))
-            full = row.entry[world] >= 0
-            parts = (row.status[world], row.measures[world], row.entry[world], row.pose[world][full])
+            full = row.catalog_index[world] >= 0
+            parts = (row.status[world], row.measures[world], row.catalog_index[world], row.pose[world][full])
             ticks[address].append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))
     return {address: rows for address, rows in ticks.items() if address[0] >= 0}
 

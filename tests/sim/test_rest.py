@@ -35,10 +35,10 @@ def made(device, worlds: int = 1, objects: int = 2, **settings) -> KernelWorlds:
     entry[:, :objects] = (np.arange(objects) % 2) * 2
     slot[:, :objects] = np.arange(objects)
     result.begin(Phase.SETTLE)
-    result.set(result.state.entry, entry)
-    result.set(result.state.slot, slot)
+    result.set(result.state.catalog_index, entry)
+    result.set(result.state.body_slot, slot)
     result.set(result.state.progress, [0, 0, 0, 1])
-    result.set(result.state.previous, INSIDE)
+    result.set(result.state.previous_pose, INSIDE)
     for world in range(worlds):
         for instance in range(objects):
             result.place(world, instance, INSIDE)
@@ -66,11 +66,11 @@ def touch(worlds: KernelWorlds, contacts: list[dict], room: int = 8) -> None:
 def judge(worlds: KernelWorlds, shift: float = 0.0, contacts: list[dict] | None = None) -> None:
     """One tick in which the first instance of every world moves by `shift`."""
     touch(worlds, contacts or [])
-    previous = worlds.state.previous.numpy()
+    previous = worlds.state.previous_pose.numpy()
     for world in range(worlds.worlds):
         previous[world, 0, :3] = worlds.physics.state.body_q.numpy()[world * worlds.bodies + 2, :3]
         previous[world, 0, 0] += shift
-    worlds.set(worlds.state.previous, previous)
+    worlds.set(worlds.state.previous_pose, previous)
     arrange.judge_settling(worlds.scene, worlds.state, worlds.physics, SEED)
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
 
@@ -110,13 +110,13 @@ def test_depth_of_contacts(device):
     }
     apart = {"shape0": 5, "shape1": 0, "normal": (0, 0, -1), "point1": (0, 0, 0.01)}
     touch(worlds, [low, thick, apart])
-    arrange.measure_depth(worlds.state, worlds.physics)
+    arrange.measure_penetration(worlds.state, worlds.physics)
     expected = np.zeros(worlds.bodies)
     expected[2] = 0.01
-    np.testing.assert_allclose(worlds.state.depth.numpy(), expected, atol=1e-7)
+    np.testing.assert_allclose(worlds.state.penetration.numpy(), expected, atol=1e-7)
     touch(worlds, [thick])
-    arrange.measure_depth(worlds.state, worlds.physics)
-    assert worlds.state.depth.numpy()[2] == pytest.approx(0.005, abs=1e-7)
+    arrange.measure_penetration(worlds.state, worlds.physics)
+    assert worlds.state.penetration.numpy()[2] == pytest.approx(0.005, abs=1e-7)
 
 
 def test_contacts_beyond_the_count_do_not_exist(device):
@@ -124,8 +124,8 @@ def test_contacts_beyond_the_count_do_not_exist(device):
     worlds.set(worlds.physics.model.shape_body, 2)
     touch(worlds, [{"shape0": 0, "margin0": 0.5}] * 3)
     worlds.physics.contacts.rigid_contact_count.zero_()
-    arrange.measure_depth(worlds.state, worlds.physics)
-    assert (worlds.state.depth.numpy() == 0.0).all()
+    arrange.measure_penetration(worlds.state, worlds.physics)
+    assert (worlds.state.penetration.numpy() == 0.0).all()
 
 
 @given(
@@ -142,15 +142,15 @@ def test_shift_of_known_motions(move, angle, axis, flip, start, device):
     after[:3] += move
     if flip:
         after[3:] *= -1
-    worlds.set(worlds.state.previous, before)
+    worlds.set(worlds.state.previous_pose, before)
     worlds.place(0, 0, after)
     worlds.place(0, 1, before)
-    arrange.measure_shift(worlds.scene, worlds.state, worlds.physics)
-    shift = worlds.state.shift.numpy()[0]
+    arrange.measure_displacement(worlds.scene, worlds.state, worlds.physics)
+    shift = worlds.state.displacement.numpy()[0]
     assert shift[0] == pytest.approx(np.linalg.norm(move) + angle * worlds.radius[0], abs=2e-5)
     assert shift[1] == pytest.approx(0.0, abs=1e-6)
-    arrange.measure_shift(worlds.scene, worlds.state, worlds.physics)
-    assert worlds.state.shift.numpy()[0, 0] == pytest.approx(0.0, abs=1e-6)
+    arrange.measure_displacement(worlds.scene, worlds.state, worlds.physics)
+    assert worlds.state.displacement.numpy()[0, 0] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_shift_bounds_how_far_any_point_of_the_sphere_moved(device):
@@ -159,14 +159,14 @@ def test_shift_bounds_how_far_any_point_of_the_sphere_moved(device):
     for _ in range(20):
         turn = numbers.normal(size=4)
         after = np.concatenate([numbers.uniform(-0.1, 0.1, 3), turn / np.linalg.norm(turn)])
-        worlds.set(worlds.state.previous, [0, 0, 0, 0, 0, 0, 1])
+        worlds.set(worlds.state.previous_pose, [0, 0, 0, 0, 0, 0, 1])
         worlds.place(0, 0, after)
-        arrange.measure_shift(worlds.scene, worlds.state, worlds.physics)
+        arrange.measure_displacement(worlds.scene, worlds.state, worlds.physics)
         points = numbers.normal(size=(500, 3))
         points *= worlds.radius[0] / np.linalg.norm(points, axis=1, keepdims=True)
         cross = 2 * np.cross(after[3:6], points)
         moved = cross * after[6] + np.cross(after[3:6], cross) + after[:3]
-        assert np.linalg.norm(moved, axis=1).max() <= worlds.state.shift.numpy()[0, 0] + 1e-6
+        assert np.linalg.norm(moved, axis=1).max() <= worlds.state.displacement.numpy()[0, 0] + 1e-6
 
 
 # ---- rest ----
@@ -295,7 +295,7 @@ def test_objects_dropped_again_together_fall_one_above_the_other_from_poses_of_t
         worlds.place(0, instance, [0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0])
     judge(worlds)
     assert state_of(worlds)[2] == [1, 0, 4, 1]
-    radius = worlds.radius[worlds.state.entry.numpy()[0]]
+    radius = worlds.radius[worlds.state.catalog_index.numpy()[0]]
     poses = worlds.coordinates()[0, :4]
     gaps = np.diff(poses[:, 2]) - radius[1:] - radius[:-1]
     np.testing.assert_allclose(gaps, worlds.scene.drop.clearance, atol=1e-6)

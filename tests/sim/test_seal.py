@@ -60,7 +60,7 @@ def test_hanging_still_the_load_is_the_weight_and_a_good_seal_lifts_everything(t
     assert (np.abs(load / (MASSES * GRAVITY) - 1.0) < 0.03).all()
     table.speed[2] = LIFT
     load = table.run(130)[:, :, 0]
-    assert (table.seals.held.numpy() == 1).all()
+    assert (table.seals.attached.numpy() == 1).all()
     # Up to speed, without slack: more than the weight, and then the weight again.
     assert (load.max(axis=0) > 1.2 * MASSES * GRAVITY).all()
     assert (np.abs(load[-1] / (MASSES * GRAVITY) - 1.0) < 0.1).all()
@@ -69,27 +69,27 @@ def test_hanging_still_the_load_is_the_weight_and_a_good_seal_lifts_everything(t
     # Stretched by no more than the paper's compliance.
     tip = poses[:, 1, 2] - table.config.gripper.cup_length
     np.testing.assert_allclose(poses[:, 2, 2] + table.size[:, 0, 2] / 2, tip, atol=5e-3)
-    np.testing.assert_allclose(table.seals.peak.numpy(), load.max(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(table.seals.peak_force.numpy(), load.max(axis=0), rtol=1e-5)
 
 
 def test_a_poor_seal_holds_the_marker_and_drops_what_is_heavy(table):
     table.start(under(table), limit=2.0)
     table.speed[2] = LIFT
     load = table.run(150)[:, :, 0]
-    np.testing.assert_array_equal(table.seals.peak.numpy(), load.max(axis=0))
-    held = table.seals.held.numpy()[:, 0]
+    np.testing.assert_array_equal(table.seals.peak_force.numpy(), load.max(axis=0))
+    held = table.seals.attached.numpy()[:, 0]
     assert held[0] == 1
     assert (held[MASSES > 0.21] == 0).all()
     # Heavier objects break off sooner: those held are the lightest.
     assert (np.diff(held) <= 0).all()
     # The force that breaks a seal is recorded, too: in one step of each object that is dropped.
     assert (np.sort(load, axis=0)[-2] <= 2.0).all()
-    assert (table.seals.peak.numpy()[held == 0] > 2.0).all()
-    assert (table.seals.peak.numpy()[held == 1] <= 2.0).all()
+    assert (table.seals.peak_force.numpy()[held == 0] > 2.0).all()
+    assert (table.seals.peak_force.numpy()[held == 1] <= 2.0).all()
     # Dropped objects feel no force any more, and fall.
     force = table.physics.control.joint_f.numpy().reshape(len(MASSES), -1)[:, build.GRIPPER_DOFS :]
     assert (force[held == 0] == 0.0).all()
-    assert (table.seals.load.numpy()[held == 0] == 0.0).all()
+    assert (table.seals.seal_force.numpy()[held == 0] == 0.0).all()
     _, velocity = table.bodies()
     assert (velocity[held == 0, 2, 2] < -0.2).all()
     assert velocity[0, 2, 2] == pytest.approx(LIFT, rel=0.1)
@@ -109,8 +109,8 @@ def test_what_hangs_by_its_edge_swings_little_more_than_the_limit(device):
     assert (most < limit + 5.0).all()
     hanging.run(60)
     assert (hanging.swing() < limit + 2.0).all()
-    assert (hanging.seals.held.numpy() == 1).all()
-    np.testing.assert_allclose(hanging.seals.load.numpy()[:, 0], masses * GRAVITY, rtol=0.03)
+    assert (hanging.seals.attached.numpy() == 1).all()
+    np.testing.assert_allclose(hanging.seals.seal_force.numpy()[:, 0], masses * GRAVITY, rtol=0.03)
 
 
 # ---- momentum and energy ----
@@ -164,15 +164,15 @@ def test_two_objects_hang_on_one_cup_and_break_off_alone(pair):
     pair.start(beside(pair))
     pair.run(150)
     # They lean on one another as they swing in: together they weigh what they weigh.
-    assert (pair.seals.held.numpy() == 1).all()
+    assert (pair.seals.attached.numpy() == 1).all()
     load = pair.run(50).mean(axis=0)
     assert load.sum(axis=1) == pytest.approx(pair.mass.sum(axis=1) * GRAVITY, rel=0.1)
     assert np.abs(pair.bodies()[1][:, 2:, :3]).max() < 0.01
-    pair.seals.limit.fill_(2.0)
+    pair.seals.break_force.fill_(2.0)
     pair.run(1)
-    assert pair.seals.held.numpy().tolist() == [[0, 0], [1, 0]]
+    assert pair.seals.attached.numpy().tolist() == [[0, 0], [1, 0]]
     pair.run(30)
-    assert pair.seals.held.numpy().tolist() == [[0, 0], [1, 0]]
+    assert pair.seals.attached.numpy().tolist() == [[0, 0], [1, 0]]
     assert pair.bodies()[1][1, 3, 2] < -0.4
     assert abs(pair.bodies()[1][1, 2, 2]) < 0.1
 
@@ -186,7 +186,7 @@ def test_a_cup_does_not_push_away_what_it_holds(pair):
     try:
         for pair.ignoring in (False, True):
             pair.start(place)
-            pair.seals.held.assign(np.array([[1, 0], [1, 0]]))
+            pair.seals.attached.assign(np.array([[1, 0], [1, 0]]))
             load = pair.run(60)[-1, :, 0]
             assert (load == pytest.approx(weight, rel=0.03)) == pair.ignoring
     finally:
@@ -201,7 +201,7 @@ def test_held_objects_touch_each_other_and_what_is_not_held_touches_the_cup(pair
     place = beside(pair)
     place[..., 2] += 1e-3
     pair.start(place)
-    pair.seals.held.assign(np.array([[1, 0], [1, 1]]))
+    pair.seals.attached.assign(np.array([[1, 0], [1, 1]]))
     pair.physics.pipeline.collide(pair.physics.state, pair.physics.contacts)
 
     def pairs() -> list[tuple[int, int]]:
@@ -216,7 +216,7 @@ def test_held_objects_touch_each_other_and_what_is_not_held_touches_the_cup(pair
     both = {(one + cup, one + first), (one + cup, one + second)}
     before = pairs()
     assert {(cup, first), (cup, second), (first, second)} | both <= set(before)
-    pair.suction.ignore_held_contacts(pair.scene, pair.state, pair.seals, pair.physics)
+    pair.suction.ignore_attached_contacts(pair.scene, pair.state, pair.seals, pair.physics)
     assert set(pairs()) == set(before) - {(cup, first)} - both
 
 
@@ -229,7 +229,7 @@ LAW = {
     "twist_damping": 0.1,
     "swing_limit": np.radians(5.0),
     "swing_stiffness": 50.0,
-    "tip": 0.055,
+    "tcp_offset": 0.055,
     "finger_mass": 1.5,
     "cup_mass": 0.5,
     "tilt_inertia": 0.4,
@@ -257,12 +257,12 @@ def scripted(device, bodies: list[twin.Body], anchors: np.ndarray, held: list[in
         full[rows] = values
         owner = worlds.physics.state if name in ("body_q", "body_qd") else worlds.physics.model
         setattr(owner, name, wp.array(full, dtype=dtype, device=device))
-    worlds.set(worlds.state.slot, SLOTS)
-    worlds.set(worlds.seals.anchor, anchors)
-    worlds.set(worlds.seals.held, held)
-    worlds.set(worlds.seals.limit, limit)
-    worlds.set(worlds.seals.load, 9.0)
-    worlds.set(worlds.seals.peak, 1.0)
+    worlds.set(worlds.state.body_slot, SLOTS)
+    worlds.set(worlds.seals.object_in_tcp, anchors)
+    worlds.set(worlds.seals.attached, held)
+    worlds.set(worlds.seals.break_force, limit)
+    worlds.set(worlds.seals.seal_force, 9.0)
+    worlds.set(worlds.seals.peak_force, 1.0)
     worlds.set(worlds.physics.control.joint_f, 7.0)
     return worlds
 
@@ -286,7 +286,8 @@ def drawn(seed: int) -> tuple[list[twin.Body], np.ndarray]:
             pose = np.array(
                 _times(
                     _times(
-                        _times(bodies[0].pose, [0, 0, -LAW["tip"], 0, 0, 0, 1]), [*numbers.normal(scale=5e-4, size=3), *quaternion(0.05)]
+                        _times(bodies[0].pose, [0, 0, -LAW["tcp_offset"], 0, 0, 0, 1]),
+                        [*numbers.normal(scale=5e-4, size=3), *quaternion(0.05)],
                     ),
                     anchors[-1],
                 )
@@ -321,9 +322,9 @@ def test_the_wrench_is_the_twins_and_what_is_not_held_is_left_alone(seed, held, 
         peak = max(peak, loads[instance])
     meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
     suction = Suction(load_config("smoke", {}), catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
-    suction.hold_objects(worlds.scene, worlds.state, worlds.seals, worlds.physics, worlds.physics.state)
+    suction.apply_seal_forces(worlds.scene, worlds.state, worlds.seals, worlds.physics, worlds.physics.state)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(worlds.physics.control.joint_f.numpy(), expected, rtol=3e-4, atol=1e-4 * scale)
-    np.testing.assert_allclose(worlds.seals.load.numpy()[0], loads, rtol=3e-4, atol=1e-4 * scale)
-    assert worlds.seals.held.numpy()[0].tolist() == kept
-    assert worlds.seals.peak.numpy()[0] == pytest.approx(peak, rel=3e-4, abs=1e-4 * scale)
+    np.testing.assert_allclose(worlds.seals.seal_force.numpy()[0], loads, rtol=3e-4, atol=1e-4 * scale)
+    assert worlds.seals.attached.numpy()[0].tolist() == kept
+    assert worlds.seals.peak_force.numpy()[0] == pytest.approx(peak, rel=3e-4, abs=1e-4 * scale)

@@ -39,10 +39,10 @@ def track(device, worlds: int, disturb=None, episodes: int = EPISODES) -> dict[t
         exposure = snapshot.light_exposure.numpy()
         for world in range(worlds):
             address = (int(seen.column("episode")[world]), int(seen.column("redraw")[world]))
-            full = seen.entry[world] >= 0
+            full = seen.catalog_index[world] >= 0
             parts = (
                 seen.status[world],
-                seen.entry[world],
+                seen.catalog_index[world],
                 seen.pose[world][full],
                 fixtures[world],
                 light[world],
@@ -137,8 +137,8 @@ def energy(simulation: Simulation, seen) -> np.ndarray:
     model, layout = simulation.physics.model, simulation.layout
     mass, center, inertia = model.body_mass.numpy(), model.body_com.numpy(), model.body_inertia.numpy()
     velocity, pose = simulation.physics.state.body_qd.numpy().astype(float), simulation.physics.state.body_q.numpy().astype(float)
-    slot, total = simulation.state.slot.numpy(), np.zeros(layout.worlds)
-    for world, instance in zip(*np.nonzero(seen.entry >= 0), strict=True):
+    slot, total = simulation.state.body_slot.numpy(), np.zeros(layout.worlds)
+    for world, instance in zip(*np.nonzero(seen.catalog_index >= 0), strict=True):
         body = world * layout.bodies_per_world + build.GRIPPER_BODIES + slot[world, instance]
         turn = matrix(pose[body, 3:])
         height = (turn @ center[body] + pose[body, :3])[2]
@@ -163,8 +163,8 @@ def test_piles_come_to_rest_on_the_floor(resting):
     last = reports[-1]
     assert (last.column("phase") == Phase.ACT).any()
     assert not last.column("ending").any()
-    for world, instance in zip(*np.nonzero(last.entry >= 0), strict=True):
-        low = corners(last.entry[world, instance], last.pose[world, instance])
+    for world, instance in zip(*np.nonzero(last.catalog_index >= 0), strict=True):
+        low = corners(last.catalog_index[world, instance], last.pose[world, instance])
         # Nothing sinks into the floor, or hangs higher than the pile's objects could carry it.
         assert low[:, 2].min() > -1e-3
         assert low[:, 2].min() < 0.15
@@ -176,7 +176,7 @@ def test_something_lies_on_the_floor_in_every_world(resting):
     last = reports[-1]
     for world in range(4):
         lowest = min(
-            corners(entry, pose)[:, 2].min() for entry, pose in zip(last.entry[world], last.pose[world], strict=True) if entry >= 0
+            corners(entry, pose)[:, 2].min() for entry, pose in zip(last.catalog_index[world], last.pose[world], strict=True) if entry >= 0
         )
         assert lowest == pytest.approx(0.0, abs=1e-3)
 
@@ -193,8 +193,8 @@ def test_energy_never_grows(resting):
 
 def test_a_settled_pile_hardly_sinks_in(resting):
     config, _, _, simulation = resting
-    arrange.measure_depth(simulation.state, simulation.physics)
-    assert simulation.state.depth.numpy().max() < min(2e-3, config.settle.stuck_depth)
+    arrange.measure_penetration(simulation.state, simulation.physics)
+    assert simulation.state.penetration.numpy().max() < min(2e-3, config.settle.stuck_depth)
 
 
 def test_the_gripper_waits_outside_and_then_stands_above_the_first_corner(device):
@@ -216,7 +216,7 @@ def test_the_gripper_waits_outside_and_then_stands_above_the_first_corner(device
     corner = config.move.corner * np.array(config.tote.floor_size) / 2
     np.testing.assert_allclose(np.abs(seen[first][1][1:, :2]), np.tile(corner, (2, 1)), atol=1e-4)
     assert seen[first][1][1, 2] == pytest.approx(config.move.start_height + config.gripper.cup_length, abs=1e-4)
-    assert (seen[-1][0].entry == -1).all()
+    assert (seen[-1][0].catalog_index == -1).all()
 
 
 # ---- known answers ----
@@ -225,7 +225,7 @@ def test_the_gripper_waits_outside_and_then_stands_above_the_first_corner(device
 def placed(simulation: Simulation, world: int, entry: int, place, speed=(0, 0, 0, 0, 0, 0)) -> None:
     """Give a world one object, at a pose and speed, in its first slot; the gripper is at home."""
     state, layout, physics = simulation.state, simulation.layout, simulation.physics
-    variant, entries = np.full(layout.worlds * layout.bodies_per_world, -1, np.int32), state.entry.numpy()
+    variant, entries = np.full(layout.worlds * layout.bodies_per_world, -1, np.int32), state.catalog_index.numpy()
     variant[world * layout.bodies_per_world + build.GRIPPER_BODIES] = simulation.scene.catalog.variant.numpy()[entry]
     entries[world] = [entry] + [-1] * (layout.instances - 1)
     q, qd = physics.state.joint_q.numpy(), physics.state.joint_qd.numpy()
@@ -235,7 +235,7 @@ def placed(simulation: Simulation, world: int, entry: int, place, speed=(0, 0, 0
     restarted = np.arange(layout.worlds + 1) == world
     for array, values in (
         (state.variant, variant),
-        (state.entry, entries),
+        (state.catalog_index, entries),
         (state.restarted, restarted),
         (physics.state.joint_q, q),
         (physics.state.joint_qd, qd),
@@ -288,8 +288,8 @@ def test_depth_is_how_far_a_box_sinks_into_the_floor(bench):
     placed(bench, 0, 0, [0.0, 0.0, BOX[0][2] / 2 - 3e-3, 0.0, 0.0, 0.0, 1.0])
     placed(bench, 1, 0, [0.0, 0.0, BOX[0][2] / 2 + 1e-3, 0.0, 0.0, 0.0, 1.0])
     bench.physics.pipeline.collide(bench.physics.state, bench.physics.contacts)
-    arrange.measure_depth(bench.state, bench.physics)
-    depth = bench.state.depth.numpy().reshape(2, -1)[:, build.GRIPPER_BODIES]
+    arrange.measure_penetration(bench.state, bench.physics)
+    depth = bench.state.penetration.numpy().reshape(2, -1)[:, build.GRIPPER_BODIES]
     np.testing.assert_allclose(depth, [3e-3, 0.0], atol=5e-5)
 
 

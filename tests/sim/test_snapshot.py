@@ -17,7 +17,7 @@ from tests.worlds.kernel_worlds import filled
 
 WORLDS, ROOM, FIXTURES = 3, 2, 3
 SIZES = {"world": WORLDS, "instance": ROOM, "fixture": FIXTURES}
-KEPT = ("entry", "pose", "fixture_pose", "fixture_visible")
+KEPT = ("catalog_index", "pose", "fixture_pose", "fixture_visible")
 TICK = st.lists(st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(-1, 3)), min_size=WORLDS, max_size=WORLDS)
 """live, episode and frame of each world."""
 

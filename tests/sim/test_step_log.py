@@ -12,7 +12,7 @@ from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport, tick_batch
-from tests.twins import impedance
+from tests.twins import gripper as twin
 from tests.worlds.sights import SHORT, picking
 from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog, settings
 
@@ -64,7 +64,7 @@ def picked(device) -> tuple[Log, Simulation]:
 def masses(log: Log, objects: Catalog) -> np.ndarray:
     """Mass of each instance in each tick [kg], NaN for none."""
     table = np.append([entry.mass for entry in objects.entries], np.nan)
-    return np.array([table[row.entry[0]] for row in log.reports])
+    return np.array([table[row.catalog_index[0]] for row in log.reports])
 
 
 @pytest.mark.parametrize("run", ["moved", "picked"])
@@ -72,7 +72,7 @@ def test_the_last_step_is_what_the_tick_shows_to_the_bit(run, request):
     log, _ = request.getfixturevalue(run)
     seen = 0
     for row, steps in zip(log.reports, log.steps, strict=True):
-        there = row.entry[0] >= 0
+        there = row.catalog_index[0] >= 0
         assert steps["pose"][0, -1][there].tobytes() == row.pose[0][there].tobytes()
         seen += there.sum()
         # Whoever has just been put above a grasp or sent home has not got there by physics.
@@ -86,7 +86,7 @@ def test_what_is_not_there_is_not_a_number(run, request):
     log, _ = request.getfixturevalue(run)
     names = [name for name, values in log.steps[0].items() if values.dtype.kind == "f"]
     for row, steps, before in zip(log.reports[1:], log.steps[1:], log.reports[:-1], strict=True):
-        there = (before.entry[0] >= 0) if before.column("phase")[0] in (Phase.SETTLE, Phase.ACT) else (row.entry[0] >= 0)
+        there = (before.catalog_index[0] >= 0) if before.column("phase")[0] in (Phase.SETTLE, Phase.ACT) else (row.catalog_index[0] >= 0)
         for name in names:
             values = steps[name][0]
             if name.startswith("gripper") or values.shape[1:2] != there.shape or name in ("goal", "impedance_force"):
@@ -139,7 +139,7 @@ def test_velocities_are_those_of_poses(device):
     simulation = Simulation(settings(arrangement__max_objects=1, **COARSE), objects, 1, device, records_physics=True)
     (entry,), step = objects.entries, simulation.config.physics.step
     Log(simulation, 1)
-    slot = int(simulation.state.slot.numpy()[0, 0])
+    slot = int(simulation.state.body_slot.numpy()[0, 0])
     speeds = simulation.physics.state.joint_qd.numpy()
     first = build.GRIPPER_DOFS + build.FREE_DOFS * slot
     speeds[first : first + 6] = [0.1, -0.2, 1.0, 3.0, -2.0, 4.0]
@@ -182,8 +182,8 @@ def test_the_force_is_the_impedance_law_of_goal_pose_and_velocity(run, request):
         assert not force[~drawn].any()
         place, velocity = steps["gripper_pose"][0, :, 0, :3], steps["gripper_velocity"][0, :, 0]
         for step in 1 + np.flatnonzero(drawn[1:]):
-            twin = impedance.force(goal[step].astype(float) - place[step - 1], velocity[step - 1].astype(float), *law)
-            np.testing.assert_allclose(force[step], twin, rtol=2e-4, atol=2e-3)
+            expected = twin.force(goal[step].astype(float) - place[step - 1], velocity[step - 1].astype(float), *law)
+            np.testing.assert_allclose(force[step], expected, rtol=2e-4, atol=2e-3)
             checked += 1
         assert not drawn.any() or row.column("live")[0]
     assert checked > 200
@@ -210,7 +210,7 @@ def test_ticks_say_what_the_status_says(picked):
         assert ticks["load"][0] == row.measure("load")[0]
         for name in ("held", "caught"):
             assert (1 << np.flatnonzero(ticks[name][0])).sum() == row.column(name)[0]
-            assert ticks[name].shape == row.entry.shape
+            assert ticks[name].shape == row.catalog_index.shape
 
 
 def test_a_batch_has_the_live_worlds_arrays(moved):
@@ -267,4 +267,4 @@ def test_sums_of_contact_forces_are_exact_and_opposite(device):
     inputs = [wp.array(values, dtype=int, device=device) for values in (np.array([0, 1, -1]), np.array([4]), shapes[:, 0], shapes[:, 1])]
     forces = wp.array(force, dtype=wp.spatial_vector, device=device)
     wp.launch(step_log.sum_contacts_kernel, dim=5, inputs=[*inputs, forces], outputs=[total], device=device)
-    np.testing.assert_array_equal(total.numpy() / float(step_log.COUNTS), [[0.5, -2.0, 2.0, 3.5], [-0.5, 2.0, 6.0, 11.5]])
+    np.testing.assert_array_equal(total.numpy() / float(step_log.COUNTS_PER_NEWTON), [[0.5, -2.0, 2.0, 3.5], [-0.5, 2.0, 6.0, 11.5]])

@@ -48,12 +48,12 @@ def made(device, worlds: int = 1, **pick) -> KernelWorlds:
         single_slots=3,
         compound_slots=0,
         pick=PICK | pick,
-        move={"tip": TIP, "step": STEP},
+        move={"tcp_offset": TIP, "step": STEP},
     )
     result.begin(Phase.ACT)
     result.set(result.state.mode, Mode.PICK)
-    result.set(result.state.entry, [0, 1, 2])
-    result.set(result.state.slot, [0, 1, 2])
+    result.set(result.state.catalog_index, [0, 1, 2])
+    result.set(result.state.body_slot, [0, 1, 2])
     result.set(result.plan.point, POINT)
     result.set(result.plan.normal, NORMAL)
     return result
@@ -74,7 +74,7 @@ def step(worlds: KernelWorlds, count: int = 1) -> None:
 
 def begin_attempt(worlds: KernelWorlds) -> None:
     """With fingers that cannot turn: they have no model."""
-    worlds.physics.turn_fingers = lambda yaw: None
+    worlds.physics.set_yaw = lambda yaw: None
     gripper.begin_attempts(worlds.scene, worlds.state, worlds.attempts, worlds.plan, worlds.physics)
 
 
@@ -94,9 +94,9 @@ def test_who_begins_to_pick_looks(device):
 def test_nothing_hangs_where_nobody_acts(device):
     worlds = made(device, worlds=2)
     worlds.set(worlds.state.phase, [Phase.ACT, Phase.SETTLE])
-    worlds.set(worlds.seals.held, 1)
-    gripper.forget_seals(worlds.state, worlds.seals)
-    assert worlds.seals.held.numpy().tolist() == [[1, 1, 1], [0, 0, 0]]
+    worlds.set(worlds.seals.attached, 1)
+    gripper.clear_seals(worlds.state, worlds.seals)
+    assert worlds.seals.attached.numpy().tolist() == [[1, 1, 1], [0, 0, 0]]
 
 
 def test_who_acts_already_keeps_its_task(device):
@@ -104,11 +104,11 @@ def test_who_acts_already_keeps_its_task(device):
     worlds.set(worlds.state.frame, 7)
     worlds.set(worlds.attempts.task, Task.LIFT)
     worlds.set(worlds.attempts.outcome, Outcome.DROPPED)
-    worlds.set(worlds.seals.held, 1)
+    worlds.set(worlds.seals.attached, 1)
     begin(worlds)
     assert worlds.attempts.task.numpy()[0] == Task.LIFT
     assert worlds.attempts.outcome.numpy()[0] == Outcome.NONE
-    assert worlds.seals.held.numpy().all()
+    assert worlds.seals.attached.numpy().all()
 
 
 def test_an_attempt_begins_above_the_grasp(device):
@@ -123,7 +123,7 @@ def test_an_attempt_begins_above_the_grasp(device):
     joints = worlds.physics.state.joint_q.numpy().reshape(2, -1)
     np.testing.assert_allclose(joints[0, :4], [*axis, 0.3], rtol=1e-6)
     np.testing.assert_allclose(worlds.physics.control.joint_target_q.numpy().reshape(2, -1)[:, 3], [0.3, 0.0], rtol=1e-6)
-    np.testing.assert_allclose(worlds.state.goal.numpy()[0], axis, rtol=1e-6)
+    np.testing.assert_allclose(worlds.state.setpoint.numpy()[0], axis, rtol=1e-6)
 
 
 def test_the_goal_goes_down_slowly_at_the_end_and_up_again(device):
@@ -136,7 +136,7 @@ def test_the_goal_goes_down_slowly_at_the_end_and_up_again(device):
     seen: list[tuple[int, np.ndarray]] = []
     for _ in range(1200):
         step(worlds)
-        seen.append((int(worlds.attempts.task.numpy()[0]), worlds.state.goal.numpy()[0].copy()))
+        seen.append((int(worlds.attempts.task.numpy()[0]), worlds.state.setpoint.numpy()[0].copy()))
     order = [task for task, _ in seen]
     counts = {task: order.count(task) for task in set(order)}
     way = np.linalg.norm(axis + np.array([0.0, 0.0, PICK["appear_height"]]) - before)
@@ -154,9 +154,9 @@ def test_the_goal_goes_down_slowly_at_the_end_and_up_again(device):
     heights = []
     for _ in range(round(PICK["lift_height"] / (PICK["lift_speed"] * STEP)) + 3):
         step(worlds)
-        heights.append(worlds.state.goal.numpy()[0, 2])
+        heights.append(worlds.state.setpoint.numpy()[0, 2])
     np.testing.assert_allclose(heights[9], axis[2] + 10 * PICK["lift_speed"] * STEP, atol=1e-5)
-    np.testing.assert_allclose(worlds.state.goal.numpy()[0], axis + np.array([0.0, 0.0, PICK["lift_height"]]), atol=1e-6)
+    np.testing.assert_allclose(worlds.state.setpoint.numpy()[0], axis + np.array([0.0, 0.0, PICK["lift_height"]]), atol=1e-6)
     assert worlds.attempts.outcome.numpy()[0] == Outcome.NONE
     end(worlds)
     assert worlds.attempts.outcome.numpy()[0] == Outcome.NOTHING_CAUGHT
@@ -185,9 +185,9 @@ def lifted(device, target: int, caught: int, held: tuple[int, ...], mode: int = 
     worlds.set(worlds.state.mode, mode)
     worlds.set(worlds.attempts.task, Task.LIFT)
     worlds.set(worlds.plan.target, target)
-    worlds.set(worlds.attempts.caught, caught)
-    worlds.set(worlds.seals.held, held)
-    worlds.set(worlds.state.goal, LIFTED)
+    worlds.set(worlds.attempts.engaged_bits, caught)
+    worlds.set(worlds.seals.attached, held)
+    worlds.set(worlds.state.setpoint, LIFTED)
     step(worlds)
     return worlds
 
@@ -199,10 +199,10 @@ def test_what_hangs_after_the_lift_leaves_the_scene(device, target, caught, held
     assert worlds.attempts.outcome.numpy()[0] == outcome
     assert worlds.attempts.failures.numpy()[0] == failures
     assert worlds.attempts.task.numpy()[0] == Task.LOOK
-    assert worlds.attempts.hanging.numpy()[0] == sum(bit << i for i, bit in enumerate(held))
+    assert worlds.attempts.attached_bits.numpy()[0] == sum(bit << i for i, bit in enumerate(held))
     assert worlds.attempts.removed.numpy()[0].tolist() == [tasks.PICKED * bit for bit in held]
-    assert worlds.state.entry.numpy()[0].tolist() == [-1 if bit else i for i, bit in enumerate(held)]
-    assert not worlds.seals.held.numpy().any()
+    assert worlds.state.catalog_index.numpy()[0].tolist() == [-1 if bit else i for i, bit in enumerate(held)]
+    assert not worlds.seals.attached.numpy().any()
     np.testing.assert_allclose(worlds.physics.state.joint_q.numpy()[:4], [3.0, 0.0, 1.0, 0.0])
 
 
@@ -240,15 +240,15 @@ PLACES = [
 @pytest.mark.parametrize(("place", "shift", "lost"), PLACES)
 def test_what_left_the_tote_is_lost_when_it_lies_or_is_deep(device, place, shift, lost):
     worlds = made(device)
-    worlds.set(worlds.seals.held, 1)
-    worlds.set(worlds.state.shift, [1.0, shift, 1.0])
+    worlds.set(worlds.seals.attached, 1)
+    worlds.set(worlds.state.displacement, [1.0, shift, 1.0])
     for instance in range(3):
         worlds.place(0, instance, [0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0])
     worlds.place(0, 1, [*place, 0.0, 0.0, 0.0, 1.0])
     gripper.remove_lost(worlds.scene, worlds.state, worlds.attempts, worlds.seals, worlds.physics)
-    assert worlds.state.entry.numpy()[0].tolist() == [0, -1 if lost else 1, 2]
+    assert worlds.state.catalog_index.numpy()[0].tolist() == [0, -1 if lost else 1, 2]
     assert worlds.attempts.removed.numpy()[0].tolist() == [0, tasks.LOST * lost, 0]
-    assert worlds.seals.held.numpy()[0].tolist() == [1, 1 - lost, 1]
+    assert worlds.seals.attached.numpy()[0].tolist() == [1, 1 - lost, 1]
 
 
 def test_what_has_left_is_parked_apart_and_weightless_no_more(device):
@@ -281,7 +281,7 @@ def test_when_picking_ends(device, task, entry, failures, ending):
         worlds.place(0, instance, [0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0])
     worlds.set(worlds.attempts.task, task)
     worlds.set(worlds.attempts.failures, failures)
-    worlds.set(worlds.state.entry, entry)
+    worlds.set(worlds.state.catalog_index, entry)
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
     assert worlds.state.ending.numpy()[0] == ending
     assert worlds.state.phase.numpy()[0] == (Phase.ACT if ending == Ending.RUNNING else Phase.OVER)

@@ -9,8 +9,8 @@ import numpy as np
 from synpick_warp.codes import Stream
 from tests.twins import rng
 
-MOST_DRAWS = 4096
-DRAWN_MODES = (1, 2, 0)
+MAX_SAMPLES = 4096
+MODE_ORDER = (1, 2, 0)
 """Codes of the modes in the order of their weights: pick, target, move."""
 
 
@@ -23,14 +23,14 @@ class Arrangement:
     overflow: bool = False
 
 
-def draw_modes(seed: int, episodes: np.ndarray, weights: tuple[float, float, float]) -> np.ndarray:
+def sample_modes(seed: int, episodes: np.ndarray, weights: tuple[float, float, float]) -> np.ndarray:
     """Mode of each episode: the first whose cumulative share of the weights exceeds the episode's number."""
     number = rng.uniform(rng.stream_key(seed, episodes, 0, Stream.MODE), 0)
     share = (np.cumsum(weights) / np.sum(weights)).astype(np.float32)
-    return np.array(DRAWN_MODES)[np.searchsorted(share, number, side="right")]
+    return np.array(MODE_ORDER)[np.searchsorted(share, number, side="right")]
 
 
-def draw_objects(
+def sample_objects(
     seed: int,
     episode: int,
     redraw: int,
@@ -45,7 +45,7 @@ def draw_objects(
 ) -> Arrangement:
     """Draw until the next object would exceed the budget; sums in float32, as on the device."""
     key = rng.stream_key(seed, episode, redraw, Stream.OBJECTS)
-    sequence = rng.uniform_index(key, np.arange(MOST_DRAWS), len(volume))
+    sequence = rng.uniform_index(key, np.arange(MAX_SAMPLES), len(volume))
     entries: list[int] = []
     slots: list[int] = []
     free = {False: list(range(single_slots)), True: list(range(single_slots, single_slots + compound_slots))}

@@ -39,7 +39,7 @@ class SegmenterHarness:
         for name in ("center_share", "heavy_mass", "heavy_center_share"):
             setattr(rules, name, getattr(self.config.sight, name))
         self.scene = SimpleNamespace(catalog=catalog, perception=rules)
-        self.entry = wp.array(np.tile(np.arange(instances), (worlds, 1)), dtype=wp.int32, device=device)
+        self.catalog_index = wp.array(np.tile(np.arange(instances), (worlds, 1)), dtype=wp.int32, device=device)
         self.observation = allocate(Observation, world_sizes(self.config, 0), device)
         self.focal = make_cameras(replace(config.cameras, resolution=(width, height)))[0].matrix[[0, 1], [0, 1]]
 
@@ -55,7 +55,7 @@ class SegmenterHarness:
         stage.arrays.world.assign(np.array(shown + [-1] * (stage.views - len(shown))))
         self.scene.catalog.mass.assign(self.mass)
         self.scene.catalog.area.assign(self.area)
-        stage.find_grasp_points(self.scene, self.entry, self.observation)  # type: ignore[arg-type]
+        stage.find_grasp_points(self.scene, self.catalog_index, self.observation)  # type: ignore[arg-type]
 
     def image(self, name: str, view: int = 0) -> np.ndarray:
         """A scratch array of one view."""

@@ -76,7 +76,7 @@ class PlannerHarness:
             single_slots=instances,
             compound_slots=0,
         )
-        self.worlds.set(self.worlds.state.entry, np.arange(instances))
+        self.worlds.set(self.worlds.state.catalog_index, np.arange(instances))
         kernel_worlds.filled(self.worlds.scene.perception, {**SETTINGS, **(settings or {})})
         sizes = {"view": self.views, "world": self.views, "instance": instances, "row": height, "column": width, "point": CAPACITY}
         self.arrays, self.observation = allocate(PerceptionArrays, sizes, device), allocate(Observation, sizes, device)

@@ -75,7 +75,7 @@ def seal_wrench(cup: Body, body: Body, anchor: np.ndarray, law: SimpleNamespace,
     """
     turn, held = rotation_of(cup.pose[3:]), rotation_of(body.pose[3:])
     axis, hinge = turn[:, 2], turn[:, 1]
-    tip = cup.pose[:3] - law.tip * axis
+    tip = cup.pose[:3] - law.tcp_offset * axis
     caught = held @ rotation_of(anchor[3:]).T
     origin = body.pose[:3] - caught @ anchor[:3]
     stiffness, swing = law.twist_stiffness * np.outer(axis, axis), turn.T @ caught

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels.sim.impedance import impedance_force
+from synpick_warp.kernels.sim.gripper import impedance_force
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim.physics import Physics

@@ -52,8 +52,8 @@ class Hanging:
         meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
         self.suction = Suction(self.config, objects, SimpleNamespace(meshes=meshes, keep=()), device)
         order = np.arange(self.mass.size).reshape(self.mass.shape)
-        self.state.entry.assign(order)
-        self.state.slot.assign(np.tile(np.arange(self.instances), (self.worlds, 1)))
+        self.state.catalog_index.assign(order)
+        self.state.body_slot.assign(np.tile(np.arange(self.instances), (self.worlds, 1)))
         variant = np.full((self.worlds, built.layout.bodies_per_world), -1)
         variant[:, build.GRIPPER_BODIES : build.GRIPPER_BODIES + self.instances] = built.variant[order]
         self.state.variant.assign(variant.reshape(-1))
@@ -73,10 +73,10 @@ class Hanging:
         self.physics.state.joint_qd.zero_()
         self.physics.control.joint_f.zero_()
         self.physics.load(self.state.variant, self.state.restarted)
-        self.seals.anchor.assign(np.concatenate([place, turn], axis=2))
-        self.seals.held.fill_(1)
-        self.seals.limit.fill_(limit)
-        self.seals.peak.zero_()
+        self.seals.object_in_tcp.assign(np.concatenate([place, turn], axis=2))
+        self.seals.attached.fill_(1)
+        self.seals.break_force.fill_(limit)
+        self.seals.peak_force.zero_()
         self.goal[:], self.speed[:] = (0.0, 0.0, HEIGHT), 0.0
 
     def run(self, steps: int) -> np.ndarray:
@@ -84,7 +84,7 @@ class Hanging:
         loads = []
         for _ in range(steps):
             self.physics.tick(self.drive, self.ignore)
-            loads.append(self.seals.load.numpy().copy())
+            loads.append(self.seals.seal_force.numpy().copy())
         return np.array(loads)
 
     def drive(self, current) -> None:
@@ -99,12 +99,12 @@ class Hanging:
         if self.carried:
             force[:, :3] = (pick.stiffness * (offset - step * velocity) - pick.damping * velocity) / gain
             force[:, 2] += self.gripper_mass * self.config.physics.gravity
-        self.suction.hold_objects(self.scene, self.state, self.seals, self.physics, current)
+        self.suction.apply_seal_forces(self.scene, self.state, self.seals, self.physics, current)
 
     def ignore(self) -> None:
         """Contacts of cups with what they hold."""
         if self.ignoring:
-            self.suction.ignore_held_contacts(self.scene, self.state, self.seals, self.physics)
+            self.suction.ignore_attached_contacts(self.scene, self.state, self.seals, self.physics)
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
         """Poses (world, body, 7) and velocities (world, body, 6): finger, cup, objects."""

@@ -69,8 +69,8 @@ class KernelWorlds:
             "rest_ticks": 2,
             "stuck_ticks": 2,
             "late_ticks": 50,
-            "rest_shift": 1e-4,
-            "last_shift": 1e-3,
+            "rest_threshold": 1e-4,
+            "relaxed_rest_threshold": 1e-3,
             "stuck_depth": 0.01,
             "max_redrops": 8,
             **self.settle,
@@ -79,7 +79,7 @@ class KernelWorlds:
             "waypoints": 8,
             "corner": wp.vec3(0.2, 0.1, 0.02),
             "start_height": 0.3,
-            "tip": 0.05,
+            "tcp_offset": 0.05,
             "mass": 2.0,
             "gravity": 9.81,
             "step": 2e-3,
@@ -182,7 +182,7 @@ class KernelWorlds:
     def begin(self, phase: int, episodes: Any = None, redraw: Any = 0) -> None:
         """All worlds in a phase; world w has episode w."""
         episodes = np.arange(self.worlds) if episodes is None else episodes
-        self.set(self.state.address, np.stack(np.broadcast_arrays(episodes, redraw), axis=-1))
+        self.set(self.state.arrangement_id, np.stack(np.broadcast_arrays(episodes, redraw), axis=-1))
         self.set(self.state.phase, phase)
 
     def coordinates(self) -> np.ndarray:
@@ -196,7 +196,7 @@ class KernelWorlds:
     def place(self, world: int, instance: int, pose: Any) -> None:
         """Put an instance's body at a pose (7)."""
         body_q = self.physics.state.body_q.numpy()
-        body_q[world * self.bodies + GRIPPER_BODIES + self.state.slot.numpy()[world, instance]] = pose
+        body_q[world * self.bodies + GRIPPER_BODIES + self.state.body_slot.numpy()[world, instance]] = pose
         self.physics.state.body_q.assign(body_q)
 
 

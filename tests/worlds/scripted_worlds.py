@@ -11,7 +11,7 @@ import numpy as np
 
 from synpick_warp.arrays import allocate
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
-from synpick_warp.codes import Ending, Measure, Mode, Outcome, Phase, Status, Task
+from synpick_warp.codes import Ending, Measure, Mode, Outcome, Phase, Status, Task, column_names
 from synpick_warp.configs.schema import Config
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim import worlds
@@ -30,24 +30,24 @@ class World:
         self.observation, self.plan = (_host(allocate(kind, sizes, device)) for kind in (Observation, Plan))
         self.status = np.zeros((1, len(Status)), np.int32)
         self.measures = np.zeros((1, len(Measure)), np.float32)
-        self.entry = np.full((1, self.room), -1, np.int32)
+        self.catalog_index = np.full((1, self.room), -1, np.int32)
 
-    def now(self, *, load: float | None = None, entry: list[int] | None = None, **columns: int) -> None:
+    def now(self, *, load: float | None = None, catalog_index: list[int] | None = None, **columns: int) -> None:
         """Change columns; the rest stays."""
         for name, value in columns.items():
             # As the device writes bits of 32 instances.
-            self.status[0, Status[name.upper()]] = np.uint32(value).astype(np.int32) if value > 2**31 - 1 else value
+            self.status[0, column_names(Status)[name]] = np.uint32(value).astype(np.int32) if value > 2**31 - 1 else value
         if load is not None:
-            self.measures[0, Measure.LOAD] = load
-        if entry is not None:
-            self.entry[0] = entry
+            self.measures[0, Measure.PEAK_FORCE] = load
+        if catalog_index is not None:
+            self.catalog_index[0] = catalog_index
 
     def frame(self, **columns: object) -> None:
         """As `now`, in the next frame, in which no attempt has ended unless `columns` say so."""
         following = int(self.status[0, Status.FRAME]) + 1
         self.now(**{"frame": following, "outcome": 0, **columns})
 
-    def settle(self, episode: int, redraw: int, mode: int, entry: list[int]) -> None:
+    def settle(self, episode: int, redraw: int, mode: int, catalog_index: list[int]) -> None:
         """An arrangement falls."""
         self.now(
             phase=Phase.SETTLE,
@@ -60,7 +60,7 @@ class World:
             outcome=0,
             attempt=-1,
             ending=0,
-            entry=entry,
+            catalog_index=catalog_index,
         )
 
     def first_frame(self) -> None:
@@ -120,9 +120,11 @@ def report(side_by_side: list[World]) -> TickReport:
         parts = [vars(getattr(world, part)) for world in side_by_side]
         return SimpleNamespace(**{name: np.concatenate([arrays[name] for arrays in parts]) for name in parts[0]})
 
-    status, measures, entry = (np.concatenate([getattr(world, name) for world in side_by_side]) for name in ("status", "measures", "entry"))
-    pose = np.zeros((*entry.shape, 7), np.float32)
-    return TickReport(status, measures, entry, pose, stacked("observation"), stacked("plan"), SimpleNamespace())
+    status, measures, catalog_index = (
+        np.concatenate([getattr(world, name) for world in side_by_side]) for name in ("status", "measures", "catalog_index")
+    )
+    pose = np.zeros((*catalog_index.shape, 7), np.float32)
+    return TickReport(status, measures, catalog_index, pose, stacked("observation"), stacked("plan"), SimpleNamespace())
 
 
 def bits(*instances: int) -> int:

@@ -153,7 +153,7 @@ def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
             entries[world, i] = which
             poses[world, i] = pose
     made = allocate(Snapshot, {"world": worlds, "instance": toy.room, "fixture": 3}, device)
-    made.entry.assign(entries)
+    made.catalog_index.assign(entries)
     made.pose.assign(poses)
     made.fixture_pose.assign(np.tile(np.array(toy.fixture_poses, np.float32), (worlds, 1, 1)))
     made.fixture_visible.assign(np.tile(np.array(toy.fixtures_visible), (worlds, 1)))

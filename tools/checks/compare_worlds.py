@@ -156,9 +156,9 @@ def _note(reader: TickReader, ticks: Ticks) -> bool:
     report = reader.wait()
     episode, redraw, phase = (report.column(name) for name in ("episode", "redraw", "phase"))
     for world in np.flatnonzero(phase != Phase.IDLE):
-        full = report.entry[world] >= 0
+        full = report.catalog_index[world] >= 0
         poses = np.concatenate((report.pose[world][full], report.snapshot.fixture_pose[world]))
-        ticks[int(episode[world]), int(redraw[world])].append((report.entry[world], poses))
+        ticks[int(episode[world]), int(redraw[world])].append((report.catalog_index[world], poses))
     return bool((phase == Phase.IDLE).all())
 
 

@@ -137,13 +137,13 @@ class Tally:
 
     def _count_frame(self, sequence: Sequence, report: TickReport, world: int) -> None:
         """Objects that are there and that have gone, and the attempt that ended in this tick."""
-        present = report.entry[world] >= 0
+        present = report.catalog_index[world] >= 0
         held = _bits(int(report.column("held")[world]), len(present))
         outcome = Outcome(int(report.column("outcome")[world]))
         if sequence.frames == 0:
             sequence.objects = int(present.sum())
         elif self._before is not None:
-            gone = (self._before.entry[world] >= 0) & ~present
+            gone = (self._before.catalog_index[world] >= 0) & ~present
             picked = int((gone & held).sum()) if outcome.succeeded else 0
             sequence.picked += picked
             sequence.lost += int(gone.sum()) - picked
@@ -175,8 +175,8 @@ class Tally:
             return fastest
         same = [report.column(name) == before.column(name) for name in ("episode", "redraw")]
         both = (report.column("live") != 0) & (before.column("live") != 0) & same[0] & same[1]
-        world, instance = np.nonzero(both[:, None] & (report.entry >= 0) & (before.entry >= 0))
-        center = self.center[report.entry[world, instance]]
+        world, instance = np.nonzero(both[:, None] & (report.catalog_index >= 0) & (before.catalog_index >= 0))
+        center = self.center[report.catalog_index[world, instance]]
         place, _ = place_of(report.pose[world, instance], center)
         last, _ = place_of(before.pose[world, instance], center)
         held = (report.column("held")[world] | before.column("held")[world]) >> instance & 1

@@ -174,7 +174,7 @@ def _one_each(config: Config, worlds: int, device: Any) -> Snapshot:
     snapshot = allocate(Snapshot, {"world": worlds, "instance": room, "fixture": len(FIXTURES)}, device)
     entry = np.full((worlds, room), -1)
     entry[:, 0] = np.arange(worlds)
-    snapshot.entry.assign(entry)
+    snapshot.catalog_index.assign(entry)
     for poses in (snapshot.pose, snapshot.fixture_pose):
         poses.assign(np.tile(np.array([0, 0, 0, 0, 0, 0, 1], np.float32), (*poses.shape, 1)))
     return snapshot

@@ -201,14 +201,14 @@ def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: 
     """Numbers of these worlds at the end of this tick."""
     state, layout = simulation.state, simulation.layout
     tick = simulation.config.physics.step * simulation.config.physics.steps_per_tick
-    progress, slots = state.progress.numpy(), state.slot.numpy()
+    progress, slots = state.progress.numpy(), state.body_slot.numpy()
     body_qd = simulation.physics.state.body_qd
     assert body_qd is not None  # Newton's models of rigid bodies have it.
-    depths, velocities = state.depth.numpy(), body_qd.numpy().astype(np.float64)
+    depths, velocities = state.penetration.numpy(), body_qd.numpy().astype(np.float64)
     piles = []
     for world in worlds:
-        instances = np.flatnonzero(now.entry[world] >= 0)
-        entries = [catalog.entries[index] for index in now.entry[world][instances]]
+        instances = np.flatnonzero(now.catalog_index[world] >= 0)
+        entries = [catalog.entries[index] for index in now.catalog_index[world][instances]]
         bodies = world * layout.bodies_per_world + build.GRIPPER_BODIES + slots[world][instances]
         centers = np.array([entry.center_of_mass for entry in entries])
         place, turn = place_of(now.pose[world][instances], centers)

@@ -44,11 +44,11 @@ def prepare_motions_kernel(
     # Scene:
     cameras: Cameras,
     # State:
-    entry: wp.array2d[int],
+    catalog_index: wp.array2d[int],
     pose: wp.array2d[wp.transformf],
     fixture_pose: wp.array2d[wp.transformf],
     follows: wp.array[int],
-    last_entry: wp.array2d[int],
+    last_catalog_index: wp.array2d[int],
     last_pose: wp.array2d[wp.transformf],
     last_fixture_pose: wp.array2d[wp.transformf],
     last_fixture_visible: wp.array2d[int],
@@ -71,7 +71,7 @@ def prepare_motions_kernel(
     if body < instances:
         now = pose[world, body]
         then = last_pose[world, body]
-        if entry[world, body] < 0 or last_entry[world, body] != entry[world, body]:
+        if catalog_index[world, body] < 0 or last_catalog_index[world, body] != catalog_index[world, body]:
             known = 0
     else:
         now = fixture_pose[world, body - instances]

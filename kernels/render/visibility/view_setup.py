@@ -40,7 +40,7 @@ def prepare_bodies_kernel(
     cameras: Cameras,
     grid: ImageGrid,
     # State:
-    entry: wp.array2d[int],
+    catalog_index: wp.array2d[int],
     pose: wp.array2d[wp.transformf],
     fixture_pose: wp.array2d[wp.transformf],
     fixture_visible: wp.array2d[int],
@@ -60,7 +60,7 @@ def prepare_bodies_kernel(
     if world < 0:
         mesh = -1
     elif body < instances:
-        mesh = entry[world, body]
+        mesh = catalog_index[world, body]
         placed = pose[world, body]
     elif fixture_visible[world, body - instances] != 0:
         mesh = meshes.entries + body - instances

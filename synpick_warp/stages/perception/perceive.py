@@ -96,7 +96,7 @@ class Perception:
             device=self.device,
         )
         self.segmenter.render(snapshot)
-        self.segmenter.find_grasp_points(self.scene, snapshot.entry, self.observation)
+        self.segmenter.find_grasp_points(self.scene, snapshot.catalog_index, self.observation)
         self.planner.plan(self.scene, self.segmenter, self.state, self.attempts, self.observation, self.plan, self.seed)
         wp.launch(
             worklist.advance_batch_kernel, dim=1, inputs=[views, self._count], outputs=[self._next, self._remaining], device=self.device

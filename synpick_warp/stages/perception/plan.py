@@ -117,7 +117,7 @@ class GraspPlanner:
         """Compute each contour's bounding box, and its instance's reach."""
         arrays, (views, instances) = images.arrays, images.arrays.largest.shape
         self.voting.extent.fill_(int(NOWHERE))
-        inputs = [scene.catalog, images.cameras, scene.perception, state.entry, arrays.world, arrays.camera]
+        inputs = [scene.catalog, images.cameras, scene.perception, state.catalog_index, arrays.world, arrays.camera]
         inputs += [arrays.contour, arrays.contour_length, observation.depth]
         dim = (views, instances, int(CONTOUR_LANES))
         wp.launch(bound_contours_kernel, dim=dim, inputs=inputs, outputs=[self.voting.extent, self.voting.reach], device=self.device)
@@ -154,7 +154,7 @@ class GraspPlanner:
         seed: int,
     ) -> None:
         """Choose the instance to pick."""
-        inputs = [wp.uint64(seed), scene.pick, state.address, state.mode, attempts.attempt, attempts.outcome]
+        inputs = [wp.uint64(seed), scene.pick, state.arrangement_id, state.mode, attempts.attempt, attempts.outcome]
         inputs += [images.arrays.world, observation.visible, observation.visible_fraction, observation.ancestors]
         self._launch(choose_target_kernel, inputs, [plan.target])
 

@@ -121,7 +121,14 @@ class LayerPainter:
 
     def prepare_motions(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int) -> None:
         """How every body moved since the frame before."""
-        inputs = [self.scene.cameras, snapshot.entry, snapshot.pose, snapshot.fixture_pose, snapshot.follows, snapshot.last_entry]
+        inputs = [
+            self.scene.cameras,
+            snapshot.catalog_index,
+            snapshot.pose,
+            snapshot.fixture_pose,
+            snapshot.follows,
+            snapshot.last_catalog_index,
+        ]
         inputs += [snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible, view_world, view_camera, self.instances]
         dim = (count, self.instances + len(FIXTURES))
         wp.launch(prepare_motions_kernel, dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)

@@ -80,7 +80,7 @@ def place_bodies(
     """
     dim = (count, bodies.mesh.shape[1])
     instances = dim[1] - len(FIXTURES)
-    inputs = [scene.meshes, cameras, grid, snapshot.entry, snapshot.pose, snapshot.fixture_pose, fixture_visible]
+    inputs = [scene.meshes, cameras, grid, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, fixture_visible]
     inputs += [view_world, view_camera, instances]
     wp.launch(prepare_bodies_kernel, dim=dim, inputs=inputs, outputs=[bodies], device=scene.device)
     wp.launch(order_bodies_kernel, dim=dim, outputs=[bodies], device=scene.device)

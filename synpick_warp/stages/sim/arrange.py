@@ -11,37 +11,37 @@ from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 
 
-def take_episodes(state: WorldState, episodes: wp.array, tries: int) -> None:
+def assign_episodes(state: WorldState, episodes: wp.array, tries: int) -> None:
     """Give worlds whose episode is over the next of the numbers `episodes`, or their own again if it delivered nothing."""
     wp.launch(
-        arrangement.take_episodes_kernel,
+        arrangement.assign_episodes_kernel,
         dim=1,
-        inputs=[state.phase.shape[0], episodes, tries, state.address, state.phase, state.ending, state.next_episode],
+        inputs=[state.phase.shape[0], episodes, tries, state.arrangement_id, state.phase, state.ending, state.next_episode],
         device=state.phase.device,
     )
 
 
-def draw_objects(scene: SceneData, state: WorldState, seed: int) -> None:
+def sample_objects(scene: SceneData, state: WorldState, seed: int) -> None:
     """Draw mode, objects and light of worlds that start an episode."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
-        arrangement.draw_modes_kernel,
+        arrangement.sample_modes_kernel,
         dim=worlds,
-        inputs=[wp.uint64(seed), scene.mode, state.address, state.phase],
+        inputs=[wp.uint64(seed), scene.mode, state.arrangement_id, state.phase],
         outputs=[state.mode],
         device=device,
     )
     wp.launch(
-        arrangement.draw_objects_kernel,
+        arrangement.sample_objects_kernel,
         dim=worlds,
-        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, state.address, state.mode, state.phase, state.ending],
-        outputs=[state.entry, state.slot],
+        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, state.arrangement_id, state.mode, state.phase, state.ending],
+        outputs=[state.catalog_index, state.body_slot],
         device=device,
     )
     wp.launch(
-        arrangement.draw_lights_kernel,
+        arrangement.sample_lights_kernel,
         dim=worlds,
-        inputs=[wp.uint64(seed), scene.drop, state.address, state.phase],
+        inputs=[wp.uint64(seed), scene.drop, state.arrangement_id, state.phase],
         outputs=[state.light, state.light_yaw, state.light_exposure],
         device=device,
     )
@@ -52,7 +52,7 @@ def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: in
     worlds, device = state.phase.shape[0], state.phase.device
     joints = [physics.state.joint_q, physics.state.joint_qd, physics.control.joint_f]
     wp.launch(
-        arrangement.empty_worlds_kernel,
+        arrangement.reset_worlds_kernel,
         dim=worlds,
         inputs=[scene.layout, scene.catalog, scene.drop, state.phase],
         outputs=[state.variant, *joints, state.restarted, state.progress, state.stuck],
@@ -61,19 +61,28 @@ def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: in
     wp.launch(
         arrangement.drop_objects_kernel,
         dim=worlds,
-        inputs=[wp.uint64(seed), scene.layout, scene.catalog, scene.drop, state.address, state.entry, state.slot, state.phase],
+        inputs=[
+            wp.uint64(seed),
+            scene.layout,
+            scene.catalog,
+            scene.drop,
+            state.arrangement_id,
+            state.catalog_index,
+            state.body_slot,
+            state.phase,
+        ],
         outputs=[state.variant, *joints],
         device=device,
     )
     physics.load(state.variant, state.restarted)
 
 
-def measure_depth(state: WorldState, physics: Physics) -> None:
+def measure_penetration(state: WorldState, physics: Physics) -> None:
     """Deepest penetration of each body, from the contacts of the last step."""
     contacts = physics.contacts
-    state.depth.zero_()
+    state.penetration.zero_()
     wp.launch(
-        rest.measure_depth_kernel,
+        rest.measure_penetration_kernel,
         dim=contacts.rigid_contact_max,
         inputs=[
             contacts.rigid_contact_count,
@@ -87,26 +96,26 @@ def measure_depth(state: WorldState, physics: Physics) -> None:
             physics.model.shape_body,
             physics.state.body_q,
         ],
-        outputs=[state.depth],
+        outputs=[state.penetration],
         device=state.phase.device,
     )
 
 
-def measure_shift(scene: SceneData, state: WorldState, physics: Physics) -> None:
+def measure_displacement(scene: SceneData, state: WorldState, physics: Physics) -> None:
     """How far each instance moved in the last tick."""
     wp.launch(
-        rest.measure_shift_kernel,
-        dim=state.entry.shape,
-        inputs=[scene.layout, scene.catalog, state.entry, state.slot, physics.state.body_q, state.previous],
-        outputs=[state.shift],
+        rest.measure_displacement_kernel,
+        dim=state.catalog_index.shape,
+        inputs=[scene.layout, scene.catalog, state.catalog_index, state.body_slot, physics.state.body_q, state.previous_pose],
+        outputs=[state.displacement],
         device=state.phase.device,
     )
 
 
 def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
     """Re-drop what left the tote or is stuck, count ticks at rest, let worlds at rest act."""
-    measure_depth(state, physics)
-    measure_shift(scene, state, physics)
+    measure_penetration(state, physics)
+    measure_displacement(scene, state, physics)
     wp.launch(
         rest.redrop_objects_kernel,
         dim=state.phase.shape[0],
@@ -116,12 +125,12 @@ def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: 
             scene.catalog,
             scene.drop,
             scene.settle,
-            state.address,
+            state.arrangement_id,
             state.phase,
-            state.entry,
-            state.slot,
+            state.catalog_index,
+            state.body_slot,
             physics.state.body_q,
-            state.depth,
+            state.penetration,
             state.stuck,
             state.progress,
             physics.state.joint_q,
@@ -132,7 +141,7 @@ def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: 
     wp.launch(
         rest.judge_rest_kernel,
         dim=state.phase.shape[0],
-        inputs=[scene.layout, scene.settle, state.entry, state.shift, state.phase, state.progress],
+        inputs=[scene.layout, scene.settle, state.catalog_index, state.displacement, state.phase, state.progress],
         device=state.phase.device,
     )
 
@@ -149,7 +158,7 @@ def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, 
             scene.pick,
             state.phase,
             state.mode,
-            state.entry,
+            state.catalog_index,
             state.waypoint,
             attempts.task,
             attempts.failures,
@@ -163,8 +172,8 @@ def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, 
         inputs=[
             scene.layout,
             scene.settle,
-            state.entry,
-            state.slot,
+            state.catalog_index,
+            state.body_slot,
             physics.state.body_q,
             physics.solver.constraint_overflow,
             observation.overflow,

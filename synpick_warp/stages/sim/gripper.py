@@ -21,14 +21,14 @@ def begin_moving(scene: SceneData, state: WorldState, physics: Physics, seed: in
             wp.uint64(seed),
             scene.layout,
             scene.move,
-            state.address,
+            state.arrangement_id,
             state.mode,
             state.phase,
             state.frame,
             physics.state.joint_q,
             physics.state.joint_qd,
         ],
-        outputs=[state.order, state.goal, state.waypoint],
+        outputs=[state.corner_order, state.setpoint, state.waypoint],
         device=state.phase.device,
     )
 
@@ -57,15 +57,15 @@ def begin_picking(
     )
 
 
-def forget_seals(state: WorldState, seals: SealState) -> None:
+def clear_seals(state: WorldState, seals: SealState) -> None:
     """Before a world's objects fall, let go of what hung on its cup."""
-    wp.launch(tasks.forget_seals_kernel, dim=seals.held.shape, inputs=[state.phase], outputs=[seals.held], device=state.phase.device)
+    wp.launch(tasks.clear_seals_kernel, dim=seals.attached.shape, inputs=[state.phase], outputs=[seals.attached], device=state.phase.device)
 
 
-def set_fingers(scene: SceneData, state: WorldState, physics: Physics) -> None:
+def set_shaft_collision(scene: SceneData, state: WorldState, physics: Physics) -> None:
     """Let the finger collide where the gripper moves, and not where it picks."""
     wp.launch(
-        tasks.set_fingers_kernel,
+        tasks.set_shaft_collision_kernel,
         dim=state.phase.shape[0],
         inputs=[scene.layout, state.mode],
         outputs=[physics.model.shape_transform],
@@ -77,20 +77,20 @@ def drive_gripper(scene: SceneData, state: WorldState, attempts: AttemptState, p
     """Move the goals on by one step and set the grippers' forces."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
-        gripper.move_goals_kernel,
+        gripper.advance_setpoints_kernel,
         dim=worlds,
         inputs=[
             scene.move,
             scene.pick,
             state.phase,
             state.mode,
-            state.order,
+            state.corner_order,
             plan.point,
             plan.normal,
             attempts.task,
             attempts.steps,
             state.waypoint,
-            state.goal,
+            state.setpoint,
         ],
         device=device,
     )
@@ -104,7 +104,7 @@ def drive_gripper(scene: SceneData, state: WorldState, attempts: AttemptState, p
             state.phase,
             state.mode,
             attempts.task,
-            state.goal,
+            state.setpoint,
             current.joint_q,
             current.joint_qd,
         ],
@@ -117,19 +117,19 @@ def remove_lost(scene: SceneData, state: WorldState, attempts: AttemptState, sea
     """Take out of the scene what has left the tote."""
     wp.launch(
         tasks.remove_lost_kernel,
-        dim=state.entry.shape,
+        dim=state.catalog_index.shape,
         inputs=[
             scene.layout,
             scene.drop,
             scene.settle,
             scene.pick,
             state.phase,
-            state.slot,
-            state.shift,
+            state.body_slot,
+            state.displacement,
             physics.state.body_q,
-            state.entry,
+            state.catalog_index,
         ],
-        outputs=[attempts.removed, seals.held],
+        outputs=[attempts.removed, seals.attached],
         device=state.phase.device,
     )
 
@@ -138,7 +138,11 @@ def end_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, se
     """Judge lifts that are over, take what was picked out of the scene, and send grippers home."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
-        tasks.count_held_kernel, dim=worlds, inputs=[scene.layout, state.entry, seals.held], outputs=[attempts.hanging], device=device
+        tasks.pack_attached_kernel,
+        dim=worlds,
+        inputs=[scene.layout, state.catalog_index, seals.attached],
+        outputs=[attempts.attached_bits],
+        device=device,
     )
     wp.launch(
         tasks.advance_tasks_kernel,
@@ -148,12 +152,12 @@ def end_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, se
             scene.pick,
             state.phase,
             state.mode,
-            state.goal,
+            state.setpoint,
             plan.point,
             plan.normal,
             plan.target,
-            attempts.caught,
-            attempts.hanging,
+            attempts.engaged_bits,
+            attempts.attached_bits,
             attempts.task,
             attempts.steps,
             attempts.failures,
@@ -164,8 +168,15 @@ def end_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, se
     wp.launch(
         tasks.end_attempts_kernel,
         dim=worlds,
-        inputs=[scene.layout, scene.drop, state.phase, attempts.task, attempts.hanging],
-        outputs=[state.entry, attempts.removed, seals.held, physics.state.joint_q, physics.state.joint_qd, physics.control.joint_target_q],
+        inputs=[scene.layout, scene.drop, state.phase, attempts.task, attempts.attached_bits],
+        outputs=[
+            state.catalog_index,
+            attempts.removed,
+            seals.attached,
+            physics.state.joint_q,
+            physics.state.joint_qd,
+            physics.control.joint_target_q,
+        ],
         device=device,
     )
 
@@ -174,8 +185,8 @@ def park_removed(scene: SceneData, state: WorldState, attempts: AttemptState, ph
     """Keep what has left the scene out of the way."""
     wp.launch(
         tasks.park_removed_kernel,
-        dim=state.entry.shape,
-        inputs=[scene.layout, state.slot, attempts.removed],
+        dim=state.catalog_index.shape,
+        inputs=[scene.layout, state.body_slot, attempts.removed],
         outputs=[physics.state.joint_q, physics.state.joint_qd, physics.control.joint_f],
         device=state.phase.device,
     )
@@ -188,14 +199,14 @@ def begin_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, 
         tasks.begin_attempts_kernel,
         dim=worlds,
         inputs=[state.phase, plan.target, attempts.task, attempts.attempt],
-        outputs=[attempts.steps, attempts.hits, attempts.caught],
+        outputs=[attempts.steps, attempts.hits, attempts.engaged_bits],
         device=device,
     )
     wp.launch(
         tasks.place_grippers_kernel,
         dim=worlds,
         inputs=[scene.layout, scene.move, scene.pick, state.phase, attempts.task, attempts.steps, plan.point, plan.normal, plan.tilt],
-        outputs=[state.goal, physics.state.joint_q, physics.state.joint_qd, physics.control.joint_target_q],
+        outputs=[state.setpoint, physics.state.joint_q, physics.state.joint_qd, physics.control.joint_target_q],
         device=device,
     )
-    physics.turn_fingers(plan.yaw)
+    physics.set_yaw(plan.yaw)

@@ -12,7 +12,7 @@ import warp as wp
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.schema import Physics as PhysicsConfig
-from synpick_warp.kernels.sim import joints, rest
+from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
 
 # Contacts with a larger gap make no rows [m]: none has that the pipeline finds, only those that a hook has pulled apart.
@@ -90,7 +90,7 @@ class Physics:
         fingers = np.arange(worlds) * built.layout.bodies_per_world
         self._finger_joint = wp.array(np.argsort(self.model.joint_child.numpy())[fingers], dtype=wp.int32, device=self.device)
 
-    def turn_fingers(self, yaw: wp.array) -> None:
+    def set_yaw(self, yaw: wp.array) -> None:
         """Turn each finger about the vertical through its origin; the cup turns with it, x, y and z stay the world's axes.
 
         Takes effect with the next step, and in body poses with `refresh_poses`. Nothing is read back from the device.
@@ -99,7 +99,7 @@ class Physics:
             yaw: Counter-clockwise from above (world) float32 [rad].
         """
         wp.launch(
-            joints.turn_fingers_kernel,
+            gripper.set_yaw_kernel,
             dim=self.layout.worlds,
             inputs=[self._finger_joint, yaw],
             outputs=[self.model.joint_X_c],

@@ -114,15 +114,15 @@ class Simulation:
     def tick(self, record: TickRecord) -> None:
         """Hand out episodes, simulate one tick, judge, record what came of it in one of `records`, and look where one must choose."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
-        arrange.take_episodes(state, self.episodes, self.config.settle.tries)
-        arrange.draw_objects(scene, state, seed)
+        arrange.assign_episodes(state, self.episodes, self.config.settle.tries)
+        arrange.sample_objects(scene, state, seed)
         arrange.drop_objects(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
-        gripper.set_fingers(scene, state, physics)
-        gripper.forget_seals(state, self.seals)
-        self.seals.peak.zero_()
+        gripper.set_shaft_collision(scene, state, physics)
+        gripper.clear_seals(state, self.seals)
+        self.seals.peak_force.zero_()
         if self.recorder is not None:
-            self.recorder.keep_drops()
+            self.recorder.save_drop_poses()
         physics.tick(self._drive, self._let_go_of_contacts, self.recorder if self.config.trajectory.steps else None)
         arrange.judge_settling(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
@@ -148,14 +148,14 @@ class Simulation:
         """Forces before a step."""
         gripper.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current)
         if self.recorder is not None:
-            self.recorder.keep_force()
+            self.recorder.save_impedance_force()
         if self.suction is not None:
-            self.suction.hold_objects(self.scene, self.state, self.seals, self.physics, current)
+            self.suction.apply_seal_forces(self.scene, self.state, self.seals, self.physics, current)
 
     def _let_go_of_contacts(self) -> None:
         """After contacts were found."""
         if self.suction is not None:
-            self.suction.ignore_held_contacts(self.scene, self.state, self.seals, self.physics)
+            self.suction.ignore_attached_contacts(self.scene, self.state, self.seals, self.physics)
 
     def _take_snapshot(self, record: TickRecord) -> None:
         state, attempts, snapshot, status = self.state, self.attempts, record.snapshot, record.status
@@ -167,18 +167,18 @@ class Simulation:
                 self.scene.layout,
                 state.phase,
                 state.ending,
-                state.address,
+                state.arrangement_id,
                 state.frame,
                 attempts.task,
-                state.entry,
-                state.slot,
+                state.catalog_index,
+                state.body_slot,
                 self.physics.state.body_q,
             ],
             outputs=[
                 snapshot.live,
                 snapshot.episode,
                 snapshot.frame,
-                snapshot.entry,
+                snapshot.catalog_index,
                 snapshot.pose,
                 snapshot.fixture_pose,
                 snapshot.fixture_visible,
@@ -192,7 +192,7 @@ class Simulation:
                 snapshot.live,
                 state.phase,
                 state.ending,
-                state.address,
+                state.arrangement_id,
                 state.frame,
                 state.mode,
                 attempts.task,
@@ -200,14 +200,14 @@ class Simulation:
                 attempts.outcome,
                 self.plan.target,
                 attempts.hits,
-                attempts.caught,
-                attempts.hanging,
-                self.seals.peak,
+                attempts.engaged_bits,
+                attempts.attached_bits,
+                self.seals.peak_force,
             ],
             outputs=[status.table, status.measures],
             device=device,
         )
-        outputs = [_frame_poses(self.last), snapshot.follows, snapshot.last_entry, snapshot.last_pose, snapshot.last_fixture_pose]
+        outputs = [_frame_poses(self.last), snapshot.follows, snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose]
         outputs += [snapshot.last_fixture_visible]
         wp.launch(pack.link_frames_kernel, dim=self.layout.worlds, inputs=[_frame_poses(snapshot)], outputs=outputs, device=device)
         wp.copy(snapshot.light, state.light)

@@ -17,6 +17,9 @@ from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
+PUBLIC_NAMES = {"seal_force": "seal_load", "attached": "held", "setpoint": "goal"}
+"""Names that arrays of `StepArrays` have in data sets, where they differ."""
+
 
 @dataclass(frozen=True, eq=False)
 class StepArrays:
@@ -32,11 +35,11 @@ class StepArrays:
     """Sum of the forces of all contacts on the body, mean over the step."""
     contact_load: wp.array = device_array("world", "step", "place", dtype=wp.float32, unit="N")
     """Sum of their sizes."""
-    seal_load: wp.array = device_array("world", "step", "instance", dtype=wp.float32, unit="N")
+    seal_force: wp.array = device_array("world", "step", "instance", dtype=wp.float32, unit="N")
     """Tension and shear that the instance's seal bore; 0: none holds it."""
-    held: wp.array = device_array("world", "step", "instance", dtype=wp.uint8)
+    attached: wp.array = device_array("world", "step", "instance", dtype=wp.uint8)
     """1: a seal holds the instance at the step's end."""
-    goal: wp.array = device_array("world", "step", dtype=wp.vec3f, unit="m")
+    setpoint: wp.array = device_array("world", "step", dtype=wp.vec3f, unit="m")
     """Where the finger's tilt axis was drawn to in the step; NaN: nowhere."""
     impedance_force: wp.array = device_array("world", "step", dtype=wp.vec3f, unit="N")
     """The force that drew it, without the gripper's weight, which is borne."""
@@ -104,7 +107,7 @@ class Recorder:
         self._current = self.new_record()
         self._share = 1.0 / config.physics.substeps
         self._weight = (config.gripper.finger_mass + config.gripper.cup_mass) * config.physics.gravity
-        self._total = wp.zeros((sizes["body"], int(step_log.SIZE) + 1), dtype=wp.int64, device=self._device)
+        self._total = wp.zeros((sizes["body"], int(step_log.MAGNITUDE) + 1), dtype=wp.int64, device=self._device)
         self._force = wp.zeros(sizes["world"], dtype=wp.vec3, device=self._device)
 
     def new_record(self) -> PhysicsRecord:
@@ -112,13 +115,13 @@ class Recorder:
         steps = allocate(StepArrays, self._sizes, self._device) if self._steps else None
         return PhysicsRecord(steps, allocate(DropArrays, self._sizes, self._device))
 
-    def keep_drops(self) -> None:
+    def save_drop_poses(self) -> None:
         """Where objects that have just been dropped begin to fall."""
         state = self._state
         wp.launch(
-            step_log.keep_drops_kernel,
-            dim=state.entry.shape,
-            inputs=[self._scene.layout, state.phase, state.progress, state.entry, state.slot, self._physics.state.body_q],
+            step_log.save_drop_poses_kernel,
+            dim=state.catalog_index.shape,
+            inputs=[self._scene.layout, state.phase, state.progress, state.catalog_index, state.body_slot, self._physics.state.body_q],
             outputs=[self._current.drops.drop_pose],
             device=self._device,
         )
@@ -127,11 +130,11 @@ class Recorder:
         """Before a step."""
         self._total.zero_()
 
-    def keep_force(self) -> None:
+    def save_impedance_force(self) -> None:
         """After the impedance force of a step was set, and before the seals add theirs."""
         if self._steps:
             wp.launch(
-                step_log.keep_force_kernel,
+                step_log.save_impedance_force_kernel,
                 dim=self._force.shape,
                 inputs=[self._scene.layout, self._weight, self._physics.control.joint_f],
                 outputs=[self._force],
@@ -164,22 +167,22 @@ class Recorder:
         wp.launch(
             step_log.record_motion_kernel,
             dim=places,
-            inputs=[scene.layout, step, state.entry, state.slot, current.body_q, current.body_qd],
+            inputs=[scene.layout, step, state.catalog_index, state.body_slot, current.body_q, current.body_qd],
             outputs=[made.pose, made.velocity, made.angular_velocity],
             device=self._device,
         )
         wp.launch(
             step_log.record_forces_kernel,
             dim=places,
-            inputs=[scene.layout, step, self._share, state.entry, state.slot, seals.held, seals.load, self._total],
-            outputs=[made.contact_force, made.contact_load, made.seal_load, made.held],
+            inputs=[scene.layout, step, self._share, state.catalog_index, state.body_slot, seals.attached, seals.seal_force, self._total],
+            outputs=[made.contact_force, made.contact_load, made.seal_force, made.attached],
             device=self._device,
         )
         wp.launch(
             step_log.record_gripper_kernel,
             dim=self._sizes["world"],
-            inputs=[step, state.phase, state.mode, self._attempts.task, state.goal, self._force],
-            outputs=[made.goal, made.impedance_force, made.task],
+            inputs=[step, state.phase, state.mode, self._attempts.task, state.setpoint, self._force],
+            outputs=[made.setpoint, made.impedance_force, made.task],
             device=self._device,
         )
 
@@ -222,7 +225,7 @@ def _split(found: Mapping[str, np.ndarray], names: list[str], instances: int) ->
             steps[item.name] = values[:, :, :instances]
             steps[f"gripper_{item.name}"] = values[:, :, instances:]
         else:
-            steps[item.name] = values
+            steps[PUBLIC_NAMES.get(item.name, item.name)] = values
     return steps
 
 

@@ -40,26 +40,26 @@ class Suction:
         wp.launch(
             cup_rays.count_seal_rays_kernel,
             dim=state.phase.shape[0],
-            inputs=[scene.layout, scene.pick, scene.suction, self.surface, *task, state.entry, state.slot, body_q],
-            outputs=[attempts.hits, attempts.caught],
+            inputs=[scene.layout, scene.pick, scene.suction, self.surface, *task, state.catalog_index, state.body_slot, body_q],
+            outputs=[attempts.hits, attempts.engaged_bits],
             device=device,
         )
         wp.launch(
-            cup_rays.make_seals_kernel,
-            dim=state.entry.shape,
-            inputs=[scene.layout, scene.pick, scene.suction, *task, state.slot, body_q, attempts.hits, attempts.caught],
-            outputs=[seals.held, seals.anchor, seals.load, seals.limit],
+            cup_rays.engage_seals_kernel,
+            dim=state.catalog_index.shape,
+            inputs=[scene.layout, scene.pick, scene.suction, *task, state.body_slot, body_q, attempts.hits, attempts.engaged_bits],
+            outputs=[seals.attached, seals.object_in_tcp, seals.seal_force, seals.break_force],
             device=device,
         )
 
-    def hold_objects(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
+    def apply_seal_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
         """Before a step: pull what hangs on the cups to the tip, and break seals that bear too much.
 
         After the gripper's forces have been written: the reactions are added to them.
         """
         model = physics.model
         wp.launch(
-            seal.hold_objects_kernel,
+            seal.apply_seal_forces_kernel,
             dim=state.phase.shape[0],
             inputs=[
                 scene.layout,
@@ -67,31 +67,31 @@ class Suction:
                 model.body_com,
                 model.body_inv_mass,
                 model.body_inv_inertia,
-                state.slot,
-                seals.anchor,
-                seals.limit,
+                state.body_slot,
+                seals.object_in_tcp,
+                seals.break_force,
                 current.body_q,
                 current.body_qd,
-                seals.held,
-                seals.load,
-                seals.peak,
+                seals.attached,
+                seals.seal_force,
+                seals.peak_force,
                 physics.control.joint_f,
             ],
             device=state.phase.device,
         )
 
-    def ignore_held_contacts(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics) -> None:
+    def ignore_attached_contacts(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics) -> None:
         """Between collision and solver: cups do not touch what hangs on them."""
         contacts = physics.contacts
         wp.launch(
-            seal.ignore_held_contacts_kernel,
+            seal.ignore_attached_contacts_kernel,
             dim=contacts.rigid_contact_max,
             inputs=[
                 scene.layout,
                 physics.model.shape_body,
                 contacts.rigid_contact_count,
-                state.slot,
-                seals.held,
+                state.body_slot,
+                seals.attached,
                 contacts.rigid_contact_shape0,
                 contacts.rigid_contact_shape1,
             ],

@@ -19,7 +19,7 @@ CORNERS = 4
 class WorldState:
     """Changes every tick; lives on the device."""
 
-    address: wp.array = device_array("world", dtype=wp.vec2i)
+    arrangement_id: wp.array = device_array("world", dtype=wp.vec2i)
     """Episode number and redraw; episode -1: none."""
     phase: wp.array = device_array("world", dtype=wp.int32)
     """A `Phase`."""
@@ -31,17 +31,17 @@ class WorldState:
     """How many of the bake's episode numbers worlds have taken."""
     progress: wp.array = device_array("world", dtype=wp.vec4i, unit="ticks")
     """Ticks since the drop, ticks at rest, re-drops, whether the guide walls stand."""
-    entry: wp.array = device_array("world", "instance", dtype=wp.int32)
+    catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
     """Catalog index of each instance; -1: none."""
-    slot: wp.array = device_array("world", "instance", dtype=wp.int32)
+    body_slot: wp.array = device_array("world", "instance", dtype=wp.int32)
     """Body slot of each instance."""
     stuck: wp.array = device_array("world", "instance", dtype=wp.int32, unit="ticks")
     """How long the instance has been stuck."""
-    previous: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
+    previous_pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     """Object to world, one tick ago."""
-    shift: wp.array = device_array("world", "instance", dtype=wp.float32, unit="m")
+    displacement: wp.array = device_array("world", "instance", dtype=wp.float32, unit="m")
     """How far the instance moved in the last tick."""
-    depth: wp.array = device_array("body", dtype=wp.float32, unit="m")
+    penetration: wp.array = device_array("body", dtype=wp.float32, unit="m")
     """Deepest penetration of each body."""
     variant: wp.array = device_array("body", dtype=wp.int32)
     """Body variant to select; -1: as it is."""
@@ -49,11 +49,11 @@ class WorldState:
     """Worlds that got new objects this tick; the last entry stands for what belongs to no world."""
     frame: wp.array = device_array("world", dtype=wp.int32)
     """Frames since the gripper began to act; -1: not yet."""
-    order: wp.array = device_array("world", "waypoint", dtype=wp.int32)
+    corner_order: wp.array = device_array("world", "waypoint", dtype=wp.int32)
     """Corners in the order of their visit."""
     waypoint: wp.array = device_array("world", dtype=wp.int32)
     """How many corners the goal has reached."""
-    goal: wp.array = device_array("world", dtype=wp.vec3f, unit="m")
+    setpoint: wp.array = device_array("world", dtype=wp.vec3f, unit="m")
     """Goal of the finger's tilt axis."""
     light: wp.array = device_array("world", dtype=wp.int32)
     """Light map of the episode."""
@@ -79,9 +79,9 @@ class AttemptState:
     """Attempts that have failed and count."""
     hits: wp.array = device_array("world", dtype=wp.int32)
     """Rays that hit an object when the suction was switched on."""
-    caught: wp.array = device_array("world", dtype=wp.uint32)
+    engaged_bits: wp.array = device_array("world", dtype=wp.uint32)
     """Bit i: instance i was caught then."""
-    hanging: wp.array = device_array("world", dtype=wp.uint32)
+    attached_bits: wp.array = device_array("world", dtype=wp.uint32)
     """Bit i: instance i hung on the cup at the end of the tick."""
     removed: wp.array = device_array("world", "instance", dtype=wp.int32)
     """Whether the instance has left the scene: 0 no, 1 picked, 2 lost."""
@@ -91,15 +91,15 @@ class AttemptState:
 class SealState:
     """What hangs on each world's cup."""
 
-    held: wp.array = device_array("world", "instance", dtype=wp.int32)
+    attached: wp.array = device_array("world", "instance", dtype=wp.int32)
     """1: a seal holds the instance."""
-    anchor: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
+    object_in_tcp: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     """Object to the frame at the cup's tip (axes of the cup) when it was caught."""
-    load: wp.array = device_array("world", "instance", dtype=wp.float32, unit="N")
+    seal_force: wp.array = device_array("world", "instance", dtype=wp.float32, unit="N")
     """Tension and shear that the seal bore in the last step."""
-    limit: wp.array = device_array("world", dtype=wp.float32, unit="N")
+    break_force: wp.array = device_array("world", dtype=wp.float32, unit="N")
     """Break force of every seal of the world."""
-    peak: wp.array = device_array("world", dtype=wp.float32, unit="N")
+    peak_force: wp.array = device_array("world", dtype=wp.float32, unit="N")
     """Largest load of any seal since the tick began."""
 
 
