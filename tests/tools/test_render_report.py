@@ -110,4 +110,4 @@ def test_a_bad_size_or_setting_is_an_error(capsys):
     assert render_report.main(["--size", "axb", "--scenes", "0"]) == 2
     assert render_report.main(["--set", "render.bounces=0", "--scenes", "0"]) == 2
     assert render_report.main(["--sheet", "sheet.txt"]) == 2
-    assert capsys.readouterr().err.count("render_report: ") == 4
+    assert capsys.readouterr().err.count("reports.render: ") == 4

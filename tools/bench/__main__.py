@@ -4,7 +4,7 @@ Everything is warmed up first; numbers are medians of repeated, synchronised mea
 worlds, which pick; with `--set bake.mode=move` they are stirred. Writing gets views of them over and over. Files go to the system's
 temporary folder (TMPDIR) and are removed. The part sensor renders the same views by Newton's SensorCamera, too.
 
-    python tools.bench --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
+    python -m tools.bench --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
 """
 
 from __future__ import annotations

@@ -3,17 +3,15 @@
 Piles settle once, on the first device; then objects creep, so that there is motion to see. Exits with 1 if a difference is larger
 than its tolerance, with 2 if nothing can be compared.
 
-    python tools/checks/compare_pictures.py --devices cpu,cuda:0 --models DIR --lights DIR --scenes 3 --size 160x90
+    python -m tools.checks.compare_pictures --devices cpu,cuda:0 --models DIR --lights DIR --scenes 3 --size 160x90
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
 from dataclasses import dataclass, fields
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,7 +20,6 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp.arrays import allocate
-from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
@@ -33,6 +30,7 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
+from tools.options import configure, fail, make_parser, write_json
 from tools.reports.render_checks import with_mode
 from tools.reports.render_piles import following, settled
 
@@ -137,44 +135,33 @@ def main(arguments: list[str] | None = None) -> int:
         config = _config(options, names[0])
         differences = compare_devices(config, devices, console)
     except SynpickError as error:
-        print(f"compare_pictures: {error}", file=sys.stderr)
-        return 2
+        return fail("compare_pictures", error)
     _print(console, differences, f"{names[0]} and {names[1]}, {options.scenes} piles, {options.size}, {options.samples} paths")
-    if options.json:
-        rows = [dataclasses.asdict(row) | {"holds": row.holds} for row in differences]
-        options.json.write_text(json.dumps({"devices": names, "size": options.size, "rows": rows}, indent=1) + "\n")
+    rows = [dataclasses.asdict(row) | {"holds": row.holds} for row in differences]
+    write_json(options.json, {"devices": names, "size": options.size, "rows": rows})
     return 0 if all(row.holds for row in differences) else 1
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--devices", default="cpu,cuda:0", help="two devices with a comma between them (default cpu,cuda:0)")
-    parser.add_argument("--models", default="", help="folder of BOP models (default: the embedded objects)")
-    parser.add_argument("--lights", default="", help="folder of light maps (default: the embedded skies)")
-    parser.add_argument("--scenes", type=int, default=3, help="piles to render, by all cameras (default 3)")
-    parser.add_argument("--size", default="160x90", help="width and height of the pictures (default 160x90)")
-    parser.add_argument("--samples", type=int, default=8, help="paths a pixel of the reference (default 8)")
-    parser.add_argument("--seed", type=int, default=0, help="of all draws (default 0)")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any other setting; may be repeated")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
+    parser = make_parser(__doc__, "models", "lights", "seed", "set", "json")
+    parser.add_argument("--devices", default="cpu,cuda:0", help="two devices with a comma between them (default: cpu,cuda:0)")
+    parser.add_argument("--scenes", type=int, default=3, help="piles to render, by all cameras (default: 3)")
+    parser.add_argument("--size", default="160x90", help="width and height of the pictures (default: 160x90)")
+    parser.add_argument("--samples", type=int, default=8, help="paths per pixel of the reference (default: 8)")
     return parser.parse_args(arguments)
 
 
 def _config(options: argparse.Namespace, device: str) -> Config:
-    overrides: dict[str, object] = dict(parse_assignment(text) for text in options.set)
-    overrides |= {
+    fixed = {
         "bake.mode": "move",
-        "bake.models": options.models,
-        "bake.lights": options.lights,
         "bake.episodes": options.scenes,
         "bake.worlds": options.scenes,
         "bake.device": device,
-        "bake.seed": options.seed,
         "render.samples": options.samples,
         "render.layers": list(LAYERS),
         "cameras.resolution": [int(part) if part.isdecimal() else part for part in options.size.split("x")],
     }
-    return load_config(None, overrides, source=COMMAND_LINE)
+    return configure(options, fixed)
 
 
 def compare_devices(config: Config, devices: list[Any], console: Console) -> list[Difference]:

@@ -4,7 +4,7 @@ A layer is what a kind of file holds: rgb, depth, scene_gt.json, an array of the
 such as the number of worlds, count for nothing. Exits with 0 if the data sets are the same, 1 if not, 2 if there is
 nothing to compare.
 
-    python tools/checks/compare_runs.py A B
+    python -m tools.checks.compare_runs A B
 """
 
 from __future__ import annotations

@@ -5,20 +5,18 @@ two and the last one's are made again without the solver's rows in a fixed order
 eight worlds: one that is asked for is simulated beside seven idle ones, as in a bake. Exits with 1 if episodes differ that should
 not, with 2 if nothing can be simulated.
 
-    python tools/checks/compare_worlds.py --device cuda:0 --models DIR --worlds 8,1,64,512 --episodes 8
+    python -m tools.checks.compare_worlds --device cuda:0 --models DIR --worlds 8,1,64,512 --episodes 8
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import statistics
 import sys
 import time
 from collections import defaultdict
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import warp as wp
@@ -26,13 +24,13 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp.codes import Phase
-from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
 from synpick_warp.pipeline import build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.stream import TickReader
+from tools.options import configure, fail, make_parser, write_json
 
 WARM_TICKS = 3
 """First ticks whose time does not count: kernels are loaded, the steps recorded."""
@@ -70,23 +68,17 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         runs = compare_worlds(_config(options), options.worlds, options.ticks, console)
     except SynpickError as error:
-        print(f"compare_worlds: {error}", file=sys.stderr)
-        return 2
+        return fail("compare_worlds", error)
     _print(console, runs)
-    if options.json:
-        options.json.write_text(json.dumps([dataclasses.asdict(run) for run in runs], indent=1) + "\n")
+    write_json(options.json, [dataclasses.asdict(run) for run in runs])
     return int(any(run.differing for run in runs if run.deterministic))
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--device", default="auto", help="cpu, cuda:N or auto (default)")
-    parser.add_argument("--models", default="", help="folder of models (default: the embedded objects)")
-    parser.add_argument("--worlds", type=_numbers, default=(8, 1, 64), help="how many, one number a run (default 8,1,64)")
-    parser.add_argument("--episodes", type=int, default=8, help="episodes of each run (default 8)")
-    parser.add_argument("--ticks", type=int, default=1000, help="most ticks of a run (default 1000)")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any other setting; may be repeated")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
+    parser = make_parser(__doc__, "device", "models", "set", "json")
+    parser.add_argument("--worlds", type=_numbers, default=(8, 1, 64), help="world counts, one for each run (default: 8,1,64)")
+    parser.add_argument("--episodes", type=int, default=8, help="episodes of each run (default: 8)")
+    parser.add_argument("--ticks", type=int, default=1000, help="ticks of a run at most (default: 1000)")
     return parser.parse_args(arguments)
 
 
@@ -98,10 +90,7 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 
 def _config(options: argparse.Namespace) -> Config:
-    overrides: dict[str, object] = {"cameras.resolution": SIZE} | dict(parse_assignment(text) for text in options.set)
-    overrides |= {"bake.device": options.device, "bake.models": options.models, "bake.episodes": options.episodes}
-    overrides["bake.formats"] = ["zarr"]
-    return load_config(None, overrides, source=COMMAND_LINE)
+    return configure(options, {"bake.episodes": options.episodes, "bake.formats": ["zarr"]}, {"cameras.resolution": SIZE})
 
 
 def compare_worlds(config: Config, worlds: tuple[int, ...], most_ticks: int, console: Console) -> list[Run]:

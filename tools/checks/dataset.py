@@ -3,7 +3,7 @@
 Uses nothing of the project: triangles of models/ are intersected with the rays of pixel centres here, in float64. Prints a
 table; exits with 1 if a bound is violated, with 2 if the folder cannot be checked.
 
-    python tools/checks/dataset.py DIR --views 24
+    python -m tools.checks.dataset DIR --views 24
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Uses nothing of the project but the store: Newton's law, the law of the gripper's controller and what ties steps to frames are
 evaluated here, in float64. Prints a table; exits with 1 if a bound is violated, with 2 if the folder cannot be checked.
 
-    python tools/checks/trajectory.py DIR --episodes 8
+    python -m tools.checks.trajectory DIR --episodes 8
 """
 
 from __future__ import annotations

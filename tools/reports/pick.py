@@ -3,17 +3,15 @@
 Both modes run in one simulation. Pictures are not shaded; their hits and counts are all that visibility needs. Exits with 1 if a
 bound is violated, with 2 if nothing can be simulated. When time is up, the table is of the sequences that have ended.
 
-    python tools/reports/pick.py --models DIR --device cuda:0 --episodes 64 --json picks.json
+    python -m tools.reports.pick --models DIR --device cuda:0 --episodes 64 --json picks.json
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +22,6 @@ from rich.table import Table
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.codes import Phase
-from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import MIXED, Config
 from synpick_warp.configs.schema import MODES as MIX
 from synpick_warp.device import pick_device
@@ -35,7 +32,8 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.annotate import annotate
 from synpick_warp.stages.sim.simulate import RECORDS
 from synpick_warp.stages.stream import HostCopy, TickReader, TickReport
-from tools.reports.pick_tally import MODES, PAPER, Row, Tally, report, visible_shares
+from tools.options import INTERRUPTED, configure, fail, make_parser, names_of, print_machine, write_json
+from tools.reports.pick_tally import MODES, PAPER, ModeRow, Tally, report, visible_shares
 
 SPARE = 1.25
 """With both modes drawn at random, so many worlds for each wanted sequence: with 160, one draw in forty has less than 64 of a mode."""
@@ -55,8 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
         device = pick_device(config.bake.device)
         factory = build_factory(config, SilentProgress())
     except SynpickError as error:
-        print(f"pick_report: {error}", file=sys.stderr)
-        return 2
+        return fail("reports.pick", error)
     tally = Tally(config, factory.catalog, options.modes, options.episodes)
     eyes = None if options.no_visibility else Eyes(factory)
     meter, interrupted = Meter(tally, console.print), False
@@ -68,65 +65,48 @@ def main(arguments: list[str] | None = None) -> int:
                 break
     except KeyboardInterrupt:
         interrupted = True
-        print("pick_report: interrupted", file=sys.stderr)
+        print("reports.pick: interrupted", file=sys.stderr)
     rows = report(tally)
     worlds = factory.simulation.layout.worlds
     pace = {"worlds": worlds, "ticks": meter.ticks, "seconds": meter.seconds, "ticks/s": meter.ticks / meter.seconds}
     machine = describe_machine(device)
     tables(console, machine, rows, tally, pace)
-    if options.json:
-        record = {
-            "machine": dict(machine),
-            "seed": config.bake.seed,
-            "real_objects": bool(options.models),
-            "interrupted": interrupted,
-            **pace,
-            "redrawn": tally.redrawn,
-            "rows": [row.record() for row in rows],
-            "sequences": [vars(sequence) for mode in options.modes for sequence in tally.sequences(mode)],
-        }
-        options.json.write_text(json.dumps(record, indent=1) + "\n")
-    return 130 if interrupted else 0 if all(all(row.holds.values()) for row in rows) and tally.complete() else 1
+    record = {
+        "machine": dict(machine),
+        "seed": config.bake.seed,
+        "real_objects": bool(options.models),
+        "interrupted": interrupted,
+        **pace,
+        "redrawn": tally.redrawn,
+        "rows": [row.record() for row in rows],
+        "sequences": [vars(sequence) for mode in options.modes for sequence in tally.sequences(mode)],
+    }
+    write_json(options.json, record)
+    return INTERRUPTED if interrupted else 0 if all(all(row.holds.values()) for row in rows) and tally.complete() else 1
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--models", default="", help="folder of BOP models (default: the embedded objects)")
-    parser.add_argument("--modes", type=_modes, default=tuple(MODES), help=f"with commas (default {','.join(MODES)})")
-    parser.add_argument("--episodes", type=int, default=64, help="sequences of each mode (default 64)")
+    parser = make_parser(__doc__, "models", "device", "seed", "set", "json")
+    parser.add_argument("--modes", type=names_of(MODES, "mode of picking"), default=tuple(MODES), help=f"default: {','.join(MODES)}")
+    parser.add_argument("--episodes", type=int, default=64, help="sequences of each mode (default: 64)")
     parser.add_argument("--worlds", type=int, default=0, help=f"side by side (default: {SPARE:g} for each sequence, 1 with one mode)")
-    parser.add_argument("--device", default="auto", help="cpu, cuda:N or auto (default)")
-    parser.add_argument("--seed", type=int, default=0, help="of all draws (default 0)")
-    parser.add_argument("--visibility-resolution", default="640x360", help="of the views that are counted [px] (default 640x360)")
-    parser.add_argument("--no-visibility", action="store_true", help="no views")
-    parser.add_argument("--max-seconds", type=float, default=0.0, help="end then, with what has ended [s] (default: never)")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any other setting; may be repeated")
-    parser.add_argument("--json", type=Path, help="write the numbers, and each sequence's, to this file, too")
+    parser.add_argument("--visibility-resolution", default="640x360", help="of the views in which pixels are counted (default: 640x360)")
+    parser.add_argument("--no-visibility", action="store_true", help="render no views")
+    parser.add_argument("--max-seconds", type=float, default=0.0, help="stop after this time, with what has ended [s] (default: never)")
     return parser.parse_args(arguments)
-
-
-def _modes(text: str) -> tuple[str, ...]:
-    modes = tuple(text.split(","))
-    if unknown := [mode for mode in modes if mode not in MODES]:
-        raise argparse.ArgumentTypeError(f"no such mode of picking: {', '.join(unknown)}; modes: {', '.join(MODES)}")
-    return modes
 
 
 def _config(options: argparse.Namespace) -> Config:
     mixed = len(options.modes) > 1
     worlds = options.worlds or round(options.episodes * (SPARE * len(options.modes) if mixed else 1))
-    overrides: dict[str, object] = dict(parse_assignment(text) for text in options.set)
-    overrides |= {
-        "bake.models": options.models,
+    fixed = {
         "bake.mode": MIXED if mixed else options.modes[0],
         "bake.mix": tuple(float(mode in options.modes) for mode in MIX),
         "bake.worlds": worlds,
         "bake.episodes": worlds * RUNS if mixed else options.episodes,
-        "bake.device": options.device,
-        "bake.seed": options.seed,
         "cameras.resolution": parse_resolution(options.visibility_resolution),
     }
-    return load_config(None, overrides, source=COMMAND_LINE)
+    return configure(options, fixed)
 
 
 class Eyes:
@@ -221,12 +201,10 @@ def simulate(factory: Factory, eyes: Eyes | None, tally: Tally) -> Iterator[None
             return
 
 
-def tables(console: Console, machine: list[tuple[str, str]], rows: list[Row], tally: Tally, pace: dict[str, float]) -> None:
+def tables(console: Console, machine: list[tuple[str, str]], rows: list[ModeRow], tally: Tally, pace: dict[str, float]) -> None:
     """Print machine and report."""
-    head = Table(show_header=False, box=None)
-    for name, value in (*machine, ("drawn again", ", ".join(f"{count} {name}" for name, count in tally.redrawn.items()) or "nothing")):
-        head.add_row(name, value)
-    console.print(head)
+    resampled = ", ".join(f"{count} {name}" for name, count in tally.redrawn.items()) or "none"
+    print_machine(console, [*machine, ("arrangements resampled", resampled)])
     title = f"{pace['worlds']:.0f} worlds, {pace['ticks']:.0f} ticks in {pace['seconds']:.0f} s, {pace['ticks/s']:.2f} ticks/s"
     table = Table("picking", *(text for mode in tally.modes for text in (mode, "paper")), "unit", "bound", "", title=title)
     table.columns[0].no_wrap = True

@@ -74,7 +74,7 @@ class Sequence:
 
 
 @dataclass(frozen=True)
-class Row:
+class ModeRow:
     """A line of the report: a number for each mode; with a bound if these must keep one."""
 
     name: str
@@ -212,35 +212,37 @@ def visible_shares(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (visible / np.maximum(whole, 1)).sum(axis=1), (whole > 0).sum(axis=1)
 
 
-def report(tally: Tally) -> list[Row]:
+def report(tally: Tally) -> list[ModeRow]:
     """The lines of the report."""
     sequences = {mode: tally.sequences(mode) for mode in tally.modes}
     rows = [
-        Row("sequences", "", {mode: len(found) for mode, found in sequences.items()}),
-        Row("begun, but not ended", "", {mode: sum(n not in tally.ended for n in tally.chosen(mode)) for mode in tally.modes}),
-        Row("given up", "", {mode: sum(tally.ended.get(n, 0) is None for n in tally.chosen(mode)) for mode in tally.modes}),
+        ModeRow("sequences", "", {mode: len(found) for mode, found in sequences.items()}),
+        ModeRow("begun, but not ended", "", {mode: sum(n not in tally.ended for n in tally.chosen(mode)) for mode in tally.modes}),
+        ModeRow("given up", "", {mode: sum(tally.ended.get(n, 0) is None for n in tally.chosen(mode)) for mode in tally.modes}),
     ]
     columns = {mode: dict(_numbers(found)) for mode, found in sequences.items()}
     names = list(dict.fromkeys(key for column in columns.values() for key in column))
     for name, unit in names:
         values = {mode: float(columns[mode].get((name, unit), 0.0)) for mode in tally.modes}
-        rows.append(_bounded(Row(name, unit, values)))
+        rows.append(_bounded(ModeRow(name, unit, values)))
     return rows
 
 
-def _bounded(row: Row) -> Row:
+def _bounded(row: ModeRow) -> ModeRow:
     """The row with what the issue asks of it."""
     paper = PAPER.get(row.name, {})
     values = row.values.items()  # NaN holds nowhere.
     if row.name == "frames a sequence":
         within = {mode: abs(value / paper[mode] - 1.0) <= FRAMES_WITHIN for mode, value in values}
-        return Row(row.name, row.unit, row.values, f"±{100 * FRAMES_WITHIN:.0f} %", within)
+        return ModeRow(row.name, row.unit, row.values, f"±{100 * FRAMES_WITHIN:.0f} %", within)
     if row.name == "visibility, mean":
-        return Row(row.name, row.unit, row.values, f"±{VISIBILITY_WITHIN}", {m: abs(v - paper[m]) <= VISIBILITY_WITHIN for m, v in values})
+        return ModeRow(
+            row.name, row.unit, row.values, f"±{VISIBILITY_WITHIN}", {m: abs(v - paper[m]) <= VISIBILITY_WITHIN for m, v in values}
+        )
     if row.name.startswith("largest speed"):
-        return Row(row.name, row.unit, row.values, f"< {MOST_SPEED:g}", {mode: value < MOST_SPEED for mode, value in values})
+        return ModeRow(row.name, row.unit, row.values, f"< {MOST_SPEED:g}", {mode: value < MOST_SPEED for mode, value in values})
     if row.name == "poses that are no numbers":
-        return Row(row.name, row.unit, row.values, "= 0", {mode: value == 0 for mode, value in values})
+        return ModeRow(row.name, row.unit, row.values, "= 0", {mode: value == 0 for mode, value in values})
     return row
 
 

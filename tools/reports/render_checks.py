@@ -19,6 +19,7 @@ from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Environment
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
+from tools.options import Row
 
 MOST_FURNACE_ERROR = 1.0
 """Of a white object in an even room, and of a plane's irradiance [%]."""
@@ -29,17 +30,6 @@ LAMP_HEIGHTS = (90.0, 60.0, 30.0)
 """Above the plane [°]."""
 QUADRATURE = 4
 """Cosines, and azimuths, from which a plane is seen."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """A line of the report; with a bound if the number must keep one."""
-
-    name: str
-    value: float
-    unit: str
-    bound: str = ""
-    holds: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,8 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
-from tools.reports.render_checks import Row, Shot, Studio, bounded, with_mode
+from tools.options import Row
+from tools.reports.render_checks import Shot, Studio, bounded, with_mode
 
 LEAST_PSNR = 32.0
 """Fast against reference, mean over scenes [dB]."""

@@ -3,28 +3,23 @@
 A world is at rest in the tick in which it begins to act. Its numbers are taken there; then it gets the next arrangement, so that
 arrangements may outnumber worlds. Exits with 1 if a bound is violated, with 2 if nothing can be simulated.
 
-    python tools/reports/rest.py --models DIR --arrangements 64 --device cpu
+    python -m tools.reports.rest --models DIR --arrangements 64 --device cpu
 """
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import json
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.codes import Ending, Phase
-from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
@@ -34,6 +29,7 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
+from tools.options import INTERRUPTED, Row, configure, fail, make_parser, print_machine, print_rows, write_json
 
 MOST_SPEED = 0.2
 """Median of the objects' speeds [mm/s]."""
@@ -83,17 +79,6 @@ class Findings:
     given_up: int = 0
 
 
-@dataclass(frozen=True)
-class Row:
-    """A line of the report; with a bound if the number must keep one."""
-
-    name: str
-    value: float
-    unit: str
-    bound: str = ""
-    holds: bool = True
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Measure, print, and return the exit code."""
     options = _parse(arguments)
@@ -106,58 +91,46 @@ def main(arguments: list[str] | None = None) -> int:
         started = time.perf_counter()
         simulation = Simulation(config, catalog, 1, device)
     except SynpickError as error:
-        print(f"rest_report: {error}", file=sys.stderr)
-        return 2
+        return fail("reports.rest", error)
     findings = Findings()
     interrupted = False
     try:
         settle(simulation, catalog, findings, console.print)
     except KeyboardInterrupt:
         interrupted = True
-        print(f"rest_report: interrupted; {len(findings.piles)} of {config.bake.episodes} arrangements are at rest", file=sys.stderr)
+        print(f"reports.rest: interrupted; {len(findings.piles)} of {config.bake.episodes} arrangements are at rest", file=sys.stderr)
     machine = describe_machine(device)
     rows = report(findings)
     wall = time.perf_counter() - started
-    tables(console, machine, rows, config, wall)
-    if options.json:
-        record = {
-            "machine": dict(machine),
-            "arrangements": config.bake.episodes,
-            "worlds": config.bake.worlds,
-            "seed": config.bake.seed,
-            "real_objects": bool(options.models),
-            "interrupted": interrupted,
-            "seconds": wall,
-            "rows": [dataclasses.asdict(row) | {"value": row.value if np.isfinite(row.value) else None} for row in rows],
-        }
-        options.json.write_text(json.dumps(record, indent=1) + "\n")
-    return 130 if interrupted else 0 if all(row.holds for row in rows) else 1
+    print_machine(console, machine)
+    objects = "the models folder's objects" if config.bake.models else "the embedded objects"
+    title = f"{config.bake.episodes} arrangements of {objects} in {config.bake.worlds} worlds, seed {config.bake.seed}, {wall:.0f} s"
+    print_rows(console, "at rest", title, rows)
+    record = {
+        "machine": dict(machine),
+        "arrangements": config.bake.episodes,
+        "worlds": config.bake.worlds,
+        "seed": config.bake.seed,
+        "real_objects": bool(options.models),
+        "interrupted": interrupted,
+        "seconds": wall,
+        "rows": [row.record() for row in rows],
+    }
+    write_json(options.json, record)
+    return INTERRUPTED if interrupted else 0 if all(row.holds for row in rows) else 1
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--models", default="", help="folder of BOP models (default: the embedded objects)")
-    parser.add_argument("--arrangements", type=int, default=64, help="how many to settle (default 64)")
-    parser.add_argument("--worlds", type=int, help="side by side (default: one an arrangement)")
-    parser.add_argument("--device", default="auto", help="cpu, cuda:N or auto (default)")
-    parser.add_argument("--seed", type=int, default=0, help="of all draws (default 0)")
-    parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any other setting; may be repeated")
-    parser.add_argument("--json", type=Path, help="write the numbers to this file, too")
+    parser = make_parser(__doc__, "models", "device", "seed", "set", "json")
+    parser.add_argument("--arrangements", type=int, default=64, help="how many to settle (default: 64)")
+    parser.add_argument("--worlds", type=int, help="side by side (default: one for each arrangement)")
     return parser.parse_args(arguments)
 
 
 def _config(options: argparse.Namespace) -> Config:
-    overrides: dict[str, object] = dict(parse_assignment(text) for text in options.set)
-    # Arrangements of moving: any object may come several times. Nothing is picked, so nothing need be seen.
-    overrides |= {
-        "bake.mode": "move",
-        "bake.models": options.models,
-        "bake.episodes": options.arrangements,
-        "bake.worlds": options.worlds or options.arrangements,
-        "bake.device": options.device,
-        "bake.seed": options.seed,
-    }
-    return load_config(None, overrides, source=COMMAND_LINE)
+    # Arrangements of mode move: an object may come several times, and perception is not needed.
+    worlds = options.worlds or options.arrangements
+    return configure(options, {"bake.mode": "move", "bake.episodes": options.arrangements, "bake.worlds": worlds})
 
 
 def settle(simulation: Simulation, catalog: Catalog, findings: Findings, say: Callable[[str], None]) -> None:
@@ -296,23 +269,6 @@ def _percentiles(name: str, values: np.ndarray, unit: str, which: tuple[int, ...
     if most_median is not None:
         rows[0] = _bounded(rows[0].name, rows[0].value, unit, most_median, f"< {most_median:g}")
     return rows
-
-
-def tables(console: Console, machine: list[tuple[str, str]], rows: list[Row], config: Config, wall: float) -> None:
-    """Print machine and report."""
-    head = Table(show_header=False, box=None)
-    for name, value in machine:
-        head.add_row(name, value)
-    console.print(head)
-    objects = "the models folder's objects" if config.bake.models else "the embedded objects"
-    title = f"{config.bake.episodes} arrangements of {objects} in {config.bake.worlds} worlds, seed {config.bake.seed}, {wall:.0f} s"
-    table = Table("at rest", "", "unit", "bound", "", title=title)
-    table.columns[1].justify = "right"
-    for row in rows:
-        verdict = "" if not row.bound else "holds" if row.holds else "VIOLATED"
-        value = f"{row.value:.0f}" if row.unit == "" else f"{row.value:.3f}"
-        table.add_row(row.name, value, row.unit, row.bound, verdict)
-    console.print(table)
 
 
 if __name__ == "__main__":
