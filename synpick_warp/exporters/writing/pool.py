@@ -282,8 +282,8 @@ class WriterPool:
     def _finish(self, queued: _QueuedTask, failure: Failure | None) -> None:
         if failure is not None:
             self._fail(_to_output_error(failure, queued.path), failure.trace)
-        if queued.body_slot is not None:
-            self._free.append(queued.body_slot)
+        if queued.slot is not None:
+            self._free.append(queued.slot)
         if queued.on_done is not None:
             queued.on_done()
 
