@@ -12,7 +12,7 @@ import numpy as np
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config, Trajectory
-from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, Quantity
+from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, ArraySpec
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
 from synpick_warp.frames import EpisodeEnd, TickBatch
 from tests.harness.exporter_contract import exporting, finish
@@ -76,17 +76,17 @@ def ticks(episodes: tuple[int, ...], frames: int, steps: bool = True) -> Iterato
 def _physics(episode: int, frame: int, steps: bool) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     numbers = np.random.default_rng((episode, frame))
     own = {item.name for item in dataclasses.fields(TickBatch)}
-    tick = {name: _some(numbers, quantity) for name, quantity in TICKS.arrays.items() if name not in own}
+    tick = {name: _some(numbers, spec) for name, spec in TICKS.arrays.items() if name not in own}
     drops = np.random.default_rng(episode).normal(size=(box_views.ROOM, 7)).astype(np.float32)
     tick |= {"mode": np.int32(1), "redrops": np.int32(episode), "drop_pose": drops}
-    made = {name: _some(numbers, quantity) for name, quantity in STEPS.arrays.items() if name not in COMPUTED} if steps else {}
+    made = {name: _some(numbers, spec) for name, spec in STEPS.arrays.items() if name not in COMPUTED} if steps else {}
     return tick, made
 
 
-def _some(numbers: np.random.Generator, quantity: Quantity) -> np.ndarray:
-    shape = quantity.shape({"tick": 1, "step": STEP_COUNT, "instance": box_views.ROOM})
-    shape = shape[1:] if quantity.dims[0] == "tick" else shape
-    kind = np.dtype(quantity.dtype)
+def _some(numbers: np.random.Generator, spec: ArraySpec) -> np.ndarray:
+    shape = spec.shape({"tick": 1, "step": STEP_COUNT, "instance": box_views.ROOM})
+    shape = shape[1:] if spec.dims[0] == "tick" else shape
+    kind = np.dtype(spec.dtype)
     if kind.kind == "f":
         return numbers.normal(size=shape).astype(kind)
     return numbers.integers(0, 2, shape).astype(np.uint8 if kind.kind == "b" else kind)

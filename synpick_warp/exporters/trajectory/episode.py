@@ -1,4 +1,4 @@
-"""An episode's group in the zarr store, made of its rows. Runs in writer processes."""
+"""Tasks that write or discard an episode's group in the zarr store. They run in writer processes."""
 
 from __future__ import annotations
 
@@ -14,62 +14,62 @@ import zarr
 
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.schema import Trajectory
-from synpick_warp.exporters.trajectory.arrays import ARRANGEMENT, ATTEMPTS, EPISODE
+from synpick_warp.exporters.trajectory.arrays import ARRANGEMENT, ATTEMPTS, EPISODE_GROUPS
 from synpick_warp.exporters.trajectory.spool import field_name, read_rows
-from synpick_warp.exporters.trajectory.store import add_array, add_group, shard_rows
+from synpick_warp.exporters.trajectory.store import add_array, add_group, chunk_layout
 from synpick_warp.exporters.writing.files import sync_file, sync_folder
 
 GROUP, ROWS = "group", "rows"
-"""In an episode's hidden folder."""
+"""Names in an episode's staging folder: the group, and the spool file."""
 
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """What is the same for all episodes."""
+    """Settings common to all episodes."""
 
     trajectory: Trajectory
     step: float
-    """[s]"""
+    """Duration of a physics step [s]."""
     steps_per_tick: int
     masses: Mapping[int, float]
     """obj_id -> mass [kg]."""
 
 
 @dataclass(frozen=True, eq=False)
-class EpisodeFacts:
-    """What an episode is, besides its rows."""
+class EpisodeContent:
+    """Content of an episode's group besides the spooled ticks."""
 
     attributes: Mapping[str, Any]
-    """Of its group."""
+    """Attributes of its group."""
     object_id: np.ndarray
-    """At the first frame (instance) int32."""
+    """obj_id of each instance at the first frame (instance) int32."""
     drop_pose: np.ndarray | None
-    """(instance, 7) float32; None: it was not recorded."""
+    """Poses at which the objects were dropped (instance, 7) float32; None: not recorded."""
     attempts: Sequence[str]
-    """Lines of JSON."""
+    """Lines of attempts.jsonl."""
 
 
-def write_episode(folder: Path, kind: np.dtype, count: int, place: Path, facts: EpisodeFacts, settings: EpisodeSettings) -> None:
-    """Task: write an episode's group and move it to its place.
+def write_episode(folder: Path, row: np.dtype, count: int, place: Path, content: EpisodeContent, settings: EpisodeSettings) -> None:
+    """Task: write an episode's group and rename it to its place.
 
     Args:
-        folder: The episode's hidden folder, with its rows.
-        kind: Type of these.
-        count: How many there are.
-        place: Where the group goes.
-        facts: What else is known of the episode.
-        settings: What is the same for all.
+        folder: The episode's staging folder with its spool file.
+        row: Structured type of a spooled row.
+        count: Number of rows.
+        place: Final path of the group.
+        content: Content besides the rows.
+        settings: Settings common to all episodes.
     """
-    group = zarr.create_group(folder / GROUP, attributes=dict(facts.attributes))
+    group = zarr.create_group(folder / GROUP, attributes=dict(content.attributes))
     level = settings.trajectory.level
-    rows = read_rows(folder / ROWS, kind, count)
+    rows = read_rows(folder / ROWS, row, count)
     _write_rows(group, rows, settings)
-    _write_arrangement(group, facts, settings)
-    arrays = attempt_arrays([json.loads(line) for line in facts.attempts], len(facts.object_id))
-    arrays["record"] = np.frombuffer("".join(facts.attempts).encode(), np.uint8)
+    _write_arrangement(group, content, settings)
+    arrays = make_attempt_arrays([json.loads(line) for line in content.attempts], len(content.object_id))
+    arrays["record"] = np.frombuffer("".join(content.attempts).encode(), np.uint8)
     attempts = add_group(group, "attempts", ATTEMPTS)
-    for name, quantity in ATTEMPTS.arrays.items():
-        add_array(attempts, name, quantity, arrays[name], level)
+    for name, spec in ATTEMPTS.arrays.items():
+        add_array(attempts, name, spec, arrays[name], level)
     del rows
     for path in sorted((folder / GROUP).rglob("*")):
         if path.is_dir():
@@ -82,33 +82,33 @@ def write_episode(folder: Path, kind: np.dtype, count: int, place: Path, facts: 
     shutil.rmtree(folder)
 
 
-def drop_episode(folder: Path) -> None:
-    """Task: remove an episode that delivers nothing."""
+def discard_episode(folder: Path) -> None:
+    """Task: remove the staging folder of a discarded arrangement."""
     shutil.rmtree(folder)
 
 
 def _write_rows(group: zarr.Group, rows: np.ndarray, settings: EpisodeSettings) -> None:
-    """The groups `ticks` and `steps`, one array after the other."""
+    """Write the groups `ticks` and `steps`, one array after the other to bound memory."""
     steps = settings.steps_per_tick
     for name, rows_per_tick in (("ticks", 1), ("steps", steps)):
         names = rows.dtype.names or ()
-        given = {array: rows[field_name(name, array)] for array in EPISODE[name].arrays if field_name(name, array) in names}
+        given = {array: rows[field_name(name, array)] for array in EPISODE_GROUPS[name].arrays if field_name(name, array) in names}
         if name == "steps" and given:
-            # Each step's end, back from the tick's.
+            # The time at each step's end, counted back from the tick's time.
             given["time"] = rows["ticks/time"][:, None] - settings.step * np.arange(steps - 1, -1, -1)
         if not given:
             continue
-        made = add_group(group, name, EPISODE[name])
-        chunk, shard = shard_rows(settings.trajectory, len(rows), rows_per_tick)
-        for array, quantity in EPISODE[name].arrays.items():
+        target = add_group(group, name, EPISODE_GROUPS[name])
+        chunk, shard = chunk_layout(settings.trajectory, len(rows), rows_per_tick)
+        for array, spec in EPISODE_GROUPS[name].arrays.items():
             if array in given:
                 values = given[array]
-                data = _Flat(values) if name == "steps" else values
-                add_array(made, array, quantity, data, settings.trajectory.level, chunk, shard)  # type: ignore[arg-type]
+                data = _FlattenedSteps(values) if name == "steps" else values
+                add_array(target, array, spec, data, settings.trajectory.level, chunk, shard)  # type: ignore[arg-type]
 
 
-class _Flat:
-    """An array (tick, step, ...) as (tick · step, ...), of which only what is sliced is read; slices begin and end with ticks."""
+class _FlattenedSteps:
+    """Lazy reshape of an array (tick, step, ...) to (tick · step, ...): only slices are read; they begin and end at whole ticks."""
 
     def __init__(self, values: np.ndarray) -> None:
         self._values = values
@@ -124,31 +124,31 @@ class _Flat:
         return values.reshape(-1, *self.shape[1:])
 
 
-def _write_arrangement(group: zarr.Group, facts: EpisodeFacts, settings: EpisodeSettings) -> None:
-    made = add_group(group, "arrangement", ARRANGEMENT)
-    drop_pose = facts.drop_pose
+def _write_arrangement(group: zarr.Group, content: EpisodeContent, settings: EpisodeSettings) -> None:
+    arrangement = add_group(group, "arrangement", ARRANGEMENT)
+    drop_pose = content.drop_pose
     values = {
-        "object_id": facts.object_id,
-        "mass": np.array([settings.masses.get(int(number), np.nan) for number in facts.object_id]),
-        "drop_pose": drop_pose if drop_pose is not None else np.full((len(facts.object_id), 7), np.nan, np.float32),
+        "object_id": content.object_id,
+        "mass": np.array([settings.masses.get(int(obj_id), np.nan) for obj_id in content.object_id]),
+        "drop_pose": drop_pose if drop_pose is not None else np.full((len(content.object_id), 7), np.nan, np.float32),
     }
-    for name, quantity in ARRANGEMENT.arrays.items():
-        add_array(made, name, quantity, values[name].astype(quantity.dtype), settings.trajectory.level)
+    for name, spec in ARRANGEMENT.arrays.items():
+        add_array(arrangement, name, spec, values[name].astype(spec.dtype), settings.trajectory.level)
 
 
-def attempt_arrays(records: Sequence[Mapping[str, Any]], instances: int) -> dict[str, np.ndarray]:
-    """Columns of the records of attempts, as the table ATTEMPTS has them, but for `record`."""
-    ticks = max((len(record["load"]) for record in records), default=0)
-    sizes = {"attempt": len(records), "instance": instances, "lift_tick": ticks, "byte": 0}
-    made = {}
-    for name, quantity in ATTEMPTS.arrays.items():
-        kind = np.dtype(quantity.dtype)
-        nothing = {"f": np.nan, "i": -1}.get(kind.kind, 0)
-        column = made[name] = np.full(quantity.shape(sizes), nothing, kind)
+def make_attempt_arrays(attempts: Sequence[Mapping[str, Any]], instances: int) -> dict[str, np.ndarray]:
+    """Convert attempts (lines of attempts.jsonl) to columns, the arrays of ATTEMPTS; `record` stays empty."""
+    ticks = max((len(attempt["load"]) for attempt in attempts), default=0)
+    sizes = {"attempt": len(attempts), "instance": instances, "lift_tick": ticks, "byte": 0}
+    columns = {}
+    for name, spec in ATTEMPTS.arrays.items():
+        dtype = np.dtype(spec.dtype)
+        missing = {"f": np.nan, "i": -1}.get(dtype.kind, 0)
+        column = columns[name] = np.full(spec.shape(sizes), missing, dtype)
         if name == "record":
             continue
-        for row, record in enumerate(records):
-            value = record[name]
+        for row, attempt in enumerate(attempts):
+            value = attempt[name]
             if name == "outcome":
                 column[row] = Outcome[value.upper()]
             elif name == "load":
@@ -157,4 +157,4 @@ def attempt_arrays(records: Sequence[Mapping[str, Any]], instances: int) -> dict
                 column[row, list(value)] = True
             elif value is not None:
                 column[row] = value
-    return made
+    return columns

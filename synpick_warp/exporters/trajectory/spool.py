@@ -1,4 +1,4 @@
-"""Ticks of an episode on their way into its arrays: rows of one type, a few at a time, so that memory stays flat."""
+"""Spool of an episode's ticks: rows of one structured type, written to disk a few at a time, so that memory stays constant."""
 
 from __future__ import annotations
 
@@ -7,26 +7,25 @@ from pathlib import Path
 
 import numpy as np
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, Quantity
+from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, ArraySpec
 from synpick_warp.frames import TickBatch
 
 SPOOL_TICKS = 8
-"""Ticks of an episode that are handed over at once: at most half a megabyte, with 24 objects."""
+"""Number of ticks of an episode handed to a writer at once: at most half a megabyte with 24 objects."""
 _OWN = ("object_id", "pose", "fixture_pose", "fixture_visible", "time")
-"""Arrays of a tick that `TickBatch` always has."""
+"""Fields that every `TickBatch` has."""
 _TABLES = {"ticks": TICKS.arrays, "steps": STEPS.arrays}
 _COMPUTED = "steps/time"
-"""Follows from the tick's time."""
+"""Computed from the tick's time when the group is written."""
 
 
 def field_name(group: str, name: str) -> str:
-    """Of an array in a row."""
+    """Name of an array's field in a row."""
     return f"{group}/{name}"
 
 
-def row_type(ticks: dict[str, Quantity], steps: dict[str, Quantity], instances: int, steps_per_tick: int) -> np.dtype:
-    """A row: one tick's part of the arrays, in the order of their names' tables."""
+def row_type(ticks: dict[str, ArraySpec], steps: dict[str, ArraySpec], instances: int, steps_per_tick: int) -> np.dtype:
+    """Structured type of a row: one tick's part of all arrays, in the order of their tables."""
     fields = []
     for group, quantities in (("ticks", ticks), ("steps", steps)):
         for name, quantity in quantities.items():
@@ -36,17 +35,23 @@ def row_type(ticks: dict[str, Quantity], steps: dict[str, Quantity], instances: 
     return np.dtype(fields)
 
 
-def spool_bytes(config: Config) -> int:
-    """Most room that the rows of one task take [B]."""
-    steps = dict(STEPS.arrays) if config.trajectory.steps else {}
-    return SPOOL_TICKS * row_type(dict(TICKS.arrays), steps, config.arrangement.max_objects, config.physics.steps_per_tick).itemsize
+def spool_bytes(instances: int, steps_per_tick: int, has_steps: bool) -> int:
+    """Maximum size of the rows of one task [B].
+
+    Args:
+        instances: Instance capacity of a world.
+        steps_per_tick: Number of physics steps in a tick.
+        has_steps: Whether steps are recorded.
+    """
+    steps = dict(STEPS.arrays) if has_steps else {}
+    return SPOOL_TICKS * row_type(dict(TICKS.arrays), steps, instances, steps_per_tick).itemsize
 
 
 def batch_type(batch: TickBatch, instances: int) -> np.dtype:
-    """Rows that hold what a batch has.
+    """Structured type of rows that hold a batch's arrays.
 
     Raises:
-        ValueError: It has arrays that the tables do not name.
+        ValueError: The batch has arrays that the schema lacks.
     """
     ticks = {name: quantity for name, quantity in TICKS.arrays.items() if name in _OWN or name in batch.tick}
     steps = {name: quantity for name, quantity in STEPS.arrays.items() if name in batch.steps}
@@ -64,19 +69,19 @@ def fill_row(row: np.void, batch: TickBatch, world: int) -> None:
             values, axis = batch.steps[array][world], 1
         else:
             values, axis = (getattr(batch, array) if array in _OWN else batch.tick[array])[world], 0
-        if _is_instance(_TABLES[group][array]):
+        if _has_instances(_TABLES[group][array]):
             values = values[:, : row[name].shape[1]] if axis else values[: row[name].shape[0]]
         row[name] = values
-    # Whatever the buffer has of an instance that is not there depends on who used it before.
+    # The buffer's content for an absent instance depends on the world's earlier episodes.
     row["ticks/pose"][row["ticks/object_id"] < 0] = np.nan
 
 
-def _is_instance(quantity: Quantity) -> bool:
+def _has_instances(quantity: ArraySpec) -> bool:
     return quantity.dims[1:2] == ("instance",)
 
 
 def write_rows(rows: np.ndarray, path: Path, offset: int) -> None:
-    """Task: put rows, as bytes, into an episode's file, from a byte on. Tasks may come in any order."""
+    """Task: write rows, as bytes, to the spool file at a byte offset. Tasks may run in any order."""
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
         rest = memoryview(rows.data)
@@ -89,12 +94,12 @@ def write_rows(rows: np.ndarray, path: Path, offset: int) -> None:
         os.close(handle)
 
 
-def read_rows(path: Path, kind: np.dtype, count: int) -> np.ndarray:
-    """All rows of an episode's file, which stay there until they are looked at (tick)."""
-    return np.memmap(path, kind, "r", shape=(count,))
+def read_rows(path: Path, row: np.dtype, count: int) -> np.ndarray:
+    """Memory-map all rows of a spool file (tick)."""
+    return np.memmap(path, row, "r", shape=(count,))
 
 
-def present(batch: TickBatch, world: int) -> int:
-    """Instances that a world has at its first frame: one more than the index of the last."""
-    there = np.flatnonzero(batch.object_id[world] >= 0)
-    return int(there[-1]) + 1 if there.size else 0
+def count_instances(batch: TickBatch, world: int) -> int:
+    """Size of a world's instance dimension: 1 + the largest index of an instance at its first frame."""
+    present = np.flatnonzero(batch.object_id[world] >= 0)
+    return int(present[-1]) + 1 if present.size else 0

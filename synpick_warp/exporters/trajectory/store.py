@@ -1,4 +1,4 @@
-"""Zarr arrays with names, units and meaning, and what a data set's store says once."""
+"""Zarr arrays with units and descriptions as attributes, and the groups of the store that all episodes share."""
 
 from __future__ import annotations
 
@@ -11,49 +11,49 @@ import numpy as np
 import zarr
 from zarr.codecs import ZstdCodec
 
-from synpick_warp.configs.schema import Config, Trajectory
-from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANTS, EPISODES, FORMAT, LABELS, OBJECTS, GroupDoc, Quantity
+from synpick_warp.configs.schema import Physics, Trajectory
+from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANT_GROUPS, EPISODES, FORMAT, LABELS, OBJECTS, ArraySpec, GroupSpec
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 
-# The writers are the parallelism.
+# The writer processes are the parallelism.
 zarr.config.set({"async.concurrency": 1, "threading.max_workers": 1})
 
 
-def add_group(parent: zarr.Group, name: str, doc: GroupDoc, attributes: Mapping[str, Any] | None = None) -> zarr.Group:
-    """Make an empty group that says what it is."""
+def add_group(parent: zarr.Group, name: str, doc: GroupSpec, attributes: Mapping[str, Any] | None = None) -> zarr.Group:
+    """Create an empty group with its description as attribute."""
     return parent.create_group(name, attributes={"description": doc.description, **(attributes or {})})
 
 
-def add_array(group: zarr.Group, name: str, quantity: Quantity, data: np.ndarray, level: int, chunk: int = 0, shard: int = 0) -> None:
+def add_array(group: zarr.Group, name: str, spec: ArraySpec, data: np.ndarray, level: int, chunk: int = 0, shard: int = 0) -> None:
     """Write an array.
 
     Args:
-        group: Where.
-        name: Its name there.
-        quantity: What it is.
-        data: Its values, of the quantity's shape; read one file's worth at a time.
-        level: Of zstd.
-        chunk: Rows that are compressed at once; 0: all.
-        shard: Rows in a file, a multiple of `chunk`; 0: the array is not sharded.
+        group: Parent group.
+        name: Name in the group.
+        spec: Schema of the array.
+        data: Values, of the schema's shape; sliced one shard at a time.
+        level: Compression level of zstd.
+        chunk: Rows per chunk (compressed together); 0: all.
+        shard: Rows per shard (file), a multiple of `chunk`; 0: the array is not sharded.
     """
-    attributes: dict[str, Any] = {"unit": quantity.unit, "description": quantity.description}
-    labels = {dim: list(LABELS[dim]) for dim in quantity.dims if dim in LABELS}
+    attributes: dict[str, Any] = {"unit": spec.unit, "description": spec.description}
+    labels = {dim: list(LABELS[dim]) for dim in spec.dims if dim in LABELS}
     if labels:
         attributes["labels"] = labels
-    if quantity.codes:
-        attributes["codes"] = list(quantity.codes)
-    kind = np.dtype(quantity.dtype)
+    if spec.codes:
+        attributes["codes"] = list(spec.codes)
+    dtype = np.dtype(spec.dtype)
     inner = tuple(max(1, extent) for extent in data.shape[1:])
     rows = chunk or max(1, len(data))
     array = group.create_array(
         name,
         shape=data.shape,
-        dtype=kind,
+        dtype=dtype,
         chunks=(rows, *inner),
         shards=(shard, *inner) if shard else None,
         compressors=ZstdCodec(level=level),
-        fill_value=np.nan if kind.kind == "f" else 0,
-        dimension_names=_distinct(quantity.dims),
+        fill_value=np.nan if dtype.kind == "f" else 0,
+        dimension_names=_make_unique(spec.dims),
         attributes=attributes,
         # One file in the array's folder, instead of folders in folders.
         chunk_key_encoding={"name": "default", "separator": "."},
@@ -65,35 +65,36 @@ def add_array(group: zarr.Group, name: str, quantity: Quantity, data: np.ndarray
         array[first:last] = np.ascontiguousarray(data[first:last])
 
 
-def _distinct(dims: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of dimensions, none twice: a matrix has an axis and an axis_2."""
-    return tuple(name if name not in dims[:place] else f"{name}_2" for place, name in enumerate(dims))
+def _make_unique(dims: tuple[str, ...]) -> tuple[str, ...]:
+    """Number repeated dimension names: a matrix has the dimensions axis and axis_2."""
+    return tuple(name if name not in dims[:index] else f"{name}_2" for index, name in enumerate(dims))
 
 
-def shard_rows(settings: Trajectory, ticks: int, rows_per_tick: int) -> tuple[int, int]:
-    """Rows in a chunk and in a file of an episode of so many ticks: a file is no larger than the array."""
+def chunk_layout(settings: Trajectory, ticks: int, rows_per_tick: int) -> tuple[int, int]:
+    """Rows per chunk and per shard for an episode of `ticks` ticks; a shard is no larger than the array needs."""
     chunks = min(settings.shard_chunks, max(1, -(-ticks // settings.chunk_ticks)))
     chunk = settings.chunk_ticks * rows_per_tick
     return chunk, chunks * chunk
 
 
 def write_constants(
-    store: Path, config: Config, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...]
+    store: Path, seed: int, physics: Physics, level: int, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...]
 ) -> list[Path]:
-    """Write what all episodes share, in place of what is there of it.
+    """Write the store's root, the groups of objects and cameras, and the empty group of episodes, replacing existing ones.
 
     Args:
-        store: A folder that exists, and in it one for the episodes.
-        config: Settings.
+        store: Existing folder that contains a folder for the episodes.
+        seed: Seed of the bake.
+        physics: Time step and gravity.
+        level: Compression level of zstd.
         catalog: The objects.
         cameras: The cameras.
-        lights: The light maps.
+        lights: The environment maps.
 
     Returns:
         Files and folders that were written.
     """
-    physics = config.physics
-    places = [store / "zarr.json", *(store / name for name in CONSTANTS), store / EPISODES / "zarr.json"]
+    places = [store / "zarr.json", *(store / name for name in CONSTANT_GROUPS), store / EPISODES / "zarr.json"]
     for place in places:
         if place.is_dir():
             shutil.rmtree(place)
@@ -105,7 +106,7 @@ def write_constants(
             "description": "Physics of a synpick-warp data set. SI units; the world's origin is the centre of the tote's inner floor, z up."
             f" Episodes are in {EPISODES}, named by number.",
             "format": FORMAT,
-            "seed": config.bake.seed,
+            "seed": seed,
             "step": physics.step,
             "steps_per_tick": physics.steps_per_tick,
             "gravity": physics.gravity,
@@ -115,12 +116,12 @@ def write_constants(
     )
     entries = catalog.entries
     objects = add_group(root, "objects", OBJECTS, {"names": [entry.name for entry in entries]})
-    for name, quantity in OBJECTS.arrays.items():
+    for name, spec in OBJECTS.arrays.items():
         values = [entry.obj_id if name == "object_id" else getattr(entry, name) for entry in entries]
-        add_array(objects, name, quantity, np.array(values, quantity.dtype), config.trajectory.level)
+        add_array(objects, name, spec, np.array(values, spec.dtype), level)
     group = add_group(root, "cameras", CAMERAS)
-    for name, quantity in CAMERAS.arrays.items():
+    for name, spec in CAMERAS.arrays.items():
         values = [(camera.width, camera.height) if name == "resolution" else getattr(camera, name) for camera in cameras]
-        add_array(group, name, quantity, np.array(values, quantity.dtype), config.trajectory.level)
-    add_group(root, EPISODES, GroupDoc("One group an episode, named by its number with six digits."))
+        add_array(group, name, spec, np.array(values, spec.dtype), level)
+    add_group(root, EPISODES, GroupSpec("One group an episode, named by its number with six digits."))
     return places

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Outcome
 from synpick_warp.exporters.trajectory import arrays as tables
-from synpick_warp.exporters.trajectory.episode import attempt_arrays
+from synpick_warp.exporters.trajectory.episode import make_attempt_arrays
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
 from synpick_warp.exporters.trajectory.spool import SPOOL_TICKS, spool_bytes
-from synpick_warp.exporters.trajectory.store import shard_rows
+from synpick_warp.exporters.trajectory.store import chunk_layout
 from tests.harness.exporter_contract import ExporterContract, digests, exporting
 from tests.worlds import box_views, trajectories
 from tests.worlds.trajectories import ATTEMPT, STEP_COUNT, UNSEEN, config, ends, ticks, write_set
@@ -135,7 +135,7 @@ def test_an_episode_without_attempts_has_empty_columns(tmp_path):
 
 
 def test_columns_of_attempts_have_the_tables_types():
-    made = attempt_arrays([ATTEMPT], 4)
+    made = make_attempt_arrays([ATTEMPT], 4)
     assert {name: values.dtype.str for name, values in made.items()} == {name: one.dtype for name, one in tables.ATTEMPTS.arrays.items()}
 
 
@@ -155,7 +155,7 @@ def test_objects_and_cameras(store):
 def test_every_array_says_what_it_is(store):
     """Unit, meaning, and a name for each dimension; every group a description."""
     found = arrays(store)
-    once, each = (sum(len(doc.arrays) for doc in docs.values()) for docs in (tables.CONSTANTS, tables.EPISODE))
+    once, each = (sum(len(doc.arrays) for doc in docs.values()) for docs in (tables.CONSTANT_GROUPS, tables.EPISODE_GROUPS))
     assert len(found) == once + len(EPISODES) * each
     for path, array in found.items():
         assert array.attrs["unit"], path
@@ -195,8 +195,8 @@ def test_two_writes_are_identical_whatever_writes_them(tmp_path, folder):
 def test_without_steps_there_are_ticks_alone(tmp_path):
     write_set(tmp_path, config(steps=False), (0,), 3, steps=False)
     episode = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000", mode="r")
-    assert set(episode.group_keys()) == set(tables.EPISODE) - {"steps"}
-    assert spool_bytes(config(steps=False)) < spool_bytes(config()) / 3
+    assert set(episode.group_keys()) == set(tables.EPISODE_GROUPS) - {"steps"}
+    assert spool_bytes(INSTANCES, STEP_COUNT, False) < spool_bytes(INSTANCES, STEP_COUNT, True) / 3
 
 
 def test_missing_frames_are_an_error(tmp_path):
@@ -217,7 +217,7 @@ def test_an_array_that_nothing_describes_is_an_error(tmp_path):
 @given(ticks=st.integers(0, 5000), chunk=st.integers(1, 64), chunks=st.integers(1, 64), rows=st.integers(1, 40))
 @settings(max_examples=200)
 def test_files_are_whole_chunks_of_whole_ticks_and_no_larger_than_needed(ticks, chunk, chunks, rows):
-    made, shard = shard_rows(trajectories.config(chunk_ticks=chunk, shard_chunks=chunks).trajectory, ticks, rows)
+    made, shard = chunk_layout(trajectories.config(chunk_ticks=chunk, shard_chunks=chunks).trajectory, ticks, rows)
     assert made == chunk * rows
     assert shard % made == 0
     assert shard <= chunks * made
