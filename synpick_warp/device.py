@@ -1,4 +1,4 @@
-"""Chooses the device that everything runs on, and keeps Warp from talking."""
+"""Device selection, and start of Warp without its banner."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from synpick_warp.errors import DeviceError
 
 _CUDA = re.compile(r"cuda:(\d+)")
 _NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
-"""Warp's native part prints this past its own log level. A machine without a GPU is no fault."""
+"""Warp's native code prints this regardless of the log level; a machine without a GPU is not a fault."""
 
 
 def pick_device(name: str) -> wp.Device:
-    """The device of that name; starts Warp if nobody did.
+    """Select a device by name; starts Warp on the first call.
 
     Args:
         name: "cpu", "cuda:N", or "auto": the first GPU if there is one, else the CPU.
 
     Raises:
-        DeviceError: The name is none of these, or there is no such GPU.
+        DeviceError: The name has another form, or there is no such GPU.
     """
     start_warp()
     count = wp.get_cuda_device_count()
@@ -37,13 +37,13 @@ def pick_device(name: str) -> wp.Device:
     if match is None:
         raise DeviceError(f'bake.device is "{name}"; allowed: cpu, cuda:N such as cuda:0, or auto')
     if int(match[1]) >= count:
-        found = "no CUDA device" if count == 0 else f"only cuda:0 to cuda:{count - 1}" if count > 1 else "only cuda:0"
-        raise DeviceError(f"{name} was asked for, but Warp finds {found} here; use --device {'cuda:0' if count else 'cpu'}")
+        present = "no CUDA device" if count == 0 else f"only cuda:0 to cuda:{count - 1}" if count > 1 else "only cuda:0"
+        raise DeviceError(f"{name} was requested, but Warp finds {present} here; use --device {'cuda:0' if count else 'cpu'}")
     return wp.get_device(f"cuda:{int(match[1])}")
 
 
 def start_warp() -> None:
-    """Initialise Warp without its banner and without a word for every kernel it loads; its warnings are kept."""
+    """Initialise Warp without its banner and its messages per loaded kernel; warnings are kept."""
     wp.config.log_level = wp.LOG_WARNING
     with _without_driver_warning():
         wp.init()
@@ -51,7 +51,7 @@ def start_warp() -> None:
 
 @contextlib.contextmanager
 def _without_driver_warning() -> Iterator[None]:
-    """Hold back what native code writes to the standard error meanwhile, and pass on all but the line about the missing driver."""
+    """Redirect stderr at file-descriptor level, and then print everything but the line about the missing driver."""
     if sys.stderr is None:
         yield
         return

@@ -1,14 +1,14 @@
-"""Errors that a user can cause and mend. The command line prints them as one line and exits with code 2."""
+"""Exceptions for errors that a user can correct; the command line prints them as one line and exits with code 2."""
 
 from __future__ import annotations
 
 
 class SynpickError(Exception):
-    """What came, what is allowed, and what to do about it, in one line."""
+    """Base class; the message says in one line what was given, what is allowed and what to do."""
 
 
 class ConfigError(SynpickError):
-    """A setting is unknown, of the wrong type, or out of range."""
+    """A setting is unknown, of the wrong type, out of range, or inconsistent with others."""
 
 
 class CatalogError(SynpickError):
@@ -20,7 +20,7 @@ class LightError(SynpickError):
 
 
 class DeviceError(SynpickError):
-    """The device that was asked for is not there."""
+    """The requested device does not exist."""
 
 
 class OutputError(SynpickError):
@@ -28,4 +28,4 @@ class OutputError(SynpickError):
 
 
 class DatasetError(SynpickError):
-    """A folder is no data set, or lacks a file that it should have."""
+    """A folder is not a data set, or a file in it is missing or damaged."""

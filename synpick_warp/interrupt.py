@@ -1,4 +1,7 @@
-"""Ctrl-C and the signal by which clusters announce that a job's time is over: the first is a request, the second is not."""
+"""Graceful shutdown: the first SIGINT or SIGTERM requests a stop after the current tick, the second acts as usual.
+
+SIGTERM is the signal by which job schedulers announce the end of a job's time.
+"""
 
 from __future__ import annotations
 
@@ -10,33 +13,33 @@ from types import FrameType
 from typing import Self
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_STOPPING = b"\nstopping after this tick; whole episodes stay, the same command goes on; once more: stop at once\n"
+_STOPPING = b"\nstopping after this tick; committed episodes stay, the same command resumes the bake; once more: stop at once\n"
 _STANDARD_ERROR = 2
 
 
 class StopRequest:
-    """While it is entered, the first of SIGNALS is only noted; from then on they do what they did before.
+    """Context manager that records the first of SIGNALS; after it the previous handlers are restored.
 
-    Outside of the main thread, where signals do not arrive, it notes nothing.
+    Outside of the main thread, which receives no signals, it does nothing.
     """
 
     def __init__(self) -> None:
         self.number = 0
-        """Of the signal that was noted; 0: none."""
+        """Number of the received signal; 0: none."""
         self._before: dict[signal.Signals, object] = {}
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
+            self._before = {number: signal.signal(number, self._handle) for number in SIGNALS}
         return self
 
     def __exit__(self, *_: object) -> None:
         self._restore()
 
-    def _note(self, number: int, _: FrameType | None) -> None:
+    def _handle(self, number: int, _: FrameType | None) -> None:
         self.number = number
         self._restore()
-        # Not through a console: a handler may run within its own calls.
+        # os.write, not print: a signal handler can interrupt buffered output.
         with contextlib.suppress(OSError):
             os.write(_STANDARD_ERROR, _STOPPING)
 

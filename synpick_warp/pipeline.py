@@ -1,4 +1,7 @@
-"""A bake from settings to files: the one place that knows the order of the stages."""
+"""Pipeline of a bake, from settings to committed files: assembles catalog, simulation, renderer and exporters, and runs their tick loop.
+
+This is the one module that passes the whole `Config` on; stages take what they need.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +21,8 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import FAST, Config
 from synpick_warp.dataset.digests import digest_inputs
-from synpick_warp.dataset.manifest import episode_place, read_record
-from synpick_warp.dataset.writing import Output, complete
+from synpick_warp.dataset.manifest import episode_entry, read_entry
+from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
 from synpick_warp.device import pick_device
 from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_redrawn, remedy
 from synpick_warp.errors import OutputError
@@ -56,7 +59,7 @@ from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport
 
 @dataclass(frozen=True, eq=False)
 class Factory:
-    """Everything that a bake holds on the device."""
+    """Stages and assets of a bake, on the device."""
 
     catalog: Catalog
     cameras: tuple[Camera, ...]
@@ -67,13 +70,13 @@ class Factory:
 
 
 def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | None = None, records_physics: bool = False) -> Factory:
-    """Load what the settings name and put it on the device.
+    """Load assets and build the stages on the device.
 
     Args:
         config: All settings.
-        progress: Told what happens.
-        episodes: Numbers of the episodes to simulate; None: from 0, as many as are set.
-        records_physics: Whether ticks come with their physics.
+        progress: Observer.
+        episodes: Indices of the episodes to simulate; None: all of `bake.episodes`.
+        records_physics: Whether ticks are recorded with their physics.
 
     Raises:
         SynpickError: Device, models, lights, tote or cameras cannot be used.
@@ -96,27 +99,27 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
 
 
 def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, int] = (0, 1)) -> BakeSummary:
-    """Simulate, render and write a data set, or what is left of one.
+    """Simulate, render and write a data set, or the remaining episodes of one.
 
     Args:
         config: All settings.
-        out: Folder of the data set: new, empty, or of a bake with the same settings that did not come to its end.
-        progress: Told what happens.
-        shard: (i, n): only episodes whose number leaves i when divided by n.
+        out: Folder of the data set: new, empty, or of an earlier bake with the same settings.
+        progress: Observer.
+        shard: (i, n): only episodes with index % n == i.
 
     Raises:
-        SynpickError: Something a user can mend; whole episodes stay, and the same bake goes on with them.
+        SynpickError: An error that the user can correct; committed episodes stay, and the same bake resumes.
     """
     kinds = load_exporter_classes(config.bake.formats)
-    with Output(out, config, range(shard[0], config.bake.episodes, shard[1])) as output:
+    with OutputFolder(out, config, range(shard[0], config.bake.episodes, shard[1])) as output:
         summary = BakeSummary(len(output.episodes))
-        for episode in output.before:
-            summary.take_record(read_record(out, episode_place(episode)) or {})
+        for episode in output.committed:
+            summary.take_record(read_entry(out, episode_entry(episode)) or {})
         if output.is_finished():
             progress.note("the data set is finished: nothing is left to do")
             return summary
-        if output.before:
-            progress.note(f"{len(output.before)} of {len(output.episodes)} episodes are whole; going on with the others")
+        if output.committed:
+            progress.note(f"{len(output.committed)} of {len(output.episodes)} episodes are complete; resuming with the others")
         try:
             _fill(config, output, kinds, summary, progress)
         except OutputError as error:
@@ -124,22 +127,22 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
                 raise
             raise OutputError(f"{out} was removed while the bake wrote to it") from error
         finally:
-            output.close()
+            output.clean_up()
     return summary
 
 
-def _fill(config: Config, output: Output, kinds: tuple[type[Exporter], ...], summary: BakeSummary, progress: Progress) -> None:
-    """Make the episodes that are left, and the lists."""
+def _fill(config: Config, output: OutputFolder, kinds: tuple[type[Exporter], ...], summary: BakeSummary, progress: Progress) -> None:
+    """Generate the remaining episodes, then the indices over all."""
     needs_physics = any(kind.needs_physics for kind in kinds)
-    factory = build_factory(config, progress, output.left, needs_physics) if output.left else None
+    factory = build_factory(config, progress, output.remaining, needs_physics) if output.remaining else None
     writers = config.bake.writers or len(os.sched_getaffinity(0))
     with WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
             exporters = Exporters(kinds, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
             try:
-                output.begin(exporters, digest_inputs(factory.catalog, factory.lights), pool)
-                _Run(config, factory, exporters, partial(output.record, exporters, pool), summary, progress).run()
+                output.prepare(exporters, digest_inputs(factory.catalog, factory.lights), pool)
+                _Run(config, factory, exporters, partial(output.commit, exporters, pool), summary, progress).run()
                 pool.wait()
                 exporters.close()
             except BaseException:
@@ -148,28 +151,31 @@ def _fill(config: Config, output: Output, kinds: tuple[type[Exporter], ...], sum
                 raise
         if not summary.stopped:
             progress.stage("finishing files")
-            complete(output.out, config, kinds, pool)
+            finalize_data_set(output.out, config, kinds, pool)
         summary.wall_seconds = time.perf_counter() - started
 
 
 class _Run:
-    """The ticks of a bake."""
+    """Tick loop of a bake: simulate, read back, render, hand over to exporters."""
 
     def __init__(
         self,
         config: Config,
         factory: Factory,
         exporters: Exporters,
-        whole: Callable[[EpisodeEnd], None],
+        commit: Callable[[EpisodeEnd], None],
         summary: BakeSummary,
         progress: Progress,
     ) -> None:
         self.config, self.factory, self.exporters = config, factory, exporters
-        self.whole, self.summary, self.progress = whole, summary, progress
+        self.commit, self.summary, self.progress = commit, summary, progress
         self.meter = _Meter(config, summary, progress)
 
     def run(self) -> None:
-        """Tick until no episode is left or somebody asks to stop. The device works on the next tick while the host reads this one."""
+        """Tick until no episode remains or a signal requests a stop.
+
+        Double-buffered: the device simulates the next tick while the host reads this one.
+        """
         simulation = self.factory.simulation
         readers = [TickReader(record) for record in simulation.records]
         self.progress.stage("compiling kernels, dropping objects")
@@ -191,7 +197,7 @@ class _Run:
         self.summary.stopped = stop.number
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot) -> None:
-        """A tick's frames and ends to the exporters."""
+        """Hand a tick's frames, views and episode ends to the exporters."""
         physics = self.config.physics
         batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
         if len(batch):
@@ -217,11 +223,11 @@ class _Run:
             self.exporters.end_episode(end, lambda: None)
         else:
             self.summary.take_episode(row, record)
-            self.exporters.end_episode(end, partial(self.whole, end))
+            self.exporters.end_episode(end, partial(self.commit, end))
 
 
 class _Meter:
-    """Rates and remaining time for whoever watches."""
+    """Throughput and remaining time, reported to the observer."""
 
     def __init__(self, config: Config, summary: BakeSummary, progress: Progress) -> None:
         self.summary, self.progress = summary, progress
@@ -229,7 +235,7 @@ class _Meter:
         self.cameras = len(config.cameras.positions)
 
     def show(self, active: int) -> None:
-        """Report after a tick in which `active` worlds were busy. The clock starts with the first view, when all is compiled."""
+        """Report after a tick in which `active` worlds were busy. Time counts from the first view, when all kernels are compiled."""
         summary, now = self.summary, time.perf_counter()
         if self.started is None and summary.views:
             self.started = now
@@ -237,11 +243,11 @@ class _Meter:
         done = [row for row in summary.episodes if row.ending.delivers]
         left = None
         if len(summary.episodes) > summary.resumed and elapsed > 0.0 and done and summary.views:
-            # Short episodes end first: those that run may already be longer than the mean of those that ended.
+            # Short episodes end first: running ones can already be longer than the mean of the ended ones.
             running = summary.views / self.cameras / (len(summary.episodes) - summary.resumed + active)
             frames = max(sum(row.frames for row in done) / len(done), running)
-            share = summary.views / ((summary.total - summary.resumed) * self.cameras * frames)
-            left = (1.0 / share - 1.0) * elapsed if share < 1.0 else None
+            fraction = summary.views / ((summary.total - summary.resumed) * self.cameras * frames)
+            left = (1.0 / fraction - 1.0) * elapsed if fraction < 1.0 else None
         self.progress.update(
             episodes_done=len(summary.episodes),
             episodes=summary.total,
@@ -253,9 +259,9 @@ class _Meter:
 
 
 def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int]]:
-    """Rows (name, shape, unit, bytes) of every array that a bake declares on the device, all copies counted.
+    """Memory table: rows (name, shape, unit, bytes) of every device array that a bake declares, one per copy.
 
-    Newton's own arrays come on top. Body slots are counted at their most: as many for each kind as there is room for objects.
+    Newton's own arrays are not included. Body slots are counted at their maximum: the object capacity for each slot type.
     """
     device: wp.Device = pick_device(config.bake.device)
     config = with_enough_worlds(config, device)

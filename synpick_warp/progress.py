@@ -1,4 +1,4 @@
-"""What a long run tells whoever watches it."""
+"""Progress reporting: the observer interface of a bake, and a silent observer."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ from typing import Protocol, Self
 
 
 class Progress(Protocol):
-    """A watcher of a bake. Whoever makes it enters it before the bake and leaves it afterwards; the bake only reports."""
+    """Observer of a bake. The caller enters and exits it as a context manager; the bake only reports to it."""
 
     def __enter__(self) -> Self: ...
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...
 
     def stage(self, text: str) -> None:
-        """A new stage begins, such as "building 512 worlds"."""
+        """A new stage starts, such as "building 512 worlds"."""
         ...
 
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """How far it is. May be called at any rate. `seconds_left` is None while nothing can be said."""
+        """Report counts, at any rate. `seconds_left` is None while there is no estimate."""
         ...
 
     def note(self, text: str) -> None:
-        """Something worth a line of its own, such as a drawn-again arrangement."""
+        """Report an event in one line, such as a resampled arrangement."""
         ...
 
 
 class SilentProgress:
-    """Watches and says nothing: for tests and tools."""
+    """Observer that ignores all reports."""
 
     def __enter__(self) -> Self:
         return self

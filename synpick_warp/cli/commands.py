@@ -1,4 +1,4 @@
-"""The command line. Every user's mistake ends as one line on the standard error and exit code 2."""
+"""Command line interface: bake, verify, merge, preview, explain, doctor, config. User errors are one line on stderr and exit code 2."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ NAME = "synpick-warp"
 EXIT_INCOMPLETE = 1
 EXIT_MISTAKE = 2
 EXIT_INTERRUPTED = 130
-"""128 + SIGINT, as shells have it."""
+"""128 + SIGINT, the shell convention."""
 EXIT_PIPE = 141
-"""128 + SIGPIPE: whoever read the output has left."""
+"""128 + SIGPIPE: the reader of the output has closed it."""
 EXIT_SIGNAL = 128
-"""Added to a signal's number, as shells have it."""
-SHOWN = 10
-"""Most numbers that a message lists."""
+"""Added to a signal's number, the shell convention."""
+MAX_LISTED = 10
+"""Maximum number of indices that a message lists."""
 _SHARD = re.compile(r"(\d{1,9})/(\d{1,9})")
 _RESOLUTION = re.compile(r"(\d{1,9})[xX](\d{1,9})")
 
 app = App(
     name=NAME,
-    help="Bake data sets for dynamic bin picking: simulated totes, ray-cast RGB-D, exact 6D ground truth.",
+    help="Generate data sets for dynamic bin picking: simulated totes, rendered RGB-D, exact 6D ground truth.",
     version=__version__,
     result_action="return_value",
     suppress_keyboard_interrupt=False,
@@ -43,7 +43,7 @@ app = App(
 
 
 def _help(key: str, extra: str = "") -> str:
-    """Meaning, unit, range and default of a setting, from its declaration."""
+    """Help text of a setting from its declaration: meaning, range, default, unit and key."""
     section, name = key.split(".")
     item, kind = settings_of(sections()[section])[name]
     unit = f" {item.metadata['unit']}" if item.metadata["unit"] else ""
@@ -71,7 +71,7 @@ DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
 @app.command
 def bake(
     *,
-    out: Annotated[Path, Parameter(help="Folder of the data set: new, empty, or one that a bake with the same settings began.")],
+    out: Annotated[Path, Parameter(help="Output folder: new, empty, or of an interrupted bake with the same settings.")],
     config: ConfigOption = None,
     worlds: WorldsOption = None,
     episodes: Annotated[int | None, Parameter(help=_help("bake.episodes"))] = None,
@@ -83,13 +83,17 @@ def bake(
     resolution: ResolutionOption = None,
     writers: Annotated[int | None, Parameter(help=_help("bake.writers"))] = None,
     formats: Annotated[str | None, Parameter(help=_help("bake.formats", " Joined by commas."))] = None,
-    shard: Annotated[str | None, Parameter(help="i/n: only episodes whose number leaves i when divided by n; join with merge.")] = None,
+    shard: Annotated[
+        str | None, Parameter(help="i/n: only episodes with index % n == i, such as 0/4; combine the data sets with merge.")
+    ] = None,
     set_: SetOption = None,
 ) -> int:
-    """Simulate, render and write a data set. Stopped or killed, the same command goes on with the episodes that are left.
+    """Simulate, render and write a data set. After an interruption, the same command resumes with the remaining episodes.
 
-    Options win over the file, the file over the preset. Ctrl-C stops after the tick, twice at once. Exit code: 0, all episodes
-    were delivered; 1, some were given up; 2, a mistake in the options, in a file or in a folder; 130 and 143, interrupted.
+    Options override the file, the file overrides the preset. Ctrl-C stops after the current tick, a second Ctrl-C at once.
+
+    Exit codes: 0, all episodes were delivered; 1, some were given up; 2, an error in the options, a file or a folder; 130 and 143,
+    interrupted.
     """
     given = {
         "bake.worlds": worlds,
@@ -108,35 +112,40 @@ def bake(
 
 @app.command
 def verify(folder: Annotated[Path, Parameter(name="DIR", help="A data set.")], /) -> int:
-    """Check every file of a data set against the checksum noted when it was written. Exit code: 1, a file is wrong or missing, which is
-    named, or the bake did not come to its end."""
+    """Verify the SHA-256 checksum of every file of a data set.
+
+    Exit codes: 0, all match; 1, a file is damaged or missing (it is named), or the bake is not finished; 2, the folder is not a data set.
+    """
     from synpick_warp.dataset.verify import verify as check
 
     verdict = check(folder)
     if verdict.problem:
         print(verdict.problem)
         return EXIT_INCOMPLETE
-    print(f"{verdict.files:,} files of {verdict.episodes:,} episodes are as they were written")
+    print(f"{verdict.files:,} files of {verdict.episodes:,} episodes match their checksums")
     if not verdict.finished:
-        print("the data set is not finished: the bake that made it can go on")
+        print("the data set is not finished: the command that started it resumes it")
     return 0 if verdict.finished else EXIT_INCOMPLETE
 
 
 @app.command
 def merge(
-    *parts: Annotated[Path, Parameter(name="PARTS", help="Data sets made with --shard.")],
-    out: Annotated[Path, Parameter(help="Folder of the joined data set: new, or empty.")],
+    *parts: Annotated[Path, Parameter(name="PARTS", help="Data sets that were baked with --shard.")],
+    out: Annotated[Path, Parameter(help="Folder of the merged data set: new or empty.")],
 ) -> int:
-    """Join the parts of a data set; files are linked, not copied, where the file system can. Exit code: 1, some episodes are in no part."""
-    from synpick_warp.dataset.merge import merge as join
+    """Merge data sets of --shard into one; files are hard-linked where the file system allows, else copied.
+
+    Exit codes: 0, all episodes are there; 1, some are in no part; 2, the parts do not match.
+    """
+    from synpick_warp.dataset.merge import merge as merge_parts
 
     if not parts:
-        raise ConfigError("merge joins data sets, and none is named; name the folders that `bake --shard` made")
-    merged = join(parts, out)
+        raise ConfigError("merge needs data sets, and none is named; name the folders that `bake --shard` wrote")
+    merged = merge_parts(parts, out)
     print(f"data set: {out}, {merged.episodes:,} episodes")
     if merged.missing:
-        shown = ", ".join(map(str, merged.missing[:SHOWN])) + (", ..." if len(merged.missing) > SHOWN else "")
-        print(f"{len(merged.missing):,} are in no part: {shown}; `bake --out {out}` with the same settings makes them")
+        shown = ", ".join(map(str, merged.missing[:MAX_LISTED])) + (", ..." if len(merged.missing) > MAX_LISTED else "")
+        print(f"{len(merged.missing):,} are in no part: {shown}; `bake --out {out}` with the same settings generates them")
     return EXIT_INCOMPLETE if merged.missing else 0
 
 
@@ -146,9 +155,9 @@ def preview(
     /,
     *,
     out: Annotated[Path | None, Parameter(help="PNG file to write (default contact-sheet.png in the data set).")] = None,
-    views: Annotated[int, Parameter(help="Views to show, spread over the data set.")] = 8,
+    views: Annotated[int, Parameter(help="Number of views, spread over the data set.")] = 8,
 ) -> int:
-    """Draw a contact sheet of a data set: colour, depth, instances and boxes of sampled views."""
+    """Draw a contact sheet: colour, depth, instance masks, bounding boxes and layers of sampled views."""
     if views < 1:
         raise ConfigError(f"--views is {views}; allowed: at least 1")
     from synpick_warp.viz.preview import write_contact_sheet
@@ -161,21 +170,21 @@ def preview(
 
 @app.command
 def explain(
-    folder: Annotated[Path, Parameter(name="DIR", help="A data set in which something was picked.")],
+    folder: Annotated[Path, Parameter(name="DIR", help="A data set with pick attempts.")],
     /,
     *,
-    episode: Annotated[int, Parameter(help="Number of the episode.")],
-    attempt: Annotated[int | None, Parameter(help="Number of the attempt in the episode (default: all, below each other).")] = None,
+    episode: Annotated[int, Parameter(help="Index of the episode.")],
+    attempt: Annotated[int | None, Parameter(help="Index of the attempt in the episode (default: all).")] = None,
     out: Annotated[
         Path | None,
         Parameter(help="PNG or JPEG file to write (default explain-EPISODE.png or explain-EPISODE-ATTEMPT.png in the data set)."),
     ] = None,
 ) -> int:
-    """Draw attempts to pick: image with contours and suction points, clutter graph, what was chosen and why, the seal's load."""
+    """Draw pick attempts: image with contours and suction points, clutter graph, choice of the target with its reason, seal force."""
     from synpick_warp.viz.explain import write_explanation
 
-    number = "" if attempt is None else f"-{attempt:03d}"
-    picture = out or folder / f"explain-{episode:06d}{number}.png"
+    suffix = "" if attempt is None else f"-{attempt:03d}"
+    picture = out or folder / f"explain-{episode:06d}{suffix}.png"
     write_explanation(folder, picture, episode, attempt)
     print(f"explanation: {picture}")
     return 0
@@ -190,7 +199,7 @@ def doctor(
     device: DeviceOption = None,
     set_: SetOption = None,
 ) -> int:
-    """Show device, versions and kernel cache, and the memory that a bake's arrays would take."""
+    """Show device, versions, kernel cache, and the memory of a bake's device arrays."""
     resolved = _resolve(config, {"bake.worlds": worlds, "bake.device": device}, resolution, set_)
     from synpick_warp.cli.display import make_console
     from synpick_warp.cli.doctor import examine
@@ -201,7 +210,7 @@ def doctor(
 
 @app.command(name="config")
 def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
-    """Print all settings as TOML, with meaning, unit and range: a file to start your own from."""
+    """Print all settings as TOML with meaning, unit and range: a template for your own file."""
     print(config_to_toml(_resolve(config, {}, None, set_), comments=True), end="")
     return 0
 
@@ -210,7 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
 
     Args:
-        arguments: What follows the program's name; None: of this process.
+        arguments: Command line without the program's name; None: `sys.argv`.
     """
     try:
         result = app(sys.argv[1:] if arguments is None else list(arguments), exit_on_error=False, print_error=False)
@@ -228,10 +237,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def parse_resolution(text: str) -> list[int]:
-    """Width and height [px] from "640x360".
+    """Parse "640x360" into width and height [px].
 
     Raises:
-        ConfigError: The text is something else.
+        ConfigError: The text has another form.
     """
     match = _RESOLUTION.fullmatch(text)
     if match is None:
@@ -240,10 +249,10 @@ def parse_resolution(text: str) -> list[int]:
 
 
 def parse_shard(text: str, episodes: int) -> tuple[int, int]:
-    """Share and number of shares from "0/4".
+    """Parse "0/4" into shard index and number of shards.
 
     Raises:
-        ConfigError: The text is something else, or the share would have no episode.
+        ConfigError: The text has another form, or the shard would have no episode.
     """
     match = _SHARD.fullmatch(text)
     if match is None or not int(match[1]) < int(match[2]):
@@ -254,7 +263,7 @@ def parse_shard(text: str, episodes: int) -> tuple[int, int]:
 
 
 def _resolve(config: str | None, given: dict[str, object], resolution: str | None, assignments: list[str] | None) -> Config:
-    """Settings from file and options. Options of their own win over --set."""
+    """Resolve settings from file and options; named options override --set."""
     overrides = dict(parse_assignment(text) for text in assignments or [])
     overrides |= {key: value for key, value in given.items() if value is not None}
     if resolution is not None:
@@ -263,7 +272,7 @@ def _resolve(config: str | None, given: dict[str, object], resolution: str | Non
 
 
 def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:
-    """Check everything that can be checked cheaply, then bake."""
+    """Check device and folders, which is cheap, then bake."""
     from synpick_warp.cli.display import make_console, make_progress, print_summary
     from synpick_warp.device import pick_device
     from synpick_warp.exporters.writing.files import check_output_folder
@@ -282,8 +291,8 @@ def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:
         summary = run_bake(config, out, progress, shard)
     print_summary(console, summary, out)
     if summary.stopped:
-        left = f"{len(summary.episodes)} of {summary.total} episodes are whole"
-        print(f"{NAME}: interrupted: {left}; the same command goes on with the others", file=sys.stderr)
+        done = f"{len(summary.episodes)} of {summary.total} episodes are complete"
+        print(f"{NAME}: interrupted: {done}; the same command resumes with the others", file=sys.stderr)
         return EXIT_SIGNAL + summary.stopped
     delivered = sum(1 for row in summary.episodes if row[2].delivers)
     return 0 if delivered == summary.total else EXIT_INCOMPLETE

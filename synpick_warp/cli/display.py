@@ -1,4 +1,4 @@
-"""Shows a bake to people: live on a terminal, in plain lines elsewhere; and what became of it at the end."""
+"""Progress display and final summary of a bake: a live line on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -21,26 +21,26 @@ if TYPE_CHECKING:
     from synpick_warp.episodes import BakeSummary, EpisodeRow
 
 PLAIN_WIDTH = 120
-"""Width of tables where there is no terminal [characters]."""
+"""Width of tables without a terminal [characters]."""
 PLAIN_INTERVAL = 10.0
-"""Least time between two plain lines of the same stage [s]."""
-LISTED = 20
-"""Episodes are listed one by one up to this number; of more, only those that failed."""
+"""Minimum time between two plain progress lines [s]."""
+MAX_ROWS = 20
+"""Maximum number of episodes in the table; with more, only failed ones are listed."""
 
 
 def make_console() -> Console:
-    """The standard output, as wide as the terminal."""
+    """Console on the standard output, as wide as the terminal."""
     console = Console(highlight=False)
     return console if console.is_terminal else Console(highlight=False, width=PLAIN_WIDTH)
 
 
 def make_progress(console: Console) -> Progress:
-    """A live display on a terminal, plain lines elsewhere."""
+    """Choose the display: live on a terminal, plain lines elsewhere."""
     return LiveProgress(console) if console.is_terminal else PlainProgress(console)
 
 
 class LiveProgress:
-    """One line that redraws itself: stage, bar of episodes, worlds, views, rate, time left."""
+    """Live progress bar: stage, episodes, worlds, views, rate, remaining time."""
 
     def __init__(self, console: Console) -> None:
         stage, detail = TextColumn("{task.description}", markup=False), TextColumn("{task.fields[detail]}", markup=False)
@@ -56,13 +56,13 @@ class LiveProgress:
         self._bar.stop()
 
     def stage(self, text: str) -> None:
-        """Name the stage."""
+        """Show the stage's name."""
         self._bar.update(self._task, description=text, detail="")
 
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Move the bar."""
+        """Update the bar."""
         detail = _detail(worlds_active, views, views_per_s, seconds_left)
         self._bar.update(self._task, completed=episodes_done, total=episodes, detail=detail)
 
@@ -72,7 +72,7 @@ class LiveProgress:
 
 
 class PlainProgress:
-    """A line for every stage and note, and now and then one for how far it is."""
+    """Plain progress lines: one per stage and note, and a rate-limited one for counts."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -92,29 +92,29 @@ class PlainProgress:
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
-        """Print how far it is, unless a line was printed a short while ago."""
+        """Print counts, at most every `PLAIN_INTERVAL`."""
         now = time.monotonic()
         if now - self._printed_at >= PLAIN_INTERVAL:
             self._printed_at = now
             self.note(f"episodes {episodes_done}/{episodes} · {_detail(worlds_active, views, views_per_s, seconds_left)}")
 
     def note(self, text: str) -> None:
-        """Print a line, after the time since the start."""
+        """Print a line with the time since the start."""
         self._console.print(f"{_duration(time.monotonic() - self._started):>7}  {text}", markup=False, soft_wrap=True)
         self._console.file.flush()
 
 
 def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
-    """Print what became of every episode, and the totals. Of many episodes, only those are listed that delivered nothing."""
-    many = len(summary.episodes) > LISTED
+    """Print endings of the episodes, totals, and advice. Of more than `MAX_ROWS` episodes, only failed ones are listed."""
+    many = len(summary.episodes) > MAX_ROWS
     if many:
         console.print(_counts(summary))
     failed = [row for row in summary.episodes if not row.ending.delivers]
     rows = failed if many else summary.episodes
     if rows:
-        console.print(_listing(rows[:LISTED]))
-    if len(rows) > LISTED:
-        console.print(f"and {len(rows) - LISTED} more that delivered nothing", markup=False)
+        console.print(_listing(rows[:MAX_ROWS]))
+    if len(rows) > MAX_ROWS:
+        console.print(f"and {len(rows) - MAX_ROWS} more that delivered nothing", markup=False)
     rate = summary.views / summary.wall_seconds if summary.wall_seconds > 0.0 else 0.0
     before = f" ({summary.resumed:,} of them before)" if summary.resumed else ""
     console.print(
@@ -131,6 +131,7 @@ def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
 
 
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
+    """Table with one line per episode."""
     columns = ["episode", "mode", "ending", "redraws", "frames", "time"]
     cells = [[str(row.episode), row.mode, row.ending.sentence, str(row.redraw), str(row.frames), _duration(row.seconds)] for row in rows]
     if any(row.attempts for row in rows):
@@ -146,6 +147,7 @@ def _listing(rows: Sequence[EpisodeRow]) -> Table:
 
 
 def _counts(summary: BakeSummary) -> Table:
+    """Table of episodes and frames by mode and ending."""
     table = Table("mode", "ending", "episodes", "frames")
     table.columns[2].justify = table.columns[3].justify = "right"
     episodes: Counter = Counter()
@@ -161,13 +163,13 @@ def _counts(summary: BakeSummary) -> Table:
 
 
 def _attempts(summary: BakeSummary) -> str:
-    """How attempts ended, the most frequent outcome first, and how many objects they took away."""
+    """Counts of attempts by outcome, the most frequent first, and of picked and lost objects."""
     total = summary.outcomes.total()
-    shares = [f"{_words(outcome)} {count:,} ({count / total:.0%})" for outcome, count in summary.outcomes.most_common()]
+    fractions = [f"{_words(outcome)} {count:,} ({count / total:.0%})" for outcome, count in summary.outcomes.most_common()]
     picked, objects, lost = (
         sum(getattr(row, name) for row in summary.episodes if row.mode != "move") for name in ("picked", "objects", "lost")
     )
-    return f"{total:,} attempts: {', '.join(shares)}; {picked:,} of {objects:,} objects picked, {lost:,} lost otherwise"
+    return f"{total:,} attempts: {', '.join(fractions)}; {picked:,} of {objects:,} objects picked, {lost:,} lost otherwise"
 
 
 def _words(code: Ending | Outcome) -> str:
@@ -176,12 +178,13 @@ def _words(code: Ending | Outcome) -> str:
 
 
 def _detail(worlds_active: int, views: int, views_per_s: float, seconds_left: float | None) -> str:
+    """Worlds, views, rate and remaining time in one line."""
     left = "" if seconds_left is None else f" · {_duration(seconds_left)} left"
     return f"worlds {worlds_active} · views {views:,} · {views_per_s:.1f} views/s{left}"
 
 
 def _duration(seconds: float) -> str:
-    """Such as 0:07 or 1:02:03."""
+    """Format a duration as 0:07 or 1:02:03."""
     whole = round(seconds)
     minutes = f"{whole // 60 % 60:02}" if whole >= 3600 else str(whole // 60)
     return f"{whole // 3600}:{minutes}:{whole % 60:02}" if whole >= 3600 else f"{minutes}:{whole % 60:02}"

@@ -1,4 +1,4 @@
-"""Says what this machine has and what a bake would take of it."""
+"""Machine report: versions, CPU, device and kernel cache, and the memory of a bake's device arrays."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def examine(config: Config, console: Console) -> None:
     """Print device, versions, caches and the memory of every array of a bake with these settings.
 
     Raises:
-        DeviceError: The device that the settings name is not there.
+        DeviceError: The configured device does not exist.
     """
     device = pick_device(config.bake.device)
     table = Table(show_header=False, box=None)
@@ -36,12 +36,12 @@ def examine(config: Config, console: Console) -> None:
 
 
 def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
-    """Rows (name, value): versions, processor, memory and device, as measurements should name them."""
+    """Rows (name, value) of versions, CPU, memory and device, to be quoted with measurements."""
     return [*_software(), *_host(), *_device(device)]
 
 
 def memory_report(config: Config) -> Table:
-    """Shape, unit and size of every declared array of a bake with these settings, and their sum."""
+    """Table of shape, unit and size of every declared device array of a bake with these settings, and their sum."""
     from synpick_warp.pipeline import describe_arrays
     from synpick_warp.stages.sim.physics import with_enough_worlds
 
@@ -64,7 +64,7 @@ def _software() -> list[tuple[str, str]]:
 
 def _host() -> list[tuple[str, str]]:
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    rows = [("processor cores", f"{usable} usable of {os.cpu_count()}")]
+    rows = [("CPU cores", f"{usable} usable of {os.cpu_count()}")]
     if hasattr(os, "sysconf"):
         rows.append(("memory", f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / GIB:.1f} GiB"))
     return rows

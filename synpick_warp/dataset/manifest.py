@@ -1,12 +1,12 @@
-"""What a data set says of its own making: seed, versions, settings, and a record with checksums of everything that is whole.
+"""Manifest of a data set: seed, versions and settings, and one entry with checksums per committed episode.
 
-    manifest.json           seed, versions, the settings that what is written depends on; the first file of a data set
-    manifest/constants.*    models, assets: what the data set says once
+    manifest.json           seed, versions, the settings that determine the output; the first file of a data set
+    manifest/constants.*    constants: models, USD assets
     manifest/000012.*       episode 12: how it ended, its attempts
-    manifest/joined.*       lists that span episodes; the last files of a data set
+    manifest/joined.*       indices: lists over all episodes; the last files of a data set
 
-A record is two files: `NAME.sha256` has the files' checksums, as `sha256sum -c` reads them in the data set's folder; `NAME.json` is
-written after it, and what has one is whole. Nothing here depends on the machine, the time, or the number of worlds and writers.
+An entry is two files: `NAME.sha256` lists the checksums of its files, as `sha256sum -c` reads them in the data set's folder; `NAME.json`
+is written after it and commits them. Nothing here depends on the machine, the time, or the number of worlds and writers.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import MANIFEST_FILE
 
-RECORDS = Path("manifest")
-"""Folder of the records, in the data set."""
-CONSTANTS, JOINED = RECORDS / "constants", RECORDS / "joined"
+ENTRIES = Path("manifest")
+"""Folder of the entries, in the data set."""
+CONSTANTS, INDICES = ENTRIES / "constants", ENTRIES / "joined"
 CONFIG_FILE = "config.toml"
-"""The resolved settings, in the data set; those of the last bake that went on with it."""
+"""Resolved settings of the last bake that wrote to the data set."""
 EPISODES_FILE = "episodes.jsonl"
-"""How every episode ended, in the data set."""
+"""List of episodes and how they ended."""
 ATTEMPTS_FILE = "attempts.jsonl"
-"""List of all attempts to pick, ordered by episode and index; absent from bakes without picking."""
+"""List of all pick attempts, ordered by episode and index; absent from bakes without picking."""
 INPUTS = "inputs"
-"""Key in the manifest: checksums of what is in the objects and in the lights."""
+"""Key in the manifest: content digests of objects and lights."""
 FORMAT = 1
-"""Of these files."""
-FREE = (
+"""Version of the manifest's file format."""
+FREE_SETTINGS = (
     "bake.worlds",
     "bake.episodes",
     "bake.device",
@@ -47,15 +47,15 @@ FREE = (
     "render.views_per_batch",
     "sight.views",
 )
-"""Settings in which a bake may differ from the one that it goes on with: no episode depends on them. Objects and lights are compared by
-what is in them, not by the name of their folder. A device of another kind computes the same episodes to its own last bits."""
+"""Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
+of their folder. A device of another type computes the same episodes up to rounding."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
-"""Whose versions files depend on."""
+"""Packages whose versions the output depends on."""
 
 
 def make_manifest(config: Config) -> dict[str, Any]:
-    """The content of a data set's manifest, as JSON has it."""
-    settings = binding_settings(config)
+    """Build the manifest of a data set with these settings, in types of JSON."""
+    settings = fixed_settings(config)
     content = {
         "format": FORMAT,
         "seed": config.bake.seed,
@@ -66,10 +66,10 @@ def make_manifest(config: Config) -> dict[str, Any]:
     return json.loads(json.dumps(content))
 
 
-def binding_settings(config: Config) -> dict[str, Any]:
-    """All settings but FREE, nested as in the file; formats in the order of their names."""
+def fixed_settings(config: Config) -> dict[str, Any]:
+    """Settings that determine the output: all but FREE_SETTINGS, nested as in the file; formats sorted by name."""
     settings = dataclasses.asdict(config)
-    for key in FREE:
+    for key in FREE_SETTINGS:
         section, name = key.split(".")
         del settings[section][name]
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
@@ -88,12 +88,12 @@ def _digest(content: object) -> str:
 
 
 def encode_manifest(content: Mapping[str, Any]) -> bytes:
-    """As it is written."""
+    """Serialize a manifest."""
     return (json.dumps(content, indent=2) + "\n").encode()
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """A data set's manifest.
+    """Read a data set's manifest.
 
     Raises:
         DatasetError: There is none, or it is damaged.
@@ -104,15 +104,15 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if content.get("format") != FORMAT:
         raise DatasetError(f"{folder / MANIFEST_FILE} has the format {content.get('format')}; this version reads {FORMAT}")
     if content.get("settings_checksum") != _digest(content.get("settings")):
-        raise DatasetError(f"the settings in {folder / MANIFEST_FILE} do not fit their checksum; it has been changed by hand")
+        raise DatasetError(f"the settings in {folder / MANIFEST_FILE} do not match their checksum; it has been changed by hand")
     return content
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """An object from a file of ours; None: no such file.
+    """Read a JSON object from a file that a bake wrote; None: no such file.
 
     Raises:
-        DatasetError: The file cannot be read, or is none of ours.
+        DatasetError: The file cannot be read, or is damaged.
     """
     try:
         content = json.loads(path.read_bytes())
@@ -123,12 +123,12 @@ def read_json(path: Path) -> dict[str, Any] | None:
     except ValueError as error:
         raise DatasetError(f"{path} is damaged: {error}") from None
     if not isinstance(content, dict):
-        raise DatasetError(f"{path} is damaged: it has no object")
+        raise DatasetError(f"{path} is damaged: it is not a JSON object")
     return content
 
 
 def differences(here: Mapping[str, Any], there: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Keys in which two manifests differ, as (key, value here, value there); None: no such key."""
+    """Compare two manifests: (key, value here, value there) of each difference; None: no such key."""
     for name in [*here, *(name for name in there if name not in here)]:
         first, second = here.get(name), there.get(name)
         if isinstance(first, Mapping) and isinstance(second, Mapping):
@@ -138,7 +138,7 @@ def differences(here: Mapping[str, Any], there: Mapping[str, Any], path: str = "
 
 
 def describe_differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> str:
-    """Keys in which two manifests differ, with both values, as people know them: "physics.step is 0.004, there 0.002"."""
+    """Describe the differences of two manifests in a sentence: "physics.step is 0.004, there 0.002"."""
     parts = []
     for key, first, second in differences(here, there):
         if key not in ("settings_checksum", "seed"):
@@ -146,46 +146,46 @@ def describe_differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> s
     return "; ".join(parts)
 
 
-def episode_place(episode: int) -> Path:
-    """Where the record of an episode is, relative to the data set, without suffix."""
-    return RECORDS / f"{episode:06d}"
+def episode_entry(episode: int) -> Path:
+    """Path of an episode's manifest entry, relative to the data set, without suffix."""
+    return ENTRIES / f"{episode:06d}"
 
 
-def recorded_episodes(folder: Path) -> list[int]:
-    """Numbers of the episodes that have a record, in order."""
-    place = folder / RECORDS
-    names = (path.stem for path in place.iterdir() if path.suffix == ".json") if place.is_dir() else ()
+def committed_episodes(folder: Path) -> list[int]:
+    """Indices of the episodes that have a manifest entry, sorted."""
+    entries = folder / ENTRIES
+    names = (path.stem for path in entries.iterdir() if path.suffix == ".json") if entries.is_dir() else ()
     return sorted(int(name) for name in names if name.isdecimal())
 
 
-def read_record(folder: Path, place: Path) -> dict[str, Any] | None:
-    """The record at a place; None: there is none."""
-    return read_json(folder / f"{place}.json")
+def read_entry(folder: Path, entry: Path) -> dict[str, Any] | None:
+    """Read a manifest entry; None: there is none."""
+    return read_json(folder / f"{entry}.json")
 
 
-def read_checksums(folder: Path, place: Path) -> dict[str, str]:
-    """Path -> checksum of a record's files.
+def read_checksums(folder: Path, entry: Path) -> dict[str, str]:
+    """Read the checksums of an entry's files: path relative to the data set -> SHA-256.
 
     Raises:
-        DatasetError: The list is missing, or does not fit its record.
+        DatasetError: The list is missing, or does not match its entry.
     """
-    path, record = folder / f"{place}.sha256", read_record(folder, place)
+    path, content = folder / f"{entry}.sha256", read_entry(folder, entry)
     try:
         lines = path.read_bytes()
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    if record is None or hashlib.sha256(lines).hexdigest() != record.get("checksum"):
-        raise DatasetError(f"{path} does not fit {path.with_suffix('.json')}")
+    if content is None or hashlib.sha256(lines).hexdigest() != content.get("checksum"):
+        raise DatasetError(f"{path} does not match {path.with_suffix('.json')}")
     pairs = (line.split("  ", 1) for line in lines.decode().splitlines())
     return {name: digest for digest, name in pairs}
 
 
-def seems_whole(folder: Path, place: Path) -> bool:
-    """Whether a record and its files are there, by size; content is for `verify` to check."""
-    record = read_record(folder, place)
-    if record is None:
+def is_complete(folder: Path, entry: Path) -> bool:
+    """Whether an entry and all of its files exist, compared by total size; `verify` checks content."""
+    content = read_entry(folder, entry)
+    if content is None:
         return False
     try:
-        return sum((folder / name).stat().st_size for name in read_checksums(folder, place)) == record.get("bytes")
+        return sum((folder / name).stat().st_size for name in read_checksums(folder, entry)) == content.get("bytes")
     except (FileNotFoundError, NotADirectoryError, DatasetError):
         return False

@@ -16,7 +16,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from synpick_warp.dataset.manifest import CONFIG_FILE, MANIFEST_FILE, RECORDS, episode_place, read_record
+from synpick_warp.dataset.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry, read_entry
 from synpick_warp.dataset.trajectory import (
     GROUP_FILE,
     Arrays,
@@ -60,7 +60,7 @@ class Episode:
 
     @cached_property
     def _record(self) -> dict[str, Any] | None:
-        return read_record(self._data_set.folder, episode_place(self.index))
+        return read_entry(self._data_set.folder, episode_entry(self.index))
 
     @cached_property
     def row(self) -> dict[str, Any]:
@@ -278,7 +278,7 @@ class DataSet(Mapping[int, Episode]):
 
     def _is_committed(self, index: int) -> bool:
         """Whether an episode has its manifest entry; a data set without manifest, such as a lone store, has none to check."""
-        return not (self.folder / RECORDS).is_dir() or (self.folder / f"{episode_place(index)}.json").is_file()
+        return not (self.folder / ENTRIES).is_dir() or (self.folder / f"{episode_entry(index)}.json").is_file()
 
     def __getitem__(self, index: int) -> Episode:
         if not (self._is_committed(index) and self._has_files(index)):

@@ -1,4 +1,4 @@
-"""Checks a data set against its own checksums, and says what is the first that does not fit."""
+"""Checksum verification of a data set: every file against the SHA-256 in its manifest entry, up to the first mismatch."""
 
 from __future__ import annotations
 
@@ -13,78 +13,78 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.manifest import (
     CONFIG_FILE,
     CONSTANTS,
-    JOINED,
+    INDICES,
+    committed_episodes,
     describe_differences,
-    episode_place,
+    episode_entry,
     make_manifest,
     read_checksums,
+    read_entry,
     read_manifest,
-    read_record,
-    recorded_episodes,
 )
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.checksums import checksum
 
 _AHEAD = 4
-"""Files that wait for each thread: enough to keep it busy."""
+"""Queued files per thread: enough to keep it busy."""
 
 
 class Verdict(NamedTuple):
-    """What came of the check of a data set."""
+    """Result of a verification."""
 
     problem: str
-    """The first file that is missing or wrong, and how; empty: none."""
+    """First file that is missing or damaged, and how; empty: none."""
     episodes: int
-    """Whole ones."""
+    """Number of committed episodes."""
     files: int
-    """That were checked."""
+    """Number of files that were checked."""
     finished: bool
-    """Whether the bake came to its end."""
+    """Whether the bake finished."""
 
 
 def verify(folder: Path) -> Verdict:
-    """Compare every file of a data set with the checksum that was noted when it was written; stops at the first that differs.
+    """Compare every file of a data set with its checksum from the time of writing; stops at the first mismatch.
 
-    In this order: settings, constants, episodes by number, lists.
+    Order: settings, constants, episodes by index, indices.
 
     Raises:
-        DatasetError: The folder is no data set.
+        DatasetError: The folder is not a data set.
     """
     manifest = read_manifest(folder)
-    episodes = recorded_episodes(folder)
-    joined = read_record(folder, JOINED)
-    finished = joined is not None and joined.get("episodes") == episodes
-    places = [CONSTANTS, *map(episode_place, episodes), *([JOINED] if joined else [])]
+    episodes = committed_episodes(folder)
+    indices = read_entry(folder, INDICES)
+    finished = indices is not None and indices.get("episodes") == episodes
+    entries = [CONSTANTS, *map(episode_entry, episodes), *([INDICES] if indices else [])]
     files = 0
     if problem := _check_settings(folder, manifest):
         return Verdict(problem, len(episodes), files, finished)
-    for place in places if episodes or joined else []:
+    for entry in entries if episodes or indices else []:
         try:
-            known = read_checksums(folder, place)
+            known = read_checksums(folder, entry)
         except DatasetError as error:
             return Verdict(str(error), len(episodes), files, finished)
         for name, problem in _check_files(folder, known):
             files += 1
             if problem:
                 return Verdict(f"{folder / name} {problem}", len(episodes), files, finished)
-    missing = sorted(set(joined["episodes"]) - set(episodes)) if joined else []
-    problem = f"{folder / episode_place(missing[0])}.json is missing" if missing else ""
+    missing = sorted(set(indices["episodes"]) - set(episodes)) if indices else []
+    problem = f"{folder / episode_entry(missing[0])}.json is missing" if missing else ""
     return Verdict(problem, len(episodes), files, finished)
 
 
 def _check_settings(folder: Path, manifest: dict) -> str:
-    """Whether the settings are those of the manifest; returns the problem."""
+    """Compare config.toml with the manifest; returns the problem, or an empty string."""
     path = folder / CONFIG_FILE
     try:
         config = load_config(str(path), {})
     except ConfigError as error:
         return str(error)
     said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": manifest["settings"]})
-    return f"{path} is not as the manifest: {said}" if said else ""
+    return f"{path} does not match the manifest: {said}" if said else ""
 
 
 def _check_files(folder: Path, known: dict[str, str]) -> Iterator[tuple[str, str]]:
-    """(name, problem) of each file, in order; several are read at a time, but never many ahead."""
+    """Yield (name, problem) of each file, in order; files are read in parallel, with bounded read-ahead."""
     threads = len(os.sched_getaffinity(0))
     with ThreadPoolExecutor(threads) as pool:
         names = iter(known)
@@ -93,8 +93,9 @@ def _check_files(folder: Path, known: dict[str, str]) -> Iterator[tuple[str, str
 
 
 def _check_file(path: Path, expected: str) -> str:
+    """Compare a file's checksum; returns the problem, or an empty string."""
     try:
-        return "" if checksum(path) == expected else "has another checksum than when it was written"
+        return "" if checksum(path) == expected else "has changed since it was written: its checksum differs"
     except FileNotFoundError:
         return "is missing"
     except OSError as error:

@@ -1,4 +1,8 @@
-"""The folder of a data set while a bake writes to it: locked, compared with the settings, cleaned of what is not whole, completed."""
+"""Output folder of a bake: lock, resume check, atomic commit of episodes, removal of partial files, indices over all episodes.
+
+An episode is committed when its manifest entry is written, after its files have been renamed into place; anything without entry is partial,
+and is removed when the bake is resumed.
+"""
 
 from __future__ import annotations
 
@@ -20,20 +24,20 @@ from synpick_warp.dataset.manifest import (
     ATTEMPTS_FILE,
     CONFIG_FILE,
     CONSTANTS,
+    ENTRIES,
     EPISODES_FILE,
+    INDICES,
     INPUTS,
-    JOINED,
     MANIFEST_FILE,
-    RECORDS,
+    committed_episodes,
     describe_differences,
     encode_manifest,
-    episode_place,
+    episode_entry,
+    is_complete,
     make_manifest,
     read_checksums,
+    read_entry,
     read_manifest,
-    read_record,
-    recorded_episodes,
-    seems_whole,
 )
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 from synpick_warp.exporters.base import Exporter
@@ -44,42 +48,42 @@ from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 
 LOCK_TIMEOUT = 20.0
-"""How long writers of a killed bake may take to end [s]."""
+"""Longest wait for the writer processes of a killed bake to exit [s]."""
 _LOCK_INTERVAL = 0.1
-"""Between two looks whether they have [s]."""
-_ADVICE = "go on with the same, or name another folder with --out"
+"""Time between two attempts to lock [s]."""
+_ADVICE = "resume with the same, or name another folder with --out"
 
 
-class Output:
-    """The folder of a data set. Use it as a context manager: it holds the folder's lock.
+class OutputFolder:
+    """Folder of a data set during a bake; a context manager that holds the folder's advisory lock (flock).
 
-    The lock belongs to the open handle, so writer processes that inherit it hold it too: as long as one of a killed bake
-    still writes, nobody else begins.
+    The lock belongs to the open file description, so writer processes that inherit the handle hold it, too: no bake starts while a
+    writer of a killed bake is still running.
     """
 
     def __init__(self, out: Path, config: Config, episodes: Sequence[int]) -> None:
-        """Make or lock the folder, and compare what it says with the settings.
+        """Create and lock the folder, and compare its manifest with the settings.
 
         Args:
             out: Folder of the data set: new, empty, or of a bake with the same settings.
             config: All settings.
-            episodes: Numbers of the episodes that are to be there in the end, in order.
+            episodes: Indices of the episodes that the bake must deliver, sorted.
 
         Raises:
-            ConfigError: The folder was begun with other settings.
+            ConfigError: The folder was started with other settings.
             OutputError: The folder cannot be used, or another bake uses it.
         """
         self.out, self.config, self.episodes = out, config, list(episodes)
         self._manifest = make_manifest(config)
         check_output_folder(out)
-        self._made = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
+        self._created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
         try:
             out.mkdir(parents=True, exist_ok=True)
             self.lock = lock_folder(out)
         except OSError as error:
             raise output_error(out, error) from error
         try:
-            self._look()
+            self._scan()
         except OSError as error:
             os.close(self.lock)
             raise output_error(out, error) from error
@@ -87,63 +91,62 @@ class Output:
             os.close(self.lock)
             raise
 
-    def __enter__(self) -> Output:
+    def __enter__(self) -> OutputFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
         os.close(self.lock)
 
-    def _look(self) -> None:
-        """Compare settings, and find out which episodes are whole."""
+    def _scan(self) -> None:
+        """Compare settings, and sort episodes into committed, remaining and partial ones."""
         out, episodes = self.out, self.config.bake.episodes
         self._known = read_manifest(out) if (out / MANIFEST_FILE).exists() else None
         if self._known:
             said = describe_differences(self._manifest, {name: self._known[name] for name in self._known if name != INPUTS})
             if said:
-                raise ConfigError(f"{out} was begun with other settings: {said}; {_ADVICE}")
-        recorded = recorded_episodes(out)
-        if recorded and recorded[-1] >= episodes:
-            raise ConfigError(f"bake.episodes is {episodes}, but {out} has episode {recorded[-1]}; a data set can only grow")
-        whole = {number for number in recorded if seems_whole(self.out, episode_place(number))}
-        self.before = sorted(whole.intersection(self.episodes))
-        self.left = sorted(set(self.episodes) - whole)
-        self._strays = sorted(set(range(max(episodes, _episodes_of(out)))) - whole) if self._known else []
+                raise ConfigError(f"{out} was started with other settings: {said}; {_ADVICE}")
+        entries = committed_episodes(out)
+        if entries and entries[-1] >= episodes:
+            raise ConfigError(f"bake.episodes is {episodes}, but {out} has episode {entries[-1]}; a data set can only grow")
+        complete = {index for index in entries if is_complete(self.out, episode_entry(index))}
+        self.committed = sorted(complete.intersection(self.episodes))
+        self.remaining = sorted(set(self.episodes) - complete)
+        self._partial = sorted(set(range(max(episodes, _planned_episodes(out)))) - complete) if self._known else []
 
     def is_finished(self) -> bool:
-        """Whether nothing is left to do."""
-        lists = read_record(self.out, JOINED) or {}
-        return not self.left and lists.get("episodes") == recorded_episodes(self.out) and seems_whole(self.out, JOINED)
+        """Whether all episodes are committed and the indices cover them."""
+        indices = read_entry(self.out, INDICES) or {}
+        return not self.remaining and indices.get("episodes") == committed_episodes(self.out) and is_complete(self.out, INDICES)
 
-    def begin(self, exporters: Exporters, inputs: dict[str, str], pool: WriterPool) -> None:
-        """Make the folder ready for the episodes that are left.
+    def prepare(self, exporters: Exporters, inputs: dict[str, str], pool: WriterPool) -> None:
+        """Prepare the folder for the remaining episodes: manifest, settings, constants; remove partial episodes and stale indices.
 
         Args:
-            exporters: What will be written.
-            inputs: Checksums of objects and lights.
-            pool: Writers.
+            exporters: All exporters of the bake.
+            inputs: Content digests of objects and lights.
+            pool: Writer processes.
 
         Raises:
-            ConfigError: The data set was made of other objects or lights.
+            ConfigError: The data set was started with other objects or lights.
             OutputError: The folder cannot be written.
         """
         differing = [name for name in inputs if self._known and self._known.get(INPUTS, {}).get(name) != inputs[name]]
         if differing:
-            raise ConfigError(f"{self.out} was begun with other {' and '.join(differing)}; {_ADVICE}")
+            raise ConfigError(f"{self.out} was started with other {' and '.join(differing)}; {_ADVICE}")
         try:
             shutil.rmtree(self.out / PARTIAL, ignore_errors=True)
             if not self._known:
                 write_atomically(self.out / MANIFEST_FILE, encode_manifest({**self._manifest, INPUTS: inputs}))
-            (self.out / RECORDS).mkdir(exist_ok=True)
-            # Lists that will not be true any longer, and episodes that are not whole.
-            self._remove_files(JOINED)
-            for episode in self._strays:
-                self._remove_record(episode_place(episode))
+            (self.out / ENTRIES).mkdir(exist_ok=True)
+            self._remove_files(INDICES)
+            for episode in self._partial:
+                self._remove_entry(episode_entry(episode))
                 for path in exporters.files(episode):
                     _remove(self.out / path)
             write_atomically(self.out / CONFIG_FILE, config_to_toml(self.config).encode())
             (self.out / PARTIAL).mkdir()
-            if not seems_whole(self.out, CONSTANTS):
-                self._remove_record(CONSTANTS)
+            if not is_complete(self.out, CONSTANTS):
+                self._remove_entry(CONSTANTS)
                 paths = self._write_constants(exporters)
                 pool.submit(write_manifest_entry, (), (self.out, CONSTANTS, paths, {}), path=self.out / CONSTANTS)
                 pool.wait()
@@ -151,6 +154,7 @@ class Output:
             raise output_error(self.out, error) from error
 
     def _write_constants(self, exporters: Exporters) -> list[Path]:
+        """Have constants written; an error removes what was added."""
         before = set(os.listdir(self.out))
         try:
             return exporters.write_constants()
@@ -160,39 +164,39 @@ class Output:
                     _remove(self.out / name)
             raise
 
-    def _remove_files(self, place: Path) -> None:
-        """Remove a record and its files."""
+    def _remove_files(self, entry: Path) -> None:
+        """Remove a manifest entry and its files."""
         with contextlib.suppress(DatasetError):
-            for name in read_checksums(self.out, place) if read_record(self.out, place) else ():
+            for name in read_checksums(self.out, entry) if read_entry(self.out, entry) else ():
                 _remove(self.out / name)
-        self._remove_record(place)
+        self._remove_entry(entry)
 
-    def _remove_record(self, place: Path) -> None:
+    def _remove_entry(self, entry: Path) -> None:
         for suffix in (".json", ".sha256"):
-            (self.out / f"{place}{suffix}").unlink(missing_ok=True)
+            (self.out / f"{entry}{suffix}").unlink(missing_ok=True)
 
-    def record(self, exporters: Exporters, pool: WriterPool, end: EpisodeEnd) -> None:
-        """All files of an episode are in their place: have their checksums noted, by which it is whole."""
+    def commit(self, exporters: Exporters, pool: WriterPool, end: EpisodeEnd) -> None:
+        """Commit an episode whose files are all in place: a writer computes their checksums and writes the manifest entry."""
         content = {"episode": end.episode, "row": dict(end.row), "attempts": [json.loads(line) for line in end.attempts]}
-        place = episode_place(end.episode)
-        pool.submit(write_manifest_entry, (), (self.out, place, exporters.files(end.episode), content), path=self.out / place)
+        entry = episode_entry(end.episode)
+        pool.submit(write_manifest_entry, (), (self.out, entry, exporters.files(end.episode), content), path=self.out / entry)
 
-    def close(self) -> None:
-        """Remove what is not whole, after success or after an error. Of a data set without a whole episode nothing stays."""
+    def clean_up(self) -> None:
+        """Remove partial files, after success or an error; a data set without committed episodes is removed entirely."""
         shutil.rmtree(self.out / PARTIAL, ignore_errors=True)
         with contextlib.suppress(OSError, DatasetError):
-            if not recorded_episodes(self.out):
+            if not committed_episodes(self.out):
                 self._remove_files(CONSTANTS)
-                shutil.rmtree(self.out / RECORDS, ignore_errors=True)
+                shutil.rmtree(self.out / ENTRIES, ignore_errors=True)
                 for name in (CONFIG_FILE, MANIFEST_FILE):
                     (self.out / name).unlink(missing_ok=True)
                 _remove_empty_folders(self.out)
-                for folder in self._made:
+                for folder in self._created:
                     folder.rmdir()
 
 
-def complete(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:
-    """Write the lists that span episodes, from the records and from what is there.
+def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:
+    """Build the indices over all committed episodes, and commit them.
 
     Raises:
         OutputError: They cannot be written.
@@ -200,21 +204,21 @@ def complete(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: W
     try:
         shutil.rmtree(out / PARTIAL, ignore_errors=True)
         (out / PARTIAL).mkdir()
-        paths = join_lists(out, config) + finalize(kinds, out, config, pool)
-        write_manifest_entry(out, JOINED, paths, {"episodes": recorded_episodes(out)})
+        paths = build_lists(out, config) + finalize(kinds, out, config, pool)
+        write_manifest_entry(out, INDICES, paths, {"episodes": committed_episodes(out)})
         shutil.rmtree(out / PARTIAL)
     except OSError as error:
         raise output_error(out, error) from error
 
 
-def join_lists(out: Path, config: Config) -> list[Path]:
-    """Write the lists of episodes and of attempts from the records, in the order of their numbers; returns both files."""
+def build_lists(out: Path, config: Config) -> list[Path]:
+    """Write the lists of episodes and of attempts from the manifest entries, sorted by episode; returns both files."""
     paths = [Path(name) for name in (EPISODES_FILE, *((ATTEMPTS_FILE,) if may_pick(config) else ()))]
     for path in paths:
         with (out / PARTIAL / path).open("w", encoding="ascii") as file:
-            for number in recorded_episodes(out):
-                record = read_record(out, episode_place(number)) or {}
-                rows = [{**record["row"], "checksum": record["checksum"]}] if path.name == EPISODES_FILE else record["attempts"]
+            for index in committed_episodes(out):
+                entry = read_entry(out, episode_entry(index)) or {}
+                rows = [{**entry["row"], "checksum": entry["checksum"]}] if path.name == EPISODES_FILE else entry["attempts"]
                 file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)
             file.flush()
             os.fsync(file.fileno())
@@ -223,15 +227,15 @@ def join_lists(out: Path, config: Config) -> list[Path]:
     return paths
 
 
-def _episodes_of(out: Path) -> int:
-    """How many episodes the last bake of the folder was to make, as far as can be told."""
+def _planned_episodes(out: Path) -> int:
+    """`bake.episodes` of the last bake of the folder; 0 if its settings cannot be read."""
     with contextlib.suppress(ConfigError):
         return load_config(str(out / CONFIG_FILE), {}).bake.episodes
     return 0
 
 
 def lock_folder(out: Path) -> int:
-    """An open handle of the folder, which holds its lock; file systems that know no locks go without."""
+    """Lock a folder by an open handle, which is returned; file systems without locks are used unlocked."""
     handle = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
     deadline = time.monotonic() + LOCK_TIMEOUT
     while True:
@@ -251,7 +255,7 @@ def lock_folder(out: Path) -> int:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file, or a folder with all that is in it."""
+    """Remove a file, or a folder with its content."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -259,6 +263,7 @@ def _remove(path: Path) -> None:
 
 
 def _remove_empty_folders(out: Path) -> None:
+    """Remove all empty folders below a folder, deepest first."""
     for folder, _, _ in os.walk(out, topdown=False):
         if Path(folder) != out:
             with contextlib.suppress(OSError):

@@ -117,7 +117,7 @@ def test_a_mistake_is_one_line_and_leaves_nothing(tmp_path, bakes, capsys, monke
 @pytest.mark.skipif(wp.get_cuda_device_count() > 0, reason="this machine has a GPU")
 def test_a_gpu_that_is_not_there(tmp_path, bakes, capsys):
     said = mistake(capsys, "bake", "--out", str(tmp_path / "data"), "--device", "cuda:0")
-    assert said == "cuda:0 was asked for, but Warp finds no CUDA device here; use --device cpu"
+    assert said == "cuda:0 was requested, but Warp finds no CUDA device here; use --device cpu"
     assert list(tmp_path.iterdir()) == []
 
 
@@ -157,7 +157,7 @@ def test_a_stopped_bake_says_how_to_go_on(tmp_path, bakes, capsys):
     bakes.result = finished(4)
     bakes.result.stopped = 2
     assert main(["bake", "--device=cpu", f"--out={tmp_path}"]) == 130
-    assert capsys.readouterr().err.endswith("interrupted: 4 of 4 episodes are whole; the same command goes on with the others\n")
+    assert capsys.readouterr().err.endswith("interrupted: 4 of 4 episodes are complete; the same command resumes with the others\n")
 
 
 def test_output_folder_that_is_not_empty(tmp_path, bakes, capsys):
@@ -238,7 +238,7 @@ def test_config_prints_what_it_would_use(capsys):
 def test_doctor(capsys, bakes):
     assert main(["doctor", "--worlds", "16", "--resolution", "640x360", "--device", "cpu"]) == 0
     text = capsys.readouterr().out
-    assert all(word in text for word in ("newton", "numpy", "warp-lang", "processor cores", "kernel cache"))
+    assert all(word in text for word in ("newton", "numpy", "warp-lang", "CPU cores", "kernel cache"))
     assert all(word in text for word in ("16 worlds, 640x360", "Snapshot.pose", "16 x 24", "2.00"))
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from synpick_warp import pipeline
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.dataset.manifest import episode_place, read_checksums
+from synpick_warp.dataset.manifest import episode_entry, read_checksums
 from synpick_warp.layer_codec import read_layer
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
@@ -200,7 +200,7 @@ def test_worlds_writers_and_batches_change_no_layer(split, tmp_path):
 
 
 def test_layers_have_checksums(split):
-    names = {name for episode in range(TINY["bake__episodes"]) for name in read_checksums(split.parent, episode_place(episode))}
+    names = {name for episode in range(TINY["bake__episodes"]) for name in read_checksums(split.parent, episode_entry(episode))}
     assert names == {f"{split.name}/{name}" for name in digests(split)}
     assert {Path(name).parts[2] for name in names} >= set(LAYERS)
 

@@ -47,11 +47,11 @@ def keys() -> Iterator[str]:
 @pytest.mark.parametrize("key", list(keys()))
 def test_every_setting_binds_but_the_free_ones(key):
     said = manifest.describe_differences(manifest.make_manifest(changed(key)), manifest.make_manifest(settings()))
-    assert said.startswith(f"{key} is ") if key not in manifest.FREE else said == ""
+    assert said.startswith(f"{key} is ") if key not in manifest.FREE_SETTINGS else said == ""
 
 
 def test_free_settings_exist():
-    assert set(manifest.FREE) <= set(keys())
+    assert set(manifest.FREE_SETTINGS) <= set(keys())
 
 
 def test_the_order_of_formats_is_of_no_account():
@@ -83,7 +83,7 @@ def test_a_manifest_comes_back(tmp_path):
     ("text", "said"),
     [
         ("{", "is damaged"),
-        ("[]", "it has no object"),
+        ("[]", "it is not a JSON object"),
         ('{"format": 9}', "has the format 9; this version reads 1"),
         ('{"format": 1, "settings": {}, "settings_checksum": "0"}', "changed by hand"),
     ],
@@ -138,21 +138,21 @@ def test_a_record_has_every_file_once_and_is_whole_while_they_are_there(tmp_path
     (tmp_path / "manifest").mkdir()
     for name in ("a/deep/two", "a/one", "three"):
         (tmp_path / name).write_text(name)
-    place = manifest.episode_place(7)
+    place = manifest.episode_entry(7)
     given = [manifest.Path("three"), manifest.Path("a"), manifest.Path("a/one")]
     assert [str(path) for path in list_files(tmp_path, given)] == ["a/deep/two", "a/one", "three"]
-    assert not manifest.seems_whole(tmp_path, place)
+    assert not manifest.is_complete(tmp_path, place)
     write_manifest_entry(tmp_path, place, given, {"row": {"frames": 3}})
-    record = manifest.read_record(tmp_path, place)
+    record = manifest.read_entry(tmp_path, place)
     assert record is not None
     assert (record["row"], record["files"], record["bytes"]) == ({"frames": 3}, 3, 20)
     assert list(manifest.read_checksums(tmp_path, place)) == ["a/deep/two", "a/one", "three"]
-    assert manifest.recorded_episodes(tmp_path) == [7]
-    assert manifest.seems_whole(tmp_path, place)
+    assert manifest.committed_episodes(tmp_path) == [7]
+    assert manifest.is_complete(tmp_path, place)
     (tmp_path / "a/one").write_text("longer")
-    assert not manifest.seems_whole(tmp_path, place)
+    assert not manifest.is_complete(tmp_path, place)
     (tmp_path / "a/one").unlink()
-    assert not manifest.seems_whole(tmp_path, place)
+    assert not manifest.is_complete(tmp_path, place)
 
 
 def test_a_list_that_does_not_fit_its_record(tmp_path):
@@ -162,6 +162,6 @@ def test_a_list_that_does_not_fit_its_record(tmp_path):
     write_manifest_entry(tmp_path, place, [manifest.Path("file")], {})
     path = tmp_path / "manifest" / "constants.sha256"
     path.write_text(path.read_text().replace("file", "elif"))
-    with pytest.raises(DatasetError, match="does not fit"):
+    with pytest.raises(DatasetError, match="does not match"):
         manifest.read_checksums(tmp_path, place)
     assert json.loads((tmp_path / "manifest" / "constants.json").read_text())["files"] == 1

@@ -17,7 +17,7 @@ import pytest
 
 from synpick_warp.cli.commands import main
 from synpick_warp.dataset import writing
-from synpick_warp.dataset.manifest import CONSTANTS, episode_place, read_checksums, recorded_episodes
+from synpick_warp.dataset.manifest import CONSTANTS, committed_episodes, episode_entry, read_checksums
 from synpick_warp.dataset.merge import merge
 from synpick_warp.dataset.verify import verify
 from synpick_warp.errors import DatasetError, OutputError
@@ -111,7 +111,7 @@ def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expec
     changed = {"physics.friction": 0.4, "bake.seed": 3, "bake.worlds": 1}
     assert server.bake(whole, settings=changed, log=str(log)) == 2
     (line,) = log.read_text().splitlines()
-    assert line.startswith(f"synpick-warp: error: {whole} was begun with other settings: ")
+    assert line.startswith(f"synpick-warp: error: {whole} was started with other settings: ")
     assert "bake.seed is 3, there 0; physics.friction is 0.4, there 0.5; " in line
     assert "worlds" not in line
     log.unlink()
@@ -133,7 +133,7 @@ def test_shares_are_joined_to_what_one_bake_makes(server, expected, tmp_path):
     parts = [tmp_path / str(part) for part in range(3)]
     for part, folder in enumerate(parts):
         assert server.bake(folder, arguments=["--shard", f"{part}/3"]) == 0
-        assert recorded_episodes(folder) == list(range(part, EPISODES, 3))
+        assert committed_episodes(folder) == list(range(part, EPISODES, 3))
         assert verify(folder).finished
     merged = merge(parts, tmp_path / "set")
     assert (merged.episodes, merged.missing) == (EPISODES, [])
@@ -162,14 +162,14 @@ def test_parts_that_do_not_fit(server, whole, tmp_path):
 def test_stopped_once_it_finishes_what_is_whole(server, expected, tmp_path, number):
     out, log = tmp_path / "set", tmp_path / "log"
     process = server.start(out, log=str(log), settings={"bake.worlds": 1})
-    wait_for(lambda: len(recorded_episodes(out)) >= 1)
+    wait_for(lambda: len(committed_episodes(out)) >= 1)
     os.kill(process, number)
     assert server.wait() == 128 + number
-    there = recorded_episodes(out)
+    there = committed_episodes(out)
     assert 1 <= len(there) < EPISODES
     said = log.read_text()
     assert "stopping after this tick" in said
-    assert f"interrupted: {len(there)} of {EPISODES} episodes are whole" in said
+    assert f"interrupted: {len(there)} of {EPISODES} episodes are complete" in said
     verdict = verify(out)
     assert (verdict.problem, verdict.finished) == ("", False)
     assert not (out / PARTIAL).exists()
@@ -195,7 +195,7 @@ def test_stopped_twice_it_ends_at_once(server, expected, tmp_path):
 def test_a_writer_that_is_killed(server, expected, tmp_path):
     out, log = tmp_path / "set", tmp_path / "log"
     process = server.start(out, log=str(log))
-    wait_for(lambda: len(recorded_episodes(out)) >= 1)
+    wait_for(lambda: len(committed_episodes(out)) >= 1)
     (writer,) = children(process)
     os.kill(writer, signal.SIGKILL)
     goes_on_after(server, out, log, expected, "a writer process was ended by SIGKILL")
@@ -204,7 +204,7 @@ def test_a_writer_that_is_killed(server, expected, tmp_path):
 def test_the_folder_is_removed(server, expected, tmp_path):
     out, log = tmp_path / "set", tmp_path / "log"
     server.start(out, log=str(log))
-    wait_for(lambda: len(recorded_episodes(out)) >= 1)
+    wait_for(lambda: len(committed_episodes(out)) >= 1)
     out.rename(tmp_path / "moved")
     assert server.wait() == 2
     assert log.read_text().splitlines()[-1] == f"synpick-warp: error: {out} was removed while the bake wrote to it"
@@ -228,7 +228,7 @@ def test_a_full_disk(server, expected, small_disk):
     said = log.read_text().splitlines()[-1]
     assert said.startswith("synpick-warp: error: cannot write ")
     assert "No space left on device" in said
-    there = recorded_episodes(out)
+    there = committed_episodes(out)
     assert 1 <= len(there) < EPISODES
     assert verify(out).problem == ""
     assert not (out / PARTIAL).exists()
@@ -241,7 +241,7 @@ def goes_on_after(server: BakeServer, out: Path, log: Path, expected: dict[str, 
     """The bake that runs ends with one line and exit code 2; whole episodes stay, and the next goes on."""
     assert server.wait() == 2
     assert log.read_text().splitlines()[-1].startswith(f"synpick-warp: error: {said}")
-    there = recorded_episodes(out)
+    there = committed_episodes(out)
     assert 1 <= len(there) < EPISODES
     assert verify(out).problem == ""
     assert not (out / PARTIAL).exists()
@@ -256,7 +256,7 @@ def small_disk(whole, tmp_path) -> Iterator[Path]:
     folder.mkdir()
     constants, episodes = (
         sum(-(-(whole / name).stat().st_size // PAGE) * PAGE for place in places for name in read_checksums(whole, place))
-        for places in ([CONSTANTS], [episode_place(number) for number in range(EPISODES)])
+        for places in ([CONSTANTS], [episode_entry(number) for number in range(EPISODES)])
     )
     size = f"size={(constants + 0.6 * episodes) / 1024:.0f}k"
     if os.geteuid() or subprocess.run(["mount", "-t", "tmpfs", "-o", size, "tmpfs", folder], capture_output=True).returncode:
@@ -298,20 +298,20 @@ def test_what_is_wrong_or_missing_is_named(copied, capsys):
 
     targets = copied / "test_targets_bop19.json"
     targets.write_bytes(targets.read_bytes()[:-1])
-    assert said() == f"{targets} has another checksum than when it was written"
+    assert said() == f"{targets} has changed since it was written: its checksum differs"
     picture = copied / "train/000004/depth/000002.png"
     picture.unlink()
     assert said() == f"{picture} is missing"
     model = copied / "models/models_info.json"
     model.write_bytes(model.read_bytes() + b" ")
-    assert said() == f"{model} has another checksum than when it was written"
+    assert said() == f"{model} has changed since it was written: its checksum differs"
     settings = copied / "config.toml"
     settings.write_text(settings.read_text().replace("seed = 0", "seed = 1"))
-    assert said() == f"{settings} is not as the manifest: bake.seed is 1, there 0"
+    assert said() == f"{settings} does not match the manifest: bake.seed is 1, there 0"
     manifest = copied / "manifest.json"
     manifest.write_text(manifest.read_text().replace('"friction": 0.5', '"friction": 0.6'))
     assert main(["verify", str(copied)]) == 2
-    assert "do not fit their checksum" in capsys.readouterr().err
+    assert "do not match their checksum" in capsys.readouterr().err
 
 
 def test_an_episode_that_lost_a_file_is_made_again(server, copied, expected):

@@ -10,7 +10,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.configs.write import config_to_toml
-from synpick_warp.dataset.manifest import CONFIG_FILE, MANIFEST_FILE, RECORDS, episode_place
+from synpick_warp.dataset.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
@@ -31,11 +31,11 @@ def write_set(folder: Path, exporter: type, **bop: object) -> Path:
     export(exporter, folder, settings, EPISODES)
     (folder / CONFIG_FILE).write_text(config_to_toml(settings))
     (folder / MANIFEST_FILE).write_text("{}")
-    (folder / RECORDS).mkdir()
+    (folder / ENTRIES).mkdir()
     for episode in EPISODES:
         row = {"episode": episode, "ending": "finished", "frames": FRAMES, "mode": "move"}
         content = {"row": row, "attempts": [ATTEMPT] if episode == 2 else []}
-        (folder / f"{episode_place(episode)}.json").write_text(json.dumps(content))
+        (folder / f"{episode_entry(episode)}.json").write_text(json.dumps(content))
     return folder
 
 
@@ -133,7 +133,7 @@ def test_views_come_frame_by_frame_and_end_with_the_last(data):
 
 def test_an_episode_without_manifest_entry_is_not_listed(tmp_path):
     folder = write_set(tmp_path, BopExporter)
-    (folder / f"{episode_place(0)}.json").unlink()
+    (folder / f"{episode_entry(0)}.json").unlink()
     data = synpick_warp.open(folder)
     assert list(data) == [2]
     with pytest.raises(KeyError, match="no episode 0"):

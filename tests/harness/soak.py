@@ -22,8 +22,8 @@ import numpy as np
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import FORMATS, Config
-from synpick_warp.dataset.manifest import episode_place, read_record
-from synpick_warp.dataset.writing import Output
+from synpick_warp.dataset.manifest import episode_entry, read_entry
+from synpick_warp.dataset.writing import OutputFolder
 from synpick_warp.episodes import EpisodeRow
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes, slot_bytes
@@ -85,9 +85,9 @@ def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
     kinds = load_exporter_classes(config.bake.formats)
     frames = frames_of(lenses)
     memory, files = [], []
-    with Output(out, config, ()) as output, WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
+    with OutputFolder(out, config, ()) as output, WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
         exporters = Exporters(kinds, ExportContext(out, config, box_views.catalog(), lenses, skies(), pool))
-        output.begin(exporters, {}, pool)
+        output.prepare(exporters, {}, pool)
         for tick in range(ticks):
             first, frame = divmod(tick, FRAMES)
             episodes = np.arange(WORLDS) + WORLDS * first
@@ -97,7 +97,7 @@ def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
             if frame == FRAMES - 1:
                 for episode in episodes.tolist():
                     end = end_of(episode)
-                    exporters.end_episode(end, partial(output.record, exporters, pool, end))
+                    exporters.end_episode(end, partial(output.commit, exporters, pool, end))
                 _forget(out, exporters, WORLDS * (first - KEPT))
             if (tick + 1) % max(1, ticks // SAMPLES) == 0:
                 pool.wait()
@@ -110,8 +110,8 @@ def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
 
 def _forget(out: Path, exporters: Exporters, before: int) -> None:
     for episode in range(max(0, before - WORLDS), before):
-        assert read_record(out, episode_place(episode))
-        for path in (*exporters.files(episode), *(Path(f"{episode_place(episode)}{suffix}") for suffix in (".json", ".sha256"))):
+        assert read_entry(out, episode_entry(episode))
+        for path in (*exporters.files(episode), *(Path(f"{episode_entry(episode)}{suffix}") for suffix in (".json", ".sha256"))):
             shutil.rmtree(out / path) if (out / path).is_dir() else (out / path).unlink()
 
 

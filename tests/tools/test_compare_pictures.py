@@ -104,7 +104,7 @@ def test_a_device_and_itself(tmp_path):
 def test_without_a_gpu_it_says_so(capsys):
     assert tool.main([]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == "compare_pictures: cuda:0 was asked for, but Warp finds no CUDA device here; use --device cpu"
+    assert line == "compare_pictures: cuda:0 was requested, but Warp finds no CUDA device here; use --device cpu"
 
 
 @pytest.mark.parametrize("devices", ["cpu", "cpu,cpu,cpu", "cpu,tpu", ""])

@@ -25,7 +25,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from synpick_warp.dataset.manifest import CONFIG_FILE, FREE, MANIFEST_FILE
+from synpick_warp.dataset.manifest import CONFIG_FILE, FREE_SETTINGS, MANIFEST_FILE
 
 IMAGES = (".png", ".jpg")
 USD = (".usd", ".usdc", ".usda")
@@ -153,7 +153,7 @@ def compare_bytes(name: str, first: bytes, second: bytes) -> Difference | None:
         return _from_pairs(compare_values(lines, others))
     if suffix == ".toml":
         pairs = compare_values(tomllib.loads(first.decode()), tomllib.loads(second.decode()))
-        return _from_pairs(pair for pair in pairs if pair[0].lstrip(".") not in FREE)
+        return _from_pairs(pair for pair in pairs if pair[0].lstrip(".") not in FREE_SETTINGS)
     length = min(len(first), len(second))
     unlike = np.flatnonzero(np.frombuffer(first[:length], np.uint8) != np.frombuffer(second[:length], np.uint8))
     place = int(unlike[0]) if unlike.size else length
