@@ -13,7 +13,7 @@
 # files and 20 GB. Longer episodes, or full HD, fill a small disk.
 #
 # Environment:
-#     STEPS              "rest bench pick bake": what to do, in this order; also "render", "devices" and "sameness"
+#     STEPS              "rest bench pick bake": what to do, in this order; also "render", "devices", "sameness" and "tests"
 #     PYTHON             interpreter (python3)
 #     DATA               folder of data (.gpu/data): ycbv_models/, hdri/ and cache/ in it are used if they are there
 #     DEVICE             cuda:0
@@ -35,7 +35,8 @@
 #     BAKE_RESOLUTION    640x360
 #     BAKE_FORMATS       bop; or any of bop,shards,usd,zarr
 #     BAKE_SETTINGS      "move.rounds=1 move.speed=0.4 pick.failures=1": short episodes
-#     REST_LIMIT BENCH_LIMIT RENDER_LIMIT DEVICES_LIMIT SAME_LIMIT PICK_LIMIT BAKE_LIMIT   most seconds of each step (its share of what is left)
+#     TEST_WORKERS       8: processes of the tests; TESTS "tests": what to run
+#     REST_LIMIT BENCH_LIMIT RENDER_LIMIT DEVICES_LIMIT SAME_LIMIT PICK_LIMIT BAKE_LIMIT TESTS_LIMIT   most seconds of each step (its share of what is left)
 #     TOTAL_LIMIT        most seconds of all steps (490)
 #
 # DATA/cache is a cache folder as XDG has it, so that concave objects need not be decomposed on the GPU machine, which takes minutes.
@@ -49,7 +50,7 @@ if [ $# -ne 1 ]; then
     exit 2
 fi
 # Shares of the time; a step whose name is not here does not exist.
-declare -A shares=([rest]=60 [bench]=130 [render]=200 [devices]=60 [sameness]=200 [pick]=210 [bake]=90)
+declare -A shares=([rest]=60 [bench]=130 [render]=200 [devices]=60 [sameness]=200 [pick]=210 [bake]=90 [tests]=240)
 read -ra steps <<<"${STEPS:-rest bench pick bake}"
 for name in "${steps[@]}"; do
     if [ -z "${shares[$name]:-}" ]; then
@@ -67,12 +68,13 @@ deadline=$((SECONDS + ${TOTAL_LIMIT:-490}))
 failed=0
 export PYTHONUNBUFFERED=1 COLUMNS=160
 
-synpick=("$python" -c 'import sys; from synpick_warp.cli.commands import main; sys.exit(main())')
+synpick=("$python" -m synpick_warp)
 models=() lights=()
 [ -d "$data/ycbv_models" ] && models=(--models "$data/ycbv_models")
 [ -d "$data/hdri" ] && lights=(--lights "$data/hdri")
 [ -d "$data/cache" ] && XDG_CACHE_HOME=$(cd "$data/cache" && pwd) && export XDG_CACHE_HOME
 
+read -ra tests <<<"${TESTS:-tests}"
 bakes=$(mktemp -d) || exit 2
 trap 'rm -rf "$bakes"' EXIT
 
@@ -146,6 +148,12 @@ measure_sameness() {
     step "trajectories" 30 "$python" -m tools.checks.trajectory "$bakes/same-${worlds%%,*}"
     step "numbers of worlds" "$((all / 2))" "$python" -m tools.checks.compare_worlds --device "$device" "${models[@]}" --worlds "$worlds" \
         --episodes "${SAME_EPISODES:-8}" --ticks "${SAME_TICKS:-60}" --set bake.mode=mixed "${settings[@]}" --json "$results/worlds.json"
+}
+
+# The tests on the device, with their results as JUnit XML. Plugins that the machine happens to have are left out.
+measure_tests() {
+    step "tests" "${TESTS_LIMIT:-$1}" "$python" -m pytest --device "$device" -n "${TEST_WORKERS:-8}" -q --tb=short -p no:benchmark \
+        -p no:cacheprovider --junitxml="$results/tests.xml" "${tests[@]}"
 }
 
 measure_pick() {
