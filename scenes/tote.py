@@ -11,7 +11,7 @@ from synpick_warp.configs.schema import Tote
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.collision.hulls import simplify_hull
 from synpick_warp.scenes.embedded.meshes import Patch, join, loft, make_mesh, rounded_rectangle, solid, strips
-from synpick_warp.scenes.types import ConvexPiece, Fixture, Hollow, Material
+from synpick_warp.scenes.types import ConvexPiece, Fixture, Interior, Material
 
 CORNER_RADIUS = 0.02
 """Radius of the inner vertical edges at the floor [m], as moulded boxes have it; it grows by as much as the draft opens the corner."""
@@ -24,7 +24,7 @@ FLOOR_DEPTH = 0.1
 """Thickness of the floor's collision shape [m]: more than anything falls through in one step."""
 MIN_WALL = 0.02
 """Least thickness of the walls' collision shapes at the rim [m], for the same reason."""
-HOLLOW_MARGIN = 1e-4
+INTERIOR_MARGIN = 1e-4
 """Far more than positions of hits are off by rounding, and less than rays start off a surface [m]."""
 GUIDE_THICKNESS = 0.1
 """Thickness of the guide walls [m]."""
@@ -59,18 +59,18 @@ def tote_fixture(tote: Tote) -> Fixture:
     )
     shell = join(strips(rings[0], below=True), loft(rings), strips(rings[-1]))
     mesh = make_mesh(join(shell, *_ribs(tote)), centered=False)
-    return Fixture(mesh, Material(tote.color, None, tote.metallic, tote.roughness), tote_hollow(tote))
+    return Fixture(mesh, Material(tote.color, None, tote.metallic, tote.roughness), tote_interior(tote))
 
 
-def tote_hollow(tote: Tote) -> Hollow:
-    """The room in the visible tote, HOLLOW_MARGIN off its faces; chords cut off its round corners."""
+def tote_interior(tote: Tote) -> Interior:
+    """The room in the visible tote, INTERIOR_MARGIN off its faces; chords cut off its round corners."""
     top = rim_height(tote)
     half = []
     for level in (0.0, top):
         (length, width), radius = _opening(tote, level)
-        half.append(np.array((length, width, length + width - radius)) - HOLLOW_MARGIN * np.array((1.0, 1.0, np.sqrt(2.0))))
+        half.append(np.array((length, width, length + width - radius)) - INTERIOR_MARGIN * np.array((1.0, 1.0, np.sqrt(2.0))))
     growth = (half[1] - half[0]) / top
-    return Hollow(tuple(half[0].tolist()), tuple(growth.tolist()), HOLLOW_MARGIN, top + HOLLOW_MARGIN)
+    return Interior(tuple(half[0].tolist()), tuple(growth.tolist()), INTERIOR_MARGIN, top + INTERIOR_MARGIN)
 
 
 def tote_colliders(tote: Tote) -> tuple[ConvexPiece, ...]:

@@ -105,7 +105,7 @@ class Catalog:
 
 
 @dataclass(frozen=True)
-class Hollow:
+class Interior:
     """A convex room in a mesh's own frame that no triangle reaches into, open at the top: |x| <= half[0], |y| <= half[1] and |x| + |y| <=
     half[2] at z = 0, each wider by its growth a metre up."""
 
@@ -125,7 +125,7 @@ class Fixture:
 
     mesh: TriangleMesh
     material: Material
-    hollow: Hollow | None = None
+    interior: Interior | None = None
     """The room in it, if it is a container."""
 
 

@@ -40,16 +40,16 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.perception.arrays import Observation, Plan
-from synpick_warp.stages.perception.plan import CycleArrays, VoteArrays, plan_sizes
+from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
 from synpick_warp.stages.perception.segment import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.render.denoised import FAST_SCRATCH, cell_sizes
-from synpick_warp.stages.render.layers import MOVING, MotionArrays
+from synpick_warp.stages.render.layers import MOTIONS, MOVING
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
 from synpick_warp.stages.render.postprocess import SpreadArrays, has_spread
-from synpick_warp.stages.render.raster import MarkArrays, mark_sizes
-from synpick_warp.stages.render.renderer import PictureArrays, Renderer
+from synpick_warp.stages.render.raster import VISIBILITY_BUFFER, visibility_sizes
+from synpick_warp.stages.render.renderer import SHADED_IMAGE, Renderer
 from synpick_warp.stages.render.scene import build_render_scene
-from synpick_warp.stages.render.view_setup import BodyArrays, HitArrays, body_sizes
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import RECORDS, Simulation
 from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
@@ -274,19 +274,19 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     groups += [(kind, worlds, 1 + RECORDS) for kind in (Observation, Plan)]
     groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
     groups += [(BoundaryBuffers, boundary_sizes(views), ring), (BoundaryScratch, boundary_sizes(views), 1)]
-    groups += [(kind, views, 1) for kind in (BodyArrays, HitArrays, PictureArrays)]
-    pixels = mark_sizes(views["view"], *config.cameras.resolution)
-    groups += [(MarkArrays, pixels, 1), (HitArrays, pixels | {"view": len(config.cameras.positions)}, 1)]
+    groups += [(kind, views, 1) for kind in (VIEW_BODIES, GBUFFER, SHADED_IMAGE)]
+    pixels = visibility_sizes(views["view"], *config.cameras.resolution)
+    groups += [(VISIBILITY_BUFFER, pixels, 1), (GBUFFER, pixels | {"view": len(config.cameras.positions)}, 1)]
     if any(kind.needs_physics for kind in load_exporter_classes(config.bake.formats)):
         groups += [(kind, record_sizes(config, worlds), 1 + RECORDS) for kind in record_kinds(config)]
     if MOVING.intersection(config.render.layers):
-        groups += [(MotionArrays, views, 1)]
+        groups += [(MOTIONS, views, 1)]
     if has_spread(config):
         groups += [(SpreadArrays, views, 1)]
     if may_pick(config):
         looks = count_views(config.sight, worlds["world"], room, device)
         groups += [(kind, perception_sizes(config.sight, room, looks), 1) for kind in SCRATCH]
-        groups += [(kind, plan_sizes(config.sight, room, looks), 1) for kind in (VoteArrays, CycleArrays)]
+        groups += [(kind, plan_sizes(config.sight, room, looks), 1) for kind in (VoteArrays, CYCLES)]
     rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
     if config.render.mode == FAST:
         cells = views | cell_sizes(config, *config.cameras.resolution)

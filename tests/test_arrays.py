@@ -7,25 +7,25 @@ from dataclasses import dataclass, fields
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate, device_array, memory_table
+from synpick_warp.arrays import StructArrays, allocate, allocate_struct, device_array, memory_table, struct_arrays
 from synpick_warp.device import pick_device
 from synpick_warp.pipeline import describe_arrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
-from synpick_warp.stages.perception.plan import CycleArrays, VoteArrays
+from synpick_warp.stages.perception.plan import CYCLES, VoteArrays
 from synpick_warp.stages.perception.segment import SegmentationScratch, count_views
-from synpick_warp.stages.render.denoised import Edges, GatheredArrays, GuideArrays, ShadowArrays, ShareArrays, cell_paths, cell_sizes
-from synpick_warp.stages.render.layers import MotionArrays
+from synpick_warp.stages.render.denoised import GATHERED, GUIDE, SHARES, Edges, ShadowArrays, cell_paths, cell_sizes
+from synpick_warp.stages.render.layers import MOTIONS
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch
-from synpick_warp.stages.render.raster import MarkArrays
-from synpick_warp.stages.render.renderer import PictureArrays
-from synpick_warp.stages.render.view_setup import BodyArrays, HitArrays
+from synpick_warp.stages.render.raster import VISIBILITY_BUFFER
+from synpick_warp.stages.render.renderer import SHADED_IMAGE
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus
 from tests.worlds.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
-    "image field boundary cell_row cell_column shadow_row shadow_column segment segment_square block"
+    "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_square block"
 )
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
@@ -38,20 +38,20 @@ MOVING = [
     WorldStatus,
     Snapshot,
     ViewBuffers,
-    BodyArrays,
-    HitArrays,
-    PictureArrays,
+    VIEW_BODIES,
+    GBUFFER,
+    SHADED_IMAGE,
     BoundaryBuffers,
     BoundaryScratch,
-    GuideArrays,
-    GatheredArrays,
-    ShareArrays,
+    GUIDE,
+    GATHERED,
+    SHARES,
     ShadowArrays,
     Edges,
-    MarkArrays,
+    VISIBILITY_BUFFER,
 ]
-LOOKING = [PerceptionArrays, SegmentationScratch, VoteArrays, CycleArrays]
-LAYERS = [LayerBuffers, MotionArrays]
+LOOKING = [VIEWS, PerceptionArrays, SegmentationScratch, VoteArrays, CYCLES]
+LAYERS = [LayerBuffers, MOTIONS]
 DECLARED = MOVING + LOOKING + LAYERS
 
 
@@ -83,12 +83,41 @@ def test_a_size_that_is_not_given_is_an_error(device):
 
 @pytest.mark.parametrize("kind", DECLARED, ids=lambda kind: kind.__name__)
 def test_the_table_is_true_of_every_declaration(device, kind):
-    made = allocate(kind, SIZES, device)
+    is_struct = isinstance(kind, StructArrays)
+    arrays = allocate_struct(kind, SIZES, device) if is_struct else allocate(kind, SIZES, device)
+    names = [name for name in kind.struct.vars if wp.types.is_array(getattr(arrays, name))] if is_struct else [f.name for f in fields(kind)]
     rows = {name: (shape, size) for name, shape, _, size in memory_table(kind, SIZES)}
-    assert len(rows) == len(fields(kind))
-    for item in fields(kind):
-        array = getattr(made, item.name)
-        assert rows[f"{kind.__name__}.{item.name}"] == (array.shape, array.numpy().nbytes)
+    assert len(rows) == len(names)
+    for name in names:
+        array = getattr(arrays, name)
+        assert rows[f"{kind.__name__}.{name}"] == (array.shape, array.numpy().nbytes)
+
+
+@wp.struct
+class SampleStruct:
+    gap: wp.array2d[float]
+    pose: wp.array[wp.transformf]
+    count: int
+
+
+def test_arrays_of_a_struct_have_its_types_and_the_declared_dimensions(device):
+    declared = struct_arrays(SampleStruct, "world", "cup", pose=("world",), units={"gap": "m"})
+    struct = allocate_struct(declared, {"world": 3, "cup": 2}, device)
+    assert (struct.gap.shape, struct.pose.shape, struct.count) == ((3, 2), (3,), 0)
+    assert (struct.gap.dtype, struct.pose.dtype) == (wp.float32, wp.transformf)
+    assert memory_table(declared, {"world": 3, "cup": 2}) == [("SampleStruct.gap", (3, 2), "m", 24), ("SampleStruct.pose", (3,), "", 84)]
+
+
+@pytest.mark.parametrize(
+    ("shape", "others", "message"),
+    [
+        (("world", "cup"), {}, "SampleStruct.pose has 1 dimensions, not 2: world, cup"),
+        (("world", "cup"), {"pose": ("world",), "count": ("world",)}, "SampleStruct has no array count"),
+    ],
+)
+def test_dimensions_that_do_not_fit_a_struct_are_an_error(shape, others, message):
+    with pytest.raises(TypeError, match=message):
+        struct_arrays(SampleStruct, *shape, **others)
 
 
 def test_a_bakes_table_lists_every_array_with_its_copies():
@@ -123,8 +152,8 @@ def test_small_cells_have_one_path_and_wider_ones_two(cell, width, paths):
 
 def test_the_reference_has_no_cells():
     names = {name.split(".")[0] for name, *_ in describe_arrays(settings(render__mode="reference"))}
-    assert "PictureArrays" in names
-    assert not names & {"GuideArrays", "GatheredArrays", "ShareArrays", "ShadowArrays"}
+    assert "ShadedImage" in names
+    assert not names & {"Guide", "Gathered", "Shares", "ShadowArrays"}
 
 
 @pytest.mark.parametrize("mode", [{"bake__mode": "target"}, {"bake__mode": "mixed", "bake__mix": [1, 0, 3]}])
@@ -137,7 +166,7 @@ def test_a_bake_that_may_pick_has_the_arrays_of_looking_as_well(mode):
     shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in LOOKING}}
     assert shapes["PerceptionArrays.component"] == shapes["SegmentationScratch.gap"] == (looks, 48, 64)
     assert shapes["VoteArrays.count"] == (looks, room, room, 2)
-    assert [name for name, *_ in rows].count("HitArrays.depth") == 3
+    assert [name for name, *_ in rows].count("GBuffer.depth") == 3
 
 
 def test_a_mixture_without_picking_has_none():
@@ -156,5 +185,5 @@ def test_layers_are_in_the_table_if_they_are_asked_for():
     rows = {name: (shape, unit, size) for name, shape, unit, size in describe_arrays(settings(render__layers=["flow", "nocs"]))}
     assert {name for name in rows if name.startswith("LayerBuffers")} == {"LayerBuffers.flow", "LayerBuffers.nocs"}
     assert rows["LayerBuffers.flow"][1] == "px"
-    assert "MotionArrays.turn" in rows
-    assert not any(name.startswith("MotionArrays") for name, *_ in describe_arrays(settings(render__layers=["nocs"])))
+    assert "Motions.rotation" in rows
+    assert not any(name.startswith("Motions") for name, *_ in describe_arrays(settings(render__layers=["nocs"])))

@@ -47,8 +47,8 @@ class FakeRenderer:
 
     calls: list[tuple[Any, list[int], list[int], int]]
 
-    def render(self, snapshot, view_world, view_camera, count, out, layers) -> None:
-        world, camera = view_world.numpy(), view_camera.numpy()
+    def render(self, snapshot, views, out, layers) -> None:
+        world, camera, count = views.world.numpy(), views.camera.numpy(), views.count
         self.calls.append((snapshot, world.tolist(), camera.tolist(), count))
         for array in (*vars(out).values(), *(array for array in vars(layers).values() if array is not None)):
             values = array.numpy()

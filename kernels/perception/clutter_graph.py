@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.structs import PerceptionData
 
 wp.set_module_options({"enable_backward": False})
@@ -143,7 +144,7 @@ def order_clutter_kernel(
     # Scene:
     sight: PerceptionData,
     # In:
-    view_world: wp.array[int],
+    views: Views,
     votes: wp.array3d[float],
     # Out:
     cycles_out: Cycles,
@@ -156,7 +157,7 @@ def order_clutter_kernel(
     the heaviest acyclic subset of edges is kept; in components of more than `exact_cycle` objects a greedy one.
     """
     view = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     if world < 0:
         return
     instances = votes.shape[1]

@@ -6,6 +6,8 @@ counted in registers and few atomics are left. All atomics are on integers: the 
 
 import warp as wp
 
+from synpick_warp.kernels.render.visibility.camera import Views
+
 wp.set_module_options({"enable_backward": False})
 
 STRIP = wp.constant(32)
@@ -17,11 +19,11 @@ PIXEL_BITS = wp.constant(wp.int64(31))
 
 
 @wp.func
-def strip_of(index: int, height: int, strips: int) -> wp.vec3i:
+def strip_of(index: int, height: int, strips: int) -> tuple[int, int, int]:
     """(view, row, strip) of a flat index."""
     line = index // strips
     view = line // height
-    return wp.vec3i(view, line - view * height, index - line * strips)
+    return view, line - view * height, index - line * strips
 
 
 @wp.func
@@ -37,9 +39,9 @@ def unpack_pixel(key: wp.int64) -> int:
 
 
 @wp.func
-def instance_code(code: wp.array2d[wp.uint8], view: int, pixel: int, instances: int) -> int:
+def instance_segment(segment: wp.array2d[wp.uint8], view: int, pixel: int, instances: int) -> int:
     """1 + instance where the pixel shows one, else 0."""
-    found = int(code[view, pixel])
+    found = int(segment[view, pixel])
     if found > instances:
         return 0
     return found
@@ -48,9 +50,8 @@ def instance_code(code: wp.array2d[wp.uint8], view: int, pixel: int, instances: 
 @wp.kernel
 def label_strips_kernel(
     # In:
-    view_world: wp.array[int],
-    code: wp.array2d[wp.uint8],
-    instances: int,
+    views: Views,
+    segment: wp.array2d[wp.uint8],
     width: int,
     height: int,
     strips: int,
@@ -60,16 +61,15 @@ def label_strips_kernel(
     area_out: wp.array2d[int],
 ):
     """Name each pixel by the first one of its run of equal codes within its strip; sizes to 0. One thread a strip."""
-    place = strip_of(wp.tid() + first, height, strips)
-    view = place[0]
-    if view_world[view] < 0:
+    view, row, strip = strip_of(wp.tid() + first, height, strips)
+    if views.world[view] < 0:
         return
-    column = place[2] * STRIP
-    pixel = place[1] * width + column
+    column = strip * STRIP
+    pixel = row * width + column
     start = int(0)
     before = int(0)
     for i in range(wp.min(STRIP, width - column)):
-        here = instance_code(code, view, pixel + i, instances)
+        here = instance_segment(segment, view, pixel + i, views.instances)
         if here != before:
             start = pixel + i
         before = here
@@ -115,33 +115,32 @@ def unite(component: wp.array2d[int], view: int, a: int, b: int):
 @wp.kernel
 def merge_strips_kernel(
     # In:
-    view_world: wp.array[int],
-    code: wp.array2d[wp.uint8],
-    instances: int,
+    views: Views,
+    segment: wp.array2d[wp.uint8],
     width: int,
     # Out:
     component_inout: wp.array2d[int],
 ):
     """Join runs of equal codes with the strip to the left and with the row above, 8 neighbours, once for every pair of runs."""
     view, row, strip = wp.tid()
-    if view_world[view] < 0:
+    if views.world[view] < 0:
         return
     begin = strip * STRIP
     left = int(0)
     above_left = int(0)
     above = int(0)
     if begin > 0:
-        left = instance_code(code, view, row * width + begin - 1, instances)
+        left = instance_segment(segment, view, row * width + begin - 1, views.instances)
         if row > 0:
-            above_left = instance_code(code, view, (row - 1) * width + begin - 1, instances)
+            above_left = instance_segment(segment, view, (row - 1) * width + begin - 1, views.instances)
     if row > 0:
-        above = instance_code(code, view, (row - 1) * width + begin, instances)
+        above = instance_segment(segment, view, (row - 1) * width + begin, views.instances)
     for column in range(begin, wp.min(begin + STRIP, width)):
         pixel = row * width + column
-        here = instance_code(code, view, pixel, instances)
+        here = instance_segment(segment, view, pixel, views.instances)
         above_right = int(0)
         if row > 0 and column + 1 < width:
-            above_right = instance_code(code, view, pixel - width + 1, instances)
+            above_right = instance_segment(segment, view, pixel - width + 1, views.instances)
         if here > 0:
             if column == begin and left == here:
                 unite(component_inout, view, pixel - 1, pixel)
@@ -162,7 +161,7 @@ def merge_strips_kernel(
 @wp.kernel
 def measure_components_kernel(
     # In:
-    view_world: wp.array[int],
+    views: Views,
     width: int,
     # Out:
     component_inout: wp.array2d[int],
@@ -170,7 +169,7 @@ def measure_components_kernel(
 ):
     """Name each pixel by the root of its component, and count pixels there: area[root] = sum over its runs of their lengths."""
     view, row, strip = wp.tid()
-    if view_world[view] < 0:
+    if views.world[view] < 0:
         return
     begin = row * width + strip * STRIP
     run = int(NO_COMPONENT)
@@ -197,25 +196,25 @@ def measure_components_kernel(
 @wp.kernel
 def find_largest_kernel(
     # In:
-    view_world: wp.array[int],
-    code: wp.array2d[wp.uint8],
+    views: Views,
+    segment: wp.array2d[wp.uint8],
     area: wp.array2d[int],
     # Out:
     largest_key_out: wp.array2d[wp.int64],
 ):
     """Key of each instance's largest component: the maximum of `pack_key(area, root)` over its roots. The keys begin as 0."""
     view, pixel = wp.tid()
-    if view_world[view] < 0:
+    if views.world[view] < 0:
         return
     size = area[view, pixel]
     if size > 0:
-        wp.atomic_max(largest_key_out, view, int(code[view, pixel]) - 1, pack_key(wp.int64(size), pixel))
+        wp.atomic_max(largest_key_out, view, int(segment[view, pixel]) - 1, pack_key(wp.int64(size), pixel))
 
 
 @wp.kernel
 def unpack_largest_kernel(
     # In:
-    view_world: wp.array[int],
+    views: Views,
     largest_key: wp.array2d[wp.int64],
     # Out:
     largest_out: wp.array2d[int],
@@ -223,5 +222,5 @@ def unpack_largest_kernel(
     """Root of each instance's largest component; -1: the instance is not visible."""
     view, instance = wp.tid()
     largest_out[view, instance] = NO_COMPONENT
-    if view_world[view] >= 0 and largest_key[view, instance] > wp.int64(0):
+    if views.world[view] >= 0 and largest_key[view, instance] > wp.int64(0):
         largest_out[view, instance] = unpack_pixel(largest_key[view, instance])

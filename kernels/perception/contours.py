@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from synpick_warp.kernels.perception.distance_transform import CODE_BITS, direction_column, direction_row
+from synpick_warp.kernels.perception.distance_transform import SEGMENT_BITS, direction_column, direction_row
+from synpick_warp.kernels.render.visibility.camera import Views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,7 +70,7 @@ def next_direction(neighbours: int, start: int, turn: int) -> int:
 @wp.kernel
 def trace_contours_kernel(
     # In:
-    view_world: wp.array[int],
+    views: Views,
     patch: wp.array2d[wp.uint16],
     largest: wp.array2d[int],
     width: int,
@@ -85,7 +86,7 @@ def trace_contours_kernel(
     would be made again. Every step reads one word. A contour longer than its room is cut there, and its world told.
     """
     view, instance = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     contour_length_out[view, instance] = 0
     if world < 0:
         return
@@ -94,7 +95,7 @@ def trace_contours_kernel(
         return
     start_row = origin // width
     start_column = origin - start_row * width
-    neighbours = int(patch[view, origin]) >> CODE_BITS
+    neighbours = int(patch[view, origin]) >> SEGMENT_BITS
     direction = next_direction(neighbours, NORTH_WEST, CLOCKWISE)
     # The pixel from which the border comes back to its start: the last one.
     last_u = direction_column(direction)
@@ -118,7 +119,7 @@ def trace_contours_kernel(
         u = next_u
         v = next_v
         direction = (direction + 4) & 7
-        neighbours = int(patch[view, origin + v * width + u]) >> CODE_BITS
+        neighbours = int(patch[view, origin + v * width + u]) >> SEGMENT_BITS
     contour_length_out[view, instance] = polygon.points
     centroid = centroid_of(polygon)
     centroid_out[world, instance] = wp.vec2(float(start_column) + float(centroid[0]), float(start_row) + float(centroid[1]))

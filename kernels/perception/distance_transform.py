@@ -6,7 +6,7 @@ largest component of an instance; one word a pixel holds which patch it is of an
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, Views, in_image, tile_pixel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -15,9 +15,9 @@ NORTH = wp.constant(2)
 WEST = wp.constant(4)
 SOUTH = wp.constant(6)
 """Directions count counter-clockwise in the image, from east (0) over north (2) and west (4) to south-east (7)."""
-CODE_BITS = wp.constant(8)
+SEGMENT_BITS = wp.constant(8)
 """The low byte of a patch word is 1 + instance, 0: of no patch; bit 8 + d above it: the neighbour in direction d is of the same patch."""
-CODE_MASK = wp.constant(255)
+SEGMENT_MASK = wp.constant(255)
 
 
 @wp.func
@@ -45,8 +45,8 @@ def mark_patches_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
-    view_world: wp.array[int],
-    code: wp.array2d[wp.uint8],
+    views: Views,
+    segment: wp.array2d[wp.uint8],
     component: wp.array2d[int],
     largest: wp.array2d[int],
     first: int,
@@ -54,17 +54,14 @@ def mark_patches_kernel(
     patch_out: wp.array2d[wp.uint16],
 ):
     """Patch word of each pixel: 1 + instance, and a bit for each of the 8 neighbours in the same component. Beyond the border: no."""
-    place = tile_pixel(grid, wp.tid() + first)
-    view = place[0]
-    row = place[1]
-    column = place[2]
-    if row >= grid.height or column >= grid.width or view_world[view] < 0:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column) or views.world[view] < 0:
         return
     pixel = row * grid.width + column
     name = component[view, pixel]
     word = int(0)
     if name >= 0:
-        here = int(code[view, pixel])
+        here = int(segment[view, pixel])
         if largest[view, here - 1] == name:
             word = here
             for direction in range(8):
@@ -72,7 +69,7 @@ def mark_patches_kernel(
                 y = row + direction_row(direction)
                 if x >= 0 and y >= 0 and x < grid.width and y < grid.height:
                     if component[view, y * grid.width + x] == name:
-                        word = word | (1 << (direction + CODE_BITS))
+                        word = word | (1 << (direction + SEGMENT_BITS))
     patch_out[view, pixel] = wp.uint16(word)
 
 
@@ -81,14 +78,14 @@ def measure_columns_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
-    view_world: wp.array[int],
+    views: Views,
     patch: wp.array2d[wp.uint16],
     # Out:
     gap_out: wp.array2d[int],
 ):
     """256 g + (1 + instance) for pixels of a patch, else 0: g [px] the distance to the nearest pixel of the column that is not of it."""
     view, column = wp.tid()
-    if view_world[view] < 0:
+    if views.world[view] < 0:
         return
     gap = int(0)
     for row in range(grid.height):
@@ -96,33 +93,33 @@ def measure_columns_kernel(
         word = int(patch[view, pixel])
         if word == 0:
             gap = 0
-        elif (word >> (NORTH + CODE_BITS)) & 1 != 0:
+        elif (word >> (NORTH + SEGMENT_BITS)) & 1 != 0:
             gap += 1
         else:
             gap = 1
-        gap_out[view, pixel] = (gap << CODE_BITS) | (word & CODE_MASK)
+        gap_out[view, pixel] = (gap << SEGMENT_BITS) | (word & SEGMENT_MASK)
     gap = int(0)
     for i in range(grid.height):
         pixel = (grid.height - 1 - i) * grid.width + column
         word = int(patch[view, pixel])
         if word != 0:
-            if (word >> (SOUTH + CODE_BITS)) & 1 != 0:
+            if (word >> (SOUTH + SEGMENT_BITS)) & 1 != 0:
                 gap += 1
             else:
                 gap = 1
-            if gap < gap_out[view, pixel] >> CODE_BITS:
-                gap_out[view, pixel] = (gap << CODE_BITS) | (word & CODE_MASK)
+            if gap < gap_out[view, pixel] >> SEGMENT_BITS:
+                gap_out[view, pixel] = (gap << SEGMENT_BITS) | (word & SEGMENT_MASK)
 
 
 @wp.func
-def gap_in(gap: wp.array2d[int], view: int, row: int, column: int, width: int, code: int) -> int:
+def gap_in(gap: wp.array2d[int], view: int, row: int, column: int, width: int, segment: int) -> int:
     """Distance to the nearest pixel not of a patch, within a column and from a pixel; 0 if that pixel is not of it."""
     if column < 0 or column >= width:
         return 0
     word = gap[view, row * width + column]
-    if word & CODE_MASK != code:
+    if word & SEGMENT_MASK != segment:
         return 0
-    return word >> CODE_BITS
+    return word >> SEGMENT_BITS
 
 
 @wp.kernel
@@ -130,27 +127,24 @@ def measure_rows_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
-    view_world: wp.array[int],
+    views: Views,
     gap: wp.array2d[int],
     first: int,
     # Out:
     distance_out: wp.array2d[float],
 ):
     """d = sqrt(min over x' of (x - x')² + g²(x')) [px], searched outwards until (x - x')² alone is as large; 0 outside of patches."""
-    place = tile_pixel(grid, wp.tid() + first)
-    view = place[0]
-    row = place[1]
-    column = place[2]
-    if row >= grid.height or column >= grid.width or view_world[view] < 0:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column) or views.world[view] < 0:
         return
     word = gap[view, row * grid.width + column]
-    code = word & CODE_MASK
-    least = word >> CODE_BITS
+    segment = word & SEGMENT_MASK
+    least = word >> SEGMENT_BITS
     least = least * least
     offset = int(1)
     while offset * offset < least:
-        left = gap_in(gap, view, row, column - offset, grid.width, code)
-        right = gap_in(gap, view, row, column + offset, grid.width, code)
+        left = gap_in(gap, view, row, column - offset, grid.width, segment)
+        right = gap_in(gap, view, row, column + offset, grid.width, segment)
         nearer = wp.min(left, right)
         least = wp.min(least, offset * offset + nearer * nearer)
         offset += 1

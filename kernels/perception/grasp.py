@@ -3,8 +3,8 @@
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.materials import Surfaces, mesh_surface
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray
-from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Hits, Meshes
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies
 from synpick_warp.kernels.structs import PickData
 
 wp.set_module_options({"enable_backward": False})
@@ -56,10 +56,9 @@ def smooth_normal_kernel(
     grid: ImageGrid,
     window: int,
     # In:
-    bodies: Bodies,
-    hits: Hits,
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
     component: wp.array3d[int],
     largest: wp.array2d[int],
     suction: wp.array2d[wp.vec2i],
@@ -72,19 +71,19 @@ def smooth_normal_kernel(
     n_p is the interpolated unit normal of the surface, towards the camera. Not a unit vector yet; the order of the sum is fixed.
     """
     view = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     if world < 0 or target[world] < 0:
         return
     instance = target[world]
-    camera = view_camera[view]
+    camera = views.camera[view]
     p = suction[world, instance]
     total = wp.vec3(0.0, 0.0, 0.0)
     for row in range(wp.max(p[1] - window, 0), wp.min(p[1] + window + 1, grid.height)):
         for column in range(wp.max(p[0] - window, 0), wp.min(p[0] + window + 1, grid.width)):
             if component[view, row, column] == largest[view, instance]:
                 ray = cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
-                triangle = hits.triangle[view, row, column]
-                barycentric = hits.barycentric[view, row, column]
+                triangle = gbuffer.triangle[view, row, column]
+                barycentric = gbuffer.barycentric[view, row, column]
                 # Of the surface only the normal counts; the pixel's width matters to textures.
                 surface = mesh_surface(meshes, surfaces, bodies, view, instance, triangle, barycentric, -wp.normalize(ray), 0.0)
                 total += surface.normal
@@ -99,9 +98,8 @@ def frame_grasp_kernel(
     # State:
     normal_inout: wp.array[wp.vec3],
     # In:
-    hits: Hits,
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
+    gbuffer: GBuffer,
+    views: Views,
     suction: wp.array2d[wp.vec2i],
     target: wp.array[int],
     # Out:
@@ -114,12 +112,12 @@ def frame_grasp_kernel(
     Worlds without a target keep what they had.
     """
     view = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     if world < 0 or target[world] < 0:
         return
-    camera = view_camera[view]
+    camera = views.camera[view]
     p = suction[world, target[world]]
-    ray = camera_ray(cameras.intrinsics[camera], p[1], p[0], wp.vec2(0.0, 0.0)) * hits.depth[view, p[1], p[0]]
+    ray = camera_ray(cameras.intrinsics[camera], p[1], p[0], wp.vec2(0.0, 0.0)) * gbuffer.depth[view, p[1], p[0]]
     away = wp.vec3d(wp.float64(ray[0]), wp.float64(ray[1]), wp.float64(ray[2]))
     point_out[world] = wp.vec3(cameras.center[camera] + wp.transpose(cameras.rotation[camera]) * away)
     normal = limit_normal(normal_inout[world], pick.tilt_limit)

@@ -3,7 +3,8 @@
 import warp as wp
 
 from synpick_warp.kernels.perception.components import STRIP, pack_key, unpack_pixel
-from synpick_warp.kernels.perception.distance_transform import CODE_MASK
+from synpick_warp.kernels.perception.distance_transform import SEGMENT_MASK
+from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.structs import CatalogData, PerceptionData
 
 wp.set_module_options({"enable_backward": False})
@@ -15,7 +16,7 @@ SQUARE_UNITS = wp.constant(16777216.0)
 @wp.kernel
 def clear_sums_kernel(
     # In:
-    view_world: wp.array[int],
+    views: Views,
     # Out:
     largest_key_out: wp.array2d[wp.int64],
     pole_key_out: wp.array2d[wp.int64],
@@ -27,14 +28,14 @@ def clear_sums_kernel(
     largest_key_out[view, instance] = wp.int64(0)
     pole_key_out[view, instance] = wp.int64(0)
     square_out[view, instance] = wp.int64(0)
-    if instance == 0 and view_world[view] >= 0:
-        overflow_out[view_world[view]] = 0
+    if instance == 0 and views.world[view] >= 0:
+        overflow_out[views.world[view]] = 0
 
 
 @wp.kernel
 def measure_patches_kernel(
     # In:
-    view_world: wp.array[int],
+    views: Views,
     patch: wp.array2d[wp.uint16],
     distance: wp.array2d[float],
     depth: wp.array2d[float],
@@ -48,14 +49,14 @@ def measure_patches_kernel(
     d² is a whole number and comes back from its float32 root as long as d < 1600 px; beyond, neighbouring squares may count as equal.
     """
     view, row, strip = wp.tid()
-    if view_world[view] < 0:
+    if views.world[view] < 0:
         return
     begin = row * width + strip * STRIP
     run = int(0)
     key = wp.int64(0)
     square = wp.int64(0)
     for pixel in range(begin, wp.min(begin + STRIP, (row + 1) * width)):
-        here = int(patch[view, pixel]) & CODE_MASK
+        here = int(patch[view, pixel]) & SEGMENT_MASK
         if here != run:
             if run > 0:
                 wp.atomic_max(pole_key_out, view, run - 1, key)
@@ -97,7 +98,7 @@ def measure_points_kernel(
     # State:
     entry: wp.array2d[int],
     # In:
-    view_world: wp.array[int],
+    views: Views,
     component: wp.array2d[int],
     area: wp.array2d[int],
     largest: wp.array2d[int],
@@ -114,7 +115,7 @@ def measure_points_kernel(
 ):
     """Pixels, share = Σ (z / fx) (z / fy) / expected area, pole, and distance to the contour of pole, centroid c and (pole + c) / 2."""
     view, instance = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     if world < 0:
         return
     name = largest[view, instance]
@@ -149,7 +150,7 @@ def choose_grasp_points_kernel(
     # State:
     entry: wp.array2d[int],
     # In:
-    view_world: wp.array[int],
+    views: Views,
     visible: wp.array2d[int],
     pole: wp.array2d[wp.vec2],
     centroid: wp.array2d[wp.vec2],
@@ -165,7 +166,7 @@ def choose_grasp_points_kernel(
     The centroid wins a tie. Above heavy_mass [kg] the share asked for is heavy_center_share (Periyasamy et al., 2021).
     """
     view, instance = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     if world < 0:
         return
     middle_out[world, instance] = 0.5 * (pole[world, instance] + centroid[world, instance])

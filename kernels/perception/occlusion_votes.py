@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid
-from synpick_warp.kernels.render.visibility.gbuffer import Hits
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer
 from synpick_warp.kernels.structs import CatalogData, PerceptionData
 
 wp.set_module_options({"enable_backward": False})
@@ -20,12 +20,12 @@ DEEP = wp.constant(1)
 
 
 @wp.func
-def seen_instance(hits: Hits, view: int, row: int, column: int, instances: int) -> int:
+def seen_instance(gbuffer: GBuffer, view: int, row: int, column: int, instances: int) -> int:
     """The instance that a pixel shows; -1: none."""
-    code = int(hits.code[view, row, column])
-    if code < 1 or code > instances:
+    segment = int(gbuffer.segment[view, row, column])
+    if segment < 1 or segment > instances:
         return -1
-    return code - 1
+    return segment - 1
 
 
 @wp.func
@@ -87,8 +87,7 @@ def bound_contours_kernel(
     # State:
     entry: wp.array2d[int],
     # In:
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
+    views: Views,
     contour: wp.array3d[wp.vec2i],
     contour_length: wp.array2d[int],
     depth: wp.array2d[float],
@@ -101,12 +100,12 @@ def bound_contours_kernel(
     The extents begin at NOWHERE. An instance without an entry shows no pixel, so nobody asks for its reach.
     """
     view, instance, lane = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     if world < 0:
         return
     e = entry[world, instance]
     if lane == 0 and e >= 0:
-        reach_out[view, instance] = sight.reach * catalog.diagonal[e] * cameras.intrinsics[view_camera[view]][0] / depth[world, instance]
+        reach_out[view, instance] = sight.reach * catalog.diagonal[e] * cameras.intrinsics[views.camera[view]][0] / depth[world, instance]
     extent = wp.vec4i(NOWHERE, NOWHERE, NOWHERE, NOWHERE)
     length = contour_length[view, instance]
     for point in range(lane, length, CONTOUR_LANES):
@@ -122,8 +121,8 @@ def count_votes_kernel(
     grid: ImageGrid,
     sight: PerceptionData,
     # In:
-    hits: Hits,
-    view_world: wp.array[int],
+    gbuffer: GBuffer,
+    views: Views,
     component: wp.array3d[int],
     largest: wp.array2d[int],
     contour: wp.array3d[wp.vec2i],
@@ -141,7 +140,7 @@ def count_votes_kernel(
     where a point of j's contour is farther from q than j's reach: what is seen is then too large for j, which true masks hardly ever are.
     """
     view, instance, lane = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     if world < 0 or largest[view, instance] < 0:
         return
     instances = largest.shape[1]
@@ -151,9 +150,9 @@ def count_votes_kernel(
         inside = beside(p, normal, -sight.contour_offset, grid)
         q = beside(p, normal, sight.contour_offset, grid)
         if inside[0] >= 0 and q[0] >= 0 and component[view, inside[1], inside[0]] == largest[view, instance]:
-            j = seen_instance(hits, view, q[1], q[0], instances)
-            d = hits.depth[view, q[1], q[0]]
-            if j >= 0 and j != instance and d < hits.depth[view, inside[1], inside[0]]:
+            j = seen_instance(gbuffer, view, q[1], q[0], instances)
+            d = gbuffer.depth[view, q[1], q[0]]
+            if j >= 0 and j != instance and d < gbuffer.depth[view, inside[1], inside[0]]:
                 if is_in_reach(q, reach[view, j], extent[view, j], contour, view, j, contour_length[view, j]):
                     if d > depth[world, instance] + sight.deep_distance:
                         wp.atomic_add(count_out, view, instance, j, DEEP, 1)
@@ -166,14 +165,14 @@ def weigh_votes_kernel(
     # Scene:
     sight: PerceptionData,
     # In:
-    view_world: wp.array[int],
+    views: Views,
     count: wp.array4d[int],
     # Out:
     votes_out: wp.array3d[float],
 ):
     """votes[i, j] = full + deep_weight · deep."""
     view, instance, neighbour = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     if world < 0:
         return
     deep = float(count[view, instance, neighbour, DEEP])

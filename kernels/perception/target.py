@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Mode, Outcome, Stream
+from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.rng import stream_key, uniform_index
 from synpick_warp.kernels.structs import PickData
 
@@ -63,7 +64,7 @@ def choose_target_kernel(
     attempt: wp.array[int],
     outcome: wp.array[int],
     # In:
-    view_world: wp.array[int],
+    views: Views,
     visible: wp.array2d[int],
     share: wp.array2d[float],
     ancestors: wp.array2d[wp.uint32],
@@ -76,7 +77,7 @@ def choose_target_kernel(
     of the coming attempt is the draw's index. -1: nothing is visible.
     """
     view = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     if world < 0:
         return
     chosen = int(-1)

@@ -51,7 +51,7 @@ def take_batch_kernel(
 @wp.kernel
 def advance_batch_kernel(
     # Scene:
-    views: int,
+    batch_size: int,
     # State:
     count: wp.array[int],
     # Out:
@@ -59,5 +59,5 @@ def advance_batch_kernel(
     left_out: wp.array[int],
 ):
     """Go on behind the batch."""
-    first_inout[0] = first_inout[0] + views
+    first_inout[0] = first_inout[0] + batch_size
     left_out[0] = wp.max(count[0] - first_inout[0], 0)

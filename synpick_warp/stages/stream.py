@@ -17,6 +17,7 @@ from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
 
@@ -209,7 +210,7 @@ class FrameStream:
         self.cameras = len(config.cameras.positions)
         self.tick_time = config.physics.step * config.physics.steps_per_tick
         sizes = view_sizes(config, device)
-        self.batch = sizes["view"]
+        self.batch, self.instances = sizes["view"], sizes["instance"]
         self.device = device
         self.copy_stream = wp.Stream(device) if device.is_cuda else None
         self.images = [item.name for kind in (ViewBuffers, BoundaryBuffers) for item in fields(kind)]
@@ -248,11 +249,12 @@ class FrameStream:
             yield self._collect(waiting, world, camera, report)
 
     def _launch(self, slot: int, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray) -> None:
-        views = self.lists[slot]
+        rows = self.lists[slot]
         padded = np.zeros((2, self.batch), dtype=np.int32)
         padded[:, : len(world)] = world, camera
-        views.assign(padded)
-        self.renderer.render(snapshot, views[0], views[1], len(world), self.buffers[slot], self.layer_buffers[slot])
+        rows.assign(padded)
+        views = make_views(rows[0], rows[1], len(world), self.instances)
+        self.renderer.render(snapshot, views, self.buffers[slot], self.layer_buffers[slot])
         list_boundaries(self.boundary_scratch, len(world), self.buffers[slot], self.boundaries[slot])
         self.copies[slot].start(self.copy_stream)
 

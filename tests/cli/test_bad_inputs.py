@@ -24,6 +24,7 @@ from synpick_warp.scenes.types import Catalog, Material
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.view_setup import make_views
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, camera, entry, even_light, sheet, snapshot
 
 TEXEL, PIXELS = 0.01, 5
@@ -74,7 +75,9 @@ def albedo(material: Material, rows: int, columns: int, device) -> np.ndarray:
     sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
     layers = allocate(LayerBuffers, sizes, device, ("albedo",))
     zero = wp.zeros(1, dtype=wp.int32, device=device)
-    Renderer(config, scene, toy.room, 1).render(snapshot(toy, device), zero, zero, 1, allocate(ViewBuffers, sizes, device), layers)
+    Renderer(config, scene, toy.room, 1).render(
+        snapshot(toy, device), make_views(zero, zero, 1, toy.room), allocate(ViewBuffers, sizes, device), layers
+    )
     return layers.albedo.numpy()[0]
 
 

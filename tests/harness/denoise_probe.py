@@ -3,15 +3,15 @@
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate
-from synpick_warp.kernels.render.lighting.coarse_grid import CellGrid, Guide, cell_number, spread_cell
-from synpick_warp.kernels.render.lighting.coarse_paths import Gathered
-from synpick_warp.kernels.render.lighting.denoise import Shares, choose_windows_kernel, narrowed, soften_shares_kernel, sum_blocks_kernel
+from synpick_warp.arrays import allocate_struct
+from synpick_warp.kernels.render.lighting.coarse_grid import CellGrid, cell_number, spread_cell
+from synpick_warp.kernels.render.lighting.denoise import choose_windows_kernel, narrowed, soften_shares_kernel, sum_blocks_kernel
 from synpick_warp.kernels.render.lighting.sampling import scrambled_point, sobol_point
+from synpick_warp.kernels.render.visibility.camera import in_image
 from synpick_warp.scenes.types import Camera
-from synpick_warp.stages.render.denoised import GatheredArrays, GuideArrays, ShareArrays, cell_grid
+from synpick_warp.stages.render.denoised import GATHERED, GUIDE, SHARES, cell_grid
 from synpick_warp.stages.render.scene import build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import filled
+from synpick_warp.stages.render.view_setup import make_views
 
 wp.set_module_options({"enable_backward": False})
 
@@ -24,9 +24,9 @@ def visit_kernel(
     visits_inout: wp.array3d[int],
 ):
     """How often each cell of each view is visited."""
-    cell = spread_cell(cells, wp.tid())
-    if cell[1] < cells.cells.height and cell[2] < cells.cells.width:
-        wp.atomic_add(visits_inout, cell[0], cell[1], cell[2], 1)
+    view, row, column = spread_cell(cells, wp.tid())
+    if in_image(cells.cells, row, column):
+        wp.atomic_add(visits_inout, view, row, column, 1)
 
 
 @wp.kernel
@@ -90,13 +90,14 @@ class FlatFilter:
         self.device, self.count = device, build_grid(width, height).tiles * 32
         self.cameras = build_cameras((Camera(width, height, matrix, np.eye(3), np.zeros(3)),), device)
         self.cells = cell_grid(build_grid(width, height), 1, 1)
-        self.view_camera = wp.zeros(1, dtype=wp.int32, device=device)
-        self.guide = filled(Guide, allocate(GuideArrays, sizes, device))
-        self.guide.code.fill_(1)
+        zero = wp.zeros(1, dtype=wp.int32, device=device)
+        self.views = make_views(zero, zero, 1, 1)
+        self.guide = allocate_struct(GUIDE, sizes, device)
+        self.guide.segment.fill_(1)
         self.guide.depth.fill_(1.0)
         self.guide.normal.fill_(wp.vec3(0.0, 0.0, -1.0))
-        self.gathered, self.blocks = (filled(Gathered, allocate(GatheredArrays, sizes, device)) for _ in range(2))
-        self.chosen, self.shares = (filled(Shares, allocate(ShareArrays, sizes, device)) for _ in range(2))
+        self.gathered, self.blocks = (allocate_struct(GATHERED, sizes, device) for _ in range(2))
+        self.chosen, self.shares = (allocate_struct(SHARES, sizes, device) for _ in range(2))
 
     def assign(self, name: str, values: np.ndarray) -> None:
         """Set an array of what was gathered: (row, column) grey, or (row, column, 3)."""
@@ -111,6 +112,6 @@ class FlatFilter:
             (choose_windows_kernel, self.blocks, (doubt,), self.chosen),
             (soften_shares_kernel, self.chosen, (), self.shares),
         ):
-            wp.launch(kernel, self.count, [*shared, source, self.view_camera, *rules, 0], [out], device=self.device)
+            wp.launch(kernel, self.count, [*shared, source, self.views, *rules, 0], [out], device=self.device)
         made = {name: getattr(self.shares, name).numpy()[0] for name in ("diffuse", "gloss", "between")}
         return made | {f"chosen_{name}": getattr(self.chosen, name).numpy()[0] for name in ("diffuse", "gloss", "between")}

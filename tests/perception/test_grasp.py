@@ -19,6 +19,7 @@ from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays,
 from synpick_warp.stages.perception.plan import GraspPlanner
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.worlds import AttemptState
 from tests.harness.grasp_probe import solve_kinematics_kernel
 from tests.twins import planning
@@ -118,10 +119,12 @@ class GraspHarness:
         }
         self.arrays, self.observation = allocate(PerceptionArrays, sizes, device), allocate(Observation, sizes, device)
         self.grasp = allocate(Plan, sizes, device)
-        self.arrays.world.assign(np.arange(views))
-        renderer.prepare_bodies(snapshot(toy, device), self.arrays.world, self.arrays.camera, views)
-        renderer.find_hits(self.arrays.camera, views, allocate(ViewBuffers, sizes, device))
-        self.ids, self.depth = renderer.hits.code.numpy().astype(int) - 1, renderer.hits.depth.numpy()
+        world, camera_index = wp.array(range(views), dtype=wp.int32, device=device), wp.zeros(views, dtype=wp.int32, device=device)
+        batch = make_views(world, camera_index, views, instances)
+        renderer.set_up_views(snapshot(toy, device), batch)
+        renderer.rasterize(batch, allocate(ViewBuffers, sizes, device))
+        gbuffer = renderer.gbuffer
+        self.ids, self.depth = gbuffer.segment.numpy().astype(int) - 1, gbuffer.depth.numpy()
         self.expected = planning.segment(self.ids, self.depth, instances)
         self.arrays.component.assign(self.expected["component"])
         self.arrays.largest.assign(self.expected["largest"])
@@ -134,7 +137,13 @@ class GraspHarness:
         self.worlds.scene.pick.tilt_limit = tilt_limit
         self.scene = self.worlds.scene
         self.images: Any = SimpleNamespace(
-            render_scene=scene, arrays=self.arrays, hits=renderer.hits, bodies=renderer.bodies, cameras=scene.cameras, grid=scene.grid
+            render_scene=scene,
+            views=batch,
+            arrays=self.arrays,
+            gbuffer=gbuffer,
+            bodies=renderer.bodies,
+            cameras=scene.cameras,
+            grid=scene.grid,
         )
         self.planner = GraspPlanner(toy.settings().sight, self.images, device)
 
@@ -233,7 +242,7 @@ def test_worlds_without_a_target_and_unused_views_keep_their_plan(device):
     pose = (0, 0, 0, *axis_angle((0, 1, 0), 0.3))
     harness = GraspHarness(device, ToyScene([entry(sheet(0.2, 0.2))], [[(0, pose)]] * 3, (VIEW,)))
     harness.grasp.target.assign(np.array([-1, 0, 0]))
-    harness.arrays.world.assign(np.array([0, 1, -1]))
+    harness.images.views.world.assign(np.array([0, 1, -1]))
     for array in (harness.grasp.normal, harness.grasp.point, harness.grasp.yaw, harness.grasp.tilt):
         array.fill_(5.0)
     plan = harness.plan_grasps()
@@ -248,7 +257,7 @@ def test_the_whole_planner(device):
     wide, small = 0, 1
     placed = [[(wide, lower), (small, upper)], [(small, upper), (wide, lower)], [], [(wide, lower)]]
     harness = GraspHarness(device, ToyScene([entry(box(0.2, 0.15, 0.04)), entry(box(0.12, 0.08, 0.04))], placed, (VIEW,)))
-    harness.arrays.world.assign(np.array([0, 1, 2, -1]))
+    harness.images.views.world.assign(np.array([0, 1, 2, -1]))
     worlds, attempts = harness.worlds, allocate(AttemptState, {"world": 4, "instance": 4}, device)
     worlds.set(worlds.state.catalog_index, [[0, 1, -1, -1], [1, 0, -1, -1], [-1] * 4, [0, -1, -1, -1]])
     for name in ("contour", "contour_length"):

@@ -244,23 +244,23 @@ def test_gbuffer_equals_the_renderers_without_gripper(device):
     cameras = make_cameras(config.cameras)
     shared = build_render_scene(config, Catalog(tuple(scene.entries)), scene.fixtures, cameras, scene.lights, device)
     segmenter = segment.Segmenter(config.sight, config.cameras, shared, 4, scene.room)
-    segmenter.arrays.world.assign([1, -1, 0])
-    segmenter.hit_arrays.code.fill_(77)
+    segmenter.views.world.assign([1, -1, 0])
+    segmenter.gbuffer.segment.fill_(77)
     scene.fixtures_visible = (1, 1, 1)
     segmenter.render(snapshot(scene, device))
-    code, depth = segmenter.hits.code.numpy(), segmenter.hits.depth.numpy()
+    code, depth = segmenter.gbuffer.segment.numpy(), segmenter.gbuffer.depth.numpy()
     for view, world in ((0, 1), (2, 0)):
         assert (code[view] == expected.instance[world]).all()
         # The renderer rasterizes triangles; perception casts rays through BVHs.
         np.testing.assert_allclose(depth[view], expected.exact_depth[world], rtol=1e-6)
     assert (code[1] == 77).all()
-    assert segmenter.arrays.camera.numpy().tolist() == [0, -1, 0]
+    assert segmenter.views.camera.numpy().tolist() == [0, -1, 0]
 
 
 def test_a_batch_without_worlds_writes_nothing(device):
     """All views are unused at the start."""
     harness = SegmenterHarness(device, WIDTH, HEIGHT, worlds=2)
-    assert harness.stage.arrays.world.numpy().tolist() == [-1, -1]
+    assert harness.stage.views.world.numpy().tolist() == [-1, -1]
     harness.observe(worlds=[])
     assert (harness.observation.grasp_pixel.numpy() == 0).all()
 

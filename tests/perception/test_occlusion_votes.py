@@ -167,7 +167,7 @@ def test_neighbour_without_contour_points_is_within_reach(device):
 def test_unused_views_write_nothing(device):
     picture = paint([(20, 20, 49, 59, LOW), (50, 0, 90, 79, HIGH)])
     harness = harness_of(device, picture, picture)
-    harness.arrays.world.assign(np.array([-1, 0]))
+    harness.images.views.world.assign(np.array([-1, 0]))
     harness.observation.votes.fill_(7.0)
     votes = harness.votes()
     assert votes[0, 0, 1] == 40

@@ -104,5 +104,5 @@ def test_no_visible_instance_to_sample_from(device):
 def test_an_unused_view_keeps_the_target(device):
     harness = harness_of(device, [[1, 1]] * 2, [[0.5, 0.6]] * 2, [[0, 0]] * 2)
     harness.grasp.target.fill_(7)
-    harness.arrays.world.assign(np.array([1, -1]))
+    harness.images.views.world.assign(np.array([1, -1]))
     assert choose(harness, Mode.PICK) == [7, 1]

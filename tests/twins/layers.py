@@ -13,6 +13,7 @@ from synpick_warp.scenes.types import Camera, Catalog
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.view_setup import make_views
 from tests.twins.raycast import rotation_of
 from tests.worlds.toy_scene import ToyScene, snapshot
 
@@ -30,10 +31,10 @@ class Before:
 
 @dataclass(frozen=True)
 class Drawn:
-    """Layers by name, beside the hits from which they came: codes and planar depth [m]."""
+    """Layers by name, beside the G-buffer that they are computed from: segmentation ids and planar depth [m]."""
 
     layers: dict[str, np.ndarray]
-    code: np.ndarray
+    segment: np.ndarray
     depth: np.ndarray
     names: tuple[str, ...] = field(default=LAYERS)
 
@@ -59,9 +60,9 @@ def draw(toy: ToyScene, device: wp.Device, before: Before | None = None, names: 
     out = allocate(LayerBuffers, sizes, device, names)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
-    renderer.render(made, view_world, view_camera, views, allocate(ViewBuffers, sizes, device), out)
+    renderer.render(made, make_views(view_world, view_camera, views, toy.room), allocate(ViewBuffers, sizes, device), out)
     layers = {name: getattr(out, name).numpy() for name in names}
-    return Drawn(layers, renderer.hits.code.numpy(), renderer.hits.depth.numpy(), names)
+    return Drawn(layers, renderer.gbuffer.segment.numpy(), renderer.gbuffer.depth.numpy(), names)
 
 
 def points(depth: np.ndarray, camera: Camera) -> np.ndarray:

@@ -46,13 +46,13 @@ class SegmenterHarness:
     def observe(self, *codes: np.ndarray, depth: np.ndarray | float = 2.0, worlds: list[int] | None = None) -> None:
         """Process images of segmentation ids (H, W), one a view, with a depth image or one depth [m]; by default of worlds 0, 1, ..."""
         stage = self.stage
-        images = stage.hit_arrays.code.numpy()
+        images = stage.gbuffer.segment.numpy()
         for view, image in enumerate(codes):
             images[view] = image
-        stage.hit_arrays.code.assign(images)
-        stage.hit_arrays.depth.assign(np.broadcast_to(np.float32(depth), images.shape))
+        stage.gbuffer.segment.assign(images)
+        stage.gbuffer.depth.assign(np.broadcast_to(np.float32(depth), images.shape))
         shown = list(range(len(codes))) if worlds is None else worlds
-        stage.arrays.world.assign(np.array(shown + [-1] * (stage.views - len(shown))))
+        stage.views.world.assign(np.array(shown + [-1] * (stage.views.count - len(shown))))
         self.scene.catalog.mass.assign(self.mass)
         self.scene.catalog.area.assign(self.area)
         stage.find_grasp_points(self.scene, self.catalog_index, self.observation)  # type: ignore[arg-type]

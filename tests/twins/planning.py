@@ -8,15 +8,15 @@ from typing import Any
 
 import cv2
 import numpy as np
+import warp as wp
 
-from synpick_warp.arrays import allocate
+from synpick_warp.arrays import allocate, allocate_struct
 from synpick_warp.configs.schema import Sight
-from synpick_warp.kernels.render.visibility.gbuffer import Hits
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import GraspPlanner
 from synpick_warp.stages.render.scene import build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import HitArrays, filled
+from synpick_warp.stages.render.view_setup import GBUFFER, make_views
 from synpick_warp.stages.sim.worlds import AttemptState
 from tests.worlds import kernel_worlds
 
@@ -81,20 +81,22 @@ class PlannerHarness:
         sizes = {"view": self.views, "world": self.views, "instance": instances, "row": height, "column": width, "point": CAPACITY}
         self.arrays, self.observation = allocate(PerceptionArrays, sizes, device), allocate(Observation, sizes, device)
         self.grasp, self.attempts = allocate(Plan, sizes, device), allocate(AttemptState, sizes, device)
-        self.hits = allocate(HitArrays, sizes, device)
-        self.hits.code.assign((ids + 1).astype(np.uint8))
-        self.hits.depth.assign(depths)
+        self.gbuffer = allocate_struct(GBUFFER, sizes, device)
+        self.gbuffer.segment.assign((ids + 1).astype(np.uint8))
+        self.gbuffer.depth.assign(depths)
         camera = Camera(width, height, np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1.0]]), np.eye(3), np.zeros(3))
+        world, camera_index = (wp.array(values, dtype=wp.int32, device=device) for values in (range(self.views), [0] * self.views))
+        views = make_views(world, camera_index, self.views, instances)
         self.images: Any = SimpleNamespace(
             render_scene=None,
             arrays=self.arrays,
-            hits=filled(Hits, self.hits),
+            views=views,
+            gbuffer=self.gbuffer,
             bodies=None,
             cameras=build_cameras((camera,), device),
             grid=build_grid(width, height),
         )
         self.expected = segment(ids, depths, instances)
-        self.arrays.world.assign(np.arange(self.views))
         for name in ("component", "largest", "contour", "contour_length"):
             getattr(self.arrays, name).assign(self.expected[name])
         for name in ("visible", "grasp_pixel", "depth", "visible_fraction"):
@@ -167,7 +169,7 @@ def votes(harness: PlannerHarness, diagonal: float | np.ndarray) -> np.ndarray:
     rule, expected = SETTINGS, harness.expected
     with np.errstate(divide="ignore"):
         reach = rule["reach"] * np.asarray(diagonal) * FOCAL / expected["depth"]
-    codes, depths = harness.hits.code.numpy().astype(int) - 1, harness.hits.depth.numpy()
+    codes, depths = harness.gbuffer.segment.numpy().astype(int) - 1, harness.gbuffer.depth.numpy()
     result = np.zeros(harness.observation.votes.shape)
     for view, i in np.argwhere(expected["contour_length"] > 0):
         line = expected["contour"][view, i, : expected["contour_length"][view, i]].astype(float)

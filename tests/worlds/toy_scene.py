@@ -14,6 +14,7 @@ from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Environment
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.view_setup import make_views
 
 GREY = Material(color=(0.7, 0.7, 0.7), texture=None, metallic=0.0, roughness=0.8)
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -173,10 +174,10 @@ def render(toy: ToyScene, device: wp.Device) -> Picture:
     out = allocate(ViewBuffers, sizes, device)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
-    renderer.render(snapshot(toy, device), view_world, view_camera, views, out)
+    renderer.render(snapshot(toy, device), make_views(view_world, view_camera, views, toy.room), out)
     images = {name: getattr(out, name).numpy() for name in ("color", "depth", "instance", "amodal", "pixels", "boxes")}
-    shown = renderer.picture
-    return Picture(**images, exact_depth=renderer.hits.depth.numpy(), radiance=shown.radiance.numpy(), mix=shown.mix.numpy())
+    shown = renderer.image
+    return Picture(**images, exact_depth=renderer.gbuffer.depth.numpy(), radiance=shown.radiance.numpy(), mix=shown.mix.numpy())
 
 
 def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
@@ -186,6 +187,7 @@ def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
     sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
     out = allocate(ViewBuffers, sizes, device)
     zero = wp.zeros(1, dtype=wp.int32, device=device)
-    renderer.prepare_bodies(snapshot(toy, device), zero, zero, 1)
-    renderer.find_hits(zero, 1, out)
+    views = make_views(zero, zero, 1, toy.room)
+    renderer.set_up_views(snapshot(toy, device), views)
+    renderer.rasterize(views, out)
     return out, renderer

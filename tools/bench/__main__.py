@@ -39,7 +39,8 @@ from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.pipeline import Factory, build_factory, run_bake
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.render.annotate import annotate
-from synpick_warp.stages.render.denoised import FastPicture
+from synpick_warp.stages.render.denoised import DenoisedRenderer
+from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, TickReader, TickReport
@@ -216,28 +217,29 @@ def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], objec
     """Launches of each stage of a batch of `count` views, by name, in order; "all" is all of them."""
     simulation, renderer, out = factory.simulation, factory.stream.renderer, factory.stream.buffers[0]
     cameras, snapshot, shading = len(factory.cameras), simulation.records[0].snapshot, renderer.shading
-    bodies, hits, picture = renderer.bodies, renderer.hits, renderer.picture
+    bodies, gbuffer, image = renderer.bodies, renderer.gbuffer, renderer.image
     view = np.arange(count, dtype=np.int32)
     world, camera = (wp.array(values, dtype=wp.int32, device=simulation.device) for values in (view // cameras, view % cameras))
+    views = make_views(world, camera, count, renderer.instances)
     stages: dict[str, Callable[[], object]] = {
-        "prepare bodies": lambda: renderer.prepare_bodies(snapshot, world, camera, count),
-        "find hits": lambda: renderer.find_hits(camera, count, out),
+        "prepare bodies": lambda: renderer.set_up_views(snapshot, views),
+        "find hits": lambda: renderer.rasterize(views, out),
     }
-    if isinstance(shading, FastPicture):
+    if isinstance(shading, DenoisedRenderer):
         stages |= {
-            "gather light": lambda: shading.gather(snapshot, bodies, hits, world, camera, count),
-            "filter light": lambda: shading.filter(camera, count),
-            "shadows of the main light": lambda: shading.cast_shadows(snapshot, bodies, hits, world, camera, count),
-            "shade": lambda: shading.light(snapshot, bodies, hits, world, camera, count, picture.radiance),
+            "gather light": lambda: shading.gather(snapshot, bodies, gbuffer, views),
+            "filter light": lambda: shading.filter(views),
+            "shadows of the main light": lambda: shading.cast_shadows(snapshot, bodies, gbuffer, views),
+            "shade": lambda: shading.light(snapshot, bodies, gbuffer, views, image.radiance),
         }
         if shading.antialias:
-            stages["anti-alias"] = lambda: shading.smooth(bodies, hits, camera, count, picture)
+            stages["anti-alias"] = lambda: shading.smooth(bodies, gbuffer, views, image)
     else:
-        stages["trace paths"] = lambda: shading.shade(snapshot, bodies, hits, world, camera, count, picture)
+        stages["trace paths"] = lambda: shading.shade(snapshot, bodies, gbuffer, views, image)
     return stages | {
-        "develop": lambda: renderer.develop(snapshot, world, camera, count, out),
-        "annotate": lambda: annotate(renderer.scene, renderer.bodies, camera, count, out),
-        "all": lambda: renderer.render(snapshot, world, camera, count, out),
+        "develop": lambda: renderer.postprocess(snapshot, views, out),
+        "annotate": lambda: annotate(renderer.scene, renderer.bodies, views, out),
+        "all": lambda: renderer.render(snapshot, views, out),
     }
 
 

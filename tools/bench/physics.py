@@ -251,7 +251,7 @@ def _looks(simulation: Simulation, least: float) -> Iterator[Row]:
         while calls < LEAST_REPEATS or sum(watch.seconds(name) for _, _, name in parts) < least:
             perceive_batch()
             calls += 1
-    views = perception.segmenter.views
+    views = perception.segmenter.views.count
     yield Row("sight", "views in a batch", views, "")
     for _, _, name in parts:
         yield Row("sight", f"a look: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")

@@ -21,7 +21,8 @@ from synpick_warp.pipeline import Factory
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot
-from synpick_warp.stages.render.layers import LayerPainter
+from synpick_warp.stages.render.layers import LayerRenderer
+from synpick_warp.stages.render.view_setup import make_views
 from tools.bench.physics import BURST, Row, seconds_per_call
 
 ORDERS = {
@@ -258,24 +259,23 @@ class _Ours:
     def __init__(self, config: Config, factory: Factory, count: int) -> None:
         self.renderer, self.out = factory.stream.renderer, factory.stream.buffers[0]
         self.snapshot = factory.simulation.records[0].snapshot
-        self.count = count
         scene, cameras, view = self.renderer.scene, len(factory.cameras), np.arange(count, dtype=np.int32)
-        self.world, self.camera = (wp.array(v, dtype=wp.int32, device=scene.device) for v in (view // cameras, view % cameras))
+        world, camera = (wp.array(v, dtype=wp.int32, device=scene.device) for v in (view // cameras, view % cameras))
+        self.views = make_views(world, camera, count, self.renderer.instances)
         asked = replace(config, render=replace(config.render, layers=LAYERS))
-        self.painter = LayerPainter(asked, scene, self.renderer.instances, count)
+        self.layer_renderer = LayerRenderer(asked, scene, self.renderer.instances, count)
         self.layers = allocate(LayerBuffers, {"view": count, "row": scene.height, "column": scene.width}, scene.device, LAYERS)
 
     def hits(self) -> None:
-        self.renderer.prepare_bodies(self.snapshot, self.world, self.camera, self.count)
-        self.renderer.find_hits(self.camera, self.count, self.out)
+        self.renderer.set_up_views(self.snapshot, self.views)
+        self.renderer.rasterize(self.views, self.out)
 
     def hits_and_layers(self) -> None:
         self.hits()
-        bodies, hits = self.renderer.bodies, self.renderer.hits
-        self.painter.draw(self.snapshot, bodies, hits, self.world, self.camera, self.count, self.layers)
+        self.layer_renderer.draw(self.snapshot, self.renderer.bodies, self.renderer.gbuffer, self.views, self.layers)
 
     def picture(self) -> None:
-        self.renderer.render(self.snapshot, self.world, self.camera, self.count, self.out)
+        self.renderer.render(self.snapshot, self.views, self.out)
 
 
 def _pair(outputs: str, ours_too: str, theirs_too: str, ours: float, theirs: float) -> Iterator[Row]:

@@ -30,6 +30,7 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.view_setup import make_views
 from tools.options import configure, fail, make_parser, write_json
 from tools.reports.render_checks import with_mode
 from tools.reports.render_piles import following, settled
@@ -201,7 +202,7 @@ def render_views(config: Config, scene: Any, snapshot: Snapshot) -> dict[str, np
     out, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, LAYERS)
     view = np.arange(worlds * cameras, dtype=np.int32)
     world, camera = (wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras))
-    renderer.render(snapshot, world, camera, len(view), out, layers)
+    renderer.render(snapshot, make_views(world, camera, len(view), renderer.instances), out, layers)
     images = {item.name: getattr(out, item.name).numpy() for item in fields(ViewBuffers)}
     return images | {name: getattr(layers, name).numpy() for name in LAYERS}
 

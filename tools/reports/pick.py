@@ -30,6 +30,7 @@ from synpick_warp.pipeline import Factory, build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.annotate import annotate
+from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.simulate import RECORDS
 from synpick_warp.stages.stream import HostCopy, TickReader, TickReport
 from tools.options import INTERRUPTED, configure, fail, make_parser, names_of, print_machine, write_json
@@ -129,10 +130,11 @@ class Eyes:
             target.assign(np.pad(values, (0, target.shape[0] - len(values))).astype(np.int32))
         for first in range(0, len(self.world), self.batch):
             count = min(self.batch, len(self.world) - first)
-            world, camera = (_part(views, first, count) for views in self.lists)
-            self.renderer.prepare_bodies(snapshot, world, camera, count)
-            self.renderer.find_hits(camera, count, self.out)
-            annotate(self.renderer.scene, self.renderer.bodies, camera, count, self.out)
+            world, camera = (_part(values, first, count) for values in self.lists)
+            views = make_views(world, camera, count, self.renderer.instances)
+            self.renderer.set_up_views(snapshot, views)
+            self.renderer.rasterize(views, self.out)
+            annotate(self.renderer.scene, self.renderer.bodies, views, self.out)
             wp.copy(_part(self.pixels, first, count), _part(self.out.pixels, 0, count))
         self.copy.start(None)
 

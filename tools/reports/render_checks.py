@@ -19,6 +19,7 @@ from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Environment
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.view_setup import make_views
 from tools.options import Row
 
 MOST_FURNACE_ERROR = 1.0
@@ -62,10 +63,10 @@ class Studio:
         """Picture of a world by a camera."""
         started = time.perf_counter()
         world_list, camera_list = (wp.array([number], dtype=wp.int32, device=self.device) for number in (world, camera))
-        self.renderer.render(snapshot, world_list, camera_list, 1, self.out)
+        self.renderer.render(snapshot, make_views(world_list, camera_list, 1, self.renderer.instances), self.out)
         color = self.out.color.numpy()[0].copy()
         seconds = time.perf_counter() - started
-        return Shot(color, self.renderer.picture.radiance.numpy()[0].copy(), self.out.instance.numpy()[0].copy(), seconds)
+        return Shot(color, self.renderer.image.radiance.numpy()[0].copy(), self.out.instance.numpy()[0].copy(), seconds)
 
 
 def bounded(name: str, value: float, unit: str, most: float) -> Row:

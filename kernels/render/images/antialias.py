@@ -9,18 +9,18 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, off_plane, pixel_plane
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     RAY_REGISTERS,
-    Bodies,
+    GBuffer,
     Hit,
-    Hits,
     Meshes,
     Table,
+    ViewBodies,
     body_of,
     face_normal,
     hit_table,
-    trace_candidates,
+    trace_bodies,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -33,10 +33,10 @@ of four rows or columns, so that edges of any direction are seen."""
 CORNERS = wp.constant(4)
 """Pixels whose centres are a square's corners: upper left, upper right, lower left, lower right."""
 BITS = wp.constant(2)
-"""Of a sample in `Picture.mix`."""
+"""Of a sample in `ShadedImage.mix`."""
 LOWEST = wp.constant(wp.uint32(3))
 """The lowest BITS."""
-SEGMENT_TILES = wp.constant(32)
+CHUNK_TILES = wp.constant(32)
 """Tiles of squares whose edges have a counter of their own: threads that count up the same number stand in line."""
 CREASE = wp.constant(1.5)
 """Slopes [m/m] of a body's surface before and behind a square that differ by more are an edge: by 2 do those of a box's edge that points
@@ -54,7 +54,7 @@ NEARNESS = wp.constant(0.1)
 
 
 @wp.struct
-class Picture:
+class ShadedImage:
     """A picture before development."""
 
     radiance: wp.array3d[wp.vec3]
@@ -72,32 +72,32 @@ def sample_source(mix: wp.uint32, sample: int) -> wp.vec2i:
 
 
 @wp.func
-def pixel_radiance(picture: Picture, view: int, row: int, column: int) -> wp.vec3:
+def pixel_radiance(image: ShadedImage, view: int, row: int, column: int) -> wp.vec3:
     """What a pixel shows."""
-    mix = picture.mix[view, row, column]
+    mix = image.mix[view, row, column]
     if mix == wp.uint32(0):
-        return picture.radiance[view, row, column]
+        return image.radiance[view, row, column]
     total = wp.vec3(0.0, 0.0, 0.0)
     for sample in range(SAMPLES):
         step = sample_source(mix, sample)
-        total += picture.radiance[view, row + step[0], column + step[1]]
+        total += image.radiance[view, row + step[0], column + step[1]]
     return total / float(SAMPLES)
 
 
 @wp.func
-def bends(hits: Hits, grid: ImageGrid, focal: float, view: int, row: int, column: int, down: int, right: int) -> bool:
+def bends(gbuffer: GBuffer, grid: ImageGrid, focal: float, view: int, row: int, column: int, down: int, right: int) -> bool:
     """Whether a body's surface bends or ends between a pixel and the next one `down` or `right`: 1/z of a plane is linear in the image,
     so each two pixels on one side tell what the next should be. At the picture's rim one side speaks for both."""
-    middle = 1.0 / hits.depth[view, row, column]
-    next = 1.0 / hits.depth[view, row + down, column + right]
+    middle = 1.0 / gbuffer.depth[view, row, column]
+    next = 1.0 / gbuffer.depth[view, row + down, column + right]
     before = float(0.0)
     behind = float(0.0)
     starts = row >= down and column >= right
     ends = row + 2 * down < grid.height and column + 2 * right < grid.width
     if starts:
-        before = wp.abs(1.0 / hits.depth[view, row - down, column - right] + next - 2.0 * middle)
+        before = wp.abs(1.0 / gbuffer.depth[view, row - down, column - right] + next - 2.0 * middle)
     if ends:
-        behind = wp.abs(1.0 / hits.depth[view, row + 2 * down, column + 2 * right] + middle - 2.0 * next)
+        behind = wp.abs(1.0 / gbuffer.depth[view, row + 2 * down, column + 2 * right] + middle - 2.0 * next)
     if not starts:
         before = behind
     elif not ends:
@@ -123,18 +123,22 @@ def differs(radiance: wp.array3d[wp.vec3], view: int, top: int, left: int, botto
 
 
 @wp.func
-def is_edge(hits: Hits, grid: ImageGrid, intrinsics: wp.vec4, view: int, top: int, left: int, bottom: int, right: int) -> bool:
+def is_edge(gbuffer: GBuffer, grid: ImageGrid, intrinsics: wp.vec4, view: int, top: int, left: int, bottom: int, right: int) -> bool:
     """Whether several bodies, or a body's surface that bends or ends, show in the square between these rows and columns."""
-    code = hits.code[view, top, left]
-    if hits.code[view, top, right] != code or hits.code[view, bottom, left] != code or hits.code[view, bottom, right] != code:
+    segment = gbuffer.segment[view, top, left]
+    if (
+        gbuffer.segment[view, top, right] != segment
+        or gbuffer.segment[view, bottom, left] != segment
+        or gbuffer.segment[view, bottom, right] != segment
+    ):
         return True
-    if int(code) == Segment.NOTHING or int(code) == Segment.TABLE:
+    if int(segment) == Segment.NOTHING or int(segment) == Segment.TABLE:
         return False
     if left < right:
-        if bends(hits, grid, intrinsics[0], view, top, left, 0, 1) or bends(hits, grid, intrinsics[0], view, bottom, left, 0, 1):
+        if bends(gbuffer, grid, intrinsics[0], view, top, left, 0, 1) or bends(gbuffer, grid, intrinsics[0], view, bottom, left, 0, 1):
             return True
     if top < bottom:
-        return bends(hits, grid, intrinsics[1], view, top, left, 1, 0) or bends(hits, grid, intrinsics[1], view, top, right, 1, 0)
+        return bends(gbuffer, grid, intrinsics[1], view, top, left, 1, 0) or bends(gbuffer, grid, intrinsics[1], view, top, right, 1, 0)
     return False
 
 
@@ -145,9 +149,9 @@ def find_edges_kernel(
     grid: ImageGrid,
     squares: ImageGrid,
     # In:
-    hits: Hits,
+    gbuffer: GBuffer,
     radiance: wp.array3d[wp.vec3],
-    view_camera: wp.array[int],
+    views: Views,
     # Out:
     mix_out: wp.array3d[wp.uint32],
     edge_out: wp.array3d[int],
@@ -158,11 +162,8 @@ def find_edges_kernel(
 
     The square (row, column) has the pixel of the same place in its lower right corner; at the picture's rim it has two or one.
     """
-    square = tile_pixel(squares, wp.tid())
-    view = square[0]
-    row = square[1]
-    column = square[2]
-    if row >= squares.height or column >= squares.width:
+    view, row, column = tile_pixel(squares, wp.tid())
+    if not in_image(squares, row, column):
         return
     if row < grid.height and column < grid.width:
         mix_out[view, row, column] = wp.uint32(0)
@@ -170,10 +171,10 @@ def find_edges_kernel(
     left = wp.max(column - 1, 0)
     bottom = wp.min(row, grid.height - 1)
     right = wp.min(column, grid.width - 1)
-    if is_edge(hits, grid, cameras.intrinsics[view_camera[view]], view, top, left, bottom, right):
+    if is_edge(gbuffer, grid, cameras.intrinsics[views.camera[view]], view, top, left, bottom, right):
         if differs(radiance, view, top, left, bottom, right):
-            segment = tile_of(squares, row, column) // SEGMENT_TILES
-            edge_out[view, segment, wp.atomic_add(edges_inout, view, segment, 1)] = row * squares.width + column
+            chunk = tile_of(squares, row, column) // CHUNK_TILES
+            edge_out[view, chunk, wp.atomic_add(edges_inout, view, chunk, 1)] = row * squares.width + column
 
 
 @wp.func
@@ -188,33 +189,28 @@ def corner_column(column: int, corner: int) -> int:
 
 
 @wp.func
-def is_pixel(grid: ImageGrid, row: int, column: int) -> bool:
-    return row >= 0 and row < grid.height and column >= 0 and column < grid.width
-
-
-@wp.func
-def seen_bodies(hits: Hits, grid: ImageGrid, view: int, row: int, column: int, instances: int) -> wp.uint64:
+def seen_bodies(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, column: int, instances: int) -> wp.uint64:
     """Bits of the bodies that a square's corners show."""
     seen = wp.uint64(0)
     for corner in range(CORNERS):
         r = corner_row(row, corner)
         c = corner_column(column, corner)
-        if is_pixel(grid, r, c):
-            code = int(hits.code[view, r, c])
-            if code != Segment.NOTHING and code != Segment.TABLE:
-                seen = seen | (wp.uint64(1) << wp.uint64(body_of(code, instances)))
+        if in_image(grid, r, c):
+            segment = int(gbuffer.segment[view, r, c])
+            if segment != Segment.NOTHING and segment != Segment.TABLE:
+                seen = seen | (wp.uint64(1) << wp.uint64(body_of(segment, instances)))
     return seen
 
 
 @wp.func
-def seen_candidates(bodies: Bodies, view: int, tile: int, seen: wp.uint64) -> wp.uint64:
+def shown_bodies_mask(bodies: ViewBodies, view: int, tile: int, seen: wp.uint64) -> wp.uint64:
     """The tile's candidates, without bodies that have no bit in `seen`."""
-    candidates = bodies.candidates[view, tile]
+    body_mask = bodies.body_mask[view, tile]
     kept = wp.uint64(0)
     number = int(0)
-    while (candidates >> wp.uint64(number)) != wp.uint64(0):
+    while (body_mask >> wp.uint64(number)) != wp.uint64(0):
         bit = wp.uint64(1) << wp.uint64(number)
-        if (candidates & bit) != wp.uint64(0):
+        if (body_mask & bit) != wp.uint64(0):
             if ((seen >> wp.uint64(bodies.order[view, number])) & wp.uint64(1)) != wp.uint64(0):
                 kept = kept | bit
         number += 1
@@ -222,7 +218,9 @@ def seen_candidates(bodies: Bodies, view: int, tile: int, seen: wp.uint64) -> wp
 
 
 @wp.func
-def like_corner(hits: Hits, grid: ImageGrid, view: int, row: int, column: int, own: int, offset: wp.vec2, hit: Hit, plane: Plane) -> int:
+def like_corner(
+    gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, column: int, own: int, offset: wp.vec2, hit: Hit, plane: Plane
+) -> int:
     """Which corner of a square shows best what a ray `offset` [px] off the centre of its corner `own` hit: the same body, near the tangent
     plane there, close by. `own`, if none shows that body. `plane` is the hit's, as that pixel sees it."""
     best = own
@@ -230,13 +228,13 @@ def like_corner(hits: Hits, grid: ImageGrid, view: int, row: int, column: int, o
     for corner in range(CORNERS):
         r = corner_row(row, corner)
         c = corner_column(column, corner)
-        if is_pixel(grid, r, c):
-            if int(hits.code[view, r, c]) == hit.code:
+        if in_image(grid, r, c):
+            if int(gbuffer.segment[view, r, c]) == hit.segment:
                 down = corner // 2 - own // 2
                 right = corner % 2 - own % 2
                 apart = NEARNESS * wp.length(wp.vec2(float(right) - offset[0], float(down) - offset[1]))
-                if hit.code != Segment.NOTHING:
-                    apart += off_plane(plane, down, right, hits.depth[view, r, c]) / plane.width
+                if hit.segment != Segment.NOTHING:
+                    apart += off_plane(plane, down, right, gbuffer.depth[view, r, c]) / plane.width
                 if apart < least:
                     least = apart
                     best = corner
@@ -252,12 +250,11 @@ def mix_edges_kernel(
     grid: ImageGrid,
     squares: ImageGrid,
     # In:
-    bodies: Bodies,
-    hits: Hits,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
     edge: wp.array3d[int],
     edges: wp.array2d[int],
-    view_camera: wp.array[int],
-    instances: int,
+    views: Views,
     threads: int,
     # Out:
     mix_inout: wp.array3d[wp.uint32],
@@ -265,13 +262,13 @@ def mix_edges_kernel(
     """Which pixels' radiance the pixels about each square with edges show in it. The host knows no number of squares, so `threads`
     threads take the samples of a segment in turn; neighbouring threads take one square's, whose rays meet the same bodies."""
     thread = wp.tid()
-    segments = edges.shape[1]
-    view = thread // (segments * threads)
-    segment = (thread // threads) % segments
-    camera = view_camera[view]
+    chunks = edges.shape[1]
+    view = thread // (chunks * threads)
+    chunk = (thread // threads) % chunks
+    camera = views.camera[view]
     intrinsics = cameras.intrinsics[camera]
-    for number in range(thread % threads, SAMPLES * edges[view, segment], threads):
-        place = edge[view, segment, number // SAMPLES]
+    for number in range(thread % threads, SAMPLES * edges[view, chunk], threads):
+        place = edge[view, chunk, number // SAMPLES]
         row = place // squares.width
         column = place % squares.width
         own = number % SAMPLES
@@ -279,17 +276,17 @@ def mix_edges_kernel(
         sample = SAMPLES - 1 - own
         r = corner_row(row, own)
         c = corner_column(column, own)
-        if is_pixel(grid, r, c):
+        if in_image(grid, r, c):
             offset = wp.vec2(ROOKS[sample, 0], ROOKS[sample, 1])
             ray = camera_ray(intrinsics, r, c, offset)
-            seen = seen_bodies(hits, grid, view, row, column, instances)
-            candidates = seen_candidates(bodies, view, tile_of(grid, r, c), seen)
-            hit = trace_candidates(meshes, bodies, view, candidates, ray, instances)
+            seen = seen_bodies(gbuffer, grid, view, row, column, views.instances)
+            body_mask = shown_bodies_mask(bodies, view, tile_of(grid, r, c), seen)
+            hit = trace_bodies(meshes, bodies, view, body_mask, ray, views.instances)
             hit = hit_table(table, cameras, camera, ray, hit)
             normal = wp.vec3(0.0, 0.0, 0.0)
-            if hit.code != Segment.NOTHING:
-                normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, view, hit, instances)
-            plane = pixel_plane(intrinsics, r, c, wp.uint8(hit.code), hit.depth, normal)
+            if hit.segment != Segment.NOTHING:
+                normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, view, hit, views.instances)
+            plane = pixel_plane(intrinsics, r, c, wp.uint8(hit.segment), hit.depth, normal)
             plane.height = hit.depth * wp.dot(normal, ray)
-            best = like_corner(hits, grid, view, row, column, own, offset, hit, plane)
+            best = like_corner(gbuffer, grid, view, row, column, own, offset, hit, plane)
             wp.atomic_or(mix_inout, view, r, c, wp.uint32(best ^ own) << wp.uint32(BITS * sample))

@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray
-from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Meshes, hits_body
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray
+from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies, hits_body
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,7 +52,7 @@ def count_inside_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
-    bodies: Bodies,
+    bodies: ViewBodies,
     instance_image: wp.array3d[wp.uint8],
     depth_image: wp.array3d[wp.uint16],
     amodal_image: wp.array3d[wp.uint32],
@@ -73,7 +73,7 @@ def count_inside_kernel(
     if columns <= 0 or rows <= 0:
         return
     bit = wp.uint32(1) << wp.uint32(instance)
-    code = wp.uint8(instance + 1)
+    segment = wp.uint8(instance + 1)
     all_pixels = int(0)
     valid = int(0)
     visible = int(0)
@@ -87,7 +87,7 @@ def count_inside_kernel(
             whole_box = grown(whole_box, row, column)
             if depth_image[view, row, column] != wp.uint16(0):
                 valid += 1
-            if instance_image[view, row, column] == code:
+            if instance_image[view, row, column] == segment:
                 visible += 1
                 visible_box = grown(visible_box, row, column)
     if all_pixels > 0:
@@ -106,8 +106,8 @@ def count_outside_kernel(
     cameras: Cameras,
     grid: ImageGrid,
     # In:
-    bodies: Bodies,
-    view_camera: wp.array[int],
+    bodies: ViewBodies,
+    views: Views,
     threads: int,
     # Out:
     pixels_out: wp.array3d[int],
@@ -118,7 +118,7 @@ def count_outside_kernel(
     box = bodies.box[view, instance]
     if box[2] < box[0] or (box[0] >= 0 and box[1] >= 0 and box[2] < grid.width and box[3] < grid.height):
         return
-    intrinsics = cameras.intrinsics[view_camera[view]]
+    intrinsics = cameras.intrinsics[views.camera[view]]
     columns = box[2] - box[0] + 1
     rows = box[3] - box[1] + 1
     count = int(0)

@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Effect, Stream
+from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.rng import normal_pair, pixel_key, uniform, view_key
 
 wp.set_module_options({"enable_backward": False})
@@ -29,8 +30,7 @@ def draw_effects_kernel(
     frame: wp.array[int],
     # In:
     rules: EffectRules,
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
+    views: Views,
     # Out:
     effects_out: wp.array[Strengths],
 ):
@@ -39,8 +39,8 @@ def draw_effects_kernel(
     The quality of JPEG is a whole number, each as likely as the others.
     """
     view = wp.tid()
-    world = view_world[view]
-    key = view_key(rules.seed, episode[world], frame[world], view_camera[view], Stream.EFFECTS)
+    world = views.world[view]
+    key = view_key(rules.seed, episode[world], frame[world], views.camera[view], Stream.EFFECTS)
     strengths = Strengths()
     for index in range(wp.static(int(Effect.JPEG_QUALITY))):
         strengths[index] = rules.low[index] + (rules.high[index] - rules.low[index]) * uniform(key, index)

@@ -5,8 +5,8 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.materials import Surface, Surfaces, base_color, mesh_surface, table_surface
-from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, Cameras, ImageGrid, camera_ray, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Hits, Meshes, body_of
+from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, Cameras, ImageGrid, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,7 +17,7 @@ class Motions:
 
     known: wp.array2d[int]
     """1: the body was in the picture in the frame before, as part of the same episode."""
-    turn: wp.array2d[wp.mat33]
+    rotation: wp.array2d[wp.mat33]
     """Rotation from now to then, minus the identity."""
     origin: wp.array2d[wp.vec3]
     """Origin of the body now [m]."""
@@ -53,9 +53,7 @@ def prepare_motions_kernel(
     last_fixture_pose: wp.array2d[wp.transformf],
     last_fixture_visible: wp.array2d[int],
     # In:
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
-    instances: int,
+    views: Views,
     # Out:
     motions_out: Motions,
 ):
@@ -64,26 +62,26 @@ def prepare_motions_kernel(
     Differences are stored, not poses, so that the error of a small motion is small.
     """
     view, body = wp.tid()
-    world = view_world[view]
+    world = views.world[view]
     known = follows[world]
     now = pose[world, 0]
     then = now
-    if body < instances:
+    if body < views.instances:
         now = pose[world, body]
         then = last_pose[world, body]
         if catalog_index[world, body] < 0 or last_catalog_index[world, body] != catalog_index[world, body]:
             known = 0
     else:
-        now = fixture_pose[world, body - instances]
-        then = last_fixture_pose[world, body - instances]
-        known *= last_fixture_visible[world, body - instances]
+        now = fixture_pose[world, body - views.instances]
+        then = last_fixture_pose[world, body - views.instances]
+        known *= last_fixture_visible[world, body - views.instances]
     motions_out.known[view, body] = known
     if known == 0:
         return
-    to_camera = cameras.rotation[view_camera[view]]
-    turn = to_camera * rotation_of(then) * wp.transpose(rotation_of(now)) * wp.transpose(to_camera)
-    motions_out.turn[view, body] = wp.mat33(turn - wp.identity(n=3, dtype=wp.float64))
-    motions_out.origin[view, body] = wp.vec3(to_camera * (position_of(now) - cameras.center[view_camera[view]]))
+    to_camera = cameras.rotation[views.camera[view]]
+    rotation = to_camera * rotation_of(then) * wp.transpose(rotation_of(now)) * wp.transpose(to_camera)
+    motions_out.rotation[view, body] = wp.mat33(rotation - wp.identity(n=3, dtype=wp.float64))
+    motions_out.origin[view, body] = wp.vec3(to_camera * (position_of(now) - cameras.center[views.camera[view]]))
     motions_out.shift[view, body] = wp.vec3(to_camera * (position_of(then) - position_of(now)))
 
 
@@ -92,8 +90,8 @@ def hit_surface(
     meshes: Meshes,
     surfaces: Surfaces,
     cameras: Cameras,
-    bodies: Bodies,
-    hits: Hits,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
     view: int,
     row: int,
     column: int,
@@ -102,13 +100,13 @@ def hit_surface(
 ) -> Surface:
     """Surface that a pixel's ray hit, which must have hit something."""
     to_camera = -wp.normalize(cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0)))
-    code = int(hits.code[view, row, column])
-    if code == Segment.TABLE:
+    segment = int(gbuffer.segment[view, row, column])
+    if segment == Segment.TABLE:
         return table_surface(meshes, to_camera)
-    triangle = hits.triangle[view, row, column]
-    barycentric = hits.barycentric[view, row, column]
-    width = hits.depth[view, row, column] / cameras.intrinsics[camera][0]
-    return mesh_surface(meshes, surfaces, bodies, view, body_of(code, instances), triangle, barycentric, to_camera, width)
+    triangle = gbuffer.triangle[view, row, column]
+    barycentric = gbuffer.barycentric[view, row, column]
+    width = gbuffer.depth[view, row, column] / cameras.intrinsics[camera][0]
+    return mesh_surface(meshes, surfaces, bodies, view, body_of(segment, instances), triangle, barycentric, to_camera, width)
 
 
 @wp.kernel
@@ -119,25 +117,21 @@ def draw_normals_kernel(
     cameras: Cameras,
     grid: ImageGrid,
     # In:
-    bodies: Bodies,
-    hits: Hits,
-    view_camera: wp.array[int],
-    instances: int,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
     first: int,
     # Out:
     normals_out: wp.array3d[wp.vec3],
 ):
     """The interpolated normal that shading uses, in the camera's axes; zero where nothing is."""
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    camera = view_camera[view]
+    camera = views.camera[view]
     normal = wp.vec3(0.0, 0.0, 0.0)
-    if int(hits.code[view, row, column]) != Segment.NOTHING:
-        surface = hit_surface(meshes, surfaces, cameras, bodies, hits, view, row, column, camera, instances)
+    if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
+        surface = hit_surface(meshes, surfaces, cameras, bodies, gbuffer, view, row, column, camera, views.instances)
         normal = wp.transpose(cameras.to_world[camera]) * surface.normal
     normals_out[view, row, column] = normal
 
@@ -150,24 +144,20 @@ def draw_albedo_kernel(
     cameras: Cameras,
     grid: ImageGrid,
     # In:
-    bodies: Bodies,
-    hits: Hits,
-    view_camera: wp.array[int],
-    instances: int,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
     first: int,
     # Out:
     albedo_out: wp.array3d[wp.vec3ub],
 ):
     """Base colour: material times texture, filtered over the pixel; black where nothing is."""
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
     color = wp.vec3(0.0, 0.0, 0.0)
-    if int(hits.code[view, row, column]) != Segment.NOTHING:
-        surface = hit_surface(meshes, surfaces, cameras, bodies, hits, view, row, column, view_camera[view], instances)
+    if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
+        surface = hit_surface(meshes, surfaces, cameras, bodies, gbuffer, view, row, column, views.camera[view], views.instances)
         color = base_color(surfaces, surface)
     albedo_out[view, row, column] = wp.vec3ub(srgb_byte(color[0]), srgb_byte(color[1]), srgb_byte(color[2]))
 
@@ -178,9 +168,9 @@ def draw_nocs_kernel(
     meshes: Meshes,
     grid: ImageGrid,
     # In:
-    bodies: Bodies,
-    hits: Hits,
-    instances: int,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
     first: int,
     # Out:
     nocs_out: wp.array3d[wp.vec3],
@@ -189,20 +179,17 @@ def draw_nocs_kernel(
 
     No place on an object of any extent gives 0 in all three, which stands for no instance.
     """
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    code = int(hits.code[view, row, column])
+    segment = int(gbuffer.segment[view, row, column])
     place = wp.vec3(0.0, 0.0, 0.0)
-    if code != Segment.NOTHING and code <= instances:
-        mesh = bodies.mesh[view, code - 1]
+    if segment != Segment.NOTHING and segment <= views.instances:
+        mesh = bodies.mesh[view, segment - 1]
         lower = meshes.lower[mesh]
         upper = meshes.upper[mesh]
-        barycentric = hits.barycentric[view, row, column]
-        point = wp.mesh_eval_position(meshes.id[mesh], hits.triangle[view, row, column], barycentric[0], barycentric[1])
+        barycentric = gbuffer.barycentric[view, row, column]
+        point = wp.mesh_eval_position(meshes.id[mesh], gbuffer.triangle[view, row, column], barycentric[0], barycentric[1])
         place = (point - 0.5 * (lower + upper)) / wp.length(upper - lower) + wp.vec3(0.5, 0.5, 0.5)
     nocs_out[view, row, column] = place
 
@@ -213,41 +200,38 @@ def draw_classes_kernel(
     grid: ImageGrid,
     obj_id: wp.array[int],
     # In:
-    bodies: Bodies,
-    hits: Hits,
-    instances: int,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
     first: int,
     # Out:
     classes_out: wp.array3d[wp.uint16],
 ):
     """obj_id of the instance that is seen, 0 where none is."""
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    code = int(hits.code[view, row, column])
+    segment = int(gbuffer.segment[view, row, column])
     number = int(0)
-    if code != Segment.NOTHING and code <= instances:
-        number = obj_id[bodies.mesh[view, code - 1]]
+    if segment != Segment.NOTHING and segment <= views.instances:
+        number = obj_id[bodies.mesh[view, segment - 1]]
     classes_out[view, row, column] = wp.uint16(number)
 
 
 @wp.func
-def motion_at(motions: Motions, hits: Hits, view: int, row: int, column: int, ray: wp.vec3, follows: int, instances: int) -> wp.vec3:
+def motion_at(motions: Motions, gbuffer: GBuffer, view: int, row: int, column: int, ray: wp.vec3, follows: int, instances: int) -> wp.vec3:
     """From the point that a pixel's ray met to where it was in the frame before, in the camera's axes [m]; NaN if unknown."""
     unknown = wp.vec3(wp.NAN, wp.NAN, wp.NAN)
-    code = int(hits.code[view, row, column])
-    if code == Segment.NOTHING or follows == 0:
+    segment = int(gbuffer.segment[view, row, column])
+    if segment == Segment.NOTHING or follows == 0:
         return unknown
-    if code == Segment.TABLE:
+    if segment == Segment.TABLE:
         return wp.vec3(0.0, 0.0, 0.0)
-    body = body_of(code, instances)
+    body = body_of(segment, instances)
     if motions.known[view, body] == 0:
         return unknown
-    point = hits.depth[view, row, column] * ray
-    return motions.turn[view, body] * (point - motions.origin[view, body]) + motions.shift[view, body]
+    point = gbuffer.depth[view, row, column] * ray
+    return motions.rotation[view, body] * (point - motions.origin[view, body]) + motions.shift[view, body]
 
 
 @wp.kernel
@@ -259,23 +243,18 @@ def draw_scene_flow_kernel(
     follows: wp.array[int],
     # In:
     motions: Motions,
-    hits: Hits,
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
-    instances: int,
+    gbuffer: GBuffer,
+    views: Views,
     first: int,
     # Out:
     scene_flow_out: wp.array3d[wp.vec3],
 ):
     """Displacement of the surface point to the frame before, in the camera's axes [m]."""
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    ray = camera_ray(cameras.intrinsics[view_camera[view]], row, column, wp.vec2(0.0, 0.0))
-    scene_flow_out[view, row, column] = motion_at(motions, hits, view, row, column, ray, follows[view_world[view]], instances)
+    ray = camera_ray(cameras.intrinsics[views.camera[view]], row, column, wp.vec2(0.0, 0.0))
+    scene_flow_out[view, row, column] = motion_at(motions, gbuffer, view, row, column, ray, follows[views.world[view]], views.instances)
 
 
 @wp.kernel
@@ -287,10 +266,8 @@ def draw_flow_kernel(
     follows: wp.array[int],
     # In:
     motions: Motions,
-    hits: Hits,
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
-    instances: int,
+    gbuffer: GBuffer,
+    views: Views,
     first: int,
     # Out:
     flow_out: wp.array3d[wp.vec2],
@@ -299,16 +276,13 @@ def draw_flow_kernel(
 
     NaN where the displacement d is, and where the point was behind the camera.
     """
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    intrinsics = cameras.intrinsics[view_camera[view]]
+    intrinsics = cameras.intrinsics[views.camera[view]]
     ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
-    d = motion_at(motions, hits, view, row, column, ray, follows[view_world[view]], instances)
-    depth = hits.depth[view, row, column] + d[2]
+    d = motion_at(motions, gbuffer, view, row, column, ray, follows[views.world[view]], views.instances)
+    depth = gbuffer.depth[view, row, column] + d[2]
     flow = wp.vec2(wp.NAN, wp.NAN)
     if depth > NEAR_PLANE:
         flow = wp.vec2(intrinsics[0] * (d[0] - ray[0] * d[2]) / depth, intrinsics[1] * (d[1] - ray[1] * d[2]) / depth)

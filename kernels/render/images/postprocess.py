@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Effect, Stream, Tone
-from synpick_warp.kernels.render.images.antialias import Picture, pixel_radiance
+from synpick_warp.kernels.render.images.antialias import ShadedImage, pixel_radiance
 from synpick_warp.kernels.render.images.camera_effects import (
     BLUR_REACH,
     Strengths,
@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.images.camera_effects import (
 )
 from synpick_warp.kernels.render.lighting.color import srgb_byte
 from synpick_warp.kernels.render.lighting.environment import Lights
-from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, Cameras, ImageGrid, camera_ray, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER, Cameras, ImageGrid, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.rng import view_key
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -58,28 +58,25 @@ def develop_kernel(
     light: wp.array[int],
     light_exposure: wp.array[float],
     # In:
-    view_world: wp.array[int],
-    picture: Picture,
+    views: Views,
+    image: ShadedImage,
     tone: int,
     first: int,
     # Out:
     color_out: wp.array3d[wp.vec3ub],
 ):
     """Radiance to sRGB bytes: exposure (the map's factor times 2 to the episode's stops), tone curve, transfer curve."""
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    world = view_world[view]
-    value = lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world]) * pixel_radiance(picture, view, row, column)
+    world = views.world[view]
+    value = lights.exposure[light[world]] * wp.pow(2.0, light_exposure[world]) * pixel_radiance(image, view, row, column)
     color_out[view, row, column] = wp.vec3ub(display_value(value[0], tone), display_value(value[1], tone), display_value(value[2], tone))
 
 
 @wp.func
 def spread_value(
-    picture: Picture,
+    image: ShadedImage,
     strengths: Strengths,
     intrinsics: wp.vec4,
     grid: ImageGrid,
@@ -123,10 +120,10 @@ def spread_value(
         at = wp.clamp(low + offset, 0, size - 1)
         value = float(0.0)
         if along_row != 0:
-            value = pixel_radiance(picture, view, row, at)[channel]
+            value = pixel_radiance(image, view, row, at)[channel]
             value *= vignette_factor(loss, camera_ray(intrinsics, row, at, wp.vec2(0.0, 0.0)), slope)
         else:
-            value = picture.radiance[view, at, column][channel]
+            value = image.radiance[view, at, column][channel]
         total += ((1.0 - share) * weight + share * before) * value
         weights += weight
         before = weight
@@ -140,23 +137,20 @@ def spread_rows_kernel(
     grid: ImageGrid,
     # In:
     effects: wp.array[Strengths],
-    view_camera: wp.array[int],
-    picture: Picture,
+    views: Views,
+    image: ShadedImage,
     first: int,
     # Out:
     spread_out: wp.array3d[wp.vec3],
 ):
     """Vignette, then the part of blur and chromatic aberration that lies along rows; see `spread_value`."""
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    intrinsics = cameras.intrinsics[view_camera[view]]
+    intrinsics = cameras.intrinsics[views.camera[view]]
     value = wp.vec3(0.0, 0.0, 0.0)
     for channel in range(3):
-        value[channel] = spread_value(picture, effects[view], intrinsics, grid, view, row, column, channel, 1)
+        value[channel] = spread_value(image, effects[view], intrinsics, grid, view, row, column, channel, 1)
     spread_out[view, row, column] = value
 
 
@@ -184,32 +178,28 @@ def develop_effects_kernel(
     # In:
     rules: DevelopRules,
     effects: wp.array[Strengths],
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
-    picture: Picture,
+    views: Views,
+    image: ShadedImage,
     first: int,
     # Out:
     color_out: wp.array3d[wp.vec3ub],
 ):
     """As `develop_kernel`, with all effects: lens (unless done), exposure and white balance, noise of the sensor, tone and transfer curve.
 
-    If `spread_rows_kernel` made `picture.radiance`, its `mix` counts no more. Noise is that of the stream (seed, episode, frame, camera,
+    If `spread_rows_kernel` made `image.radiance`, its `mix` counts no more. Noise is that of the stream (seed, episode, frame, camera,
     Stream.COLOR_NOISE).
     """
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    world = view_world[view]
-    camera = view_camera[view]
+    world = views.world[view]
+    camera = views.camera[view]
     intrinsics = cameras.intrinsics[camera]
     strengths = effects[view]
-    value = pixel_radiance(picture, view, row, column)
+    value = pixel_radiance(image, view, row, column)
     if rules.spread != 0:
         for channel in range(3):
-            value[channel] = spread_value(picture, strengths, intrinsics, grid, view, row, column, channel, 0)
+            value[channel] = spread_value(image, strengths, intrinsics, grid, view, row, column, channel, 0)
     else:
         corner = corner_slope(intrinsics, grid.width, grid.height)
         value *= vignette_factor(strengths[Effect.VIGNETTE], camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)), corner)

@@ -37,8 +37,8 @@ class Guide:
     """In the camera's axes."""
     depth: wp.array3d[float]
     """Planar depth [m]."""
-    code: wp.array3d[wp.uint8]
-    """As in `Hits`."""
+    segment: wp.array3d[wp.uint8]
+    """As in `GBuffer`."""
 
 
 @wp.func
@@ -66,7 +66,7 @@ def cell_place(cells: CellGrid, pixel: int) -> float:
 
 
 @wp.func
-def spread_cell(cells: CellGrid, index: int) -> wp.vec3i:
+def spread_cell(cells: CellGrid, index: int) -> tuple[int, int, int]:
     """(view, row, column) of a flat index. The threads of a warp take cells SPREAD apart, whose points are alike: their rays are nearly
     parallel, and visit the same nodes of a mesh's tree."""
     across = SPREAD * LANES_ACROSS
@@ -80,4 +80,4 @@ def spread_cell(cells: CellGrid, index: int) -> wp.vec3i:
     region = region - view * regions
     row = (region // regions_across) * down + (lane // LANES_ACROSS) * SPREAD + place // SPREAD
     column = (region % regions_across) * across + (lane % LANES_ACROSS) * SPREAD + place % SPREAD
-    return wp.vec3i(view, row, column)
+    return view, row, column

@@ -23,8 +23,8 @@ from synpick_warp.kernels.render.lighting.path_tracing import (
     vertex_at,
 )
 from synpick_warp.kernels.render.lighting.unoccluded import Light, even_light
-from synpick_warp.kernels.render.visibility.camera import Cameras, camera_ray, hit_position
-from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Hits, read_hit
+from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, read_hit
 from synpick_warp.kernels.rng import stream_key
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -66,11 +66,21 @@ def limited(light: wp.vec3, most: wp.vec3) -> wp.vec3:
 
 @wp.func
 def paths_place(
-    scene: PathScene, cells: CellGrid, rules: PathRules, view: int, row: int, column: int, episode: int, light: int, turn: float
+    scene: PathScene,
+    cells: CellGrid,
+    rules: PathRules,
+    views: Views,
+    view: int,
+    row: int,
+    column: int,
+    episode: int,
+    light: int,
+    turn: float,
 ) -> Place:
     """Where a cell's paths are. All of an episode's pictures take their points from one stream, so that what rests looks the same."""
     place = Place()
     place.view = view
+    place.instances = views.instances
     place.light = light
     place.first_light = light + scene.lights.maps
     place.turn = turn
@@ -82,7 +92,7 @@ def paths_place(
 @wp.func
 def mean_light(
     scene: PathScene,
-    bodies: Bodies,
+    bodies: ViewBodies,
     rules: PathRules,
     place: Place,
     number: int,
@@ -127,10 +137,9 @@ def gather_kernel(
     light: wp.array[int],
     light_yaw: wp.array[float],
     # In:
-    bodies: Bodies,
-    hits: Hits,
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
     rules: PathRules,
     most_share: float,
     first: int,
@@ -142,26 +151,23 @@ def gather_kernel(
 
     The main light is left out of the first surface's light: it casts sharp shadows, and is looked for at more pixels.
     """
-    cell = spread_cell(cells, wp.tid() + first)
-    view = cell[0]
-    row = cell[1]
-    column = cell[2]
-    if row >= cells.cells.height or column >= cells.cells.width:
+    view, row, column = spread_cell(cells, wp.tid() + first)
+    if not in_image(cells.cells, row, column):
         return
     pixel = cell_pixel(cells, row, column)
-    hit = read_hit(hits, view, pixel[0], pixel[1])
-    guide_out.code[view, row, column] = wp.uint8(hit.code)
-    if hit.code == Segment.NOTHING:
+    hit = read_hit(gbuffer, view, pixel[0], pixel[1])
+    guide_out.segment[view, row, column] = wp.uint8(hit.segment)
+    if hit.segment == Segment.NOTHING:
         return
-    camera = view_camera[view]
-    world = view_world[view]
+    camera = views.camera[view]
+    world = views.world[view]
     ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
     outgoing = -wp.normalize(cameras.to_world[camera] * ray)
     position = hit_position(cameras, camera, ray, hit.depth)
     width = float(cells.size) * hit.depth / cameras.intrinsics[camera][0]
-    vertex = vertex_at(scene, bodies, view, rules.instances, hit, position, outgoing, width, 0.0)
+    vertex = vertex_at(scene, bodies, view, views.instances, hit, position, outgoing, width, 0.0)
 
-    place = paths_place(scene, cells, rules, view, row, column, episode[world], light[world], light_yaw[world])
+    place = paths_place(scene, cells, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
     even = even_light(scene.lights, place.light, place.turn, vertex.brdf)
     number = cell_number(PERIOD, row, column) * rules.samples
     found = mean_light(scene, bodies, rules, place, number, vertex, width, even, most_share)

@@ -8,7 +8,7 @@ from synpick_warp.kernels.render.lighting.coarse_paths import Gathered
 from synpick_warp.kernels.render.lighting.color import LEAST_LIGHT, luminance
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, off_plane, pixel_plane
 from synpick_warp.kernels.render.lighting.unoccluded import Light, ratio
-from synpick_warp.kernels.render.visibility.camera import Cameras, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import Cameras, Views, in_image, tile_pixel
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -38,7 +38,7 @@ def plane_at(cells: CellGrid, guide: Guide, intrinsics: wp.vec4, view: int, row:
     """The tangent plane of what a cell shows; rows and columns are of cells."""
     pixel = cell_pixel(cells, row, column)
     depth = guide.depth[view, row, column]
-    made = pixel_plane(intrinsics, pixel[0], pixel[1], guide.code[view, row, column], depth, guide.normal[view, row, column])
+    made = pixel_plane(intrinsics, pixel[0], pixel[1], guide.segment[view, row, column], depth, guide.normal[view, row, column])
     size = float(cells.size)
     made.down = size * made.down
     made.right = size * made.right
@@ -49,7 +49,7 @@ def plane_at(cells: CellGrid, guide: Guide, intrinsics: wp.vec4, view: int, row:
 @wp.func
 def likeness(guide: Guide, plane: Plane, view: int, row: int, column: int, down: int, right: int, stride: int) -> float:
     """Weight of the cell at (row, column), so many cells down and right of the plane's own; 0 on another body."""
-    if guide.code[view, row, column] != plane.code:
+    if guide.segment[view, row, column] != plane.segment:
         return 0.0
     weight = BODY_WEIGHT
     if off_plane(plane, down, right, guide.depth[view, row, column]) < SAME_SURFACE * plane.width * float(stride):
@@ -98,21 +98,18 @@ def sum_blocks_kernel(
     # In:
     guide: Guide,
     gathered: Gathered,
-    view_camera: wp.array[int],
+    views: Views,
     first: int,
     # Out:
     gathered_out: Gathered,
 ):
     """Weighted mean over the block about each cell, and its variance: that of what it averages, over the effective number of cells."""
-    cell = tile_pixel(cells.cells, wp.tid() + first)
-    view = cell[0]
-    row = cell[1]
-    column = cell[2]
-    if row >= cells.cells.height or column >= cells.cells.width:
+    view, row, column = tile_pixel(cells.cells, wp.tid() + first)
+    if not in_image(cells.cells, row, column):
         return
-    if int(guide.code[view, row, column]) == Segment.NOTHING:
+    if int(guide.segment[view, row, column]) == Segment.NOTHING:
         return
-    plane = plane_at(cells, guide, cameras.intrinsics[view_camera[view]], view, row, column)
+    plane = plane_at(cells, guide, cameras.intrinsics[views.camera[view]], view, row, column)
     window = Window()
     share = wp.vec2(0.0, 0.0)
     square = wp.vec2(0.0, 0.0)
@@ -163,7 +160,7 @@ def choose_windows_kernel(
     # In:
     guide: Guide,
     gathered: Gathered,
-    view_camera: wp.array[int],
+    views: Views,
     doubt: float,
     first: int,
     # Out:
@@ -172,15 +169,12 @@ def choose_windows_kernel(
     """Shares of even light from the widest window that tells no other than the narrower ones: 4 x 4 blocks, 2 x 2 or one about each cell.
     Blocks of a window do not overlap, so that a mean over n of them has an n-th of a block's variance, which is `doubt` times the found.
     """
-    cell = tile_pixel(cells.cells, wp.tid() + first)
-    view = cell[0]
-    row = cell[1]
-    column = cell[2]
-    if row >= cells.cells.height or column >= cells.cells.width:
+    view, row, column = tile_pixel(cells.cells, wp.tid() + first)
+    if not in_image(cells.cells, row, column):
         return
-    if int(guide.code[view, row, column]) == Segment.NOTHING:
+    if int(guide.segment[view, row, column]) == Segment.NOTHING:
         return
-    plane = plane_at(cells, guide, cameras.intrinsics[view_camera[view]], view, row, column)
+    plane = plane_at(cells, guide, cameras.intrinsics[views.camera[view]], view, row, column)
     wide = Window()
     middle = Window()
     variance = wp.vec2(0.0, 0.0)
@@ -225,21 +219,18 @@ def soften_shares_kernel(
     # In:
     guide: Guide,
     shares: Shares,
-    view_camera: wp.array[int],
+    views: Views,
     first: int,
     # Out:
     shares_out: Shares,
 ):
     """Weighted mean over 3 x 3 cells: windows have no edges then."""
-    cell = tile_pixel(cells.cells, wp.tid() + first)
-    view = cell[0]
-    row = cell[1]
-    column = cell[2]
-    if row >= cells.cells.height or column >= cells.cells.width:
+    view, row, column = tile_pixel(cells.cells, wp.tid() + first)
+    if not in_image(cells.cells, row, column):
         return
-    if int(guide.code[view, row, column]) == Segment.NOTHING:
+    if int(guide.segment[view, row, column]) == Segment.NOTHING:
         return
-    plane = plane_at(cells, guide, cameras.intrinsics[view_camera[view]], view, row, column)
+    plane = plane_at(cells, guide, cameras.intrinsics[views.camera[view]], view, row, column)
     diffuse = wp.vec3(0.0, 0.0, 0.0)
     gloss = wp.vec3(0.0, 0.0, 0.0)
     between = wp.vec3(0.0, 0.0, 0.0)
@@ -263,12 +254,12 @@ def soften_shares_kernel(
 @wp.func
 def cell_likeness(guide: Guide, cells: CellGrid, plane: Plane, view: int, row: int, column: int, r: int, c: int) -> float:
     """1 if the cell (r, c) is on the surface that the pixel (row, column) shows, LEAST_WEIGHT if on another, 0 if on none."""
-    code = guide.code[view, r, c]
-    if int(code) == Segment.NOTHING:
+    segment = guide.segment[view, r, c]
+    if int(segment) == Segment.NOTHING:
         return 0.0
     pixel = cell_pixel(cells, r, c)
     apart = off_plane(plane, pixel[0] - row, pixel[1] - column, guide.depth[view, r, c])
-    if code != plane.code or apart > SAME_SURFACE * float(cells.size) * plane.width:
+    if segment != plane.segment or apart > SAME_SURFACE * float(cells.size) * plane.width:
         return LEAST_WEIGHT
     return 1.0
 

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import Gloss
-from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Bodies, Meshes, triangle_normal
+from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies, triangle_normal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -82,7 +82,7 @@ def table_surface(meshes: Meshes, view_direction: wp.vec3) -> Surface:
 def mesh_surface(
     meshes: Meshes,
     surfaces: Surfaces,
-    bodies: Bodies,
+    bodies: ViewBodies,
     view: int,
     body: int,
     triangle: int,
@@ -92,7 +92,7 @@ def mesh_surface(
 ) -> Surface:
     """Surface at a hit. `view_direction` points to the camera; `pixel_width` [m] is the pixel's, across the ray."""
     mesh = bodies.mesh[view, body]
-    to_world = wp.transpose(bodies.world_turn[view, body])
+    to_world = wp.transpose(bodies.world_rotation[view, body])
     result = Surface()
     result.row = mesh
     result.face_normal = towards(to_world * triangle_normal(meshes, mesh, triangle), view_direction)

@@ -12,18 +12,18 @@ from synpick_warp.kernels.render.lighting.brdf import Brdf, Reflection, brdf_at,
 from synpick_warp.kernels.render.lighting.environment import Lights, background_radiance, turned
 from synpick_warp.kernels.render.lighting.materials import Surfaces, base_color, mesh_surface, table_surface
 from synpick_warp.kernels.render.lighting.sampling import Chances, LightSample, light_density, sample_light, scrambled_point
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray, hit_position, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
     RAY_OFFSET,
-    Bodies,
     Hit,
     Meshes,
     Table,
+    ViewBodies,
     body_of,
-    code_of,
     hit_table,
     is_blocked,
+    segment_of,
     trace_camera_ray,
 )
 from synpick_warp.kernels.rng import mix, stream_key
@@ -71,7 +71,6 @@ class PathRules:
     least_roughness: float
     """Surfaces that a path meets after the first are at least so rough: what shines through two mirrors is rare, bright and noisy."""
     seed: wp.uint64
-    instances: int
 
 
 @wp.struct
@@ -79,6 +78,8 @@ class Place:
     """Where one pixel's paths are: the world's light, the view's bodies, the stream of random numbers."""
 
     view: int
+    instances: int
+    """Instance capacity of a world."""
     first_light: int
     """Map that lights the surface which the camera sees."""
     light: int
@@ -133,14 +134,14 @@ class Path:
 
 
 @wp.func
-def nearest_hit(scene: PathScene, bodies: Bodies, view: int, instances: int, origin: wp.vec3, direction: wp.vec3) -> Hit:
+def nearest_hit(scene: PathScene, bodies: ViewBodies, view: int, instances: int, origin: wp.vec3, direction: wp.vec3) -> Hit:
     """The nearest hit of a ray along a unit vector, all in the world; `depth` is the distance [m]. The companion of `is_blocked`."""
     best = Hit()
-    best.code = Segment.NOTHING
+    best.segment = Segment.NOTHING
     best.depth = FAR
     height = origin[2] - scene.table.height
     if scene.table.visible != 0 and direction[2] * height < 0.0:
-        best.code = Segment.TABLE
+        best.segment = Segment.TABLE
         best.depth = -height / direction[2]
     for number in range(bodies.present[view]):
         body = bodies.order[view, number]
@@ -148,22 +149,22 @@ def nearest_hit(scene: PathScene, bodies: Bodies, view: int, instances: int, ori
         offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
         closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, best.depth) * direction
         if wp.dot(closest, closest) < sphere[3]:
-            turn = bodies.world_turn[view, body]
-            start = turn * (origin - bodies.position[view, body])
-            local = turn * direction
+            rotation = bodies.world_rotation[view, body]
+            start = rotation * (origin - bodies.position[view, body])
+            local = rotation * direction
             query = wp.mesh_query_ray(scene.meshes.id[bodies.mesh[view, body]], start, local, best.depth)
             if query.result:
                 best.depth = query.t
                 best.triangle = query.face
                 best.barycentric = wp.vec2(query.u, query.v)
-                best.code = code_of(body, instances)
+                best.segment = segment_of(body, instances)
     return best
 
 
 @wp.func
 def vertex_at(
     scene: PathScene,
-    bodies: Bodies,
+    bodies: ViewBodies,
     view: int,
     instances: int,
     hit: Hit,
@@ -175,11 +176,11 @@ def vertex_at(
     """The surface at a hit; `width` [m] is the path's there, across it."""
     surface = table_surface(scene.meshes, outgoing)
     at = position
-    if hit.code == Segment.TABLE:
+    if hit.segment == Segment.TABLE:
         # Far away, rounding would lift or sink it by more than the rays' offset.
         at = wp.vec3(position[0], position[1], scene.table.height)
     else:
-        body = body_of(hit.code, instances)
+        body = body_of(hit.segment, instances)
         surface = mesh_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
     made = Vertex()
     made.origin = at + RAY_OFFSET * surface.face_normal
@@ -237,7 +238,9 @@ def path_point(place: Place, number: int, dimension: int) -> wp.vec2:
 
 
 @wp.func
-def direct_light(scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, light: int, vertex: Vertex, u: wp.vec2) -> LightSample:
+def direct_light(
+    scene: PathScene, bodies: ViewBodies, rules: PathRules, place: Place, light: int, vertex: Vertex, u: wp.vec2
+) -> LightSample:
     """A direction in the world drawn from the map, and in `radiance` what comes from there, over its density and with its weight.
 
     Light that comes from behind the triangle is none, whatever the interpolated normal says.
@@ -274,7 +277,9 @@ def begun(first: Vertex, width: float) -> Path:
 
 
 @wp.func
-def scattered(scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, number: int, first_diffuse: wp.vec3, path: Path) -> Path:
+def scattered(
+    scene: PathScene, bodies: ViewBodies, rules: PathRules, place: Place, number: int, first_diffuse: wp.vec3, path: Path
+) -> Path:
     """Path `number` after it has scattered once more: with the light that it found so, at its next surface or ENDED.
 
     `first_diffuse` is the diffuse colour of its first surface, by which all diffuse light will be multiplied.
@@ -306,8 +311,8 @@ def scattered(scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, 
         scale = scale / luck
     through.diffuse = through.diffuse * scale
     through.gloss = through.gloss * scale
-    hit = nearest_hit(scene, bodies, place.view, rules.instances, path.vertex.origin, direction)
-    if hit.code == Segment.NOTHING:
+    hit = nearest_hit(scene, bodies, place.view, place.instances, path.vertex.origin, direction)
+    if hit.segment == Segment.NOTHING:
         made.found = lit(made.found, through, escaped_light(scene, rules, place, light, direction, drawn_density), bounce)
         return made
     if bounce + 1 == rules.bounces:
@@ -315,7 +320,7 @@ def scattered(scene: PathScene, bodies: Bodies, rules: PathRules, place: Place, 
     made.through = through
     made.width = path.width + SCATTERED_SPREAD * path.vertex.brdf.roughness * hit.depth
     position = path.vertex.origin + hit.depth * direction
-    made.vertex = vertex_at(scene, bodies, place.view, rules.instances, hit, position, -direction, made.width, rules.least_roughness)
+    made.vertex = vertex_at(scene, bodies, place.view, place.instances, hit, position, -direction, made.width, rules.least_roughness)
     made.bounce = bounce + 1
     return made
 
@@ -331,9 +336,8 @@ def trace_paths_kernel(
     light: wp.array[int],
     light_yaw: wp.array[float],
     # In:
-    bodies: Bodies,
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
+    bodies: ViewBodies,
+    views: Views,
     rules: PathRules,
     first: int,
     # Out:
@@ -343,16 +347,14 @@ def trace_paths_kernel(
 
     Random numbers have the address (seed, episode; camera and pixel; path, dimension): a still scene gives the same picture again.
     """
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    camera = view_camera[view]
-    world = view_world[view]
+    camera = views.camera[view]
+    world = views.world[view]
     place = Place()
     place.view = view
+    place.instances = views.instances
     place.first_light = light[world]
     place.light = light[world]
     place.turn = light_yaw[world]
@@ -363,15 +365,15 @@ def trace_paths_kernel(
     for number in range(rules.samples):
         offset = scrambled_point(place.key, number, 0) - wp.vec2(0.5, 0.5)
         ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
-        hit = trace_camera_ray(scene.meshes, bodies, view, tile_of(grid, row, column), ray, rules.instances)
+        hit = trace_camera_ray(scene.meshes, bodies, view, tile_of(grid, row, column), ray, views.instances)
         hit = hit_table(scene.table, cameras, camera, ray, hit)
         direction = wp.normalize(cameras.to_world[camera] * ray)
-        if hit.code == Segment.NOTHING:
+        if hit.segment == Segment.NOTHING:
             total += background_radiance(scene.lights, place.light, turned(direction, -place.turn))
         else:
             start = hit_position(cameras, camera, ray, hit.depth)
             width = footprint * hit.depth
-            vertex = vertex_at(scene, bodies, view, rules.instances, hit, start, -direction, width, 0.0)
+            vertex = vertex_at(scene, bodies, view, views.instances, hit, start, -direction, width, 0.0)
             diffuse = vertex.brdf.diffuse
             path = begun(vertex, width)
             while path.bounce != ENDED:

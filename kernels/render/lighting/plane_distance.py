@@ -11,8 +11,8 @@ wp.set_module_options({"enable_backward": False})
 class Plane:
     """The tangent plane of what a pixel, or a cell's, shows. n . ray is linear in the image."""
 
-    code: wp.uint8
-    """As in `Hits`."""
+    segment: wp.uint8
+    """As in `GBuffer`."""
     normal: wp.vec3
     """In the camera's axes."""
     height: float
@@ -26,10 +26,10 @@ class Plane:
 
 
 @wp.func
-def pixel_plane(intrinsics: wp.vec4, row: int, column: int, code: wp.uint8, depth: float, normal: wp.vec3) -> Plane:
+def pixel_plane(intrinsics: wp.vec4, row: int, column: int, segment: wp.uint8, depth: float, normal: wp.vec3) -> Plane:
     """The tangent plane of what a pixel shows; `normal` is in the camera's axes."""
     made = Plane()
-    made.code = code
+    made.segment = segment
     made.normal = normal
     made.facing = wp.dot(normal, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
     made.down = normal[1] / intrinsics[1]

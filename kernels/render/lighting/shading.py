@@ -12,8 +12,8 @@ from synpick_warp.kernels.render.lighting.path_tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import pixel_plane
 from synpick_warp.kernels.render.lighting.shadows import lit_share
 from synpick_warp.kernels.render.lighting.unoccluded import Light, even_light
-from synpick_warp.kernels.render.visibility.camera import Cameras, camera_ray, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Hits, body_of
+from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -45,41 +45,36 @@ def shade_kernel(
     light: wp.array[int],
     light_yaw: wp.array[float],
     # In:
-    bodies: Bodies,
-    hits: Hits,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
     guide: Guide,
     shares: Shares,
     lit: wp.array3d[float],
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
-    instances: int,
+    views: Views,
     first: int,
     # Out:
     radiance_out: wp.array3d[wp.vec3],
 ):
     """Radiance of each pixel, from its own surface and the light that was gathered around it."""
-    pixel = tile_pixel(cells.image, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= cells.image.height or column >= cells.image.width:
+    view, row, column = tile_pixel(cells.image, wp.tid() + first)
+    if not in_image(cells.image, row, column):
         return
-    camera = view_camera[view]
-    which = light[view_world[view]]
-    turn = light_yaw[view_world[view]]
+    camera = views.camera[view]
+    which = light[views.world[view]]
+    turn = light_yaw[views.world[view]]
     intrinsics = cameras.intrinsics[camera]
     ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
     outgoing = -wp.normalize(cameras.to_world[camera] * ray)
-    code = int(hits.code[view, row, column])
-    if code == Segment.NOTHING:
+    segment = int(gbuffer.segment[view, row, column])
+    if segment == Segment.NOTHING:
         radiance_out[view, row, column] = background_radiance(scene.lights, which, turned(-outgoing, -turn))
         return
-    depth = hits.depth[view, row, column]
+    depth = gbuffer.depth[view, row, column]
     surface = table_surface(scene.meshes, outgoing)
-    if code != Segment.TABLE:
-        triangle = hits.triangle[view, row, column]
-        barycentric = hits.barycentric[view, row, column]
-        body = body_of(code, instances)
+    if segment != Segment.TABLE:
+        triangle = gbuffer.triangle[view, row, column]
+        barycentric = gbuffer.barycentric[view, row, column]
+        body = body_of(segment, views.instances)
         width = depth / intrinsics[0]
         surface = mesh_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
     color = base_color(scene.surfaces, surface)
@@ -87,10 +82,10 @@ def shade_kernel(
     roughness = widened_roughness(scene.surfaces.roughness[surface.row], surface.spread)
     brdf = brdf_at(scene.surfaces.gloss, color, metallic, roughness, surface.normal, outgoing)
     normal = wp.transpose(cameras.to_world[camera]) * surface.face_normal
-    plane = pixel_plane(intrinsics, row, column, hits.code[view, row, column], depth, normal)
+    plane = pixel_plane(intrinsics, row, column, gbuffer.segment[view, row, column], depth, normal)
     share = gathered_share(guide, shares, cells, view, row, column, plane)
     sun = float(0.0)
     if wp.max(scene.lights.main_irradiance[which]) > 0.0:
         if wp.dot(surface.face_normal, turned(scene.lights.main_direction[which], turn)) > 0.0:
-            sun = lit_share(hits, lit, shadow_cells, view, row, column, plane)
+            sun = lit_share(gbuffer, lit, shadow_cells, view, row, column, plane)
     radiance_out[view, row, column] = lit_surface(scene.surfaces.gloss, scene.lights, which, turn, brdf, share, sun)

@@ -41,8 +41,22 @@ class ImageGrid:
     """Tiles in an image."""
 
 
+@wp.struct
+class Views:
+    """Views of a batch: which camera shows which world. Rows from `count` on are not read."""
+
+    world: wp.array[int]
+    """(view); -1: the view is not in use."""
+    camera: wp.array[int]
+    """(view): row of `Cameras`; -1: the view is not in use."""
+    count: int
+    """Views in the batch."""
+    instances: int
+    """Instance capacity of a world."""
+
+
 @wp.func
-def tile_pixel(grid: ImageGrid, index: int) -> wp.vec3i:
+def tile_pixel(grid: ImageGrid, index: int) -> tuple[int, int, int]:
     """(view, row, column) of a flat index that walks views, tiles, and pixels within a tile; row or column may lie outside the image."""
     lane = index % TILE_PIXELS
     tile = index // TILE_PIXELS
@@ -52,7 +66,13 @@ def tile_pixel(grid: ImageGrid, index: int) -> wp.vec3i:
     tile_column = tile - tile_row * grid.tile_columns
     row = tile_row * TILE_HEIGHT + lane // TILE_WIDTH
     column = tile_column * TILE_WIDTH + lane % TILE_WIDTH
-    return wp.vec3i(view, row, column)
+    return view, row, column
+
+
+@wp.func
+def in_image(grid: ImageGrid, row: int, column: int) -> bool:
+    """True if a pixel lies within the image."""
+    return row >= 0 and row < grid.height and column >= 0 and column < grid.width
 
 
 @wp.func
@@ -82,14 +102,14 @@ def hit_position(cameras: Cameras, camera: int, ray: wp.vec3, depth: float) -> w
 def projected_box(
     lower: wp.vec3,
     upper: wp.vec3,
-    turn: wp.mat33d,
+    rotation: wp.mat33d,
     position: wp.vec3d,
     intrinsics: wp.vec4,
     grid: ImageGrid,
 ) -> wp.vec4i:
     """Pixels that a box can cover: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: none.
 
-    The box has corners `lower` and `upper` [m] in a frame that `turn` and `position` carry to the camera's. The result is clipped
+    The box has corners `lower` and `upper` [m] in a frame that `rotation` and `position` carry to the camera's. The result is clipped
     to one image size beyond each border; it is that whole canvas where a corner lies behind the near plane, and empty where all do.
     """
     canvas = wp.vec4i(-grid.width, -grid.height, 2 * grid.width - 1, 2 * grid.height - 1)
@@ -108,7 +128,7 @@ def projected_box(
             y = upper[1]
         if corner & 4 != 0:
             z = upper[2]
-        point = turn * wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(z)) + position
+        point = rotation * wp.vec3d(wp.float64(x), wp.float64(y), wp.float64(z)) + position
         depth = float(point[2])
         if depth < NEAR_PLANE:
             behind += 1

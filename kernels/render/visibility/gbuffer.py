@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,8 +20,8 @@ MAX_COUNTS = wp.constant(65535.0)
 
 
 @wp.struct
-class Hollow:
-    """A convex room in the tote's own frame that none of its triangles reaches into, open at the top: see `scenes.types.Hollow`."""
+class Interior:
+    """A convex room in the tote's own frame that none of its triangles reaches into, open at the top: see `scenes.types.Interior`."""
 
     half: wp.vec3
     """Negative: there is none."""
@@ -47,7 +47,7 @@ class Meshes:
     """Three corners of each triangle, in the mesh's own frame [m]."""
     entries: int
     """Catalog entries; the mesh of fixture f is entries + f."""
-    hollow: Hollow
+    interior: Interior
     """The tote's."""
 
 
@@ -61,12 +61,12 @@ class Table:
 
 
 @wp.struct
-class Bodies:
+class ViewBodies:
     """Scratch, one row a view and body: the world's instances, then tote, finger, cup."""
 
     mesh: wp.array2d[int]
     """Row of `Meshes`; -1: not there."""
-    turn: wp.array2d[wp.mat33]
+    rotation: wp.array2d[wp.mat33]
     """Camera's axes to the body's."""
     start: wp.array2d[wp.vec3]
     """Where the optical axis passes depth `near`, in the body's frame [m]: rays start close to the body, so that float32 suffices."""
@@ -74,7 +74,7 @@ class Bodies:
     """No point of the body is nearer than this planar depth [m]."""
     box: wp.array2d[wp.vec4i]
     """Pixels that the body can cover: x_min, y_min, x_max, y_max, inclusive, up to one image size beyond the border."""
-    world_turn: wp.array2d[wp.mat33]
+    world_rotation: wp.array2d[wp.mat33]
     """World's axes to the body's."""
     position: wp.array2d[wp.vec3]
     """Origin of the body in the world [m]."""
@@ -84,17 +84,17 @@ class Bodies:
     """The bodies that are there, by `near`, the tote last: rays that meet the nearest first seldom have to look at the rest."""
     present: wp.array[int]
     """How many these are, one a view."""
-    backdrop: wp.array[int]
+    uses_background: wp.array[int]
     """1: the view's tote stands at the world's origin, as in the backdrop that was rendered before."""
-    candidates: wp.array2d[wp.uint64]
+    body_mask: wp.array2d[wp.uint64]
     """Of a view's tile: bit k is set if rays of its pixels may meet body order[k]."""
 
 
 @wp.struct
-class Hits:
+class GBuffer:
     """Scratch, one a view and pixel: what shading and later layers read."""
 
-    code: wp.array3d[wp.uint8]
+    segment: wp.array3d[wp.uint8]
     """0 nothing, 1 + instance_id, or the code of the table or a fixture."""
     triangle: wp.array3d[int]
     barycentric: wp.array3d[wp.vec2]
@@ -107,87 +107,87 @@ class Hits:
 class Hit:
     """The nearest hit of one ray."""
 
-    code: int
+    segment: int
     triangle: int
     barycentric: wp.vec2
     depth: float
 
 
 @wp.func
-def lies_in(hollow: Hollow, point: wp.vec3) -> bool:
+def is_in_interior(interior: Interior, point: wp.vec3) -> bool:
     """Whether a point at most as high as the top lies in a hollow."""
     x = wp.abs(point[0])
     y = wp.abs(point[1])
     z = point[2]
     return (
-        z >= hollow.floor
-        and x <= hollow.half[0] + z * hollow.growth[0]
-        and y <= hollow.half[1] + z * hollow.growth[1]
-        and x + y <= hollow.half[2] + z * hollow.growth[2]
+        z >= interior.floor
+        and x <= interior.half[0] + z * interior.growth[0]
+        and y <= interior.half[1] + z * interior.growth[1]
+        and x + y <= interior.half[2] + z * interior.growth[2]
     )
 
 
 @wp.func
-def misses_tote(hollow: Hollow, start: wp.vec3, direction: wp.vec3, reach: float) -> bool:
+def stays_in_interior(interior: Interior, start: wp.vec3, direction: wp.vec3, reach: float) -> bool:
     """Whether it is plain that a ray meets no triangle of the tote before `reach`: what of it is no higher than the tote begins and ends in
     the hollow, which is convex. Camera rays that meet an object in the tote are spared its tree thus; for rays of paths it does not pay."""
     begin = float(0.0)
     end = float(reach)
     if direction[2] > 0.0:
-        end = wp.min(reach, (hollow.top - start[2]) / direction[2])
-    elif start[2] > hollow.top:
+        end = wp.min(reach, (interior.top - start[2]) / direction[2])
+    elif start[2] > interior.top:
         begin = FAR
         if direction[2] < 0.0:
-            begin = (hollow.top - start[2]) / direction[2]
+            begin = (interior.top - start[2]) / direction[2]
     if begin >= end:
-        return hollow.half[0] > 0.0
-    return lies_in(hollow, start + begin * direction) and lies_in(hollow, start + end * direction)
+        return interior.half[0] > 0.0
+    return is_in_interior(interior, start + begin * direction) and is_in_interior(interior, start + end * direction)
 
 
 @wp.func
-def body_of(code: int, instances: int) -> int:
-    """Row of `Bodies` for a hit's code, which is neither nothing nor the table."""
-    if code >= Segment.TOTE:
-        return instances + code - Segment.TOTE
-    return code - 1
+def body_of(segment: int, instances: int) -> int:
+    """Row of `ViewBodies` for a hit's code, which is neither nothing nor the table."""
+    if segment >= Segment.TOTE:
+        return instances + segment - Segment.TOTE
+    return segment - 1
 
 
 @wp.func
-def code_of(body: int, instances: int) -> int:
-    """A hit's code for a row of `Bodies`."""
+def segment_of(body: int, instances: int) -> int:
+    """A hit's code for a row of `ViewBodies`."""
     if body >= instances:
         return Segment.TOTE + body - instances
     return body + 1
 
 
 @wp.func
-def body_ray_start(bodies: Bodies, view: int, body: int, ray: wp.vec3) -> wp.vec3:
+def body_ray_start(bodies: ViewBodies, view: int, body: int, ray: wp.vec3) -> wp.vec3:
     """Where a camera ray passes the body's near depth, in the body's frame [m]."""
-    return bodies.start[view, body] + bodies.near[view, body] * (bodies.turn[view, body] * wp.vec3(ray[0], ray[1], 0.0))
+    return bodies.start[view, body] + bodies.near[view, body] * (bodies.rotation[view, body] * wp.vec3(ray[0], ray[1], 0.0))
 
 
 @wp.func
-def hits_body(meshes: Meshes, bodies: Bodies, view: int, body: int, ray: wp.vec3) -> bool:
+def hits_body(meshes: Meshes, bodies: ViewBodies, view: int, body: int, ray: wp.vec3) -> bool:
     """Whether a camera ray hits a body at all."""
     return wp.mesh_query_ray_anyhit(
-        meshes.id[bodies.mesh[view, body]], body_ray_start(bodies, view, body, ray), bodies.turn[view, body] * ray, FAR
+        meshes.id[bodies.mesh[view, body]], body_ray_start(bodies, view, body, ray), bodies.rotation[view, body] * ray, FAR
     )
 
 
 @wp.func
-def trace_candidates(
+def trace_bodies(
     meshes: Meshes,
-    bodies: Bodies,
+    bodies: ViewBodies,
     view: int,
-    candidates: wp.uint64,
+    body_mask: wp.uint64,
     ray: wp.vec3,
     instances: int,
 ) -> Hit:
-    """Nearest hit among these bodies, as in `Bodies.candidates`."""
+    """Nearest hit among these bodies, as in `ViewBodies.body_mask`."""
     best = Hit()
-    best.code = Segment.NOTHING
+    best.segment = Segment.NOTHING
     best.depth = FAR
-    left = candidates
+    left = body_mask
     number = int(0)
     while left != wp.uint64(0):
         if (left & wp.uint64(1)) != wp.uint64(0):
@@ -196,23 +196,23 @@ def trace_candidates(
             if near < best.depth:
                 reach = best.depth - near
                 start = body_ray_start(bodies, view, body, ray)
-                direction = bodies.turn[view, body] * ray
-                if body != instances or not misses_tote(meshes.hollow, start, direction, reach):
+                direction = bodies.rotation[view, body] * ray
+                if body != instances or not stays_in_interior(meshes.interior, start, direction, reach):
                     query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, direction, reach)
                     if query.result:
                         best.depth = near + query.t
                         best.triangle = query.face
                         best.barycentric = wp.vec2(query.u, query.v)
-                        best.code = code_of(body, instances)
+                        best.segment = segment_of(body, instances)
         left = left >> wp.uint64(1)
         number += 1
     return best
 
 
 @wp.func
-def trace_camera_ray(meshes: Meshes, bodies: Bodies, view: int, tile: int, ray: wp.vec3, instances: int) -> Hit:
-    """Nearest hit among the tile's candidates; see `trace_candidates`."""
-    return trace_candidates(meshes, bodies, view, bodies.candidates[view, tile], ray, instances)
+def trace_camera_ray(meshes: Meshes, bodies: ViewBodies, view: int, tile: int, ray: wp.vec3, instances: int) -> Hit:
+    """Nearest hit among the tile's candidates; see `trace_bodies`."""
+    return trace_bodies(meshes, bodies, view, bodies.body_mask[view, tile], ray, instances)
 
 
 @wp.func
@@ -225,27 +225,27 @@ def hit_table(table: Table, cameras: Cameras, camera: int, ray: wp.vec3, best: H
         if fall * height < 0.0:
             depth = -height / fall
             if depth < best.depth:
-                result.code = Segment.TABLE
+                result.segment = Segment.TABLE
                 result.depth = depth
     return result
 
 
 @wp.func
-def store_hit(hits: Hits, view: int, row: int, column: int, hit: Hit):
-    hits.code[view, row, column] = wp.uint8(hit.code)
-    hits.triangle[view, row, column] = hit.triangle
-    hits.barycentric[view, row, column] = hit.barycentric
-    hits.depth[view, row, column] = hit.depth
+def store_hit(gbuffer: GBuffer, view: int, row: int, column: int, hit: Hit):
+    gbuffer.segment[view, row, column] = wp.uint8(hit.segment)
+    gbuffer.triangle[view, row, column] = hit.triangle
+    gbuffer.barycentric[view, row, column] = hit.barycentric
+    gbuffer.depth[view, row, column] = hit.depth
 
 
 @wp.func
-def read_hit(hits: Hits, view: int, row: int, column: int) -> Hit:
+def read_hit(gbuffer: GBuffer, view: int, row: int, column: int) -> Hit:
     """The hit of a pixel."""
     hit = Hit()
-    hit.code = int(hits.code[view, row, column])
-    hit.triangle = hits.triangle[view, row, column]
-    hit.barycentric = hits.barycentric[view, row, column]
-    hit.depth = hits.depth[view, row, column]
+    hit.segment = int(gbuffer.segment[view, row, column])
+    hit.triangle = gbuffer.triangle[view, row, column]
+    hit.barycentric = gbuffer.barycentric[view, row, column]
+    hit.depth = gbuffer.depth[view, row, column]
     return hit
 
 
@@ -258,12 +258,12 @@ def triangle_normal(meshes: Meshes, mesh: int, triangle: int) -> wp.vec3:
 
 
 @wp.func
-def face_normal(meshes: Meshes, bodies: Bodies, view: int, hit: Hit, instances: int) -> wp.vec3:
+def face_normal(meshes: Meshes, bodies: ViewBodies, view: int, hit: Hit, instances: int) -> wp.vec3:
     """Unit normal, in the world, of the triangle or table that a ray hit; either side."""
-    if hit.code == Segment.TABLE:
+    if hit.segment == Segment.TABLE:
         return wp.vec3(0.0, 0.0, 1.0)
-    body = body_of(hit.code, instances)
-    return wp.transpose(bodies.world_turn[view, body]) * triangle_normal(meshes, bodies.mesh[view, body], hit.triangle)
+    body = body_of(hit.segment, instances)
+    return wp.transpose(bodies.world_rotation[view, body]) * triangle_normal(meshes, bodies.mesh[view, body], hit.triangle)
 
 
 @wp.kernel(cuda_max_registers=RAY_REGISTERS)
@@ -274,34 +274,30 @@ def trace_sample_kernel(
     cameras: Cameras,
     grid: ImageGrid,
     # In:
-    bodies: Bodies,
-    view_camera: wp.array[int],
-    instances: int,
+    bodies: ViewBodies,
+    views: Views,
     offset: wp.vec2,
     first: int,
     # Out:
-    hits_out: Hits,
+    gbuffer_out: GBuffer,
 ):
     """Cast one ray through each pixel, `offset` [px] off its centre: a colour sample, nearest hit only. No camera (-1): no rays."""
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    camera = view_camera[view]
+    camera = views.camera[view]
     if camera < 0:
         return
     ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
-    hit = trace_camera_ray(meshes, bodies, view, tile_of(grid, row, column), ray, instances)
-    store_hit(hits_out, view, row, column, hit_table(table, cameras, camera, ray, hit))
+    hit = trace_camera_ray(meshes, bodies, view, tile_of(grid, row, column), ray, views.instances)
+    store_hit(gbuffer_out, view, row, column, hit_table(table, cameras, camera, ray, hit))
 
 
 @wp.func
 def is_blocked(
     meshes: Meshes,
     table: Table,
-    bodies: Bodies,
+    bodies: ViewBodies,
     view: int,
     origin: wp.vec3,
     direction: wp.vec3,
@@ -319,9 +315,9 @@ def is_blocked(
         offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
         closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, reach) * direction
         if wp.dot(closest, closest) < sphere[3]:
-            turn = bodies.world_turn[view, body]
-            start = turn * (origin - bodies.position[view, body])
-            local = turn * direction
+            rotation = bodies.world_rotation[view, body]
+            start = rotation * (origin - bodies.position[view, body])
+            local = rotation * direction
             if wp.mesh_query_ray_anyhit(meshes.id[bodies.mesh[view, body]], start, local, reach):
                 return True
     return False

@@ -3,30 +3,30 @@
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, camera_ray, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
     MAX_COUNTS,
-    Bodies,
+    GBuffer,
     Hit,
-    Hits,
     Meshes,
     Table,
-    code_of,
+    ViewBodies,
     hit_table,
     read_hit,
+    segment_of,
     store_hit,
 )
 from synpick_warp.kernels.render.visibility.triangles import Footprint, Triangle, camera_triangle, find_footprint, ray_weights, row_span
 
 wp.set_module_options({"enable_backward": False})
 
-UNMARKED = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
+EMPTY = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
 """Mark of a ray that meets no triangle."""
 DEPTH_BITS = wp.constant(wp.uint64(32))
 TRIANGLE_BITS = wp.constant(wp.uint32(26))
-"""A mark is a ray's planar depth, the row in `Bodies` and the triangle's number: the least is the nearest hit."""
-MOST_TRIANGLES = 1 << int(TRIANGLE_BITS)
+"""A mark is a ray's planar depth, the row in `ViewBodies` and the triangle's number: the least is the nearest hit."""
+MAX_TRIANGLES = 1 << int(TRIANGLE_BITS)
 """Most triangles of a mesh."""
 SMALL = wp.constant(256)
 """Triangles whose box has no more pixels than these are done at once, others block by block: neighbours differ little in size."""
@@ -36,20 +36,20 @@ BLOCK_COLUMNS = wp.constant(256)
 
 
 @wp.struct
-class Marks:
+class VisibilityBuffer:
     """Scratch, a row a view."""
 
     nearest: wp.array3d[wp.uint64]
     """Mark of the nearest hit of each pixel's ray."""
     block: wp.array2d[wp.vec4i]
-    """Blocks of large triangles: number of the body in `Bodies.order`, triangle, first row, first column."""
+    """Blocks of large triangles: number of the body in `ViewBodies.order`, triangle, first row, first column."""
     blocks: wp.array[int]
     """How many these would be; those that there is no room for are done at once."""
 
 
 @wp.func
-def mark_pixel(
-    marks: Marks,
+def write_sample(
+    visibility: VisibilityBuffer,
     amodal: wp.array3d[wp.uint32],
     view: int,
     row: int,
@@ -66,13 +66,13 @@ def mark_pixel(
         if depth > 0.0:
             mark = (wp.uint64(wp.cast(depth, wp.uint32)) << DEPTH_BITS) | name
             # To look first whether that changes anything costs more: a thread waits for what it reads, but not for what it merges.
-            wp.atomic_min(marks.nearest, view, row, column, mark)
+            wp.atomic_min(visibility.nearest, view, row, column, mark)
             if bit != wp.uint32(0):
                 wp.atomic_or(amodal, view, row, column, bit)
 
 
 @wp.func
-def mark_name(body: int, triangle: int) -> wp.uint64:
+def sample_id(body: int, triangle: int) -> wp.uint64:
     return wp.uint64((wp.uint32(body) << TRIANGLE_BITS) | wp.uint32(triangle))
 
 
@@ -85,8 +85,8 @@ def amodal_bit(body: int, instances: int) -> wp.uint32:
 
 
 @wp.func
-def mark_pixels(
-    marks: Marks,
+def rasterize_footprint(
+    visibility: VisibilityBuffer,
     amodal: wp.array3d[wp.uint32],
     intrinsics: wp.vec4,
     view: int,
@@ -96,7 +96,7 @@ def mark_pixels(
     name: wp.uint64,
     bit: wp.uint32,
 ):
-    """`mark_pixel` for the pixels of a footprint within a range. One loop for rows and columns: neighbouring threads, whose triangles
+    """`write_sample` for the pixels of a footprint within a range. One loop for rows and columns: neighbouring threads, whose triangles
     have other rows but about as many pixels, stay together."""
     row = pixels[1] - 1
     column = int(0)
@@ -110,60 +110,56 @@ def mark_pixels(
         if column > last:
             break
         ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
-        mark_pixel(marks, amodal, view, row, column, triangle, ray, name, bit)
+        write_sample(visibility, amodal, view, row, column, triangle, ray, name, bit)
         column += 1
 
 
 @wp.func
-def list_blocks(marks: Marks, view: int, number: int, triangle: int, pixels: wp.vec4i) -> bool:
+def list_blocks(visibility: VisibilityBuffer, view: int, number: int, triangle: int, pixels: wp.vec4i) -> bool:
     """List the blocks of a triangle's pixels; False: there is no room for all of them."""
     across = (pixels[2] - pixels[0]) // BLOCK_COLUMNS + 1
     blocks = across * ((pixels[3] - pixels[1]) // BLOCK_ROWS + 1)
-    place = wp.atomic_add(marks.blocks, view, blocks)
-    room = wp.min(marks.block.shape[1] - place, blocks)
+    place = wp.atomic_add(visibility.blocks, view, blocks)
+    room = wp.min(visibility.block.shape[1] - place, blocks)
     for i in range(room):
         row = pixels[1] + i // across * BLOCK_ROWS
-        marks.block[view, place + i] = wp.vec4i(number, triangle, row, pixels[0] + i % across * BLOCK_COLUMNS)
+        visibility.block[view, place + i] = wp.vec4i(number, triangle, row, pixels[0] + i % across * BLOCK_COLUMNS)
     return room == blocks
 
 
 @wp.kernel
-def clear_marks_kernel(
+def clear_visibility_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
     first: int,
     # Out:
-    marks_out: Marks,
+    visibility_out: VisibilityBuffer,
     amodal_out: wp.array3d[wp.uint32],
 ):
     """No marks, no bits, no blocks."""
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    marks_out.nearest[view, row, column] = UNMARKED
+    visibility_out.nearest[view, row, column] = EMPTY
     amodal_out[view, row, column] = wp.uint32(0)
     if row == 0 and column == 0:
-        marks_out.blocks[view] = 0
+        visibility_out.blocks[view] = 0
 
 
 @wp.kernel
-def mark_triangles_kernel(
+def rasterize_triangles_kernel(
     # Scene:
     meshes: Meshes,
     cameras: Cameras,
     grid: ImageGrid,
     # In:
-    bodies: Bodies,
-    view_camera: wp.array[int],
-    instances: int,
+    bodies: ViewBodies,
+    views: Views,
     threads: int,
     first: int,
     # Out:
-    marks_inout: Marks,
+    visibility_inout: VisibilityBuffer,
     amodal_inout: wp.array3d[wp.uint32],
 ):
     """Small triangles leave their marks, large ones list their blocks. The triangles of each body of a view, in the bodies' order, go
@@ -175,14 +171,14 @@ def mark_triangles_kernel(
     if number >= bodies.present[view]:
         return
     body = bodies.order[view, number]
-    if body == instances and bodies.backdrop[view] != 0:
+    if body == views.instances and bodies.uses_background[view] != 0:
         return
     box = bodies.box[view, body]
     if box[2] < 0 or box[3] < 0 or box[0] >= grid.width or box[1] >= grid.height:
         return
-    intrinsics = cameras.intrinsics[view_camera[view]]
+    intrinsics = cameras.intrinsics[views.camera[view]]
     mesh = bodies.mesh[view, body]
-    bit = amodal_bit(body, instances)
+    bit = amodal_bit(body, views.instances)
     for k in range(index % threads, meshes.first_triangle[mesh + 1] - meshes.first_triangle[mesh], threads):
         triangle = camera_triangle(meshes, bodies, view, body, k)
         footprint = find_footprint(grid, intrinsics, triangle)
@@ -192,53 +188,52 @@ def mark_triangles_kernel(
         if columns > 0 and rows > 0:
             listed = False
             if columns * rows > SMALL:
-                listed = list_blocks(marks_inout, view, number, k, found)
+                listed = list_blocks(visibility_inout, view, number, k, found)
             if not listed:
-                mark_pixels(marks_inout, amodal_inout, intrinsics, view, found, triangle, footprint, mark_name(body, k), bit)
+                rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, found, triangle, footprint, sample_id(body, k), bit)
 
 
 @wp.kernel
-def mark_blocks_kernel(
+def rasterize_blocks_kernel(
     # Scene:
     meshes: Meshes,
     cameras: Cameras,
     grid: ImageGrid,
     # In:
-    bodies: Bodies,
-    view_camera: wp.array[int],
-    instances: int,
+    bodies: ViewBodies,
+    views: Views,
     threads: int,
     first: int,
     # Out:
-    marks_inout: Marks,
+    visibility_inout: VisibilityBuffer,
     amodal_inout: wp.array3d[wp.uint32],
 ):
     """Large triangles leave their marks in their blocks. The host knows no number of blocks, so `threads` threads a view take rows of them
     in turn."""
     index = wp.tid() + first
     view = index // threads
-    intrinsics = cameras.intrinsics[view_camera[view]]
-    blocks = wp.min(marks_inout.blocks[view], marks_inout.block.shape[1])
+    intrinsics = cameras.intrinsics[views.camera[view]]
+    blocks = wp.min(visibility_inout.blocks[view], visibility_inout.block.shape[1])
     for i in range(index % threads, BLOCK_ROWS * blocks, threads):
-        block = marks_inout.block[view, i // BLOCK_ROWS]
+        block = visibility_inout.block[view, i // BLOCK_ROWS]
         row = block[2] + i % BLOCK_ROWS
         body = bodies.order[view, block[0]]
         triangle = camera_triangle(meshes, bodies, view, body, block[1])
         footprint = find_footprint(grid, intrinsics, triangle)
         if row <= footprint.pixels[3]:
             pixels = wp.vec4i(block[3], row, wp.min(block[3] + BLOCK_COLUMNS - 1, footprint.pixels[2]), row)
-            name = mark_name(body, block[1])
-            bit = amodal_bit(body, instances)
-            mark_pixels(marks_inout, amodal_inout, intrinsics, view, pixels, triangle, footprint, name, bit)
+            name = sample_id(body, block[1])
+            bit = amodal_bit(body, views.instances)
+            rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, pixels, triangle, footprint, name, bit)
 
 
 @wp.func
-def marked_hit(meshes: Meshes, bodies: Bodies, view: int, instances: int, mark: wp.uint64, ray: wp.vec3) -> Hit:
+def resolve_hit(meshes: Meshes, bodies: ViewBodies, view: int, instances: int, mark: wp.uint64, ray: wp.vec3) -> Hit:
     """The hit that left a mark, whose lower half is a name."""
     name = wp.uint32(mark)
     body = int(name >> TRIANGLE_BITS)
     hit = Hit()
-    hit.code = code_of(body, instances)
+    hit.segment = segment_of(body, instances)
     hit.triangle = int(name & ((wp.uint32(1) << TRIANGLE_BITS) - wp.uint32(1)))
     hit.depth = wp.cast(wp.uint32(mark >> DEPTH_BITS), float)
     weights = ray_weights(camera_triangle(meshes, bodies, view, body, hit.triangle), ray)
@@ -247,22 +242,21 @@ def marked_hit(meshes: Meshes, bodies: Bodies, view: int, instances: int, mark: 
 
 
 @wp.kernel
-def read_marks_kernel(
+def resolve_visibility_kernel(
     # Scene:
     meshes: Meshes,
     table: Table,
     cameras: Cameras,
     grid: ImageGrid,
-    backdrop: Hits,
+    background: GBuffer,
     # In:
-    bodies: Bodies,
-    marks: Marks,
-    view_camera: wp.array[int],
-    instances: int,
+    bodies: ViewBodies,
+    visibility: VisibilityBuffer,
+    views: Views,
     counts_per_meter: float,
     first: int,
     # Out:
-    hits_out: Hits,
+    gbuffer_out: GBuffer,
     instance_out: wp.array3d[wp.uint8],
     depth_out: wp.array3d[wp.uint16],
 ):
@@ -270,28 +264,25 @@ def read_marks_kernel(
 
     Depth is planar, in counts rounded to nearest, 0 where nothing is hit or the count does not fit.
     """
-    pixel = tile_pixel(grid, wp.tid() + first)
-    view = pixel[0]
-    row = pixel[1]
-    column = pixel[2]
-    if row >= grid.height or column >= grid.width:
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
         return
-    camera = view_camera[view]
+    camera = views.camera[view]
     ray = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
     hit = Hit()
-    hit.code = Segment.NOTHING
+    hit.segment = Segment.NOTHING
     hit.depth = FAR
-    mark = marks.nearest[view, row, column]
-    if mark != UNMARKED:
-        hit = marked_hit(meshes, bodies, view, instances, mark, ray)
-    if bodies.backdrop[view] != 0:
-        behind = read_hit(backdrop, camera, row, column)
-        if behind.code != Segment.NOTHING and behind.depth < hit.depth:
+    mark = visibility.nearest[view, row, column]
+    if mark != EMPTY:
+        hit = resolve_hit(meshes, bodies, view, views.instances, mark, ray)
+    if bodies.uses_background[view] != 0:
+        behind = read_hit(background, camera, row, column)
+        if behind.segment != Segment.NOTHING and behind.depth < hit.depth:
             hit = behind
     else:
         hit = hit_table(table, cameras, camera, ray, hit)
-    store_hit(hits_out, view, row, column, hit)
-    instance_out[view, row, column] = wp.uint8(hit.code)
+    store_hit(gbuffer_out, view, row, column, hit)
+    instance_out[view, row, column] = wp.uint8(hit.segment)
     counts = wp.rint(hit.depth * counts_per_meter)
     if counts > MAX_COUNTS:
         counts = 0.0

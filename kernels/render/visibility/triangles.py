@@ -4,7 +4,7 @@ known pixels, while a ray would have to look for its triangle in a tree. The ray
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, PIXEL_CENTER, ImageGrid
-from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Meshes
+from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
 
 wp.set_module_options({"enable_backward": False})
 
@@ -41,15 +41,15 @@ class Footprint:
 
 
 @wp.func
-def camera_triangle(meshes: Meshes, bodies: Bodies, view: int, body: int, triangle: int) -> Triangle:
+def camera_triangle(meshes: Meshes, bodies: ViewBodies, view: int, body: int, triangle: int) -> Triangle:
     """A body's triangle before a view's camera. Neighbours have the same corners to the last bit."""
     first = 3 * (meshes.first_triangle[bodies.mesh[view, body]] + triangle)
-    turn = wp.transpose(bodies.turn[view, body])
+    rotation = wp.transpose(bodies.rotation[view, body])
     start = bodies.start[view, body]
     made = Triangle()
-    made.a = turn * (meshes.corner[first] - start)
-    made.b = turn * (meshes.corner[first + 1] - start)
-    made.c = turn * (meshes.corner[first + 2] - start)
+    made.a = rotation * (meshes.corner[first] - start)
+    made.b = rotation * (meshes.corner[first + 1] - start)
+    made.c = rotation * (meshes.corner[first + 2] - start)
     made.near = bodies.near[view, body]
     return made
 

@@ -8,10 +8,11 @@ from synpick_warp.kernels.render.visibility.camera import (
     TILE_WIDTH,
     Cameras,
     ImageGrid,
+    Views,
     camera_ray,
     projected_box,
 )
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Bodies, Meshes, body_ray_start
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Meshes, ViewBodies, body_ray_start
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,20 +22,18 @@ TILE_REACH = wp.constant(5.5)
 
 @wp.kernel
 def aim_views_kernel(
-    # In:
-    view_world: wp.array[int],
     # Out:
-    view_camera_out: wp.array[int],
+    views_inout: Views,
 ):
     """Views of a world look through camera 0, views of none (-1) through none (-1)."""
     view = wp.tid()
-    view_camera_out[view] = 0
-    if view_world[view] < 0:
-        view_camera_out[view] = -1
+    views_inout.camera[view] = 0
+    if views_inout.world[view] < 0:
+        views_inout.camera[view] = -1
 
 
 @wp.kernel
-def prepare_bodies_kernel(
+def set_up_views_kernel(
     # Scene:
     meshes: Meshes,
     cameras: Cameras,
@@ -45,29 +44,27 @@ def prepare_bodies_kernel(
     fixture_pose: wp.array2d[wp.transformf],
     fixture_visible: wp.array2d[int],
     # In:
-    view_world: wp.array[int],
-    view_camera: wp.array[int],
-    instances: int,
+    views: Views,
     # Out:
-    bodies_out: Bodies,
+    bodies_out: ViewBodies,
 ):
     """Place bodies of a view's world (-1: none) before the view's camera: x_camera = R (x_world - c), in float64, stored in float32."""
     view, body = wp.tid()
-    world = view_world[view]
-    camera = view_camera[view]
+    world = views.world[view]
+    camera = views.camera[view]
     mesh = int(-1)
     placed = wp.transform_identity(dtype=float)
     if world < 0:
         mesh = -1
-    elif body < instances:
+    elif body < views.instances:
         mesh = catalog_index[world, body]
         placed = pose[world, body]
-    elif fixture_visible[world, body - instances] != 0:
-        mesh = meshes.entries + body - instances
-        placed = fixture_pose[world, body - instances]
+    elif fixture_visible[world, body - views.instances] != 0:
+        mesh = meshes.entries + body - views.instances
+        placed = fixture_pose[world, body - views.instances]
     bodies_out.mesh[view, body] = mesh
-    if body == instances:
-        bodies_out.backdrop[view] = int(mesh >= 0 and placed == wp.transform_identity(dtype=float))
+    if body == views.instances:
+        bodies_out.uses_background[view] = int(mesh >= 0 and placed == wp.transform_identity(dtype=float))
     if mesh < 0:
         bodies_out.box[view, body] = wp.vec4i(0, 0, -1, -1)
         bodies_out.sphere[view, body] = wp.vec4(0.0, 0.0, 0.0, -1.0)
@@ -76,8 +73,8 @@ def prepare_bodies_kernel(
     p = wp.transform_get_translation(placed)
     q = wp.transform_get_rotation(placed)
     position = wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
-    turn = wp.quat_to_matrix(wp.normalize(wp.quatd(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))))
-    to_camera = cameras.rotation[camera] * turn
+    rotation = wp.quat_to_matrix(wp.normalize(wp.quatd(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))))
+    to_camera = cameras.rotation[camera] * rotation
     origin = cameras.rotation[camera] * (position - cameras.center[camera])
 
     c = meshes.center[mesh]
@@ -85,29 +82,29 @@ def prepare_bodies_kernel(
     radius = meshes.radius[mesh]
     near = wp.max(float((to_camera * center + origin)[2]) - radius, 0.0)
     start = wp.transpose(to_camera) * (wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(near)) - origin)
-    sphere = turn * center + position
+    sphere = rotation * center + position
 
-    bodies_out.turn[view, body] = wp.mat33(wp.transpose(to_camera))
+    bodies_out.rotation[view, body] = wp.mat33(wp.transpose(to_camera))
     bodies_out.start[view, body] = wp.vec3(start)
     bodies_out.near[view, body] = near
     bodies_out.box[view, body] = projected_box(meshes.lower[mesh], meshes.upper[mesh], to_camera, origin, cameras.intrinsics[camera], grid)
-    bodies_out.world_turn[view, body] = wp.mat33(wp.transpose(turn))
+    bodies_out.world_rotation[view, body] = wp.mat33(wp.transpose(rotation))
     bodies_out.position[view, body] = p
     bodies_out.sphere[view, body] = wp.vec4(float(sphere[0]), float(sphere[1]), float(sphere[2]), radius * radius)
 
 
 @wp.func
-def rank_depth(bodies: Bodies, view: int, body: int) -> float:
-    """What bodies are ranked by [m]. A ray that has met an object in the tote seldom has to look at the tote, see `misses_tote`."""
+def rank_depth(bodies: ViewBodies, view: int, body: int) -> float:
+    """What bodies are ranked by [m]. A ray that has met an object in the tote seldom has to look at the tote, see `stays_in_interior`."""
     if body == bodies.mesh.shape[1] - FIXTURES:
         return FAR
     return bodies.near[view, body]
 
 
 @wp.kernel
-def order_bodies_kernel(
+def sort_bodies_kernel(
     # Out:
-    bodies_inout: Bodies,
+    bodies_inout: ViewBodies,
 ):
     """List a view's bodies that are there, the nearest first and the tote last: a body's rank is the number of those before it."""
     view, body = wp.tid()
@@ -146,22 +143,22 @@ def meets_box(lower: wp.vec3, upper: wp.vec3, start: wp.vec3, direction: wp.vec3
 
 
 @wp.kernel
-def find_candidates_kernel(
+def bin_bodies_kernel(
     # Scene:
     meshes: Meshes,
     cameras: Cameras,
     grid: ImageGrid,
     # In:
-    view_camera: wp.array[int],
+    views: Views,
     # Out:
-    bodies_inout: Bodies,
+    bodies_inout: ViewBodies,
 ):
     """Which bodies the rays of a tile's pixels may meet: those whose box, in its own axes, the ray of the tile's middle meets.
 
     Boxes are made larger by how far the tile's rays lie apart at the body's far side.
     """
     view, tile = wp.tid()
-    camera = view_camera[view]
+    camera = views.camera[view]
     found = wp.uint64(0)
     if camera >= 0:
         intrinsics = cameras.intrinsics[camera]
@@ -179,7 +176,7 @@ def find_candidates_kernel(
                 far = bodies_inout.near[view, body] + 2.0 * meshes.radius[mesh]
                 margin = wp.vec3(apart * far, apart * far, apart * far)
                 start = body_ray_start(bodies_inout, view, body, ray)
-                direction = bodies_inout.turn[view, body] * ray
+                direction = bodies_inout.rotation[view, body] * ray
                 if meets_box(meshes.lower[mesh] - margin, meshes.upper[mesh] + margin, start, direction):
                     found = found | (wp.uint64(1) << wp.uint64(number))
-    bodies_inout.candidates[view, tile] = found
+    bodies_inout.body_mask[view, tile] = found

@@ -16,10 +16,6 @@ from synpick_warp.arrays import device_array
 class PerceptionArrays:
     """Scratch of one batch: segmentation of each view, which is one image of one world."""
 
-    world: wp.array = device_array("view", dtype=wp.int32)
-    """World of each view; -1: the view is unused."""
-    camera: wp.array = device_array("view", dtype=wp.int32)
-    """Camera of each view: always 0; -1: the view is unused."""
     component: wp.array = device_array("view", "row", "column", dtype=wp.int32)
     """Connected-component label (8-connectivity, within one instance): the smallest row-major index of its pixels; -1: no instance."""
     area: wp.array = device_array("view", "row", "column", dtype=wp.int32, unit="px")

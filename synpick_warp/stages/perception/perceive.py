@@ -86,18 +86,22 @@ class Perception:
 
     def perceive_batch(self, snapshot: Snapshot) -> None:
         """Loop body: observe the next worlds of the worklist, one a view, and plan their attempts."""
-        arrays = self.segmenter.arrays
-        views = arrays.world.shape[0]
+        views = self.segmenter.views
+        batch_size = views.count
         wp.launch(
             worklist.take_batch_kernel,
-            dim=views,
+            dim=batch_size,
             inputs=[self._worklist, self._count, self._next],
-            outputs=[arrays.world],
+            outputs=[views.world],
             device=self.device,
         )
         self.segmenter.render(snapshot)
         self.segmenter.find_grasp_points(self.scene, snapshot.catalog_index, self.observation)
         self.planner.plan(self.scene, self.segmenter, self.state, self.attempts, self.observation, self.plan, self.seed)
         wp.launch(
-            worklist.advance_batch_kernel, dim=1, inputs=[views, self._count], outputs=[self._next, self._remaining], device=self.device
+            worklist.advance_batch_kernel,
+            dim=1,
+            inputs=[batch_size, self._count],
+            outputs=[self._next, self._remaining],
+            device=self.device,
         )

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import warp as wp
 
-from synpick_warp.arrays import allocate, device_array
+from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.configs import schema
 from synpick_warp.kernels.perception.clutter_graph import Cycles, order_clutter_kernel
 from synpick_warp.kernels.perception.grasp import frame_grasp_kernel, smooth_normal_kernel
@@ -22,7 +22,6 @@ from synpick_warp.kernels.perception.target import choose_target_kernel
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import filled
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 
 VIEW_BLOCK = 32
@@ -33,8 +32,9 @@ class SegmentedViews(Protocol):
     """Interface to the images of a batch that planning reads; `Segmenter` implements it."""
 
     render_scene: RenderScene
+    views: Any
     arrays: PerceptionArrays
-    hits: Any
+    gbuffer: Any
     bodies: Any
     cameras: Any
     grid: Any
@@ -52,18 +52,11 @@ class VoteArrays:
     """Largest distance allowed between a pixel where the instance gets a vote and any point of its contour."""
 
 
-@dataclass(frozen=True, eq=False)
-class CycleArrays:
-    """Arrays of the struct `Cycles`."""
-
-    member: wp.array = device_array("view", "instance", dtype=wp.int32)
-    weight: wp.array = device_array("view", "instance", "instance", dtype=wp.float32)
-    rank: wp.array = device_array("view", "instance", dtype=wp.int32)
-    best: wp.array = device_array("view", "subset", dtype=wp.float32)
+CYCLES = struct_arrays(Cycles, "view", "instance", weight=("view", "instance", "instance"), best=("view", "subset"))
 
 
 def plan_sizes(settings: schema.Sight, instances: int, views: int) -> dict[str, int]:
-    """Extents of the dimensions of `VoteArrays` and `CycleArrays`."""
+    """Extents of the dimensions of `VoteArrays` and `CYCLES`."""
     return {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(settings.exact_cycle, instances)}
 
 
@@ -82,7 +75,7 @@ class GraspPlanner:
         sizes = plan_sizes(settings, instances, self.views)
         self.device = device
         self.voting = allocate(VoteArrays, sizes, device)
-        self.cycles = filled(Cycles, allocate(CycleArrays, sizes, device))
+        self.cycles = allocate_struct(CYCLES, sizes, device)
 
     def plan(
         self,
@@ -117,7 +110,7 @@ class GraspPlanner:
         """Compute each contour's bounding box, and its instance's reach."""
         arrays, (views, instances) = images.arrays, images.arrays.largest.shape
         self.voting.extent.fill_(int(NOWHERE))
-        inputs = [scene.catalog, images.cameras, scene.perception, state.catalog_index, arrays.world, arrays.camera]
+        inputs = [scene.catalog, images.cameras, scene.perception, state.catalog_index, images.views]
         inputs += [arrays.contour, arrays.contour_length, observation.depth]
         dim = (views, instances, int(CONTOUR_LANES))
         wp.launch(bound_contours_kernel, dim=dim, inputs=inputs, outputs=[self.voting.extent, self.voting.reach], device=self.device)
@@ -126,7 +119,7 @@ class GraspPlanner:
         """Count the occlusion votes along every contour, by kind."""
         arrays, (views, instances) = images.arrays, images.arrays.largest.shape
         self.voting.count.zero_()
-        inputs = [images.grid, scene.perception, images.hits, arrays.world, arrays.component, arrays.largest]
+        inputs = [images.grid, scene.perception, images.gbuffer, images.views, arrays.component, arrays.largest]
         inputs += [arrays.contour, arrays.contour_length, observation.depth, self.voting.extent, self.voting.reach]
         dim = (views, instances, int(CONTOUR_LANES))
         wp.launch(count_votes_kernel, dim=dim, inputs=inputs, outputs=[self.voting.count], device=self.device)
@@ -134,13 +127,13 @@ class GraspPlanner:
     def weigh_votes(self, scene: SceneData, images: SegmentedViews, observation: Observation) -> None:
         """Sum the votes by weight."""
         views, instances = images.arrays.largest.shape
-        inputs = [scene.perception, images.arrays.world, self.voting.count]
+        inputs = [scene.perception, images.views, self.voting.count]
         dim = (views, instances, instances)
         wp.launch(weigh_votes_kernel, dim=dim, inputs=inputs, outputs=[observation.votes], device=self.device)
 
     def order_clutter(self, scene: SceneData, images: SegmentedViews, observation: Observation) -> None:
         """Build the acyclic clutter graph and its transitive closure."""
-        inputs = [scene.perception, images.arrays.world, observation.votes]
+        inputs = [scene.perception, images.views, observation.votes]
         self._launch(order_clutter_kernel, inputs, [self.cycles, observation.above, observation.ancestors])
 
     def choose_target(
@@ -155,21 +148,20 @@ class GraspPlanner:
     ) -> None:
         """Choose the instance to pick."""
         inputs = [wp.uint64(seed), scene.pick, state.arrangement_id, state.mode, attempts.attempt, attempts.outcome]
-        inputs += [images.arrays.world, observation.visible, observation.visible_fraction, observation.ancestors]
+        inputs += [images.views, observation.visible, observation.visible_fraction, observation.ancestors]
         self._launch(choose_target_kernel, inputs, [plan.target])
 
     def smooth_normal(self, scene: SceneData, images: SegmentedViews, observation: Observation, plan: Plan) -> None:
         """Sum the normals in the window around the target's grasp point."""
         arrays, render_scene = images.arrays, images.render_scene
         inputs = [render_scene.meshes, render_scene.surfaces, images.cameras, images.grid, scene.perception.normal_window]
-        inputs += [images.bodies, images.hits, arrays.world, arrays.camera, arrays.component, arrays.largest]
+        inputs += [images.bodies, images.gbuffer, images.views, arrays.component, arrays.largest]
         inputs += [observation.grasp_pixel, plan.target]
         self._launch(smooth_normal_kernel, inputs, [plan.normal])
 
     def frame_grasp(self, scene: SceneData, images: SegmentedViews, observation: Observation, plan: Plan) -> None:
         """Compute the grasp point in the world, its unit normal, and the gripper's angles."""
-        arrays = images.arrays
-        inputs = [images.cameras, scene.pick, plan.normal, images.hits, arrays.world, arrays.camera, observation.grasp_pixel, plan.target]
+        inputs = [images.cameras, scene.pick, plan.normal, images.gbuffer, images.views, observation.grasp_pixel, plan.target]
         self._launch(frame_grasp_kernel, inputs, [plan.point, plan.yaw, plan.tilt])
 
     def _launch(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:

@@ -7,19 +7,20 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate, device_array, memory_table
+from synpick_warp.arrays import allocate, allocate_struct, device_array, memory_table
 from synpick_warp.configs import schema
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.perception import components, contours, distance_transform, grasp_points
-from synpick_warp.kernels.render.visibility import gbuffer, view_setup
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.gbuffer import trace_sample_kernel
+from synpick_warp.kernels.render.visibility.view_setup import aim_views_kernel
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays
 from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
-from synpick_warp.stages.render.view_setup import BodyArrays, HitArrays, body_sizes, filled, place_bodies
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, body_sizes, set_up_views
 
 CPU_BYTES = 512 * 2**20
 GPU_BYTES = 2 * 2**30
@@ -46,12 +47,12 @@ class SegmentationScratch:
     """Sum of squared depths over the patch."""
 
 
-SCRATCH = (BodyArrays, HitArrays, PerceptionArrays, SegmentationScratch)
-"""Dataclasses of all arrays that a `Segmenter` allocates."""
+SCRATCH = (VIEWS, VIEW_BODIES, GBUFFER, PerceptionArrays, SegmentationScratch)
+"""Declarations of all arrays that a `Segmenter` allocates."""
 
 
 def perception_sizes(settings: schema.Sight, instances: int, views: int) -> dict[str, int]:
-    """Extents of the dimensions of the dataclasses in `SCRATCH`."""
+    """Extents of the dimensions of the declarations in `SCRATCH`."""
     width, height = settings.resolution
     return {
         "view": views,
@@ -83,11 +84,11 @@ class Segmenter:
     Owns its scratch; `render` and `find_grasp_points` only launch kernels, so a CUDA graph can capture them.
 
     Attributes:
-        arrays: Arrays of the batch. The caller fills `arrays.world`: the world of each view, each world once; -1: the view is unused.
-        hits: The struct `Hits` of the batch.
+        views: The struct `Views` of the batch. The caller fills `views.world` (view): each world once; -1: the view is unused.
+        arrays: Arrays of the batch.
+        gbuffer: The struct `GBuffer` of the batch.
         cameras: The struct `Cameras` with camera 0 alone, at the resolution of perception.
         grid: The struct `ImageGrid` of its image.
-        views: Views of a batch.
     """
 
     def __init__(self, settings: schema.Sight, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int) -> None:
@@ -104,32 +105,33 @@ class Segmenter:
             ConfigError: A batch has more pixels than 31 bits can count.
         """
         device = render_scene.device
-        self.render_scene, self.instances = render_scene, instances
-        self.views = count_views(settings, worlds, instances, device)
-        sizes = perception_sizes(settings, instances, self.views)
+        self.render_scene = render_scene
+        sizes = perception_sizes(settings, instances, count_views(settings, worlds, instances, device))
+        self.views = allocate_struct(VIEWS, sizes, device)
+        self.views.world.fill_(-1)
+        self.views.count, self.views.instances = sizes["view"], instances
         self.width, self.height = settings.resolution
         self.grid = build_grid(self.width, self.height)
-        self.pixels = self.views * self.grid.tiles * int(TILE_PIXELS)
+        self.pixels = self.views.count * self.grid.tiles * int(TILE_PIXELS)
         if self.pixels >= 2**31:
-            raise ConfigError(f"sight.views is {self.views}; of {self.width} x {self.height} px that is more than 2³¹ pixels; take fewer")
+            size = f"{self.width} x {self.height} px"
+            raise ConfigError(f"sight.views is {self.views.count}; of {size} that is more than 2³¹ pixels; take fewer")
         self.arrays = allocate(PerceptionArrays, sizes, device)
-        self.arrays.world.fill_(-1)
         self.scratch = allocate(SegmentationScratch, sizes, device)
-        self.hit_arrays = allocate(HitArrays, sizes, device)
-        self.hits = filled(gbuffer.Hits, self.hit_arrays)
-        self.bodies = filled(gbuffer.Bodies, allocate(BodyArrays, sizes, device))
+        self.gbuffer = allocate_struct(GBUFFER, sizes, device)
+        self.bodies = allocate_struct(VIEW_BODIES, sizes, device)
         self.cameras = build_cameras(make_cameras(replace(cameras, resolution=settings.resolution))[:1], device)
         self.strips = -(-self.width // int(components.STRIP))
         self.fixture_visible = wp.array([[1, 0, 0]] * worlds, dtype=wp.int32, device=device)
-        self.flat = _flatten(self.hit_arrays, self.arrays, self.scratch)
+        self.flat = _images(self.arrays, self.scratch) | {"segment": _flatten(self.gbuffer.segment), "depth": _flatten(self.gbuffer.depth)}
 
     def render(self, snapshot: Snapshot) -> None:
         """Render the G-buffer of each view without gripper shaft and cup. Unused views keep their content."""
-        scene, arrays = self.render_scene, self.arrays
-        wp.launch(view_setup.aim_views_kernel, dim=self.views, inputs=[arrays.world], outputs=[arrays.camera], device=scene.device)
-        place_bodies(scene, self.cameras, self.grid, snapshot, self.fixture_visible, arrays.world, arrays.camera, self.views, self.bodies)
-        inputs = [scene.meshes, scene.table, self.cameras, self.grid, self.bodies, arrays.camera, self.instances, CENTER]
-        self._launch_pixels(gbuffer.trace_sample_kernel, inputs, [self.hits])
+        scene, views = self.render_scene, self.views
+        wp.launch(aim_views_kernel, dim=views.count, outputs=[views], device=scene.device)
+        set_up_views(scene, self.cameras, self.grid, snapshot, self.fixture_visible, views, self.bodies)
+        inputs = [scene.meshes, scene.table, self.cameras, self.grid, self.bodies, views, CENTER]
+        self._launch_pixels(trace_sample_kernel, inputs, [self.gbuffer])
 
     def find_grasp_points(self, scene: SceneData, entry: wp.array, observation: Observation) -> None:
         """Compute components, distance transforms, contours and grasp points of the rendered views.
@@ -157,17 +159,17 @@ class Segmenter:
         """Reset maxima, sums and overflow flags to 0."""
         scratch = self.scratch
         outputs = [scratch.largest_key, scratch.pole_key, scratch.square, observation.overflow]
-        self._launch(grasp_points.clear_sums_kernel, (self.instances,), [], outputs)
+        self._launch(grasp_points.clear_sums_kernel, (self.views.instances,), [], outputs)
 
     def label_strips(self) -> None:
         """Label the runs of each strip."""
-        flat, count = self.flat, self.views * self.height * self.strips
-        inputs = [self.arrays.world, flat["code"], self.instances, self.width, self.height, self.strips]
+        flat, count = self.flat, self.views.count * self.height * self.strips
+        inputs = [self.views, flat["segment"], self.width, self.height, self.strips]
         launch_pixels(components.label_strips_kernel, count, inputs, [flat["component"], flat["area"]], self.render_scene.device)
 
     def merge_strips(self) -> None:
         """Unite runs that touch."""
-        inputs = [self.flat["code"], self.instances, self.width]
+        inputs = [self.flat["segment"], self.width]
         self._launch(components.merge_strips_kernel, (self.height, self.strips), inputs, [self.flat["component"]])
 
     def measure_components(self) -> None:
@@ -177,28 +179,28 @@ class Segmenter:
 
     def find_largest(self) -> None:
         """Find the keys of the largest components."""
-        inputs = [self.flat["code"], self.flat["area"]]
+        inputs = [self.flat["segment"], self.flat["area"]]
         self._launch(components.find_largest_kernel, (self.height * self.width,), inputs, [self.scratch.largest_key])
 
     def unpack_largest(self) -> None:
         """Unpack the labels of the largest components."""
-        self._launch(components.unpack_largest_kernel, (self.instances,), [self.scratch.largest_key], [self.arrays.largest])
+        self._launch(components.unpack_largest_kernel, (self.views.instances,), [self.scratch.largest_key], [self.arrays.largest])
 
     def mark_patches(self) -> None:
         """Mark the pixels of the largest components and their neighbours."""
         flat = self.flat
-        inputs = [self.grid, self.arrays.world, flat["code"], flat["component"], self.arrays.largest]
+        inputs = [self.grid, self.views, flat["segment"], flat["component"], self.arrays.largest]
         self._launch_pixels(distance_transform.mark_patches_kernel, inputs, [flat["patch"]])
 
     def measure_columns(self) -> None:
         """First pass of the distance transform: distances within columns."""
-        inputs = [self.grid, self.arrays.world, self.flat["patch"]]
-        dim, device = (self.views, self.width), self.render_scene.device
+        inputs = [self.grid, self.views, self.flat["patch"]]
+        dim, device = (self.views.count, self.width), self.render_scene.device
         wp.launch(distance_transform.measure_columns_kernel, dim=dim, inputs=inputs, outputs=[self.flat["gap"]], device=device)
 
     def measure_rows(self) -> None:
         """Second pass of the distance transform: minimum over the columns of a row."""
-        inputs = [self.grid, self.arrays.world, self.flat["gap"]]
+        inputs = [self.grid, self.views, self.flat["gap"]]
         self._launch_pixels(distance_transform.measure_rows_kernel, inputs, [self.flat["distance"]])
 
     def measure_patches(self) -> None:
@@ -211,39 +213,40 @@ class Segmenter:
         """Follow the outer contours and compute their centroids."""
         arrays = self.arrays
         outputs = [arrays.contour, arrays.contour_length, observation.centroid, observation.overflow]
-        self._launch(contours.trace_contours_kernel, (self.instances,), [self.flat["patch"], arrays.largest, self.width], outputs)
+        self._launch(contours.trace_contours_kernel, (self.views.instances,), [self.flat["patch"], arrays.largest, self.width], outputs)
 
     def measure_points(self, scene: SceneData, entry: wp.array, observation: Observation) -> None:
         """Compute visible fractions, and the distances to the contour at pole, centroid and midpoint."""
         arrays, flat, scratch = self.arrays, self.flat, self.scratch
-        inputs = [scene.catalog, self.cameras.intrinsics, entry, arrays.world, flat["component"], flat["area"], arrays.largest]
+        inputs = [scene.catalog, self.cameras.intrinsics, entry, self.views, flat["component"], flat["area"], arrays.largest]
         inputs += [flat["distance"], scratch.pole_key, scratch.square, self.width]
         outputs = [observation.visible, observation.visible_fraction, observation.pole, observation.centroid, observation.distances]
-        dim, device = (self.views, self.instances), self.render_scene.device
+        dim, device = (self.views.count, self.views.instances), self.render_scene.device
         wp.launch(grasp_points.measure_points_kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
 
     def choose_grasp_points(self, scene: SceneData, entry: wp.array, observation: Observation) -> None:
         """Choose each instance's grasp point among the candidates, and read its depth."""
-        inputs = [scene.catalog, scene.perception, entry, self.arrays.world, observation.visible, observation.pole, observation.centroid]
-        inputs += [observation.distances, self.hit_arrays.depth]
+        inputs = [scene.catalog, scene.perception, entry, self.views, observation.visible, observation.pole, observation.centroid]
+        inputs += [observation.distances, self.gbuffer.depth]
         outputs = [observation.midpoint, observation.grasp_pixel, observation.depth]
-        dim, device = (self.views, self.instances), self.render_scene.device
+        dim, device = (self.views.count, self.views.instances), self.render_scene.device
         wp.launch(grasp_points.choose_grasp_points_kernel, dim=dim, inputs=inputs, outputs=outputs, device=device)
 
     def _launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel over all views; its first input is the world of each view."""
-        wp.launch(kernel, dim=(self.views, *dim), inputs=[self.arrays.world, *inputs], outputs=outputs, device=self.render_scene.device)
+        """Launch a kernel over all views; its first input is the struct `Views`."""
+        wp.launch(kernel, dim=(self.views.count, *dim), inputs=[self.views, *inputs], outputs=outputs, device=self.render_scene.device)
 
     def _launch_pixels(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
         launch_pixels(kernel, self.pixels, inputs, outputs, self.render_scene.device)
 
 
-def _flatten(*groups: Any) -> dict[str, wp.array]:
-    """Views (view, pixel) of the images (view, row, column) among the arrays of dataclasses; they share memory."""
-    flat = {}
-    for group in groups:
-        for item in fields(group):
-            if item.metadata["array"].shape == ("view", "row", "column"):
-                image = getattr(group, item.name)
-                flat[item.name] = image.reshape((image.shape[0], image.shape[1] * image.shape[2]))
-    return flat
+def _images(*groups: Any) -> dict[str, wp.array]:
+    """The images (view, row, column) among the arrays of dataclasses, flattened, by name."""
+    members = [(group, item) for group in groups for item in fields(group)]
+    images = [(group, item.name) for group, item in members if item.metadata["array"].shape == ("view", "row", "column")]
+    return {name: _flatten(getattr(group, name)) for group, name in images}
+
+
+def _flatten(image: wp.array) -> wp.array:
+    """View (view, pixel) of an image (view, row, column); it shares the memory."""
+    return image.reshape((image.shape[0], image.shape[1] * image.shape[2]))

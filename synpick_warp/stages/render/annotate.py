@@ -19,31 +19,30 @@ GPU_THREADS = 1024
 """Threads that share one instance's pixels: enough to hide the latency of their reads, few enough that atomics do not crowd."""
 
 
-def annotate(scene: RenderScene, bodies: Any, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
-    """Fill `out.pixels` and `out.boxes` of the first `count` views from their images and, beyond the border, from rays.
+def annotate(scene: RenderScene, bodies: Any, views: Any, out: ViewBuffers) -> None:
+    """Fill `out.pixels` and `out.boxes` of the views from their images and, beyond the border, from rays.
 
     Args:
         scene: Constant data.
-        bodies: The struct `Bodies` that `prepare_bodies` filled for these views.
-        view_camera: Camera of each view (B) int32.
-        count: Views in use.
+        bodies: The struct `ViewBodies` that `set_up_views` filled for these views.
+        views: The struct `Views`.
         out: Its images are read, its counts and boxes written.
     """
     instances = out.pixels.shape[1]
     threads = GPU_THREADS if scene.device.is_cuda else 1
-    wp.launch(clear_annotation_kernel, dim=(count, instances), outputs=[out.pixels, out.boxes], device=scene.device)
+    wp.launch(clear_annotation_kernel, dim=(views.count, instances), outputs=[out.pixels, out.boxes], device=scene.device)
     wp.launch(
         count_inside_kernel,
-        dim=(count, instances, threads),
+        dim=(views.count, instances, threads),
         inputs=[scene.grid, bodies, out.instance, out.depth, out.amodal, threads],
         outputs=[out.pixels, out.boxes],
         device=scene.device,
     )
     wp.launch(
         count_outside_kernel,
-        dim=(count, instances, threads),
-        inputs=[scene.meshes, scene.cameras, scene.grid, bodies, view_camera, threads],
+        dim=(views.count, instances, threads),
+        inputs=[scene.meshes, scene.cameras, scene.grid, bodies, views, threads],
         outputs=[out.pixels, out.boxes],
         device=scene.device,
     )
-    wp.launch(close_boxes_kernel, dim=(count, instances, 2), outputs=[out.boxes], device=scene.device)
+    wp.launch(close_boxes_kernel, dim=(views.count, instances, 2), outputs=[out.boxes], device=scene.device)

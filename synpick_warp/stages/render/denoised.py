@@ -7,9 +7,9 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate, device_array
+from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.configs.schema import Config
-from synpick_warp.kernels.render.images.antialias import SAMPLES, SEGMENT_TILES, find_edges_kernel, mix_edges_kernel
+from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, find_edges_kernel, mix_edges_kernel
 from synpick_warp.kernels.render.lighting.coarse_grid import LANES_ACROSS, SPREAD, CellGrid, Guide
 from synpick_warp.kernels.render.lighting.coarse_paths import Gathered, gather_kernel
 from synpick_warp.kernels.render.lighting.denoise import Shares, choose_windows_kernel, soften_shares_kernel, sum_blocks_kernel
@@ -20,7 +20,6 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import BLOCK, launch_pixels
 from synpick_warp.stages.render.reference import path_rules
 from synpick_warp.stages.render.scene import RenderScene, build_grid
-from synpick_warp.stages.render.view_setup import filled
 
 CELLS_ACROSS = 384
 """Cells in a picture's width, at least, and fewer than twice as many, if the setting leaves their size open: at full HD they are 1.9 mm
@@ -44,34 +43,9 @@ EDGE_THREADS = 128
 """Threads that share the edges of a segment on a GPU: it has some hundred samples."""
 
 
-@dataclass(frozen=True, eq=False)
-class GuideArrays:
-    """Arrays of the struct `Guide`."""
-
-    normal: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
-    depth: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.float32, unit="m")
-    code: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.uint8)
-
-
-@dataclass(frozen=True, eq=False)
-class GatheredArrays:
-    """Arrays of the struct `Gathered`."""
-
-    diffuse: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
-    gloss: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
-    even_diffuse: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
-    even_gloss: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
-    between: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
-    variance: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec2)
-
-
-@dataclass(frozen=True, eq=False)
-class ShareArrays:
-    """Arrays of the struct `Shares`."""
-
-    diffuse: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
-    gloss: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
-    between: wp.array = device_array("view", "cell_row", "cell_column", dtype=wp.vec3)
+GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column", units={"depth": "m"})
+GATHERED = struct_arrays(Gathered, "view", "cell_row", "cell_column")
+SHARES = struct_arrays(Shares, "view", "cell_row", "cell_column")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +62,14 @@ class ShadowArrays:
 class Edges:
     """Squares between the centres of four pixels that anti-aliasing works on."""
 
-    place: wp.array = device_array("view", "segment", "segment_square", dtype=wp.int32)
-    """Row times columns plus column of each; a segment is a run of tiles of squares."""
-    number: wp.array = device_array("view", "segment", dtype=wp.int32)
+    place: wp.array = device_array("view", "chunk", "chunk_square", dtype=wp.int32)
+    """Row times columns plus column of each; a chunk is a run of tiles of squares."""
+    number: wp.array = device_array("view", "chunk", dtype=wp.int32)
     """How many there are."""
 
 
-FAST_SCRATCH = ((GuideArrays, 1), (GatheredArrays, 2), (ShareArrays, 2), (ShadowArrays, 1), (Edges, 1))
-"""What `FastPicture` allocates, and how often."""
+FAST_SCRATCH = ((GUIDE, 1), (GATHERED, 2), (SHARES, 2), (ShadowArrays, 1), (Edges, 1))
+"""What `DenoisedRenderer` allocates, and how often."""
 
 
 def cell_size(config: Config, width: int) -> int:
@@ -112,14 +86,14 @@ def cell_sizes(config: Config, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions that the arrays here name beside the view, for images of `width` x `height` px."""
     size = cell_size(config, width)
     shadow = max(1, size // 2)
-    segments = -(-square_grid(width, height).tiles // int(SEGMENT_TILES)) if config.render.antialias else 0
+    chunks = -(-square_grid(width, height).tiles // int(CHUNK_TILES)) if config.render.antialias else 0
     return {
         "cell_row": -(-height // size),
         "cell_column": -(-width // size),
         "shadow_row": -(-height // shadow),
         "shadow_column": -(-width // shadow),
-        "segment": segments,
-        "segment_square": int(SEGMENT_TILES) * int(TILE_PIXELS),
+        "chunk": chunks,
+        "chunk_square": int(CHUNK_TILES) * int(TILE_PIXELS),
     }
 
 
@@ -144,16 +118,15 @@ def spread_threads(cells: Any) -> int:
     return -(-cells.cells.width // across) * -(-cells.cells.height // down) * across * down
 
 
-class FastPicture:
+class DenoisedRenderer:
     """Renders linear radiance by few paths and a filter. Owns its scratch; `shade` only launches."""
 
-    def __init__(self, config: Config, scene: RenderScene, instances: int, views: int) -> None:
+    def __init__(self, config: Config, scene: RenderScene, views: int) -> None:
         """Allocate scratch.
 
         Args:
             config: All settings; `render.cell`, `cell_paths`, `bounces` and `antialias` count.
             scene: Constant data.
-            instances: Room for instances of a world.
             views: Most views of a batch.
         """
         size = cell_size(config, scene.width)
@@ -161,93 +134,87 @@ class FastPicture:
         self.scene = scene
         self.cells = cell_grid(scene.grid, size, 1)
         self.shadow_cells = cell_grid(scene.grid, max(1, size // 2), SHADOW_WINDOW)
-        self.rules = path_rules(config, instances, cell_paths(config, scene.width), ROULETTE)
+        self.rules = path_rules(config, cell_paths(config, scene.width), ROULETTE)
         self.rules.least_roughness = LEAST_ROUGHNESS
         self.most_share = MOST_SHARE
-        self.guide = filled(Guide, allocate(GuideArrays, sizes, scene.device))
-        self.gathered, self.blocks = (filled(Gathered, allocate(GatheredArrays, sizes, scene.device)) for _ in range(2))
-        self.chosen, self.shares = (filled(Shares, allocate(ShareArrays, sizes, scene.device)) for _ in range(2))
+        self.guide = allocate_struct(GUIDE, sizes, scene.device)
+        self.gathered, self.blocks = (allocate_struct(GATHERED, sizes, scene.device) for _ in range(2))
+        self.chosen, self.shares = (allocate_struct(SHARES, sizes, scene.device) for _ in range(2))
         self.shadows = allocate(ShadowArrays, sizes, scene.device)
         self.antialias = config.render.antialias
         self.squares = square_grid(scene.width, scene.height)
         self.edges = allocate(Edges, sizes, scene.device)
 
-    def shade(
-        self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int, picture: Any
-    ) -> None:
-        """Pictures of the first `count` views.
+    def shade(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
+        """Pictures of the views.
 
         Args:
             snapshot: The worlds.
-            bodies: The struct `Bodies`, prepared for these views.
-            hits: The struct `Hits` of these views.
-            view_world: World of each view (B) int32.
-            view_camera: Camera of each view (B) int32.
-            count: Views in use.
-            picture: The struct `Picture`; written.
+            bodies: The struct `ViewBodies`, prepared for these views.
+            gbuffer: The struct `GBuffer` of these views.
+            views: The struct `Views`.
+            image: The struct `ShadedImage`; written.
         """
-        self.gather(snapshot, bodies, hits, view_world, view_camera, count)
-        self.filter(view_camera, count)
-        self.cast_shadows(snapshot, bodies, hits, view_world, view_camera, count)
-        self.light(snapshot, bodies, hits, view_world, view_camera, count, picture.radiance)
+        self.gather(snapshot, bodies, gbuffer, views)
+        self.filter(views)
+        self.cast_shadows(snapshot, bodies, gbuffer, views)
+        self.light(snapshot, bodies, gbuffer, views, image.radiance)
         if self.antialias:
-            self.smooth(bodies, hits, view_camera, count, picture)
+            self.smooth(bodies, gbuffer, views, image)
 
-    def gather(self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int) -> None:
+    def gather(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
         """Trace the cells' paths."""
         scene = self.scene
-        inputs = [scene.paths, scene.cameras, self.cells, snapshot.episode, snapshot.light, snapshot.light_yaw, bodies, hits]
-        inputs += [view_world, view_camera, self.rules, self.most_share]
-        launch_pixels(gather_kernel, count * spread_threads(self.cells), inputs, [self.guide, self.gathered], scene.device)
+        inputs = [scene.paths, scene.cameras, self.cells, snapshot.episode, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
+        inputs += [views, self.rules, self.most_share]
+        launch_pixels(gather_kernel, views.count * spread_threads(self.cells), inputs, [self.guide, self.gathered], scene.device)
 
-    def filter(self, view_camera: wp.array, count: int) -> None:
+    def filter(self, views: Any) -> None:
         """Share light among cells, over windows that are as wide as the light is even."""
         shared = [self.scene.cameras, self.cells, self.guide]
-        self._launch(sum_blocks_kernel, self.cells.cells, count, [*shared, self.gathered, view_camera], [self.blocks])
+        self._launch(sum_blocks_kernel, self.cells.cells, views.count, [*shared, self.gathered, views], [self.blocks])
         doubt = LONE_DOUBT if self.rules.samples == 1 else 1.0
-        self._launch(choose_windows_kernel, self.cells.cells, count, [*shared, self.blocks, view_camera, doubt], [self.chosen])
-        self._launch(soften_shares_kernel, self.cells.cells, count, [*shared, self.chosen, view_camera], [self.shares])
+        self._launch(choose_windows_kernel, self.cells.cells, views.count, [*shared, self.blocks, views, doubt], [self.chosen])
+        self._launch(soften_shares_kernel, self.cells.cells, views.count, [*shared, self.chosen, views], [self.shares])
 
-    def cast_shadows(self, snapshot: Snapshot, bodies: Any, hits: Any, view_world: wp.array, view_camera: wp.array, count: int) -> None:
+    def cast_shadows(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
         """Visible shares of the main light."""
         scene, cells, shadows = self.scene, self.shadow_cells, self.shadows
-        inputs = [scene.meshes, scene.table, scene.cameras, cells, scene.lights, snapshot.light, snapshot.light_yaw, bodies, hits]
-        inputs += [view_world, view_camera, self.rules.instances]
-        self._launch(cast_shadow_rays_kernel, cells.cells, count, inputs, [shadows.cast])
-        inputs = [scene.meshes, scene.cameras, cells, scene.lights, snapshot.light, bodies, hits, shadows.cast]
-        inputs += [view_world, view_camera, self.rules.instances]
-        self._launch(filter_shadows_kernel, cells.cells, count, inputs, [shadows.smooth])
+        inputs = [scene.meshes, scene.table, scene.cameras, cells, scene.lights, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
+        inputs += [views]
+        self._launch(cast_shadow_rays_kernel, cells.cells, views.count, inputs, [shadows.cast])
+        inputs = [scene.meshes, scene.cameras, cells, scene.lights, snapshot.light, bodies, gbuffer, shadows.cast]
+        inputs += [views]
+        self._launch(filter_shadows_kernel, cells.cells, views.count, inputs, [shadows.smooth])
 
     def light(
         self,
         snapshot: Snapshot,
         bodies: Any,
-        hits: Any,
-        view_world: wp.array,
-        view_camera: wp.array,
-        count: int,
+        gbuffer: Any,
+        views: Any,
         radiance: wp.array,
     ) -> None:
         """Radiance of each pixel from the light around it."""
         scene = self.scene
-        inputs = [scene.paths, scene.cameras, self.cells, self.shadow_cells, snapshot.light, snapshot.light_yaw, bodies, hits]
-        inputs += [self.guide, self.shares, self.shadows.smooth, view_world, view_camera, self.rules.instances]
-        self._launch(shade_kernel, scene.grid, count, inputs, [radiance])
+        inputs = [scene.paths, scene.cameras, self.cells, self.shadow_cells, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
+        inputs += [self.guide, self.shares, self.shadows.smooth, views]
+        self._launch(shade_kernel, scene.grid, views.count, inputs, [radiance])
 
-    def smooth(self, bodies: Any, hits: Any, view_camera: wp.array, count: int, picture: Any) -> None:
-        """Which pixels' radiance those on edges show: `mix` of the struct `Picture`."""
+    def smooth(self, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
+        """Which pixels' radiance those on edges show: `mix` of the struct `ShadedImage`."""
         scene, edges = self.scene, self.edges
         edges.number.zero_()
         # Atomics of a launch on the CPU hold in one thread alone, so these are not cut into pieces.
-        inputs = [scene.cameras, scene.grid, self.squares, hits, picture.radiance, view_camera]
-        outputs = [picture.mix, edges.place, edges.number]
-        squares = count * self.squares.tiles * int(TILE_PIXELS)
+        inputs = [scene.cameras, scene.grid, self.squares, gbuffer, image.radiance, views]
+        outputs = [image.mix, edges.place, edges.number]
+        squares = views.count * self.squares.tiles * int(TILE_PIXELS)
         wp.launch(find_edges_kernel, dim=squares, inputs=inputs, outputs=outputs, device=scene.device, block_dim=BLOCK)
         threads = EDGE_THREADS if scene.device.is_cuda else int(SAMPLES)
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.squares, bodies, hits, edges.place, edges.number]
-        inputs += [view_camera, self.rules.instances, threads]
-        samples = count * edges.number.shape[1] * threads
-        wp.launch(mix_edges_kernel, dim=samples, inputs=inputs, outputs=[picture.mix], device=scene.device, block_dim=BLOCK)
+        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.squares, bodies, gbuffer, edges.place, edges.number]
+        inputs += [views, threads]
+        samples = views.count * edges.number.shape[1] * threads
+        wp.launch(mix_edges_kernel, dim=samples, inputs=inputs, outputs=[image.mix], device=scene.device, block_dim=BLOCK)
 
     def _launch(self, kernel: wp.Kernel, grid: Any, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         launch_pixels(kernel, count * grid.tiles * int(TILE_PIXELS), inputs, outputs, self.scene.device)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import allocate, device_array
+from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError
 from synpick_warp.kernels.render.images.depth_sensor import draw_depth_sensor_kernel
@@ -33,17 +32,10 @@ MOVING = {"flow", "scene_flow"}
 """Layers that need motions."""
 
 
-@dataclass(frozen=True, eq=False)
-class MotionArrays:
-    """Arrays of the struct `Motions`."""
-
-    known: wp.array = device_array("view", "body", dtype=wp.int32)
-    turn: wp.array = device_array("view", "body", dtype=wp.mat33)
-    origin: wp.array = device_array("view", "body", dtype=wp.vec3, unit="m")
-    shift: wp.array = device_array("view", "body", dtype=wp.vec3, unit="m")
+MOTIONS = struct_arrays(Motions, "view", "body", units={"origin": "m", "shift": "m"})
 
 
-class LayerPainter:
+class LayerRenderer:
     """Draws layers. Owns its scratch; `draw` only launches, so a CUDA graph can capture it."""
 
     def __init__(self, config: Config, scene: RenderScene, instances: int, views: int) -> None:
@@ -59,7 +51,6 @@ class LayerPainter:
             CatalogError: Classes are asked for, and an obj_id does not fit into 16 bits or means none.
         """
         self.scene = scene
-        self.instances = instances
         self.names = config.render.layers
         if "classes" in self.names:
             wrong = [number for number in scene.obj_id.numpy().tolist() if not 0 < number <= MOST_CLASS]
@@ -70,56 +61,59 @@ class LayerPainter:
         self.sensor = sensor_rules(config)
         self.motions = None
         if MOVING.intersection(self.names):
-            self.motions = Motions()
-            arrays = allocate(MotionArrays, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
-            for item in fields(arrays):
-                setattr(self.motions, item.name, getattr(arrays, item.name))
+            self.motions = allocate_struct(MOTIONS, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
 
     def draw(
         self,
         snapshot: Snapshot,
         bodies: Any,
-        hits: Any,
-        view_world: wp.array,
-        view_camera: wp.array,
-        count: int,
+        gbuffer: Any,
+        views: Any,
         out: LayerBuffers,
     ) -> None:
-        """Draw the layers of the first `count` views.
+        """Draw the layers of the views.
 
         Args:
             snapshot: The worlds.
-            bodies: The struct `Bodies`, prepared for these views.
-            hits: The struct `Hits` of the pixels' centres.
-            view_world: World of each view (B) int32.
-            view_camera: Camera of each view (B) int32.
-            count: Views in use.
+            bodies: The struct `ViewBodies`, prepared for these views.
+            gbuffer: The struct `GBuffer` of the pixels' centres.
+            views: The struct `Views`.
             out: Its arrays of the layers asked for are written.
         """
         scene, names = self.scene, self.names
-        surface = [scene.meshes, scene.surfaces, scene.cameras, scene.grid, bodies, hits, view_camera, self.instances]
+        surface = [scene.meshes, scene.surfaces, scene.cameras, scene.grid, bodies, gbuffer, views]
         if "normals" in names:
-            self._launch(draw_normals_kernel, count, surface, out.normals)
+            self._launch(draw_normals_kernel, views.count, surface, out.normals)
         if "albedo" in names:
-            self._launch(draw_albedo_kernel, count, surface, out.albedo)
+            self._launch(draw_albedo_kernel, views.count, surface, out.albedo)
         if "nocs" in names:
-            self._launch(draw_nocs_kernel, count, [scene.meshes, scene.grid, bodies, hits, self.instances], out.nocs)
+            self._launch(draw_nocs_kernel, views.count, [scene.meshes, scene.grid, bodies, gbuffer, views], out.nocs)
         if "classes" in names:
-            self._launch(draw_classes_kernel, count, [scene.grid, scene.obj_id, bodies, hits, self.instances], out.classes)
+            self._launch(draw_classes_kernel, views.count, [scene.grid, scene.obj_id, bodies, gbuffer, views], out.classes)
         if "depth_sensor" in names:
-            inputs = [scene.meshes, scene.surfaces, scene.cameras, scene.grid, snapshot.episode, snapshot.frame, self.sensor, bodies, hits]
-            inputs += [view_world, view_camera, self.instances]
-            self._launch(draw_depth_sensor_kernel, count, inputs, out.depth_sensor)
+            inputs = [
+                scene.meshes,
+                scene.surfaces,
+                scene.cameras,
+                scene.grid,
+                snapshot.episode,
+                snapshot.frame,
+                self.sensor,
+                bodies,
+                gbuffer,
+                views,
+            ]
+            self._launch(draw_depth_sensor_kernel, views.count, inputs, out.depth_sensor)
         if self.motions is None:
             return
-        self.prepare_motions(snapshot, view_world, view_camera, count)
-        motion = [scene.cameras, scene.grid, snapshot.follows, self.motions, hits, view_world, view_camera, self.instances]
+        self.prepare_motions(snapshot, views)
+        motion = [scene.cameras, scene.grid, snapshot.follows, self.motions, gbuffer, views]
         if "flow" in names:
-            self._launch(draw_flow_kernel, count, motion, out.flow)
+            self._launch(draw_flow_kernel, views.count, motion, out.flow)
         if "scene_flow" in names:
-            self._launch(draw_scene_flow_kernel, count, motion, out.scene_flow)
+            self._launch(draw_scene_flow_kernel, views.count, motion, out.scene_flow)
 
-    def prepare_motions(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int) -> None:
+    def prepare_motions(self, snapshot: Snapshot, views: Any) -> None:
         """How every body moved since the frame before."""
         inputs = [
             self.scene.cameras,
@@ -129,8 +123,8 @@ class LayerPainter:
             snapshot.follows,
             snapshot.last_catalog_index,
         ]
-        inputs += [snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible, view_world, view_camera, self.instances]
-        dim = (count, self.instances + len(FIXTURES))
+        inputs += [snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible, views]
+        dim = (views.count, self.motions.known.shape[1])
         wp.launch(prepare_motions_kernel, dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:

@@ -11,7 +11,7 @@ from synpick_warp.arrays import allocate, device_array
 from synpick_warp.codes import Tone
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import effect_ranges
-from synpick_warp.kernels.render.images.antialias import Picture
+from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.kernels.render.images.camera_effects import EffectRules, Strengths, draw_effects_kernel
 from synpick_warp.kernels.render.images.postprocess import DevelopRules, develop_effects_kernel, develop_kernel, spread_rows_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
@@ -47,7 +47,7 @@ def effect_rules(config: Config) -> Any:
     return rules
 
 
-class Developer:
+class PostProcessor:
     """Develops pictures. Owns its scratch; `develop` only launches, so a CUDA graph can capture it."""
 
     def __init__(self, config: Config, scene: RenderScene, views: int) -> None:
@@ -69,33 +69,31 @@ class Developer:
             sizes = {"view": views, "row": scene.height, "column": scene.width}
             self.spread = allocate(SpreadArrays, sizes, scene.device).radiance
 
-    def develop(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, picture: Any, out: ViewBuffers) -> None:
-        """Colour of the first `count` views.
+    def process(self, snapshot: Snapshot, views: Any, image: Any, out: ViewBuffers) -> None:
+        """Colour of the views.
 
         Args:
             snapshot: The worlds.
-            view_world: World of each view (B) int32.
-            view_camera: Camera of each view (B) int32.
-            count: Views in use.
-            picture: The struct `Picture`.
+            views: The struct `Views`.
+            image: The struct `ShadedImage`.
             out: `color` is written, and `effects` if there are any; else these stay zero.
         """
         scene = self.scene
         if self.effects is None:
-            inputs = [scene.grid, scene.lights, snapshot.light, snapshot.light_exposure, view_world, picture, self.rules.tone]
-            self._launch(develop_kernel, count, inputs, out.color)
+            inputs = [scene.grid, scene.lights, snapshot.light, snapshot.light_exposure, views, image, self.rules.tone]
+            self._launch(develop_kernel, views.count, inputs, out.color)
             return
-        inputs = [snapshot.episode, snapshot.frame, self.effects, view_world, view_camera]
-        wp.launch(draw_effects_kernel, dim=count, inputs=inputs, outputs=[out.effects], device=scene.device)
+        inputs = [snapshot.episode, snapshot.frame, self.effects, views]
+        wp.launch(draw_effects_kernel, dim=views.count, inputs=inputs, outputs=[out.effects], device=scene.device)
         if self.spread is not None:
-            inputs = [scene.cameras, scene.grid, out.effects, view_camera, picture]
-            self._launch(spread_rows_kernel, count, inputs, self.spread)
-            spread = Picture()
-            spread.radiance, spread.mix = self.spread, picture.mix
-            picture = spread
+            inputs = [scene.cameras, scene.grid, out.effects, views, image]
+            self._launch(spread_rows_kernel, views.count, inputs, self.spread)
+            spread = ShadedImage()
+            spread.radiance, spread.mix = self.spread, image.mix
+            image = spread
         inputs = [scene.cameras, scene.grid, scene.lights, snapshot.episode, snapshot.frame, snapshot.light, snapshot.light_exposure]
-        inputs += [self.rules, out.effects, view_world, view_camera, picture]
-        self._launch(develop_effects_kernel, count, inputs, out.color)
+        inputs += [self.rules, out.effects, views, image]
+        self._launch(develop_effects_kernel, views.count, inputs, out.color)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:
         launch_pixels(kernel, count * self.scene.grid.tiles * int(TILE_PIXELS), inputs, [output], self.scene.device)

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Any
 
-import warp as wp
-
-from synpick_warp.arrays import allocate, device_array
+from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.configs.schema import REFERENCE, Config
-from synpick_warp.kernels.render.images.antialias import Picture
-from synpick_warp.kernels.render.visibility.gbuffer import Bodies, Hits
+from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.annotate import annotate
-from synpick_warp.stages.render.denoised import FastPicture
-from synpick_warp.stages.render.layers import LayerPainter
-from synpick_warp.stages.render.postprocess import Developer
+from synpick_warp.stages.render.denoised import DenoisedRenderer
+from synpick_warp.stages.render.layers import LayerRenderer
+from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
-from synpick_warp.stages.render.reference import ReferencePicture
+from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
-from synpick_warp.stages.render.view_setup import BodyArrays, HitArrays, body_sizes, filled, place_bodies
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, set_up_views
 
-
-@dataclass(frozen=True, eq=False)
-class PictureArrays:
-    """Arrays of the struct `Picture`: what lies between hits and colour."""
-
-    radiance: wp.array = device_array("view", "row", "column", dtype=wp.vec3)
-    mix: wp.array = device_array("view", "row", "column", dtype=wp.uint32)
+SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
 
 
 class Renderer:
@@ -45,66 +36,56 @@ class Renderer:
         self.scene = scene
         self.instances = instances
         self.views = views
-        self.arrays = (
-            allocate(BodyArrays, sizes, scene.device),
-            allocate(HitArrays, sizes, scene.device),
-            allocate(PictureArrays, sizes, scene.device),
-        )
-        self.bodies = filled(Bodies, self.arrays[0])
-        self.hits = filled(Hits, self.arrays[1])
-        self.picture = filled(Picture, self.arrays[2])
+        self.bodies = allocate_struct(VIEW_BODIES, sizes, scene.device)
+        self.gbuffer = allocate_struct(GBUFFER, sizes, scene.device)
+        self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
         if config.render.mode == REFERENCE:
-            self.shading: FastPicture | ReferencePicture = ReferencePicture(config, scene, instances)
+            self.shading: DenoisedRenderer | ReferenceRenderer = ReferenceRenderer(config, scene)
         else:
-            self.shading = FastPicture(config, scene, instances, views)
-        self.rasterizer = Rasterizer(scene, instances, 1000.0 / config.bop.depth_scale, views)
-        self.layers = LayerPainter(config, scene, instances, views)
-        self.developer = Developer(config, scene, views)
+            self.shading = DenoisedRenderer(config, scene, views)
+        self.rasterizer = Rasterizer(scene, 1000.0 / config.bop.depth_scale, views)
+        self.layer_renderer = LayerRenderer(config, scene, instances, views)
+        self.postprocessor = PostProcessor(config, scene, views)
 
     def render(
         self,
         snapshot: Snapshot,
-        view_world: wp.array,
-        view_camera: wp.array,
-        count: int,
+        views: Any,
         out: ViewBuffers,
         layers: LayerBuffers | None = None,
     ) -> None:
-        """Render and annotate the first `count` views.
+        """Render and annotate a batch of views.
 
         Args:
             snapshot: The worlds.
-            view_world: World of each view (B) int32.
-            view_camera: Camera of each view (B) int32.
-            count: Views in use, known on the host.
+            views: The struct `Views`.
             out: Written.
             layers: Written, if given.
 
         Raises:
             ValueError: More views than there is scratch for.
         """
-        if count > self.views:
-            raise ValueError(f"{count} views in a batch; this renderer has scratch for {self.views}")
-        if count == 0:
+        if views.count > self.views:
+            raise ValueError(f"{views.count} views in a batch; this renderer has scratch for {self.views}")
+        if views.count == 0:
             return
-        self.prepare_bodies(snapshot, view_world, view_camera, count)
-        self.find_hits(view_camera, count, out)
+        self.set_up_views(snapshot, views)
+        self.rasterize(views, out)
         if layers is not None:
-            self.layers.draw(snapshot, self.bodies, self.hits, view_world, view_camera, count, layers)
-        self.shading.shade(snapshot, self.bodies, self.hits, view_world, view_camera, count, self.picture)
-        self.develop(snapshot, view_world, view_camera, count, out)
-        annotate(self.scene, self.bodies, view_camera, count, out)
+            self.layer_renderer.draw(snapshot, self.bodies, self.gbuffer, views, layers)
+        self.shading.shade(snapshot, self.bodies, self.gbuffer, views, self.image)
+        self.postprocess(snapshot, views, out)
+        annotate(self.scene, self.bodies, views, out)
 
-    def prepare_bodies(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int) -> None:
-        """Place every body before every view's camera."""
+    def set_up_views(self, snapshot: Snapshot, views: Any) -> None:
+        """Camera-space transforms, order and tile masks of every view's bodies."""
         scene = self.scene
-        visible = snapshot.fixture_visible
-        place_bodies(scene, scene.cameras, scene.grid, snapshot, visible, view_world, view_camera, count, self.bodies)
+        set_up_views(scene, scene.cameras, scene.grid, snapshot, snapshot.fixture_visible, views, self.bodies)
 
-    def find_hits(self, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
-        """Depth, identities and amodal bits, and the hits for shading."""
-        self.rasterizer.find(self.bodies, view_camera, count, self.hits, out)
+    def rasterize(self, views: Any, out: ViewBuffers) -> None:
+        """G-buffer, and the images of depth, instances and amodal bits."""
+        self.rasterizer.rasterize(self.bodies, views, self.gbuffer, out)
 
-    def develop(self, snapshot: Snapshot, view_world: wp.array, view_camera: wp.array, count: int, out: ViewBuffers) -> None:
+    def postprocess(self, snapshot: Snapshot, views: Any, out: ViewBuffers) -> None:
         """Radiance to bytes."""
-        self.developer.develop(snapshot, view_world, view_camera, count, self.picture, out)
+        self.postprocessor.process(snapshot, views, self.image, out)

@@ -17,7 +17,7 @@ from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXE
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS
-from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Hollow, Material, TriangleMesh
+from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.chances import build_chances
 from synpick_warp.stages.render.gloss import measure_gloss
 from synpick_warp.stages.render.light_tables import light_table
@@ -83,9 +83,9 @@ def uv_density(mesh: TriangleMesh) -> np.ndarray:
 
 
 def build_meshes(
-    shapes: list[TriangleMesh], entries: int, device: wp.Device, hollow: Hollow | None = None
+    shapes: list[TriangleMesh], entries: int, device: wp.Device, interior: Interior | None = None
 ) -> tuple[Any, tuple[wp.Mesh, ...]]:
-    """One `wp.Mesh` a shape, and the struct `Meshes` about them; `hollow` is the tote's."""
+    """One `wp.Mesh` a shape, and the struct `Meshes` about them; `interior` is the tote's."""
     keep = tuple(
         wp.Mesh(
             points=wp.array(shape.vertices, dtype=wp.vec3, device=device),
@@ -109,10 +109,10 @@ def build_meshes(
     meshes.first_triangle = wp.array(np.cumsum([0] + [len(shape.faces) for shape in shapes]), dtype=wp.int32, device=device)
     meshes.corner = wp.array(np.concatenate([corner_values(s.vertices, s) for s in shapes]), dtype=wp.vec3, device=device)
     meshes.entries = entries
-    meshes.hollow.half = wp.vec3(-1.0, -1.0, -1.0)
-    if hollow is not None:
-        meshes.hollow.half, meshes.hollow.growth = wp.vec3(*hollow.half), wp.vec3(*hollow.growth)
-        meshes.hollow.floor, meshes.hollow.top = hollow.floor, hollow.top
+    meshes.interior.half = wp.vec3(-1.0, -1.0, -1.0)
+    if interior is not None:
+        meshes.interior.half, meshes.interior.growth = wp.vec3(*interior.half), wp.vec3(*interior.growth)
+        meshes.interior.floor, meshes.interior.top = interior.floor, interior.top
     return meshes, keep
 
 
@@ -215,7 +215,7 @@ def build_render_scene(
     shapes = [entry.mesh for entry in catalog.entries] + [fixture.mesh for fixture in fixtures]
     table_material = Material(color=config.render.table_color, texture=None, metallic=0.0, roughness=TABLE_ROUGHNESS)
     materials = [entry.material for entry in catalog.entries] + [fixture.material for fixture in fixtures] + [table_material]
-    meshes, keep = build_meshes(shapes, len(catalog), device, fixtures[0].hollow)
+    meshes, keep = build_meshes(shapes, len(catalog), device, fixtures[0].interior)
     table = Table()
     table.visible, table.height = int(config.render.table), -config.tote.wall
     ground = srgb_to_linear(np.array(config.render.table_color)) if config.render.table else None

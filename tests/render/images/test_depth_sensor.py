@@ -16,6 +16,7 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.view_setup import make_views
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, sheet, snapshot
 
 WIDTH, HEIGHT, FOCAL = 160, 96, 400.0
@@ -70,9 +71,9 @@ def measure(toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, fi
     taken = []
     for frame in range(frames):
         made.frame.fill_(frame)
-        renderer.render(made, world, lens, views, images, layers)
+        renderer.render(made, make_views(world, lens, views, toy.room), images, layers)
         taken.append(layers.depth_sensor.numpy().copy())
-    return Measured(np.concatenate(taken), images.depth.numpy(), renderer.hits.depth.numpy())
+    return Measured(np.concatenate(taken), images.depth.numpy(), renderer.gbuffer.depth.numpy())
 
 
 def wall(depth: float, tilt: float = 0.0) -> ToyScene:

@@ -49,7 +49,7 @@ def test_only_what_is_asked_for_is_drawn(device):
 
 def test_normals_of_a_ball_point_from_its_centre(device):
     drawn = draw(one(ball(0.1, 5), (0.02, 0.01, 0.3, 0.1, 0.5, 0.2, 0.8)), device)
-    seen = drawn.code[0] == 1
+    seen = drawn.segment[0] == 1
     center = VIEW.rotation @ (0.02, 0.01, 0.3) + VIEW.translation
     expected = (points(drawn.depth[0], VIEW) - center)[seen]
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
@@ -58,7 +58,7 @@ def test_normals_of_a_ball_point_from_its_centre(device):
     assert np.abs(normals[seen] - expected).max() < 2e-3
     np.testing.assert_allclose(np.linalg.norm(normals[seen], axis=1), 1.0, atol=1e-6)
     assert not normals[~seen].any()
-    assert (drawn.code[0] == Segment.NOTHING).any()
+    assert (drawn.segment[0] == Segment.NOTHING).any()
 
 
 @pytest.mark.parametrize("flip", [False, True])
@@ -71,12 +71,14 @@ def test_normals_of_a_sheet_face_the_camera_from_either_side(device, flip):
     drawn = draw(one(sheet(0.2, 0.2), tuple(pose)), device)
     normal = VIEW.rotation @ rotation_of(pose[3:])[:, 2] * (-1.0 if flip else 1.0)
     assert normal[2] < 0.0
-    np.testing.assert_allclose(drawn["normals"][0][drawn.code[0] == 1], np.broadcast_to(normal, ((drawn.code == 1).sum(), 3)), atol=1e-6)
+    np.testing.assert_allclose(
+        drawn["normals"][0][drawn.segment[0] == 1], np.broadcast_to(normal, ((drawn.segment == 1).sum(), 3)), atol=1e-6
+    )
 
 
 def test_the_table_faces_a_camera_above_it(device):
     drawn = draw(crowded(), device)
-    table = drawn.code[0] == Segment.TABLE
+    table = drawn.segment[0] == Segment.TABLE
     assert table.any()
     np.testing.assert_array_equal(drawn["normals"][0][table], np.broadcast_to(np.array([0, 0, -1], np.float32), (table.sum(), 3)))
 
@@ -90,7 +92,7 @@ def test_albedo_is_the_base_colour_whatever_the_light(device):
     toy.config = replace(toy.config, render=replace(toy.config.render, table_color=(0.1, 0.0, 1.0)))
     drawn = draw(toy, device)
     for code, color in ((1, (51, 102, 255)), (Segment.TABLE, (26, 0, 255)), (Segment.TOTE, (178, 178, 178))):
-        found = drawn["albedo"][0][drawn.code[0] == code].astype(int)
+        found = drawn["albedo"][0][drawn.segment[0] == code].astype(int)
         assert len(found)
         # 0.7 and 0.1 lie half-way between two bytes.
         assert np.abs(found - color).max() <= (0 if code == 1 else 1)
@@ -118,7 +120,7 @@ def test_nocs_tells_where_on_the_object_a_pixel_lies(device):
     mesh = flat_shaded(whole.vertices + shift, whole.faces)
     pose = (0.0, 0.2, 0.1, 0.2, -0.1, 0.1, 0.9)
     drawn = draw(one(mesh, pose), device)
-    seen = drawn.code[0] == 1
+    seen = drawn.segment[0] == 1
     rotation, translation = pose_in(VIEW, pose)
     own = (points(drawn.depth[0], VIEW)[seen] - translation) @ rotation
     diagonal = np.linalg.norm((0.2, 0.1, 0.05))
@@ -132,7 +134,7 @@ def test_nocs_of_known_points(device):
     drawn = draw(one(box(0.2, 0.1, 0.05), (0.0, 0.0, 0.0, *UPRIGHT), camera(161, 91, 453.7, (0.0, 0.0, 2.0))), device)
     diagonal = np.linalg.norm((0.2, 0.1, 0.05))
     np.testing.assert_allclose(drawn["nocs"][0, 45, 80], (0.5, 0.5, 0.5 + 0.025 / diagonal), atol=1e-6)
-    rows, columns = np.nonzero(drawn.code[0] == 1)
+    rows, columns = np.nonzero(drawn.segment[0] == 1)
     # A pixel is 4.4 mm wide: the corner lies within one.
     corner = drawn["nocs"][0, rows.min(), columns.min()]
     np.testing.assert_allclose(corner, 0.5 + np.array([-0.1, 0.05, 0.025]) / diagonal, atol=0.0044 / diagonal)
@@ -140,8 +142,8 @@ def test_nocs_of_known_points(device):
 
 def test_nocs_of_fixtures_table_and_background_are_nothing(device):
     drawn = draw(crowded(), device)
-    assert drawn["nocs"][drawn.code == 1].any(axis=-1).all()
-    assert not drawn["nocs"][drawn.code != 1].any()
+    assert drawn["nocs"][drawn.segment == 1].any(axis=-1).all()
+    assert not drawn["nocs"][drawn.segment != 1].any()
 
 
 # ---- classes ----
@@ -154,8 +156,8 @@ def test_classes_are_obj_ids(device):
     drawn = draw(toy, device)
     expected = np.zeros(256, int)
     expected[1:4] = 7, 65535, 7
-    assert set(np.unique(drawn.code)) >= {1, 2, 3, Segment.TABLE, Segment.TOTE, Segment.FINGER}
-    np.testing.assert_array_equal(drawn["classes"], expected[drawn.code])
+    assert set(np.unique(drawn.segment)) >= {1, 2, 3, Segment.TABLE, Segment.TOTE, Segment.FINGER}
+    np.testing.assert_array_equal(drawn["classes"], expected[drawn.segment])
 
 
 @pytest.mark.parametrize("number", [0, 65536])
@@ -175,7 +177,7 @@ def test_motion_of_a_sheet_that_slid(device):
     view = camera(160, 90, 100.0, (0.0, 0.0, 1.0))
     toy = one(sheet(0.4, 0.4), (0.1, 0.05, 0.0, *UPRIGHT), view)
     drawn = draw(toy, device, Before([[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], [1]))
-    seen = drawn.code[0] == 1
+    seen = drawn.segment[0] == 1
     np.testing.assert_allclose(drawn["flow"][0][seen], np.broadcast_to((-10.0, 5.0), (seen.sum(), 2)), atol=1e-5)
     np.testing.assert_allclose(drawn["scene_flow"][0][seen], np.broadcast_to((-0.1, 0.05, 0.0), (seen.sum(), 3)), atol=1e-7)
 
@@ -184,7 +186,7 @@ def test_motion_of_a_sheet_that_came_nearer(device):
     view = camera(160, 90, 100.0, (0.0, 0.0, 1.0))
     toy = one(sheet(0.4, 0.4), (0.0, 0.0, 0.5, *UPRIGHT), view)
     drawn = draw(toy, device, Before([[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], [1]))
-    seen = drawn.code[0] == 1
+    seen = drawn.segment[0] == 1
     np.testing.assert_allclose(drawn["scene_flow"][0][seen], np.broadcast_to((0.0, 0.0, 0.5), (seen.sum(), 3)), atol=1e-7)
     # At twice the distance, everything was half as far from the middle of the picture.
     rows, columns = np.nonzero(seen)
@@ -213,9 +215,9 @@ def test_motion_agrees_with_poses_in_float64(device, seed):
     centers = np.stack(np.meshgrid(np.arange(160) + 0.5, np.arange(90) + 0.5), axis=-1)
     poses = {1: (now[0], then[0]), 2: (now[1], then[1]), 3: (now[2], then[2])}
     poses |= {Segment.TOTE + i: (fixtures_now[i], fixtures_then[i]) for i in range(3)}
-    assert len(np.unique(drawn.code)) >= 5
+    assert len(np.unique(drawn.segment)) >= 5
     for code, (pose, before) in poses.items():
-        seen = drawn.code[0] == code
+        seen = drawn.segment[0] == code
         was = moved(place[seen], pose_in(view, pose), pose_in(view, before))
         # The depth from which the kernel starts is itself a float32: 2 m to 2.4e-7.
         np.testing.assert_allclose(drawn["scene_flow"][0][seen], was - place[seen], atol=1e-6)
@@ -225,7 +227,7 @@ def test_motion_agrees_with_poses_in_float64(device, seed):
 def test_what_stands_still_does_not_move_at_all(device):
     toy = crowded()
     drawn = draw(toy, device, Before(toy.placed, [1]))
-    seen = drawn.code[0] != Segment.NOTHING
+    seen = drawn.segment[0] != Segment.NOTHING
     # To far less than float32 could tell of the positions themselves.
     assert np.abs(drawn["scene_flow"][0][seen]).max() < 1e-15
     assert np.abs(drawn["flow"][0][seen]).max() < 1e-12
@@ -253,14 +255,14 @@ def test_what_was_not_there_has_no_motion(device):
     # Instance 0 stays, instance 1 was another object, instance 2 was none; finger and cup were out of the picture.
     before = Before([[(1, poses[0]), (1, poses[1]), (-1, poses[2])]], [1], fixtures_visible=(1, 0, 0))
     drawn = draw(toy, device, before)
-    assert set(np.unique(drawn.code)) >= {1, 2, 3, Segment.TABLE, Segment.TOTE, Segment.FINGER}
-    np.testing.assert_array_equal(known(drawn), np.isin(drawn.code, (1, Segment.TABLE, Segment.TOTE)))
+    assert set(np.unique(drawn.segment)) >= {1, 2, 3, Segment.TABLE, Segment.TOTE, Segment.FINGER}
+    np.testing.assert_array_equal(known(drawn), np.isin(drawn.segment, (1, Segment.TABLE, Segment.TOTE)))
 
 
 def test_a_point_that_was_behind_the_camera_has_no_place_in_its_image(device):
     toy = one(sheet(0.4, 0.4), (0.0, 0.0, 0.5, *UPRIGHT), camera(160, 90, 100.0, (0.0, 0.0, 1.0)))
     drawn = draw(toy, device, Before([[(0, (0.0, 0.0, 1.5, *UPRIGHT))]], [1]))
-    seen = drawn.code[0] == 1
+    seen = drawn.segment[0] == 1
     assert np.isnan(drawn["flow"][0]).all()
     np.testing.assert_allclose(drawn["scene_flow"][0][seen][:, 2], -1.0, atol=1e-6)
 

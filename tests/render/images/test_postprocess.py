@@ -18,13 +18,14 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import Effects, effect_ranges
 from synpick_warp.device import pick_device
 from synpick_warp.errors import ConfigError
-from synpick_warp.kernels.render.images.antialias import Picture
+from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.kernels.render.images.camera_effects import Strengths
 from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.pipeline import describe_arrays
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
-from synpick_warp.stages.render.postprocess import Developer
+from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.scene import build_cameras, build_grid
+from synpick_warp.stages.render.view_setup import make_views
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, render
 
 WIDTH, HEIGHT = 72, 40
@@ -73,10 +74,11 @@ def developed(radiance: np.ndarray, config: Config, at: Addresses = ONE, stops: 
     out = SimpleNamespace(
         color=wp.zeros((views, height, width), dtype=wp.vec3ub, device=device), effects=wp.zeros(views, dtype=Strengths, device=device)
     )
-    picture = Picture()
+    picture = ShadedImage()
     picture.radiance = wp.array(np.repeat(radiance[None] / GAIN, views, axis=0), dtype=wp.vec3, device=device)
     picture.mix = wp.zeros((views, height, width), dtype=wp.uint32, device=device)
-    Developer(config, scene, views).develop(world, numbers(list(range(views))), numbers(at.camera), views, picture, out)
+    batch = make_views(numbers(list(range(views))), numbers(at.camera), views, 0)
+    PostProcessor(config, scene, views).process(world, batch, picture, out)
     return out.color.numpy(), out.effects.numpy()
 
 
@@ -128,7 +130,7 @@ def test_all_tone_curves_keep_middle_grey_and_shoulder_is_the_default():
 def test_without_effects_there_is_no_scratch_and_with_none_that_touches_light_the_bytes_are_the_same():
     device = pick_device("cpu")
     scene = SimpleNamespace(width=8, height=8, device=device)
-    plain = Developer(Config(), scene, 2)
+    plain = PostProcessor(Config(), scene, 2)
     assert plain.effects is plain.spread is None
     values = np.random.default_rng(1).uniform(0.0, 2.0, (HEIGHT, WIDTH, 3))
     color, effects = developed(values, config_of("shoulder", jpeg_quality=(30, 90)))

@@ -12,6 +12,7 @@ from synpick_warp.device import pick_device
 from synpick_warp.kernels.render.lighting.coarse_paths import PERIOD
 from synpick_warp.stages.render.denoised import cell_grid, spread_threads
 from synpick_warp.stages.render.scene import build_grid
+from synpick_warp.stages.render.view_setup import make_views
 from tests.harness.denoise_probe import FlatFilter, narrowed_kernel, number_kernel, scrambled_kernel, sobol_kernel, visit_kernel
 from tests.worlds.toy_scene import ToyScene, ball, box, camera, entry, sheet, traced
 
@@ -154,11 +155,11 @@ def test_other_bodies_and_other_depths_do_not_mix():
         flat.assign(name, np.ones((32, 32)))
     left = np.arange(32)[None] * np.ones((32, 1)) < 16
     code = np.where(left, 1, 2).astype(np.uint8)
-    flat.guide.code.assign(code[None])
+    flat.guide.segment.assign(code[None])
     flat.assign("diffuse", np.where(left, 0.2, 0.9))
     np.testing.assert_allclose(flat.run()["diffuse"][..., 0], np.where(left, 0.2, 0.9), rtol=1e-5)
     # The same body in another plane counts little: BODY_WEIGHT.
-    flat.guide.code.fill_(1)
+    flat.guide.segment.fill_(1)
     flat.guide.depth.assign(np.where(left, 1.0, 1.5)[None].astype(np.float32))
     np.testing.assert_allclose(flat.run()["diffuse"][..., 0], np.where(left, 0.2, 0.9), atol=0.05)
 
@@ -181,12 +182,13 @@ def pile(rng, count: int) -> ToyScene:
 def test_no_body_that_a_tiles_rays_meet_is_left_out(device, seed):
     toy = pile(np.random.default_rng(seed), 14)
     out, renderer = traced(toy, device)
-    candidates = renderer.bodies.candidates.numpy()[0].copy()
+    candidates = renderer.bodies.body_mask.numpy()[0].copy()
     present = renderer.bodies.present.numpy()[0]
     assert present == 14
     kept = {name: getattr(out, name).numpy().copy() for name in ("instance", "depth", "amodal")}
-    renderer.bodies.candidates.fill_(wp.uint64((1 << 14) - 1))
-    renderer.find_hits(wp.zeros(1, dtype=wp.int32, device=device), 1, out)
+    renderer.bodies.body_mask.fill_(wp.uint64((1 << 14) - 1))
+    zero = wp.zeros(1, dtype=wp.int32, device=device)
+    renderer.rasterize(make_views(zero, zero, 1, toy.room), out)
     for name, image in kept.items():
         np.testing.assert_array_equal(image, getattr(out, name).numpy())
     counts = np.array([int(value).bit_count() for value in candidates])

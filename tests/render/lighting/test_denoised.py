@@ -20,6 +20,7 @@ from synpick_warp.stages.render.gloss import measure_gloss
 from synpick_warp.stages.render.light_tables import light_table
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.view_setup import make_views
 from tests.harness.brdf_probe import evaluated, toward
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, camera, entry, even_light, render, sheet, snapshot, sun
 
@@ -146,8 +147,9 @@ def test_two_frames_of_a_still_scene_are_identical(device):
     out = allocate(ViewBuffers, sizes, device)
     state, camera_zero, made = snapshot(toy, device), wp.zeros(1, dtype=wp.int32, device=device), []
     for world in (0, 1, 0, 0):
-        renderer.render(state, wp.array([world], dtype=wp.int32, device=device), camera_zero, 1, out)
-        made.append(renderer.picture.radiance.numpy().copy())
+        views = make_views(wp.array([world], dtype=wp.int32, device=device), camera_zero, 1, toy.room)
+        renderer.render(state, views, out)
+        made.append(renderer.image.radiance.numpy().copy())
     assert made[0].tobytes() != made[1].tobytes()
     assert made[0].tobytes() == made[2].tobytes() == made[3].tobytes()
 
@@ -225,7 +227,7 @@ def test_scratch_follows_the_scenes_image_whatever_the_setting_says(device):
     config = replace(settings(cell=4), cameras=replace(Config().cameras, resolution=(8, 8)))
     scene = build_render_scene(config, Catalog((entry(sheet(0.1, 0.1)),)), ToyScene([], [], ()).fixtures, (VIEW,), (EVEN,), device)
     shading = Renderer(config, scene, 1, 2).shading
-    assert shading.guide.code.shape == shading.shares.gloss.shape == (2, 12, 16)
+    assert shading.guide.segment.shape == shading.shares.gloss.shape == (2, 12, 16)
     assert shading.shadows.smooth.shape == (2, 24, 32)
 
 

@@ -16,6 +16,7 @@ from synpick_warp.stages import launch
 from synpick_warp.stages.render.light_tables import blurred_reflections, harmonics, light_table
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene, mip_levels, uv_density
+from synpick_warp.stages.render.view_setup import make_views
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, even_light, render, sheet, sun
 
 VIEW = camera(64, 48, 200.0, (0.0, 0.0, 2.0))
@@ -219,4 +220,4 @@ def test_a_batch_larger_than_the_scratch_is_refused(device):
     scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
     renderer = Renderer(toy.settings(), scene, toy.room, 1)
     with pytest.raises(ValueError, match="2 views in a batch; this renderer has scratch for 1"):
-        renderer.render(None, None, None, 2, None)
+        renderer.render(None, make_views(None, None, 2, 1), None)

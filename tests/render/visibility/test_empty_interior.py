@@ -10,77 +10,77 @@ import trimesh
 import warp as wp
 
 from synpick_warp.configs.schema import Tote
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, misses_tote
-from synpick_warp.kernels.render.visibility.gbuffer import Hollow as DeviceHollow
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, stays_in_interior
+from synpick_warp.kernels.render.visibility.gbuffer import Interior as DeviceInterior
 from synpick_warp.scenes.tote import tote_fixture
-from synpick_warp.scenes.types import Hollow
+from synpick_warp.scenes.types import Interior
 from tests.twins.rays import first_hit
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, render
 
 TOTE = Tote()
 FIXTURE = tote_fixture(TOTE)
-HOLLOW = FIXTURE.hollow
-assert HOLLOW is not None
+INTERIOR = FIXTURE.interior
+assert INTERIOR is not None
 OTHER = replace(TOTE, floor_size=(0.3, 0.2), rim_size=(0.42, 0.26), outer_size=(0.5, 0.34, 0.2))
 
 
-def inside(hollow: Hollow, points: np.ndarray) -> np.ndarray:
+def inside(interior: Interior, points: np.ndarray) -> np.ndarray:
     """Which points (..., 3) lie in a room."""
     x, y, z = np.abs(points[..., 0]), np.abs(points[..., 1]), points[..., 2]
-    wide = [half + growth * z for half, growth in zip(hollow.half, hollow.growth, strict=True)]
-    return (z >= hollow.floor) & (z <= hollow.top) & (x <= wide[0]) & (y <= wide[1]) & (x + y <= wide[2])
+    wide = [half + growth * z for half, growth in zip(interior.half, interior.growth, strict=True)]
+    return (z >= interior.floor) & (z <= interior.top) & (x <= wide[0]) & (y <= wide[1]) & (x + y <= wide[2])
 
 
-def corners(hollow: Hollow) -> np.ndarray:
+def corners(interior: Interior) -> np.ndarray:
     """Of the room (16, 3)."""
     points = []
-    for z in (hollow.floor, hollow.top):
-        x, y, both = (half + growth * z for half, growth in zip(hollow.half, hollow.growth, strict=True))
+    for z in (interior.floor, interior.top):
+        x, y, both = (half + growth * z for half, growth in zip(interior.half, interior.growth, strict=True))
         points += [(sx * a, sy * b, z) for a, b in ((x, both - x), (both - y, y)) for sx in (1, -1) for sy in (1, -1)]
     return np.array(points)
 
 
 @wp.kernel
-def misses_tote_kernel(
+def stays_in_interior_kernel(
     # In:
-    hollow: DeviceHollow,
+    interior: DeviceInterior,
     start: wp.array[wp.vec3],
     direction: wp.array[wp.vec3],
     reach: wp.array[float],
     # Out:
     result_out: wp.array[int],
 ):
-    """1 where `misses_tote`."""
+    """1 where `stays_in_interior`."""
     ray = wp.tid()
-    result_out[ray] = int(misses_tote(hollow, start[ray], direction[ray], reach[ray]))
+    result_out[ray] = int(stays_in_interior(interior, start[ray], direction[ray], reach[ray]))
 
 
-def missed(hollow: Hollow, start: np.ndarray, direction: np.ndarray, reach: np.ndarray, device) -> np.ndarray:
-    given = DeviceHollow()
-    given.half, given.growth, given.floor, given.top = wp.vec3(*hollow.half), wp.vec3(*hollow.growth), hollow.floor, hollow.top
+def missed(interior: Interior, start: np.ndarray, direction: np.ndarray, reach: np.ndarray, device) -> np.ndarray:
+    given = DeviceInterior()
+    given.half, given.growth, given.floor, given.top = wp.vec3(*interior.half), wp.vec3(*interior.growth), interior.floor, interior.top
     inputs = [given] + [
         wp.array(values, dtype=kind, device=device) for values, kind in ((start, wp.vec3), (direction, wp.vec3), (reach, float))
     ]
     result = wp.zeros(len(start), dtype=wp.int32, device=device)
-    wp.launch(misses_tote_kernel, dim=len(start), inputs=inputs, outputs=[result], device=device)
+    wp.launch(stays_in_interior_kernel, dim=len(start), inputs=inputs, outputs=[result], device=device)
     return result.numpy() != 0
 
 
 @pytest.mark.parametrize("tote", [TOTE, OTHER, replace(TOTE, floor_size=TOTE.rim_size)])
 def test_no_part_of_the_tote_lies_in_its_room(tote):
     fixture = tote_fixture(tote)
-    hollow = fixture.hollow
-    assert hollow is not None
+    interior = fixture.interior
+    assert interior is not None
     shell = trimesh.Trimesh(fixture.mesh.vertices, fixture.mesh.faces, process=False)
     points = np.concatenate([shell.vertices, trimesh.sample.sample_surface(shell, 20_000, seed=1)[0]])
-    assert not inside(hollow, points).any()
-    assert hollow.top > shell.vertices[:, 2].max()
+    assert not inside(interior, points).any()
+    assert interior.top > shell.vertices[:, 2].max()
 
 
 def test_the_room_is_nearly_all_of_the_tote():
-    volume = trimesh.convex.convex_hull(corners(HOLLOW)).volume
+    volume = trimesh.convex.convex_hull(corners(INTERIOR)).volume
     floor, rim = (np.prod(size) for size in (TOTE.floor_size, TOTE.rim_size))
-    whole = (floor + rim + np.sqrt(floor * rim)) / 3 * HOLLOW.top
+    whole = (floor + rim + np.sqrt(floor * rim)) / 3 * INTERIOR.top
     assert 0.98 * whole < volume < whole
 
 
@@ -92,7 +92,7 @@ def test_rays_that_are_said_to_miss_the_tote_do(device, tote):
     start = rng.uniform(-0.6, 0.6, (4000, 3)) * size + (0.0, 0.0, 0.4 * size[2])
     direction = rng.normal(size=(4000, 3))
     reach = np.where(rng.random(4000) < 0.5, float(FAR), rng.uniform(0.0, 0.6, 4000))
-    said = missed(fixture.hollow, start, direction, reach, device)
+    said = missed(fixture.interior, start, direction, reach, device)
     unit = direction / np.linalg.norm(direction, axis=1)[:, None]
     distance = np.array([first_hit(fixture.mesh.vertices, fixture.mesh.faces, *ray) for ray in zip(start, unit, strict=True)])
     hit = distance < reach * np.linalg.norm(direction, axis=1)
@@ -109,14 +109,14 @@ def within(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarr
 
 def test_rays_within_the_room_or_out_by_its_opening_miss_the_tote(device):
     rng = np.random.default_rng(5)
-    room = corners(HOLLOW)
-    start, end, out = (within(points, 500, rng) for points in (room, room, room[room[:, 2] == HOLLOW.top]))
+    room = corners(INTERIOR)
+    start, end, out = (within(points, 500, rng) for points in (room, room, room[room[:, 2] == INTERIOR.top]))
     below = start * (1.0, 1.0, 0.0) - (0.0, 0.0, 0.1)
     ones = np.ones(500)
-    assert missed(HOLLOW, start, end - start, ones, device).all()
-    assert missed(HOLLOW, start, out - start, float(FAR) * ones, device).all()
-    assert missed(HOLLOW, out + (out - start), start - out, 1.5 * ones, device).all()
-    assert not missed(HOLLOW, start, below - start, ones, device).any()
+    assert missed(INTERIOR, start, end - start, ones, device).all()
+    assert missed(INTERIOR, start, out - start, float(FAR) * ones, device).all()
+    assert missed(INTERIOR, out + (out - start), start - out, 1.5 * ones, device).all()
+    assert not missed(INTERIOR, start, below - start, ones, device).any()
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.4])
@@ -133,8 +133,8 @@ def test_pictures_are_the_same_without_the_room(device, turn):
     views = (camera(96, 72, 80.0, (0.0, 0.0, 1.2)),)
     grip = (boxes[0].mesh, boxes[1].mesh)
     scenes = []
-    for fixture in (FIXTURE, replace(FIXTURE, hollow=None)):
-        fixtures = (fixture, *(replace(FIXTURE, mesh=mesh, hollow=None) for mesh in grip))
+    for fixture in (FIXTURE, replace(FIXTURE, interior=None)):
+        fixtures = (fixture, *(replace(FIXTURE, mesh=mesh, interior=None) for mesh in grip))
         toy = ToyScene(boxes, [placed], views, fixtures=fixtures, fixture_poses=(pose,) * 3, fixtures_visible=(1, 0, 0), table=True)
         scenes.append(render(toy, device))
     for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance", "mix"):

@@ -18,6 +18,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import trace_sample_kernel
 from synpick_warp.scenes.types import Fixture, TriangleMesh
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render import raster
+from synpick_warp.stages.render.view_setup import make_views
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, sheet, traced
 
 VIEW = camera(96, 64, 150.0, (0.0, 0.0, 1.0))
@@ -34,10 +35,11 @@ def hits_of(toy: ToyScene, device: wp.Device, by_trees: bool = False) -> dict[st
     """What world 0 shows to camera 0: the arrays of `Hits`, by trees if asked, and amodal bits."""
     out, renderer = traced(toy, device)
     if by_trees:
-        scene, camera_number = renderer.scene, wp.zeros(1, dtype=wp.int32, device=device)
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, renderer.bodies, camera_number, toy.room, wp.vec2(0.0, 0.0)]
-        launch_pixels(trace_sample_kernel, scene.grid.tiles * int(TILE_PIXELS), inputs, [renderer.hits], device)
-    found = {name: getattr(renderer.hits, name).numpy()[0].copy() for name in ("code", "triangle", "barycentric", "depth")}
+        scene, zero = renderer.scene, wp.zeros(1, dtype=wp.int32, device=device)
+        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, renderer.bodies]
+        inputs += [make_views(zero, zero, 1, toy.room), wp.vec2(0.0, 0.0)]
+        launch_pixels(trace_sample_kernel, scene.grid.tiles * int(TILE_PIXELS), inputs, [renderer.gbuffer], device)
+    found = {name: getattr(renderer.gbuffer, name).numpy()[0].copy() for name in ("segment", "triangle", "barycentric", "depth")}
     return found | {"amodal": out.amodal.numpy()[0].copy()}
 
 
@@ -78,7 +80,7 @@ def test_loose_triangles_of_any_size_agree_with_float64(seed, count, size):
     depth, clear = depth_in_float64(corners)
     sure = clear > 0.1
     assert sure.mean() > 0.5
-    np.testing.assert_array_equal(found["code"][sure] == 1, depth[sure] < NEVER)
+    np.testing.assert_array_equal(found["segment"][sure] == 1, depth[sure] < NEVER)
     both = sure & (depth < NEVER)
     np.testing.assert_allclose(found["depth"][both], depth[both], rtol=2e-4)
     assert (found["amodal"][both] == 1).all()
@@ -95,7 +97,7 @@ def test_triangles_that_end_at_the_camera_are_seen_to_their_edges(device, depth)
     expected, clear = depth_in_float64(corners)
     sure = clear > 0.02
     assert sure.mean() > 0.4
-    np.testing.assert_array_equal(found["code"][sure] == 1, expected[sure] < NEVER)
+    np.testing.assert_array_equal(found["segment"][sure] == 1, expected[sure] < NEVER)
     assert (expected < NEVER).sum() > 500
 
 
@@ -116,9 +118,9 @@ def test_trees_find_the_same(device, seed):
         table=True,
     )
     ours, theirs = hits_of(toy, device), hits_of(toy, device, by_trees=True)
-    np.testing.assert_array_equal(ours["code"], theirs["code"])
-    assert set(np.unique(ours["code"])) >= {1, 2, 4, Segment.TOTE, Segment.FINGER}
-    met = (ours["code"] != Segment.NOTHING) & (ours["code"] != Segment.TABLE)
+    np.testing.assert_array_equal(ours["segment"], theirs["segment"])
+    assert set(np.unique(ours["segment"])) >= {1, 2, 4, Segment.TOTE, Segment.FINGER}
+    met = (ours["segment"] != Segment.NOTHING) & (ours["segment"] != Segment.TABLE)
     same = met & (ours["triangle"] == theirs["triangle"])
     assert same.sum() > 0.99 * met.sum()
     np.testing.assert_allclose(ours["depth"], theirs["depth"], rtol=3e-6)
@@ -137,8 +139,8 @@ def test_no_ray_is_lost_between_triangles_that_share_edges(device):
     mesh = triangles(np.array(faces))
     for turn in (UPRIGHT, (1.0, 0.0, 0.0, 0.0)):
         found = hits_of(ToyScene([entry(mesh)], [[(0, (0.0, 0.0, 0.0, *turn))]], (VIEW,)), device)
-        rows, columns = np.nonzero(found["code"] == 1)
-        inside = found["code"][rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+        rows, columns = np.nonzero(found["segment"] == 1)
+        inside = found["segment"][rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
         assert (inside == 1).all()
         assert inside.size >= 24 * 18
 
@@ -151,7 +153,7 @@ def test_the_order_of_triangles_and_bodies_does_not_matter(device):
     )
     np.testing.assert_array_equal(first["depth"], second["depth"])
     np.testing.assert_array_equal(first["amodal"], second["amodal"])
-    met = first["code"] == 1
+    met = first["segment"] == 1
     np.testing.assert_array_equal(first["triangle"][met], shuffled[second["triangle"][met]])
 
 
@@ -161,9 +163,9 @@ def test_large_triangles_are_done_with_room_for_their_blocks_or_without(device, 
     expected = hits_of(toy, device, by_trees=True)
     monkeypatch.setattr(raster, "BLOCKS", room)
     found = hits_of(toy, device)
-    np.testing.assert_array_equal(found["code"], expected["code"])
-    np.testing.assert_array_equal(found["amodal"], (expected["code"] == 1).astype(np.uint32))
-    assert (found["code"] == 1).sum() > 20 * 256
+    np.testing.assert_array_equal(found["segment"], expected["segment"])
+    np.testing.assert_array_equal(found["amodal"], (expected["segment"] == 1).astype(np.uint32))
+    assert (found["segment"] == 1).sum() > 20 * 256
 
 
 def test_the_backdrop_shows_what_the_tote_itself_would(device):
@@ -191,15 +193,15 @@ def test_the_backdrop_shows_what_the_tote_itself_would(device):
 def test_a_tote_that_stands_elsewhere_or_is_gone_leaves_the_backdrop(device):
     fixtures = (Fixture(box(0.5, 0.3, 0.05), GREY),) * 3
     toy = ToyScene([entry(box(0.1, 0.1, 0.1))], [[]], (VIEW,), fixtures=fixtures, fixtures_visible=(1, 0, 0))
-    home = hits_of(toy, device)["code"] == Segment.TOTE
-    moved = hits_of(replace(toy, fixture_poses=((0.1, 0.0, 0.0, *UPRIGHT),) * 3), device)["code"] == Segment.TOTE
-    gone = hits_of(replace(toy, fixtures_visible=(0, 0, 0)), device)["code"]
+    home = hits_of(toy, device)["segment"] == Segment.TOTE
+    moved = hits_of(replace(toy, fixture_poses=((0.1, 0.0, 0.0, *UPRIGHT),) * 3), device)["segment"] == Segment.TOTE
+    gone = hits_of(replace(toy, fixtures_visible=(0, 0, 0)), device)["segment"]
     assert home.sum() > 1000
     np.testing.assert_array_equal(np.roll(home, 15, axis=1)[:, 15:], moved[:, 15:])
     assert not gone.any()
 
 
 def test_a_mesh_with_more_triangles_than_marks_can_name_is_refused(device, monkeypatch):
-    monkeypatch.setattr(raster, "MOST_TRIANGLES", 11)
+    monkeypatch.setattr(raster, "MAX_TRIANGLES", 11)
     with pytest.raises(CatalogError, match="a mesh has 12 triangles; at most 11"):
         hits_of(ToyScene([entry(box(0.1, 0.1, 0.1))], [[]], (VIEW,)), device)
