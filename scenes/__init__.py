@@ -1,1 +1,1 @@
-"""Objects, tote, gripper, cameras, lights, and the model built from them."""
+"""Assets of a scene: objects, tote, gripper, cameras, environment maps; and the simulation model built from them."""

@@ -1,8 +1,8 @@
-"""One newton.Model with N identical tote worlds: tote, guide walls, gripper, and slots that take any object of the catalog.
+"""Simulation model: one newton.Model with N identical worlds of tote, guide walls, gripper, and body slots for catalog objects.
 
-An episode needs no new model. Every world has the same bodies; a body slot becomes an object by selecting one of Newton's body
-variants, or stays empty. Objects of one convex piece and concave ones have slots of their own, since a slot needs as
-many shape rows as its largest variant, and the broad phase pays for every row.
+Episodes need no new model. Every world has the same bodies; a body slot becomes an object by selecting one of Newton's body variants,
+or stays empty. Single-hull objects and compound (decomposed) ones have slots of their own, since a slot has as many shapes as its
+largest variant, and every shape costs time in the broad phase.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.modes import mode_weights
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Config, Gripper, Physics
 from synpick_warp.errors import ConfigError
 from synpick_warp.scenes.gripper import cup_collider, finger_collider, rod_inertia
 from synpick_warp.scenes.tote import TABLE_SIZE, guide_walls, tote_colliders
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece
 
-# Mass [kg] and inertia [kg·m²] of an empty slot; its weight is cancelled, so that only their being positive matters.
+# Mass [kg] and inertia [kg·m²] of an empty slot. Its gravity is compensated, so any positive values will do.
 EMPTY_MASS = 0.1
 EMPTY_INERTIA = 1e-3
-# Rotor inertia of the cup's drive [kg·m²]; keeps the stiff drive well-conditioned at 2 ms.
+# Armature (rotor inertia) of the wrist joint [kg·m²], which keeps the stiff drive well conditioned at 2 ms.
 CUP_ARMATURE = 1e-3
-# Draws by which the number of slots is found; a share of 1e-3 of them is known to 10 %.
+# Monte Carlo trials that determine the slot counts; a fraction of 1e-3 of them is known to 10 %.
 SLOT_TRIALS = 100_000
 GRIPPER_BODIES = 2
 GRIPPER_DOFS = 4
@@ -35,21 +35,22 @@ FREE_DOFS = 6
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things lie in the model's arrays. All worlds are alike: world w adds w times the per-world extent."""
+    """Offsets of bodies, joints and shapes in the model's arrays. World w starts at w times the count per world."""
 
     worlds: int
     instances: int
-    """Room for instances in a world."""
+    """Capacity for instances in a world."""
     single_slots: int
-    """Body slots for objects of one convex piece; they come first."""
+    """Body slots for objects whose collision shape is one hull; they come first."""
     compound_slots: int
-    """Body slots for concave objects."""
+    """Body slots for objects with a convex decomposition."""
     shapes_per_world: int
     guide_shapes: tuple[int, ...]
-    """Guide walls, as shape indices inside a world."""
+    """Shape indices of the guide walls within a world."""
     finger_shape: int
+    """Shape index of the gripper shaft within a world."""
     cup_shape: int
-    """Collision shapes of the gripper, likewise."""
+    """Shape index of the suction cup within a world."""
 
     @property
     def slots(self) -> int:
@@ -70,21 +71,21 @@ class Layout:
 
 @dataclass(frozen=True, eq=False)
 class BuiltModel:
-    """The finalized model and its layout."""
+    """The finalized model, its layout, and the body variants of its slots."""
 
     model: newton.Model
     layout: Layout
     variant: np.ndarray
-    """Index of each catalog entry among the variants of its kind of slot (entry) int32."""
+    """Variant index of each catalog entry in slots of its type (entry) int32."""
     empty_variant: tuple[int, int]
-    """Index of the empty variant for single and for compound slots."""
+    """Index of the empty variant in single and in compound slots."""
 
 
 def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
-    """Body slots (single, compound) that hold every draw but a share of `slot_shortfall`, in each mode that episodes can have.
+    """Determine the body slots (single, compound) that suffice for all draws but a fraction `slot_shortfall`, in each possible mode.
 
-    Found by drawing: the volume budget couples the number of objects with which ones they are, so there is no simple formula.
-    Slots cost time whether full or not, and compound ones most: of these there are as few as possible, the single ones follow.
+    A Monte Carlo estimate: the volume budget couples how many objects are drawn with which ones, so there is no simple formula.
+    Slots cost time whether used or not, and compound ones most: their count is minimized first, then that of single slots.
 
     Raises:
         ConfigError: No object fits into the volume budget.
@@ -93,42 +94,42 @@ def count_slots(config: Config, catalog: Catalog) -> tuple[int, int]:
     compound = np.array([len(entry.pieces) > 1 for entry in catalog.entries])
     volume = np.array([entry.volume for entry in catalog.entries])
     if volume.min() > budget:
-        least = catalog.entries[int(volume.argmin())]
+        smallest = catalog.entries[int(volume.argmin())]
         raise ConfigError(
-            f"arrangement.volume is {budget:g} m³, but the smallest object, {least.name}, takes {least.volume:.3g} m³; make it larger"
+            f"arrangement.volume is {budget:g} m³, but the smallest object, {smallest.name}, takes {smallest.volume:.3g} m³; make it larger"
         )
     needed = []
-    for repeats in repeats_that_occur(config):
+    for repeats in find_repeat_rules(config):
         drawn = _draw_trials(volume, budget, config.arrangement.max_objects, repeats)
-        singles, compounds = (((drawn >= 0) & (compound[drawn] == kind)).sum(axis=1) for kind in (False, True))
-        most = np.quantile(compounds, 1.0 - shortfall, method="higher")
-        # Draws that find no room among the compound slots are lost already; all others and these together may be `shortfall`.
-        needed.append((np.quantile(np.where(compounds > most, np.inf, singles), 1.0 - shortfall, method="higher"), most))
-    return int(max(single for single, _ in needed)), int(max(most for _, most in needed))
+        singles, compounds = (((drawn >= 0) & (compound[drawn] == is_compound)).sum(axis=1) for is_compound in (False, True))
+        limit = np.quantile(compounds, 1.0 - shortfall, method="higher")
+        # Draws that exceed the compound slots fail anyway; `shortfall` bounds these and those that exceed the single slots together.
+        needed.append((np.quantile(np.where(compounds > limit, np.inf, singles), 1.0 - shortfall, method="higher"), limit))
+    return int(max(single for single, _ in needed)), int(max(limit for _, limit in needed))
 
 
-def repeats_that_occur(config: Config) -> set[bool]:
-    """Whether an object may come several times in a tote, for all modes that episodes can have."""
+def find_repeat_rules(config: Config) -> set[bool]:
+    """Whether episodes may contain several instances of an object: the values in all modes that the bake's episodes can have."""
     rules = {"pick": config.pick.repeats, "target": config.pick.repeats, "move": config.move.repeats}
     return {rules[mode] for mode, weight in mode_weights(config).items() if weight > 0.0}
 
 
-def _draw_trials(volume: np.ndarray, budget: float, room: int, repeats: bool) -> np.ndarray:
-    """Draw as kernels.sim.arrangement.draw_objects_kernel does: catalog indices (SLOT_TRIALS, room), -1 after the last."""
-    numbers = np.random.default_rng(0)
-    drawn = np.full((SLOT_TRIALS, room), -1, dtype=np.int32)
+def _draw_trials(volume: np.ndarray, budget: float, capacity: int, repeats: bool) -> np.ndarray:
+    """Draw arrangements as kernels.sim.arrangement.draw_objects_kernel does: catalog indices (SLOT_TRIALS, capacity), -1 after the last."""
+    rng = np.random.default_rng(0)
+    drawn = np.full((SLOT_TRIALS, capacity), -1, dtype=np.int32)
     total = np.zeros(SLOT_TRIALS)
-    # Trials that still draw. The first object is drawn again until one fits.
-    going, choice = np.arange(SLOT_TRIALS), np.flatnonzero(volume <= budget)
-    for position in range(room if repeats else min(room, len(volume))):
-        candidate = numbers.choice(choice, size=len(going))
-        known = np.arange(0 if repeats else len(going))
-        while len(known := known[(drawn[going[known], :position] == candidate[known, None]).any(axis=1)]):
-            candidate[known] = numbers.choice(choice, size=len(known))
-        fits = total[going] + volume[candidate] <= budget
-        going, candidate = going[fits], candidate[fits]
-        drawn[going, position] = candidate
-        total[going] += volume[candidate]
+    # `active`: trials that still draw. The first object is drawn from those that fit.
+    active, choice = np.arange(SLOT_TRIALS), np.flatnonzero(volume <= budget)
+    for position in range(capacity if repeats else min(capacity, len(volume))):
+        candidate = rng.choice(choice, size=len(active))
+        repeated = np.arange(0 if repeats else len(active))
+        while len(repeated := repeated[(drawn[active[repeated], :position] == candidate[repeated, None]).any(axis=1)]):
+            candidate[repeated] = rng.choice(choice, size=len(repeated))
+        fits = total[active] + volume[candidate] <= budget
+        active, candidate = active[fits], candidate[fits]
+        drawn[active, position] = candidate
+        total[active] += volume[candidate]
         choice = np.arange(len(volume))
     return drawn
 
@@ -137,9 +138,9 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     """Build and finalize the model of all worlds.
 
     Args:
-        config: Settings; `bake.worlds` worlds are made.
+        config: Settings; the model has `bake.worlds` worlds.
         catalog: The objects.
-        device: Where the model's arrays lie.
+        device: Device of the model's arrays.
     """
     single, compound = count_slots(config, catalog)
     world = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
@@ -152,9 +153,9 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     guides = tuple(
         world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape) for piece in guide_walls(config.tote, config.physics.guide_height)
     )
-    gripper = _add_gripper(world, config, shape)
+    gripper = _add_gripper(world, config.gripper, shape)
     variant = np.zeros(len(catalog), dtype=np.int32)
-    empty = _add_slots(world, config, catalog, shape, (single, compound), variant)
+    empty = _add_slots(world, config.physics, catalog, shape, (single, compound), variant)
     scene = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(scene)
     scene.replicate(world, copy_count=config.bake.worlds)
@@ -167,9 +168,11 @@ def _hull(piece: ConvexPiece) -> newton.Mesh:
     return newton.Mesh(piece.vertices, piece.faces.reshape(-1), compute_inertia=False)
 
 
-def _add_gripper(world: newton.ModelBuilder, config: Config, shape: newton.ModelBuilder.ShapeConfig) -> tuple[int, int]:
-    """Finger on three linear axes, cup on a hinge about y; returns their shapes. Their weight is carried by the impedance controller."""
-    gripper = config.gripper
+def _add_gripper(world: newton.ModelBuilder, gripper: Gripper, shape: newton.ModelBuilder.ShapeConfig) -> tuple[int, int]:
+    """Add shaft (three prismatic axes) and cup (revolute wrist about y); returns their shape indices.
+
+    The impedance controller compensates their weight.
+    """
     dof = newton.ModelBuilder.JointDofConfig
     free = {"limit_lower": -np.inf, "limit_upper": np.inf, "armature": 0.0}
     finger = world.add_link(
@@ -200,21 +203,21 @@ def _add_gripper(world: newton.ModelBuilder, config: Config, shape: newton.Model
 
 def _add_slots(
     world: newton.ModelBuilder,
-    config: Config,
+    physics: Physics,
     catalog: Catalog,
     shape: newton.ModelBuilder.ShapeConfig,
     slots: tuple[int, int],
     variant: np.ndarray,
 ) -> tuple[int, int]:
-    """Add the object slots; fill `variant`; return the empty variants' indices."""
+    """Add the body slots for objects; fills `variant` (entry) and returns the indices of the empty variants."""
     empty = []
     damping = {
-        "steel:rigid_body_angular_damping": config.physics.angular_damping,
-        "steel:rigid_body_max_linear_velocity": config.physics.max_speed,
+        "steel:rigid_body_angular_damping": physics.angular_damping,
+        "steel:rigid_body_max_linear_velocity": physics.max_speed,
     }
     for compound, count in enumerate(slots):
         entries = [index for index, entry in enumerate(catalog.entries) if (len(entry.pieces) > 1) == bool(compound)]
-        variants = [_variant(config, catalog.entries[index], shape) for index in entries] + [_variant(config, None, shape)]
+        variants = [_variant(physics, catalog.entries[index], shape) for index in entries] + [_variant(physics, None, shape)]
         for position, index in enumerate(entries):
             variant[index] = position
         empty.append(len(entries))
@@ -224,8 +227,9 @@ def _add_slots(
     return empty[0], empty[1]
 
 
-def _variant(config: Config, entry: CatalogEntry | None, shape: newton.ModelBuilder.ShapeConfig) -> newton.ModelBuilder:
-    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
+def _variant(physics: Physics, entry: CatalogEntry | None, shape: newton.ModelBuilder.ShapeConfig) -> newton.ModelBuilder:
+    """Body variant of an object, or the empty one."""
+    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(builder)
     if entry is None:
         builder.add_body(mass=EMPTY_MASS, inertia=wp.mat33(np.eye(3) * EMPTY_INERTIA), lock_inertia=True)

@@ -1,4 +1,4 @@
-"""The visible things in a scene that are not objects: tote and gripper."""
+"""Fixtures: the visible parts of a scene that are not objects, tote and gripper."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from synpick_warp.scenes.types import Fixture
 
 
 def make_fixtures(tote: Tote, gripper: Gripper) -> tuple[Fixture, Fixture, Fixture]:
-    """Visual meshes and materials of tote, gripper shaft and suction cup, in the order in which the renderer numbers them.
+    """Visual meshes and materials of tote, gripper shaft and suction cup, in the order of the renderer's segmentation ids.
 
     Raises:
         ConfigError: The tote's sizes do not fit each other.

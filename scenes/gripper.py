@@ -1,4 +1,7 @@
-"""The gripper: a cone-shaped finger and a suction cup with bellows. Both frames lie on the tilt axis, which is y; z up."""
+"""The suction gripper: a conical shaft, and a suction cup with bellows on a wrist joint.
+
+The origins of both bodies' frames lie on the wrist axis, which is y; z up.
+"""
 
 from __future__ import annotations
 
@@ -10,40 +13,41 @@ from synpick_warp.scenes.embedded.meshes import join, lathe, make_mesh, solid
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Material
 
 SIDES = 40
-"""Points around the visible parts."""
+"""Points per ring of the visual meshes."""
 FINGER_TIP = 0.03
-"""Width of the finger at the tilt axis [m]; no wider than its top."""
+"""Maximum diameter of the shaft at the wrist axis [m]; at most that of its top."""
 COLLIDER_SIDES = 12
-"""Points around the collision shapes: three rings of at most this many stay below 32 vertices."""
+"""Points per ring of the collision shapes: the cup's rings, two of these and one of SHOULDER_SIDES, have 32 vertices."""
 SHOULDER_SIDES = 8
+"""Points of the ring at the top of the cup's collision shape."""
 LIP = 0.06
-"""Height of the cup's lip, as a share of the cup's length."""
+"""Height of the cup's lip, as a fraction of the cup's length."""
 HINGE = 0.4
-"""Radius of hinge and shaft, as a share of the cup's."""
+"""Radius of wrist joint and cup stem, as a fraction of the cup's."""
 FOLDS = 3
 """Folds of the bellows."""
 
 
 def finger_fixture(gripper: Gripper) -> Fixture:
-    """The finger, from the tilt axis (z = 0) up to its length."""
+    """Build the visual mesh of the shaft, a surface of revolution from the wrist axis (z = 0) up to z = finger_length."""
     low, high, length = *_finger_radii(gripper), gripper.finger_length
 
-    def radius(share: float) -> float:
-        return low + share * (high - low)
+    def radius(fraction: float) -> float:
+        return low + fraction * (high - low)
 
     profile = [(0.7 * low, 0.0), (low, 0.3 * low)]
-    for share in (0.3, 0.6, 0.9):
-        # A groove around the cone shows how it turns with the light.
-        depth, half = 0.06 * radius(share), 0.004
-        profile += [(radius(share - half), (share - half) * length), (radius(share) - depth, share * length)]
-        profile += [(radius(share + half), (share + half) * length)]
+    for height in (0.3, 0.6, 0.9):
+        # Grooves around the cone make its shading vary.
+        depth, half = 0.06 * radius(height), 0.004
+        profile += [(radius(height - half), (height - half) * length), (radius(height) - depth, height * length)]
+        profile += [(radius(height + half), (height + half) * length)]
     profile += [(high, 0.99 * length), (0.96 * high, length)]
     mesh = make_mesh(solid(lathe(profile, SIDES)), centered=False)
     return Fixture(mesh, Material(gripper.color, None, gripper.metallic, gripper.roughness))
 
 
 def cup_fixture(gripper: Gripper) -> Fixture:
-    """The cup, from its hinge down to the lip at z = -cup_length; hollow below."""
+    """Build the visual mesh of the cup, a surface of revolution from the wrist axis down to the lip at z = -cup_length; hollow below."""
     radius, length = gripper.cup_width / 2, gripper.cup_length
     shaft = HINGE * radius
     profile = [(0.15 * radius, -0.84 * length), (0.55 * radius, -0.88 * length), (0.90 * radius, -length), (radius, -length)]
@@ -55,19 +59,19 @@ def cup_fixture(gripper: Gripper) -> Fixture:
         profile += [(0.62 * radius, base), (bulge, base + 0.4 * fold), (bulge, base + 0.6 * fold)]
     profile += [(0.62 * radius, -0.54 * length), (0.62 * radius, -0.46 * length), (shaft, -0.44 * length), (shaft, 0.0)]
     hinge = solid(lathe([(0.9 * shaft, -1.15 * shaft), (shaft, -1.05 * shaft), (shaft, 1.05 * shaft), (0.9 * shaft, 1.15 * shaft)], SIDES))
-    mesh = make_mesh(join(solid(lathe(profile, SIDES)), hinge.turned("x", 90.0)), centered=False)
+    mesh = make_mesh(join(solid(lathe(profile, SIDES)), hinge.rotate("x", 90.0)), centered=False)
     return Fixture(mesh, Material(gripper.cup_color, None, gripper.metallic, gripper.roughness))
 
 
 def finger_collider(gripper: Gripper) -> ConvexPiece:
-    """The finger's cone."""
+    """Build the collision shape of the shaft: its cone."""
     low, high = _finger_radii(gripper)
     rings = lathe([(low, 0.0), (high, gripper.finger_length)], COLLIDER_SIDES)
     return simplify_hull(rings.reshape(-1, 3), 2 * COLLIDER_SIDES)
 
 
 def cup_collider(gripper: Gripper) -> ConvexPiece:
-    """The cup without its folds: lip, and a cone up to the shaft; at most 32 vertices."""
+    """Build the collision shape of the cup, without bellows: lip, and a cone up to the stem; at most 32 vertices."""
     radius, length = gripper.cup_width / 2, gripper.cup_length
     lip = lathe([(radius, -length), (radius, -(1 - LIP) * length)], COLLIDER_SIDES).reshape(-1, 3)
     shaft = lathe([(HINGE * radius, 0.0)], SHOULDER_SIDES)[0]
@@ -76,7 +80,7 @@ def cup_collider(gripper: Gripper) -> ConvexPiece:
 
 
 def rod_inertia(mass: float, length: float) -> tuple[float, float, float]:
-    """Principal inertia [kg·m²] of a rod along z as thick as a quarter of its length: that of finger and cup."""
+    """Principal moments of inertia [kg·m²] of a cylinder along z whose diameter is a quarter of its length, as for shaft and cup."""
     radius = length / 8
     across = mass * (length**2 + 3 * radius**2) / 12
     return across, across, mass * radius**2 / 2

@@ -1,4 +1,4 @@
-"""Light maps from a folder: Radiance maps (.hdr) and sIBL sets (.ibl), or the embedded skies."""
+"""HDR environment maps from a folder: Radiance files (.hdr) and sIBL sets (.ibl), or the embedded procedural maps."""
 
 from __future__ import annotations
 
@@ -15,92 +15,90 @@ from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.types import EnvironmentMap, Sun
 
 MAX_HEIGHT = 512
-"""Maps with more rows are reduced to this many: half the map's 0.35° is finer than any shading here resolves."""
+"""Maps with more rows are downsampled to this many: 0.35° a texel is finer than any shading here resolves."""
 SUN_ROWS = 64
-"""Rows of the map in which a set's sun is looked for; 2.8° a texel gather the glow about a clipped sun."""
-SUN_ANGLE = 10.0
-"""A set's sun is believed if the map is bright within this angle of it [°]; hand-set ones miss by some degrees."""
-SUN_BRIGHTNESS = 0.5
-"""Bright is what has this share of the brightest place: maps of few bits have many brightest places, rooms several lamps."""
+"""Rows of the downsampled map in which a set's sun is verified; 2.8° a texel include the glow about a clipped sun."""
+MAX_SUN_OFFSET = 10.0
+"""A set's sun is used if the map is bright within this angle of it [°]; positions set by hand are off by some degrees."""
+MIN_SUN_BRIGHTNESS = 0.5
+"""Threshold of brightness, relative to the map's maximum: 8-bit maps have many maxima, rooms several lamps."""
 MAX_SUN_GAIN = 1e6
-"""Largest SUNmulti; no sun outshines its sky by more."""
+"""Maximum SUNmulti; no sun outshines its sky by more."""
 
 
 def load_lights(folder: str) -> tuple[EnvironmentMap, ...]:
-    """All light maps of a folder and its direct subfolders, sorted by name.
+    """Load all environment maps of a folder and its direct subfolders, sorted by name.
 
-    A folder that holds an .ibl file is an sIBL set (hdrlabs.com/sibl): its reflection map and its sun count, its other maps do not.
-    In other folders every .hdr file is a map. A picture's middle column becomes azimuth 0 (+x), and what lies right of
-    it for someone who stands inside lies at negative azimuth.
+    A folder with an .ibl file is an sIBL set (hdrlabs.com/sibl), of which the reflection map and the sun are used. In other folders
+    every .hdr file is a map. The image's middle column becomes azimuth 0 (+x); columns right of it, as seen from inside, get negative
+    azimuth.
 
     Args:
-        folder: The folder; empty for the embedded skies.
+        folder: The folder; empty: the embedded maps.
 
     Raises:
-        LightError: There is no such folder or no map in it; a map cannot be read or is no light map; a set names a missing file.
+        LightError: The folder does not exist or contains no map, a map cannot be read or is invalid, or a set refers to a missing file.
     """
     if not folder:
         return skies()
     root = Path(folder)
     if not root.is_dir():
-        raise LightError(
-            f"lights folder {folder} does not exist; give a folder with .hdr maps or sIBL sets, or none for the embedded skies"
-        )
+        raise LightError(f"lights folder {folder} does not exist; give a folder with .hdr maps or sIBL sets, or none for the embedded maps")
     try:
-        places = [root, *sorted(path for path in root.iterdir() if path.is_dir())]
-        maps = [light for place in places for light in _read_place(place)]
+        folders = [root, *sorted(path for path in root.iterdir() if path.is_dir())]
+        maps = [light for each in folders for light in _read_folder(each)]
     except OSError as error:
         raise LightError(f"lights folder {folder} cannot be read: {error.strerror}; check its permissions") from error
     if not maps:
-        raise LightError(f"lights folder {folder} holds no light map; put .hdr files or sIBL sets (.ibl with its maps) into it")
+        raise LightError(f"lights folder {folder} contains no environment map; add .hdr files or sIBL sets (.ibl with its maps)")
     return tuple(sorted(maps, key=lambda light: light.name))
 
 
-def _read_place(place: Path) -> list[EnvironmentMap]:
-    """The maps that lie directly in a folder."""
-    files = sorted(path for path in place.iterdir() if path.is_file())
+def _read_folder(folder: Path) -> list[EnvironmentMap]:
+    """Read the maps directly in a folder."""
+    files = sorted(path for path in folder.iterdir() if path.is_file())
     sets = [path for path in files if path.suffix.lower() == ".ibl"]
     if sets:
         return [_read_set(path) for path in sets]
-    return [EnvironmentMap(path.stem, _finish(_read_image(path, gamma=1.0), path)) for path in files if path.suffix.lower() == ".hdr"]
+    return [EnvironmentMap(path.stem, _validate(_read_image(path, gamma=1.0), path)) for path in files if path.suffix.lower() == ".hdr"]
 
 
 def _read_set(path: Path) -> EnvironmentMap:
-    """The reflection map of an sIBL set, times its REFmulti, and its sun. Set files are INI; notes in them begin with two dashes.
+    """Read the reflection map of an sIBL set, times its REFmulti, and its sun. Set files are INI, with comments that begin with two dashes.
 
-    The reflection map serves for everything, diffuse light and background as well: the environment map is a blurred copy of it.
+    The reflection map is used for diffuse light and background, too: the set's environment map is a blurred copy of it.
     """
     parser = configparser.ConfigParser(interpolation=None, strict=False, comment_prefixes=("#", ";", "--", "//"))
     try:
         parser.read_string(path.read_text(encoding="utf-8-sig", errors="replace"))
     except configparser.Error as error:
-        raise LightError(f"{path} is no sIBL set file: {str(error).splitlines()[0]}; it must be INI text") from error
+        raise LightError(f"{path} is not an sIBL set file: {str(error).splitlines()[0]}; it must be INI text") from error
     # The format spells it "Enviroment".
     for section, key in (("Background", "BGfile"), ("Enviroment", "EVfile"), ("Reflection", "REFfile")):
         file = _text(parser, section, key)
         if file and not (path.parent / file).is_file():
-            raise LightError(f"{path} names {key} = {file}, which is not beside it; add the file")
+            raise LightError(f"{path} names {key} = {file}, a file that is missing beside it; add the file")
     file = _text(parser, "Reflection", "REFfile")
     if not file:
         raise LightError(f"{path} names no reflection map; it needs REFfile in [Reflection]")
     if _number(parser, path, "REFmap", 1.0) != 1.0:
         raise LightError(f"{path} has REFmap = {_text(parser, 'Reflection', 'REFmap')}; only 1, a spherical map, can be read")
     gain = _number(parser, path, "REFmulti", 1.0)
-    picture = path.parent / file
-    image = _read_image(picture, gamma=_number(parser, path, "REFgamma", 1.0))
-    with np.errstate(over="ignore"):  # what becomes infinite is refused with the rest
+    map_file = path.parent / file
+    image = _read_image(map_file, gamma=_number(parser, path, "REFgamma", 1.0))
+    with np.errstate(over="ignore"):  # infinite values are refused by _validate
         image = image * np.float32(gain)
     sun = _read_sun(parser, path)
-    radiance = _finish(image, picture)
-    return EnvironmentMap(path.stem, radiance, sun if sun is not None and _shines(radiance, sun.direction) else None)
+    radiance = _validate(image, map_file)
+    return EnvironmentMap(path.stem, radiance, sun if sun is not None and _is_bright(radiance, sun.direction) else None)
 
 
 def _read_sun(parser: configparser.ConfigParser, path: Path) -> Sun | None:
-    """The section Sun of an sIBL set; None without a place, without light, or below the horizon.
+    """Read the section Sun of an sIBL set; None if it has no position, is black, or lies below the horizon.
 
-    SUNu grows to the right and SUNv downward over the picture, both from 0 to 1, so that SUNv = 0 is the zenith. SUNcolor is
-    sRGB in 0..255. Renderers' directional lights show a white diffuse surface that faces them as SUNmulti times this colour,
-    linear: the irradiance is π times that, in the units of the map after REFmulti.
+    SUNu and SUNv are image coordinates from 0 to 1, to the right and downward, so that SUNv = 0 is the zenith. SUNcolor is sRGB in
+    0..255. A white diffuse surface that faces the sun has radiance SUNmulti times this colour, linear: the irradiance is π times that,
+    in the units of the map after REFmulti.
     """
     u, v = (_sun_numbers(parser, path, key, 1, 1.0) for key in ("SUNu", "SUNv"))
     color = _sun_numbers(parser, path, "SUNcolor", 3, 255.0)
@@ -117,7 +115,7 @@ def _read_sun(parser: configparser.ConfigParser, path: Path) -> Sun | None:
 
 
 def _sun_numbers(parser: configparser.ConfigParser, path: Path, key: str, count: int, high: float) -> np.ndarray | None:
-    """The numbers (count) of a key of the section Sun, each in 0..high; None if it is not there."""
+    """Parse the numbers (count) of a key in the section Sun, each in 0..high; None if the key is missing."""
     text = _text(parser, "Sun", key)
     if not text:
         return None
@@ -131,18 +129,18 @@ def _sun_numbers(parser: configparser.ConfigParser, path: Path, key: str, count:
     return values
 
 
-def _shines(radiance: np.ndarray, direction: np.ndarray) -> bool:
-    """Whether a map is bright near a direction.
+def _is_bright(radiance: np.ndarray, direction: np.ndarray) -> bool:
+    """Whether a map is bright near a direction, so that the sun there is plausible.
 
-    Where it is not, the set's sun is left out and the map's own brightest place counts: shadows must agree with what shiny
-    things mirror, and some sets count v upward.
+    Otherwise the set's sun is ignored and the map's brightest place is used: shadows must agree with reflections, and in some sets v
+    points up.
     """
     height = min(radiance.shape[0], SUN_ROWS)
     bright = cv2.resize(radiance, (2 * height, height), interpolation=cv2.INTER_AREA).sum(axis=2)
     cosine = map_directions(height)[0] @ direction
     # In coarse maps even the nearest texel may lie farther away than the angle.
-    near = cosine >= min(np.cos(np.radians(SUN_ANGLE)), cosine.max())
-    return bool(bright[near].max() >= SUN_BRIGHTNESS * bright.max())
+    near = cosine >= min(np.cos(np.radians(MAX_SUN_OFFSET)), cosine.max())
+    return bool(bright[near].max() >= MIN_SUN_BRIGHTNESS * bright.max())
 
 
 def _text(parser: configparser.ConfigParser, section: str, key: str) -> str:
@@ -150,7 +148,7 @@ def _text(parser: configparser.ConfigParser, section: str, key: str) -> str:
 
 
 def _number(parser: configparser.ConfigParser, path: Path, key: str, default: float) -> float:
-    """A positive number of the section Reflection."""
+    """Parse a positive number in the section Reflection."""
     text = _text(parser, "Reflection", key)
     if not text:
         return default
@@ -164,16 +162,16 @@ def _number(parser: configparser.ConfigParser, path: Path, key: str, default: fl
 
 
 def _read_image(path: Path, gamma: float) -> np.ndarray:
-    """Linear RGB (H, W, 3) float32, as the picture shows it.
+    """Read an image as linear RGB (H, W, 3) float32, in its own orientation.
 
-    Radiance maps are linear by their format; published sets nevertheless name a gamma for them, as a hint for renderers
-    that do not work in linear light, so it is applied to pictures of 8 or 16 bits alone.
+    Gamma is applied to 8-bit and 16-bit images only: Radiance files are linear by their format, although published sets name a gamma
+    for them, as a hint for renderers that do not work in linear light.
     """
     image = _decode(path)
     if image is None:
         raise LightError(f"{path} cannot be read as an image: it is empty, cut short or of another format; replace it")
     if image.ndim != 3 or image.shape[2] < 3:
-        raise LightError(f"{path} is no colour image; a light map needs red, green and blue")
+        raise LightError(f"{path} is not a colour image; an environment map needs red, green and blue")
     linear = image[..., 2::-1].astype(np.float32)
     if image.dtype in (np.uint8, np.uint16):
         linear = (linear / np.float32(255 if image.dtype == np.uint8 else 65535)) ** np.float32(gamma)
@@ -181,7 +179,7 @@ def _read_image(path: Path, gamma: float) -> np.ndarray:
 
 
 def _decode(path: Path) -> np.ndarray | None:
-    """The picture as stored, channels as OpenCV has them; None if it cannot be read. OpenCV's own messages are kept quiet."""
+    """Decode an image as stored, in OpenCV's channel order; None if it cannot be read. OpenCV's own messages are suppressed."""
     if not path.stat().st_size:
         return None
     logging = cv2.utils.logging
@@ -195,18 +193,18 @@ def _decode(path: Path) -> np.ndarray | None:
         logging.setLogLevel(level)
 
 
-def _finish(image: np.ndarray, path: Path) -> np.ndarray:
-    """Check radiance, reduce it, and turn it to this project's convention."""
+def _validate(image: np.ndarray, path: Path) -> np.ndarray:
+    """Validate radiance, limit its resolution, and convert it to this project's orientation."""
     height, width = image.shape[:2]
     if width != 2 * height:
-        raise LightError(f"{path} is {width} x {height} pixels; an equirectangular map is twice as wide as high")
+        raise LightError(f"{path} is {width} x {height} pixels; an equirectangular map must be twice as wide as high")
     if not np.isfinite(image).all():
         raise LightError(f"{path} has radiance that is infinite or not a number; replace the map")
     if image.min() < 0:
         raise LightError(f"{path} has negative radiance ({image.min():g}); replace the map")
     if image.max() <= 0:
-        raise LightError(f"{path} is black all over; a light map must hold some light")
+        raise LightError(f"{path} is black; an environment map must contain some light")
     if height > MAX_HEIGHT:
         image = cv2.resize(image, (2 * MAX_HEIGHT, MAX_HEIGHT), interpolation=cv2.INTER_AREA)
-    # Seen from inside, right is clockwise from above, against the azimuth.
+    # Columns run clockwise as seen from above, azimuth counter-clockwise.
     return np.ascontiguousarray(image[:, ::-1], dtype=np.float32)

@@ -1,4 +1,4 @@
-"""What a BOP model folder says beside its meshes: numbers in file names, and models_info.json."""
+"""BOP model folders: obj_ids in file names, and models_info.json (diameters, symmetries)."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ _NAME = re.compile(r"obj_(\d+)\.ply", re.IGNORECASE)
 _MILLIMETRE = 1e-3
 # Published matrices have six digits.
 _ROTATION_TOLERANCE = 1e-3
-# Characters of a wrong value that an error shows.
+# Length to which wrong values are truncated in errors.
 _SHOWN = 60
 
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """One entry of models_info.json, in metres."""
+    """An entry of models_info.json, converted to metres."""
 
     diameter: float | None = None
     """[m]"""
     symmetries_discrete: tuple[tuple[float, ...], ...] = ()
-    """Row-major 4 x 4 matrices, translation in metres; the identity is not listed."""
+    """Row-major 4 x 4 rigid transforms, translation in metres; without the identity."""
     symmetries_continuous: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...] = ()
-    """(unit axis, offset [m])."""
+    """(unit axis, point on it [m])."""
 
 
 def bop_files(files: Iterable[Path]) -> dict[int, Path]:
-    """Those of the files that are BOP models, by obj_id.
+    """Select the files that are BOP models (obj_NNNNNN.ply), by obj_id.
 
     Raises:
         CatalogError: Two files have the same obj_id.
@@ -50,14 +50,14 @@ def bop_files(files: Iterable[Path]) -> dict[int, Path]:
 
 
 def read_models_info(path: Path, obj_ids: Iterable[int]) -> dict[int, ModelInfo]:
-    """Read models_info.json; without that file nothing is known, and nothing is wrong.
+    """Read models_info.json; an empty dictionary if the file is missing, which is no error.
 
     Args:
         path: The file.
-        obj_ids: Objects that must have an entry. Others are left out.
+        obj_ids: Objects that must have an entry; other entries are ignored.
 
     Raises:
-        CatalogError: The file is no JSON, lacks an object, or an entry's diameter or symmetries make no sense.
+        CatalogError: The file is not valid JSON or lacks an object, or an entry's diameter or symmetries are invalid.
     """
     if not path.is_file():
         return {}
@@ -93,7 +93,7 @@ def _short(value: Any) -> str:
 
 
 def _rows(entry: dict[str, Any], key: str, place: str) -> list[tuple[str, Any]]:
-    """The elements of a list, each with its place for errors."""
+    """The elements of a list, each with its path for errors."""
     rows = entry.get(key, [])
     if not isinstance(rows, list):
         raise CatalogError(f"{place}: {key} is {_short(rows)}; needed: a list")
@@ -113,7 +113,7 @@ def _rigid(value: Any, place: str) -> tuple[float, ...]:
     if off > _ROTATION_TOLERANCE:
         raise CatalogError(f"{place}: not a rotation and translation; needed: a rigid 4 x 4 matrix, row by row")
     matrix[:3, 3] *= _MILLIMETRE
-    return tuple(float(number) for number in matrix.reshape(-1))
+    return tuple(float(value) for value in matrix.reshape(-1))
 
 
 def _axis(value: Any, place: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

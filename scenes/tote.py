@@ -1,6 +1,6 @@
-"""The tote: a box with draft, rounded corners and a flange around its rim; and the walls that objects collide with.
+"""The tote: visual mesh of a moulded box (draft angle, rounded corners, flange, ribs), and its collision shapes.
 
-Everything stands in the tote's frame: its origin is the centre of the inner floor, z up.
+All geometry is in the tote's frame, which is the world frame: origin at the centre of the inner floor, z up.
 """
 
 from __future__ import annotations
@@ -14,22 +14,23 @@ from synpick_warp.scenes.embedded.meshes import Patch, join, loft, make_mesh, ro
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Interior, Material
 
 CORNER_RADIUS = 0.02
-"""Radius of the inner vertical edges at the floor [m], as moulded boxes have it; it grows by as much as the draft opens the corner."""
+"""Radius of the inner vertical edges at the floor [m], typical of moulded boxes; it grows upward as the draft opens the corner."""
 CORNER_SEGMENTS = 8
+"""Segments of a rounded corner."""
 RIB_SPACING = 0.1
-"""Distance of the ribs under the flange [m]."""
+"""Spacing of the ribs under the flange [m]."""
 RIB_HEIGHT = 0.3
-"""Height of the ribs, as a share of the tote's."""
+"""Height of the ribs, as a fraction of the tote's."""
 FLOOR_DEPTH = 0.1
-"""Thickness of the floor's collision shape [m]: more than anything falls through in one step."""
+"""Thickness of the floor's collision shape [m]: more than any object moves in one step, so that none tunnels."""
 MIN_WALL = 0.02
-"""Least thickness of the walls' collision shapes at the rim [m], for the same reason."""
+"""Minimum thickness of the walls' collision shapes at the rim [m], for the same reason."""
 INTERIOR_MARGIN = 1e-4
 """Far more than positions of hits are off by rounding, and less than rays start off a surface [m]."""
 GUIDE_THICKNESS = 0.1
 """Thickness of the guide walls [m]."""
 TABLE_SIZE = (10.0, 10.0, 0.1)
-"""Half size and half thickness of the table on which the tote stands [m]; large enough for whatever leaves the tote."""
+"""Half extents of the table under the tote [m]; large enough for objects that leave the tote."""
 TABLE_ROUGHNESS = 0.8
 """Roughness of the table's material: matt. Its only setting is `render.table_color`."""
 
@@ -40,7 +41,7 @@ def rim_height(tote: Tote) -> float:
 
 
 def tote_fixture(tote: Tote) -> Fixture:
-    """The visible tote: one closed shell and a closed shell for each rib.
+    """Build the visual mesh: a closed shell for the tote and one for each rib.
 
     Raises:
         ConfigError: The rim does not fit into the outer size, or the floor is larger than the rim.
@@ -51,10 +52,10 @@ def tote_fixture(tote: Tote) -> Fixture:
     rings = np.stack(
         [
             _ring(tote, 0.0, wall, -wall),
-            *(_ring(tote, share * under, wall, share * under) for share in np.linspace(0.0, 1.0, 4)),
+            *(_ring(tote, fraction * under, wall, fraction * under) for fraction in np.linspace(0.0, 1.0, 4)),
             _outer_ring(tote, under),
             _outer_ring(tote, top),
-            *(_ring(tote, share * top, 0.0, share * top) for share in np.linspace(1.0, 0.0, 4)),
+            *(_ring(tote, fraction * top, 0.0, fraction * top) for fraction in np.linspace(1.0, 0.0, 4)),
         ]
     )
     shell = join(strips(rings[0], below=True), loft(rings), strips(rings[-1]))
@@ -74,10 +75,10 @@ def tote_interior(tote: Tote) -> Interior:
 
 
 def tote_colliders(tote: Tote) -> tuple[ConvexPiece, ...]:
-    """Floor, four walls and four corners; floor and walls have the inner faces of the visible tote.
+    """Build the convex collision shapes: floor, four walls and four corners, with inner faces that coincide with the visual mesh.
 
-    The walls lean outward with the draft, reach from below the floor to the rim, and outward to the edge of the flange. A corner is
-    one plane at 45° that touches the visible round: nowhere is there more room than is seen, but for 8 % of the round's radius.
+    The walls follow the draft, from below the floor to the rim, and extend to the edge of the flange. A corner's inner face is one plane
+    at 45° tangent to the visible rounding, from which it deviates by at most 8 % of the radius.
 
     Raises:
         ConfigError: As `tote_fixture`.
@@ -97,7 +98,7 @@ def tote_colliders(tote: Tote) -> tuple[ConvexPiece, ...]:
 
 
 def _corner(tote: Tote, x: float, y: float) -> ConvexPiece:
-    """The wedge that fills a vertical edge up to the tangent at 45° of its round; (x, y) are the signs of the corner."""
+    """The wedge that fills a vertical edge up to the 45° tangent of its rounding; (x, y) are the signs of the corner."""
     points = []
     for level, z in ((0.0, -FLOOR_DEPTH), (0.0, 0.0), (rim_height(tote), rim_height(tote))):
         half, radius = _opening(tote, level)
@@ -108,7 +109,7 @@ def _corner(tote: Tote, x: float, y: float) -> ConvexPiece:
 
 
 def guide_walls(tote: Tote, height: float) -> tuple[ConvexPiece, ...]:
-    """Four upright walls on the rim that keep a drop column over the tote, flush with the opening; height [m]."""
+    """Build four temporary walls on the rim, flush with the opening, that keep falling objects over the tote; height [m]."""
     low = rim_height(tote)
     x, y = tote.rim_size[0] / 2, tote.rim_size[1] / 2
     far_x, far_y, high = x + GUIDE_THICKNESS, y + GUIDE_THICKNESS, low + height
@@ -132,26 +133,24 @@ def _check(tote: Tote) -> None:
             raise ConfigError(f"tote.floor_size: a {name} of {floor} m is larger than the rim's {rim} m; the tote must open upward")
         if floor <= 2 * CORNER_RADIUS:
             raise ConfigError(
-                f"tote.floor_size: a {name} of {floor} m leaves no room for round corners; take more than {2 * CORNER_RADIUS} m"
+                f"tote.floor_size: a {name} of {floor} m is too small for rounded corners; allowed: more than {2 * CORNER_RADIUS} m"
             )
     if tote.outer_size[2] <= 3 * tote.wall:
-        raise ConfigError(
-            f"tote.outer_size: a height of {tote.outer_size[2]} m is no more than three walls of {tote.wall} m; make it higher"
-        )
+        raise ConfigError(f"tote.outer_size: a height of {tote.outer_size[2]} m must exceed three walls of {tote.wall} m; increase it")
 
 
 def _ring(tote: Tote, level: float, offset: float, z: float) -> np.ndarray:
-    """Outline (n, 3) of the inside at a level above the floor, widened by an offset, drawn at height z [m]."""
+    """Inner outline (n, 3) at a level above the floor, offset outward, at height z [m]."""
     (length, width), radius = _opening(tote, level)
     outline = rounded_rectangle(2 * (length + offset), 2 * (width + offset), radius + offset, CORNER_SEGMENTS)
     return np.column_stack([outline, np.full(len(outline), z)])
 
 
 def _opening(tote: Tote, level: float) -> tuple[np.ndarray, float]:
-    """Half length and half width (2) of the inside at a level above the floor, and the radius of its corners [m]."""
-    share = level / rim_height(tote)
+    """Inner half length and half width (2) at a level above the floor, and the radius of the corners [m]."""
+    fraction = level / rim_height(tote)
     floor, rim = np.array(tote.floor_size), np.array(tote.rim_size)
-    return (floor + share * (rim - floor)) / 2, CORNER_RADIUS + share * float((rim - floor).min()) / 2
+    return (floor + fraction * (rim - floor)) / 2, CORNER_RADIUS + fraction * float((rim - floor).min()) / 2
 
 
 def _outer_ring(tote: Tote, z: float) -> np.ndarray:
@@ -160,7 +159,7 @@ def _outer_ring(tote: Tote, z: float) -> np.ndarray:
 
 
 def _ribs(tote: Tote) -> list[Patch]:
-    """Triangular ribs between wall and flange; they end inside both, so that nothing coincides."""
+    """Triangular ribs between wall and flange; they end inside both, so that no faces are coplanar."""
     top = rim_height(tote) - tote.wall / 2
     bottom = top - RIB_HEIGHT * tote.outer_size[2]
     ribs = []
@@ -171,11 +170,11 @@ def _ribs(tote: Tote) -> list[Patch]:
         profile = np.array([(upper, top), (lower, bottom), (lower + tote.wall / 2, bottom), (edge, top)])
         straight = tote.floor_size[1 - axis] / 2 - 2 * CORNER_RADIUS
         count = max(1, int(2 * straight / RIB_SPACING) + 1)
-        for place in np.linspace(-straight, straight, count) if count > 1 else (0.0,):
-            # Along +y the profile (x, z) runs clockwise about the way it is pushed, so it is pushed towards -y.
-            rings = [np.column_stack([profile[:, 0], np.full(4, place + side * tote.wall / 2), profile[:, 1]]) for side in (1.0, -1.0)]
+        for position in np.linspace(-straight, straight, count) if count > 1 else (0.0,):
+            # Extruded towards -y, since the profile (x, z) is clockwise about +y.
+            rings = [np.column_stack([profile[:, 0], np.full(4, position + side * tote.wall / 2), profile[:, 1]]) for side in (1.0, -1.0)]
             rib = solid(np.stack(rings))
-            ribs += [rib.turned("z", turn + 90.0 * axis) for turn in (0.0, 180.0)]
+            ribs += [rib.rotate("z", angle + 90.0 * axis) for angle in (0.0, 180.0)]
     return ribs
 
 

@@ -1,4 +1,4 @@
-"""The plain types that everything in a scene is made of."""
+"""Data types of a scene: meshes, materials, objects, fixtures, environment maps, cameras. Plain NumPy, in SI units."""
 
 from __future__ import annotations
 
@@ -10,93 +10,96 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A triangle mesh, outward orientation, metres."""
+    """Indexed triangle mesh with outward orientation."""
 
     vertices: np.ndarray
     """(V, 3) float32 [m]."""
     faces: np.ndarray
-    """(F, 3) int32, counter-clockwise seen from outside."""
+    """Vertex indices (F, 3) int32, counter-clockwise as seen from outside."""
     normals: np.ndarray
-    """Unit normal of each vertex (V, 3) float32."""
+    """Unit vertex normals (V, 3) float32."""
     uv: np.ndarray
-    """Texture coordinates (V, 2) float32, v grows upward (row 0 of the image is v = 1); zeros without a texture."""
+    """Texture coordinates (V, 2) float32; v points up (the image's top edge is v = 1); zeros without a texture."""
 
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Metallic-roughness."""
+    """PBR material in the metallic-roughness model (glTF 2.0)."""
 
     color: tuple[float, float, float]
-    """Base colour, sRGB; multiplies the texture (in linear light)."""
+    """Base colour factor, sRGB in 0..1; multiplies the texture in linear light."""
     texture: np.ndarray | None
-    """(H, W, 3) uint8, sRGB, red first, row 0 at the top (v = 1); None: the base colour alone."""
+    """Base colour texture (H, W, 3) uint8, sRGB, RGB order, top row first (v = 1); None: the factor alone."""
     metallic: float
+    """Metallic factor, 0..1."""
     roughness: float
+    """Perceptual roughness, 0..1."""
 
 
 @dataclass(frozen=True, eq=False)
 class RawObject:
-    """One object as it was read or made, before it gets a collision shape and mass properties."""
+    """An object as read from a file or made procedurally, before collision shape and mass properties are computed."""
 
     obj_id: int
+    """BOP's obj_id: class of the object."""
     name: str
     mesh: TriangleMesh
     material: Material
     mass: float | None
-    """[kg]; None: from the configured density."""
+    """[kg]; None: by objects.density."""
     concave: bool | None
-    """Whether a convex hull is too coarse a collision shape; None: the volumes of mesh and hull decide."""
+    """Use a convex decomposition instead of the hull as collision shape; None: by objects.concave_ratio."""
     symmetries_discrete: tuple[tuple[float, ...], ...]
-    """Row-major 4 x 4 matrices as BOP has them, but in metres."""
+    """Rigid transforms under which the object looks the same: row-major 4 x 4 matrices as in BOP, but in metres."""
     symmetries_continuous: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
-    """(axis, offset [m])."""
+    """(unit axis, point on it [m])."""
     source: Path | None
     """The PLY file of a BOP model folder; None: embedded, or from another format."""
 
 
 @dataclass(frozen=True, eq=False)
 class ConvexPiece:
-    """One convex collision shape, in the object's frame."""
+    """Convex polyhedron, as part of a collision shape, in the object's frame."""
 
     vertices: np.ndarray
     """(V, 3) float32 [m]."""
     faces: np.ndarray
-    """(F, 3) int32."""
+    """Vertex indices (F, 3) int32, counter-clockwise as seen from outside."""
 
 
 @dataclass(frozen=True, eq=False)
 class CatalogEntry:
-    """One object: what it looks like, how it collides, what it weighs."""
+    """An object of the catalog: visual mesh, material, collision shape, mass properties, symmetries."""
 
     obj_id: int
     name: str
     mesh: TriangleMesh
     material: Material
     pieces: tuple[ConvexPiece, ...]
-    """Collision shape; more than one piece for concave objects."""
+    """Collision shape: one hull, or the pieces of a convex decomposition."""
     volume: float
-    """Volume of the collision shape [m³]; counts against the arrangement's budget."""
+    """Volume of the collision shape [m³]; counts against arrangement.volume."""
     radius: float
     """Radius of the bounding sphere about the object's origin [m]."""
     mass: float
     """[kg]"""
     center_of_mass: np.ndarray
-    """In the object's frame (3) float64 [m]."""
+    """Centre of mass in the object's frame (3) float64 [m]."""
     inertia: np.ndarray
-    """About the centre of mass, in the object's axes (3, 3) float64 [kg·m²]."""
+    """Inertia tensor about the centre of mass, in the object's axes (3, 3) float64 [kg·m²]."""
     diameter: float
-    """Largest distance of two vertices [m]."""
+    """Largest distance between two vertices [m]."""
     symmetries_discrete: tuple[tuple[float, ...], ...]
-    """Row-major 4 x 4 matrices as BOP has them, but in metres."""
+    """Rigid transforms under which the object looks the same: row-major 4 x 4 matrices as in BOP, but in metres."""
     symmetries_continuous: tuple[tuple[tuple[float, float, float], tuple[float, float, float]], ...]
-    """(axis, offset [m])."""
+    """(unit axis, point on it [m])."""
     source: Path | None
-    """The PLY file the object came from; None: embedded, or from another format."""
+    """The PLY file of a BOP model folder; None: embedded, or from another format."""
 
 
 @dataclass(frozen=True, eq=False)
 class Catalog:
-    """The object set of a bake, ordered by obj_id."""
+    """The object set of a bake, ordered by obj_id. A catalog index is an index into `entries`."""
 
     entries: tuple[CatalogEntry, ...]
 
@@ -121,7 +124,7 @@ class Interior:
 
 @dataclass(frozen=True, eq=False)
 class Fixture:
-    """A visible thing that is no object: tote, finger, cup."""
+    """A visible part of the scene that is not an object: tote, gripper shaft, suction cup."""
 
     mesh: TriangleMesh
     material: Material
@@ -131,34 +134,34 @@ class Fixture:
 
 @dataclass(frozen=True, eq=False)
 class Sun:
-    """A directional light that a set of light maps names."""
+    """A directional light (sun) that an sIBL set names."""
 
     direction: np.ndarray
-    """Unit vector (3) float64 towards it, in the map's frame."""
+    """Unit direction (3) float64 towards the sun, in the map's frame."""
     irradiance: np.ndarray
-    """Linear RGB (3) float64 on a surface that faces it, in the map's units; not black."""
+    """Irradiance on a surface that faces the sun: linear RGB (3) float64, in the map's units; not black."""
 
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentMap:
-    """An equirectangular environment. Row 0 looks up (+z); azimuth atan2(y, x) lies at column share u = azimuth / 2π + 0.5."""
+    """HDR environment map, equirectangular: row 0 looks up (+z); azimuth atan2(y, x) is at u = azimuth / 2π + 0.5 of the width."""
 
     name: str
     radiance: np.ndarray
-    """Linear RGB (H, 2H, 3) float32, finite, not negative."""
+    """Radiance, linear RGB (H, 2H, 3) float32, finite, not negative."""
     sun: Sun | None = None
-    """Stands for the bright place that the map has there, which cameras clip."""
+    """Replaces the map's bright place at its direction, which cameras clip."""
 
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole in OpenCV's convention: x right, y down, z forward; the centre of pixel (row, column) is (column + 0.5, row + 0.5)."""
+    """Pinhole camera in OpenCV's convention: x right, y down, z forward; the centre of pixel (row, column) is (column + 0.5, row + 0.5)."""
 
     width: int
     height: int
     matrix: np.ndarray
-    """K (3, 3) float64 [px]."""
+    """Intrinsic matrix K (3, 3) float64 [px]."""
     rotation: np.ndarray
-    """World to camera (3, 3) float64."""
+    """World-to-camera rotation (3, 3) float64."""
     translation: np.ndarray
-    """World to camera (3) float64 [m]."""
+    """World-to-camera translation (3) float64 [m]."""

@@ -1,1 +1,1 @@
-"""The embedded object set and light maps, made in code."""
+"""Embedded assets, made procedurally: 21 household objects with textures, and six HDR environment maps."""

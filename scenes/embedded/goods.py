@@ -1,4 +1,4 @@
-"""The packs among the embedded objects: sizes [m], colours, words and pictures of each."""
+"""Embedded objects 1 to 9 and 12, packaged goods: sizes [m], label texts, colours and pictures."""
 
 from __future__ import annotations
 
@@ -148,8 +148,8 @@ def _crackers(image: np.ndarray) -> None:
     for x, y in ((0.34, 0.6), (0.68, 0.58), (0.5, 0.72), (0.76, 0.78), (0.24, 0.78)):
         paint.dot(image, x, y, 0.155, (170, 110, 44))
         paint.dot(image, x, y, 0.143, (238, 196, 116))
-        for turn in np.arange(8) * np.pi / 4:
-            paint.dot(image, x + 0.09 * np.cos(turn), y + 0.067 * np.sin(turn), 0.012, (176, 122, 58))
+        for angle in np.arange(8) * np.pi / 4:
+            paint.dot(image, x + 0.09 * np.cos(angle), y + 0.067 * np.sin(angle), 0.012, (176, 122, 58))
 
 
 def _cubes(image: np.ndarray) -> None:
@@ -169,8 +169,8 @@ def _tomato(image: np.ndarray) -> None:
 def _leaf(image: np.ndarray) -> None:
     paint.fill(image, (0.0, 0.48, 1.0, 0.84), (176, 32, 28))
     for x in (0.3, 0.5, 0.7):
-        for turn in np.arange(6) * np.pi / 3:
-            paint.dot(image, x + 0.045 * np.cos(turn), 0.66 + 0.045 * np.sin(turn), 0.05, (250, 216, 60))
+        for angle in np.arange(6) * np.pi / 3:
+            paint.dot(image, x + 0.045 * np.cos(angle), 0.66 + 0.045 * np.sin(angle), 0.05, (250, 216, 60))
         paint.dot(image, x, 0.66, 0.05, (210, 140, 24))
 
 

@@ -1,6 +1,6 @@
-"""Closed surfaces from rings of points: what the embedded objects, the tote and the gripper are made of.
+"""Procedural modelling: closed surfaces from cross-sections (surfaces of revolution, sweeps, lofts, rounded boxes).
 
-Points are snapped to a grid when a mesh is made, so patches that share a ring close without a gap.
+A cross-section is a ring of points. Vertices are snapped to a grid when a mesh is made, so patches that share a ring join watertight.
 """
 
 from __future__ import annotations
@@ -12,17 +12,18 @@ import numpy as np
 from synpick_warp.scenes.types import TriangleMesh
 
 Rect = tuple[float, float, float, float]
-"""Part of a texture: u0, v0, u1, v1, with v upward."""
+"""Rectangle of a texture atlas: u0, v0, u1, v1, with v upward."""
 
 NO_TEXTURE: Rect = (0.0, 0.0, 0.0, 0.0)
+"""Rectangle of surfaces without a texture."""
 SNAP = 1e-6
-"""Points nearer than this are one point [m]: far above rounding, far below any detail."""
+"""Grid spacing to which vertices are snapped [m]: far above rounding errors, far below any detail."""
 CREASE = 40.0
-"""Edges sharper than this are shaded as edges [°]."""
+"""Crease angle: sharper edges are shaded hard [°]."""
 BOX_FACES = ("+x", "+y", "-x", "-y", "+z", "-z")
-"""Faces of a box; the four sides come in the order in which one walks around it."""
+"""Faces of a box; the four sides come first, in their order around it."""
 
-# Right and up of each face as a viewer in front of it sees them: sides upright, top and bottom with +y up.
+# Texture axes (right, up) of each face as seen from outside: sides upright, top and bottom with +y up.
 _FACE_AXES = {
     "+x": ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "+y": ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
@@ -35,26 +36,26 @@ _FACE_AXES = {
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A piece of surface: triangles that share nothing yet."""
+    """A triangle soup: triangles with their own corners, before vertices are merged."""
 
     corners: np.ndarray
-    """(T, 3, 3) float64 [m], counter-clockwise seen from outside."""
+    """Positions (T, 3, 3) float64 [m], counter-clockwise as seen from outside."""
     uv: np.ndarray
-    """(T, 3, 2) float64."""
+    """Texture coordinates (T, 3, 2) float64."""
 
-    def moved(self, x: float, y: float, z: float) -> Patch:
-        """The patch shifted [m]."""
+    def translate(self, x: float, y: float, z: float) -> Patch:
+        """Translate the patch [m]."""
         return Patch(self.corners + np.array([x, y, z]), self.uv)
 
-    def turned(self, axis: str, angle: float) -> Patch:
-        """The patch turned about a coordinate axis through the origin [°]."""
+    def rotate(self, axis: str, angle: float) -> Patch:
+        """Rotate the patch about a coordinate axis through the origin [°]."""
         return Patch(self.corners @ rotation(axis, angle).T, self.uv)
 
 
 def rotation(axis: str, angle: float) -> np.ndarray:
     """Rotation matrix (3, 3) about x, y or z [°]; exact for multiples of 90."""
-    turn = np.radians(angle)
-    cosine, sine = (round(float(f(turn)), 15) for f in (np.cos, np.sin))
+    radians = np.radians(angle)
+    cosine, sine = (round(float(f(radians)), 15) for f in (np.cos, np.sin))
     first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.eye(3)
     matrix[first, first] = matrix[second, second] = cosine
@@ -63,14 +64,14 @@ def rotation(axis: str, angle: float) -> np.ndarray:
 
 
 def join(*patches: Patch) -> Patch:
-    """All patches as one."""
+    """Concatenate patches."""
     return Patch(np.concatenate([patch.corners for patch in patches]), np.concatenate([patch.uv for patch in patches]))
 
 
 def ellipse(width: float, depth: float, points: int, exponent: float = 2.0) -> np.ndarray:
-    """Ring (points, 2) of an ellipse, or with a larger exponent of a rounded rectangle [m].
+    """Ring (points, 2) of an ellipse, or with a larger exponent of a superellipse (rounded rectangle) [m].
 
-    Like all rings here it starts at +y and runs counter-clockwise, so a label's middle faces -y and its seam lies behind.
+    Like all rings here it starts at +y and runs counter-clockwise, so that a label's middle faces -y and its seam is at the back.
     """
     angles = np.pi / 2 + 2 * np.pi * np.arange(points) / points
     bend = 2.0 / exponent
@@ -79,7 +80,7 @@ def ellipse(width: float, depth: float, points: int, exponent: float = 2.0) -> n
 
 
 def rounded_rectangle(width: float, depth: float, radius: float, segments: int) -> np.ndarray:
-    """Ring (4 * (segments + 2), 2) of a rectangle with round corners [m]; the middles of its sides are points of it."""
+    """Ring (4 * (segments + 2), 2) of a rectangle with rounded corners [m]; it contains the midpoints of the sides."""
     quarter = np.pi / 2 * np.arange(segments + 1) / segments
     middles = ((0.0, depth / 2), (-width / 2, 0.0), (0.0, -depth / 2), (width / 2, 0.0))
     centers = ((-1, 1), (-1, -1), (1, -1), (1, 1))
@@ -92,24 +93,24 @@ def rounded_rectangle(width: float, depth: float, radius: float, segments: int) 
 
 
 def at_height(ring: np.ndarray, z: float) -> np.ndarray:
-    """The flat ring (n, 2) lifted to height z: (n, 3)."""
+    """Lift a planar ring (n, 2) to height z: (n, 3)."""
     return np.column_stack([ring, np.full(len(ring), z)])
 
 
 def lathe(profile: list[tuple[float, float]], points: int) -> np.ndarray:
-    """Rings (m, points, 3) of a profile of (radius, z) turned about z; its outside is to the right of the way it runs."""
+    """Rings (m, points, 3) of a surface of revolution about z; its profile of (radius, z) has the outside at its right."""
     circle = ellipse(2.0, 2.0, points)
     return np.stack([at_height(radius * circle, z) for radius, z in profile])
 
 
 def sweep(path: np.ndarray, section: np.ndarray, scales: np.ndarray, hint: tuple[float, float, float]) -> np.ndarray:
-    """Rings (m, n, 3) of a section that follows a path.
+    """Rings (m, n, 3) of a swept surface: a cross-section that follows a path.
 
     Args:
         path: (m, 3) [m].
-        section: Counter-clockwise ring (n, 2) [m]; its first axis lies along `hint`.
-        scales: Factor on the section at each point of the path: (m, 1), or (m, 2) for each of its axes.
-        hint: A direction that is nowhere parallel to the path.
+        section: Counter-clockwise ring (n, 2) [m]; its first axis is aligned with `hint`.
+        scales: Scale of the section at each point of the path: (m, 1), or (m, 2) for each of its axes.
+        hint: Reference direction, nowhere parallel to the path.
     """
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -121,31 +122,31 @@ def sweep(path: np.ndarray, section: np.ndarray, scales: np.ndarray, hint: tuple
 
 
 def loft(rings: np.ndarray, rect: Rect = NO_TEXTURE) -> Patch:
-    """The surface through rings (m, n, 3) that run counter-clockwise as seen from the last; open at both ends.
+    """Loft: surface through rings (m, n, 3) that are counter-clockwise as seen from the last; open at both ends.
 
-    The texture's part `rect` is laid around once, by length, its upper edge at the last ring.
+    The texture rectangle wraps around once, parameterized by arc length, with its upper edge at the last ring.
     """
     closed = np.concatenate([rings, rings[:, :1]], axis=1)
-    return _grid(closed, _texture_grid(_shares(closed, 1), _shares(closed, 0), rect))
+    return _grid(closed, _texture_grid(_arc_lengths(closed, 1), _arc_lengths(closed, 0), rect))
 
 
 def cap(ring: np.ndarray, rect: Rect = NO_TEXTURE, *, below: bool = False) -> Patch:
-    """A fan that closes a ring (n, 3); `below` for the ring at the start of a loft. The texture is laid on along x and y."""
+    """Triangle fan that closes a ring (n, 3); `below` for the first ring of a loft. The texture is projected along z."""
     following = np.roll(ring, -1, axis=0)
     center = np.broadcast_to(ring.mean(axis=0), ring.shape)
     corners = np.stack([center, following, ring] if below else [center, ring, following], axis=1)
     low, high = ring[:, :2].min(axis=0), ring[:, :2].max(axis=0)
-    share = (corners[..., :2] - low) / np.maximum(high - low, SNAP)
+    uv = (corners[..., :2] - low) / np.maximum(high - low, SNAP)
     if below:
-        share = share * (-1, 1) + (1, 0)
-    return Patch(corners, np.array(rect[:2]) + share * (rect[2] - rect[0], rect[3] - rect[1]))
+        uv = uv * (-1, 1) + (1, 0)
+    return Patch(corners, np.array(rect[:2]) + uv * (rect[2] - rect[0], rect[3] - rect[1]))
 
 
 def strips(ring: np.ndarray, *, below: bool = False) -> Patch:
-    """Closes a ring (n, 3) as `cap` does, by strips along x: their boxes overlap less than those of a fan, so that rays are faster.
+    """Close a ring (n, 3) as `cap` does, by strips along x: their bounding boxes overlap less than a fan's, so that rays are faster.
 
-    The ring is its own mirror image in x, and its first point and the opposite one lie in the middle of sides along x, as
-    `rounded_rectangle` makes it.
+    The ring must be symmetric in x, with its first point and the opposite one at midpoints of sides along x, as `rounded_rectangle`
+    makes it.
     """
     half = len(ring) // 2
     left, right = ring[: half + 1], ring[-np.arange(half + 1)]
@@ -154,22 +155,22 @@ def strips(ring: np.ndarray, *, below: bool = False) -> Patch:
         corners += [(left[k], left[k + 1], right[k + 1]), (left[k], right[k + 1], right[k])]
     end = half - 2
     corners += [(left[end], left[end + 1], left[half]), (left[end], left[half], right[end]), (right[end], left[half], right[end + 1])]
-    made = np.array(corners)[:, ::-1] if below else np.array(corners)
-    return Patch(made, np.zeros((*made.shape[:2], 2)))
+    triangles = np.array(corners)[:, ::-1] if below else np.array(corners)
+    return Patch(triangles, np.zeros((*triangles.shape[:2], 2)))
 
 
 def solid(rings: np.ndarray, rect: Rect = NO_TEXTURE) -> Patch:
-    """A loft with both ends closed."""
+    """Closed solid: a loft with caps at both ends."""
     return join(cap(rings[0], rect, below=True), loft(rings, rect), cap(rings[-1], rect))
 
 
 def torus(rings: np.ndarray, rect: Rect = NO_TEXTURE) -> Patch:
-    """A loft whose last ring is followed by its first."""
+    """Closed torus: a loft whose last ring is joined to its first."""
     return loft(np.concatenate([rings, rings[:1]]), rect)
 
 
 def rounded_box(size: tuple[float, float, float], radius: float, rects: dict[str, Rect], segments: int = 3) -> Patch:
-    """A box about the origin with round edges [m]; `rects` names the texture's part for each of `BOX_FACES`."""
+    """Box about the origin with rounded edges [m]; `rects`: texture rectangle of each of `BOX_FACES`."""
     angles = np.tan(np.pi / 4 * np.arange(segments + 1) / segments)
     slopes = np.concatenate([-angles[::-1], angles])
     sides = np.concatenate([-np.ones(segments + 1), np.ones(segments + 1)])
@@ -188,19 +189,19 @@ def rounded_box(size: tuple[float, float, float], radius: float, rects: dict[str
 
 
 def make_mesh(patch: Patch, *, centered: bool) -> TriangleMesh:
-    """Merge points, drop triangles without area, give normals that stay sharp at edges above `CREASE`.
+    """Merge vertices, drop degenerate triangles, and compute vertex normals that stay hard at edges above `CREASE`.
 
     Args:
-        patch: All of the surface.
-        centered: Move the middle of the bounding box to the origin.
+        patch: The whole surface.
+        centered: Translate the centre of the bounding box to the origin.
     """
     corners = patch.corners.reshape(-1, 3)
     if centered:
         corners = corners - (corners.min(axis=0) + corners.max(axis=0)) / 2
     cells, point = np.unique(np.rint(corners / SNAP).astype(np.int64), axis=0, return_inverse=True)
     point = point.reshape(-1, 3)
-    whole = (point[:, 0] != point[:, 1]) & (point[:, 1] != point[:, 2]) & (point[:, 2] != point[:, 0])
-    point, uv = point[whole], patch.uv[whole].reshape(-1, 2)
+    valid = (point[:, 0] != point[:, 1]) & (point[:, 1] != point[:, 2]) & (point[:, 2] != point[:, 0])
+    point, uv = point[valid], patch.uv[valid].reshape(-1, 2)
     points = cells * SNAP
     normals = _corner_normals(points, point)
     keys = np.column_stack([point.reshape(-1, 1), np.rint(normals * 1e4), np.rint(uv * 1e6)]).astype(np.int64)
@@ -213,21 +214,22 @@ def make_mesh(patch: Patch, *, centered: bool) -> TriangleMesh:
     )
 
 
-def _shares(points: np.ndarray, axis: int) -> np.ndarray:
-    """Share of the way along an axis of a grid of points, by mean length, from 0 to 1."""
+def _arc_lengths(points: np.ndarray, axis: int) -> np.ndarray:
+    """Normalized mean arc length along an axis of a grid of points, from 0 to 1."""
     steps = np.linalg.norm(np.diff(points, axis=axis), axis=2).mean(axis=1 - axis)
-    way = np.concatenate([[0.0], np.cumsum(steps)])
-    return way / max(way[-1], SNAP)
+    length = np.concatenate([[0.0], np.cumsum(steps)])
+    return length / max(length[-1], SNAP)
 
 
 def _texture_grid(across: np.ndarray, along: np.ndarray, rect: Rect) -> np.ndarray:
+    """Texture coordinates of a grid (rows, columns, 2) from its parameters in 0..1 along columns and rows."""
     u = rect[0] + across * (rect[2] - rect[0])
     v = rect[1] + along * (rect[3] - rect[1])
     return np.stack(np.meshgrid(u, v), axis=2)
 
 
 def _grid(points: np.ndarray, uv: np.ndarray) -> Patch:
-    """Two triangles for each cell of a grid (rows upward, columns to the right)."""
+    """Triangulate a grid of points (rows upward, columns to the right): two triangles per cell."""
 
     def triangles(grid: np.ndarray) -> np.ndarray:
         a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
@@ -238,7 +240,7 @@ def _grid(points: np.ndarray, uv: np.ndarray) -> Patch:
 
 
 def _corner_normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Normal of each corner (3F, 3): the mean, by angle, over the faces at its point that bend off by less than `CREASE`."""
+    """Corner normals (3F, 3): angle-weighted means over the faces at a vertex within the crease angle."""
     triangle = points[faces]
     edges = np.roll(triangle, -1, axis=1) - triangle
     edges /= np.linalg.norm(edges, axis=2, keepdims=True)

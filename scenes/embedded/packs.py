@@ -1,4 +1,4 @@
-"""Embedded objects that are packed food and household goods: cartons, tins and bottles with printed labels. Lengths [m]."""
+"""Packaging: procedural cartons, tins and bottles with printed labels. Lengths [m]."""
 
 from __future__ import annotations
 
@@ -24,20 +24,22 @@ from synpick_warp.scenes.embedded.meshes import (
 from synpick_warp.scenes.embedded.textures import Color
 
 SHEET = 1024
-"""Width of a printed sheet [px]: about 3 px/mm, as fine as the cameras see at 2 m and full HD."""
+"""Width of a texture atlas [px]: about 3 px/mm, the resolution of the cameras at 2 m and full HD."""
 SIDES = 48
-"""Points around a tin or a bottle."""
+"""Points per ring of tins and bottles."""
 CARTON_EDGE = 0.0015
+"""Edge radius of cartons [m]."""
 SILVER: Color = (204, 205, 208)
 
 Shape = tuple[Patch, np.ndarray]
-"""The surface of an object and its texture."""
+"""Surface of an object and its texture (H, W, 3) uint8."""
 Motif = Callable[[np.ndarray], None]
+"""Function that draws a picture into a label."""
 
 
 @dataclass(frozen=True)
 class Label:
-    """What is printed on a pack."""
+    """Content of a printed label: texts, colours, picture, and the seed of its random details."""
 
     title: tuple[str, ...]
     subtitle: str
@@ -48,11 +50,11 @@ class Label:
     motif: Motif
     seed: int
     food: bool = True
-    """Food has a table of nutrition facts."""
+    """Print a table of nutrition facts, instead of directions."""
 
 
 def front(width: int, height: int, label: Label) -> np.ndarray:
-    """The panel that sells."""
+    """Draw the front panel: title, picture, net weight."""
     image = paint.blank(width, height, label.color)
     paint.fill(image, (0.0, 0.0, 1.0, 0.05), label.accent)
     paint.fill(image, (0.0, 0.93, 1.0, 1.0), label.accent)
@@ -66,7 +68,7 @@ def front(width: int, height: int, label: Label) -> np.ndarray:
 
 
 def back(width: int, height: int, label: Label) -> np.ndarray:
-    """The panel that explains."""
+    """Draw the back panel: text, and a bar code."""
     image = paint.blank(width, height, paint.PAPER)
     paint.fill(image, (0.0, 0.0, 1.0, 0.16), label.color)
     paint.write(image, " ".join(label.title), (0.06, 0.03, 0.94, 0.13), label.text)
@@ -78,7 +80,7 @@ def back(width: int, height: int, label: Label) -> np.ndarray:
 
 
 def side(width: int, height: int, label: Label) -> np.ndarray:
-    """The panel with the table."""
+    """Draw the side panel: nutrition facts or directions."""
     image = paint.blank(width, height, label.color)
     if width > height:
         paint.write(image, " ".join(label.title), (0.04, 0.12, 0.6, 0.88), label.text)
@@ -96,7 +98,7 @@ def side(width: int, height: int, label: Label) -> np.ndarray:
 
 
 def other_side(width: int, height: int, label: Label) -> np.ndarray:
-    """The panel with the name alone."""
+    """Draw the other side panel: title, and text or a bar code."""
     image = paint.blank(width, height, label.accent)
     text = paint.legible(label.accent)
     if width > height:
@@ -110,7 +112,7 @@ def other_side(width: int, height: int, label: Label) -> np.ndarray:
 
 
 def end(width: int, height: int, label: Label) -> np.ndarray:
-    """A small face with the name."""
+    """Draw the top or bottom of a carton: title."""
     image = paint.blank(width, height, label.color)
     paint.fill(image, (0.0, 0.0, 1.0, 0.1), label.accent)
     paint.fill(image, (0.0, 0.9, 1.0, 1.0), label.accent)
@@ -119,7 +121,7 @@ def end(width: int, height: int, label: Label) -> np.ndarray:
 
 
 def carton(size: tuple[float, float, float], label: Label) -> Shape:
-    """A box of card; its largest face is the front, the face opposite the back."""
+    """Make a carton; its largest faces are front and back."""
     scale = (SHEET - 8 * paint.PADDING) / (2 * (size[0] + size[1]))
     x, y, z = (round(length * scale) for length in size)
     extent = {"+x": (y, z), "-x": (y, z), "+y": (x, z), "-y": (x, z), "+z": (x, y), "-z": (x, y)}
@@ -131,7 +133,7 @@ def carton(size: tuple[float, float, float], label: Label) -> Shape:
 
 
 def wrapper(width: int, height: int, label: Label, *, twice: bool = False) -> np.ndarray:
-    """A label for a tin, unrolled: front in the middle, table and text left and right; or the front twice, half a turn apart."""
+    """Draw an unrolled label: front in the middle, text and table left and right; or the front twice, 180° apart."""
     if twice:
         half = front(width // 2, height, label)
         return np.concatenate([half, half], axis=1)
@@ -142,15 +144,15 @@ def wrapper(width: int, height: int, label: Label, *, twice: bool = False) -> np
 
 
 def tin(ring: np.ndarray, height: float, label_image: np.ndarray, ends: dict[str, np.ndarray], metal: Color, seed: int) -> Shape:
-    """A tin: rims of metal at both ends, the label between them.
+    """Make a tin: metal rims at both ends, the label between them.
 
     Args:
         ring: Outline (n, 2) of the rim [m].
         height: Height [m].
         label_image: The label, unrolled.
-        ends: Pictures `top` and `bottom`.
-        metal: Colour of rims.
-        seed: For the scratches.
+        ends: Images `top` and `bottom`.
+        metal: Colour of the rims.
+        seed: Seed of the scratches.
     """
     texture, at = paint.pack({"label": label_image, "metal": paint.brushed(256, 64, metal, seed), **ends}, SHEET)
     half = height / 2
@@ -174,7 +176,7 @@ def tin(ring: np.ndarray, height: float, label_image: np.ndarray, ends: dict[str
 
 
 def stamped_end(size: int, color: Color, seed: int, text: str) -> np.ndarray:
-    """The end of a tin: grooves, and a line of print if there is text."""
+    """Draw the end of a tin: concentric grooves, and a line of print if there is text."""
     image = (0.6 * paint.rings(size, (color, (140, 141, 146)), 3.0) + 0.4 * paint.brushed(size, size, color, seed)).astype(np.uint8)
     if text:
         paint.write(image, text, (0.25, 0.42, 0.75, 0.58), (70, 72, 80), paint.FONT)
@@ -187,12 +189,12 @@ def bottle(
     band: tuple[int, int],
     images: dict[str, np.ndarray],
 ) -> Shape:
-    """A bottle with a screw cap.
+    """Make a bottle with a screw cap.
 
     Args:
-        levels: (width, depth, exponent, z) of the body from the bottom to the neck [m].
+        levels: Cross-sections (width, depth, superellipse exponent, z) of the body from the bottom to the neck [m].
         neck: (radius, z) of the cap's profile, from its lower edge to its top [m].
-        band: First and last level that carry the label.
+        band: First and last level with the label.
         images: `label` (unrolled), `body`, `cap`.
     """
     texture, at = paint.pack(images, SHEET)
@@ -209,12 +211,12 @@ def bottle(
 
 
 def tin_label_size(ring: np.ndarray, height: float) -> tuple[int, int]:
-    """Pixels of a label that goes once around a tin."""
+    """Width and height of the label that wraps once around a tin [px]."""
     around = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1).sum()
     width = SHEET - 2 * paint.PADDING
     return width, round(width * (height - 0.008) / around)
 
 
 def label_ring(width: float, depth: float, radius: float) -> np.ndarray:
-    """Outline of a tin with flat sides [m]."""
+    """Ring of a tin with flat sides [m]."""
     return rounded_rectangle(width, depth, radius, 10)

@@ -1,4 +1,4 @@
-"""The embedded light maps: six skies and rooms made from formulas. Radiance in arbitrary units where a white wall is about 1."""
+"""The embedded HDR environment maps: six procedural skies and interiors. Radiance in arbitrary units; a white wall is about 1."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ Rgb = tuple[float, float, float]
 
 
 def skies() -> tuple[EnvironmentMap, ...]:
-    """The embedded light maps, sorted by name; always the same."""
+    """Make the embedded environment maps, sorted by name; deterministic."""
     view, _ = map_directions(HEIGHT)
-    makers = {
+    functions = {
         "low_sun": _low_sun,
         "mixed_lamps": _mixed_lamps,
         "overcast": _overcast,
@@ -24,11 +24,11 @@ def skies() -> tuple[EnvironmentMap, ...]:
         "warehouse": _warehouse,
         "window": _window,
     }
-    return tuple(EnvironmentMap(name, np.maximum(make(view), 0.0).astype(np.float32)) for name, make in sorted(makers.items()))
+    return tuple(EnvironmentMap(name, np.maximum(make(view), 0.0).astype(np.float32)) for name, make in sorted(functions.items()))
 
 
 def _overcast(view: np.ndarray) -> np.ndarray:
-    """The CIE overcast sky, (1 + 2 sin h) / 3 of the zenith, over a grey ground."""
+    """CIE overcast sky, with (1 + 2 sin h) / 3 of the zenith's radiance at elevation h, over a grey ground."""
     sky = _color((1.55, 1.65, 1.80)) * ((1 + 2 * np.clip(view[..., 2:], 0, 1)) / 3)
     return _ground(view, sky, (0.28, 0.27, 0.25))
 
@@ -36,7 +36,7 @@ def _overcast(view: np.ndarray) -> np.ndarray:
 def _low_sun(view: np.ndarray) -> np.ndarray:
     """A clear sky, blue above and pale at the horizon, and a low warm sun."""
     up = np.clip(view[..., 2:], 0, 1)
-    near = view @ _toward(35.0, 22.0)
+    near = view @ _direction(35.0, 22.0)
     sky = _color((0.22, 0.42, 0.90)) * up**0.5 + _color((0.95, 0.88, 0.76)) * (1 - up) ** 4 * 0.8
     glow = _color((1.0, 0.72, 0.40)) * (1.6 * np.exp((near - 1) * 18) + 0.25 * np.exp((near - 1) * 3))[..., None]
     sun = _color((1.0, 0.82, 0.58)) * (900 * np.exp((near - 1) * 2600))[..., None]
@@ -52,7 +52,7 @@ def _softboxes(view: np.ndarray) -> np.ndarray:
 
 
 def _warehouse(view: np.ndarray) -> np.ndarray:
-    """A hall with five rows of lamps under its roof."""
+    """A hall with five rows of ceiling lamps."""
     hall = _room(view, (0.34, 0.35, 0.35), (0.22, 0.21, 0.20))
     for row in np.linspace(-2.0, 2.0, 5):
         for place in np.linspace(-2.4, 2.4, 7):
@@ -73,27 +73,27 @@ def _window(view: np.ndarray) -> np.ndarray:
 
 
 def _mixed_lamps(view: np.ndarray) -> np.ndarray:
-    """A warm lamp on one side, a cold panel on the other, a greenish tube overhead."""
+    """A warm lamp on one side, a cold panel on the other, a greenish fluorescent tube overhead."""
     room = _room(view, (0.20, 0.19, 0.19), (0.13, 0.12, 0.11))
-    for azimuth, height, width, color in ((200.0, 38.0, 260.0, (46.0, 27.0, 11.0)), (320.0, 30.0, 420.0, (30.0, 16.0, 6.0))):
-        room += _color(color) * np.exp((view @ _toward(azimuth, height) - 1) * width)[..., None]
+    for azimuth, elevation, width, color in ((200.0, 38.0, 260.0, (46.0, 27.0, 11.0)), (320.0, 30.0, 420.0, (30.0, 16.0, 6.0))):
+        room += _color(color) * np.exp((view @ _direction(azimuth, elevation) - 1) * width)[..., None]
     room += _color((5.5, 7.4, 10.8)) * _panel(view, (1.25, 0.6), (0.5, 0.5), 0.08)
     return room + _color((6.6, 7.8, 6.2)) * _panel(view, (-0.2, -0.4), (0.06, 1.1), 0.04)
 
 
 def _room(view: np.ndarray, walls: Rgb, floor: Rgb) -> np.ndarray:
-    """A plain room: walls that brighten upward, over a floor."""
+    """A plain room: walls that get brighter upward, over a floor."""
     return _ground(view, _color(walls) * (0.7 + 0.6 * np.clip(view[..., 2:], 0, 1)), floor)
 
 
 def _ground(view: np.ndarray, above: np.ndarray, color: Rgb) -> np.ndarray:
-    """`above` over a ground of one colour, with a soft horizon just below eye height."""
-    share = _step(view[..., 2] + 0.02, 0.03)[..., None]
-    return above * share + _color(color) * (0.75 - 0.25 * view[..., 2:]) * (1 - share)
+    """Composite radiance `above` the horizon with a ground of one colour; the soft horizon is just below eye height."""
+    fraction = _step(view[..., 2] + 0.02, 0.03)[..., None]
+    return above * fraction + _color(color) * (0.75 - 0.25 * view[..., 2:]) * (1 - fraction)
 
 
 def _panel(view: np.ndarray, center: tuple[float, float], half: tuple[float, float], soft: float) -> np.ndarray:
-    """Share (H, W, 1) covered by a level panel one unit overhead: centre and half size in units of its height."""
+    """Coverage (H, W, 1) by a horizontal panel at height 1: centre and half size in units of that height."""
     height = np.maximum(view[..., 2], 1e-6)
     x, y = view[..., 0] / height - center[0], view[..., 1] / height - center[1]
     inside = _step(half[0] - np.abs(x), soft) * _step(half[1] - np.abs(y), soft) * _step(view[..., 2] - 0.1, 0.05)
@@ -101,15 +101,15 @@ def _panel(view: np.ndarray, center: tuple[float, float], half: tuple[float, flo
 
 
 def _step(value: np.ndarray, width: float) -> np.ndarray:
-    """A smooth step from 0 to 1 around zero."""
-    share = np.clip(value / width * 0.5 + 0.5, 0, 1)
-    return share * share * (3 - 2 * share)
+    """Smoothstep from 0 to 1, over ± `width` about zero."""
+    t = np.clip(value / width * 0.5 + 0.5, 0, 1)
+    return t * t * (3 - 2 * t)
 
 
-def _toward(azimuth: float, height: float) -> np.ndarray:
-    """Unit vector from azimuth and height over the horizon [°]."""
-    turn, rise = np.radians(azimuth), np.radians(height)
-    return np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
+def _direction(azimuth: float, elevation: float) -> np.ndarray:
+    """Unit direction from azimuth and elevation [°]."""
+    phi, theta = np.radians(azimuth), np.radians(elevation)
+    return np.array([np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), np.sin(theta)])
 
 
 def _color(color: Rgb) -> np.ndarray:

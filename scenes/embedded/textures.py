@@ -1,6 +1,7 @@
-"""Pictures for the embedded objects: printed labels, bar codes, wood, metal, peel. Every random number has a fixed seed.
+"""Procedural textures of the embedded objects: print, bar codes, wood, metal, foam, peel; and texture atlas packing.
 
-Images are (H, W, 3) uint8, sRGB, red first, row 0 at the top. Boxes are (left, top, right, bottom) as shares of the image.
+Images are (H, W, 3) uint8, sRGB, RGB order, top row first. Boxes are (left, top, right, bottom) as fractions of the image. All random
+numbers have fixed seeds.
 """
 
 from __future__ import annotations
@@ -18,21 +19,21 @@ BOLD = cv2.FONT_HERSHEY_TRIPLEX
 INK: Color = (28, 26, 30)
 PAPER: Color = (244, 241, 232)
 PADDING = 3
-"""Border around each image of a sheet that repeats its edge, so that filtering does not bleed [px]."""
+"""Padding around each image of an atlas that repeats its edge, so that filtering does not bleed [px]."""
 
 
 def blank(width: int, height: int, color: Color) -> np.ndarray:
-    """An image of one colour."""
+    """Make an image of one colour."""
     return np.full((height, width, 3), color, np.uint8)
 
 
-def legible(ground: Color) -> Color:
-    """The colour of print that stands out from the ground: dark on light, light on dark."""
-    return INK if 0.3 * ground[0] + 0.6 * ground[1] + 0.1 * ground[2] > 130 else PAPER
+def legible(background: Color) -> Color:
+    """Choose a text colour with contrast to the background: dark on light, light on dark."""
+    return INK if 0.3 * background[0] + 0.6 * background[1] + 0.1 * background[2] > 130 else PAPER
 
 
 def pack(images: dict[str, np.ndarray], width: int) -> tuple[np.ndarray, dict[str, Rect]]:
-    """Put images on one sheet of the given width [px], in rows in the order given; the sheet and where each image lies."""
+    """Pack images into a texture atlas of the given width [px], row by row in order; returns atlas and rectangles."""
     places: dict[str, tuple[int, int]] = {}
     x = y = row = 0
     for name, image in images.items():
@@ -57,19 +58,19 @@ def pack(images: dict[str, np.ndarray], width: int) -> tuple[np.ndarray, dict[st
 
 
 def fill(image: np.ndarray, box: Box, color: Color) -> None:
-    """Paint a rectangle."""
+    """Fill a rectangle."""
     left, top, right, bottom = _pixels(image, box)
     image[top:bottom, left:right] = color
 
 
 def dot(image: np.ndarray, x: float, y: float, radius: float, color: Color) -> None:
-    """Paint a disc; the radius is a share of the image's shorter side."""
+    """Draw a disc; the radius is a fraction of the image's shorter side."""
     center = (round(x * image.shape[1]), round(y * image.shape[0]))
     cv2.circle(image, center, max(1, round(radius * min(image.shape[:2]))), color, -1, cv2.LINE_AA)
 
 
 def write(image: np.ndarray, text: str, box: Box, color: Color, font: int = BOLD) -> None:
-    """Print one line of text, as large as the box allows, in its middle."""
+    """Write one line of text centred in a box, as large as it allows."""
     left, top, right, bottom = _pixels(image, box)
     (wide, high), below = cv2.getTextSize(text, font, 1.0, 1)
     scale = min((right - left) / wide, (bottom - top) / (high + below))
@@ -79,7 +80,7 @@ def write(image: np.ndarray, text: str, box: Box, color: Color, font: int = BOLD
 
 
 def small_print(image: np.ndarray, box: Box, color: Color, rows: int, seed: int) -> None:
-    """Lines of words too small to read."""
+    """Draw lines of illegible words."""
     rng = np.random.default_rng(seed)
     left, top, right, bottom = _pixels(image, box)
     pitch = (bottom - top) / rows
@@ -93,7 +94,7 @@ def small_print(image: np.ndarray, box: Box, color: Color, rows: int, seed: int)
 
 
 def bar_code(image: np.ndarray, box: Box, seed: int) -> None:
-    """A bar code with its number, on white."""
+    """Draw a bar code with its digits, on white."""
     rng = np.random.default_rng(seed)
     fill(image, box, (252, 252, 252))
     left, top, right, bottom = _pixels(image, box)
@@ -106,7 +107,7 @@ def bar_code(image: np.ndarray, box: Box, seed: int) -> None:
 
 
 def facts(image: np.ndarray, box: Box, seed: int) -> None:
-    """A table of nutrition facts."""
+    """Draw a table of nutrition facts."""
     rng = np.random.default_rng(seed)
     fill(image, box, (250, 249, 244))
     left, top, right, bottom = _pixels(image, box)
@@ -123,7 +124,7 @@ def facts(image: np.ndarray, box: Box, seed: int) -> None:
 
 
 def grain(width: int, height: int, scale: tuple[float, float], seed: int) -> np.ndarray:
-    """Smooth noise (H, W) from 0 to 1, with spots of the given width and height [px]."""
+    """Value noise (H, W) in 0..1, with features of the given width and height [px]."""
     rng = np.random.default_rng(seed)
     coarse = rng.random((max(2, round(height / scale[1])), max(2, round(width / scale[0])))).astype(np.float32)
     smooth = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
@@ -131,56 +132,56 @@ def grain(width: int, height: int, scale: tuple[float, float], seed: int) -> np.
 
 
 def plain(color: Color, seed: int, roughness: float = 0.04) -> np.ndarray:
-    """A moulded surface: one colour with faint specks."""
+    """Moulded plastic: one colour with faint specks."""
     size = 128
     noise = 0.6 * grain(size, size, (2, 2), seed) + 0.4 * grain(size, size, (24, 24), seed + 1) - 0.5
-    return _shade(np.array(color, np.float32) * (1 + 2 * roughness * noise[..., None]))
+    return _to_uint8(np.array(color, np.float32) * (1 + 2 * roughness * noise[..., None]))
 
 
 def brushed(width: int, height: int, color: Color, seed: int) -> np.ndarray:
-    """Metal with fine scratches from left to right."""
+    """Brushed metal: fine horizontal scratches."""
     noise = 0.7 * grain(width, height, (60, 1.5), seed) + 0.3 * grain(width, height, (width / 2, 6), seed + 1) - 0.5
-    return _shade(np.array(color, np.float32) * (1 + 0.3 * noise[..., None]))
+    return _to_uint8(np.array(color, np.float32) * (1 + 0.3 * noise[..., None]))
 
 
 def rings(size: int, colors: tuple[Color, Color], count: float) -> np.ndarray:
-    """Concentric grooves of two colours, the same seen from every side."""
+    """Concentric grooves of two colours, rotationally symmetric."""
     axis = (np.arange(size) + 0.5) / size * 2 - 1
     radius = np.hypot(*np.meshgrid(axis, axis))
     wave = (0.5 + 0.5 * np.cos(radius * 2 * np.pi * count))[..., None]
-    return _shade(np.array(colors[0], np.float32) * wave + np.array(colors[1], np.float32) * (1 - wave))
+    return _to_uint8(np.array(colors[0], np.float32) * wave + np.array(colors[1], np.float32) * (1 - wave))
 
 
 def wood(width: int, height: int, seed: int) -> np.ndarray:
-    """Wood along the grain, which runs up; the same after half a turn, so that faces of a block cannot be told apart."""
+    """Wood along its vertical grain; symmetric under rotation by 180°, so that a block with it is symmetric, too."""
     x = np.linspace(-1.0, 1.0, width, dtype=np.float32)[None]
-    warp = 0.45 * (_half_turn(grain(width, height, (width / 2, height / 2.5), seed)) - 0.5)
+    warp = 0.45 * (_symmetrize(grain(width, height, (width / 2, height / 2.5), seed)) - 0.5)
     year = 0.5 + 0.5 * np.sin(2 * np.pi * (4.0 * (np.abs(x) + 0.2 * warp) + 2.0 * warp))
-    fibre = _half_turn(grain(width, height, (1.5, 40), seed + 1)) - 0.5
+    fibre = _symmetrize(grain(width, height, (1.5, 40), seed + 1)) - 0.5
     tone = np.clip(0.45 + 0.4 * (year**3 - 0.4) + 0.7 * fibre, 0, 1)[..., None]
-    return _shade(np.array((146, 98, 52), np.float32) * tone + np.array((220, 180, 124), np.float32) * (1 - tone))
+    return _to_uint8(np.array((146, 98, 52), np.float32) * tone + np.array((220, 180, 124), np.float32) * (1 - tone))
 
 
 def end_grain(size: int, seed: int) -> np.ndarray:
-    """Wood across the grain: year rings around the middle, the same after each quarter turn."""
+    """Wood across the grain: growth rings around the centre, symmetric under rotation by 90°."""
     axis = np.linspace(-1.0, 1.0, size, dtype=np.float32)
     radius = np.hypot(*np.meshgrid(axis, axis))
     warp = grain(size, size, (size / 4, size / 4), seed)
     warp = (warp + np.rot90(warp) + np.rot90(warp, 2) + np.rot90(warp, 3)) / 4 - 0.5
     year = (0.5 + 0.5 * np.sin(2 * np.pi * 9 * (radius + 0.12 * warp)))[..., None]
-    return _shade(np.array((138, 92, 50), np.float32) * year + np.array((206, 164, 110), np.float32) * (1 - year))
+    return _to_uint8(np.array((138, 92, 50), np.float32) * year + np.array((206, 164, 110), np.float32) * (1 - year))
 
 
 def foam(width: int, height: int, color: Color, seed: int) -> np.ndarray:
-    """Fine-pored foam, the same after half a turn."""
-    pores = _half_turn(grain(width, height, (3, 3), seed))
-    blotch = _half_turn(grain(width, height, (30, 30), seed + 1)) - 0.5
+    """Fine-pored foam, symmetric under rotation by 180°."""
+    pores = _symmetrize(grain(width, height, (3, 3), seed))
+    blotch = _symmetrize(grain(width, height, (30, 30), seed + 1)) - 0.5
     tone = 1 - np.clip(0.42 - pores, 0, 1) + 0.12 * blotch
-    return _shade(np.array(color, np.float32) * tone[..., None])
+    return _to_uint8(np.array(color, np.float32) * tone[..., None])
 
 
 def peel(width: int, height: int, seed: int) -> np.ndarray:
-    """A banana's skin, unrolled: stem at the top, green below it, brown streaks and specks, a dark lower tip."""
+    """Unrolled banana peel: stem at the top, green below it, brown streaks and specks, a dark lower tip."""
     y = np.linspace(0.0, 1.0, height, dtype=np.float32)[:, None]
     streak = grain(width, height, (7, 130), seed)
     blotch = grain(width, height, (10, 16), seed + 1)
@@ -190,11 +191,11 @@ def peel(width: int, height: int, seed: int) -> np.ndarray:
     edges = 0.5 + 0.5 * np.cos(2 * np.pi * 5 * np.linspace(0, 1, width, dtype=np.float32))[None]
     spots = np.clip((blotch - 0.8) * 8, 0, 1) + np.clip((streak - 0.86) * 6, 0, 1) + 0.25 * edges**12
     tips = np.clip(1 - y / 0.035, 0, 1) + np.clip((y - 0.955) / 0.03, 0, 1)
-    share = np.clip(0.75 * spots + tips, 0, 1)[..., None]
-    return _shade((color * (1 - share) + brown * share) * (0.94 + 0.12 * streak[..., None]))
+    fraction = np.clip(0.75 * spots + tips, 0, 1)[..., None]
+    return _to_uint8((color * (1 - fraction) + brown * fraction) * (0.94 + 0.12 * streak[..., None]))
 
 
-def _half_turn(noise: np.ndarray) -> np.ndarray:
+def _symmetrize(noise: np.ndarray) -> np.ndarray:
     return (noise + noise[::-1, ::-1]) / 2
 
 
@@ -203,5 +204,5 @@ def _pixels(image: np.ndarray, box: Box) -> tuple[int, int, int, int]:
     return round(box[0] * wide), round(box[1] * high), round(box[2] * wide), round(box[3] * high)
 
 
-def _shade(image: np.ndarray) -> np.ndarray:
+def _to_uint8(image: np.ndarray) -> np.ndarray:
     return np.clip(image, 0, 255).astype(np.uint8)

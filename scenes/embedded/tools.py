@@ -1,4 +1,4 @@
-"""Embedded objects that are tools and everyday things: banana, drill, block, scissors, marker, clamps, foam. Lengths [m]."""
+"""Embedded objects: banana, drill, wood block, scissors, marker, clamps, foam block. Lengths [m]."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ STEEL = (186, 189, 194)
 
 def banana() -> Shape:
     """A banana, lying flat."""
-    turn = np.radians(np.linspace(-62, 62, 33))
-    bend = 0.1065
-    path = np.stack([bend * np.cos(turn), bend * np.sin(turn), np.zeros_like(turn)], axis=1)
-    share = np.linspace(0, 1, len(turn))
+    angle = np.radians(np.linspace(-62, 62, 33))
+    bend_radius = 0.1065
+    path = np.stack([bend_radius * np.cos(angle), bend_radius * np.sin(angle), np.zeros_like(angle)], axis=1)
+    fraction = np.linspace(0, 1, len(angle))
     knots = [0.0, 0.02, 0.07, 0.2, 0.5, 0.75, 0.87, 0.92, 0.98, 1.0]
-    radius = np.interp(share, knots, [0.0035, 0.0058, 0.0110, 0.0165, 0.0182, 0.0160, 0.0095, 0.0058, 0.0050, 0.0062])
+    radius = np.interp(fraction, knots, [0.0035, 0.0058, 0.0110, 0.0165, 0.0182, 0.0160, 0.0095, 0.0058, 0.0050, 0.0062])
     angles = 2 * np.pi * np.arange(25) / 25
     section = (1 + 0.045 * np.cos(5 * angles))[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     texture, at = paint.pack({"peel": paint.peel(384, 768, 1000), "tip": paint.plain((70, 50, 28), 1002)}, 640)
     rings = sweep(path, section, radius[:, None], (0.0, 0.0, 1.0))
     patch = join(cap(rings[0], at["tip"], below=True), loft(rings, at["peel"]), cap(rings[-1], at["tip"]))
-    return patch.turned("z", 25.0), texture
+    return patch.rotate("z", 25.0), texture
 
 
 def drill() -> Shape:
@@ -78,22 +78,22 @@ def drill() -> Shape:
         (-0.030, 0.052, 0.040, 0.052),
     ]
     handle = np.stack([at_height(ellipse(width, depth, 32, 2.6) + np.array([x, 0.0]), z) for x, width, depth, z in grip])
-    battery = rounded_box((0.114, 0.0565, 0.030), 0.006, dict.fromkeys(BOX_FACES, at["black"])).moved(-0.034, 0.0, -0.0787)
-    foot = rounded_box((0.098, 0.050, 0.012), 0.004, dict.fromkeys(BOX_FACES, at["orange"])).moved(-0.036, 0.0, -0.0600)
-    trigger = rounded_box((0.016, 0.016, 0.028), 0.004, dict.fromkeys(BOX_FACES, at["orange"])).moved(-0.010, 0.0, 0.020)
-    barrel = join(housing, chuck).turned("y", 90.0).moved(0.0, 0.0, 0.0652)
-    return join(barrel, solid(handle, at["black"]), battery, foot, trigger).turned("x", -90.0), texture
+    battery = rounded_box((0.114, 0.0565, 0.030), 0.006, dict.fromkeys(BOX_FACES, at["black"])).translate(-0.034, 0.0, -0.0787)
+    foot = rounded_box((0.098, 0.050, 0.012), 0.004, dict.fromkeys(BOX_FACES, at["orange"])).translate(-0.036, 0.0, -0.0600)
+    trigger = rounded_box((0.016, 0.016, 0.028), 0.004, dict.fromkeys(BOX_FACES, at["orange"])).translate(-0.010, 0.0, 0.020)
+    barrel = join(housing, chuck).rotate("y", 90.0).translate(0.0, 0.0, 0.0652)
+    return join(barrel, solid(handle, at["black"]), battery, foot, trigger).rotate("x", -90.0), texture
 
 
 def wood_block() -> Shape:
-    """A square block; all its sides are alike, and so are its ends."""
+    """A square block with four equal sides and two equal ends, so that it is symmetric."""
     texture, at = paint.pack({"side": paint.wood(300, 706, 1600), "end": paint.end_grain(300, 1602)}, 624)
     rects = {name: at["end" if name[1] == "z" else "side"] for name in BOX_FACES}
     return rounded_box((0.0875, 0.0875, 0.206), 0.002, rects), texture
 
 
 def foam_block() -> Shape:
-    """A brick of foam; opposite faces are alike."""
+    """A brick of foam; opposite faces are equal, so that it is symmetric."""
     color = (178, 66, 44)
     images = {"x": paint.foam(312, 202, color, 2100), "y": paint.foam(208, 202, color, 2102), "z": paint.foam(208, 312, color, 2104)}
     texture, at = paint.pack(images, 540)
@@ -122,7 +122,7 @@ def scissors() -> Shape:
 
 
 def marker() -> Shape:
-    """A thick marker along y; bands of colour, no print, so that nothing tells how it is turned."""
+    """A thick marker along y; with bands of colour and no print, so that it is symmetric about its axis."""
     bands = paint.blank(16, 256, (240, 240, 236))
     paint.fill(bands, (0.0, 0.0, 1.0, 0.06), (200, 30, 36))
     paint.fill(bands, (0.0, 0.30, 1.0, 0.34), (28, 28, 32))
@@ -141,7 +141,7 @@ def marker() -> Shape:
         loft(rings[2], at["cap"]),
         cap(rings[2][-1], at["cap"]),
     )
-    return patch.turned("x", -90.0), texture
+    return patch.rotate("x", -90.0), texture
 
 
 def clamp() -> Shape:
@@ -152,17 +152,17 @@ def clamp() -> Shape:
 def large_clamp() -> Shape:
     """A larger spring clamp, along x."""
     patch, texture = _clamp(0.210, 0.164, 0.0345, 2000)
-    return patch.turned("z", -90.0), texture
+    return patch.rotate("z", -90.0), texture
 
 
 def _clamp(length: float, width: float, depth: float, seed: int) -> Shape:
-    """A spring clamp along y whose halves change places by half a turn about y."""
+    """A spring clamp along y, symmetric under a rotation by 180° about y."""
     images = {"black": paint.plain(BLACK, seed), "orange": paint.plain(ORANGE, seed + 1), "steel": paint.plain(STEEL, seed + 2)}
     texture, at = paint.pack(images, 512)
-    shares = ((-0.445, -0.48), (-0.40, -0.40), (-0.30, -0.20), (-0.13, 0.02), (-0.095, 0.13), (-0.125, 0.26), (-0.09, 0.39), (-0.035, 0.48))
-    spine = [(x * width, y * length) for x, y in shares]
-    depths = [depth * share for share in (0.55, 0.75, 0.80, 0.95, 0.95, 0.85, 0.70, 0.55)]
-    widths = [0.098 * width * share for share in (0.6, 1.0, 1.0, 1.2, 1.15, 0.95, 0.75, 0.6)]
+    points = ((-0.445, -0.48), (-0.40, -0.40), (-0.30, -0.20), (-0.13, 0.02), (-0.095, 0.13), (-0.125, 0.26), (-0.09, 0.39), (-0.035, 0.48))
+    spine = [(x * width, y * length) for x, y in points]
+    depths = [depth * factor for factor in (0.55, 0.75, 0.80, 0.95, 0.95, 0.85, 0.70, 0.55)]
+    widths = [0.098 * width * factor for factor in (0.6, 1.0, 1.0, 1.2, 1.15, 0.95, 0.75, 0.6)]
     rings = _bar_rings(spine, 0.0, depths, widths)
     sleeve = len(rings) * 2 // 5
     arm = join(
@@ -172,35 +172,36 @@ def _clamp(length: float, width: float, depth: float, seed: int) -> Shape:
         cap(rings[-1], at["black"]),
     )
     pad = rounded_box((0.055 * width, 0.11 * length, 0.75 * depth), 0.0022, dict.fromkeys(BOX_FACES, at["orange"]))
-    half = join(arm, pad.moved(-0.036 * width, 0.445 * length, 0.0))
+    half = join(arm, pad.translate(-0.036 * width, 0.445 * length, 0.0))
     coil = [(0.055 * width, -depth / 2), (0.065 * width, -0.47 * depth), (0.065 * width, 0.47 * depth), (0.055 * width, depth / 2)]
-    pin = solid(lathe(coil, 28), at["steel"]).moved(0.0, 0.075 * length, 0.0)
-    return join(half, half.turned("y", 180.0), pin), texture
+    pin = solid(lathe(coil, 28), at["steel"]).translate(0.0, 0.075 * length, 0.0)
+    return join(half, half.rotate("y", 180.0), pin), texture
 
 
 def _bar_rings(spine: Points, z: float, depths: list[float], widths: list[float]) -> np.ndarray:
-    """Rings of a smooth bar through points in the plane at height z; depth along z and width across, for each point."""
+    """Rings of a smooth bar: a superellipse swept along a cubic spline in the plane at height z; depth (along z) and width per point."""
     points = np.array(spine)
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    fine = np.linspace(0.0, way[-1], 8 * (len(spine) - 1) + 1)
-    path = np.column_stack([CubicSpline(way, points)(fine), np.full(len(fine), z)])
-    scales = np.stack([np.interp(fine, way, depths), np.interp(fine, way, widths)], axis=1)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    fine = np.linspace(0.0, length[-1], 8 * (len(spine) - 1) + 1)
+    path = np.column_stack([CubicSpline(length, points)(fine), np.full(len(fine), z)])
+    scales = np.stack([np.interp(fine, length, depths), np.interp(fine, length, widths)], axis=1)
     return sweep(path, ellipse(1.0, 1.0, 16, 3.4), scales, (0.0, 0.0, 1.0))
 
 
 def _bar(spine: Points, z: float, depths: list[float], widths: list[float], rect: Rect) -> Patch:
+    """Closed bar; see `_bar_rings`."""
     return solid(_bar_rings(spine, z, depths, widths), rect)
 
 
 def _loop(center: tuple[float, float], radii: tuple[float, float], section: tuple[float, float], rect: Rect) -> Patch:
-    """A closed oval in the plane z = 0; section: depth along z, and width."""
-    turn = 2 * np.pi * np.arange(-1, 37) / 36
-    path = np.stack([center[0] + radii[0] * np.cos(turn), center[1] + radii[1] * np.sin(turn), np.zeros_like(turn)], axis=1)
+    """A closed oval ring in the plane z = 0; section: depth (along z) and width."""
+    angle = 2 * np.pi * np.arange(-1, 37) / 36
+    path = np.stack([center[0] + radii[0] * np.cos(angle), center[1] + radii[1] * np.sin(angle), np.zeros_like(angle)], axis=1)
     return torus(sweep(path, ellipse(*section, 14, 2.4), np.ones((len(path), 1)), (0.0, 0.0, 1.0))[1:-1], rect)
 
 
 def _drill_label() -> np.ndarray:
-    """Once around the motor, its axis upward in the picture; the same print on both sides of the drill."""
+    """Unrolled label of the motor, with its axis upward; the same print on both sides of the drill."""
     flank = paint.blank(300, 330, ORANGE)
     paint.fill(flank, (0.0, 0.0, 1.0, 0.16), BLACK)
     paint.fill(flank, (0.0, 0.84, 1.0, 1.0), BLACK)

@@ -1,4 +1,4 @@
-"""Embedded objects that hold something: pitcher, bowl, mug; hollow, with walls. Lengths [m]."""
+"""Embedded objects that are open vessels with walls: bowl, mug, pitcher. Lengths [m]."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from synpick_warp.scenes.embedded.meshes import Patch, Rect, cap, ellipse, join,
 from synpick_warp.scenes.embedded.packs import Shape
 
 SIDES = 48
-"""Points around a vessel."""
+"""Points per ring of a vessel."""
 
 
 def bowl() -> Shape:
-    """A bowl of enamel: red outside, cream inside, a dark rim. Nothing on it tells how it is turned."""
+    """A bowl of enamel: red outside, cream inside, a dark rim; symmetric about its axis."""
     outside = [
         (0.032, -0.0275),
         (0.034, -0.0275),
@@ -71,7 +71,7 @@ def pitcher() -> Shape:
     blue = (44, 92, 178)
     images = {"scale": _pitcher_scale(960, 560, blue), "blue": paint.plain(blue, 1101)}
     texture, at = paint.pack(images, 1024)
-    rings = [_with_spout(lathe(part, SIDES)) for part in (foot, outside, rim, inside)]
+    rings = [_add_spout(lathe(part, SIDES)) for part in (foot, outside, rim, inside)]
     body = join(
         cap(rings[0][0], at["blue"], below=True),
         loft(rings[0], at["blue"]),
@@ -80,18 +80,18 @@ def pitcher() -> Shape:
         loft(rings[3], at["blue"]),
         cap(rings[3][-1], at["blue"]),
     )
-    along_wall = 2.56  # the wall leans out by this angle [°]
-    handle = _handle((0.0597, 0.030, 0.075), (0.024, 0.011), at["blue"]).turned("y", along_wall).moved(0.0, 0.0, 0.012)
+    wall_tilt = 2.56  # draft angle of the wall [°]
+    handle = _handle((0.0597, 0.030, 0.075), (0.024, 0.011), at["blue"]).rotate("y", wall_tilt).translate(0.0, 0.0, 0.012)
     return join(body, handle), texture
 
 
 def _handle(reach: tuple[float, float, float], section: tuple[float, float], rect: Rect) -> Patch:
-    """A handle towards +x that ends inside the wall.
+    """A handle towards +x, swept along a superellipse, whose ends lie inside the wall.
 
     Args:
-        reach: x of its ends, how far it stands out from there, and half the distance of its ends.
+        reach: x of its ends, its extent from there, and half the distance between its ends.
         section: Width and thickness.
-        rect: Part of the texture.
+        rect: Texture rectangle.
     """
     start, out, half = reach
     angles = np.linspace(np.pi / 2, -np.pi / 2, 33)
@@ -102,8 +102,8 @@ def _handle(reach: tuple[float, float, float], section: tuple[float, float], rec
     return solid(sweep(path, ellipse(*section, 16, 2.4), np.ones((len(path), 1)), (0.0, 1.0, 0.0)), rect)
 
 
-def _with_spout(rings: np.ndarray) -> np.ndarray:
-    """Pull the upper part out towards -x."""
+def _add_spout(rings: np.ndarray) -> np.ndarray:
+    """Form a spout: displace the upper part of the rings towards -x, with a Gaussian profile in azimuth."""
     azimuth = np.arctan2(rings[..., 1], -rings[..., 0])
     height = np.clip((rings[..., 2] - 0.05) / 0.07, 0, 1)
     pull = 0.013 * height**2 * np.exp(-((azimuth / 0.32) ** 2))
@@ -114,8 +114,8 @@ def _mug_print(width: int, height: int, color: paint.Color) -> np.ndarray:
     image = paint.blank(width, height, color)
     paint.fill(image, (0.0, 0.0, 1.0, 0.08), (240, 236, 224))
     paint.fill(image, (0.0, 0.92, 1.0, 1.0), (240, 236, 224))
-    for turn in np.arange(12) * np.pi / 6:
-        paint.dot(image, 0.32 + 0.058 * np.cos(turn), 0.5 + 0.227 * np.sin(turn), 0.055, (246, 190, 60))
+    for angle in np.arange(12) * np.pi / 6:
+        paint.dot(image, 0.32 + 0.058 * np.cos(angle), 0.5 + 0.227 * np.sin(angle), 0.055, (246, 190, 60))
     paint.dot(image, 0.32, 0.5, 0.2, (246, 190, 60))
     paint.write(image, "GOOD", (0.405, 0.2, 0.62, 0.5), (240, 236, 224))
     paint.write(image, "MORNING", (0.405, 0.52, 0.62, 0.8), (246, 190, 60))

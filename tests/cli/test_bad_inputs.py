@@ -139,7 +139,7 @@ def mistake(capsys, *arguments: object) -> str:
         (lambda folder: float_picture(folder / "a.hdr", np.nan), "{folder}/a.hdr has radiance that is infinite or not a number"),
         (lambda folder: float_picture(folder / "a.hdr", np.inf), "{folder}/a.hdr has radiance that is infinite or not a number"),
         (lambda folder: float_picture(folder / "a.hdr", -1.0), "{folder}/a.hdr has negative radiance (-1); replace the map"),
-        (lambda folder: None, "lights folder {folder} holds no light map; "),
+        (lambda folder: None, "lights folder {folder} contains no environment map; "),
     ],
     ids=["truncated", "text", "set without map", "nan", "inf", "negative", "empty folder"],
 )
@@ -165,5 +165,5 @@ def test_a_texture_cut_short_is_one_line(tmp_path, capsys):
     data = cv2.imencode(".png", np.random.default_rng(0).integers(0, 256, (33, 21, 3)).astype(np.uint8))[1].tobytes()
     (models / "t.png").write_bytes(data[: len(data) // 2])
     heard = mistake(capsys, "bake", "--config", "smoke", "--device", "cpu", "--models", models, "--mode", "move", "--out", out)
-    assert heard.startswith(f"{models}/t.png: not readable as a picture (")
+    assert heard.startswith(f"{models}/t.png: not readable as an image (")
     assert not out.parent.exists()

@@ -291,8 +291,8 @@ def boxes(folder: Path, *sides: float) -> None:
 @pytest.mark.parametrize(
     ("sides", "settings", "said"),
     [
-        ((), "", "models folder {models}: no models in it; "),
-        ((0.05, 0.6), "", "cube_1: too large for the tote: 0.6 x 0.6 x 0.6 m, 1.039 m from end to end, but the tote's opening is "),
+        ((), "", "models folder {models}: it contains no models; "),
+        ((0.05, 0.6), "", "cube_1: too large for the tote: 0.6 x 0.6 x 0.6 m, diameter 1.039 m, but the tote's opening is "),
         ((0.05, 50.0), "", "cube_1: too large for the tote: 50 x 50 x 50 m, "),
         ((0.25, 0.2), "", "arrangement.volume is 0.003 m³, but the smallest object, cube_1, takes 0.008 m³; make it larger"),
         ((0.05,), '[[object_rows]]\nid = 1\nname = "cube_0"\ndiameter = 0.0866\nmass = 0\n', "object_rows[0].mass is 0 in {file}; "),

@@ -266,7 +266,7 @@ def test_the_first_object_is_drawn_again_until_one_fits_and_the_next_that_does_n
 )
 def test_rules_of_repeating_that_occur(mode, mix, rules, expected):
     config = settings(bake__mode=mode, bake__mix=list(mix), pick__repeats=rules[0], move__repeats=rules[1])
-    assert build.repeats_that_occur(config) == expected
+    assert build.find_repeat_rules(config) == expected
 
 
 def test_mixed_modes_have_the_slots_of_the_mode_that_needs_most(objects):

@@ -77,7 +77,7 @@ def test_resolution_scales_the_matrix():
         ({"ups": ((0.0, 0.0, 0.0),)}, "zero"),
         ({"ups": ((0.0, 1.0, 0.0), (0.0, 1.0, 0.0))}, "1 entries and cameras.ups 2"),
         ({"positions": (), "ups": ()}, "empty"),
-        ({"target": (0.0, 0.0, 2.0)}, "stands on"),
+        ({"target": (0.0, 0.0, 2.0)}, "is at cameras.target"),
         ({"target": (0.0, float("nan"), 0.0)}, "not finite"),
     ],
 )

@@ -175,7 +175,7 @@ def test_folders_that_are_not_there_or_empty(tmp_path):
     fails(config_for(tmp_path / "gone"), tmp_path, "gone", "no such folder")
     (tmp_path / "file").write_text("")
     fails(config_for(tmp_path / "file"), tmp_path, "no such folder")
-    fails(config_for(tmp_path), tmp_path, "no models in it")
+    fails(config_for(tmp_path), tmp_path, "contains no models")
 
 
 def test_two_files_for_one_object(tmp_path):
@@ -228,11 +228,11 @@ def turned_box(file: Path, extents: tuple[float, float, float], seed: int | None
 @pytest.mark.parametrize(
     ("extents", "said"),
     [
-        ((0.4, 0.41, 0.42), "0.4 x 0.41 x 0.42 m, 0.7103 m from end to end, "),
-        ((0.36, 0.37, 0.38), "0.36 x 0.37 x 0.38 m, 0.641 m from end to end, "),
+        ((0.4, 0.41, 0.42), "0.4 x 0.41 x 0.42 m, diameter 0.7103 m, "),
+        ((0.36, 0.37, 0.38), "0.36 x 0.37 x 0.38 m, diameter 0.641 m, "),
         ((0.02, 0.55, 0.3), ""),
         ((0.02, 0.57, 0.56), "0.02 x 0.56 x 0.57 m, "),
-        ((0.7, 0.03, 0.03), "0.03 x 0.03 x 0.7 m, 0.7013 m from end to end, but "),
+        ((0.7, 0.03, 0.03), "0.03 x 0.03 x 0.7 m, diameter 0.7013 m, but "),
         ((0.6, 0.03, 0.03), ""),
         ((0.54, 0.34, 0.1), ""),
         ((0.3, 0.3, 0.3), ""),
@@ -243,7 +243,7 @@ def test_objects_that_the_tote_cannot_take(tmp_path, extents, said, seed):
     write_box(tmp_path / "a.ply")
     turned_box(tmp_path / "thing.ply", extents, seed)
     if said:
-        tote = "but the tote's opening is 0.352 x 0.545 m, and 0.678 m the longest way through it; "
+        tote = "but the tote's opening is 0.352 x 0.545 m, and its inner diagonal 0.678 m; "
         fails(config_for(tmp_path), tmp_path, f"thing: too large for the tote: {said}", tote, "millimetres")
     else:
         assert len(load(config_for(tmp_path), tmp_path)) == 2

@@ -169,7 +169,7 @@ def test_real_maps_load(real_lights):
 
 def test_no_folder_and_no_maps(tmp_path):
     refused(tmp_path / "nowhere", "nowhere", "does not exist")
-    refused(tmp_path, str(tmp_path), "no light map")
+    refused(tmp_path, str(tmp_path), "no environment map")
     (tmp_path / "a.hdr").write_bytes(b"")
     refused(tmp_path / "a.hdr", "does not exist")
 
@@ -233,7 +233,7 @@ def test_a_set_that_overflows(tmp_path):
     ("text", "words"),
     [
         ("[Header]\nName = x\n", "no reflection map"),
-        ("no ini at all\n", "no sIBL set file"),
+        ("no ini at all\n", "not an sIBL set file"),
         ('[Reflection]\nREFfile = "ref.hdr"\nREFmap = 2\n', "REFmap = 2"),
     ],
 )

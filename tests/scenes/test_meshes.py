@@ -325,7 +325,7 @@ GOOD = ascii_ply(CORNERS, FACES)
         ("a.ply", ascii_ply([(float("nan"), 0, 0), *CORNERS[1:]], FACES), "1 vertices are not finite"),
         ("a.ply", binary_ply([(float("inf"), 0, 0), *CORNERS[1:]], FACES, ("x", "y", "z")), "not finite"),
         ("a.ply", binary_ply([(1e38, 0, 0), *CORNERS[1:]], FACES, ("x", "y", "z")), "unit"),
-        ("a.ply", ascii_ply(CORNERS, [*FACES[:3], (1, 2, 9)]), "names vertex 9"),
+        ("a.ply", ascii_ply(CORNERS, [*FACES[:3], (1, 2, 9)]), "refers to vertex 9"),
         ("a.ply", ascii_ply(CORNERS, FACES, comment="comment TextureFile gone.png"), "gone.png"),
         ("a.ply", binary_ply(CORNERS, FACES, ("x", "y", "z"))[:-9], "not readable"),
         ("a.ply", ascii_ply([c[:2] for c in CORNERS], FACES, ("x", "y")), "a.ply"),
@@ -354,7 +354,7 @@ def test_a_texture_needs_coordinates_and_a_readable_picture(tmp_path):
     with pytest.raises(CatalogError, match="texture_u"):
         read_mesh(file, 1.0)
     (tmp_path / "t.png").write_bytes(b"no picture")
-    with pytest.raises(CatalogError, match="not readable as a picture"):
+    with pytest.raises(CatalogError, match="not readable as an image"):
         read_mesh(file, 1.0)
 
 
