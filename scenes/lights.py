@@ -77,7 +77,7 @@ def _read_set(path: Path) -> EnvironmentMap:
     for section, key in (("Background", "BGfile"), ("Enviroment", "EVfile"), ("Reflection", "REFfile")):
         file = _text(parser, section, key)
         if file and not (path.parent / file).is_file():
-            raise LightError(f"{path} names {key} = {file}, a file that is missing beside it; add the file")
+            raise LightError(f"{path} names {key} = {file}, but there is no such file beside it; add it")
     file = _text(parser, "Reflection", "REFfile")
     if not file:
         raise LightError(f"{path} names no reflection map; it needs REFfile in [Reflection]")
