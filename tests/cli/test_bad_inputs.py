@@ -135,7 +135,10 @@ def mistake(capsys, *arguments: object) -> str:
     [
         (lambda folder: truncated(folder / "a.hdr"), "{folder}/a.hdr cannot be read as an image: it is empty, cut short or of another "),
         (lambda folder: (folder / "a.hdr").write_text("no picture"), "{folder}/a.hdr cannot be read as an image"),
-        (lambda folder: (folder / "room.ibl").write_text(IBL), "{folder}/room.ibl names REFfile = room.hdr, but there is no such file beside it; "),
+        (
+            lambda folder: (folder / "room.ibl").write_text(IBL),
+            "{folder}/room.ibl names REFfile = room.hdr, but there is no such file beside it; ",
+        ),
         (lambda folder: float_picture(folder / "a.hdr", np.nan), "{folder}/a.hdr has radiance that is infinite or not a number"),
         (lambda folder: float_picture(folder / "a.hdr", np.inf), "{folder}/a.hdr has radiance that is infinite or not a number"),
         (lambda folder: float_picture(folder / "a.hdr", -1.0), "{folder}/a.hdr has negative radiance (-1); replace the map"),
