@@ -1,1 +1,1 @@
-"""Visualization from files alone: contact sheets and explained pick attempts."""
+"""Visualization of data sets from their files: contact sheets, and figures that explain pick attempts."""

@@ -1,4 +1,7 @@
-"""Draws attempts to pick as the paper's figure does, from a data set's files alone: image, contours, suction points, clutter graph."""
+"""Figure of a pick attempt, from a data set's files: image with contours and suction points, clutter graph, choice, seal force.
+
+The layout follows the figure of the paper (Periyasamy et al., SynPick, 2021).
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import numpy as np
 
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.view_files import read_image, read_json
 from synpick_warp.errors import DatasetError
 from synpick_warp.viz.explain_graph import (
     CYCLIC,
@@ -29,51 +33,53 @@ from synpick_warp.viz.explain_graph import (
 )
 from synpick_warp.viz.explain_panels import GREEN, LINE, PLOT_HEIGHT, SMALL, SOFT, TEXT, WORDS_WIDTH, draw_load, draw_words
 from synpick_warp.viz.explain_record import MODE_WORDS, Attempt, Pixel, labels, read_attempts
-from synpick_warp.viz.preview import FONT, Image, check_picture_name, instance_color, put_text, read_image, read_json, write_picture
+from synpick_warp.viz.preview import FONT, Image, check_picture_name, instance_color, put_text, write_picture
 
 MARGIN = 20
-"""Around everything on the sheet, and between columns [px]."""
+"""Margin of the sheet, and gap between columns [px]."""
 HEAD = 64
-"""Height of the headline and of the captions below it [px]."""
+"""Height of the headline and the captions below it [px]."""
 IMAGE_WIDTH = 880
-"""Of the colour image on the sheet; it is never higher than `_HIGHEST` [px]."""
-_HIGHEST = 880
+"""Width of the colour image on the sheet [px]."""
+_MAX_IMAGE_HEIGHT = 880
+"""Maximum height of the colour image [px]."""
 _GRAPH_WIDTH = 500
-_LEAST_HEIGHT = 640
-"""Of a row, without its headline [px]."""
+"""Width of the clutter graph [px]."""
+_MIN_ROW_HEIGHT = 640
+"""Minimum height of a row without its headline [px]."""
 _LABEL = 0.5
-"""Size of an object's label on the image; the target's is larger."""
+"""Font scale of an object's label on the image; the target's is larger."""
 _HALO = 3
-"""Width of dark edges around bright lines on the image [px]."""
+"""Width of the dark outline around bright lines on the image [px]."""
 _MODEL_NAME = re.compile(rb"^comment (.+), millimetres\r?$", re.MULTILINE)
-"""How the exporter signs a model that it made."""
+"""Comment in a PLY file that the BOP exporter wrote: the object's name."""
 _PLY_HEAD = 2048
-"""Within so many bytes of a PLY file the comments stand [B]."""
+"""Size of the part of a PLY file that is searched for comments [B]."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Scene:
-    """What the files of camera 0 show of an attempt."""
+    """Images of camera 0 at the time of an attempt's observation."""
 
     place: str
     color: Image
     masks: dict[int, np.ndarray] | None
-    """Instance -> visible mask of the colour image; None: the data set has none."""
+    """Instance id -> modal mask; None: the data set has no masks."""
 
 
 def write_explanation(dataset: Path, out: Path, episode: int, attempt: int | None) -> Path:
-    """Draw one attempt of an episode, or all of them below each other, and write the picture.
+    """Draw one attempt of an episode, or all of them below each other, and write the image file.
 
     Args:
         dataset: Folder of the data set.
-        out: PNG or JPEG file to write; its folder is made.
-        episode: Its number.
-        attempt: Its number within the episode; None: all.
+        out: PNG or JPEG file to write; its folder is created.
+        episode: Index of the episode.
+        attempt: Index of the attempt in the episode; None: all.
 
     Raises:
         ConfigError: The data set's config.toml is damaged.
         DatasetError: There is no such attempt, or a file is missing or damaged.
-        OutputError: The picture cannot be written.
+        OutputError: The image cannot be written.
     """
     check_picture_name(out)
     if not dataset.is_dir():
@@ -89,24 +95,25 @@ def write_explanation(dataset: Path, out: Path, episode: int, attempt: int | Non
 
 
 def object_names(dataset: Path, config: Config, object_ids: set[int]) -> dict[int, str]:
-    """obj_id -> name, of those that have one: in the model that the exporter made, else in the settings' object table."""
+    """Names of objects (obj_id -> name): from the exported model's comment, else from the settings' object table; some have none."""
     infos = read_json(dataset / "models" / "models_info.json")
     names = {}
     for object_id in object_ids:
         path = dataset / "models" / f"obj_{object_id:06d}.ply"
-        made = None
+        comment = None
         if path.is_file():
             with path.open("rb") as file:
-                made = _MODEL_NAME.search(file.read(_PLY_HEAD))
+                comment = _MODEL_NAME.search(file.read(_PLY_HEAD))
         size = float(infos.get(str(object_id), {}).get("diameter", 0.0)) / 1000.0
         fits = (row.name for row in config.object_rows if row.id == object_id and _fits(row.diameter, size, config))
-        name = made[1].decode(errors="replace") if made else next(fits, "")
+        name = comment[1].decode(errors="replace") if comment else next(fits, "")
         if name:
             names[object_id] = name
     return names
 
 
 def _fits(expected: float, size: float, config: Config) -> bool:
+    """Whether a model's diameter matches that of a row in the object table [m]."""
     return abs(size - expected) <= config.objects.diameter_tolerance * expected
 
 
@@ -115,7 +122,7 @@ def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
     stem = f"{attempt.frame:06d}"
     truth = read_json(scene / "scene_gt.json").get(str(attempt.frame))
     if truth is None:
-        raise DatasetError(f"{scene}/scene_gt.json has no image {attempt.frame}, of which {dataset}/attempts.jsonl tells")
+        raise DatasetError(f"{scene}/scene_gt.json has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
     color = read_image(scene / "rgb", stem, cv2.IMREAD_COLOR)
     masks = None
     folder = scene / "mask_visib"
@@ -130,13 +137,13 @@ def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
 
 
 def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, int]) -> tuple[float, float]:
-    """Where a pixel of the sight image lies in the colour image (column, row), in both of which whole numbers are pixel centres.
+    """Map a pixel of the perception image to the colour image (column, row); in both, integers are pixel centres.
 
-    Both have the same camera in the middle, and their widths the same angle of view; heights may show more or less.
+    Both images have the same camera, principal point in the middle and horizontal field of view; their aspect ratios may differ.
 
     Args:
-        pixel: Column and row in the sight image.
-        resolution: Width and height of the sight image [px].
+        pixel: Column and row in the perception image.
+        resolution: Width and height of the perception image [px].
         size: Width and height of the colour image [px].
     """
     scale = size[0] / resolution[0]
@@ -145,15 +152,16 @@ def to_color_image(pixel: Pixel, resolution: tuple[int, int], size: tuple[int, i
 
 
 def image_scale(size: tuple[int, int]) -> float:
-    """By how much the colour image of that width and height [px] is enlarged on the sheet."""
-    return min(IMAGE_WIDTH / size[0], _HIGHEST / size[1])
+    """Scale of a colour image of that width and height [px] on the sheet."""
+    return min(IMAGE_WIDTH / size[0], _MAX_IMAGE_HEIGHT / size[1])
 
 
 def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Config) -> Image:
+    """Draw one attempt: image and force plot, clutter graph, text and table."""
     image = _draw_image(attempt, scene)
     words = draw_words(attempt, names, config)
     left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
-    height = max(left, words.shape[0], _LEAST_HEIGHT)
+    height = max(left, words.shape[0], _MIN_ROW_HEIGHT)
     sheet = np.full((HEAD + height + 2 * MARGIN, IMAGE_WIDTH + _GRAPH_WIDTH + WORDS_WIDTH + 4 * MARGIN, 3), 255, np.uint8)
     columns = MARGIN, 2 * MARGIN + IMAGE_WIDTH, 3 * MARGIN + IMAGE_WIDTH + _GRAPH_WIDTH
     top = MARGIN + HEAD
@@ -183,7 +191,7 @@ def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:
 
 
 def _draw_image(attempt: Attempt, scene: _Scene) -> Image:
-    """The colour image, darker but for the target, with contours and suction points."""
+    """Draw contours and suction points on the colour image, which is darkened except for the target."""
     height, width = scene.color.shape[:2]
     scale = image_scale((width, height))
     size = (round(scale * width), round(scale * height))
@@ -206,7 +214,7 @@ def _draw_image(attempt: Attempt, scene: _Scene) -> Image:
 
 
 def _draw_contours(drawn: Image, color: Image, mask: np.ndarray, instance: int, target: bool) -> None:
-    """Contours of all parts and holes of a mask, in place; the target keeps its brightness and gets a tint and a white edge."""
+    """Draw contours of a mask's components and holes, in place; the target keeps its brightness, with tint and white outline."""
     lines = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
     shade = instance_color(instance)
     if target:
@@ -219,7 +227,7 @@ def _draw_contours(drawn: Image, color: Image, mask: np.ndarray, instance: int, 
 
 
 def draw_mark(picture: Image, kind: int, place: tuple[float, float]) -> None:
-    """A candidate for the suction point, white with a dark edge: pole, a ring; centroid, a cross; half-way, a diamond."""
+    """Draw a suction point candidate, white with a dark outline: pole of inaccessibility, ring; centroid, cross; half-way, diamond."""
     x, y = place
     reach = 5.0
     shapes = {
@@ -235,7 +243,7 @@ def draw_mark(picture: Image, kind: int, place: tuple[float, float]) -> None:
 
 
 def draw_chosen(picture: Image, place: tuple[float, float], color: tuple[int, int, int], target: bool) -> None:
-    """A suction point: a disc in the object's colour; the target's has a ring about it as well."""
+    """Draw a suction point: a disc in the object's colour; the target's has a ring."""
     if target:
         disc(picture, place, 14, INK, 5)
         disc(picture, place, 14, WHITE, 3)
@@ -250,7 +258,7 @@ def _put_label(picture: Image, text: str, point: tuple[float, float], color: tup
 
 
 def _draw_key(sheet: Image, x: int, y: int) -> None:
-    """What the marks on the image mean."""
+    """Draw the legend of the image's markers."""
     for kind, text in enumerate(("pole of inaccessibility", "centroid", "half-way", "suction point", "that of the target")):
         place = (x + (17.0 if kind == 4 else 8.0), y - 4.5)
         if kind < 3:

@@ -1,4 +1,7 @@
-"""The clutter graph as a picture: layers from the top of the pile downward, each arrow from the object on top to the object below."""
+"""Layered graph drawing (Sugiyama et al., 1981) of the clutter graph: arrows run downward, from the object on top to the one below.
+
+Layers by longest path, crossing reduction by barycentres, x coordinates by isotonic least squares, long edges as splines.
+"""
 
 from __future__ import annotations
 
@@ -17,25 +20,25 @@ from synpick_warp.viz.explain_record import Attempt, SeenObject, labels
 from synpick_warp.viz.preview import FONT, Image, instance_color, put_text
 
 RADIUS = 20
-"""Of a node [px]."""
-_APART = 13
-"""Least gap between nodes of a layer [px]."""
-_STRETCH = 1.7
-"""A narrow graph is widened by at most so much."""
+"""Radius of a node [px]."""
+_MIN_GAP = 13
+"""Minimum gap between nodes of a layer [px]."""
+_MAX_STRETCH = 1.7
+"""Maximum factor by which a narrow graph is widened."""
 _ROUTE = 9
-"""Half the room that a passing arrow gets in a layer [px]."""
-_LAYER = 150
-"""Largest distance of two layers [px]."""
+"""Half the width reserved for an edge that passes a layer [px]."""
+_MAX_LAYER_GAP = 150
+"""Maximum distance of two layers [px]."""
 _MARGIN = 38
-"""From the picture's border to the outermost nodes' centres [px]."""
+"""Distance from the border to the outermost nodes' centres [px]."""
 _SWEEPS = 8
-"""Down and up again, each: more change nothing in graphs of this size."""
+"""Number of downward and upward sweeps; more change nothing in graphs of this size."""
 _BEND = 0.32
-"""How far an edge that is not in the graph is bent aside, as a share of its length; the curve goes half as far."""
+"""Offset of the control point of a removed edge's curve, as a fraction of its length; the curve deviates by half of it."""
 _SAMPLES = 12
-"""Points of a curve between two layers."""
+"""Number of points of a curve between two layers."""
 _SHIFT = 4
-"""Fractional bits of coordinates that OpenCV gets."""
+"""Fractional bits of OpenCV's fixed-point coordinates."""
 INK = (40, 40, 40)
 GREY = (150, 150, 150)
 RED = (60, 60, 200)
@@ -43,31 +46,31 @@ WHITE = (255, 255, 255)
 KEPT, OUTVOTED, CYCLIC = "kept", "outvoted by the opposite", "dropped to break a cycle"
 
 Key = int | tuple[int, int, int]
-"""An instance; or a place where the arrow (upper, lower) passes layer n."""
+"""A node: an instance id, or the dummy node of edge (upper, lower) in layer n."""
 
 
 @dataclass(frozen=True)
 class Edge:
-    """An arrow."""
+    """Directed edge between two instances."""
 
     upper: int
     lower: int
     weight: float
-    """Votes, less those for the opposite; where it is not kept, its own votes."""
+    """Votes minus those for the opposite edge; of a removed edge, its own votes."""
     state: str
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Where everything stands in the picture [px]."""
+    """Positions in the image [px]."""
 
     nodes: dict[int, tuple[float, float]]
     routes: dict[tuple[int, int], np.ndarray]
-    """(upper, lower) of kept edges -> (N, 2) points from node to node."""
+    """(upper, lower) of a kept edge -> polyline from node to node (N, 2)."""
 
 
 def clutter_edges(attempt: Attempt, min_votes: float) -> list[Edge]:
-    """All edges for which there are votes enough, in order of instance: those of the graph, and those that were taken out of it."""
+    """All edges with at least `min_votes`, sorted by instance: those kept in the acyclic graph, and those removed from it."""
     edges = []
     for lower, one in sorted(attempt.objects.items()):
         voted = {upper for (at, upper), votes in attempt.votes.items() if at == lower and votes >= min_votes}
@@ -82,20 +85,20 @@ def clutter_edges(attempt: Attempt, min_votes: float) -> list[Edge]:
 
 
 def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> Layout:
-    """Place nodes in layers, so that every kept edge runs downward, and with few crossings.
+    """Place nodes in layers such that every kept edge runs downward, with few crossings.
 
     Args:
-        attempt: Its suction points give the order from left to right to begin with.
-        edges: The attempt's.
-        size: Width and height of the picture [px].
+        attempt: Its suction points give the initial order from left to right.
+        edges: Edges of the attempt.
+        size: Width and height of the image [px].
 
     Raises:
-        DatasetError: Kept edges run in a circle.
+        DatasetError: The kept edges have a cycle.
     """
     width, height = size
     kept = [(edge.upper, edge.lower) for edge in edges if edge.state == KEPT]
     place: dict[Key, float] = {one.instance: one.suction[0] / attempt.resolution[0] for one in attempt.seen}
-    depth = _depths(attempt, kept, place, max(1, int((width - 2 * _MARGIN) // (2 * RADIUS + _APART)) + 1))
+    depth = _assign_layers(attempt, kept, place, max(1, int((width - 2 * _MARGIN) // (2 * RADIUS + _MIN_GAP)) + 1))
     layers: list[list[Key]] = [[] for _ in range(1 + max(depth.values(), default=-1))]
     for instance, layer in depth.items():
         layers[layer].append(instance)
@@ -108,15 +111,15 @@ def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> L
         chains[upper, lower] = [upper, *passed, lower]
     pairs = [pair for chain in chains.values() for pair in itertools.pairwise(chain)]
     seeds: dict[Key, float] = {key: _MARGIN + x * (width - 2 * _MARGIN) for key, x in place.items()}
-    column = _widened(_columns(_ordered(layers, pairs, place), pairs, seeds, width), width)
-    gap = min(_LAYER, (height - 2 * _MARGIN) / max(1, len(layers) - 1))
+    column = _widen(_align_columns(_order_layers(layers, pairs, place), pairs, seeds, width), width)
+    gap = min(_MAX_LAYER_GAP, (height - 2 * _MARGIN) / max(1, len(layers) - 1))
     point = {key: (column[key], _MARGIN + gap * layer) for layer, keys in enumerate(layers) for key in keys}
     routes = {edge: _curve(np.array([point[key] for key in chain])) for edge, chain in chains.items()}
     return Layout({instance: point[instance] for instance in depth}, routes)
 
 
-def _depths(attempt: Attempt, kept: list[tuple[int, int]], place: Mapping[Key, float], room: int) -> dict[int, int]:
-    """Layer of each instance: the longest path from above; layers with too many nodes become several."""
+def _assign_layers(attempt: Attempt, kept: list[tuple[int, int]], place: Mapping[Key, float], capacity: int) -> dict[int, int]:
+    """Assign each instance to a layer by its longest path from a source; layers with more than `capacity` nodes are split."""
     graph = nx.DiGraph(kept)
     graph.add_nodes_from(one.instance for one in attempt.seen)
     try:
@@ -124,13 +127,13 @@ def _depths(attempt: Attempt, kept: list[tuple[int, int]], place: Mapping[Key, f
             sorted(layer, key=lambda instance: (graph.degree(instance) > 0, place[instance])) for layer in nx.topological_generations(graph)
         ]
     except nx.NetworkXUnfeasible as error:
-        raise DatasetError(f"the clutter graph of attempt {attempt.number} of episode {attempt.episode} runs in a circle") from error
-    rows = [layer[start : start + room] for layer in generations for start in range(0, len(layer), room)]
+        raise DatasetError(f"the clutter graph of attempt {attempt.number} of episode {attempt.episode} has a cycle") from error
+    rows = [layer[start : start + capacity] for layer in generations for start in range(0, len(layer), capacity)]
     return {instance: number for number, row in enumerate(rows) for instance in row}
 
 
-def _ordered(layers: list[list[Key]], pairs: list[tuple[Key, Key]], place: Mapping[Key, float]) -> list[list[Key]]:
-    """Each layer ordered by the mean position of its neighbours, downward and upward in turn; of all orders that with least crossings."""
+def _order_layers(layers: list[list[Key]], pairs: list[tuple[Key, Key]], place: Mapping[Key, float]) -> list[list[Key]]:
+    """Crossing reduction: sort each layer by the barycentre of its neighbours, downward and upward in turn; returns the best order seen."""
     above: dict[Key, list[Key]] = {key: [] for layer in layers for key in layer}
     below: dict[Key, list[Key]] = {key: [] for layer in layers for key in layer}
     for upper, lower in pairs:
@@ -144,12 +147,13 @@ def _ordered(layers: list[list[Key]], pairs: list[tuple[Key, Key]], place: Mappi
             rank = {key: (index + 0.5) / len(layer) for layer in current for index, key in enumerate(layer)}
             means = {key: float(np.mean([rank[other] for other in neighbours[key] or [key]])) for key in current[number]}
             current[number].sort(key=means.__getitem__)
-        if _crossings(current, pairs) < _crossings(best, pairs):
+        if _count_crossings(current, pairs) < _count_crossings(best, pairs):
             best = current
     return best
 
 
-def _crossings(layers: list[list[Key]], pairs: list[tuple[Key, Key]]) -> int:
+def _count_crossings(layers: list[list[Key]], pairs: list[tuple[Key, Key]]) -> int:
+    """Number of crossing pairs of edge segments."""
     layer_of = {key: number for number, layer in enumerate(layers) for key in layer}
     rank = {key: index for layer in layers for index, key in enumerate(layer)}
     return sum(
@@ -159,8 +163,8 @@ def _crossings(layers: list[list[Key]], pairs: list[tuple[Key, Key]]) -> int:
     )
 
 
-def _columns(layers: list[list[Key]], pairs: list[tuple[Key, Key]], place: Mapping[Key, float], width: int) -> dict[Key, float]:
-    """x of each key [px]: as near as possible to the mean of its neighbours, in order and apart (least squares, by isotonic regression)."""
+def _align_columns(layers: list[list[Key]], pairs: list[tuple[Key, Key]], place: Mapping[Key, float], width: int) -> dict[Key, float]:
+    """x of each node [px]: least squares to the mean of its neighbours under order and gaps, by isotonic regression."""
     near: dict[Key, list[Key]] = {key: [] for layer in layers for key in layer}
     for upper, lower in pairs:
         near[lower].append(upper)
@@ -169,7 +173,7 @@ def _columns(layers: list[list[Key]], pairs: list[tuple[Key, Key]], place: Mappi
     for sweep in range(2 * _SWEEPS):
         for layer in layers if sweep % 2 == 0 else layers[::-1]:
             wanted = np.array([np.mean([x[other] for other in near[key] or [key]]) for key in layer])
-            half = np.array([RADIUS + _APART / 2 if isinstance(key, int) else _ROUTE for key in layer])
+            half = np.array([RADIUS + _MIN_GAP / 2 if isinstance(key, int) else _ROUTE for key in layer])
             apart = np.concatenate(([0.0], np.cumsum(half[1:] + half[:-1])))
             apart *= min(1.0, (width - 2 * _MARGIN) / max(apart[-1], 1.0))
             free = np.asarray(isotonic_regression(wanted - apart).x)
@@ -177,17 +181,17 @@ def _columns(layers: list[list[Key]], pairs: list[tuple[Key, Key]], place: Mappi
     return x
 
 
-def _widened(column: Mapping[Key, float], width: int) -> dict[Key, float]:
-    """The same columns in the middle of the picture, farther apart where there is room."""
+def _widen(column: Mapping[Key, float], width: int) -> dict[Key, float]:
+    """Centre the graph horizontally, and widen it where the image allows."""
     if not column:
         return {}
     low, high = min(column.values()), max(column.values())
-    factor = min(_STRETCH, (width - 2 * _MARGIN) / max(high - low, 1.0))
+    factor = min(_MAX_STRETCH, (width - 2 * _MARGIN) / max(high - low, 1.0))
     return {key: width / 2 + factor * (x - (low + high) / 2) for key, x in column.items()}
 
 
 def _curve(points: np.ndarray) -> np.ndarray:
-    """A smooth curve through points (Catmull and Rom, 1974); two points give a straight line."""
+    """Catmull-Rom spline through points (Catmull and Rom, 1974); two points give a straight line."""
     padded = np.concatenate((2 * points[:1] - points[1:2], points, 2 * points[-1:] - points[-2:-1]))
     t = np.linspace(0.0, 1.0, _SAMPLES)[:, None]
     parts = [
@@ -198,11 +202,11 @@ def _curve(points: np.ndarray) -> np.ndarray:
 
 
 def draw_graph(attempt: Attempt, min_votes: float, size: tuple[int, int]) -> Image:
-    """The graph on white, without its explanation.
+    """Draw the clutter graph on white, without legend.
 
     Args:
-        attempt: Whose graph.
-        min_votes: Votes that make an edge.
+        attempt: Attempt whose observation gave the graph.
+        min_votes: Minimum votes of an edge.
         size: Width and height [px].
     """
     canvas = np.full((size[1], size[0], 3), 255, np.uint8)
@@ -225,6 +229,7 @@ def draw_graph(attempt: Attempt, min_votes: float, size: tuple[int, int]) -> Ima
 
 
 def _draw_node(canvas: Image, place: tuple[float, float], label: str, one: SeenObject, target: bool) -> None:
+    """Draw a node with its label, and a badge with the number of its ancestors."""
     x, y = place
     color = instance_color(one.instance)
     if target:
@@ -240,7 +245,7 @@ def _draw_node(canvas: Image, place: tuple[float, float], label: str, one: SeenO
 
 
 def _draw_arrow(canvas: Image, route: np.ndarray, color: tuple[int, int, int], thickness: int, dashed: bool = False) -> None:
-    """From node to node: the curve is cut at both nodes' borders, and ends in a triangle."""
+    """Draw a curve clipped at both nodes' borders, with an arrow head."""
     dense = _resample(route)
     free = (np.hypot(*(dense - dense[0]).T) > RADIUS + 1) & (np.hypot(*(dense - dense[-1]).T) > RADIUS + 3)
     line = dense[free]
@@ -257,7 +262,7 @@ def _draw_arrow(canvas: Image, route: np.ndarray, color: tuple[int, int, int], t
 
 
 def _draw_bent(canvas: Image, edge: Edge, layout: Layout) -> None:
-    """An edge that is not in the graph, beside the straight line, where its opposite runs."""
+    """Draw a removed edge as a dashed curve beside the straight line, on which its opposite runs."""
     start, end = (np.array(layout.nodes[node]) for node in (edge.upper, edge.lower))
     bend = (start + end) / 2 + _BEND * np.array([end[1] - start[1], start[0] - end[0]])
     t = np.linspace(0.0, 1.0, 3 * _SAMPLES)[:, None]
@@ -265,31 +270,32 @@ def _draw_bent(canvas: Image, edge: Edge, layout: Layout) -> None:
 
 
 def _draw_weight(canvas: Image, edge: Edge, route: np.ndarray) -> None:
+    """Draw the votes of an edge on its curve."""
     dense = _resample(route)
     place = dense[int(0.42 * len(dense))]
     put_boxed(canvas, f"{edge.weight:.0f}", (float(place[0]), float(place[1])), 0.38, (90, 90, 90), WHITE)
 
 
 def _resample(route: np.ndarray) -> np.ndarray:
-    """The same curve in steps of one pixel."""
+    """Resample a polyline in steps of one pixel."""
     length = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(route, axis=0).T))))
     steps = np.linspace(0.0, length[-1], max(2, math.ceil(length[-1])))
     return np.stack([np.interp(steps, length, route[:, axis]) for axis in range(2)], axis=1)
 
 
 def fixed(points: np.ndarray) -> np.ndarray:
-    """Points (N, 2) as OpenCV takes fractions of pixels, with `shift` 4."""
+    """Convert points (N, 2) to OpenCV's fixed-point coordinates with `shift` 4."""
     return np.rint(np.asarray(points) * (1 << _SHIFT)).astype(np.int32)
 
 
 def disc(canvas: Image, place: Sequence[float], radius: float, color: tuple[int, int, int], thickness: int = -1) -> None:
-    """A circle with fractions of pixels; thickness -1: filled."""
+    """Draw a circle at subpixel position; thickness -1: filled."""
     x, y = (round(value * (1 << _SHIFT)) for value in place)
     cv2.circle(canvas, (x, y), round(radius * (1 << _SHIFT)), color, thickness, cv2.LINE_AA, _SHIFT)
 
 
 def put_centered(canvas: Image, text: str, place: Sequence[float], size: float, color: tuple[int, int, int], thickness: int) -> None:
-    """Text whose middle is at a place."""
+    """Draw text centred at a position."""
     (width, height), _ = cv2.getTextSize(text, FONT, size, thickness)
     put_text(canvas, text, (round(place[0] - width / 2), round(place[1] + height / 2)), size, color, thickness)
 
@@ -297,7 +303,7 @@ def put_centered(canvas: Image, text: str, place: Sequence[float], size: float, 
 def put_boxed(
     canvas: Image, text: str, place: Sequence[float], size: float, color: tuple[int, int, int], ground: tuple[int, int, int]
 ) -> None:
-    """As `put_centered`, on a box of another colour."""
+    """Draw centred text on a filled box of colour `ground`."""
     (width, height), _ = cv2.getTextSize(text, FONT, size, 1)
     half = np.array([width / 2 + 2, height / 2 + 2])
     low, high = np.rint(np.array(place) - half).astype(int), np.rint(np.array(place) + half).astype(int)
@@ -306,6 +312,6 @@ def put_boxed(
 
 
 def readable_on(color: tuple[int, int, int]) -> tuple[int, int, int]:
-    """Dark or white, whichever can be read on a colour (blue first)."""
+    """Text colour with contrast to a background (blue first): dark or white by luma."""
     blue, green, red = color
     return INK if 0.114 * blue + 0.587 * green + 0.299 * red > 110 else WHITE

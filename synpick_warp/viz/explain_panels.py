@@ -1,4 +1,4 @@
-"""Panels beside the image and the clutter graph of an attempt: words, the table of objects, the seal's load."""
+"""Panels of an attempt's figure: explanation in sentences, table of objects, plot of the seal force over time."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from synpick_warp.viz.explain_record import Attempt, break_force, choice_words, 
 from synpick_warp.viz.preview import FONT, Image, instance_color, put_text
 
 WORDS_WIDTH = 470
-"""Of the words and the table [px]."""
+"""Width of the text and the table [px]."""
 PLOT_HEIGHT = 190
-_PLOT_MOST = 260
-"""Least and largest height of the plot [px]."""
+_MAX_PLOT_HEIGHT = 260
+"""Minimum and maximum height of the plot [px]."""
 LINE = 22
-"""Of text [px]."""
+"""Height of a line of text [px]."""
 TEXT = 0.46
-"""Size of text, as OpenCV's font scale."""
+"""Font scale of text (OpenCV)."""
 SMALL = 0.42
 GREEN = (60, 130, 30)
 SOFT = (110, 110, 110)
 _BLUE = (170, 90, 20)
 _COLUMNS = ((0, "object"), (236, "above"), (296, "share"), (356, "pixels"), (416, "point"))
-"""Place [px] and heading of the table's columns."""
+"""Position [px] and heading of the table's columns."""
 
 
 def draw_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> Image:
-    """Sentences, and below them all objects in the order of choice."""
+    """Draw the explanation in sentences, and below it the table of objects, ranked by the choice rule."""
     lines = [(line, INK) for text in choice_words(attempt, names, config) for line in wrapped(text, TEXT, WORDS_WIDTH)]
     lines += [(line, INK) for text in seal_words(attempt, names, config) for line in wrapped(text, TEXT, WORDS_WIDTH)]
-    last = attempt.sentence[:1].upper() + attempt.sentence[1:]
-    lines += [(line, GREEN if attempt.picked else RED) for line in wrapped(last, TEXT, WORDS_WIDTH)]
+    outcome = attempt.sentence[:1].upper() + attempt.sentence[1:]
+    lines += [(line, GREEN if attempt.picked else RED) for line in wrapped(outcome, TEXT, WORDS_WIDTH)]
     canvas = np.full((LINE * (len(lines) + len(attempt.seen) + 3), WORDS_WIDTH, 3), 255, np.uint8)
     for number, (text, color) in enumerate(lines):
         put_text(canvas, text, (0, LINE * number + 16), TEXT, color)
@@ -44,6 +44,7 @@ def draw_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> Im
 
 
 def _draw_table(canvas: Image, attempt: Attempt, names: Mapping[int, str], top: int) -> None:
+    """Draw the table of objects, in place; the target's row is highlighted."""
     short = labels(attempt)
     for x, text in _COLUMNS:
         put_text(canvas, text, (x, top + 16), TEXT, SOFT)
@@ -63,7 +64,7 @@ def _draw_table(canvas: Image, attempt: Attempt, names: Mapping[int, str], top: 
 
 
 def wrapped(text: str, size: float, width: int) -> list[str]:
-    """Text in lines of at most that width [px]; all but the first are indented."""
+    """Wrap text to lines of at most that width [px]; all but the first are indented."""
     lines: list[str] = []
     current = ""
     for word in text.split():
@@ -77,7 +78,7 @@ def wrapped(text: str, size: float, width: int) -> list[str]:
 
 
 def fitted(text: str, size: float, width: int) -> str:
-    """Text, cut so that it takes at most that width [px]."""
+    """Truncate text to that width [px]."""
     if cv2.getTextSize(text, FONT, size, 2)[0][0] <= width:
         return text
     while text and cv2.getTextSize(text + "..", FONT, size, 2)[0][0] > width:
@@ -86,24 +87,24 @@ def fitted(text: str, size: float, width: int) -> str:
 
 
 def draw_load(attempt: Attempt, config: Config, width: int, height: int) -> Image:
-    """Load over time, with the break force."""
-    height = max(PLOT_HEIGHT, min(height, _PLOT_MOST))
+    """Plot the seal force over time, with the break force."""
+    height = max(PLOT_HEIGHT, min(height, _MAX_PLOT_HEIGHT))
     canvas = np.full((height, width, 3), 255, np.uint8)
     left, right, top, bottom = 52, width - 12, 26, height - 40
-    put_text(canvas, "load of the seal [N] (the largest, if several)", (0, 14), TEXT, SOFT)
+    put_text(canvas, "seal force [N] (the largest, if several)", (0, 14), TEXT, SOFT)
     cv2.line(canvas, (left, bottom), (right, bottom), INK, 1)
     cv2.line(canvas, (left, top), (left, bottom), INK, 1)
     if not attempt.load or not attempt.hits:
-        put_text(canvas, "no load: nothing was caught", (left + 20, (top + bottom) // 2), TEXT, SOFT)
+        put_text(canvas, "no force: nothing was engaged", (left + 20, (top + bottom) // 2), TEXT, SOFT)
         return canvas
     tick = config.physics.step * config.physics.steps_per_tick
     limit = break_force(attempt, config)
-    span, most = tick * max(1, len(attempt.load) - 1), 1.12 * max(limit, *attempt.load)
+    span, peak = tick * max(1, len(attempt.load) - 1), 1.12 * max(limit, *attempt.load)
 
     def place(time: float, load: float) -> tuple[float, float]:
-        return left + (right - left) * time / span, bottom - (bottom - top) * load / most
+        return left + (right - left) * time / span, bottom - (bottom - top) * load / peak
 
-    for value in ticks(most, 4):
+    for value in ticks(peak, 4):
         x, y = place(0.0, value)
         cv2.line(canvas, (round(x) - 4, round(y)), (right, round(y)), (228, 228, 228) if value else INK, 1)
         text = f"{value:g}"
@@ -123,9 +124,9 @@ def draw_load(attempt: Attempt, config: Config, width: int, height: int) -> Imag
     return canvas
 
 
-def ticks(most: float, count: int) -> Sequence[float]:
-    """Round numbers from 0 to `most`, about so many: steps of 1, 2 or 5 times a power of ten."""
-    raw = most / count
+def ticks(maximum: float, count: int) -> Sequence[float]:
+    """Axis ticks from 0 to `maximum`, about `count`, at steps of 1, 2 or 5 times a power of ten."""
+    raw = maximum / count
     power = 10.0 ** np.floor(np.log10(raw))
     step = next(factor * power for factor in (1, 2, 5, 10) if factor * power >= raw)
-    return [float(round(step * number, 9)) for number in range(int(most / step + 1e-9) + 1)]
+    return [float(round(step * number, 9)) for number in range(int(maximum / step + 1e-9) + 1)]

@@ -1,4 +1,4 @@
-"""The record of an attempt to pick: read from a data set's attempts.jsonl, and told in words."""
+"""Records of pick attempts: parsed and validated from attempts.jsonl, and explained in sentences."""
 
 from __future__ import annotations
 
@@ -15,74 +15,74 @@ from synpick_warp.errors import DatasetError
 
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
 CANDIDATES = ("pole", "centroid", "middle")
-"""Where a suction point may lie, in the order of `SeenObject.distances`."""
+"""Candidates of the suction point, in the order of `SeenObject.distances`."""
 
 Pixel = tuple[float, float]
-"""Column and row in the sight image; whole numbers are pixel centres."""
+"""Column and row in the perception image; integers are pixel centres."""
 
 
 @dataclass(frozen=True)
 class SeenObject:
-    """What was concluded of one instance of which something was visible."""
+    """Observation of one visible instance."""
 
     instance: int
     object_id: int
     visible: int
-    """Pixels of its largest component."""
+    """Pixel count of its largest connected component."""
     share: float
-    """Visible share of the expected area."""
+    """Visible fraction of the expected area."""
     candidates: tuple[Pixel, Pixel, Pixel]
-    """As `CANDIDATES`."""
+    """Positions of `CANDIDATES`."""
     distances: tuple[float, float, float]
-    """Distance of each to the contour [px]."""
+    """Distance of each candidate to the contour [px]."""
     suction: Pixel
     above: frozenset[int]
-    """Instances from which an edge of the clutter graph runs to this one."""
+    """Parents: instances with an edge of the clutter graph to this one."""
     all_above: frozenset[int]
-    """Instances from which a path does."""
+    """Ancestors: instances with a path to this one (transitive closure)."""
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """One try to pick."""
+    """One pick attempt."""
 
     episode: int
     number: int
     mode: str
     frame: int
-    """Image from which was chosen."""
+    """Frame of the observation."""
     end_frame: int
     sentence: str
-    """Of the outcome."""
+    """The outcome in words."""
     target: int | None
     tilt: float | None
-    """Of the cup [rad]; None, as `hits`: nothing was chosen."""
+    """Tilt of the cup about the wrist axis [rad]; None: nothing was chosen."""
     rays: int
     hits: int
     good_seal: bool
     caught: tuple[int, ...]
     picked: tuple[int, ...]
     load: tuple[float, ...]
-    """Largest load of any seal in each tick of the lift [N]; the suction was switched on at the end of the first."""
+    """Largest seal force in each tick of the lift [N]; the suction is switched on at the end of the first."""
     resolution: tuple[int, int]
-    """Width and height of the sight image [px]."""
+    """Width and height of the perception image [px]."""
     seen: tuple[SeenObject, ...]
     votes: dict[tuple[int, int], float]
-    """(lower, upper): what the contour of the lower says for the upper lying above it."""
+    """(lower, upper) -> occlusion votes along the contour of the lower that the upper lies above it."""
 
     @property
     def objects(self) -> dict[int, SeenObject]:
-        """Instance -> what was seen of it."""
+        """Instance id -> its observation."""
         return {one.instance: one for one in self.seen}
 
     def ranked(self) -> list[SeenObject]:
-        """In the order of choice: fewest objects above, then largest share; in targeted picking the reverse."""
+        """Rank by the choice rule: fewest ancestors, then largest visible fraction; in targeted picking the reverse."""
         sign = -1 if self.mode == "target" else 1
         return sorted(self.seen, key=lambda one: (sign * len(one.all_above), -sign * one.share, one.instance))
 
 
 def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attempt]:
-    """The attempts of an episode, ordered, or one of them.
+    """Read the attempts of an episode, sorted, or one of them.
 
     Raises:
         DatasetError: The file is missing or damaged, or has no such episode or attempt.
@@ -104,36 +104,36 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
             except KeyError as error:
                 raise DatasetError(f"{path}, line {line}: the record has no {error.args[0]}") from error
             except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-                raise DatasetError(f"{path}, line {line}: the record of an attempt has a value of the wrong kind: {error}") from error
+                raise DatasetError(f"{path}, line {line}: the record of an attempt has a value of the wrong type: {error}") from error
     return attempts
 
 
 def _read_records(path: Path) -> list[tuple[int, dict[str, Any]]]:
-    """Line number and object of every line."""
+    """Parse a JSON Lines file: line number and object of every line."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except FileNotFoundError as error:
         raise DatasetError(
-            f"{path.parent} has no {path.name}: nothing was picked; explain draws attempts of a bake with mode pick, target or mixed"
+            f"{path.parent} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target or mixed"
         ) from error
     except OSError as error:
         raise DatasetError(f"cannot read {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise DatasetError(f"{path} is no text: byte {error.start} is no UTF-8") from error
+        raise DatasetError(f"{path} is not text: byte {error.start} is not UTF-8") from error
     records = []
     for line, text in enumerate(lines, start=1):
         try:
             record = json.loads(text)
         except ValueError as error:
-            raise DatasetError(f"{path}, line {line} is no JSON: {error}") from error
+            raise DatasetError(f"{path}, line {line} is not JSON: {error}") from error
         if not isinstance(record, dict) or not all(type(record.get(key)) is int for key in ("episode", "attempt")):
-            raise DatasetError(f"{path}, line {line} is no record of an attempt: it needs whole numbers episode and attempt")
+            raise DatasetError(f"{path}, line {line} is not a record of an attempt: it needs integers episode and attempt")
         records.append((line, record))
     return records
 
 
 def _which(what: str, numbers: list[int]) -> str:
-    """Whole numbers, ascending, with runs put together."""
+    """List ascending integers with runs merged: "attempts: 0 to 3, 5"."""
     runs: list[list[int]] = []
     for number in numbers:
         if runs and number == runs[-1][1] + 1:
@@ -144,6 +144,7 @@ def _which(what: str, numbers: list[int]) -> str:
 
 
 def _attempt(record: dict[str, Any]) -> Attempt:
+    """Parse and validate the record of an attempt."""
     sight = record["sight"]
     width, height = map(int, sight["resolution"])
     if min(width, height) < 1:
@@ -151,7 +152,7 @@ def _attempt(record: dict[str, Any]) -> Attempt:
     seen = tuple(_seen(one) for one in sight["instances"] if one["visible"] > 0)
     target = None if record["target"] is None else int(record["target"])
     if target is not None and target not in {one.instance for one in seen}:
-        raise ValueError(f"target is {target}, which was not seen")
+        raise ValueError(f"target is {target}, which was not visible")
     if record["mode"] not in MODE_WORDS:
         raise ValueError(f"mode is {json.dumps(record['mode'])}")
     return Attempt(
@@ -196,13 +197,14 @@ def _pixel(value: Any) -> Pixel:
 
 
 def _finite(value: Any) -> float:
+    """Check that a number is finite."""
     if not math.isfinite(value):
         raise ValueError(f"{value} is not finite")
     return float(value)
 
 
 def labels(attempt: Attempt) -> dict[int, str]:
-    """Short name of every seen instance: its obj_id, with a letter where several have the same."""
+    """Short label of every visible instance: its obj_id, with a letter where several share it."""
     by_object: dict[int, list[int]] = {}
     for one in attempt.seen:
         by_object.setdefault(one.object_id, []).append(one.instance)
@@ -214,18 +216,18 @@ def labels(attempt: Attempt) -> dict[int, str]:
 
 
 def full_names(attempt: Attempt, names: Mapping[int, str]) -> dict[int, str]:
-    """Label and the object's name, where it has one."""
+    """Label and name of every visible instance."""
     short = labels(attempt)
     return {one.instance: f"{short[one.instance]} {names.get(one.object_id, '')}".rstrip() for one in attempt.seen}
 
 
 def suction_kind(one: SeenObject) -> int:
-    """Which of `CANDIDATES` the suction point is: the nearest, as the point is a whole pixel."""
+    """Index of the candidate that became the suction point: the nearest, as the point is rounded to a pixel."""
     return min(range(len(CANDIDATES)), key=lambda kind: math.dist(one.candidates[kind], one.suction))
 
 
 def choice_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> list[str]:
-    """What was chosen and why, and where the cup is put, in sentences."""
+    """Explain in sentences the chosen target, the reason, and the suction point."""
     if attempt.target is None:
         return ["target: none, nothing is visible"]
     full = full_names(attempt, names)
@@ -244,35 +246,35 @@ def _reason(attempt: Attempt, one: SeenObject, full: Mapping[int, str], config: 
     first = attempt.ranked()[0]
     if first.share != one.share or len(first.all_above) != count:
         if targeted and config.target.random_after_failure:
-            return f"{above}; drawn at random after a failed attempt"
+            return f"{above}; chosen at random after a failed attempt"
         return f"{above}; the rule would name {full[first.instance]}"
     equals = sum(len(other.all_above) == count for other in attempt.seen)
     if len(attempt.seen) == 1:
-        return f"{above}; the only object in sight"
+        return f"{above}; the only visible object"
     if equals == 1:
         return f"{above}, the {'most' if targeted else 'fewest'} of all"
-    return f"{above}; visible share {one.share:.2f}, the {'smallest' if targeted else 'largest'} of {equals} such"
+    return f"{above}; visible fraction {one.share:.2f}, the {'smallest' if targeted else 'largest'} of {equals} such"
 
 
 def seal_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> list[str]:
-    """Rays, seal, load and what hung on the cup, in sentences; none if nothing was chosen."""
+    """Explain in sentences the rays, the seal, its force and the picked objects; none if nothing was chosen."""
     if attempt.target is None:
         return []
     full = full_names(attempt, names)
     lines = [f"rays: {attempt.hits} of {attempt.rays} hit"]
     if attempt.hits:
         lines[0] += f"; {'good' if attempt.good_seal else 'poor'} seal, breaks at {break_force(attempt, config):g} N"
-        peak = f"; largest load {max(attempt.load):.1f} N" if attempt.load else ""
-        lines.append(f"caught: {_listed(attempt.caught, full)}{peak}")
+        peak = f"; largest force {max(attempt.load):.1f} N" if attempt.load else ""
+        lines.append(f"engaged: {_listed(attempt.caught, full)}{peak}")
         lines.append(f"picked: {_listed(attempt.picked, full)}")
     return lines
 
 
 def break_force(attempt: Attempt, config: Config) -> float:
-    """Load at which a seal of the attempt breaks [N]."""
+    """Force at which a seal of the attempt breaks [N]."""
     return config.suction.good_force if attempt.good_seal else config.suction.poor_force
 
 
 def _listed(instances: tuple[int, ...], full: Mapping[int, str]) -> str:
-    """An object that is caught need not be visible from camera 0."""
+    """List names of instances; an engaged object can be invisible to camera 0."""
     return ", ".join(full.get(instance, f"instance {instance}, unseen") for instance in instances) or "nothing"

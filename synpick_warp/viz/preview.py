@@ -1,9 +1,8 @@
-"""A contact sheet of a BOP data set, from its files alone: colour, depth, instances, boxes and layers of sampled views."""
+"""Contact sheet of a BOP data set, from its files: colour, depth colour map, instance masks, bounding boxes and layers of sampled views."""
 
 from __future__ import annotations
 
 import colorsys
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -13,24 +12,25 @@ from typing import Any
 import cv2
 import numpy as np
 
+from synpick_warp.dataset.view_files import read_image, read_json
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.viz.preview_layers import layer_pictures
 
 _PANEL_WIDTH = 480
-"""Width of one picture on the sheet [px]."""
+"""Width of one image on the sheet [px]."""
 _CAPTION = 20
-"""Height of the line above a picture [px]."""
+"""Height of the caption above an image [px]."""
 _GAP = 4
-"""Between pictures [px]."""
+"""Gap between images [px]."""
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 _GOLDEN = 0.6180339887498949
-"""(√5 - 1) / 2: its multiples modulo 1 are evenly spread, however many are taken."""
+"""Golden ratio conjugate (√5 - 1) / 2: multiples modulo 1 are a low-discrepancy sequence for any count."""
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _DEPTH_RANGE = (1.0, 99.0)
-"""Percentiles of a picture's depths that get the first and the last colour."""
+"""Percentiles of the depths that map to the first and the last colour."""
 
 Image = np.ndarray
-"""(H, W, 3) uint8, blue first, as OpenCV has it."""
+"""(H, W, 3) uint8, blue first, OpenCV's order."""
 
 
 @dataclass(frozen=True)
@@ -40,24 +40,24 @@ class _View:
     depth_scale: float
     """[mm]"""
     truth: list[tuple[dict[str, Any], dict[str, Any]]]
-    """scene_gt's and scene_gt_info's record of each instance."""
+    """Records of scene_gt and scene_gt_info, per instance."""
 
 
 def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
-    """Draw sampled views of a data set, one a row, and write the picture.
+    """Draw sampled views of a data set, one per row, and write the image file.
 
     Args:
-        dataset: Folder of the data set; all its splits count.
-        out: PNG or JPEG file to write; its folder is made.
-        views: How many views to draw, spread over cameras, scenes and time; fewer if there are fewer.
+        dataset: Folder of the data set; all its splits are sampled.
+        out: PNG or JPEG file to write; its folder is created.
+        views: Maximum number of views, spread over cameras, scenes and time.
 
     Raises:
-        DatasetError: The folder is no data set, or a file is missing or damaged.
-        OutputError: The picture cannot be written.
+        DatasetError: The folder is not a data set, or a file is missing or damaged.
+        OutputError: The image cannot be written.
     """
     check_picture_name(out)
     if views < 1:
-        raise OutputError(f"{views} views asked for; a contact sheet has at least 1")
+        raise OutputError(f"{views} views requested; a contact sheet has at least 1")
     rows = [_row(_read_view(scene, frame)) for scene, frame in sample(find_scenes(dataset), views)]
     width = max(row.shape[1] for row in rows)
     sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
@@ -65,13 +65,13 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
 
 
 def check_picture_name(out: Path) -> None:
-    """Raise OutputError unless the file's name is that of a PNG or JPEG picture."""
+    """Raise OutputError unless the file name ends as a PNG or JPEG file."""
     if out.suffix.lower() not in _SUFFIXES:
-        raise OutputError(f"{out} is no picture file; its name must end in {', '.join(_SUFFIXES)}")
+        raise OutputError(f"{out} is not an image file; its name must end in {', '.join(_SUFFIXES)}")
 
 
 def write_picture(out: Path, picture: Image) -> Path:
-    """Write a picture in the format that its name says; its folder is made.
+    """Write an image in the format of its suffix; its folder is created.
 
     Raises:
         OutputError: It cannot be written.
@@ -85,7 +85,7 @@ def write_picture(out: Path, picture: Image) -> Path:
 
 
 def find_scenes(dataset: Path) -> list[Path]:
-    """The folders of all scenes of a data set, ordered.
+    """Find the folders of all scenes of a data set, sorted.
 
     Raises:
         DatasetError: There is none.
@@ -94,14 +94,14 @@ def find_scenes(dataset: Path) -> list[Path]:
         raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
     scenes = sorted(path.parent for path in dataset.glob("*/*/scene_camera.json") if path.parent.name.isdecimal())
     if not scenes:
-        raise DatasetError(f"{dataset} has no whole scene; a BOP data set has folders such as train_pbr/000000 with a scene_camera.json")
+        raise DatasetError(f"{dataset} has no complete scene; a BOP data set has folders such as train_pbr/000000 with a scene_camera.json")
     return scenes
 
 
 def sample(scenes: list[Path], views: int) -> list[tuple[Path, int]]:
-    """Scene and image of sampled views, ordered and without repetition.
+    """Sample views: (scene, frame), sorted and distinct.
 
-    All cameras in turn; a camera's scenes evenly; within a scene at times that differ from view to view.
+    Cameras in turn; a camera's scenes evenly; within a scene at frames of a low-discrepancy sequence.
     """
     by_camera: dict[tuple[float, ...], list[tuple[Path, list[int]]]] = {}
     for scene in scenes:
@@ -113,13 +113,13 @@ def sample(scenes: list[Path], views: int) -> list[tuple[Path, int]]:
     groups = list(by_camera.values())
     if not groups:
         raise DatasetError(f"no scene in {scenes[0].parent} has a view; bake the data set again")
-    taken = set()
+    samples = set()
     for number in range(views):
         group = groups[number % len(groups)]
         in_group = -(-(views - number % len(groups)) // len(groups))
         scene, frames = group[number // len(groups) * len(group) // in_group]
-        taken.add((scene, frames[int((0.5 + number * _GOLDEN) % 1.0 * len(frames))]))
-    return sorted(taken)
+        samples.add((scene, frames[int((0.5 + number * _GOLDEN) % 1.0 * len(frames))]))
+    return sorted(samples)
 
 
 def _read_view(scene: Path, frame: int) -> _View:
@@ -129,37 +129,8 @@ def _read_view(scene: Path, frame: int) -> _View:
     return _View(scene, frame, float(camera["depth_scale"]), list(zip(truth, infos, strict=True)))
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON file's object.
-
-    Raises:
-        DatasetError: The file is missing, or no JSON.
-    """
-    try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise DatasetError(f"{path} is no JSON file: {error}") from error
-
-
-def read_image(folder: Path, stem: str, flags: int) -> np.ndarray:
-    """The picture of that name, PNG or JPEG, as OpenCV reads it with these flags.
-
-    Raises:
-        DatasetError: There is none, or OpenCV cannot read it.
-    """
-    for suffix in (".png", ".jpg"):
-        path = folder / f"{stem}{suffix}"
-        if path.is_file():
-            image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags) if path.stat().st_size else None
-            if image is None:
-                raise DatasetError(f"{path} is no picture that OpenCV can read")
-            return image
-    raise DatasetError(f"there is no {folder / stem}.png or .jpg; the data set is not complete")
-
-
 def _row(view: _View) -> Image:
+    """Draw all panels of a view side by side."""
     stem = f"{view.frame:06d}"
     color = read_image(view.scene / "rgb", stem, cv2.IMREAD_COLOR)
     depth = read_image(view.scene / "depth", stem, cv2.IMREAD_UNCHANGED) * view.depth_scale
@@ -167,7 +138,7 @@ def _row(view: _View) -> Image:
         (f"{view.scene.parent.name}/{view.scene.name} image {view.frame}", lambda scale: _fit(color, scale)),
         (_depth_caption(depth), lambda scale: _fit(_color_depth(depth), scale, smooth=False)),
         (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
-        ("boxes: whole thin, visible thick; obj_id and visible share", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
+        ("boxes: amodal thin, visible thick; obj_id and visible fraction", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
     ]
     panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layer_pictures(view.scene, view.frame)]
     scale = _PANEL_WIDTH / color.shape[1]
@@ -175,22 +146,25 @@ def _row(view: _View) -> Image:
 
 
 def _fit(image: Image, scale: float, smooth: bool = True) -> Image:
+    """Scale an image to the panel's width; nearest neighbour for ids, masks and colour maps."""
     size = (_PANEL_WIDTH, max(1, round(image.shape[0] * scale)))
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA if smooth and scale < 1 else cv2.INTER_NEAREST)
 
 
 def _captioned(image: Image, caption: str) -> Image:
+    """Add a caption above an image and gaps around it."""
     head = np.zeros((_CAPTION, image.shape[1], 3), np.uint8)
     put_text(head, caption, (4, 14), 0.42, (230, 230, 230))
     return np.pad(np.concatenate((head, image)), ((0, _GAP), (0, _GAP), (0, 0)))
 
 
 def put_text(image: Image, text: str, place: tuple[int, int], size: float, color: tuple[int, int, int], thickness: int = 1) -> None:
-    """Text; the place is its lower left corner [px], the size OpenCV's font scale."""
+    """Draw text; `place` is its lower left corner [px], `size` OpenCV's font scale."""
     cv2.putText(image, text, place, FONT, size, color, thickness, cv2.LINE_AA)
 
 
 def _depth_limits(depth: np.ndarray) -> tuple[float, float] | None:
+    """Depth range of the colour map [mm]; None: no surface."""
     known = depth[depth > 0]
     if not known.size:
         return None
@@ -204,6 +178,7 @@ def _depth_caption(depth: np.ndarray) -> str:
 
 
 def _color_depth(depth: np.ndarray) -> Image:
+    """Depth as a TURBO colour map, near red, far blue, no surface black."""
     low, high = _depth_limits(depth) or (0.0, 1.0)
     nearness = np.clip((high - depth) / max(high - low, 1e-9), 0.0, 1.0)
     colored = cv2.applyColorMap(np.rint(255 * nearness).astype(np.uint8), cv2.COLORMAP_TURBO)
@@ -217,7 +192,7 @@ def _instances_caption(view: _View) -> str:
 
 
 def _color_instances(view: _View, color: Image) -> Image:
-    """Each visible mask in its instance's colour, over the picture in dark grey."""
+    """Visible masks in their instances' colours over the darkened grey image."""
     grey = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY) // 3
     drawn = np.repeat(grey[..., None], 3, axis=2)
     folder = view.scene / "mask_visib"
@@ -230,20 +205,21 @@ def _color_instances(view: _View, color: Image) -> Image:
     return drawn
 
 
-def instance_color(number: int) -> tuple[int, int, int]:
-    """Colour of an instance, the same in all pictures of an episode; blue first."""
-    red, green, blue = colorsys.hsv_to_rgb(number * _GOLDEN % 1.0, 0.85 - 0.3 * (number % 2), 1.0)
+def instance_color(instance: int) -> tuple[int, int, int]:
+    """Colour of an instance id, the same in all images of an episode; blue first."""
+    red, green, blue = colorsys.hsv_to_rgb(instance * _GOLDEN % 1.0, 0.85 - 0.3 * (instance % 2), 1.0)
     return round(255 * blue), round(255 * green), round(255 * red)
 
 
 def _draw_boxes(view: _View, image: Image, scale: float) -> Image:
+    """Draw amodal and visible bounding boxes with object id and visible fraction, in place."""
     for index, (record, info) in enumerate(view.truth):
         if info["px_count_visib"] == 0:
             continue
         color = instance_color(record.get("instance_id", index))
         for name, thickness in (("bbox_obj", 1), ("bbox_visib", 2)):
             x, y, width, height = info[name]
-            # A box's far edge belongs to its last pixel; OpenCV takes the pixel that it starts in.
+            # BOP's boxes end with their last pixel; OpenCV takes corner coordinates, hence + 1.
             first, second = ((round(scale * u), round(scale * v)) for u, v in ((x, y), (x + width + 1, y + height + 1)))
             cv2.rectangle(image, first, second, color, thickness)
         x, y = info["bbox_visib"][:2]

@@ -173,11 +173,11 @@ FIRST, SECOND, THIRD = seen(0, share=0.4), seen(1, share=0.6), seen(2, frozenset
 @pytest.mark.parametrize(
     ("objects", "target", "mode", "said"),
     [
-        ((FIRST,), 0, "pick", "target: 1 tin: 0 objects above; the only object in sight"),
-        ((FIRST, SECOND, THIRD), 1, "pick", "target: 2 box: 0 objects above; visible share 0.60, the largest of 2 such"),
+        ((FIRST,), 0, "pick", "target: 1 tin: 0 objects above; the only visible object"),
+        ((FIRST, SECOND, THIRD), 1, "pick", "target: 2 box: 0 objects above; visible fraction 0.60, the largest of 2 such"),
         ((FIRST, THIRD), 0, "pick", "target: 1 tin: 0 objects above, the fewest of all"),
         ((FIRST, SECOND, THIRD), 2, "target", "target: 3 mug: 1 object above, the most of all"),
-        ((FIRST, SECOND), 0, "target", "target: 1 tin: 0 objects above; visible share 0.40, the smallest of 2 such"),
+        ((FIRST, SECOND), 0, "target", "target: 1 tin: 0 objects above; visible fraction 0.40, the smallest of 2 such"),
         ((FIRST, SECOND, THIRD), 0, "pick", "target: 1 tin: 0 objects above; the rule would name 2 box"),
         ((), None, "pick", "target: none, nothing is visible"),
     ],
@@ -189,7 +189,7 @@ def test_why_it_was_chosen(objects, target, mode, said):
 def test_a_draw_after_a_failure_is_named_where_the_settings_have_it():
     drawn_one = attempt((FIRST, SECOND, THIRD), {}, 0, mode="target")
     released = Config(target=Target(random_after_failure=True))
-    assert choice_words(drawn_one, NAMES, released)[0] == "target: 1 tin: 0 objects above; drawn at random after a failed attempt"
+    assert choice_words(drawn_one, NAMES, released)[0] == "target: 1 tin: 0 objects above; chosen at random after a failed attempt"
 
 
 @pytest.mark.parametrize(
@@ -209,11 +209,11 @@ def test_what_the_seal_bore():
     good = attempt((FIRST, SECOND), {}, 0, caught=(0, 1), picked=(1,), load=(1.0, 6.25, 3.0))
     assert seal_words(good, NAMES, Config()) == [
         "rays: 10 of 10 hit; good seal, breaks at 40 N",
-        "caught: 1 tin, 2 box; largest load 6.2 N",
+        "engaged: 1 tin, 2 box; largest force 6.2 N",
         "picked: 2 box",
     ]
     poor = attempt((FIRST,), {}, 0, hits=3, good_seal=False, caught=(7,))
-    said = ["rays: 3 of 10 hit; poor seal, breaks at 2 N", "caught: instance 7, unseen", "picked: nothing"]
+    said = ["rays: 3 of 10 hit; poor seal, breaks at 2 N", "engaged: instance 7, unseen", "picked: nothing"]
     assert seal_words(poor, NAMES, Config()) == said
     assert seal_words(attempt((FIRST,), {}, 0, hits=0, load=(0.0, 0.0)), NAMES, Config()) == ["rays: 0 of 10 hit"]
     assert seal_words(attempt((), {}), NAMES, Config()) == []
@@ -234,7 +234,7 @@ def test_ticks():
 
 
 def test_text_fits():
-    text = "target: 5 mustard_bottle: 0 objects above; visible share 0.61, the largest of 3 such"
+    text = "target: 5 mustard_bottle: 0 objects above; visible fraction 0.61, the largest of 3 such"
     lines = wrapped(text, 0.5, 200)
     assert " ".join(" ".join(lines).split()) == text
     assert all(cv2.getTextSize(line, FONT, 0.5, 1)[0][0] <= 200 for line in lines)
@@ -258,18 +258,18 @@ CIRCLE = {
 @pytest.mark.parametrize(
     ("line", "said"),
     [
-        ("{", r"attempts\.jsonl, line 2 is no JSON: "),
-        ("", r"attempts\.jsonl, line 2 is no JSON: "),
-        ("[1]", r"line 2 is no record of an attempt: it needs whole numbers episode and attempt"),
-        ('{"episode": 1, "attempt": "0"}', r"line 2 is no record of an attempt"),
+        ("{", r"attempts\.jsonl, line 2 is not JSON: "),
+        ("", r"attempts\.jsonl, line 2 is not JSON: "),
+        ("[1]", r"line 2 is not a record of an attempt: it needs integers episode and attempt"),
+        ('{"episode": 1, "attempt": "0"}', r"line 2 is not a record of an attempt"),
         ('{"episode": 1, "attempt": 0}', r"line 2: the record has no sight"),
-        (damaged(frame="first"), r"line 2: the record of an attempt has a value of the wrong kind: .*'first'"),
+        (damaged(frame="first"), r"line 2: the record of an attempt has a value of the wrong type: .*'first'"),
         (damaged(mode="move"), r'line 2: .* mode is "move"'),
-        (damaged(target=9), r"line 2: .* target is 9, which was not seen"),
+        (damaged(target=9), r"line 2: .* target is 9, which was not visible"),
         (damaged(load=[float("inf")]), r"line 2: .* inf is not finite"),
         (damaged(sight=NO_POLE), r"line 2: .*'NoneType'"),
-        (damaged(sight=CIRCLE), r"the clutter graph of attempt 0 of episode 1 runs in a circle"),
-        (damaged(frame=77), r"scene_gt\.json has no image 77, of which "),
+        (damaged(sight=CIRCLE), r"the clutter graph of attempt 0 of episode 1 has a cycle"),
+        (damaged(frame=77), r"scene_gt\.json has no image 77, which "),
     ],
 )
 def test_a_damaged_record_is_one_clear_line(dataset, line, said):
@@ -285,14 +285,17 @@ def test_a_damaged_record_is_one_clear_line(dataset, line, said):
     ("harm", "said"),
     [
         (lambda folder: shutil.rmtree(folder), r"there is no folder .*set; name the folder of a BOP data set"),
-        (lambda folder: (folder / "attempts.jsonl").unlink(), r"has no attempts\.jsonl: nothing was picked; .*mode pick, target or mixed"),
-        (lambda folder: (folder / "attempts.jsonl").write_bytes(b"\xff"), r"attempts\.jsonl is no text: byte 0 is no UTF-8"),
+        (
+            lambda folder: (folder / "attempts.jsonl").unlink(),
+            r"has no attempts\.jsonl: it has no pick attempts; .*mode pick, target or mixed",
+        ),
+        (lambda folder: (folder / "attempts.jsonl").write_bytes(b"\xff"), r"attempts\.jsonl is not text: byte 0 is not UTF-8"),
         (lambda folder: (folder / "attempts.jsonl").write_text(""), r"has no attempt of episode 1; episodes that have: none"),
         (lambda folder: (folder / "config.toml").unlink(), r"has no config\.toml"),
         (lambda folder: (folder / "models" / "models_info.json").unlink(), r"cannot read .*models_info\.json: No such file"),
         (lambda folder: shutil.rmtree(folder / "train" / "000003"), r"cannot read .*000003/scene_gt\.json: No such file"),
         (lambda folder: (folder / "train/000003/rgb/000000.png").unlink(), r"there is no .*rgb/000000\.png or \.jpg"),
-        (lambda folder: (folder / "train/000003/rgb/000000.png").write_bytes(b"x"), r"000000\.png is no picture"),
+        (lambda folder: (folder / "train/000003/rgb/000000.png").write_bytes(b"x"), r"000000\.png is not an image"),
         (lambda folder: (folder / "train/000003/mask_visib/000000_000001.png").unlink(), r"there is no .*000000_000001\.png"),
     ],
 )
@@ -309,7 +312,7 @@ def test_what_does_not_exist_is_answered_with_what_does(dataset):
         write_explanation(dataset, dataset / "picture.png", 2, None)
     with pytest.raises(DatasetError, match=r"has no attempt 3 of episode 1; attempts: 0 to 2$"):
         write_explanation(dataset, dataset / "picture.png", 1, 3)
-    with pytest.raises(OutputError, match=r"picture\.bmp is no picture file; its name must end in \.png, \.jpg, \.jpeg"):
+    with pytest.raises(OutputError, match=r"picture\.bmp is not an image file; its name must end in \.png, \.jpg, \.jpeg"):
         write_explanation(dataset, dataset / "picture.bmp", 1, None)
 
 
@@ -334,7 +337,7 @@ def test_the_command(dataset, tmp_path, capsys):
     [
         (["--episode", "2"], "attempts.jsonl has no attempt of episode 2; episodes that have: 1, 4"),
         (["--episode", "1", "--attempt", "-1"], "attempts.jsonl has no attempt -1 of episode 1; attempts: 0 to 2"),
-        (["--episode", "1", "--out", "a.txt"], "a.txt is no picture file; its name must end in .png, .jpg, .jpeg"),
+        (["--episode", "1", "--out", "a.txt"], "a.txt is not an image file; its name must end in .png, .jpg, .jpeg"),
         ([], 'Command "explain" parameter --episode requires an argument.'),
     ],
 )

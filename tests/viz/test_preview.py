@@ -111,7 +111,7 @@ def test_a_set_without_masks_and_with_png_colour(tmp_path):
 def test_folders_that_are_no_data_set(tmp_path):
     with pytest.raises(DatasetError, match="there is no folder"):
         write_contact_sheet(tmp_path / "none", tmp_path / "sheet.png", 1)
-    with pytest.raises(DatasetError, match="has no whole scene"):
+    with pytest.raises(DatasetError, match="has no complete scene"):
         write_contact_sheet(tmp_path, tmp_path / "sheet.png", 1)
 
 
@@ -119,10 +119,10 @@ def test_folders_that_are_no_data_set(tmp_path):
     ("damage", "message"),
     [
         (lambda scene: (scene / "scene_gt.json").unlink(), r"cannot read .*scene_gt\.json: No such file"),
-        (lambda scene: (scene / "scene_gt_info.json").write_text("{"), r"scene_gt_info\.json is no JSON file"),
+        (lambda scene: (scene / "scene_gt_info.json").write_text("{"), r"scene_gt_info\.json is not a JSON file"),
         (lambda scene: (scene / "scene_gt.json").write_text(json.dumps({"0": []})), "do not agree about image"),
         (lambda scene: shutil.rmtree(scene / "rgb"), r"there is no .*rgb/.*\.png or \.jpg"),
-        (lambda scene: [path.write_bytes(b"") for path in (scene / "depth").iterdir()], "is no picture"),
+        (lambda scene: [path.write_bytes(b"") for path in (scene / "depth").iterdir()], "is not an image"),
     ],
 )
 def test_a_damaged_data_set_is_one_clear_line(dataset, tmp_path, damage, message):
