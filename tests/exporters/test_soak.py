@@ -1,4 +1,4 @@
-"""The writers of all formats keep neither memory nor open files of what they have written."""
+"""Memory and open files of the writers stay constant (leak test)."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import sys
 from pathlib import Path
 
 TICKS = 100
-"""A short soak; `python -m tests.reference.soak` makes 10,000. One writer, so that it has done all kinds of work by half time."""
+"""A short soak; `python -m tests.harness.soak` runs 10,000. One writer, so that it has run every type of task by half time."""
 
 
-def test_memory_and_open_files_stay_as_they_are():
+def test_memory_and_open_files_stay_constant():
     command = [sys.executable, "-m", "tests.harness.soak", "--ticks", str(TICKS), "--writers", "1"]
-    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True)
-    found = json.loads(done.stdout)
-    late = slice(len(found["memory"]) // 2, None)
-    assert len(set(found["files"][late])) == 1
-    assert max(found["memory"][late]) < 1.02 * min(found["memory"][late])
+    process = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True)
+    samples = json.loads(process.stdout)
+    late = slice(len(samples["memory"]) // 2, None)
+    assert len(set(samples["files"][late])) == 1
+    assert max(samples["memory"][late]) < 1.02 * min(samples["memory"][late])

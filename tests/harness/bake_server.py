@@ -1,6 +1,6 @@
-"""Bakes of boxes in processes of their own, quickly: a server loads everything once, and forks for every bake. Bakes may be killed.
+"""Fork server for quick bakes of boxes in separate processes, which tests may kill: it loads everything once and forks for every bake.
 
-The server reads a line of JSON a bake, prints the process's number, and when that has ended its exit code (minus the signal's number).
+The server reads one line of JSON per bake, prints the process id, and after its end the exit code (minus the signal's number).
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ TINY = {
     "move.speed": 4.0,
     "settle.max_time": 3.0,
 }
-"""On top of QUICK: an episode takes less than a second."""
+"""Overrides on top of QUICK: an episode takes less than a second."""
 _EVENTS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir")
-"""What changes a folder, as audit hooks see it."""
+"""Audit events of changes to a folder (sys.addaudithook)."""
 
 
 class BakeServer:
-    """The test's side. Use it as a context manager."""
+    """Client of the fork server, as a context manager."""
 
     def __init__(self) -> None:
         self._running = False
@@ -63,20 +63,20 @@ class BakeServer:
         self._process.wait(30)
 
     def start(self, out: Path, **options: object) -> int:
-        """Begin a bake and return the process's number. Options: settings, arguments, and what `_prepare` knows."""
+        """Start a bake; returns its process id. Options: settings, arguments, and the fault injections of `_prepare`."""
         if self._running:
-            self.wait()  # A test has failed, and its bake has not been waited for.
+            self.wait()  # A test failed before it waited for its bake.
         self._send({"out": str(out), **options})
         self._running = True
-        return int(self._hear())
+        return int(self._receive())
 
     def wait(self) -> int:
-        """Its exit code."""
+        """Wait for the bake; returns its exit code."""
         self._running = False
-        return int(self._hear())
+        return int(self._receive())
 
     def bake(self, out: Path, **options: object) -> int:
-        """Both."""
+        """Run a bake; returns its exit code."""
         self.start(out, **options)
         return self.wait()
 
@@ -85,13 +85,13 @@ class BakeServer:
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
 
-    def _hear(self) -> str:
+    def _receive(self) -> str:
         assert self._process.stdout
         return self._process.stdout.readline()
 
 
 def arguments(request: dict) -> list[str]:
-    """Of the command line."""
+    """Command-line arguments of a request."""
     given = QUICK | TINY | request.get("settings", {})
     settings = [part for key, value in given.items() for part in ("--set", f"{key}={json.dumps(value)}")]
     return ["bake", "--out", request["out"], "--config", "smoke", *settings, *request.get("arguments", [])]
@@ -110,7 +110,7 @@ def _serve() -> None:
     for line in sys.stdin:
         request = json.loads(line)
         if not warm and request.get("warm"):
-            # In this process, so that those that follow find all kernels loaded.
+            # In this process, so that later children inherit all loaded kernels.
             os.write(answer, f"0\n{commands.main(arguments(request))}\n".encode())
             warm = True
             continue
@@ -126,31 +126,31 @@ def _serve() -> None:
 
 
 def _prepare(request: dict) -> None:
-    """What is to go wrong in a bake."""
+    """Inject the faults that a request names."""
     from synpick_warp import pipeline
     from synpick_warp.exporters.writing.pool import WriterPool
 
     if "alone" in request:
-        # Files are written by this process, too.
-        def alone(_: int, slot_bytes: int, held: int) -> WriterPool:
-            pool = WriterPool(0, slot_bytes, held)
+        # Write files in the bake's own process.
+        def make_inline_pool(_: int, slot_bytes: int, inherited_handle: int) -> WriterPool:
+            pool = WriterPool(0, slot_bytes, inherited_handle)
             if "most_bytes" in request:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (request["most_bytes"],) * 2)
             return pool
 
-        pipeline.WriterPool = alone
+        pipeline.WriterPool = make_inline_pool
     if "kill_at" in request:
         _kill_at(request["kill_at"], request["out"])
     if "count" in request:
         _count(Path(request["count"]), request["out"])
 
 
-def _kill_at(number: int, out: str) -> None:
-    """Kill this process before the data set's folder is changed for the `number`th time."""
-    left = [number]
+def _kill_at(nth: int, out: str) -> None:
+    """Kill this process before the nth change to the data set's folder."""
+    left = [nth]
 
-    def watch(event: str, given: tuple) -> None:
-        if _changes(event, given, out):
+    def watch(event: str, arguments: tuple) -> None:
+        if _is_change(event, arguments, out):
             left[0] -= 1
             if left[0] == 0:
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -159,19 +159,19 @@ def _kill_at(number: int, out: str) -> None:
 
 
 def _count(file: Path, out: str) -> None:
-    """Have the number of changes written to a file."""
-    number = [0]
+    """Count the changes to the data set's folder in a file."""
+    count = [0]
 
-    def watch(event: str, given: tuple) -> None:
-        if _changes(event, given, out):
-            number[0] += 1
-            file.write_text(str(number[0]))
+    def watch(event: str, arguments: tuple) -> None:
+        if _is_change(event, arguments, out):
+            count[0] += 1
+            file.write_text(str(count[0]))
 
     sys.addaudithook(watch)
 
 
-def _changes(event: str, given: tuple, out: str) -> bool:
-    return event in _EVENTS and str(given[0]).startswith(out) and not (event == "open" and given[1] in ("r", "rb", None))
+def _is_change(event: str, arguments: tuple, out: str) -> bool:
+    return event in _EVENTS and str(arguments[0]).startswith(out) and not (event == "open" and arguments[1] in ("r", "rb", None))
 
 
 if __name__ == "__main__":

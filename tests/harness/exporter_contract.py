@@ -1,4 +1,4 @@
-"""What every exporter must do, whatever it writes: test classes of exporters inherit `ExporterContract`."""
+"""Contract tests of the exporter interface: determinism, atomic commits, resuming. Test classes of exporters inherit `ExporterContract`."""
 
 from __future__ import annotations
 
@@ -30,27 +30,27 @@ LENSES = cameras()
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Digest of every file below a folder."""
+    """SHA-256 of every file below a folder."""
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
 
 
 @contextmanager
 def exporting(
-    kind: type[Exporter], out: Path, config: Config, processes: int = 2, lenses: tuple[Camera, ...] = LENSES
+    exporter_class: type[Exporter], out: Path, config: Config, processes: int = 2, lenses: tuple[Camera, ...] = LENSES
 ) -> Iterator[Exporter]:
-    """An exporter of a folder as a bake prepares it; afterwards what was not whole is gone, as after a bake."""
+    """Create an exporter on a folder prepared as by a bake; afterwards remove partial files, as a bake does."""
     resolution = (lenses[0].width, lenses[0].height)
     config = dataclasses.replace(config, cameras=dataclasses.replace(config.cameras, resolution=resolution))
     (out / PARTIAL).mkdir(parents=True, exist_ok=True)
-    with WriterPool(processes, kind.slot_bytes(config)) as pool:
+    with WriterPool(processes, exporter_class.slot_bytes(config)) as pool:
         try:
-            yield kind(ExportContext(out, config, catalog(), lenses, skies(), pool))
+            yield exporter_class(ExportContext(out, config, catalog(), lenses, skies(), pool))
         finally:
             shutil.rmtree(out / PARTIAL, ignore_errors=True)
 
 
 def export(
-    kind: type[Exporter],
+    exporter_class: type[Exporter],
     out: Path,
     config: Config,
     episodes: tuple[int, ...] = (0, 2),
@@ -58,8 +58,8 @@ def export(
     frames: int = FRAMES,
     lenses: tuple[Camera, ...] = LENSES,
 ) -> Path:
-    """A finished data set of boxes."""
-    with exporting(kind, out, config, processes, lenses) as exporter:
+    """Write a complete data set of boxes."""
+    with exporting(exporter_class, out, config, processes, lenses) as exporter:
         exporter.write_constants()
         feed(exporter, episodes, frames)
         finish(exporter)
@@ -69,25 +69,25 @@ def export(
 def feed(
     exporter: Exporter, episodes: tuple[int, ...], frames: int = FRAMES, ending: Ending = Ending.FINISHED, views: int = 4
 ) -> list[int]:
-    """Episodes side by side, in batches whose buffers are used again; returns a list to which each whole episode will be added."""
-    whole: list[int] = []
+    """Feed interleaved episodes in batches whose buffers are overwritten; returns a list to which committed episodes are appended."""
+    committed: list[int] = []
     lenses = export_context(exporter).cameras
-    room = len(lenses) * len(episodes)
-    given = list(batches(views, episodes, frames, lenses))
-    for number, tick in enumerate(ticks(len(episodes), episodes, frames)):
+    views_per_tick = len(lenses) * len(episodes)
+    view_batches = list(batches(views, episodes, frames, lenses))
+    for index, tick in enumerate(ticks(len(episodes), episodes, frames)):
         exporter.write_ticks(tick)
-        wipe(tick)
-        first, last = -(-number * room // views), -(-(number + 1) * room // views)
-        for batch in given[first:last]:
+        overwrite(tick)
+        first, last = -(-index * views_per_tick // views), -(-(index + 1) * views_per_tick // views)
+        for batch in view_batches[first:last]:
             exporter.write_views(batch)
-            wipe(batch)
+            overwrite(batch)
     for end in ends(episodes, frames, ending):
-        exporter.end_episode(end, lambda number=end.episode: whole.append(number))
-    return whole
+        exporter.end_episode(end, lambda index=end.episode: committed.append(index))
+    return committed
 
 
-def wipe(batch: FrameBatch | TickBatch) -> None:
-    """The buffers behind a batch are used for something else."""
+def overwrite(batch: FrameBatch | TickBatch) -> None:
+    """Overwrite the buffers of a batch, as the bake reuses them."""
     layers = batch.layers.values() if isinstance(batch, FrameBatch) else ()
     for value in (*vars(batch).values(), *layers):
         if isinstance(value, np.ndarray):
@@ -95,7 +95,7 @@ def wipe(batch: FrameBatch | TickBatch) -> None:
 
 
 def finish(exporter: Exporter) -> list[Path]:
-    """As a bake ends: wait, close, join."""
+    """End as a bake does: wait, close, write index files."""
     context = export_context(exporter)
     context.pool.wait()
     exporter.close()
@@ -103,25 +103,25 @@ def finish(exporter: Exporter) -> list[Path]:
 
 
 def export_context(exporter: Exporter) -> ExportContext:
-    """Every exporter keeps what it was given under this name."""
+    """The exporter's constructor argument; every exporter keeps it under this name."""
     return exporter._context  # type: ignore[attr-defined]
 
 
-def below(out: Path, paths: list[Path]) -> set[str]:
-    """Files that these files and folders are or hold."""
-    found = set()
+def expand(out: Path, paths: list[Path]) -> set[str]:
+    """Expand files and folders into the files they hold."""
+    files = set()
     for path in paths:
         assert not path.is_absolute()
-        inside = [out / path] if (out / path).is_file() else [one for one in (out / path).rglob("*") if one.is_file()]
+        inside = [out / path] if (out / path).is_file() else [file for file in (out / path).rglob("*") if file.is_file()]
         assert inside, path
-        found |= {str(one.relative_to(out)) for one in inside}
-    return found
+        files |= {str(file.relative_to(out)) for file in inside}
+    return files
 
 
 class ExporterContract:
-    """Inherit, and name the class under test in `kind`."""
+    """Inherit, and set `exporter_class`."""
 
-    kind: ClassVar[type[Exporter]]
+    exporter_class: ClassVar[type[Exporter]]
 
     @classmethod
     def config(cls) -> Config:
@@ -131,63 +131,63 @@ class ExporterContract:
     @pytest.fixture(scope="class")
     @classmethod
     def reference(cls, tmp_path_factory) -> dict[str, str]:
-        """Digests of a data set of episodes 0 and 2."""
-        return digests(export(cls.kind, tmp_path_factory.mktemp("contract") / "set", cls.config()))
+        """SHA-256 of the files of a data set of episodes 0 and 2."""
+        return digests(export(cls.exporter_class, tmp_path_factory.mktemp("contract") / "set", cls.config()))
 
     @pytest.mark.parametrize("processes", [0, 1])
-    def test_neither_the_number_of_processes_nor_the_order_changes_a_byte(self, tmp_path, reference, processes):
-        with exporting(self.kind, tmp_path, self.config(), processes) as exporter:
+    def test_bytes_do_not_depend_on_process_count_or_order_of_episodes(self, tmp_path, reference, processes):
+        with exporting(self.exporter_class, tmp_path, self.config(), processes) as exporter:
             exporter.write_constants()
             for episode in (2, 0):
                 feed(exporter, (episode,), views=1 + processes)
             finish(exporter)
         assert digests(tmp_path) == reference
 
-    def test_every_file_is_a_constant_or_an_episodes_or_joined(self, tmp_path, reference):
-        with exporting(self.kind, tmp_path, self.config()) as exporter:
-            constants = below(tmp_path, exporter.write_constants())
-            whole = feed(exporter, (0, 2))
+    def test_every_file_belongs_to_constants_or_one_episode_or_index_files(self, tmp_path, reference):
+        with exporting(self.exporter_class, tmp_path, self.config()) as exporter:
+            constants = expand(tmp_path, exporter.write_constants())
+            committed = feed(exporter, (0, 2))
             export_context(exporter).pool.wait()
-            assert sorted(whole) == [0, 2]
+            assert sorted(committed) == [0, 2]
             first, none, second = (exporter.files(episode) for episode in (0, 1, 2))
             assert none == []
             for files in (first, second):
                 assert files == sorted(files) != []
-            joined = below(tmp_path, finish(exporter))
-            parts = [constants, below(tmp_path, first), below(tmp_path, second), joined]
+            index_files = expand(tmp_path, finish(exporter))
+            parts = [constants, expand(tmp_path, first), expand(tmp_path, second), index_files]
         assert set().union(*parts) == set(reference)
         assert sum(map(len, parts)) == len(reference)
 
-    def test_an_arrangement_that_is_drawn_again_leaves_nothing(self, tmp_path, reference):
-        with exporting(self.kind, tmp_path, self.config()) as exporter:
+    def test_discarded_arrangements_leave_no_files(self, tmp_path, reference):
+        with exporting(self.exporter_class, tmp_path, self.config()) as exporter:
             exporter.write_constants()
-            dropped = feed(exporter, (0, 2), frames=2, ending=Ending.NOT_FINITE)
-            unseen: list[int] = []
-            exporter.end_episode(EpisodeEnd(2, 1, 0, int(Ending.UNSETTLED)), lambda: unseen.append(2))
+            discarded = feed(exporter, (0, 2), frames=2, ending=Ending.NOT_FINITE)
+            without_frames: list[int] = []
+            exporter.end_episode(EpisodeEnd(2, 1, 0, int(Ending.UNSETTLED)), lambda: without_frames.append(2))
             feed(exporter, (0, 2))
             finish(exporter)
-        assert (sorted(dropped), unseen) == ([0, 2], [2])
+        assert (sorted(discarded), without_frames) == ([0, 2], [2])
         assert digests(tmp_path) == reference
 
-    def test_an_episode_is_in_its_place_only_when_it_is_whole(self, tmp_path, reference):
-        with exporting(self.kind, tmp_path, self.config()) as exporter:
+    def test_episodes_appear_only_when_committed(self, tmp_path, reference):
+        with exporting(self.exporter_class, tmp_path, self.config()) as exporter:
             exporter.write_constants()
-            whole = feed(exporter, (0,))
+            committed = feed(exporter, (0,))
             for batch in batches(4, (2,), 2, LENSES):
                 exporter.write_views(batch)
             for tick in ticks(1, (2,), 2):
                 exporter.write_ticks(tick)
             export_context(exporter).pool.wait()
-            assert whole == [0]
+            assert committed == [0]
             assert exporter.files(2) == []
             export_context(exporter).pool.abort()
             exporter.abort()
         kept = digests(tmp_path)
         assert kept.items() <= reference.items()
 
-    def test_what_a_killed_bake_left_is_written_again(self, tmp_path, reference):
-        export(self.kind, tmp_path, self.config())
-        with exporting(self.kind, tmp_path, self.config()) as exporter:
+    def test_removed_episode_is_rewritten_identically(self, tmp_path, reference):
+        export(self.exporter_class, tmp_path, self.config())
+        with exporting(self.exporter_class, tmp_path, self.config()) as exporter:
             exporter.write_constants()
             for path in exporter.files(2):
                 shutil.rmtree(tmp_path / path) if (tmp_path / path).is_dir() else (tmp_path / path).unlink()
@@ -196,9 +196,9 @@ class ExporterContract:
         assert digests(tmp_path) == reference
 
     @pytest.mark.parametrize("processes", [0, 2])
-    def test_a_data_set_that_vanishes_is_an_error_and_not_made_again(self, tmp_path, processes):
+    def test_removed_data_set_is_an_error_and_not_recreated(self, tmp_path, processes):
         out = tmp_path / "set"
-        with exporting(self.kind, out, self.config(), processes) as exporter:
+        with exporting(self.exporter_class, out, self.config(), processes) as exporter:
             exporter.write_constants()
             shutil.rmtree(out)
             with pytest.raises(OutputError):

@@ -1,8 +1,8 @@
-"""Ticks without end through the writers of all formats: what memory and open files do meanwhile.
+"""Soak test (leak check) of the writers of all formats: memory and open files over many ticks.
 
-    python -m tests.reference.soak --ticks 10000
+    python -m tests.harness.soak --ticks 10000
 
-prints a line now and then, and at the end JSON: samples of memory [B] and of open files, each the sum over the bake and its writers.
+prints progress lines, and at the end JSON: samples of memory [B] and of open files, each summed over the bake and its writers.
 """
 
 from __future__ import annotations
@@ -34,44 +34,44 @@ from tests.worlds import box_views, trajectories
 
 WORLDS = 2
 FRAMES = 25
-"""Of an episode."""
-SEEN = 8
-"""Frames that come again and again."""
+"""Number of frames of an episode."""
+REPEATED = 8
+"""Number of distinct frames, which repeat."""
 SAMPLES = 50
 KEPT = 4
-"""Episodes whose files stay, so that no disk fills."""
+"""Number of latest episodes whose files are kept, so that the disk does not fill up."""
 
 
 def settings() -> tuple[Config, tuple]:
-    """Small pictures, all formats, and the cameras."""
+    """Settings with small images and all formats, and the cameras."""
     lenses = box_views.cameras(48, 36)
     config = trajectories.config(chunk_ticks=8, shard_chunks=4)
     bake = dataclasses.replace(config.bake, formats=FORMATS, episodes=1)
     return dataclasses.replace(config, bake=bake, cameras=dataclasses.replace(config.cameras, resolution=(48, 36))), lenses
 
 
-def renamed(batch: Any, episodes: np.ndarray, frame: int) -> Any:
-    """The same as a frame of other episodes."""
-    number = np.repeat(episodes, len(batch.episode) // len(episodes)).astype(np.int32)
-    return dataclasses.replace(batch, episode=number, frame=np.full(len(number), frame, np.int32))
+def relabel(batch: Any, episodes: np.ndarray, frame: int) -> Any:
+    """Copy of a batch with other episode and frame indices."""
+    index = np.repeat(episodes, len(batch.episode) // len(episodes)).astype(np.int32)
+    return dataclasses.replace(batch, episode=index, frame=np.full(len(index), frame, np.int32))
 
 
-def frames_of(lenses: tuple) -> list[tuple[FrameBatch, TickBatch]]:
-    """Views and ticks of SEEN frames."""
+def make_frames(lenses: tuple) -> list[tuple[FrameBatch, TickBatch]]:
+    """View and tick batches of REPEATED frames."""
     worlds = tuple(range(WORLDS))
-    views = list(box_views.batches(WORLDS * len(lenses), worlds, SEEN, lenses))
-    return list(zip(views, trajectories.ticks(worlds, SEEN), strict=True))
+    views = list(box_views.batches(WORLDS * len(lenses), worlds, REPEATED, lenses))
+    return list(zip(views, trajectories.ticks(worlds, REPEATED), strict=True))
 
 
-def end_of(episode: int) -> EpisodeEnd:
-    """Every episode ends well, with an attempt."""
+def make_end(episode: int) -> EpisodeEnd:
+    """Successful end of an episode, with one attempt."""
     row = EpisodeRow(episode, 0, Ending.FINISHED, FRAMES, 1.0, "pick", 3, 1, 1, 0, 2)
     attempt = json.dumps(trajectories.ATTEMPT | {"episode": episode}) + "\n"
     return EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (attempt,))
 
 
 def sample(pool: WriterPool) -> tuple[int, int]:
-    """Resident memory [B] and number of open files, of the bake and its writers."""
+    """Measure resident memory [B] and number of open files of the bake and its writers."""
     memory = files = 0
     for process in (os.getpid(), *(worker.process.pid for worker in pool._workers)):
         memory += int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -80,25 +80,25 @@ def sample(pool: WriterPool) -> tuple[int, int]:
 
 
 def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
-    """Samples of memory and of open files."""
+    """Run the writers; returns samples of memory and of open files."""
     config, lenses = settings()
-    kinds = load_exporter_classes(config.bake.formats)
-    frames = frames_of(lenses)
+    classes = load_exporter_classes(config.bake.formats)
+    frames = make_frames(lenses)
     memory, files = [], []
-    with OutputFolder(out, config, ()) as output, WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
-        exporters = Exporters(kinds, ExportContext(out, config, box_views.catalog(), lenses, skies(), pool))
+    with OutputFolder(out, config, ()) as output, WriterPool(writers, slot_bytes(classes, config), output.lock) as pool:
+        exporters = Exporters(classes, ExportContext(out, config, box_views.catalog(), lenses, skies(), pool))
         output.prepare(exporters, {}, pool)
         for tick in range(ticks):
             first, frame = divmod(tick, FRAMES)
             episodes = np.arange(WORLDS) + WORLDS * first
-            views, worlds = frames[frame % SEEN]
-            exporters.write_ticks(renamed(worlds, episodes, frame))
-            exporters.write_views(renamed(views, episodes, frame))
+            views, worlds = frames[frame % REPEATED]
+            exporters.write_ticks(relabel(worlds, episodes, frame))
+            exporters.write_views(relabel(views, episodes, frame))
             if frame == FRAMES - 1:
                 for episode in episodes.tolist():
-                    end = end_of(episode)
+                    end = make_end(episode)
                     exporters.end_episode(end, partial(output.commit, exporters, pool, end))
-                _forget(out, exporters, WORLDS * (first - KEPT))
+                _remove_old(out, exporters, WORLDS * (first - KEPT))
             if (tick + 1) % max(1, ticks // SAMPLES) == 0:
                 pool.wait()
                 for values, value in zip((memory, files), sample(pool), strict=True):
@@ -108,7 +108,7 @@ def soak(ticks: int, writers: int, out: Path) -> tuple[list[int], list[int]]:
     return memory, files
 
 
-def _forget(out: Path, exporters: Exporters, before: int) -> None:
+def _remove_old(out: Path, exporters: Exporters, before: int) -> None:
     for episode in range(max(0, before - WORLDS), before):
         assert read_entry(out, episode_entry(episode))
         for path in (*exporters.files(episode), *(Path(f"{episode_entry(episode)}{suffix}") for suffix in (".json", ".sha256"))):
@@ -116,13 +116,13 @@ def _forget(out: Path, exporters: Exporters, before: int) -> None:
 
 
 def main() -> None:
-    """See above."""
+    """Command line; see the module's docstring."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--ticks", type=int, default=10_000)
     parser.add_argument("--writers", type=int, default=2)
-    given = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        memory, files = soak(given.ticks, given.writers, Path(folder) / "set")
+        memory, files = soak(options.ticks, options.writers, Path(folder) / "set")
     late = memory[len(memory) // 5 :]
     print(json.dumps({"memory": memory, "files": files, "growth": max(late) / min(late) - 1.0}))
 

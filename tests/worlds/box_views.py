@@ -1,4 +1,4 @@
-"""Frame batches of scenes made of boxes, from the analytic intersection of ray and box in float64."""
+"""View and tick batches of scenes made of boxes, rendered by analytic ray-box intersection (slab test) in float64."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material, TriangleMesh
 
 ROOM = 5
-"""Instances that a world has room for; 1 and 4 do not exist."""
+"""Instance capacity of a world; instances 1 and 4 do not exist."""
 OBJECT_IDS = np.array([3, -1, 7, 3, -1], np.int32)
 SIZES = {3: (0.16, 0.10, 0.06), 7: (0.05, 0.05, 0.20)}
 FINGER_SIZE = (0.05, 0.05, 0.10)
 FOCAL = 3.0
-"""Focal length in picture widths."""
+"""Focal length in image widths."""
 
 
 def config(layers: tuple[str, ...] = (), **bop: object) -> Config:
-    """Layers may be those of `_layers`."""
+    """Settings of the BOP writers. `layers` may name those that `_layers` makes."""
     lens = cameras()[0]
     return Config(bop=Bop(**bop), cameras=Cameras(resolution=(lens.width, lens.height)), render=Render(layers=layers))
 
@@ -36,7 +36,7 @@ def _entry(obj_id: int, texture: np.ndarray | None) -> CatalogEntry:
     box = trimesh.creation.box(extents=SIZES[obj_id])
     vertices = np.asarray(box.vertices, np.float32)
     mesh = TriangleMesh(vertices, np.asarray(box.faces, np.int32), np.asarray(box.vertex_normals, np.float32), np.zeros((8, 2), np.float32))
-    turn = (-1.0, 0, 0, 0, 0, -1.0, 0, 0, 0, 0, 1.0, 0.002, 0, 0, 0, 1.0)
+    half_turn = (-1.0, 0, 0, 0, 0, -1.0, 0, 0, 0, 0, 1.0, 0.002, 0, 0, 0, 1.0)
     return CatalogEntry(
         obj_id=obj_id,
         name=f"box {obj_id}",
@@ -49,7 +49,7 @@ def _entry(obj_id: int, texture: np.ndarray | None) -> CatalogEntry:
         center_of_mass=np.zeros(3),
         inertia=np.eye(3),
         diameter=float(np.linalg.norm(SIZES[obj_id])),
-        symmetries_discrete=(turn,) if obj_id == 7 else (),
+        symmetries_discrete=(half_turn,) if obj_id == 7 else (),
         symmetries_continuous=(((0.0, 0.0, 1.0), (0.001, 0.0, 0.0)),) if obj_id == 7 else (),
         source=None,
     )
@@ -69,20 +69,20 @@ def _camera(place: np.ndarray, width: int, height: int) -> Camera:
 
 
 def poses(episode: int, frame: int) -> np.ndarray:
-    """(ROOM, 7) float32. Instance 0 leaves the picture, instance 2 stands, instance 3 drifts under the finger."""
-    made = np.zeros((ROOM, 7), np.float32)
-    made[:, 6] = 1.0
-    turn = np.array([0.3 + 0.1 * frame, 0.2, 0.1 * episode, 1.7])  # Of any length: a quaternion is normalised where it is used.
-    made[0] = [-0.10 - 0.04 * frame, 0.07, 0.03, *turn]
-    made[2] = [0.02, -0.02, 0.05, 0.2, -0.3 - 0.1 * episode, 0.1, 1.0]
-    made[3] = [0.10 - 0.03 * frame, 0.01, 0.0, 0.0, 0.0, 0.4, 0.9]
-    return made
+    """Poses (ROOM, 7) float32: instance 0 leaves the image, instance 2 rests, instance 3 drifts under the gripper shaft."""
+    result = np.zeros((ROOM, 7), np.float32)
+    result[:, 6] = 1.0
+    rotation = np.array([0.3 + 0.1 * frame, 0.2, 0.1 * episode, 1.7])  # Not of unit length: users normalise quaternions.
+    result[0] = [-0.10 - 0.04 * frame, 0.07, 0.03, *rotation]
+    result[2] = [0.02, -0.02, 0.05, 0.2, -0.3 - 0.1 * episode, 0.1, 1.0]
+    result[3] = [0.10 - 0.03 * frame, 0.01, 0.0, 0.0, 0.0, 0.4, 0.9]
+    return result
 
 
 def batches(
     views: int, episodes: tuple[int, ...], frames: int, lenses: tuple[Camera, ...], depth_scale: float = 0.1
 ) -> Iterator[FrameBatch]:
-    """All views of the episodes, interleaved as worlds that run side by side would bring them, in batches of at most `views`."""
+    """All views of the episodes, interleaved as from worlds that run in parallel, in batches of at most `views`."""
     order = [(episode, frame, camera) for frame in range(frames) for episode in episodes for camera in range(len(lenses))]
     for start in range(0, len(order), views):
         rows = [_view(episode, frame, camera, lenses[camera], depth_scale) for episode, frame, camera in order[start : start + views]]
@@ -94,14 +94,14 @@ def batches(
 
 
 def _layers(view: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Layers that differ between views; no truth of the boxes."""
-    number = int(100 * view["episode"] + 10 * view["camera"] + view["frame"])
-    flow = np.stack([view["instance"] - np.float32(number), np.where(view["instance"] == Segment.TABLE, np.nan, 0.25)], axis=-1)
-    return {"classes": (view["instance"] + np.uint16(number)).astype(np.uint16), "flow": flow.astype(np.float32)}
+    """Layers with made-up values that differ between views."""
+    index = int(100 * view["episode"] + 10 * view["camera"] + view["frame"])
+    flow = np.stack([view["instance"] - np.float32(index), np.where(view["instance"] == Segment.TABLE, np.nan, 0.25)], axis=-1)
+    return {"classes": (view["instance"] + np.uint16(index)).astype(np.uint16), "flow": flow.astype(np.float32)}
 
 
 def ticks(worlds: int, episodes: tuple[int, ...], frames: int) -> Iterator[TickBatch]:
-    """Every frame of the episodes, at most `worlds` side by side."""
+    """Every frame of the episodes, in batches of at most `worlds`."""
     order = [(episode, frame) for frame in range(frames) for episode in episodes]
     for start in range(0, len(order), worlds):
         rows = [_tick(episode, frame) for episode, frame in order[start : start + worlds]]
@@ -143,10 +143,10 @@ def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: flo
     instance = codes[nearest]
     pixels, boxes = np.zeros((ROOM, 3), np.int32), np.tile(np.array([0, 0, -1, -1], np.int32), (ROOM, 2, 1))
     for i in range(ROOM):
-        seen = instance == 1 + i
-        pixels[i] = np.isfinite(depths[i]).sum(), np.isfinite(inner[i]).sum(), seen.sum()
+        visible = instance == 1 + i
+        pixels[i] = np.isfinite(depths[i]).sum(), np.isfinite(inner[i]).sum(), visible.sum()
         boxes[i, 0] = _box(np.isfinite(depths[i]), camera.width, camera.height)
-        boxes[i, 1] = _box(seen, 0, 0)
+        boxes[i, 1] = _box(visible, 0, 0)
     shade = (40 * (nearest + 1) % 256).astype(np.uint8)
     return {
         "episode": np.int32(episode),
@@ -170,7 +170,7 @@ def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: flo
 
 
 def _rays(camera: Camera) -> np.ndarray:
-    """Directions with z = 1 in the camera's frame, over three widths and heights with the picture in the middle."""
+    """Ray directions with z = 1 in the camera's frame, over a canvas of 3 x 3 image sizes with the image in the middle."""
     x = np.arange(-camera.width, 2 * camera.width) + 0.5
     y = np.arange(-camera.height, 2 * camera.height) + 0.5
     columns, rows = np.meshgrid((x - camera.matrix[0, 2]) / camera.matrix[0, 0], (y - camera.matrix[1, 2]) / camera.matrix[1, 1])
@@ -182,7 +182,7 @@ def _nothing(camera: Camera) -> np.ndarray:
 
 
 def _depth(size: tuple[float, ...], pose: np.ndarray, camera: Camera) -> np.ndarray:
-    """Planar depth of a box [m], infinite where rays miss: the slabs between its faces."""
+    """Planar depth of a box [m] by the slab test; infinite where rays miss."""
     x, y, z, w = pose[3:].astype(np.float64) / np.linalg.norm(pose[3:].astype(np.float64))
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross

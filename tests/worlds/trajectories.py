@@ -1,4 +1,4 @@
-"""Ticks with all that physics records, of numbers that follow from episode and frame, and the store that a test makes of them."""
+"""Tick batches with physics arrays of pseudo-random values seeded by episode and frame, and zarr stores made of them."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ UNSEEN = ATTEMPT | {
 
 
 def config(**trajectory: Any) -> Config:
-    """Small chunks, so that a few frames fill several files."""
+    """Settings with small chunks, so that a few frames fill several files."""
     base = box_views.config()
     physics = dataclasses.replace(base.physics, steps_per_tick=STEP_COUNT)
     arrangement = dataclasses.replace(base.arrangement, max_objects=box_views.ROOM)
@@ -66,7 +66,7 @@ def config(**trajectory: Any) -> Config:
 
 
 def ticks(episodes: tuple[int, ...], frames: int, steps: bool = True) -> Iterator[TickBatch]:
-    """As `box_views.ticks`, all episodes side by side, with the arrays of physics."""
+    """Like `box_views.ticks` for all episodes in parallel, with physics arrays."""
     for batch in box_views.ticks(len(episodes), episodes, frames):
         rows = [_physics(int(episode), int(frame), steps) for episode, frame in zip(batch.episode, batch.frame, strict=True)]
         parts = [{name: np.stack([row[part][name] for row in rows]) for name in rows[0][part]} for part in range(2)]
@@ -76,14 +76,14 @@ def ticks(episodes: tuple[int, ...], frames: int, steps: bool = True) -> Iterato
 def _physics(episode: int, frame: int, steps: bool) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     numbers = np.random.default_rng((episode, frame))
     own = {item.name for item in dataclasses.fields(TickBatch)}
-    tick = {name: _some(numbers, spec) for name, spec in TICKS.arrays.items() if name not in own}
+    tick = {name: _random_array(numbers, spec) for name, spec in TICKS.arrays.items() if name not in own}
     drops = np.random.default_rng(episode).normal(size=(box_views.ROOM, 7)).astype(np.float32)
     tick |= {"mode": np.int32(1), "redrops": np.int32(episode), "drop_pose": drops}
-    made = {name: _some(numbers, spec) for name, spec in STEPS.arrays.items() if name not in COMPUTED} if steps else {}
-    return tick, made
+    step_arrays = {name: _random_array(numbers, spec) for name, spec in STEPS.arrays.items() if name not in COMPUTED} if steps else {}
+    return tick, step_arrays
 
 
-def _some(numbers: np.random.Generator, spec: ArraySpec) -> np.ndarray:
+def _random_array(numbers: np.random.Generator, spec: ArraySpec) -> np.ndarray:
     shape = spec.shape({"tick": 1, "step": STEP_COUNT, "instance": box_views.ROOM})
     shape = shape[1:] if spec.dims[0] == "tick" else shape
     kind = np.dtype(spec.dtype)
@@ -93,16 +93,16 @@ def _some(numbers: np.random.Generator, spec: ArraySpec) -> np.ndarray:
 
 
 def ends(episodes: tuple[int, ...], frames: int) -> list[EpisodeEnd]:
-    """Each with two attempts, of which the second saw nothing."""
-    made = []
+    """Ends of episodes, each with two attempts, the second without a visible object."""
+    result = []
     for episode in episodes:
         lines = tuple(json.dumps(record | {"episode": episode}) + "\n" for record in (ATTEMPT, UNSEEN))
-        made.append(EpisodeEnd(episode, 1, frames, int(Ending.EMPTIED), {"episode": episode, "mode": "pick", "picked": 2}, lines))
-    return made
+        result.append(EpisodeEnd(episode, 1, frames, int(Ending.EMPTIED), {"episode": episode, "mode": "pick", "picked": 2}, lines))
+    return result
 
 
 def write_set(out: Path, settings: Config, episodes: tuple[int, ...], frames: int, processes: int = 2, steps: bool = True) -> Path:
-    """A finished data set."""
+    """Write a complete data set."""
     with exporting(TrajectoryExporter, out, settings, processes) as exporter:
         exporter.write_constants()
         for batch in ticks(episodes, frames, steps):

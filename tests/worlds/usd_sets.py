@@ -1,4 +1,4 @@
-"""Small data sets in USD: objects of one and of two boxes that drift through an episode, of which one is picked."""
+"""Small USD data sets: objects made of one or two boxes that drift through an episode; one of them is picked."""
 
 from __future__ import annotations
 
@@ -21,23 +21,24 @@ from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
 
 FRAMES = 70
-"""More than are kept in memory at once."""
+"""More than the spool buffers in memory."""
 OBJECT_IDS = np.array([3, -1, 1, 2], np.int32)
 """At the first frame; instance 1 does not exist."""
 PICKED, PICKED_FRAME = 2, 41
-"""Instance that leaves, and the first frame without it."""
+"""Picked instance, and the first frame without it."""
 GRIPPER = (3, 60)
-"""First frame with gripper, first frame without it again."""
-LIGHT, TURN, STOPS = 1, 0.7, -0.25
+"""First frame with the gripper, and first frame without it after that."""
+LIGHT, YAW, EXPOSURE = 1, 0.7, -0.25
+"""Index of the environment map, its yaw [rad], and exposure compensation [EV]."""
 
 
 def settings(**overrides: object) -> Config:
-    """The preset `smoke` with changes; keys with __ for the dot."""
+    """The preset `smoke` with overrides; keys have __ for the dot."""
     return load_config("smoke", {key.replace("__", "."): value for key, value in overrides.items()})
 
 
 def textured(catalog: Catalog) -> Catalog:
-    """The second object gets texture coordinates, and a texture that its colour tints."""
+    """Copy of a catalog whose second object has texture coordinates, a texture and a base colour."""
     first, second, *others = catalog.entries
     numbers = np.random.default_rng(7)
     mesh = dataclasses.replace(second.mesh, uv=numbers.random((len(second.mesh.vertices), 2), dtype=np.float32))
@@ -46,14 +47,14 @@ def textured(catalog: Catalog) -> Catalog:
 
 
 def episode_ticks(episode: int, frames: int = FRAMES) -> list[TickBatch]:
-    """One world's ticks. Quaternions change their sign from frame to frame, which changes no pose."""
+    """Ticks of one world. Quaternions alternate their sign from frame to frame, which leaves poses unchanged."""
     numbers = np.random.default_rng(episode)
     start = numbers.normal(size=(7, 7))
     start[:, :3] *= 0.1
     drift = 0.02 * numbers.normal(size=(7, 7))
     drift[3] = 0.0  # instance 3 rests
     drift[4], start[4] = 0.0, [0, 0, 0, 0, 0, 0, 1]  # so does the tote
-    made = []
+    result = []
     for frame in range(frames):
         pose = start + frame * drift
         pose[:, 3:] *= (-1.0) ** frame / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
@@ -61,9 +62,9 @@ def episode_ticks(episode: int, frames: int = FRAMES) -> list[TickBatch]:
         object_id = OBJECT_IDS.copy()
         if frame >= PICKED_FRAME:
             object_id[PICKED] = -1
-            pose[PICKED, :] = 0.0  # nobody may look at it
-        seen = GRIPPER[0] <= frame < GRIPPER[1]
-        made.append(
+            pose[PICKED, :] = 0.0  # readers must ignore it
+        visible = GRIPPER[0] <= frame < GRIPPER[1]
+        result.append(
             TickBatch(
                 episode=np.array([episode], np.int32),
                 frame=np.array([frame], np.int32),
@@ -71,13 +72,13 @@ def episode_ticks(episode: int, frames: int = FRAMES) -> list[TickBatch]:
                 object_id=object_id[None],
                 pose=pose[None, :4].astype(np.float32),
                 fixture_pose=pose[None, 4:].astype(np.float32),
-                fixture_visible=np.array([[1, seen, seen]], np.int32),
+                fixture_visible=np.array([[1, visible, visible]], np.int32),
                 light=np.array([LIGHT], np.int32),
-                light_yaw=np.array([TURN], np.float32),
-                light_exposure=np.array([STOPS], np.float32),
+                light_yaw=np.array([YAW], np.float32),
+                light_exposure=np.array([EXPOSURE], np.float32),
             )
         )
-    return made
+    return result
 
 
 def write_set(
@@ -88,7 +89,7 @@ def write_set(
     lights: tuple[EnvironmentMap, ...] | None = None,
     frames: int = FRAMES,
 ) -> Path:
-    """A finished data set, written in this process; returns the folder of its USD files."""
+    """Write a complete data set in this process; returns the folder of its USD files."""
     (out / PARTIAL).mkdir(parents=True)
     with WriterPool(0, 0) as pool:
         exporter = UsdExporter(ExportContext(out, config, catalog, make_cameras(config.cameras), lights or skies()[:2], pool))

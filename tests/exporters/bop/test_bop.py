@@ -375,7 +375,7 @@ def test_bop_models_are_copied_byte_for_byte(tmp_path):
 
 
 class TestContract(ExporterContract):
-    kind = BopExporter
+    exporter_class = BopExporter
 
     @classmethod
     def config(cls) -> Config:

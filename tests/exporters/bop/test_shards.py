@@ -34,7 +34,7 @@ KINDS = ("rgb.jpg", "depth.png", "camera.json", "gt.json", "gt_info.json", "mask
 class TestShardsContract(ExporterContract):
     """Shards are whole or not there."""
 
-    kind = ShardsExporter
+    exporter_class = ShardsExporter
 
     @classmethod
     def config(cls) -> Config:

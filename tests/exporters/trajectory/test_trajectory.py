@@ -28,7 +28,7 @@ INSTANCES = 4
 
 
 class TestContract(ExporterContract):
-    kind = TrajectoryExporter
+    exporter_class = TrajectoryExporter
 
 
 @pytest.fixture(scope="module")

@@ -23,10 +23,7 @@ CATALOG = usd_sets.textured(small_worlds.catalog())
 
 
 class TestContract(ExporterContract):
-    kind = UsdExporter
-
-    def joins(self) -> bool:
-        return False
+    exporter_class = UsdExporter
 
 
 @pytest.fixture(scope="module")
@@ -220,4 +217,4 @@ def test_lights_are_named_after_their_maps(folder):
     dome = UsdLux.DomeLight.Get(stage, "/Episode/Lights/Dome")
     assert dome.GetPrim().GetDisplayName() == "mixed_lamps"
     assert dome.GetTextureFileAttr().Get().path == "./assets/lights/light_001.exr"
-    assert dome.GetExposureAttr().Get() == usd_sets.STOPS
+    assert dome.GetExposureAttr().Get() == usd_sets.EXPOSURE

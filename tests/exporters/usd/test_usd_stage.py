@@ -195,7 +195,7 @@ def test_the_dome_shows_its_map_where_the_pictures_do(tmp_path, rows, azimuth, p
     latitude = np.pi / 2 - (row + 0.5) / picture.shape[0] * np.pi
     local = np.array([np.cos(latitude) * np.sin(longitude), np.sin(latitude), np.cos(latitude) * np.cos(longitude)])
     found = placed(stage.GetPrimAtPath("/Episode/Lights/Dome"), 0)[:3, :3] @ local
-    a, p = np.radians(azimuth) + usd_sets.TURN, np.radians(polar)
+    a, p = np.radians(azimuth) + usd_sets.YAW, np.radians(polar)
     expected = np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
     assert np.degrees(np.arccos(found @ expected)) < 180.0 / ROWS
 
@@ -219,7 +219,7 @@ def test_suns_shine_from_where_they_stand(rows, azimuth, polar):
     stage = open_episode(rows, lights=(light, light))
     sun = UsdLux.DistantLight.Get(stage, "/Episode/Lights/Sun")
     found = placed(sun.GetPrim(), 0)[:3, :3] @ [0.0, 0.0, -1.0]
-    a, p = np.radians(azimuth) + usd_sets.TURN, np.radians(polar)
+    a, p = np.radians(azimuth) + usd_sets.YAW, np.radians(polar)
     np.testing.assert_allclose(found, -np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)]), atol=1e-6)
     assert sun.GetNormalizeAttr().Get()
     assert np.radians(sun.GetAngleAttr().Get() / 2) == pytest.approx(np.arctan(separate_sun(light)[2]), rel=1e-5)

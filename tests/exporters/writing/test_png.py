@@ -1,4 +1,4 @@
-"""PNG files: what OpenCV reads from them is what was written."""
+"""PNG encoder: OpenCV and Pillow decode the pixels that were encoded."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ def read(data: bytes) -> np.ndarray:
         hnp.arrays(np.uint16, st.tuples(SIDE, SIDE, st.just(3))),
     )
 )
-def test_pixels_come_back(image):
+def test_round_trip_by_opencv(image):
     back = read(encode_png(image))
     assert back.dtype == image.dtype.newbyteorder("=")
     np.testing.assert_array_equal(back, image)
 
 
 @pytest.mark.parametrize("strip_bytes", [0, 30, 45, 1 << 20])
-def test_strips_make_one_image(strip_bytes, monkeypatch):
+def test_strip_size_does_not_matter(strip_bytes, monkeypatch):
     monkeypatch.setattr(png, "_STRIP_BYTES", strip_bytes)
     for shape, kind in (((7, 5), np.uint16), ((7, 5, 3), np.uint8), ((1, 1), np.uint8)):
         image = np.random.default_rng(0).integers(0, np.iinfo(kind).max, shape, kind)
         np.testing.assert_array_equal(read(encode_png(image)), image)
 
 
-def test_a_view_into_a_larger_array_is_written_like_a_copy():
+def test_array_views_are_encoded_like_copies():
     ring = np.arange(4 * 6 * 8 * 3, dtype=np.uint8).reshape(4, 6, 8, 3)
     image = ring[2, ::2, 1:-1]
     assert encode_png(image) == encode_png(image.copy())
@@ -57,7 +57,7 @@ def test_a_view_into_a_larger_array_is_written_like_a_copy():
 
 
 def test_known_bytes():
-    """A 2 x 2 grey image, read off by hand: signature, header, then rows with the filter "up"."""
+    """A 2 x 2 greyscale image decoded by hand: signature, header, then rows with the filter "up"."""
     data = encode_png(np.array([[1, 2], [4, 2]], np.uint8))
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     assert data[8:33] == b"\x00\x00\x00\rIHDR" + bytes([0, 0, 0, 2, 0, 0, 0, 2, 8, 0, 0, 0, 0]) + zlib.crc32(data[12:29]).to_bytes(4)
@@ -67,7 +67,7 @@ def test_known_bytes():
 
 
 @given(st.data())
-def test_a_mask_is_written_at_its_place(data):
+def test_masks_are_encoded_at_their_place(data):
     height, width = data.draw(GREY)
     top, left = data.draw(st.integers(0, height)), data.draw(st.integers(0, width))
     rows, columns = data.draw(st.integers(0, height - top)), data.draw(st.integers(0, width - left))
@@ -77,7 +77,7 @@ def test_a_mask_is_written_at_its_place(data):
     runs = find_run_boundaries(mask.view(np.uint8), top, left).runs_of(1)
     stream = encode_mask_png(runs, height, width)
     np.testing.assert_array_equal(read(stream), full)
-    # OpenCV reads on where a checksum is wrong.
+    # OpenCV ignores wrong checksums; zlib and Pillow do not.
     length = int.from_bytes(stream[33:37])
     assert len(zlib.decompress(stream[41 : 41 + length])) == height * (1 + width)
     with Image.open(io.BytesIO(stream)) as image:
@@ -88,6 +88,6 @@ def test_a_mask_is_written_at_its_place(data):
 @pytest.mark.parametrize(
     "image", [np.zeros((2, 2)), np.zeros((2, 2, 2), np.uint16), np.zeros((2, 2, 4), np.uint8), np.zeros((0, 3), np.uint8)]
 )
-def test_other_images_are_refused(image):
+def test_unsupported_images_are_refused(image):
     with pytest.raises(ValueError, match="no PNG for an image of shape"):
         encode_png(image)

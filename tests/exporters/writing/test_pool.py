@@ -1,4 +1,4 @@
-"""Writer processes: order, back-pressure, failures."""
+"""Writer process pool: order, back-pressure, failures, processes."""
 
 from __future__ import annotations
 
@@ -59,6 +59,10 @@ def wait_for(*parts: object) -> None:
         time.sleep(0.005)
 
 
+def quit_python(_: Path) -> None:
+    os._exit(3)
+
+
 def interrupt(path: Path) -> None:
     os.kill(os.getpid(), signal.SIGINT)
     path.write_text(" ".join(sorted(sys.modules)))
@@ -87,7 +91,7 @@ def processes(pool: WriterPool) -> list[subprocess.Popen[bytes]]:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
-def test_images_arrive_whole_though_the_callers_buffer_changes(tmp_path, count):
+def test_images_are_copied_before_submit_returns(tmp_path, count):
     ring = np.empty((40, 50, 3), np.uint8)
     done = []
     with WriterPool(count, SIZE) as pool:
@@ -99,7 +103,7 @@ def test_images_arrive_whole_though_the_callers_buffer_changes(tmp_path, count):
         np.testing.assert_array_equal(np.load(tmp_path / f"{value}.npy"), np.full((20, 50, 3), value))
 
 
-def test_several_images_of_different_types_share_a_slot(tmp_path):
+def test_images_of_different_types_share_a_slot(tmp_path):
     images = (np.arange(7, dtype=np.uint8), np.arange(6.0).reshape(2, 3), np.zeros((0, 4), np.uint16), np.full((3, 3), 7, np.uint32))
     with WriterPool(1, shared_bytes(image.nbytes for image in images)) as pool:
         pool.submit(save_all, images, (tmp_path / "all.npz",), path=tmp_path)
@@ -123,40 +127,40 @@ def test_threads_copy_large_images(tmp_path, monkeypatch):
             np.testing.assert_array_equal(back, image)
 
 
-def test_many_orders_are_taken_at_once_each_with_its_own_images(tmp_path, monkeypatch):
-    """More than there are slots, made one by one, while threads copy the images of those before."""
+def test_more_tasks_than_slots_each_keep_their_own_image(tmp_path, monkeypatch):
+    """Tasks are prepared one by one while threads copy the images of earlier ones."""
     monkeypatch.setattr(pool_module, "PROCESSES_PER_COPY_THREAD", 1)
     count, side = 5 * QUEUE_DEPTH, 700
     ring = np.empty((count, side, side), np.uint8)
-    made, done = [], []
+    prepared, done = [], []
 
-    def orders(first: int) -> Iterator[WriteTask]:
+    def make_tasks(first: int) -> Iterator[WriteTask]:
         for value in range(first, first + count):
-            made.append(value)
+            prepared.append(value)
             ring[value - first] = value
             yield WriteTask(save, (ring[value - first],), (tmp_path / f"{value}.npy",), tmp_path, lambda value=value: done.append(value))
 
     with WriterPool(2, side * side) as pool:
         for first in (0, count):
-            pool.submit_all(orders(first))
+            pool.submit_all(make_tasks(first))
             ring[...] = 255
-    assert made == sorted(done) == list(range(2 * count))
-    for value in made:
+    assert prepared == sorted(done) == list(range(2 * count))
+    for value in prepared:
         np.testing.assert_array_equal(np.load(tmp_path / f"{value}.npy"), np.full((side, side), value))
 
 
-def test_a_failure_ends_the_orders(tmp_path):
-    made = []
+def test_a_failure_stops_taking_tasks(tmp_path):
+    prepared = []
 
-    def orders() -> Iterator[WriteTask]:
+    def make_tasks() -> Iterator[WriteTask]:
         while True:
-            made.append(None)
+            prepared.append(None)
             yield WriteTask(stumble_on, (np.zeros(4),), (tmp_path,), tmp_path)
 
     pool = WriterPool(2, SIZE)
     with pytest.raises(OutputError, match="ValueError: two lines"):
-        pool.submit_all(orders())
-    assert len(made) <= 1 + 2 * QUEUE_DEPTH
+        pool.submit_all(make_tasks())
+    assert len(prepared) <= 1 + 2 * QUEUE_DEPTH
     pool.abort()
 
 
@@ -166,7 +170,7 @@ def test_images_too_large_for_a_slot_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 2])
-def test_a_finished_task_may_have_others_done(tmp_path, count):
+def test_on_done_may_submit_further_tasks(tmp_path, count):
     with WriterPool(count, SIZE) as pool:
 
         def follow() -> None:
@@ -179,7 +183,7 @@ def test_a_finished_task_may_have_others_done(tmp_path, count):
         assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
 
 
-def test_answers_that_come_together_are_each_heard_once(tmp_path):
+def test_simultaneous_results_are_each_received_once(tmp_path):
     gate = tmp_path / "gate"
     with WriterPool(4, 1) as pool:
 
@@ -189,7 +193,7 @@ def test_answers_that_come_together_are_each_heard_once(tmp_path):
         for _ in range(4):
             pool.submit(wait_for, (), (gate,), path=gate, on_done=more)
         gate.touch()
-        # All four have answered before anybody listens.
+        # All four results are there before the pool receives any.
         time.sleep(0.5)
         listener = threading.Thread(target=pool.wait, daemon=True)
         listener.start()
@@ -198,7 +202,7 @@ def test_answers_that_come_together_are_each_heard_once(tmp_path):
     assert (tmp_path / "more").read_text() == "xxxx"
 
 
-def test_one_process_keeps_the_order(tmp_path):
+def test_one_process_runs_tasks_in_order(tmp_path):
     with WriterPool(1, SIZE) as pool:
         for letter in "abcdefghijklmnop":
             pool.submit(note, (), (tmp_path / "all", letter), path=tmp_path)
@@ -212,17 +216,17 @@ def test_many_tasks_without_images_do_not_block(tmp_path):
     assert len((tmp_path / "all").read_text()) == 500
 
 
-def test_a_full_queue_makes_the_caller_wait(tmp_path):
+def test_a_full_queue_blocks_the_caller(tmp_path):
     gate = tmp_path / "gate"
     with WriterPool(1, SIZE) as pool:
         for _ in range(QUEUE_DEPTH):
             pool.submit(wait_for, (np.zeros(4),), (gate,), path=tmp_path)
         threading.Timer(0.1, gate.touch).start()
-        pool.submit(wait_for, (np.zeros(4),), (gate,), path=tmp_path)  # Returns when there is room, so not before the gate opens.
+        pool.submit(wait_for, (np.zeros(4),), (gate,), path=tmp_path)  # Returns when a slot is free, so not before the gate opens.
         assert gate.exists()
 
 
-def test_an_abort_ends_what_runs(tmp_path):
+def test_abort_kills_running_processes(tmp_path):
     pool = WriterPool(2, SIZE)
     pool.submit(wait_for, (), (tmp_path / "never",), path=tmp_path)
     running = processes(pool)
@@ -234,7 +238,7 @@ def test_an_abort_ends_what_runs(tmp_path):
 
 
 @pytest.mark.parametrize("count", [0, 2])
-def test_a_full_disk_is_one_clear_line(tmp_path, count):
+def test_a_full_disk_is_reported_in_one_line(tmp_path, count):
     path = tmp_path / "picture.png"
     with pytest.raises(OutputError) as caught:
         run_one(count, fill_the_disk, path, tmp_path)
@@ -243,7 +247,7 @@ def test_a_full_disk_is_one_clear_line(tmp_path, count):
 
 
 @pytest.mark.parametrize("count", [0, 2])
-def test_a_failure_comes_up_at_the_next_call_and_stays(tmp_path, count):
+def test_a_failure_is_raised_by_this_and_every_later_call(tmp_path, count):
     pool = WriterPool(count, SIZE)
     with pytest.raises(OutputError, match="ValueError: two lines") as caught:
         submit_and_wait(pool, stumble, tmp_path, tmp_path)
@@ -255,17 +259,23 @@ def test_a_failure_comes_up_at_the_next_call_and_stays(tmp_path, count):
     pool.close()
 
 
-def test_a_dead_process_is_reported_with_what_it_wrote(tmp_path):
-    with pytest.raises(OutputError, match=r"was ended by SIGKILL while it wrote .*scene 3"):
+def test_a_killed_process_is_reported_with_its_path_and_memory_hint(tmp_path):
+    with pytest.raises(OutputError, match=r"was ended by SIGKILL while it wrote .*scene 3; if memory ran out, set bake\.writers"):
         run_one(2, die, tmp_path, tmp_path / "scene 3")
 
 
-def test_a_process_that_dies_while_it_waits_is_noticed(tmp_path):
+def test_memory_is_not_blamed_for_a_process_that_exits(tmp_path):
+    with pytest.raises(OutputError, match=r"ended with exit code 3 while it wrote .*scene 3; see its message above") as caught:
+        run_one(2, quit_python, tmp_path, tmp_path / "scene 3")
+    assert "ran out" not in str(caught.value)
+
+
+def test_a_process_that_dies_while_idle_is_reported(tmp_path):
     with pytest.raises(OutputError, match="while it had nothing to do"):
         kill_one(tmp_path / "a")
 
 
-def test_processes_survive_ctrl_c_and_never_load_the_simulator(tmp_path):
+def test_processes_ignore_ctrl_c_and_never_import_the_simulator(tmp_path):
     with WriterPool(1, SIZE) as pool:
         (writer,) = pool.pids()
         assert os.getpgid(writer) != os.getpgid(0)
@@ -277,7 +287,7 @@ def test_processes_survive_ctrl_c_and_never_load_the_simulator(tmp_path):
     assert not {"warp", "newton", "trimesh"} & set((tmp_path / "modules").read_text().split())
 
 
-def test_the_processes_end_when_the_bake_is_killed(tmp_path):
+def test_processes_exit_when_the_bake_is_killed(tmp_path):
     script = """
 import os, signal
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -285,17 +295,38 @@ pool = WriterPool(2, 1 << 16)
 print(*(worker.process.pid for worker in pool._workers), flush=True)
 os.kill(os.getpid(), signal.SIGKILL)
 """
-    done = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
-    assert done.returncode == -signal.SIGKILL
-    assert done.stderr == ""
+    killed = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    assert killed.stderr == ""
     deadline = time.monotonic() + 30
-    while any(_alive(int(pid)) for pid in done.stdout.split()):
+    while any(_alive(int(pid)) for pid in killed.stdout.split()):
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
 
+UNGUARDED_SCRIPT = """
+from pathlib import Path
+from synpick_warp.exporters.writing.files import write_synced
+from synpick_warp.exporters.writing.pool import WriterPool
+print("imported", flush=True)
+with WriterPool(2, 1) as pool:
+    for name in ("a", "b"):
+        pool.submit(write_synced, (), (Path(name), b"x"), path=Path(name))
+"""
+
+
+def test_a_script_without_main_guard_can_use_the_pool(tmp_path):
+    """Processes started by `multiprocessing` with spawn would run the script again, and fail."""
+    (tmp_path / "script.py").write_text(UNGUARDED_SCRIPT)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])}
+    command = [sys.executable, "script.py"]
+    ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
+    assert (ran.returncode, ran.stderr, ran.stdout) == (0, "", "imported\n")
+    assert [(tmp_path / name).read_text() for name in ("a", "b")] == ["x", "x"]
+
+
 def _alive(pid: int) -> bool:
-    """Whether a process runs; one that ended and waits to be collected does not."""
+    """Whether a process runs; a zombie does not."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:

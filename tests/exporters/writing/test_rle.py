@@ -1,4 +1,4 @@
-"""Masks cut from images, and run lengths."""
+"""Run-length encoding: runs of masks from run boundaries of images, and COCO's counts."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ SIDE = st.integers(1, 12)
 
 
 def decode(counts: list[int], height: int, width: int) -> np.ndarray:
-    """COCO's definition: runs down the columns, in turn 0 and 1, beginning with 0."""
+    """Decode COCO's uncompressed RLE: column-major runs that alternate between 0 and 1, starting with 0."""
     values = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
     return values.reshape(width, height).T
 
 
-def painted(runs: Runs, height: int, width: int) -> np.ndarray:
+def paint(runs: Runs, height: int, width: int) -> np.ndarray:
     full = np.zeros((height, width), bool)
     for column, first, past in zip(runs.column, runs.first, runs.past, strict=True):
         assert not full[first:past, column].any()
@@ -28,20 +28,20 @@ def painted(runs: Runs, height: int, width: int) -> np.ndarray:
     return full
 
 
-def cut(image: np.ndarray, data: st.DataObject) -> tuple[np.ndarray, int, int, int, int]:
-    """A part, with its first row and column, and height and width of a picture that holds it."""
+def place_randomly(image: np.ndarray, data: st.DataObject) -> tuple[np.ndarray, int, int, int, int]:
+    """A crop, its first row and column, and height and width of an image that contains it."""
     rows, columns = image.shape
     height, width = rows + data.draw(st.integers(0, 3)), columns + data.draw(st.integers(0, 3))
     return image, data.draw(st.integers(0, height - rows)), data.draw(st.integers(0, width - columns)), height, width
 
 
-def placed(part: np.ndarray, top: int, left: int, height: int, width: int) -> np.ndarray:
+def paste(part: np.ndarray, top: int, left: int, height: int, width: int) -> np.ndarray:
     full = np.zeros((height, width), part.dtype)
     full[top : top + part.shape[0], left : left + part.shape[1]] = part
     return full
 
 
-def of_mask(mask: object) -> Runs:
+def runs_of_mask(mask: object) -> Runs:
     return find_run_boundaries(np.array(mask, np.uint8)).runs_of(1)
 
 
@@ -56,11 +56,11 @@ def of_mask(mask: object) -> Runs:
     ],
 )
 def test_known_run_lengths(mask, counts):
-    assert of_mask(mask).counts(*np.shape(mask)).tolist() == counts
+    assert runs_of_mask(mask).counts(*np.shape(mask)).tolist() == counts
 
 
 @pytest.mark.parametrize("shape", [(0, 3), (3, 0), (0, 0), (2, 3)])
-def test_a_part_without_pixels_has_no_runs(shape):
+def test_an_empty_crop_has_no_runs(shape):
     runs = find_run_boundaries(np.zeros(shape, np.uint32), 2, 1).runs_with(31)
     assert runs.counts(4, 5).tolist() == [20]
     assert runs.box() is None
@@ -69,10 +69,10 @@ def test_a_part_without_pixels_has_no_runs(shape):
 
 @given(hnp.arrays(np.uint8, st.tuples(SIDE, SIDE), elements=st.integers(0, 3)), st.integers(1, 4), st.data())
 def test_values_become_runs_and_run_lengths(image, value, data):
-    part, top, left, height, width = cut(image, data)
-    expected = placed(part, top, left, height, width) == value
+    part, top, left, height, width = place_randomly(image, data)
+    expected = paste(part, top, left, height, width) == value
     runs = find_run_boundaries(part, top, left).runs_of(value)
-    np.testing.assert_array_equal(painted(runs, height, width), expected)
+    np.testing.assert_array_equal(paint(runs, height, width), expected)
     counts = runs.counts(height, width).tolist()
     assert sum(counts) == height * width
     assert all(counts[1:])
@@ -88,16 +88,16 @@ def test_values_become_runs_and_run_lengths(image, value, data):
     st.data(),
 )
 def test_bits_become_runs(bits, instance, data):
-    part, top, left, height, width = cut(bits, data)
-    expected = placed((bits >> np.uint32(instance)) & 1 == 1, top, left, height, width)
-    np.testing.assert_array_equal(painted(find_run_boundaries(part, top, left).runs_with(instance), height, width), expected)
+    part, top, left, height, width = place_randomly(bits, data)
+    expected = paste((bits >> np.uint32(instance)) & 1 == 1, top, left, height, width)
+    np.testing.assert_array_equal(paint(find_run_boundaries(part, top, left).runs_with(instance), height, width), expected)
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 @given(hnp.arrays(bool, st.tuples(SIDE, SIDE)))
-def test_pycocotools_reads_and_makes_the_same_run_lengths(mask):
+def test_pycocotools_decodes_and_encodes_the_same_run_lengths(mask):
     height, width = mask.shape
-    runs = of_mask(mask)
+    runs = runs_of_mask(mask)
     record = {"counts": runs.counts(height, width).tolist(), "size": [height, width]}
     theirs = coco.frPyObjects(record, height, width)
     np.testing.assert_array_equal(coco.decode(theirs), mask)
