@@ -52,7 +52,7 @@ def draw(toy: ToyScene, device: wp.Device, before: Before | None = None, names: 
     if before is not None:
         poses, visible = before.fixture_poses or toy.fixture_poses, before.fixtures_visible or toy.fixtures_visible
         last = snapshot(replace(toy, placed=before.placed, fixture_poses=poses, fixtures_visible=visible), device)
-        for name in ("entry", "pose", "fixture_pose", "fixture_visible"):
+        for name in ("catalog_index", "pose", "fixture_pose", "fixture_visible"):
             wp.copy(getattr(made, f"last_{name}"), getattr(last, name))
         made.follows.assign(np.array(before.follows))
     renderer = Renderer(config, scene, toy.room, views)
