@@ -1,10 +1,10 @@
-"""Kernels that ask the surface's law and the samplers for what tests want to know."""
+"""Test kernels that evaluate the BRDF, the environment sampler and the sample points."""
 
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.brdf import Gloss, brdf_at, density, evaluate_disc, evaluate_parts, scatter
-from synpick_warp.kernels.render.lighting.sampling import Chances, light_density, sample_light, scrambled_point
+from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, brdf_pdf, evaluate_brdf, evaluate_disc, make_brdf, sample_brdf
+from synpick_warp.kernels.render.lighting.sampling import EnvironmentCdf, environment_pdf, sample_environment, scrambled_point
 
 wp.set_module_options({"enable_backward": False})
 
@@ -14,104 +14,104 @@ UP = wp.constant(wp.vec3(0.0, 0.0, 1.0))
 @wp.kernel
 def evaluate_kernel(
     # In:
-    gloss: Gloss,
+    tables: AlbedoTables,
     base: wp.vec3,
     metallic: float,
     roughness: float,
-    outgoing: wp.array[wp.vec3],
-    incoming: wp.array[wp.vec3],
+    outgoing: wp.array[wp.vec3],  # (sample)
+    incoming: wp.array[wp.vec3],  # (sample)
     # Out:
-    value_out: wp.array[wp.vec3],
-    density_out: wp.array[float],
+    value_out: wp.array[wp.vec3],  # (sample)
+    pdf_out: wp.array[float],  # (sample)
 ):
-    """f cos and the density of drawing `incoming`, normal +z."""
+    """BRDF times cosine, and the pdf of sampling `incoming`; normal +z."""
     i = wp.tid()
-    brdf = brdf_at(gloss, base, metallic, roughness, UP, outgoing[i])
-    parts = evaluate_parts(gloss, brdf, incoming[i])
-    value_out[i] = parts.gloss + parts.diffuse * brdf.diffuse
-    density_out[i] = density(brdf, incoming[i])
+    brdf = make_brdf(tables, base, metallic, roughness, UP, outgoing[i])
+    value = evaluate_brdf(tables, brdf, incoming[i])
+    value_out[i] = value.specular + value.diffuse * brdf.diffuse
+    pdf_out[i] = brdf_pdf(brdf, incoming[i])
 
 
 @wp.kernel
 def evaluate_disc_kernel(
     # In:
-    gloss: Gloss,
+    tables: AlbedoTables,
     base: wp.vec3,
     metallic: float,
     roughness: float,
     outgoing: wp.vec3,
-    middle: wp.array[wp.vec3],
-    spread: float,
+    center: wp.array[wp.vec3],  # (sample)
+    radius: float,
     # Out:
-    value_out: wp.array[wp.vec3],
+    value_out: wp.array[wp.vec3],  # (sample)
 ):
-    """Mean of f cos over discs about `middle`, normal +z."""
+    """Mean of BRDF times cosine over disc lights about `center`; normal +z."""
     i = wp.tid()
-    value_out[i] = evaluate_disc(gloss, brdf_at(gloss, base, metallic, roughness, UP, outgoing), middle[i], spread)
+    value_out[i] = evaluate_disc(tables, make_brdf(tables, base, metallic, roughness, UP, outgoing), center[i], radius)
 
 
 @wp.kernel
-def scatter_kernel(
+def sample_brdf_kernel(
     # In:
-    gloss: Gloss,
+    tables: AlbedoTables,
     base: wp.vec3,
     metallic: float,
     roughness: float,
     outgoing: wp.vec3,
-    numbers: wp.array[wp.vec3],
+    numbers: wp.array[wp.vec3],  # (sample)
     # Out:
-    incoming_out: wp.array[wp.vec3],
+    incoming_out: wp.array[wp.vec3],  # (sample)
 ):
-    """Directions drawn from triples of numbers, normal +z."""
+    """Directions sampled by triples of uniform numbers; normal +z."""
     i = wp.tid()
     u = numbers[i]
-    incoming_out[i] = scatter(brdf_at(gloss, base, metallic, roughness, UP, outgoing), u[0], wp.vec2(u[1], u[2]))
+    incoming_out[i] = sample_brdf(make_brdf(tables, base, metallic, roughness, UP, outgoing), u[0], wp.vec2(u[1], u[2]))
 
 
 @wp.kernel
-def light_kernel(
+def sample_environment_kernel(
     # In:
-    chances: Chances,
-    numbers: wp.array[wp.vec2],
+    cdf: EnvironmentCdf,
+    numbers: wp.array[wp.vec2],  # (sample)
     # Out:
-    direction_out: wp.array[wp.vec3],
-    drawn_out: wp.array[float],
-    found_out: wp.array[float],
+    direction_out: wp.array[wp.vec3],  # (sample)
+    sampled_pdf_out: wp.array[float],  # (sample)
+    evaluated_pdf_out: wp.array[float],  # (sample)
 ):
-    """Directions drawn from map 0, the density that comes with them, and the density that is found for them afterwards."""
+    """Directions sampled from map 0, the pdf that the sampler returns with them, and the pdf evaluated for them afterwards."""
     i = wp.tid()
-    made = sample_light(chances, 0, numbers[i])
-    direction_out[i] = made.direction
-    drawn_out[i] = made.density
-    found_out[i] = light_density(chances, 0, made.direction)
+    sample = sample_environment(cdf, 0, numbers[i])
+    direction_out[i] = sample.direction
+    sampled_pdf_out[i] = sample.pdf
+    evaluated_pdf_out[i] = environment_pdf(cdf, 0, sample.direction)
 
 
 @wp.kernel
-def point_kernel(
+def sample_point_kernel(
     # In:
     key: wp.uint64,
     dimension: int,
     # Out:
-    point_out: wp.array[wp.vec2],
+    point_out: wp.array[wp.vec2],  # (sample)
 ):
-    """The first points of a dimension."""
+    """The first scrambled Sobol' points of a dimension."""
     i = wp.tid()
     point_out[i] = scrambled_point(key, i, dimension)
 
 
 def toward(cosine, azimuth=0.0):
-    """Unit vectors (..., 3) float32 with these cosines to +z."""
+    """Unit vectors (..., 3) float32 with the given cosines to +z and azimuths [rad]."""
     sine = np.sqrt(1.0 - np.square(cosine))
     return np.stack(np.broadcast_arrays(sine * np.cos(azimuth), sine * np.sin(azimuth), cosine), axis=-1).astype(np.float32)
 
 
-def evaluated(gloss, material, outgoing, incoming):
-    """f cos (N, 3) and density (N) for pairs of directions."""
+def evaluate(tables, material, outgoing, incoming):
+    """BRDF times cosine (N, 3) and pdf (N) for pairs of directions."""
     incoming = np.atleast_2d(incoming)
     outgoing = np.broadcast_to(outgoing, incoming.shape)
-    arrays = [wp.array(np.ascontiguousarray(a), dtype=wp.vec3, device=gloss.albedo.device) for a in (outgoing, incoming)]
-    value = wp.empty(len(incoming), dtype=wp.vec3, device=gloss.albedo.device)
-    density = wp.empty(len(incoming), dtype=wp.float32, device=gloss.albedo.device)
+    arrays = [wp.array(np.ascontiguousarray(a), dtype=wp.vec3, device=tables.directional.device) for a in (outgoing, incoming)]
+    value = wp.empty(len(incoming), dtype=wp.vec3, device=tables.directional.device)
+    pdf = wp.empty(len(incoming), dtype=wp.float32, device=tables.directional.device)
     base, metallic, roughness = material
-    wp.launch(evaluate_kernel, len(incoming), [gloss, wp.vec3(*base), metallic, roughness, *arrays], [value, density], device=value.device)
-    return value.numpy().astype(np.float64), density.numpy().astype(np.float64)
+    wp.launch(evaluate_kernel, len(incoming), [tables, wp.vec3(*base), metallic, roughness, *arrays], [value, pdf], device=value.device)
+    return value.numpy().astype(np.float64), pdf.numpy().astype(np.float64)

@@ -1,195 +1,201 @@
-"""How a surface scatters light: metallic-roughness with a GGX lobe, what that lobe scatters several times, and a diffuse lobe below it.
+"""Metallic-roughness BRDF: a GGX specular lobe with energy-compensated multiple scattering over a diffuse lobe; evaluation and sampling.
 
-With μ the cosine to the normal, F₀ the reflectance at normal incidence, E(μ) the single-scattering albedo of the lobe for F = 1 and
-E_d(μ) that of all gloss of a dielectric, their cosine-weighted means written Ē:
+With μ the cosine to the normal, F₀ the reflectance at normal incidence, E(μ) the directional albedo of the single-scattering lobe for
+F = 1 and E_d(μ) the directional albedo of all specular reflection of a dielectric, their cosine-weighted means written Ē:
 
-    f = D F G₂ / (4 μ_i μ_o)                                        gloss, single scattering (Walter et al., 2007; Heitz, 2014)
-      + F_m (1 - E(μ_i)) (1 - E(μ_o)) / (π (1 - Ē))                 gloss, multiple scattering (Kulla and Conty, 2017)
-      + (1 - metallic) base (1 - E_d(μ_i)) (1 - E_d(μ_o)) / (π (1 - Ē_d))     diffuse: what the gloss lets through (Kelemen, 2001)
+    f = D F G₂ / (4 μ_i μ_o)                                        specular, single scattering (Walter et al., 2007; Heitz, 2014)
+      + F_m (1 - E(μ_i)) (1 - E(μ_o)) / (π (1 - Ē))                 specular, multiple scattering (Kulla and Conty, 2017)
+      + (1 - metallic) base (1 - E_d(μ_i)) (1 - E_d(μ_o)) / (π (1 - Ē_d))     diffuse: what the specular lobe transmits (Kelemen, 2001)
 
-This is the mixture, by `metallic`, of a metal and a dielectric, as glTF has it. Each part is reciprocal, and a white base colour
-reflects all light. F is Schlick's, so that the albedo is linear in F₀: ∫ D F G₂ / (4 μ_o) dω = F₀ a(μ) + b(μ), E = a + b. A table
-holds a and b.
+This blends a metal and a dielectric by `metallic`, as glTF does. Each term is reciprocal, and a white base colour reflects all light
+(white furnace test). F is Schlick's approximation, so the albedo is linear in F₀: ∫ D F G₂ / (4 μ_o) dω = F₀ a(μ) + b(μ), E = a + b.
+`AlbedoTables` holds a and b.
 """
 
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.sampling import around, sobol_point
+from synpick_warp.kernels.render.lighting.sampling import rotate_to_axis, sobol_point
 
 wp.set_module_options({"enable_backward": False})
 
-DIELECTRIC = wp.constant(0.04)
-"""Reflectance of plastics and paper at normal incidence."""
+DIELECTRIC_F0 = wp.constant(0.04)
+"""F₀ of plastics and paper: reflectance at normal incidence."""
 MIN_ALPHA = wp.constant(0.01)
-"""Smallest squared roughness; smoother surfaces would mirror a lamp as a point that no pixel meets."""
+"""Smallest GGX width alpha = roughness²; smoother surfaces would reflect a lamp into a point that no pixel samples."""
 MIN_COSINE = wp.constant(1.0e-4)
-"""Cosines, and products of such, are kept off zero by this much before something is divided by them."""
-LEAST_FACING = wp.constant(0.01)
-"""Interpolated normals are bent until this is their cosine to the side from which they are seen."""
-LEAST_RISE = wp.constant(1.0e-7)
-"""Facets point up by at least this much, so that their normal has a direction."""
-LEAST_LOST = wp.constant(1.0e-6)
-"""A mirror scatters nothing twice; what it would is divided by no less than this."""
-GLOSS_ROWS = wp.constant(32)
-"""Roughness in the table of albedos: i / (GLOSS_ROWS - 1)."""
-GLOSS_COLUMNS = wp.constant(32)
-"""Roots of cosines in the table: j / (GLOSS_COLUMNS - 1); the albedo changes fastest at grazing angles."""
-GLOSS_SAMPLES = wp.constant(4096)
-"""Directions that find one entry of the table, to about 1e-4."""
-LEAST_SHARE = wp.constant(0.25)
-"""No lobe that scatters anything is chosen more seldom than this."""
+"""Divisors that are cosines or products of cosines are at least this."""
+MIN_FACING = wp.constant(0.01)
+"""Interpolated normals are bent towards the viewer until their cosine to the view direction is this."""
+MIN_FACET_Z = wp.constant(1.0e-7)
+"""Smallest z of a sampled microfacet normal before it is normalized."""
+MIN_LOST_ALBEDO = wp.constant(1.0e-6)
+"""Smallest divisor 1 - Ē: a mirror scatters nothing more than once."""
+ALBEDO_ROWS = wp.constant(32)
+"""Rows of the albedo table: roughness i / (ALBEDO_ROWS - 1)."""
+ALBEDO_COLUMNS = wp.constant(32)
+"""Columns of the albedo table: √cosine j / (ALBEDO_COLUMNS - 1), because the albedo changes fastest at grazing angles."""
+ALBEDO_SAMPLES = wp.constant(4096)
+"""Directions per entry of the albedo table: its error is about 1e-4."""
+MIN_LOBE_PROBABILITY = wp.constant(0.25)
+"""Smallest probability of sampling a lobe that is not black."""
 
 
 @wp.struct
-class Gloss:
-    """Albedo of the single-scattering lobe: F₀ times the first component plus the second."""
+class AlbedoTables:
+    """Directional albedo of the single-scattering GGX lobe: F₀ times the first component (a) plus the second (b)."""
 
-    albedo: wp.array2d[wp.vec2]
-    """(roughness, root of the cosine)."""
+    directional: wp.array2d[wp.vec2]
+    """(roughness, √cosine)."""
     mean: wp.array[wp.vec2]
-    """(roughness): 2 ∫ albedo μ dμ of the table as it is interpolated."""
+    """(roughness): cosine-weighted mean, 2 ∫ albedo μ dμ of the table as it is interpolated."""
 
 
 @wp.struct
 class Brdf:
-    """A surface at one hit, seen from one direction. Directions are unit vectors in the world that point away from the hit."""
+    """The BRDF at one hit for one view direction. Directions are unit vectors in the world that point away from the hit."""
 
     normal: wp.vec3
     tangent: wp.vec3
     bitangent: wp.vec3
     outgoing: wp.vec3
+    """View direction."""
     roughness: float
     alpha: float
-    reflectance: wp.vec3
-    """F₀."""
+    """GGX width: roughness², at least MIN_ALPHA."""
+    f0: wp.vec3
+    """F₀: reflectance at normal incidence."""
     diffuse: wp.vec3
-    """(1 - metallic) times base colour."""
-    multiple: wp.vec3
-    """F_m: what is left of light that the lobe scatters more than once."""
-    coat_multiple: float
+    """Diffuse colour: (1 - metallic) times base colour."""
+    multi_scatter: wp.vec3
+    """F_m: fraction of light that survives being scattered more than once."""
+    coat_multi_scatter: float
     """F_m of a dielectric."""
     albedo: wp.vec2
-    """The table's entry for the outgoing direction."""
-    mean: wp.vec2
-    """The table's mean."""
-    gloss_share: float
-    """How often a direction is drawn from the GGX lobe; else from the cosine."""
+    """Entry of the directional albedo table for the view direction."""
+    mean_albedo: wp.vec2
+    """Entry of the mean albedo table."""
+    specular_probability: float
+    """Probability of sampling the GGX lobe; else the cosine lobe is sampled."""
 
 
 @wp.func
-def gloss_albedo(gloss: Gloss, roughness: float, cosine: float) -> wp.vec2:
-    """The table at a roughness and a cosine, bilinear in roughness and in the cosine's root."""
-    y = wp.clamp(roughness, 0.0, 1.0) * float(GLOSS_ROWS - 1)
-    x = wp.sqrt(wp.clamp(cosine, 0.0, 1.0)) * float(GLOSS_COLUMNS - 1)
-    row = wp.min(int(y), GLOSS_ROWS - 2)
-    column = wp.min(int(x), GLOSS_COLUMNS - 2)
+def directional_albedo(tables: AlbedoTables, roughness: float, cosine: float) -> wp.vec2:
+    """Directional albedo at a roughness and a cosine, bilinear in roughness and √cosine."""
+    y = wp.clamp(roughness, 0.0, 1.0) * float(ALBEDO_ROWS - 1)
+    x = wp.sqrt(wp.clamp(cosine, 0.0, 1.0)) * float(ALBEDO_COLUMNS - 1)
+    row = wp.min(int(y), ALBEDO_ROWS - 2)
+    column = wp.min(int(x), ALBEDO_COLUMNS - 2)
     right = x - float(column)
     return wp.lerp(
-        wp.lerp(gloss.albedo[row, column], gloss.albedo[row, column + 1], right),
-        wp.lerp(gloss.albedo[row + 1, column], gloss.albedo[row + 1, column + 1], right),
+        wp.lerp(tables.directional[row, column], tables.directional[row, column + 1], right),
+        wp.lerp(tables.directional[row + 1, column], tables.directional[row + 1, column + 1], right),
         y - float(row),
     )
 
 
 @wp.func
-def gloss_mean(gloss: Gloss, roughness: float) -> wp.vec2:
-    """The table's mean at a roughness."""
-    y = wp.clamp(roughness, 0.0, 1.0) * float(GLOSS_ROWS - 1)
-    row = wp.min(int(y), GLOSS_ROWS - 2)
-    return wp.lerp(gloss.mean[row], gloss.mean[row + 1], y - float(row))
+def mean_albedo_at(tables: AlbedoTables, roughness: float) -> wp.vec2:
+    """Mean albedo at a roughness."""
+    y = wp.clamp(roughness, 0.0, 1.0) * float(ALBEDO_ROWS - 1)
+    row = wp.min(int(y), ALBEDO_ROWS - 2)
+    return wp.lerp(tables.mean[row], tables.mean[row + 1], y - float(row))
 
 
 @wp.func
-def multiple_share(kept: float, reflectance: float) -> float:
-    """F_m for the table's mean albedo `kept`: light meets the facets k > 1 times with chance ∝ (1 - Ē)^(k - 1), and F̄ stays each time.
+def multi_scatter_fresnel(mean_albedo: float, reflectance: float) -> float:
+    """F_m, the Fresnel factor of multiple scattering, for F₀ = `reflectance` and Ē = `mean_albedo`.
 
-    Schlick's term averages to F̄ = F₀ + (1 - F₀) / 21. The sum begins at the second time, hence the square (Hill, 2018).
+    Light hits k > 1 facets with probability ∝ (1 - Ē)^(k - 1) and keeps the fraction F̄ each time. Schlick's approximation has the mean
+    F̄ = F₀ + (1 - F₀) / 21. The series begins at the second hit, hence the square (Hill, 2018).
     """
     average = (20.0 * reflectance + 1.0) / 21.0
-    return average * average * kept / (1.0 - (1.0 - kept) * average)
+    return average * average * mean_albedo / (1.0 - (1.0 - mean_albedo) * average)
 
 
 @wp.func
-def coat_share(brdf: Brdf, albedo: wp.vec2) -> float:
-    """E_d: what all gloss of a dielectric reflects where the table says `albedo`."""
-    return albedo[0] * DIELECTRIC + albedo[1] + (1.0 - albedo[0] - albedo[1]) * brdf.coat_multiple
+def coat_albedo(brdf: Brdf, albedo: wp.vec2) -> float:
+    """E_d: albedo of all specular reflection of a dielectric (the coat over the diffuse lobe), for the table's entry `albedo`."""
+    return albedo[0] * DIELECTRIC_F0 + albedo[1] + (1.0 - albedo[0] - albedo[1]) * brdf.coat_multi_scatter
 
 
 @wp.func
-def even_gloss(brdf: Brdf) -> wp.vec3:
-    """Share of even light from everywhere that the gloss reflects to where it is seen from, however often it scatters it."""
-    once = brdf.albedo[0] * brdf.reflectance + wp.vec3(brdf.albedo[1], brdf.albedo[1], brdf.albedo[1])
-    return once + (1.0 - brdf.albedo[0] - brdf.albedo[1]) * brdf.multiple
+def specular_albedo(brdf: Brdf) -> wp.vec3:
+    """Directional albedo of all specular reflection, single and multiple scattering: its response to uniform light."""
+    single = brdf.albedo[0] * brdf.f0 + wp.vec3(brdf.albedo[1], brdf.albedo[1], brdf.albedo[1])
+    return single + (1.0 - brdf.albedo[0] - brdf.albedo[1]) * brdf.multi_scatter
 
 
 @wp.func
-def mean_of(color: wp.vec3) -> float:
+def mean_channel(color: wp.vec3) -> float:
+    """Mean of the three channels."""
     return (color[0] + color[1] + color[2]) / 3.0
 
 
 @wp.func
-def facing(normal: wp.vec3, outgoing: wp.vec3) -> wp.vec3:
-    """`normal`, bent towards `outgoing` as far as it takes to see its front: interpolated normals turn away at silhouettes."""
+def bend_normal(normal: wp.vec3, outgoing: wp.vec3) -> wp.vec3:
+    """`normal`, bent until it faces the viewer: interpolated normals point away at silhouettes. `outgoing` is the view direction."""
     cosine = wp.dot(normal, outgoing)
-    if cosine >= LEAST_FACING:
+    if cosine >= MIN_FACING:
         return normal
-    return wp.normalize(normal + (LEAST_FACING - cosine) * outgoing)
+    return wp.normalize(normal + (MIN_FACING - cosine) * outgoing)
 
 
 @wp.func
-def brdf_at(gloss: Gloss, base: wp.vec3, metallic: float, roughness: float, normal: wp.vec3, outgoing: wp.vec3) -> Brdf:
-    """A surface of linear base colour `base`, seen from `outgoing`; `normal` points to the same side."""
-    made = Brdf()
-    made.normal = facing(normal, outgoing)
-    made.tangent = around(made.normal, wp.vec3(1.0, 0.0, 0.0))
-    made.bitangent = around(made.normal, wp.vec3(0.0, 1.0, 0.0))
-    made.outgoing = outgoing
-    made.roughness = roughness
-    made.alpha = wp.clamp(roughness * roughness, MIN_ALPHA, 1.0)
-    made.reflectance = wp.lerp(wp.vec3(DIELECTRIC, DIELECTRIC, DIELECTRIC), base, metallic)
-    made.diffuse = (1.0 - metallic) * base
-    made.albedo = gloss_albedo(gloss, roughness, wp.dot(made.normal, outgoing))
-    made.mean = gloss_mean(gloss, roughness)
-    kept = made.mean[0] + made.mean[1]
-    made.coat_multiple = multiple_share(kept, DIELECTRIC)
-    metal = wp.vec3(multiple_share(kept, base[0]), multiple_share(kept, base[1]), multiple_share(kept, base[2]))
-    made.multiple = wp.lerp(wp.vec3(made.coat_multiple, made.coat_multiple, made.coat_multiple), metal, metallic)
-    single = made.albedo[0] * mean_of(made.reflectance) + made.albedo[1]
-    rest = (1.0 - made.albedo[0] - made.albedo[1]) * mean_of(made.multiple)
-    rest += (1.0 - coat_share(made, made.albedo)) * mean_of(made.diffuse)
-    made.gloss_share = 1.0
+def make_brdf(tables: AlbedoTables, base: wp.vec3, metallic: float, roughness: float, normal: wp.vec3, outgoing: wp.vec3) -> Brdf:
+    """Build the BRDF of a surface with linear base colour `base` for the view direction `outgoing`; `normal` points to the same side."""
+    brdf = Brdf()
+    brdf.normal = bend_normal(normal, outgoing)
+    brdf.tangent = rotate_to_axis(brdf.normal, wp.vec3(1.0, 0.0, 0.0))
+    brdf.bitangent = rotate_to_axis(brdf.normal, wp.vec3(0.0, 1.0, 0.0))
+    brdf.outgoing = outgoing
+    brdf.roughness = roughness
+    brdf.alpha = wp.clamp(roughness * roughness, MIN_ALPHA, 1.0)
+    brdf.f0 = wp.lerp(wp.vec3(DIELECTRIC_F0, DIELECTRIC_F0, DIELECTRIC_F0), base, metallic)
+    brdf.diffuse = (1.0 - metallic) * base
+    brdf.albedo = directional_albedo(tables, roughness, wp.dot(brdf.normal, outgoing))
+    brdf.mean_albedo = mean_albedo_at(tables, roughness)
+    mean = brdf.mean_albedo[0] + brdf.mean_albedo[1]
+    brdf.coat_multi_scatter = multi_scatter_fresnel(mean, DIELECTRIC_F0)
+    metal = wp.vec3(multi_scatter_fresnel(mean, base[0]), multi_scatter_fresnel(mean, base[1]), multi_scatter_fresnel(mean, base[2]))
+    brdf.multi_scatter = wp.lerp(wp.vec3(brdf.coat_multi_scatter, brdf.coat_multi_scatter, brdf.coat_multi_scatter), metal, metallic)
+    single = brdf.albedo[0] * mean_channel(brdf.f0) + brdf.albedo[1]
+    # The cosine lobe also samples multiple scattering.
+    rest = (1.0 - brdf.albedo[0] - brdf.albedo[1]) * mean_channel(brdf.multi_scatter)
+    rest += (1.0 - coat_albedo(brdf, brdf.albedo)) * mean_channel(brdf.diffuse)
+    brdf.specular_probability = 1.0
     if rest > 0.0:
-        made.gloss_share = wp.clamp(single / (single + rest), LEAST_SHARE, 1.0 - LEAST_SHARE)
-    return made
+        brdf.specular_probability = wp.clamp(single / (single + rest), MIN_LOBE_PROBABILITY, 1.0 - MIN_LOBE_PROBABILITY)
+    return brdf
 
 
 @wp.func
 def to_local(brdf: Brdf, direction: wp.vec3) -> wp.vec3:
-    """A direction in the frame whose z is the normal."""
+    """Transform a world direction into the shading frame, whose z is the normal."""
     return wp.vec3(wp.dot(direction, brdf.tangent), wp.dot(direction, brdf.bitangent), wp.dot(direction, brdf.normal))
 
 
 @wp.func
-def smith(cosine: float, alpha: float) -> float:
-    """1 + 2 Λ of GGX: masking alone is 2 / (1 + smith), both ways, correlated in height, it is 2 / (smith_i + smith_o)."""
+def smith_term(cosine: float, alpha: float) -> float:
+    """1 + 2 Λ of Smith's masking function for GGX, s: G₁ = 2 / (1 + s); height-correlated G₂ = 2 / (s_i + s_o)."""
     a2 = alpha * alpha
     c2 = wp.max(cosine * cosine, MIN_COSINE * MIN_COSINE)
     return wp.sqrt(1.0 + a2 * wp.max(1.0 - c2, 0.0) / c2)
 
 
 @wp.func
-def facets(half_way: wp.vec3, alpha: float) -> float:
-    """D of GGX: density of microfacets about a local half vector."""
+def ggx_distribution(half_way: wp.vec3, alpha: float) -> float:
+    """GGX normal distribution D at a half vector in the shading frame."""
     a2 = alpha * alpha
-    spread = (half_way[0] * half_way[0] + half_way[1] * half_way[1]) + a2 * half_way[2] * half_way[2]
-    return a2 / (wp.PI * spread * spread)
+    denominator = (half_way[0] * half_way[0] + half_way[1] * half_way[1]) + a2 * half_way[2] * half_way[2]
+    return a2 / (wp.PI * denominator * denominator)
 
 
 @wp.func
-def facets_towards_disc(half_way: wp.vec3, alpha: float, radius: float) -> float:
-    """Mean D of GGX over half vectors whose slopes lie in a disc of this radius about a local one's; `facets` if the radius is 0.
+def ggx_disc_distribution(half_way: wp.vec3, alpha: float, radius: float) -> float:
+    """Mean of D over a disc of half-vector slopes with this radius about that of `half_way`; `ggx_distribution` if the radius is 0.
 
-    Over slopes GGX is the even distribution on a sphere in stereographic projection, which turns discs into caps, whose area is known.
+    In slope space GGX is the stereographic projection of the uniform distribution on a sphere: discs map to spherical caps, whose area
+    has a closed form.
     """
     c2 = wp.max(half_way[2] * half_way[2], MIN_COSINE)
     away = (half_way[0] * half_way[0] + half_way[1] * half_way[1]) / (c2 * alpha * alpha)
@@ -202,97 +208,120 @@ def facets_towards_disc(half_way: wp.vec3, alpha: float, radius: float) -> float
 
 
 @wp.func
-def schlick(cosine: float) -> float:
-    """Share by which F rises from F₀ to 1."""
+def schlick_weight(cosine: float) -> float:
+    """(1 - cosine)⁵: Schlick's Fresnel reflectance is F = F₀ + (1 - F₀) of this."""
     x = wp.clamp(1.0 - cosine, 0.0, 1.0)
     x2 = x * x
     return x2 * x2 * x
 
 
 @wp.func
-def visible_facet(outgoing: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
-    """Local normal of a microfacet that is seen from the local direction `outgoing`, by its visible area (Dupuy and Benyoub, 2023)."""
-    seen = wp.normalize(wp.vec3(alpha * outgoing[0], alpha * outgoing[1], outgoing[2]))
+def sample_ggx_vndf(outgoing: wp.vec3, alpha: float, u: wp.vec2) -> wp.vec3:
+    """Sample a microfacet normal from the GGX distribution of visible normals (VNDF), by spherical caps (Dupuy and Benyoub, 2023).
+
+    Directions are in the shading frame; `u` is uniform in [0, 1)².
+    """
+    warped = wp.normalize(wp.vec3(alpha * outgoing[0], alpha * outgoing[1], outgoing[2]))
     angle = wp.TAU * u[0]
-    z = (1.0 - u[1]) * (1.0 + seen[2]) - seen[2]
+    z = (1.0 - u[1]) * (1.0 + warped[2]) - warped[2]
     radius = wp.sqrt(wp.clamp(1.0 - z * z, 0.0, 1.0))
-    h = wp.vec3(radius * wp.cos(angle), radius * wp.sin(angle), z) + seen
-    return wp.normalize(wp.vec3(alpha * h[0], alpha * h[1], wp.max(h[2], LEAST_RISE)))
+    h = wp.vec3(radius * wp.cos(angle), radius * wp.sin(angle), z) + warped
+    return wp.normalize(wp.vec3(alpha * h[0], alpha * h[1], wp.max(h[2], MIN_FACET_Z)))
 
 
 @wp.struct
-class Reflection:
-    """f times the cosine to where light comes from, in two parts: diffuse color times `diffuse`, plus `gloss` [1/sr]."""
+class BrdfValue:
+    """BRDF times the cosine of the incoming direction [1/sr], by lobe: diffuse colour times `diffuse`, plus `specular`."""
 
     diffuse: float
-    gloss: wp.vec3
+    specular: wp.vec3
+
+
+@wp.struct
+class SplitRadiance:
+    """Radiance that a surface reflects to the camera: its diffuse colour times `diffuse` + `indirect`, plus `specular`."""
+
+    diffuse: wp.vec3
+    """Diffuse reflection of light that arrives straight from the environment map, without the surface's colour."""
+    indirect: wp.vec3
+    """Diffuse reflection of light that arrives from other surfaces, without the surface's colour."""
+    specular: wp.vec3
+    """Specular reflection of both."""
 
 
 @wp.func
-def reflected_parts(gloss: Gloss, brdf: Brdf, i: wp.vec3, o: wp.vec3, half_way: wp.vec3, density: float) -> Reflection:
-    """How much of the light from the local direction i a surface reflects to o, with `density` of facets about the half vector."""
-    made = Reflection()
+def evaluate_lobes(tables: AlbedoTables, brdf: Brdf, i: wp.vec3, o: wp.vec3, half_way: wp.vec3, distribution: float) -> BrdfValue:
+    """Both lobes for light from i seen from o, in the shading frame; `distribution` is D at the half vector."""
+    value = BrdfValue()
     one = wp.vec3(1.0, 1.0, 1.0)
-    fresnel = brdf.reflectance + schlick(wp.dot(o, half_way)) * (one - brdf.reflectance)
-    masking = 2.0 / (smith(i[2], brdf.alpha) + smith(o[2], brdf.alpha))
-    single = density * masking / (4.0 * wp.max(o[2], MIN_COSINE)) * fresnel
+    fresnel = brdf.f0 + schlick_weight(wp.dot(o, half_way)) * (one - brdf.f0)
+    masking = 2.0 / (smith_term(i[2], brdf.alpha) + smith_term(o[2], brdf.alpha))
+    single = distribution * masking / (4.0 * wp.max(o[2], MIN_COSINE)) * fresnel
 
-    albedo = gloss_albedo(gloss, brdf.roughness, i[2])
-    lost = (1.0 - albedo[0] - albedo[1]) * (1.0 - brdf.albedo[0] - brdf.albedo[1]) / wp.max(1.0 - brdf.mean[0] - brdf.mean[1], LEAST_LOST)
-    through = (1.0 - coat_share(brdf, albedo)) * (1.0 - coat_share(brdf, brdf.albedo)) / (1.0 - coat_share(brdf, brdf.mean))
-    made.gloss = single + (i[2] / wp.PI * lost) * brdf.multiple
-    made.diffuse = i[2] / wp.PI * through
-    return made
+    albedo = directional_albedo(tables, brdf.roughness, i[2])
+    lost = (
+        (1.0 - albedo[0] - albedo[1])
+        * (1.0 - brdf.albedo[0] - brdf.albedo[1])
+        / wp.max(1.0 - brdf.mean_albedo[0] - brdf.mean_albedo[1], MIN_LOST_ALBEDO)
+    )
+    transmitted = (1.0 - coat_albedo(brdf, albedo)) * (1.0 - coat_albedo(brdf, brdf.albedo)) / (1.0 - coat_albedo(brdf, brdf.mean_albedo))
+    value.specular = single + (i[2] / wp.PI * lost) * brdf.multi_scatter
+    value.diffuse = i[2] / wp.PI * transmitted
+    return value
 
 
 @wp.func
-def evaluate_parts(gloss: Gloss, brdf: Brdf, incoming: wp.vec3) -> Reflection:
-    """How much of the light from `incoming` a surface reflects; none below the surface."""
+def evaluate_brdf(tables: AlbedoTables, brdf: Brdf, incoming: wp.vec3) -> BrdfValue:
+    """Evaluate the BRDF times cosine for light from `incoming`; zero below the surface."""
     i = to_local(brdf, incoming)
     o = to_local(brdf, brdf.outgoing)
     if i[2] <= 0.0 or o[2] <= 0.0:
-        return Reflection()
+        return BrdfValue()
     half_way = wp.normalize(i + o)
-    return reflected_parts(gloss, brdf, i, o, half_way, facets(half_way, brdf.alpha))
+    return evaluate_lobes(tables, brdf, i, o, half_way, ggx_distribution(half_way, brdf.alpha))
 
 
 @wp.func
-def evaluate_disc(gloss: Gloss, brdf: Brdf, middle: wp.vec3, spread: float) -> wp.vec3:
-    """Mean over a disc of directions about `middle` of f times the cosine; `spread` is the tangent of its angular radius, and small.
+def evaluate_disc(tables: AlbedoTables, brdf: Brdf, center: wp.vec3, radius: float) -> wp.vec3:
+    """Evaluate the BRDF times cosine, averaged over a disc light (the sun) about `center`.
 
-    The half vectors of a disc fill an ellipse, for which a disc of the same area stands: wide lamps seen from cosines below 0.5 in sharp
-    gloss shine too bright in the highlight's middle, too dark at its side.
+    `radius` is the tangent of the light's angular radius, and small. The half vectors of a disc light fill an ellipse in slope space,
+    approximated by a disc of the same area: in sharp highlights of wide lamps at cosines below 0.5 the middle is too bright and the sides
+    are too dark.
     """
-    i = to_local(brdf, middle)
+    i = to_local(brdf, center)
     o = to_local(brdf, brdf.outgoing)
     if i[2] <= 0.0 or o[2] <= 0.0:
         return wp.vec3(0.0, 0.0, 0.0)
     half_way = wp.normalize(i + o)
-    # Half vectors turn by half the angle in the plane of both directions, by more across it; slopes change by more than angles do.
-    radius = 0.5 * spread / wp.sqrt(wp.max(wp.dot(o, half_way) * half_way[2] * half_way[2] * half_way[2], MIN_COSINE))
-    parts = reflected_parts(gloss, brdf, i, o, half_way, facets_towards_disc(half_way, brdf.alpha, radius))
-    return parts.gloss + parts.diffuse * brdf.diffuse
+    # A half vector rotates by half the angle in the plane of both directions, by more across it; slopes change by more than angles do.
+    slopes = 0.5 * radius / wp.sqrt(wp.max(wp.dot(o, half_way) * half_way[2] * half_way[2] * half_way[2], MIN_COSINE))
+    value = evaluate_lobes(tables, brdf, i, o, half_way, ggx_disc_distribution(half_way, brdf.alpha, slopes))
+    return value.specular + value.diffuse * brdf.diffuse
 
 
 @wp.func
-def density(brdf: Brdf, incoming: wp.vec3) -> float:
-    """Probability per solid angle with which `scatter` gives a direction [1/sr]."""
+def brdf_pdf(brdf: Brdf, incoming: wp.vec3) -> float:
+    """Probability density over solid angle with which `sample_brdf` returns a direction [1/sr]."""
     i = to_local(brdf, incoming)
     o = to_local(brdf, brdf.outgoing)
     if i[2] <= 0.0:
         return 0.0
     half_way = wp.normalize(i + o)
-    visible = facets(half_way, brdf.alpha) / (2.0 * wp.max(o[2], MIN_COSINE) * (1.0 + smith(o[2], brdf.alpha)))
-    return brdf.gloss_share * visible + (1.0 - brdf.gloss_share) * i[2] / wp.PI
+    visible = ggx_distribution(half_way, brdf.alpha) / (2.0 * wp.max(o[2], MIN_COSINE) * (1.0 + smith_term(o[2], brdf.alpha)))
+    return brdf.specular_probability * visible + (1.0 - brdf.specular_probability) * i[2] / wp.PI
 
 
 @wp.func
-def scatter(brdf: Brdf, choice: float, u: wp.vec2) -> wp.vec3:
-    """A direction from which light may come, drawn from three numbers in [0, 1); below the surface: none."""
+def sample_brdf(brdf: Brdf, choice: float, u: wp.vec2) -> wp.vec3:
+    """Sample an incoming direction: from the GGX lobe if `choice` < specular_probability, else cosine-weighted.
+
+    `choice` and `u` are uniform in [0, 1). A direction below the surface carries no light.
+    """
     o = to_local(brdf, brdf.outgoing)
     i = wp.vec3(0.0, 0.0, 1.0)
-    if choice < brdf.gloss_share:
-        facet = visible_facet(o, brdf.alpha, u)
+    if choice < brdf.specular_probability:
+        facet = sample_ggx_vndf(o, brdf.alpha, u)
         i = 2.0 * wp.dot(o, facet) * facet - o
     else:
         radius = wp.sqrt(u[0])
@@ -302,24 +331,24 @@ def scatter(brdf: Brdf, choice: float, u: wp.vec2) -> wp.vec3:
 
 
 @wp.kernel
-def measure_gloss_kernel(
+def measure_albedo_kernel(
     # Out:
-    albedo_out: wp.array2d[wp.vec2],
+    albedo_out: wp.array2d[wp.vec2],  # (roughness, cosine)
 ):
-    """Albedo of the lobe at each roughness and cosine: the mean of (1 - s, s) G₂ / G₁ over visible facets, s Schlick's term."""
+    """Measure the directional albedo table: the mean of (1 - s, s) G₂ / G₁ over sampled visible normals, s Schlick's weight."""
     row, column = wp.tid()
-    roughness = float(row) / float(GLOSS_ROWS - 1)
-    root = float(column) / float(GLOSS_COLUMNS - 1)
+    roughness = float(row) / float(ALBEDO_ROWS - 1)
+    root = float(column) / float(ALBEDO_COLUMNS - 1)
     alpha = wp.clamp(roughness * roughness, MIN_ALPHA, 1.0)
     cosine = wp.max(root * root, MIN_COSINE)
     o = wp.vec3(wp.sqrt(wp.max(1.0 - cosine * cosine, 0.0)), 0.0, cosine)
     total = wp.vec2(0.0, 0.0)
-    for number in range(GLOSS_SAMPLES):
-        facet = visible_facet(o, alpha, sobol_point(number))
-        slope = wp.dot(o, facet)
-        i = 2.0 * slope * facet - o
+    for index in range(ALBEDO_SAMPLES):
+        facet = sample_ggx_vndf(o, alpha, sobol_point(index))
+        cosine_facet = wp.dot(o, facet)
+        i = 2.0 * cosine_facet * facet - o
         if i[2] > 0.0:
-            kept = (1.0 + smith(cosine, alpha)) / (smith(i[2], alpha) + smith(cosine, alpha))
-            rise = schlick(slope)
-            total += kept * wp.vec2(1.0 - rise, rise)
-    albedo_out[row, column] = total / float(GLOSS_SAMPLES)
+            unmasked = (1.0 + smith_term(cosine, alpha)) / (smith_term(i[2], alpha) + smith_term(cosine, alpha))
+            weight = schlick_weight(cosine_facet)
+            total += unmasked * wp.vec2(1.0 - weight, weight)
+    albedo_out[row, column] = total / float(ALBEDO_SAMPLES)

@@ -1,4 +1,4 @@
-"""Cells of pixels, of which one pixel casts rays for all: where they are, what surface is in their middle, which points they take."""
+"""Coarse pixels: blocks of pixels that are lit by the rays of their middle pixel; visiting order, sample order, and guide image."""
 
 import warp as wp
 
@@ -6,78 +6,92 @@ from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, ImageGrid
 
 wp.set_module_options({"enable_backward": False})
 
-SPREAD = wp.constant(4)
-"""The threads of a warp take cells so far apart, by row and by column."""
-LANES_ACROSS = wp.constant(8)
-"""So many of a warp's threads take cells of one row."""
-SAME_SURFACE = wp.constant(1.0)
-"""Cells count as one surface up to this distance from its tangent plane, in widths of a cell at their depth, times the stride."""
-LEAST_WEIGHT = wp.constant(1.0e-4)
-"""Weight, when a pixel looks for cells, of one on another surface: it serves where there is no other."""
+LANE_STRIDE = wp.constant(4)
+"""Interleaved order: neighbouring threads of a warp take coarse pixels this far apart, by row and by column."""
+LANE_COLUMNS = wp.constant(8)
+"""Interleaved order: number of a warp's threads in one row."""
+PLANE_TOLERANCE = wp.constant(1.0)
+"""Coarse pixels lie on one surface up to this distance from its tangent plane, in widths of a coarse pixel at their depth times the
+filter's stride."""
+MIN_WEIGHT = wp.constant(1.0e-4)
+"""Joint bilateral upsampling: weight of a coarse pixel on another surface, which counts only where no other is left."""
 
 
 @wp.struct
-class CellGrid:
-    """Cells of pixels, and which pixel stands for each: the one in its middle."""
+class CoarseGrid:
+    """Grid of coarse pixels over an image; the pixel in the middle of each represents it."""
 
     size: int
-    """Width of a cell [px]."""
+    """Width of a coarse pixel [px]."""
     window: int
-    """Width of the window that shares shadow rays among cells, a power of two. A square so wide holds each of window² points once,
-    wherever it lies, so that they leave no pattern."""
+    """Width of the shadow filter [coarse pixels], a power of two. Any window of this width holds each of window² sample points once,
+    so that the filtered noise shows no pattern."""
     image: ImageGrid
-    cells: ImageGrid
+    """Full-resolution grid [px]."""
+    grid: ImageGrid
+    """Grid of the coarse pixels."""
 
 
 @wp.struct
 class Guide:
-    """Scratch, one a view and cell: the surface in the cell's middle."""
+    """Guide image of the joint bilateral filters: a G-buffer at coarse resolution. Scratch."""
 
     normal: wp.array3d[wp.vec3]
-    """In the camera's axes."""
+    """(view, cell_row, cell_column): shading normal in camera space."""
     depth: wp.array3d[float]
-    """Planar depth [m]."""
+    """(view, cell_row, cell_column): planar depth [m]."""
     segment: wp.array3d[wp.uint8]
-    """As in `GBuffer`."""
+    """(view, cell_row, cell_column): segmentation id, as in `GBuffer`."""
 
 
 @wp.func
-def cell_pixel(cells: CellGrid, row: int, column: int) -> wp.vec2i:
-    """(row, column) of the pixel that stands for a cell."""
-    middle = cells.size // 2
-    return wp.vec2i(wp.min(row * cells.size + middle, cells.image.height - 1), wp.min(column * cells.size + middle, cells.image.width - 1))
+def middle_pixel(coarse: CoarseGrid, row: int, column: int) -> wp.vec2i:
+    """(row, column) of the pixel that represents a coarse pixel."""
+    middle = coarse.size // 2
+    return wp.vec2i(
+        wp.min(row * coarse.size + middle, coarse.image.height - 1), wp.min(column * coarse.size + middle, coarse.image.width - 1)
+    )
 
 
 @wp.func
-def cell_number(period: int, row: int, column: int) -> int:
-    """Which of period² points a cell takes: bits of row and column in turn, so that aligned squares hold aligned runs of numbers."""
-    number = int(0)
+def morton_index(period: int, row: int, column: int) -> int:
+    """Morton code (Z-order) of a coarse pixel within squares of `period` (2 to 16) pixels: which of period² sample points it takes.
+
+    The bits of row and column are interleaved, so that aligned squares of 2^k pixels hold aligned runs of 4^k indices.
+    """
+    index = int(0)
     for bit in range(4):
         if (1 << bit) < period:
-            number += ((column >> bit) & 1) << (2 * bit)
-            number += ((row >> bit) & 1) << (2 * bit + 1)
-    return number
+            index += ((column >> bit) & 1) << (2 * bit)
+            index += ((row >> bit) & 1) << (2 * bit + 1)
+    return index
 
 
 @wp.func
-def cell_place(cells: CellGrid, pixel: int) -> float:
-    """A pixel's row or column in cells, from the middle of the first one's window, which is half a cell before its own."""
-    return float(pixel - cells.size // 2) / float(cells.size) + 0.5
+def coarse_coordinate(coarse: CoarseGrid, pixel: int) -> float:
+    """Row or column of a pixel in coarse pixels, for interpolation between filtered values.
+
+    Filter kernels have an even width: the centre of coarse pixel i's kernel lies half a coarse pixel before its middle, at coordinate i.
+    """
+    return float(pixel - coarse.size // 2) / float(coarse.size) + 0.5
 
 
 @wp.func
-def spread_cell(cells: CellGrid, index: int) -> tuple[int, int, int]:
-    """(view, row, column) of a flat index. The threads of a warp take cells SPREAD apart, whose points are alike: their rays are nearly
-    parallel, and visit the same nodes of a mesh's tree."""
-    across = SPREAD * LANES_ACROSS
-    down = SPREAD * (TILE_PIXELS // LANES_ACROSS)
-    regions_across = (cells.cells.width + across - 1) // across
-    regions = regions_across * ((cells.cells.height + down - 1) // down)
+def interleaved_pixel(coarse: CoarseGrid, index: int) -> tuple[int, int, int]:
+    """(view, row, column) of a thread in interleaved order; row or column may lie outside the grid.
+
+    The threads of a warp take coarse pixels LANE_STRIDE apart, whose sample points are close together: their rays are nearly parallel and
+    visit the same BVH nodes.
+    """
+    across = LANE_STRIDE * LANE_COLUMNS
+    down = LANE_STRIDE * (TILE_PIXELS // LANE_COLUMNS)
+    regions_across = (coarse.grid.width + across - 1) // across
+    regions = regions_across * ((coarse.grid.height + down - 1) // down)
     lane = index % TILE_PIXELS
-    place = (index // TILE_PIXELS) % (SPREAD * SPREAD)
-    region = index // (TILE_PIXELS * SPREAD * SPREAD)
+    offset = (index // TILE_PIXELS) % (LANE_STRIDE * LANE_STRIDE)
+    region = index // (TILE_PIXELS * LANE_STRIDE * LANE_STRIDE)
     view = region // regions
     region = region - view * regions
-    row = (region // regions_across) * down + (lane // LANES_ACROSS) * SPREAD + place // SPREAD
-    column = (region % regions_across) * across + (lane % LANES_ACROSS) * SPREAD + place % SPREAD
+    row = (region // regions_across) * down + (lane // LANE_COLUMNS) * LANE_STRIDE + offset // LANE_STRIDE
+    column = (region % regions_across) * across + (lane % LANE_COLUMNS) * LANE_STRIDE + offset % LANE_STRIDE
     return view, row, column

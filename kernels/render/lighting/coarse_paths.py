@@ -1,73 +1,76 @@
-"""The fast picture's light: few paths for each cell of pixels, and a filter that shares them among neighbours on the same surface.
+"""Coarse path pass: few paths per coarse pixel, and the unoccluded light that they are compared with (ratio estimator).
 
-What a path finds is kept beside what the surface would reflect of the map if nothing stood in the way, which is known without any
-path. Their ratio changes slowly over a surface, even where it bends or its colour changes; so the ratio is what is filtered, and
-each pixel multiplies it by its own unhindered light (after Heitz, Hill and McGuire, 2018).
+Next to the light that paths find, the kernel stores what the surface would reflect of the unoccluded environment map, which needs no ray.
+Their ratio, the visibility ratio, varies slowly over a surface even where it bends or its colour changes. So the denoiser filters the
+ratio, and each pixel multiplies it by its own unoccluded light (after Heitz, Hill and McGuire, 2018).
 """
 
 import warp as wp
 
 from synpick_warp.codes import Segment, Stream
-from synpick_warp.kernels.render.lighting.brdf import even_gloss
-from synpick_warp.kernels.render.lighting.coarse_grid import CellGrid, Guide, cell_number, cell_pixel, spread_cell
-from synpick_warp.kernels.render.lighting.color import LEAST_LIGHT
+from synpick_warp.kernels.render.lighting.brdf import SplitRadiance, specular_albedo
+from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide, interleaved_pixel, middle_pixel, morton_index
+from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE
 from synpick_warp.kernels.render.lighting.path_tracing import (
-    ENDED,
+    TERMINATED,
+    PathContext,
     PathRules,
     PathScene,
-    Place,
-    Reflected,
     Vertex,
-    begun,
-    scattered,
-    vertex_at,
+    extend_path,
+    init_path,
+    make_vertex,
 )
-from synpick_warp.kernels.render.lighting.unoccluded import Light, even_light
+from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, read_hit
 from synpick_warp.kernels.rng import stream_key
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-GATHER_REGISTERS = 56
+COARSE_PATH_REGISTERS = 56
 """As `kernels.render.visibility.gbuffer.RAY_REGISTERS`; with paths, a few less are better still."""
-PERIOD = wp.constant(16)
-"""Cells take their points from one sequence by their place in squares of PERIOD x PERIOD; aligned smaller squares hold aligned runs."""
-MOST_BOUNCES = wp.constant(4.0)
-"""A path's light from other surfaces counts by so many times what a white one that faces the main light sends back more: few paths find
-such a one, and those for others, too."""
-PHASES = wp.constant(1.0)
-"""Points of the first dimension move so far through their unit square along the picture's height and width: slowly within a window, which
-so keeps its points evenly spread, but enough for the picture's mean to be right."""
+SEQUENCE_PERIOD = wp.constant(16)
+"""Coarse pixels share one Sobol' sequence by their Morton index in squares of this width; aligned smaller squares hold aligned runs."""
+INDIRECT_CLAMP = wp.constant(4.0)
+"""Firefly clamp of indirect light: at most this many times what a white surface that faces the sun reflects. Few paths find sunlit
+surfaces, and those that do count for the others."""
+SHIFT_RANGE = wp.constant(1.0)
+"""Cranley-Patterson rotation of the first dimension over an image's height and width: slow enough that the points of a filter kernel
+stay stratified, and large enough that the image's mean is unbiased."""
 
 
 @wp.struct
-class Gathered:
-    """Scratch, one a view and cell: light that its surface reflects; diffuse light without the surface's colour."""
+class CoarseLight:
+    """Light that the surfaces of coarse pixels reflect; diffuse light without the surface's colour. Scratch.
+
+    All arrays are (view, cell_row, cell_column).
+    """
 
     diffuse: wp.array3d[wp.vec3]
-    """From the map, without its main light."""
-    gloss: wp.array3d[wp.vec3]
-    """From the map, without its main light, and from other surfaces."""
-    even_diffuse: wp.array3d[wp.vec3]
-    even_gloss: wp.array3d[wp.vec3]
-    """Both if nothing stood in the way."""
-    between: wp.array3d[wp.vec3]
-    """Diffuse light from other surfaces: it changes slowly, but few of the paths find much of it."""
+    """Diffuse reflection of the environment map without its sun."""
+    specular: wp.array3d[wp.vec3]
+    """Specular reflection of the environment map without its sun, and of light from other surfaces."""
+    unoccluded_diffuse: wp.array3d[wp.vec3]
+    """`diffuse` if nothing blocked the map."""
+    unoccluded_specular: wp.array3d[wp.vec3]
+    """`specular` if nothing blocked the map."""
+    indirect: wp.array3d[wp.vec3]
+    """Indirect diffuse: diffuse reflection of light from other surfaces. It varies slowly, but few paths carry much of it."""
     variance: wp.array3d[wp.vec2]
-    """Of the ratios of `diffuse` and of `gloss` to even light, in luminance; of means, not of single paths."""
+    """Variance of the visibility ratios of `diffuse` and `specular`, in luminance; of filtered means, not of single paths."""
 
 
 @wp.func
-def limited(light: wp.vec3, most: wp.vec3) -> wp.vec3:
-    """`light`, made darker if it exceeds `most`, in the same colour."""
-    return light * wp.min(1.0, wp.max(most) / wp.max(wp.max(light), LEAST_LIGHT))
+def clamp_light(light: wp.vec3, limit: wp.vec3) -> wp.vec3:
+    """Firefly clamp: `light`, scaled down where its largest channel exceeds that of `limit`; its hue stays."""
+    return light * wp.min(1.0, wp.max(limit) / wp.max(wp.max(light), MIN_RADIANCE))
 
 
 @wp.func
-def paths_place(
+def make_context(
     scene: PathScene,
-    cells: CellGrid,
+    coarse: CoarseGrid,
     rules: PathRules,
     views: Views,
     view: int,
@@ -75,86 +78,90 @@ def paths_place(
     column: int,
     episode: int,
     light: int,
-    turn: float,
-) -> Place:
-    """Where a cell's paths are. All of an episode's pictures take their points from one stream, so that what rests looks the same."""
-    place = Place()
-    place.view = view
-    place.instances = views.instances
-    place.light = light
-    place.first_light = light + scene.lights.maps
-    place.turn = turn
-    place.key = stream_key(rules.seed, episode, 0, Stream.PATHS)
-    place.shift = wp.vec2(PHASES * float(row) / float(cells.cells.height), PHASES * float(column) / float(cells.cells.width))
-    return place
+    yaw: float,
+) -> PathContext:
+    """Context of a coarse pixel's paths. All images of an episode use one stream of random numbers, so that noise on what rests is still.
+
+    The sun is left out of the light on the first surface: row `light` + maps of `Lights.radiance`.
+    """
+    context = PathContext()
+    context.view = view
+    context.instances = views.instances
+    context.light = light
+    context.first_light = light + scene.lights.maps
+    context.yaw = yaw
+    context.key = stream_key(rules.seed, episode, 0, Stream.PATHS)
+    context.shift = wp.vec2(SHIFT_RANGE * float(row) / float(coarse.grid.height), SHIFT_RANGE * float(column) / float(coarse.grid.width))
+    return context
 
 
 @wp.func
-def mean_light(
+def average_paths(
     scene: PathScene,
     bodies: ViewBodies,
     rules: PathRules,
-    place: Place,
-    number: int,
+    context: PathContext,
+    index: int,
     first: Vertex,
     width: float,
-    even: Light,
-    most_share: float,
-) -> Reflected:
-    """What the surface at `first` reflects of the light that paths from `number` on find, on the average.
+    unoccluded: SplitRadiance,
+    firefly_clamp: float,
+) -> SplitRadiance:
+    """Mean reflected light over the paths from `index` on that start at `first`, each with a firefly clamp.
 
-    A path counts with at most `most_share` times the light that comes if nothing hides it, `even`; what other surfaces send, by
-    MOST_BOUNCES more, since `even` knows nothing of the main light.
+    The clamp is `firefly_clamp` times the unoccluded light; for light from other surfaces INDIRECT_CLAMP is added, because the unoccluded
+    light lacks the sun.
     """
-    sum = Reflected()
-    bounced = (MOST_BOUNCES / wp.PI) * scene.lights.main_irradiance[place.light]
-    # One loop over all scatterings of all paths: a thread whose path ends early begins the next while others of its warp go on.
+    sum = SplitRadiance()
+    sunlit = (INDIRECT_CLAMP / wp.PI) * scene.lights.sun_irradiance[context.light]
+    # One loop over all bounces of all paths: a thread whose path ends early starts the next while others of its warp go on.
     sample = int(0)
-    path = begun(first, width)
+    path = init_path(first, width)
     while sample < rules.samples:
-        path = scattered(scene, bodies, rules, place, number + sample, first.brdf.diffuse, path)
-        if path.bounce == ENDED:
-            sum.diffuse += limited(path.found.diffuse, most_share * even.diffuse)
-            sum.between += limited(path.found.between, most_share * even.diffuse + bounced)
-            sum.gloss += limited(path.found.gloss, most_share * even.gloss + wp.cw_mul(even_gloss(first.brdf), bounced))
-            path = begun(first, width)
+        path = extend_path(scene, bodies, rules, context, index + sample, first.brdf.diffuse, path)
+        if path.bounce == TERMINATED:
+            sum.diffuse += clamp_light(path.radiance.diffuse, firefly_clamp * unoccluded.diffuse)
+            sum.indirect += clamp_light(path.radiance.indirect, firefly_clamp * unoccluded.diffuse + sunlit)
+            limit = firefly_clamp * unoccluded.specular + wp.cw_mul(specular_albedo(first.brdf), sunlit)
+            sum.specular += clamp_light(path.radiance.specular, limit)
+            path = init_path(first, width)
             sample += 1
-    share = 1.0 / float(rules.samples)
-    sum.diffuse = share * sum.diffuse
-    sum.between = share * sum.between
-    sum.gloss = share * sum.gloss
+    scale = 1.0 / float(rules.samples)
+    sum.diffuse = scale * sum.diffuse
+    sum.indirect = scale * sum.indirect
+    sum.specular = scale * sum.specular
     return sum
 
 
-@wp.kernel(cuda_max_registers=GATHER_REGISTERS)
-def gather_kernel(
+@wp.kernel(cuda_max_registers=COARSE_PATH_REGISTERS)
+def trace_coarse_paths_kernel(
     # Scene:
     scene: PathScene,
     cameras: Cameras,
-    cells: CellGrid,
-    # State:
-    episode: wp.array[int],
-    light: wp.array[int],
-    light_yaw: wp.array[float],
+    coarse: CoarseGrid,
+    # State: worlds
+    episode: wp.array[int],  # (world)
+    light: wp.array[int],  # (world)
+    light_yaw: wp.array[float],  # (world) [rad]
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: Views,
     rules: PathRules,
-    most_share: float,
+    firefly_clamp: float,
     first: int,
     # Out:
     guide_out: Guide,
-    gathered_out: Gathered,
+    coarse_light_out: CoarseLight,
 ):
-    """Mean of N paths from the pixel in each cell's middle, and the light that they would find if nothing stood in their way.
+    """Trace N paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
-    The main light is left out of the first surface's light: it casts sharp shadows, and is looked for at more pixels.
+    The sun's direct light is left out: it casts sharp shadows, and `shadows` samples it at more pixels. `variance` is not written.
     """
-    view, row, column = spread_cell(cells, wp.tid() + first)
-    if not in_image(cells.cells, row, column):
+    view, row, column = interleaved_pixel(coarse, wp.tid() + first)
+    if not in_image(coarse.grid, row, column):
         return
-    pixel = cell_pixel(cells, row, column)
+    pixel = middle_pixel(coarse, row, column)
     hit = read_hit(gbuffer, view, pixel[0], pixel[1])
     guide_out.segment[view, row, column] = wp.uint8(hit.segment)
     if hit.segment == Segment.NOTHING:
@@ -164,17 +171,17 @@ def gather_kernel(
     ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
     outgoing = -wp.normalize(cameras.to_world[camera] * ray)
     position = hit_position(cameras, camera, ray, hit.depth)
-    width = float(cells.size) * hit.depth / cameras.intrinsics[camera][0]
-    vertex = vertex_at(scene, bodies, view, views.instances, hit, position, outgoing, width, 0.0)
+    width = float(coarse.size) * hit.depth / cameras.intrinsics[camera][0]
+    vertex = make_vertex(scene, bodies, view, views.instances, hit, position, outgoing, width, 0.0)
 
-    place = paths_place(scene, cells, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
-    even = even_light(scene.lights, place.light, place.turn, vertex.brdf)
-    number = cell_number(PERIOD, row, column) * rules.samples
-    found = mean_light(scene, bodies, rules, place, number, vertex, width, even, most_share)
-    gathered_out.diffuse[view, row, column] = found.diffuse
-    gathered_out.between[view, row, column] = found.between
-    gathered_out.gloss[view, row, column] = found.gloss
-    gathered_out.even_diffuse[view, row, column] = even.diffuse
-    gathered_out.even_gloss[view, row, column] = even.gloss
+    context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
+    unoccluded = unoccluded_light(scene.lights, context.light, context.yaw, vertex.brdf)
+    index = morton_index(SEQUENCE_PERIOD, row, column) * rules.samples
+    mean = average_paths(scene, bodies, rules, context, index, vertex, width, unoccluded, firefly_clamp)
+    coarse_light_out.diffuse[view, row, column] = mean.diffuse
+    coarse_light_out.indirect[view, row, column] = mean.indirect
+    coarse_light_out.specular[view, row, column] = mean.specular
+    coarse_light_out.unoccluded_diffuse[view, row, column] = unoccluded.diffuse
+    coarse_light_out.unoccluded_specular[view, row, column] = unoccluded.specular
     guide_out.normal[view, row, column] = wp.transpose(cameras.to_world[camera]) * vertex.brdf.normal
     guide_out.depth[view, row, column] = hit.depth

@@ -1,58 +1,85 @@
-"""The filter of the fast picture: shares light among cells on the same surface, over windows as wide as the light is even."""
+"""Variance-guided denoiser: the widest of three kernels (16², 8², 4² coarse pixels) whose mean agrees with the narrower ones within noise.
+
+It filters visibility ratios (see `coarse_paths`) in three passes: joint bilateral means over blocks, choice of the kernel, smoothing.
+`upsample_ratios` then interpolates them at full resolution: joint bilateral upsampling (Kopf et al., 2007).
+"""
 
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.coarse_grid import LEAST_WEIGHT, SAME_SURFACE, CellGrid, Guide, cell_pixel, cell_place
-from synpick_warp.kernels.render.lighting.coarse_paths import Gathered
-from synpick_warp.kernels.render.lighting.color import LEAST_LIGHT, luminance
-from synpick_warp.kernels.render.lighting.plane_distance import Plane, off_plane, pixel_plane
-from synpick_warp.kernels.render.lighting.unoccluded import Light, ratio
+from synpick_warp.kernels.render.lighting.coarse_grid import (
+    MIN_WEIGHT,
+    PLANE_TOLERANCE,
+    CoarseGrid,
+    Guide,
+    coarse_coordinate,
+    middle_pixel,
+)
+from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight
+from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE, luminance
+from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
+from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, in_image, tile_pixel
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 BLOCK = wp.constant(4)
-"""Cells across a block: the narrowest window of the filter."""
+"""Width of the narrow kernel, a block [coarse pixels]."""
 BLOCKS = wp.constant(4)
-"""Blocks across the widest window."""
-MIDDLE_BLOCKS = wp.constant(4.0)
-"""Blocks of the window between: 2 x 2."""
+"""Width of the wide kernel [blocks]."""
+MEDIUM_BLOCKS = wp.constant(4.0)
+"""Blocks of the medium kernel: 2 x 2."""
 RING = wp.constant(1)
-"""How many cells farther a pixel looks for its surface if none of the four about it is on it."""
-BODY_WEIGHT = wp.constant(0.02)
-"""Weight of a cell on the same body but another surface: it calms places that have few like them around."""
+"""Upsampling fallback: width of the ring around the four nearest coarse pixels that is searched if none of them is on the surface."""
+SAME_BODY_WEIGHT = wp.constant(0.02)
+"""Bilateral weight of a coarse pixel on the same body but on another surface: it reduces noise where few pixels are similar."""
 
 
 @wp.struct
-class Shares:
-    """Scratch, one a view and cell: what each pixel about it multiplies its own even light by, and what it adds."""
+class RatioImages:
+    """Denoised light of coarse pixels. Scratch. All arrays are (view, cell_row, cell_column)."""
 
     diffuse: wp.array3d[wp.vec3]
-    gloss: wp.array3d[wp.vec3]
-    between: wp.array3d[wp.vec3]
+    """Visibility ratio of diffuse light: a pixel multiplies its own unoccluded light by it."""
+    specular: wp.array3d[wp.vec3]
+    """Visibility ratio of specular light."""
+    indirect: wp.array3d[wp.vec3]
+    """Indirect diffuse light, without the surface's colour: no ratio."""
+
+
+@wp.struct
+class Ratios:
+    """One element of `RatioImages`, or a weighted sum of them."""
+
+    diffuse: wp.vec3
+    indirect: wp.vec3
+    specular: wp.vec3
 
 
 @wp.func
-def plane_at(cells: CellGrid, guide: Guide, intrinsics: wp.vec4, view: int, row: int, column: int) -> Plane:
-    """The tangent plane of what a cell shows; rows and columns are of cells."""
-    pixel = cell_pixel(cells, row, column)
+def coarse_plane(coarse: CoarseGrid, guide: Guide, intrinsics: wp.vec4, view: int, row: int, column: int) -> Plane:
+    """Tangent plane at a coarse pixel, whose `down`, `right` and `width` are per coarse pixel."""
+    pixel = middle_pixel(coarse, row, column)
     depth = guide.depth[view, row, column]
-    made = pixel_plane(intrinsics, pixel[0], pixel[1], guide.segment[view, row, column], depth, guide.normal[view, row, column])
-    size = float(cells.size)
-    made.down = size * made.down
-    made.right = size * made.right
-    made.width = size * made.width
-    return made
+    plane = tangent_plane(intrinsics, pixel[0], pixel[1], guide.segment[view, row, column], depth, guide.normal[view, row, column])
+    size = float(coarse.size)
+    plane.down = size * plane.down
+    plane.right = size * plane.right
+    plane.width = size * plane.width
+    return plane
 
 
 @wp.func
-def likeness(guide: Guide, plane: Plane, view: int, row: int, column: int, down: int, right: int, stride: int) -> float:
-    """Weight of the cell at (row, column), so many cells down and right of the plane's own; 0 on another body."""
+def bilateral_weight(guide: Guide, plane: Plane, view: int, row: int, column: int, down: int, right: int, stride: int) -> float:
+    """Bilateral weight of the coarse pixel at (row, column), at offset (down, right) from the plane's own: body, plane distance, normal.
+
+    0 on another body; SAME_BODY_WEIGHT off the plane; else that plus the 8th power of the normals' cosine. The tolerance of the plane
+    distance grows with the filter's `stride` [coarse pixels].
+    """
     if guide.segment[view, row, column] != plane.segment:
         return 0.0
-    weight = BODY_WEIGHT
-    if off_plane(plane, down, right, guide.depth[view, row, column]) < SAME_SURFACE * plane.width * float(stride):
+    weight = SAME_BODY_WEIGHT
+    if plane_distance(plane, down, right, guide.depth[view, row, column]) < PLANE_TOLERANCE * plane.width * float(stride):
         cosine = wp.max(wp.dot(guide.normal[view, row, column], plane.normal), 0.0)
         square = cosine * cosine
         weight += square * square * square * square
@@ -60,91 +87,94 @@ def likeness(guide: Guide, plane: Plane, view: int, row: int, column: int, down:
 
 
 @wp.struct
-class Window:
-    """Weighted sums over a window."""
+class KernelSum:
+    """Weighted sums of `CoarseLight` over a filter kernel."""
 
     diffuse: wp.vec3
-    gloss: wp.vec3
-    even_diffuse: wp.vec3
-    even_gloss: wp.vec3
-    between: wp.vec3
+    specular: wp.vec3
+    unoccluded_diffuse: wp.vec3
+    unoccluded_specular: wp.vec3
+    indirect: wp.vec3
     weight: float
 
 
 @wp.func
-def widened(window: Window, gathered: Gathered, view: int, row: int, column: int, weight: float) -> Window:
-    """`window` with one more cell."""
-    made = Window()
-    made.diffuse = window.diffuse + weight * gathered.diffuse[view, row, column]
-    made.gloss = window.gloss + weight * gathered.gloss[view, row, column]
-    made.even_diffuse = window.even_diffuse + weight * gathered.even_diffuse[view, row, column]
-    made.even_gloss = window.even_gloss + weight * gathered.even_gloss[view, row, column]
-    made.between = window.between + weight * gathered.between[view, row, column]
-    made.weight = window.weight + weight
-    return made
+def add_light(total: KernelSum, light: CoarseLight, view: int, row: int, column: int, weight: float) -> KernelSum:
+    """Add one coarse pixel to the sums."""
+    result = KernelSum()
+    result.diffuse = total.diffuse + weight * light.diffuse[view, row, column]
+    result.specular = total.specular + weight * light.specular[view, row, column]
+    result.unoccluded_diffuse = total.unoccluded_diffuse + weight * light.unoccluded_diffuse[view, row, column]
+    result.unoccluded_specular = total.unoccluded_specular + weight * light.unoccluded_specular[view, row, column]
+    result.indirect = total.indirect + weight * light.indirect[view, row, column]
+    result.weight = total.weight + weight
+    return result
 
 
 @wp.func
-def bright_ratio(light: wp.vec3, even: wp.vec3) -> float:
-    """Of luminances; even light is never 0 unless the whole map is."""
-    return luminance(light) / wp.max(luminance(even), LEAST_LIGHT)
+def luminance_ratio(light: wp.vec3, unoccluded: wp.vec3) -> float:
+    """Ratio of luminances; unoccluded light is 0 only if the whole map is black."""
+    return luminance(light) / wp.max(luminance(unoccluded), MIN_RADIANCE)
 
 
 @wp.kernel
-def sum_blocks_kernel(
+def filter_blocks_kernel(
     # Scene:
     cameras: Cameras,
-    cells: CellGrid,
+    coarse: CoarseGrid,
     # In:
     guide: Guide,
-    gathered: Gathered,
+    coarse_light: CoarseLight,
     views: Views,
     first: int,
     # Out:
-    gathered_out: Gathered,
+    blocks_out: CoarseLight,
 ):
-    """Weighted mean over the block about each cell, and its variance: that of what it averages, over the effective number of cells."""
-    view, row, column = tile_pixel(cells.cells, wp.tid() + first)
-    if not in_image(cells.cells, row, column):
+    """Narrow filter: bilateral mean over the 4 x 4 block around each coarse pixel, and the variance of the mean visibility ratio.
+
+    The variance of a mean is that of its samples over their effective number, (Σ w)² / Σ w². All members of `blocks_out` are written.
+    """
+    view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
+    if not in_image(coarse.grid, row, column):
         return
     if int(guide.segment[view, row, column]) == Segment.NOTHING:
         return
-    plane = plane_at(cells, guide, cameras.intrinsics[views.camera[view]], view, row, column)
-    window = Window()
-    share = wp.vec2(0.0, 0.0)
+    plane = coarse_plane(coarse, guide, cameras.intrinsics[views.camera[view]], view, row, column)
+    sums = KernelSum()
+    mean = wp.vec2(0.0, 0.0)
     square = wp.vec2(0.0, 0.0)
     squared_weight = float(0.0)
     for i in range(BLOCK):
         down = i - BLOCK // 2
         r = row + down
-        if r >= 0 and r < cells.cells.height:
+        if r >= 0 and r < coarse.grid.height:
             for j in range(BLOCK):
                 right = j - BLOCK // 2
                 c = column + right
-                if c >= 0 and c < cells.cells.width:
-                    weight = likeness(guide, plane, view, r, c, down, right, 1)
+                if c >= 0 and c < coarse.grid.width:
+                    weight = bilateral_weight(guide, plane, view, r, c, down, right, 1)
                     if weight > 0.0:
-                        window = widened(window, gathered, view, r, c, weight)
-                        d = bright_ratio(gathered.diffuse[view, r, c], gathered.even_diffuse[view, r, c])
-                        g = bright_ratio(gathered.gloss[view, r, c], gathered.even_gloss[view, r, c])
-                        share += weight * wp.vec2(d, g)
-                        square += weight * wp.vec2(d * d, g * g)
+                        sums = add_light(sums, coarse_light, view, r, c, weight)
+                        d = luminance_ratio(coarse_light.diffuse[view, r, c], coarse_light.unoccluded_diffuse[view, r, c])
+                        s = luminance_ratio(coarse_light.specular[view, r, c], coarse_light.unoccluded_specular[view, r, c])
+                        mean += weight * wp.vec2(d, s)
+                        square += weight * wp.vec2(d * d, s * s)
                         squared_weight += weight * weight
-    total = window.weight
-    gathered_out.diffuse[view, row, column] = window.diffuse / total
-    gathered_out.gloss[view, row, column] = window.gloss / total
-    gathered_out.even_diffuse[view, row, column] = window.even_diffuse / total
-    gathered_out.even_gloss[view, row, column] = window.even_gloss / total
-    gathered_out.between[view, row, column] = window.between / total
-    share = share / total
-    spread = square / total - wp.cw_mul(share, share)
+    total = sums.weight
+    blocks_out.diffuse[view, row, column] = sums.diffuse / total
+    blocks_out.specular[view, row, column] = sums.specular / total
+    blocks_out.unoccluded_diffuse[view, row, column] = sums.unoccluded_diffuse / total
+    blocks_out.unoccluded_specular[view, row, column] = sums.unoccluded_specular / total
+    blocks_out.indirect[view, row, column] = sums.indirect / total
+    mean = mean / total
+    variance = square / total - wp.cw_mul(mean, mean)
     count = total * total / squared_weight
-    gathered_out.variance[view, row, column] = wp.vec2(wp.max(spread[0], 0.0), wp.max(spread[1], 0.0)) / count
+    blocks_out.variance[view, row, column] = wp.vec2(wp.max(variance[0], 0.0), wp.max(variance[1], 0.0)) / count
 
 
 @wp.func
-def narrowed(wide: wp.vec3, narrow: wp.vec3, variance: float) -> wp.vec3:
-    """`wide`, moved towards `narrow` as far as their difference is more than the noise of `narrow`, of this variance."""
+def shrink(wide: wp.vec3, narrow: wp.vec3, variance: float) -> wp.vec3:
+    """Shrinkage estimator: `wide`, moved towards `narrow` as far as their squared difference exceeds the `variance` of `narrow`."""
     difference = luminance(narrow) - luminance(wide)
     square = difference * difference
     if square <= variance:
@@ -153,168 +183,170 @@ def narrowed(wide: wp.vec3, narrow: wp.vec3, variance: float) -> wp.vec3:
 
 
 @wp.kernel
-def choose_windows_kernel(
+def choose_widths_kernel(
     # Scene:
     cameras: Cameras,
-    cells: CellGrid,
+    coarse: CoarseGrid,
     # In:
     guide: Guide,
-    gathered: Gathered,
+    blocks: CoarseLight,
     views: Views,
-    doubt: float,
+    variance_scale: float,
     first: int,
     # Out:
-    shares_out: Shares,
+    ratios_out: RatioImages,
 ):
-    """Shares of even light from the widest window that tells no other than the narrower ones: 4 x 4 blocks, 2 x 2 or one about each cell.
-    Blocks of a window do not overlap, so that a mean over n of them has an n-th of a block's variance, which is `doubt` times the found.
+    """Choose the filter width: visibility ratios of the widest kernel (4 x 4, 2 x 2 or 1 block) that agrees with the narrower ones.
+
+    Blocks of a kernel do not overlap, so a mean over n of them has 1/n of a block's variance. That is the estimated variance times
+    `variance_scale`. Indirect light always takes the wide kernel. All members of `ratios_out` are written.
     """
-    view, row, column = tile_pixel(cells.cells, wp.tid() + first)
-    if not in_image(cells.cells, row, column):
+    view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
+    if not in_image(coarse.grid, row, column):
         return
     if int(guide.segment[view, row, column]) == Segment.NOTHING:
         return
-    plane = plane_at(cells, guide, cameras.intrinsics[views.camera[view]], view, row, column)
-    wide = Window()
-    middle = Window()
+    plane = coarse_plane(coarse, guide, cameras.intrinsics[views.camera[view]], view, row, column)
+    wide = KernelSum()
+    medium = KernelSum()
     variance = wp.vec2(0.0, 0.0)
     for i in range(BLOCKS):
         down = i * BLOCK - BLOCK * (BLOCKS - 1) // 2
         r = row + down
-        if r >= 0 and r < cells.cells.height:
+        if r >= 0 and r < coarse.grid.height:
             for j in range(BLOCKS):
                 right = j * BLOCK - BLOCK * (BLOCKS - 1) // 2
                 c = column + right
-                if c >= 0 and c < cells.cells.width:
-                    weight = likeness(guide, plane, view, r, c, down, right, BLOCK)
+                if c >= 0 and c < coarse.grid.width:
+                    weight = bilateral_weight(guide, plane, view, r, c, down, right, BLOCK)
                     if weight > 0.0:
-                        wide = widened(wide, gathered, view, r, c, weight)
-                        variance += weight * gathered.variance[view, r, c]
+                        wide = add_light(wide, blocks, view, r, c, weight)
+                        variance += weight * blocks.variance[view, r, c]
                         if (i == 1 or i == 2) and (j == 1 or j == 2):
-                            middle = widened(middle, gathered, view, r, c, weight)
-    own_diffuse = ratio(gathered.diffuse[view, row, column], gathered.even_diffuse[view, row, column])
-    own_gloss = ratio(gathered.gloss[view, row, column], gathered.even_gloss[view, row, column])
+                            medium = add_light(medium, blocks, view, r, c, weight)
+    narrow_diffuse = visibility_ratio(blocks.diffuse[view, row, column], blocks.unoccluded_diffuse[view, row, column])
+    narrow_specular = visibility_ratio(blocks.specular[view, row, column], blocks.unoccluded_specular[view, row, column])
     if wide.weight <= 0.0:
-        # None of the blocks may have its middle on the body.
-        shares_out.diffuse[view, row, column] = own_diffuse
-        shares_out.gloss[view, row, column] = own_gloss
-        shares_out.between[view, row, column] = gathered.between[view, row, column]
+        # No block may have its middle on the body.
+        ratios_out.diffuse[view, row, column] = narrow_diffuse
+        ratios_out.specular[view, row, column] = narrow_specular
+        ratios_out.indirect[view, row, column] = blocks.indirect[view, row, column]
         return
-    variance = doubt * variance / wide.weight
-    diffuse = ratio(wide.diffuse, wide.even_diffuse)
-    gloss = ratio(wide.gloss, wide.even_gloss)
-    if middle.weight > 0.0:
-        diffuse = narrowed(diffuse, ratio(middle.diffuse, middle.even_diffuse), variance[0] / MIDDLE_BLOCKS)
-        gloss = narrowed(gloss, ratio(middle.gloss, middle.even_gloss), variance[1] / MIDDLE_BLOCKS)
-    shares_out.diffuse[view, row, column] = narrowed(diffuse, own_diffuse, variance[0])
-    shares_out.gloss[view, row, column] = narrowed(gloss, own_gloss, variance[1])
-    shares_out.between[view, row, column] = wide.between / wide.weight
+    variance = variance_scale * variance / wide.weight
+    diffuse = visibility_ratio(wide.diffuse, wide.unoccluded_diffuse)
+    specular = visibility_ratio(wide.specular, wide.unoccluded_specular)
+    if medium.weight > 0.0:
+        diffuse = shrink(diffuse, visibility_ratio(medium.diffuse, medium.unoccluded_diffuse), variance[0] / MEDIUM_BLOCKS)
+        specular = shrink(specular, visibility_ratio(medium.specular, medium.unoccluded_specular), variance[1] / MEDIUM_BLOCKS)
+    ratios_out.diffuse[view, row, column] = shrink(diffuse, narrow_diffuse, variance[0])
+    ratios_out.specular[view, row, column] = shrink(specular, narrow_specular, variance[1])
+    ratios_out.indirect[view, row, column] = wide.indirect / wide.weight
 
 
 @wp.kernel
-def soften_shares_kernel(
+def smooth_ratios_kernel(
     # Scene:
     cameras: Cameras,
-    cells: CellGrid,
+    coarse: CoarseGrid,
     # In:
     guide: Guide,
-    shares: Shares,
+    ratios: RatioImages,
     views: Views,
     first: int,
     # Out:
-    shares_out: Shares,
+    ratios_out: RatioImages,
 ):
-    """Weighted mean over 3 x 3 cells: windows have no edges then."""
-    view, row, column = tile_pixel(cells.cells, wp.tid() + first)
-    if not in_image(cells.cells, row, column):
+    """Bilateral mean over 3 x 3 coarse pixels, which hides the borders between kernel widths. All members of `ratios_out` are written."""
+    view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
+    if not in_image(coarse.grid, row, column):
         return
     if int(guide.segment[view, row, column]) == Segment.NOTHING:
         return
-    plane = plane_at(cells, guide, cameras.intrinsics[views.camera[view]], view, row, column)
+    plane = coarse_plane(coarse, guide, cameras.intrinsics[views.camera[view]], view, row, column)
     diffuse = wp.vec3(0.0, 0.0, 0.0)
-    gloss = wp.vec3(0.0, 0.0, 0.0)
-    between = wp.vec3(0.0, 0.0, 0.0)
+    specular = wp.vec3(0.0, 0.0, 0.0)
+    indirect = wp.vec3(0.0, 0.0, 0.0)
     total = float(0.0)
     for down in range(-1, 2):
         r = row + down
-        if r >= 0 and r < cells.cells.height:
+        if r >= 0 and r < coarse.grid.height:
             for right in range(-1, 2):
                 c = column + right
-                if c >= 0 and c < cells.cells.width:
-                    weight = likeness(guide, plane, view, r, c, down, right, 1)
-                    diffuse += weight * shares.diffuse[view, r, c]
-                    gloss += weight * shares.gloss[view, r, c]
-                    between += weight * shares.between[view, r, c]
+                if c >= 0 and c < coarse.grid.width:
+                    weight = bilateral_weight(guide, plane, view, r, c, down, right, 1)
+                    diffuse += weight * ratios.diffuse[view, r, c]
+                    specular += weight * ratios.specular[view, r, c]
+                    indirect += weight * ratios.indirect[view, r, c]
                     total += weight
-    shares_out.diffuse[view, row, column] = diffuse / total
-    shares_out.gloss[view, row, column] = gloss / total
-    shares_out.between[view, row, column] = between / total
+    ratios_out.diffuse[view, row, column] = diffuse / total
+    ratios_out.specular[view, row, column] = specular / total
+    ratios_out.indirect[view, row, column] = indirect / total
 
 
 @wp.func
-def cell_likeness(guide: Guide, cells: CellGrid, plane: Plane, view: int, row: int, column: int, r: int, c: int) -> float:
-    """1 if the cell (r, c) is on the surface that the pixel (row, column) shows, LEAST_WEIGHT if on another, 0 if on none."""
+def upsampling_weight(guide: Guide, coarse: CoarseGrid, plane: Plane, view: int, row: int, column: int, r: int, c: int) -> float:
+    """Edge-stopping weight of the coarse pixel (r, c) for the pixel (row, column): 1 on its surface, MIN_WEIGHT off it, 0 on background."""
     segment = guide.segment[view, r, c]
     if int(segment) == Segment.NOTHING:
         return 0.0
-    pixel = cell_pixel(cells, r, c)
-    apart = off_plane(plane, pixel[0] - row, pixel[1] - column, guide.depth[view, r, c])
-    if segment != plane.segment or apart > SAME_SURFACE * float(cells.size) * plane.width:
-        return LEAST_WEIGHT
+    pixel = middle_pixel(coarse, r, c)
+    distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, guide.depth[view, r, c])
+    if segment != plane.segment or distance > PLANE_TOLERANCE * float(coarse.size) * plane.width:
+        return MIN_WEIGHT
     return 1.0
 
 
 @wp.func
-def with_cell(light: Light, shares: Shares, view: int, row: int, column: int, weight: float) -> Light:
-    """`light` with the shares of one more cell."""
-    made = Light()
-    made.diffuse = light.diffuse + weight * shares.diffuse[view, row, column]
-    made.gloss = light.gloss + weight * shares.gloss[view, row, column]
-    made.between = light.between + weight * shares.between[view, row, column]
-    return made
+def add_ratios(total: Ratios, ratios: RatioImages, view: int, row: int, column: int, weight: float) -> Ratios:
+    """Add one coarse pixel to a weighted sum."""
+    result = Ratios()
+    result.diffuse = total.diffuse + weight * ratios.diffuse[view, row, column]
+    result.specular = total.specular + weight * ratios.specular[view, row, column]
+    result.indirect = total.indirect + weight * ratios.indirect[view, row, column]
+    return result
 
 
 @wp.func
-def gathered_share(guide: Guide, shares: Shares, cells: CellGrid, view: int, row: int, column: int, plane: Plane) -> Light:
-    """Shares of even light at a pixel, from the four cells about it; those on other surfaces count next to nothing.
+def upsample_ratios(guide: Guide, ratios: RatioImages, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane) -> Ratios:
+    """Joint bilateral upsampling: visibility ratios at a pixel from the four nearest coarse pixels, those on its surface first.
 
-    If all four are on other surfaces, those around them are looked at too: light changes less along a surface than from one to another.
-    `plane` is the pixel's.
+    If all four are on other surfaces, the ring around them is searched too, because light changes less along a surface than between
+    surfaces. `plane` is the pixel's tangent plane.
     """
-    y = cell_place(cells, row)
-    x = cell_place(cells, column)
+    y = coarse_coordinate(coarse, row)
+    x = coarse_coordinate(coarse, column)
     top = int(wp.floor(y))
     left = int(wp.floor(x))
-    made = Light()
+    result = Ratios()
     total = float(0.0)
-    most = float(0.0)
+    best = float(0.0)
     for i in range(2):
-        r = wp.clamp(top + i, 0, cells.cells.height - 1)
+        r = wp.clamp(top + i, 0, coarse.grid.height - 1)
         vertical = 1.0 - wp.abs(y - float(top + i))
         for j in range(2):
-            c = wp.clamp(left + j, 0, cells.cells.width - 1)
-            like = cell_likeness(guide, cells, plane, view, row, column, r, c)
-            if like > 0.0:
-                weight = like * (vertical * (1.0 - wp.abs(x - float(left + j))) + LEAST_WEIGHT)
-                made = with_cell(made, shares, view, r, c, weight)
+            c = wp.clamp(left + j, 0, coarse.grid.width - 1)
+            surface_weight = upsampling_weight(guide, coarse, plane, view, row, column, r, c)
+            if surface_weight > 0.0:
+                weight = surface_weight * (vertical * (1.0 - wp.abs(x - float(left + j))) + MIN_WEIGHT)
+                result = add_ratios(result, ratios, view, r, c, weight)
                 total += weight
-                most = wp.max(most, like)
-    if most < 1.0:
+                best = wp.max(best, surface_weight)
+    if best < 1.0:
         # Not unrolled: few pixels come here.
         ring = int(RING)
         for i in range(-ring, 2 + ring):
-            r = wp.clamp(top + i, 0, cells.cells.height - 1)
+            r = wp.clamp(top + i, 0, coarse.grid.height - 1)
             for j in range(-ring, 2 + ring):
-                c = wp.clamp(left + j, 0, cells.cells.width - 1)
-                if cell_likeness(guide, cells, plane, view, row, column, r, c) == 1.0:
-                    made = with_cell(made, shares, view, r, c, 1.0)
+                c = wp.clamp(left + j, 0, coarse.grid.width - 1)
+                if upsampling_weight(guide, coarse, plane, view, row, column, r, c) == 1.0:
+                    result = add_ratios(result, ratios, view, r, c, 1.0)
                     total += 1.0
     if total <= 0.0:
-        # Nothing but background around: as if nothing stood in the way.
-        made.diffuse = wp.vec3(1.0, 1.0, 1.0)
-        made.gloss = wp.vec3(1.0, 1.0, 1.0)
-        return made
-    made.diffuse = made.diffuse / total
-    made.gloss = made.gloss / total
-    made.between = made.between / total
-    return made
+        # Only background around the pixel: light as if nothing blocked it.
+        result.diffuse = wp.vec3(1.0, 1.0, 1.0)
+        result.specular = wp.vec3(1.0, 1.0, 1.0)
+        return result
+    result.diffuse = result.diffuse / total
+    result.specular = result.specular / total
+    result.indirect = result.indirect / total
+    return result

@@ -1,58 +1,60 @@
-"""Light from the environment: directions, background, diffuse irradiance, blurred reflections."""
+"""Environment lighting: radiance maps (equirectangular), irradiance by spherical harmonics, prefiltered specular maps, dominant sun."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-REFLECTION_LEVELS = wp.constant(5)
-"""Reflections are blurred for roughness 1/5, 2/5, ... 1."""
-
-
-FLAT_HARMONIC = wp.constant(0.282095)
-"""The real spherical harmonic of order 0: 1 / (2 √π)."""
+PREFILTER_LEVELS = wp.constant(5)
+"""Levels of the prefiltered specular map, for roughness 1/5, 2/5, ... 1."""
+SH_CONSTANT = wp.constant(0.282095)
+"""Real spherical harmonic of order 0: 1 / (2 √π)."""
 
 
 @wp.struct
 class Lights:
-    """Constant, one row a light map. Directions are the map's; a world turns them about +z."""
+    """Environment maps and what is precomputed from them. Constant. A world rotates its map about +z by its yaw.
+
+    A map's sun is its dominant light, split off where it is small enough: see `scenes.sun`. Directions are in the map's frame.
+    """
 
     maps: int
-    background: wp.array3d[wp.vec3]
-    """Radiance (map, row, column), first of all maps whole, then of all without their main light; row 0 looks up, column
+    """Number of environment maps."""
+    radiance: wp.array3d[wp.vec3]
+    """(2 maps, row, column): first every map as it is, then every map without its sun. Row 0 is the zenith, column
     u = azimuth / 2π + 0.5."""
-    reflection: wp.array4d[wp.vec3]
-    """Radiance without the main light, blurred for growing roughness (map, level, row, column)."""
+    prefiltered: wp.array4d[wp.vec3]
+    """(map, level, row, column): radiance without the sun, convolved with GGX lobes of increasing roughness."""
     irradiance: wp.array2d[wp.vec3]
-    """Irradiance without the main light: nine coefficients of real spherical harmonics, already convolved with the cosine."""
-    main_direction: wp.array[wp.vec3]
-    """Unit vector towards the main light."""
-    main_irradiance: wp.array[wp.vec3]
-    """Irradiance of the main light on a surface that faces it; zero: the map has none."""
-    main_spread: wp.array[float]
-    """Tangent of the main light's angular radius."""
+    """(map, coefficient): irradiance without the sun as nine real spherical harmonics, already convolved with the cosine."""
+    sun_direction: wp.array[wp.vec3]
+    """(map): unit vector towards the sun."""
+    sun_irradiance: wp.array[wp.vec3]
+    """(map): irradiance of the sun on a surface that faces it; zero: the map has no sun."""
+    sun_radius: wp.array[float]
+    """(map): tangent of the sun's angular radius."""
     exposure: wp.array[float]
-    """Factor that brings the map's radiance to display range."""
+    """(map): factor that brings the map's radiance to display range."""
 
 
 @wp.func
-def turned(direction: wp.vec3, angle: float) -> wp.vec3:
-    """`direction`, turned counter-clockwise about +z [rad]."""
+def rotate_z(direction: wp.vec3, angle: float) -> wp.vec3:
+    """`direction`, rotated counter-clockwise about +z by `angle` [rad]."""
     c = wp.cos(angle)
     s = wp.sin(angle)
     return wp.vec3(c * direction[0] - s * direction[1], s * direction[0] + c * direction[1], direction[2])
 
 
 @wp.func
-def map_position(direction: wp.vec3, rows: int, columns: int) -> wp.vec2:
-    """(row, column) of a unit direction in an equirectangular map, in texels from the centre of the first."""
+def map_coordinates(direction: wp.vec3, rows: int, columns: int) -> wp.vec2:
+    """(row, column) of a unit direction in an equirectangular map, in texels from the centre of the first one."""
     u = wp.atan2(direction[1], direction[0]) / wp.TAU + 0.5
     v = wp.acos(wp.clamp(direction[2], -1.0, 1.0)) / wp.PI
     return wp.vec2(v * float(rows) - 0.5, u * float(columns) - 0.5)
 
 
 @wp.struct
-class Corners:
-    """Where a bilinear look-up reads, and how far it lies from the upper left of the four texels."""
+class BilinearTaps:
+    """Rows and columns of the four texels of a bilinear look-up, and its position from the upper left one [texels]."""
 
     upper: int
     lower: int
@@ -63,76 +65,80 @@ class Corners:
 
 
 @wp.func
-def map_corners(direction: wp.vec3, rows: int, columns: int) -> Corners:
-    """The texels about a unit direction in an equirectangular map, whose left edge continues its right one."""
-    at = map_position(direction, rows, columns)
+def find_taps(direction: wp.vec3, rows: int, columns: int) -> BilinearTaps:
+    """Texels to interpolate for a unit direction in an equirectangular map; columns wrap around, rows are clamped."""
+    at = map_coordinates(direction, rows, columns)
     row = int(wp.floor(at[0]))
     column = int(wp.floor(at[1]))
-    made = Corners()
-    made.down = at[0] - float(row)
-    made.right = at[1] - float(column)
-    made.upper = wp.clamp(row, 0, rows - 1)
-    made.lower = wp.clamp(row + 1, 0, rows - 1)
+    taps = BilinearTaps()
+    taps.down = at[0] - float(row)
+    taps.right = at[1] - float(column)
+    taps.upper = wp.clamp(row, 0, rows - 1)
+    taps.lower = wp.clamp(row + 1, 0, rows - 1)
     # -1 is the last column, as `columns` is the first.
-    made.west = wp.where(column < 0, columns - 1, column)
-    made.east = wp.where(column + 1 == columns, 0, column + 1)
-    return made
+    taps.west = wp.where(column < 0, columns - 1, column)
+    taps.east = wp.where(column + 1 == columns, 0, column + 1)
+    return taps
 
 
 @wp.func
-def bilinear(at: Corners, upper_west: wp.vec3, upper_east: wp.vec3, lower_west: wp.vec3, lower_east: wp.vec3) -> wp.vec3:
-    return wp.lerp(wp.lerp(upper_west, upper_east, at.right), wp.lerp(lower_west, lower_east, at.right), at.down)
+def bilinear(taps: BilinearTaps, upper_west: wp.vec3, upper_east: wp.vec3, lower_west: wp.vec3, lower_east: wp.vec3) -> wp.vec3:
+    """Bilinear interpolation of four texels."""
+    return wp.lerp(wp.lerp(upper_west, upper_east, taps.right), wp.lerp(lower_west, lower_east, taps.right), taps.down)
 
 
 @wp.func
-def background_radiance(lights: Lights, light: int, direction: wp.vec3) -> wp.vec3:
-    """Radiance from a unit direction in the map's frame, bilinear."""
-    at = map_corners(direction, lights.background.shape[1], lights.background.shape[2])
+def environment_radiance(lights: Lights, light: int, direction: wp.vec3) -> wp.vec3:
+    """Radiance from a unit direction in the map's frame, bilinear.
+
+    `light` is a row of `Lights.radiance`: the index of a map, or that plus `maps` for the map without its sun.
+    """
+    taps = find_taps(direction, lights.radiance.shape[1], lights.radiance.shape[2])
     return bilinear(
-        at,
-        lights.background[light, at.upper, at.west],
-        lights.background[light, at.upper, at.east],
-        lights.background[light, at.lower, at.west],
-        lights.background[light, at.lower, at.east],
+        taps,
+        lights.radiance[light, taps.upper, taps.west],
+        lights.radiance[light, taps.upper, taps.east],
+        lights.radiance[light, taps.lower, taps.west],
+        lights.radiance[light, taps.lower, taps.east],
     )
 
 
 @wp.func
-def reflection_texel(lights: Lights, light: int, level: int, at: Corners) -> wp.vec3:
-    """One level of the blurred reflections, bilinear."""
+def prefiltered_level(lights: Lights, light: int, level: int, taps: BilinearTaps) -> wp.vec3:
+    """One level of the prefiltered specular map, bilinear."""
     return bilinear(
-        at,
-        lights.reflection[light, level, at.upper, at.west],
-        lights.reflection[light, level, at.upper, at.east],
-        lights.reflection[light, level, at.lower, at.west],
-        lights.reflection[light, level, at.lower, at.east],
+        taps,
+        lights.prefiltered[light, level, taps.upper, taps.west],
+        lights.prefiltered[light, level, taps.upper, taps.east],
+        lights.prefiltered[light, level, taps.lower, taps.west],
+        lights.prefiltered[light, level, taps.lower, taps.east],
     )
 
 
 @wp.func
-def reflected_radiance(lights: Lights, light: int, direction: wp.vec3, roughness: float) -> wp.vec3:
-    """Mean radiance of the reflection lobe of a rough surface about a unit direction in the map's frame."""
-    level = wp.clamp(roughness * float(REFLECTION_LEVELS) - 1.0, 0.0, float(REFLECTION_LEVELS - 1))
-    lower = wp.min(int(level), REFLECTION_LEVELS - 2)
-    at = map_corners(direction, lights.reflection.shape[2], lights.reflection.shape[3])
+def prefiltered_radiance(lights: Lights, light: int, direction: wp.vec3, roughness: float) -> wp.vec3:
+    """Prefiltered specular radiance without the sun (Karis, 2013), trilinear: the GGX lobe's mean about a unit direction of the map."""
+    level = wp.clamp(roughness * float(PREFILTER_LEVELS) - 1.0, 0.0, float(PREFILTER_LEVELS - 1))
+    lower = wp.min(int(level), PREFILTER_LEVELS - 2)
+    taps = find_taps(direction, lights.prefiltered.shape[2], lights.prefiltered.shape[3])
     return wp.lerp(
-        reflection_texel(lights, light, lower, at),
-        reflection_texel(lights, light, lower + 1, at),
+        prefiltered_level(lights, light, lower, taps),
+        prefiltered_level(lights, light, lower + 1, taps),
         level - float(lower),
     )
 
 
 @wp.func
-def diffuse_irradiance(lights: Lights, light: int, normal: wp.vec3) -> wp.vec3:
-    """Irradiance on a surface with a unit normal in the map's frame, without the main light.
+def sh_irradiance(lights: Lights, light: int, normal: wp.vec3) -> wp.vec3:
+    """Irradiance by spherical harmonics of order 2 (Ramamoorthi and Hanrahan, 2001), without the sun; clamped at zero.
 
-    Sum of nine real spherical harmonics (Ramamoorthi and Hanrahan, 2001); never negative.
+    `normal` is a unit vector in the map's frame.
     """
     x = normal[0]
     y = normal[1]
     z = normal[2]
     total = (
-        lights.irradiance[light, 0] * FLAT_HARMONIC
+        lights.irradiance[light, 0] * SH_CONSTANT
         + lights.irradiance[light, 1] * (0.488603 * y)
         + lights.irradiance[light, 2] * (0.488603 * z)
         + lights.irradiance[light, 3] * (0.488603 * x)

@@ -1,85 +1,89 @@
-"""The surface at a hit: position, normals, base colour from mip-mapped textures."""
+"""Surface shading data at a hit: geometric and interpolated normals, mip-mapped base colour, roughness with specular anti-aliasing."""
 
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.brdf import Gloss
+from synpick_warp.kernels.render.lighting.brdf import AlbedoTables
 from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies, triangle_normal
 
 wp.set_module_options({"enable_backward": False})
 
 PIXEL_VARIANCE = wp.constant(1.0 / 12.0)
-"""Of a place in a pixel along an axis [px²]."""
-MOST_WIDENING = wp.constant(0.18)
-"""Largest increase of the squared GGX width by what a pixel's normals differ (Tokuyoshi and Kaplanyan, 2019)."""
+"""Variance of a uniformly distributed position in a pixel, along one axis [px²]."""
+MAX_WIDENING = wp.constant(0.18)
+"""Specular anti-aliasing: largest increase of the squared GGX width alpha² (Tokuyoshi and Kaplanyan, 2019)."""
 MIN_TILT = wp.constant(0.1)
-"""Bounds how far a pixel stretches on a surface seen edge-on."""
+"""Smallest cosine for a pixel's footprint on a surface seen edge-on."""
 
 
 @wp.struct
 class Surfaces:
-    """Constant, one row a mesh and a last one for the table; triangles, in the order of `Meshes`, and texels lie one after the other."""
+    """Materials, textures and shading normals. Constant. Rows called mesh are those of `Meshes`, and a last one for the table."""
 
     normal: wp.array[wp.vec3]
-    """Of each corner of each triangle, as `Meshes.corner` has them."""
+    """(corner): vertex normals of the three corners of each triangle, in the order of `Meshes.corner`."""
     uv: wp.array[wp.vec2]
+    """(corner): texture coordinates."""
     uv_density: wp.array[float]
-    """Texture lengths per metre, one a triangle."""
-    bend: wp.array[float]
-    """How fast the interpolated normal turns along the triangle, both ways together [rad/m], one a triangle."""
+    """(triangle): texture lengths per metre."""
+    normal_gradient: wp.array[float]
+    """(triangle): Frobenius norm of the interpolated normal's gradient along the triangle [rad/m]."""
     color: wp.array[wp.vec3]
-    """Base colour, linear."""
+    """(mesh): base colour, linear."""
     metallic: wp.array[float]
+    """(mesh)."""
     roughness: wp.array[float]
+    """(mesh): perceptual; the GGX width is its square."""
     texture_size: wp.array[wp.vec2i]
-    """Width and height of the finest level; 0, 0: no texture."""
+    """(mesh): width and height of the finest mip level; 0, 0: no texture."""
     first_texel: wp.array2d[int]
-    """Where each mip level starts (mesh, level)."""
+    """(mesh, level): index of the first texel of a mip level."""
     texture_levels: wp.array[int]
+    """(mesh): number of mip levels."""
     texel: wp.array[wp.uint32]
-    """sRGB, red in the lowest byte: one load brings all three."""
+    """(texel): sRGB, red in the lowest byte, so that one load reads all three channels."""
     linear: wp.array[float]
-    """The linear value of each of the 256 sRGB values."""
-    gloss: Gloss
-    """What glossy lobes reflect, of any surface."""
+    """(256): linear value of each sRGB value."""
+    albedo: AlbedoTables
+    """Directional albedo of the specular lobe, the same for all surfaces."""
 
 
 @wp.struct
 class Surface:
-    """What shading knows of one hit."""
+    """Shading data at one hit."""
 
     row: int
     """Row of `Surfaces`."""
     face_normal: wp.vec3
-    """The triangle's, towards the camera."""
+    """Geometric normal, towards the viewer."""
     normal: wp.vec3
-    """Interpolated, towards the camera."""
+    """Interpolated normal, towards the viewer."""
     uv: wp.vec2
     uv_footprint: float
-    """Width of the pixel on the surface, in texture lengths."""
-    spread: float
-    """How far apart the normals in the pixel point [rad]."""
+    """Width of the pixel's footprint on the surface, in texture lengths."""
+    normal_spread: float
+    """Change of the normal across the pixel's footprint [rad]."""
 
 
 @wp.func
-def towards(normal: wp.vec3, reference: wp.vec3) -> wp.vec3:
-    """`normal`, or its opposite if that points more to `reference`."""
+def face_forward(normal: wp.vec3, reference: wp.vec3) -> wp.vec3:
+    """`normal`, flipped if it points away from `reference`."""
     if wp.dot(normal, reference) < 0.0:
         return -normal
     return normal
 
 
 @wp.func
-def table_surface(meshes: Meshes, view_direction: wp.vec3) -> Surface:
-    """The table's surface; `view_direction` points to the camera."""
+def make_table_surface(meshes: Meshes, view_direction: wp.vec3) -> Surface:
+    """Shading data of the table; `view_direction` points to the viewer."""
     result = Surface()
     result.row = meshes.entries + FIXTURES
-    result.face_normal = towards(wp.vec3(0.0, 0.0, 1.0), view_direction)
+    result.face_normal = face_forward(wp.vec3(0.0, 0.0, 1.0), view_direction)
     result.normal = result.face_normal
     return result
 
 
 @wp.func
-def mesh_surface(
+def interpolate_surface(
     meshes: Meshes,
     surfaces: Surfaces,
     bodies: ViewBodies,
@@ -90,14 +94,17 @@ def mesh_surface(
     view_direction: wp.vec3,
     pixel_width: float,
 ) -> Surface:
-    """Surface at a hit. `view_direction` points to the camera; `pixel_width` [m] is the pixel's, across the ray."""
+    """Interpolate the shading data of a mesh at a hit.
+
+    `view_direction` points to the viewer; `pixel_width` [m] is the pixel's footprint across the ray.
+    """
     mesh = bodies.mesh[view, body]
     to_world = wp.transpose(bodies.world_rotation[view, body])
     result = Surface()
     result.row = mesh
-    result.face_normal = towards(to_world * triangle_normal(meshes, mesh, triangle), view_direction)
-    number = meshes.first_triangle[mesh] + triangle
-    a = 3 * number
+    result.face_normal = face_forward(to_world * triangle_normal(meshes, mesh, triangle), view_direction)
+    triangle_index = meshes.first_triangle[mesh] + triangle
+    a = 3 * triangle_index
     b = a + 1
     c = a + 2
     u = barycentric[0]
@@ -106,24 +113,25 @@ def mesh_surface(
     smooth = to_world * (u * surfaces.normal[a] + v * surfaces.normal[b] + w * surfaces.normal[c])
     result.normal = result.face_normal
     if wp.length_sq(smooth) > 0.0:
-        result.normal = wp.normalize(towards(smooth, result.face_normal))
+        result.normal = wp.normalize(face_forward(smooth, result.face_normal))
     result.uv = u * surfaces.uv[a] + v * surfaces.uv[b] + w * surfaces.uv[c]
-    # A tilted pixel is longer one way only; the root is its mean stretch.
+    # A footprint on a tilted surface is longer along one axis only; the root is its mean stretch.
     tilt = wp.sqrt(wp.max(wp.dot(result.face_normal, view_direction), MIN_TILT))
-    result.uv_footprint = pixel_width / tilt * surfaces.uv_density[number]
-    result.spread = pixel_width / tilt * surfaces.bend[number]
+    result.uv_footprint = pixel_width / tilt * surfaces.uv_density[triangle_index]
+    result.normal_spread = pixel_width / tilt * surfaces.normal_gradient[triangle_index]
     return result
 
 
 @wp.func
-def texel_color(surfaces: Surfaces, index: int) -> wp.vec3:
+def decode_texel(surfaces: Surfaces, index: int) -> wp.vec3:
+    """Linear colour of a texel."""
     texel = int(surfaces.texel[index])
     return wp.vec3(surfaces.linear[texel & 255], surfaces.linear[(texel >> 8) & 255], surfaces.linear[(texel >> 16) & 255])
 
 
 @wp.func
-def level_color(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> wp.vec3:
-    """Bilinear look-up in one mip level. v grows upward, row 0 is the image's top; the texture repeats."""
+def sample_mip_level(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> wp.vec3:
+    """Bilinear look-up in one mip level of a repeating texture. v grows upward, row 0 is the image's top; `row` is that of `Surfaces`."""
     size = surfaces.texture_size[row]
     width = wp.max(size[0] >> level, 1)
     height = wp.max(size[1] >> level, 1)
@@ -131,24 +139,26 @@ def level_color(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> wp.vec
     y = (1.0 - uv[1] - wp.floor(1.0 - uv[1])) * float(height) - 0.5
     left = int(wp.floor(x))
     top = int(wp.floor(y))
-    right_share = x - float(left)
-    lower_share = y - float(top)
-    # Both are at least -1 and less than the level's size; a division for the remainder would cost more than the texels.
+    right_weight = x - float(left)
+    lower_weight = y - float(top)
+    # Both are at least -1 and less than the level's size; a modulo would cost more than the texels.
     right = wp.where(left + 1 == width, 0, left + 1)
     bottom = wp.where(top + 1 == height, 0, top + 1)
     left = wp.where(left < 0, width - 1, left)
     top = wp.where(top < 0, height - 1, top)
     first = surfaces.first_texel[row, level]
     return wp.lerp(
-        wp.lerp(texel_color(surfaces, first + top * width + left), texel_color(surfaces, first + top * width + right), right_share),
-        wp.lerp(texel_color(surfaces, first + bottom * width + left), texel_color(surfaces, first + bottom * width + right), right_share),
-        lower_share,
+        wp.lerp(decode_texel(surfaces, first + top * width + left), decode_texel(surfaces, first + top * width + right), right_weight),
+        wp.lerp(
+            decode_texel(surfaces, first + bottom * width + left), decode_texel(surfaces, first + bottom * width + right), right_weight
+        ),
+        lower_weight,
     )
 
 
 @wp.func
-def base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
-    """Linear base colour: material times texture, trilinear between the two mip levels whose texels are as wide as the pixel."""
+def sample_base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
+    """Linear base colour: material times texture, trilinear between the two mip levels whose texels are about as wide as the footprint."""
     color = surfaces.color[surface.row]
     size = surfaces.texture_size[surface.row]
     if size[0] == 0:
@@ -158,13 +168,13 @@ def base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
     level = wp.clamp(wp.log2(wp.max(texels, 1.0e-6)), 0.0, float(last))
     lower = int(level)
     upper = wp.min(lower + 1, last)
-    fine = level_color(surfaces, surface.row, lower, surface.uv)
-    coarse = level_color(surfaces, surface.row, upper, surface.uv)
+    fine = sample_mip_level(surfaces, surface.row, lower, surface.uv)
+    coarse = sample_mip_level(surfaces, surface.row, upper, surface.uv)
     return wp.cw_mul(color, wp.lerp(fine, coarse, level - float(lower)))
 
 
 @wp.func
-def widened_roughness(roughness: float, spread: float) -> float:
-    """Roughness of what a pixel shows whose normals lie so far apart: a lobe as wide as all of theirs (Kaplanyan et al., 2016)."""
+def widen_roughness(roughness: float, normal_spread: float) -> float:
+    """Specular anti-aliasing: widen the GGX lobe by the variance of the normals in a pixel's footprint (Kaplanyan et al., 2016)."""
     alpha = roughness * roughness
-    return wp.sqrt(wp.sqrt(wp.min(alpha * alpha + wp.min(PIXEL_VARIANCE * spread * spread, MOST_WIDENING), 1.0)))
+    return wp.sqrt(wp.sqrt(wp.min(alpha * alpha + wp.min(PIXEL_VARIANCE * normal_spread * normal_spread, MAX_WIDENING), 1.0)))

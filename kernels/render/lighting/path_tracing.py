@@ -1,17 +1,25 @@
-"""The reference picture: paths from the camera that scatter at surfaces until they leave the scene for the light map.
+"""Path tracer: paths from the camera that scatter at surfaces until they leave the scene for the environment map.
 
-A pixel's radiance is the mean over N paths of Σ_k T_k (w_l f L / p_l + w_s L_s), T the product of f cos / p along the path: at each surface
-one direction is drawn by the map's radiance and one by the surface's own law, weighted by the power heuristic (Veach, 1997),
-w_l = p_l² / (p_l² + p_s²). Nothing in the scene glows but the map.
+A pixel's radiance is the mean over N paths of Σ_k T_k (w_l f L / p_l + w_s L_s), T the throughput: the product of f cos / p along the path.
+At each surface one direction is sampled by the map's radiance (next-event estimation) and one by the BRDF, combined by multiple importance
+sampling with the power heuristic (Veach, 1997), w_l = p_l² / (p_l² + p_s²). Only the map emits light.
+
+`trace_paths_kernel` is the path-traced reference; `coarse_paths` uses the same functions at few paths per coarse pixel.
 """
 
 import warp as wp
 
 from synpick_warp.codes import Segment, Stream
-from synpick_warp.kernels.render.lighting.brdf import Brdf, Reflection, brdf_at, density, evaluate_parts, scatter
-from synpick_warp.kernels.render.lighting.environment import Lights, background_radiance, turned
-from synpick_warp.kernels.render.lighting.materials import Surfaces, base_color, mesh_surface, table_surface
-from synpick_warp.kernels.render.lighting.sampling import Chances, LightSample, light_density, sample_light, scrambled_point
+from synpick_warp.kernels.render.lighting.brdf import Brdf, BrdfValue, SplitRadiance, brdf_pdf, evaluate_brdf, make_brdf, sample_brdf
+from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_z
+from synpick_warp.kernels.render.lighting.materials import Surfaces, interpolate_surface, make_table_surface, sample_base_color
+from synpick_warp.kernels.render.lighting.sampling import (
+    EnvironmentCdf,
+    EnvironmentSample,
+    environment_pdf,
+    sample_environment,
+    scrambled_point,
+)
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, hit_position, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
@@ -30,112 +38,107 @@ from synpick_warp.kernels.rng import mix, stream_key
 
 wp.set_module_options({"enable_backward": False})
 
-BOTH = wp.constant(0)
-BY_LIGHT = wp.constant(1)
-BY_SURFACE = wp.constant(2)
-"""How directions to the light are drawn. One way alone has the same mean and more noise: it serves to check the other."""
-MOST_LUCK = wp.constant(0.95)
-"""Largest chance of a path to go on, so that all end."""
-MOST_POINT = wp.constant(0.99999994)
+COMBINED = wp.constant(0)
+LIGHT_SAMPLING = wp.constant(1)
+BRDF_SAMPLING = wp.constant(2)
+"""Sampling strategies of light: both combined by MIS, or one alone, which has the same mean and more noise and serves as a check."""
+MAX_SURVIVAL = wp.constant(0.95)
+"""Russian roulette: largest survival probability, so that every path ends."""
+BELOW_ONE = wp.constant(0.99999994)
 """The largest float32 below 1."""
-DIMENSIONS = wp.constant(3)
-"""Points in the unit square that a scattering takes: light, surface, and (lobe, roulette)."""
-ENDED = wp.constant(-1)
-SCATTERED_SPREAD = wp.constant(0.1)
-"""A path's width grows by this much per metre [m/m] after it met a rough surface, so that textures it meets later are read coarsely."""
+DIMENSIONS_PER_BOUNCE = wp.constant(3)
+"""Two-dimensional sample points that a bounce consumes: light direction, BRDF direction, (lobe choice, Russian roulette)."""
+TERMINATED = wp.constant(-1)
+"""Value of `Path.bounce` when the path has ended."""
+FOOTPRINT_GROWTH = wp.constant(0.1)
+"""Growth of a path's footprint per metre [m/m] after a bounce at roughness 1, so that later textures are read from coarse mip levels."""
 
 
 @wp.struct
 class PathScene:
-    """What rays meet. Constant."""
+    """The scene that rays intersect. Constant."""
 
     meshes: Meshes
     table: Table
     surfaces: Surfaces
     lights: Lights
-    chances: Chances
+    cdf: EnvironmentCdf
+    """Rows are those of `Lights.radiance`."""
 
 
 @wp.struct
 class PathRules:
-    """How paths are drawn."""
+    """Settings of the path tracer."""
 
     samples: int
-    """Paths a pixel."""
+    """Paths per pixel, or per coarse pixel."""
     bounces: int
-    """Most surfaces at which a path scatters."""
+    """Largest number of surfaces at which a path scatters."""
     roulette: int
-    """From this scattering on, the first being 0, dim paths end early, and those that go on count for them."""
+    """First bounce, counted from 0, with Russian roulette: dim paths end early, survivors are weighted up."""
     strategy: int
-    """BOTH, BY_LIGHT or BY_SURFACE."""
-    least_roughness: float
-    """Surfaces that a path meets after the first are at least so rough: what shines through two mirrors is rare, bright and noisy."""
+    """COMBINED, LIGHT_SAMPLING or BRDF_SAMPLING."""
+    min_roughness: float
+    """Path regularization: smallest roughness of surfaces after the first. Caustics through two mirrors are rare, bright and noisy."""
     seed: wp.uint64
 
 
 @wp.struct
-class Place:
-    """Where one pixel's paths are: the world's light, the view's bodies, the stream of random numbers."""
+class PathContext:
+    """What all paths of one pixel share: its view, its light, its stream of random numbers."""
 
     view: int
     instances: int
     """Instance capacity of a world."""
     first_light: int
-    """Map that lights the surface which the camera sees."""
+    """Environment map that lights the surface which the camera sees: row of `Lights.radiance`."""
     light: int
-    """Map that lights all others."""
-    turn: float
+    """Environment map that lights all other surfaces: row of `Lights.radiance`."""
+    yaw: float
+    """Rotation of the map about +z [rad]."""
     key: wp.uint64
+    """Key of the scrambled Sobol' points."""
     shift: wp.vec2
-    """Moves all points in the unit square, each dimension its own way; beyond an edge they come in at the other."""
+    """Cranley-Patterson rotation: times a dimension's index, added to its sample points modulo 1."""
 
 
 @wp.struct
-class Reflected:
-    """Radiance that a surface sends to the camera: diffuse colour times `diffuse` + `between`, plus `gloss`."""
+class Throughput:
+    """Product of BRDF, cosine and 1 / pdf along a path, split by the lobe of its first surface, without that surface's diffuse colour."""
 
     diffuse: wp.vec3
-    """From the map."""
-    between: wp.vec3
-    """From other surfaces."""
-    gloss: wp.vec3
-    """From both."""
-
-
-@wp.struct
-class Through:
-    """What the surfaces of a path leave of light at its end, in the two parts of the first one."""
-
-    diffuse: wp.vec3
-    gloss: wp.vec3
+    specular: wp.vec3
 
 
 @wp.struct
 class Vertex:
-    """A surface that a path met."""
+    """A path vertex: a surface that a path hit."""
 
     origin: wp.vec3
-    """Where rays leave it, in the world [m]."""
+    """Origin of rays that leave the surface, in the world [m]."""
     face_normal: wp.vec3
+    """Geometric normal, in the world, on the side of the incoming ray."""
     brdf: Brdf
 
 
 @wp.struct
 class Path:
-    """A path on its way: what it has found, and the surface at its end, at which it will scatter next."""
+    """State of a path between two bounces."""
 
-    found: Reflected
-    through: Through
+    radiance: SplitRadiance
+    """Radiance collected so far."""
+    throughput: Throughput
     vertex: Vertex
+    """Last vertex, at which the path scatters next."""
     bounce: int
-    """Scatterings so far; ENDED: it will not scatter."""
+    """Bounces so far, or TERMINATED."""
     width: float
-    """Of what it stands for, across it [m]."""
+    """Width of the path's footprint at the last vertex [m]."""
 
 
 @wp.func
-def nearest_hit(scene: PathScene, bodies: ViewBodies, view: int, instances: int, origin: wp.vec3, direction: wp.vec3) -> Hit:
-    """The nearest hit of a ray along a unit vector, all in the world; `depth` is the distance [m]. The companion of `is_blocked`."""
+def trace_ray(scene: PathScene, bodies: ViewBodies, view: int, instances: int, origin: wp.vec3, direction: wp.vec3) -> Hit:
+    """Closest hit of a world-space ray along a unit vector; `depth` is the distance [m]. `is_blocked` is its any-hit counterpart."""
     best = Hit()
     best.segment = Segment.NOTHING
     best.depth = FAR
@@ -143,8 +146,8 @@ def nearest_hit(scene: PathScene, bodies: ViewBodies, view: int, instances: int,
     if scene.table.visible != 0 and direction[2] * height < 0.0:
         best.segment = Segment.TABLE
         best.depth = -height / direction[2]
-    for number in range(bodies.present[view]):
-        body = bodies.order[view, number]
+    for rank in range(bodies.present[view]):
+        body = bodies.order[view, rank]
         sphere = bodies.sphere[view, body]
         offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
         closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, best.depth) * direction
@@ -162,7 +165,7 @@ def nearest_hit(scene: PathScene, bodies: ViewBodies, view: int, instances: int,
 
 
 @wp.func
-def vertex_at(
+def make_vertex(
     scene: PathScene,
     bodies: ViewBodies,
     view: int,
@@ -171,31 +174,32 @@ def vertex_at(
     position: wp.vec3,
     outgoing: wp.vec3,
     width: float,
-    least_roughness: float,
+    min_roughness: float,
 ) -> Vertex:
-    """The surface at a hit; `width` [m] is the path's there, across it."""
-    surface = table_surface(scene.meshes, outgoing)
+    """Build the path vertex at a hit. `outgoing` points back along the ray; `width` [m] is the footprint's, across the ray."""
+    surface = make_table_surface(scene.meshes, outgoing)
     at = position
     if hit.segment == Segment.TABLE:
         # Far away, rounding would lift or sink it by more than the rays' offset.
         at = wp.vec3(position[0], position[1], scene.table.height)
     else:
         body = body_of(hit.segment, instances)
-        surface = mesh_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
-    made = Vertex()
-    made.origin = at + RAY_OFFSET * surface.face_normal
-    made.face_normal = surface.face_normal
+        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, hit.triangle, hit.barycentric, outgoing, width)
+    vertex = Vertex()
+    vertex.origin = at + RAY_OFFSET * surface.face_normal
+    vertex.face_normal = surface.face_normal
     metallic = scene.surfaces.metallic[surface.row]
-    roughness = wp.max(scene.surfaces.roughness[surface.row], least_roughness)
-    made.brdf = brdf_at(scene.surfaces.gloss, base_color(scene.surfaces, surface), metallic, roughness, surface.normal, outgoing)
-    return made
+    roughness = wp.max(scene.surfaces.roughness[surface.row], min_roughness)
+    color = sample_base_color(scene.surfaces, surface)
+    vertex.brdf = make_brdf(scene.surfaces.albedo, color, metallic, roughness, surface.normal, outgoing)
+    return vertex
 
 
 @wp.func
-def heuristic(strategy: int, own: int, density_own: float, density_other: float) -> float:
-    """Weight of a direction drawn in the way `own`: the power heuristic, or all or nothing where one way alone is asked for."""
-    if strategy == BOTH:
-        ratio = density_other / density_own
+def mis_weight(strategy: int, own: int, own_pdf: float, other_pdf: float) -> float:
+    """MIS weight of a direction sampled by strategy `own`: the power heuristic, or 1 and 0 if `strategy` uses one of them alone."""
+    if strategy == COMBINED:
+        ratio = other_pdf / own_pdf
         return 1.0 / (1.0 + ratio * ratio)
     if strategy == own:
         return 1.0
@@ -203,73 +207,74 @@ def heuristic(strategy: int, own: int, density_own: float, density_other: float)
 
 
 @wp.func
-def extended(through: Through, parts: Reflection, color: wp.vec3, bounce: int) -> Through:
-    """With one more surface, of diffuse colour `color`, at the path's end. The first keeps its parts apart; others add both of theirs."""
-    made = Through()
+def extend_throughput(throughput: Throughput, value: BrdfValue, color: wp.vec3, bounce: int) -> Throughput:
+    """Multiply the throughput by the BRDF of one more surface, of diffuse colour `color`. Only the first keeps its lobes apart."""
+    result = Throughput()
     if bounce == 0:
-        made.diffuse = wp.vec3(parts.diffuse, parts.diffuse, parts.diffuse)
-        made.gloss = parts.gloss
+        result.diffuse = wp.vec3(value.diffuse, value.diffuse, value.diffuse)
+        result.specular = value.specular
     else:
-        both = parts.gloss + parts.diffuse * color
-        made.diffuse = wp.cw_mul(through.diffuse, both)
-        made.gloss = wp.cw_mul(through.gloss, both)
-    return made
+        both = value.specular + value.diffuse * color
+        result.diffuse = wp.cw_mul(throughput.diffuse, both)
+        result.specular = wp.cw_mul(throughput.specular, both)
+    return result
 
 
 @wp.func
-def lit(total: Reflected, through: Through, radiance: wp.vec3, bounce: int) -> Reflected:
-    """`total`, and light that arrives at the end of a path of `bounce` + 1 surfaces."""
-    made = total
-    made.gloss += wp.cw_mul(through.gloss, radiance)
+def add_light(total: SplitRadiance, throughput: Throughput, radiance: wp.vec3, bounce: int) -> SplitRadiance:
+    """Add light that arrives at the end of a path of `bounce` + 1 surfaces."""
+    result = total
+    result.specular += wp.cw_mul(throughput.specular, radiance)
     if bounce == 0:
-        made.diffuse += wp.cw_mul(through.diffuse, radiance)
+        result.diffuse += wp.cw_mul(throughput.diffuse, radiance)
     else:
-        made.between += wp.cw_mul(through.diffuse, radiance)
-    return made
+        result.indirect += wp.cw_mul(throughput.diffuse, radiance)
+    return result
 
 
 @wp.func
-def path_point(place: Place, number: int, dimension: int) -> wp.vec2:
-    """Point `number` of a dimension in [0, 1)², moved by the place's shift."""
-    point = scrambled_point(place.key, number, dimension)
-    x = point[0] + place.shift[0] * float(dimension)
-    y = point[1] + place.shift[1] * float(dimension)
-    return wp.vec2(wp.min(x - wp.floor(x), MOST_POINT), wp.min(y - wp.floor(y), MOST_POINT))
+def sample_point(context: PathContext, index: int, dimension: int) -> wp.vec2:
+    """Sample point of path `index` in a two-dimensional dimension, in [0, 1)²: scrambled Sobol' with Cranley-Patterson rotation."""
+    point = scrambled_point(context.key, index, dimension)
+    x = point[0] + context.shift[0] * float(dimension)
+    y = point[1] + context.shift[1] * float(dimension)
+    return wp.vec2(wp.min(x - wp.floor(x), BELOW_ONE), wp.min(y - wp.floor(y), BELOW_ONE))
 
 
 @wp.func
-def direct_light(
-    scene: PathScene, bodies: ViewBodies, rules: PathRules, place: Place, light: int, vertex: Vertex, u: wp.vec2
-) -> LightSample:
-    """A direction in the world drawn from the map, and in `radiance` what comes from there, over its density and with its weight.
+def sample_direct_light(
+    scene: PathScene, bodies: ViewBodies, rules: PathRules, context: PathContext, light: int, vertex: Vertex, u: wp.vec2
+) -> EnvironmentSample:
+    """Next-event estimation: sample a direction of the map and test it by a shadow ray.
 
-    Light that comes from behind the triangle is none, whatever the interpolated normal says.
+    The result's direction is in the world, its radiance is the map's over the pdf and times the MIS weight; 0: blocked. Light from behind
+    the triangle counts as blocked, whatever the interpolated normal says.
     """
-    drawn = sample_light(scene.chances, light, u)
-    made = LightSample()
-    made.direction = turned(drawn.direction, place.turn)
-    if drawn.density <= 0.0 or wp.dot(made.direction, vertex.face_normal) <= 0.0:
-        return made
-    weight = heuristic(rules.strategy, BY_LIGHT, drawn.density, density(vertex.brdf, made.direction)) / drawn.density
-    if weight <= 0.0 or wp.dot(made.direction, vertex.brdf.normal) <= 0.0:
-        return made
-    if is_blocked(scene.meshes, scene.table, bodies, place.view, vertex.origin, made.direction, FAR):
-        return made
-    made.radiance = weight * background_radiance(scene.lights, light, drawn.direction)
-    return made
+    sample = sample_environment(scene.cdf, light, u)
+    result = EnvironmentSample()
+    result.direction = rotate_z(sample.direction, context.yaw)
+    if sample.pdf <= 0.0 or wp.dot(result.direction, vertex.face_normal) <= 0.0:
+        return result
+    weight = mis_weight(rules.strategy, LIGHT_SAMPLING, sample.pdf, brdf_pdf(vertex.brdf, result.direction)) / sample.pdf
+    if weight <= 0.0 or wp.dot(result.direction, vertex.brdf.normal) <= 0.0:
+        return result
+    if is_blocked(scene.meshes, scene.table, bodies, context.view, vertex.origin, result.direction, FAR):
+        return result
+    result.radiance = weight * environment_radiance(scene.lights, light, sample.direction)
+    return result
 
 
 @wp.func
-def escaped_light(scene: PathScene, rules: PathRules, place: Place, light: int, direction: wp.vec3, drawn_density: float) -> wp.vec3:
-    """What the map sends along a path that left the scene, weighted against drawing the same direction from the map."""
-    local = turned(direction, -place.turn)
-    radiance = background_radiance(scene.lights, light, local)
-    return heuristic(rules.strategy, BY_SURFACE, drawn_density, light_density(scene.chances, light, local)) * radiance
+def escaped_radiance(scene: PathScene, rules: PathRules, context: PathContext, light: int, direction: wp.vec3, pdf: float) -> wp.vec3:
+    """Radiance of the map for a path that left the scene, times its MIS weight; `pdf` is the BRDF's for `direction`."""
+    local = rotate_z(direction, -context.yaw)
+    radiance = environment_radiance(scene.lights, light, local)
+    return mis_weight(rules.strategy, BRDF_SAMPLING, pdf, environment_pdf(scene.cdf, light, local)) * radiance
 
 
 @wp.func
-def begun(first: Vertex, width: float) -> Path:
-    """A path from the surface that the camera sees; `width` is its own there [m]."""
+def init_path(first: Vertex, width: float) -> Path:
+    """Start a path at the surface that the camera sees; `width` is its footprint's there [m]."""
     path = Path()
     path.vertex = first
     path.width = width
@@ -277,52 +282,56 @@ def begun(first: Vertex, width: float) -> Path:
 
 
 @wp.func
-def scattered(
-    scene: PathScene, bodies: ViewBodies, rules: PathRules, place: Place, number: int, first_diffuse: wp.vec3, path: Path
+def extend_path(
+    scene: PathScene, bodies: ViewBodies, rules: PathRules, context: PathContext, index: int, first_diffuse: wp.vec3, path: Path
 ) -> Path:
-    """Path `number` after it has scattered once more: with the light that it found so, at its next surface or ENDED.
+    """Scatter path `index` once: add direct light at its last vertex, then move it to the next one or terminate it.
 
-    `first_diffuse` is the diffuse colour of its first surface, by which all diffuse light will be multiplied.
+    `first_diffuse` is the diffuse colour of the path's first surface, which multiplies all its diffuse light in the end.
     """
     bounce = path.bounce
-    light = place.light
+    light = context.light
     if bounce == 0:
-        light = place.first_light
-    made = path
-    made.bounce = ENDED
-    dimension = 1 + DIMENSIONS * bounce
-    direct = direct_light(scene, bodies, rules, place, light, path.vertex, path_point(place, number, dimension))
+        light = context.first_light
+    result = path
+    result.bounce = TERMINATED
+    dimension = 1 + DIMENSIONS_PER_BOUNCE * bounce
+    direct = sample_direct_light(scene, bodies, rules, context, light, path.vertex, sample_point(context, index, dimension))
     if wp.max(direct.radiance) > 0.0:
-        parts = evaluate_parts(scene.surfaces.gloss, path.vertex.brdf, direct.direction)
-        made.found = lit(made.found, extended(path.through, parts, path.vertex.brdf.diffuse, bounce), direct.radiance, bounce)
+        value = evaluate_brdf(scene.surfaces.albedo, path.vertex.brdf, direct.direction)
+        throughput = extend_throughput(path.throughput, value, path.vertex.brdf.diffuse, bounce)
+        result.radiance = add_light(result.radiance, throughput, direct.radiance, bounce)
 
-    choice = path_point(place, number, dimension + 2)
-    direction = scatter(path.vertex.brdf, choice[0], path_point(place, number, dimension + 1))
-    drawn_density = density(path.vertex.brdf, direction)
-    if drawn_density <= 0.0 or wp.dot(direction, path.vertex.face_normal) <= 0.0:
-        return made
-    parts = evaluate_parts(scene.surfaces.gloss, path.vertex.brdf, direction)
-    through = extended(path.through, parts, path.vertex.brdf.diffuse, bounce)
-    scale = 1.0 / drawn_density
+    choice = sample_point(context, index, dimension + 2)
+    direction = sample_brdf(path.vertex.brdf, choice[0], sample_point(context, index, dimension + 1))
+    pdf = brdf_pdf(path.vertex.brdf, direction)
+    if pdf <= 0.0 or wp.dot(direction, path.vertex.face_normal) <= 0.0:
+        return result
+    value = evaluate_brdf(scene.surfaces.albedo, path.vertex.brdf, direction)
+    throughput = extend_throughput(path.throughput, value, path.vertex.brdf.diffuse, bounce)
+    scale = 1.0 / pdf
     if bounce >= rules.roulette:
-        luck = wp.min(scale * wp.max(wp.cw_mul(first_diffuse, through.diffuse) + through.gloss), MOST_LUCK)
-        if choice[1] >= luck:
-            return made
-        scale = scale / luck
-    through.diffuse = through.diffuse * scale
-    through.gloss = through.gloss * scale
-    hit = nearest_hit(scene, bodies, place.view, place.instances, path.vertex.origin, direction)
+        survival = wp.min(scale * wp.max(wp.cw_mul(first_diffuse, throughput.diffuse) + throughput.specular), MAX_SURVIVAL)
+        if choice[1] >= survival:
+            return result
+        scale = scale / survival
+    throughput.diffuse = throughput.diffuse * scale
+    throughput.specular = throughput.specular * scale
+    hit = trace_ray(scene, bodies, context.view, context.instances, path.vertex.origin, direction)
     if hit.segment == Segment.NOTHING:
-        made.found = lit(made.found, through, escaped_light(scene, rules, place, light, direction, drawn_density), bounce)
-        return made
+        radiance = escaped_radiance(scene, rules, context, light, direction, pdf)
+        result.radiance = add_light(result.radiance, throughput, radiance, bounce)
+        return result
     if bounce + 1 == rules.bounces:
-        return made
-    made.through = through
-    made.width = path.width + SCATTERED_SPREAD * path.vertex.brdf.roughness * hit.depth
+        return result
+    result.throughput = throughput
+    result.width = path.width + FOOTPRINT_GROWTH * path.vertex.brdf.roughness * hit.depth
     position = path.vertex.origin + hit.depth * direction
-    made.vertex = vertex_at(scene, bodies, place.view, place.instances, hit, position, -direction, made.width, rules.least_roughness)
-    made.bounce = bounce + 1
-    return made
+    result.vertex = make_vertex(
+        scene, bodies, context.view, context.instances, hit, position, -direction, result.width, rules.min_roughness
+    )
+    result.bounce = bounce + 1
+    return result
 
 
 @wp.kernel
@@ -331,52 +340,52 @@ def trace_paths_kernel(
     scene: PathScene,
     cameras: Cameras,
     grid: ImageGrid,
-    # State:
-    episode: wp.array[int],
-    light: wp.array[int],
-    light_yaw: wp.array[float],
+    # State: worlds
+    episode: wp.array[int],  # (world)
+    light: wp.array[int],  # (world)
+    light_yaw: wp.array[float],  # (world) [rad]
     # In:
     bodies: ViewBodies,
     views: Views,
     rules: PathRules,
     first: int,
     # Out:
-    radiance_out: wp.array3d[wp.vec3],
+    radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
-    """Mean radiance of N paths through each pixel, spread evenly over its square.
+    """Path-traced reference: mean radiance of N paths per pixel, which start at points spread over the pixel's square.
 
-    Random numbers have the address (seed, episode; camera and pixel; path, dimension): a still scene gives the same picture again.
+    Random numbers are addressed by (seed, episode; camera and pixel; path, dimension): a still scene gives the same image again.
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
     camera = views.camera[view]
     world = views.world[view]
-    place = Place()
-    place.view = view
-    place.instances = views.instances
-    place.first_light = light[world]
-    place.light = light[world]
-    place.turn = light_yaw[world]
-    address = (camera * grid.height + row) * grid.width + column
-    place.key = mix(stream_key(rules.seed, episode[world], 0, Stream.PATHS) ^ wp.uint64(address))
+    context = PathContext()
+    context.view = view
+    context.instances = views.instances
+    context.first_light = light[world]
+    context.light = light[world]
+    context.yaw = light_yaw[world]
+    pixel = (camera * grid.height + row) * grid.width + column
+    context.key = mix(stream_key(rules.seed, episode[world], 0, Stream.PATHS) ^ wp.uint64(pixel))
     footprint = 1.0 / (cameras.intrinsics[camera][0] * wp.sqrt(float(rules.samples)))
     total = wp.vec3(0.0, 0.0, 0.0)
-    for number in range(rules.samples):
-        offset = scrambled_point(place.key, number, 0) - wp.vec2(0.5, 0.5)
+    for index in range(rules.samples):
+        offset = scrambled_point(context.key, index, 0) - wp.vec2(0.5, 0.5)
         ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
         hit = trace_camera_ray(scene.meshes, bodies, view, tile_of(grid, row, column), ray, views.instances)
         hit = hit_table(scene.table, cameras, camera, ray, hit)
         direction = wp.normalize(cameras.to_world[camera] * ray)
         if hit.segment == Segment.NOTHING:
-            total += background_radiance(scene.lights, place.light, turned(direction, -place.turn))
+            total += environment_radiance(scene.lights, context.light, rotate_z(direction, -context.yaw))
         else:
             start = hit_position(cameras, camera, ray, hit.depth)
             width = footprint * hit.depth
-            vertex = vertex_at(scene, bodies, view, views.instances, hit, start, -direction, width, 0.0)
+            vertex = make_vertex(scene, bodies, view, views.instances, hit, start, -direction, width, 0.0)
             diffuse = vertex.brdf.diffuse
-            path = begun(vertex, width)
-            while path.bounce != ENDED:
-                path = scattered(scene, bodies, rules, place, number, diffuse, path)
-            total += wp.cw_mul(diffuse, path.found.diffuse + path.found.between) + path.found.gloss
+            path = init_path(vertex, width)
+            while path.bounce != TERMINATED:
+                path = extend_path(scene, bodies, rules, context, index, diffuse, path)
+            total += wp.cw_mul(diffuse, path.radiance.diffuse + path.radiance.indirect) + path.radiance.specular
     radiance_out[view, row, column] = total / float(rules.samples)

@@ -1,4 +1,4 @@
-"""Tangent planes of what pixels show, as other pixels of the image see them: who lies on the same surface."""
+"""Plane-distance weight of the denoiser: distance of other pixels from the tangent plane of a pixel's surface, an edge-stopping test."""
 
 import warp as wp
 
@@ -9,37 +9,39 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Plane:
-    """The tangent plane of what a pixel, or a cell's, shows. n . ray is linear in the image."""
+    """Tangent plane at a pixel or coarse pixel, in image space: n · ray is linear in row and column."""
 
     segment: wp.uint8
-    """As in `GBuffer`."""
+    """Segmentation id, as in `GBuffer`."""
     normal: wp.vec3
-    """In the camera's axes."""
+    """Unit normal n in camera space."""
     height: float
-    """n . x of its points x [m]: distance from the camera's centre, times a sign."""
+    """n · x of the plane's points x [m]: signed distance from the camera's centre."""
     facing: float
-    """n . ray of its own ray, and by how much n . ray changes from row to row and column to column, of pixels or of cells."""
+    """n · ray at the plane's own pixel."""
     down: float
+    """Change of n · ray per row, of pixels or coarse pixels."""
     right: float
+    """Change of n · ray per column, of pixels or coarse pixels."""
     width: float
-    """Of a pixel, or of a cell, at its depth [m]."""
+    """Width of a pixel, or coarse pixel, at the surface's depth [m]."""
 
 
 @wp.func
-def pixel_plane(intrinsics: wp.vec4, row: int, column: int, segment: wp.uint8, depth: float, normal: wp.vec3) -> Plane:
-    """The tangent plane of what a pixel shows; `normal` is in the camera's axes."""
-    made = Plane()
-    made.segment = segment
-    made.normal = normal
-    made.facing = wp.dot(normal, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
-    made.down = normal[1] / intrinsics[1]
-    made.right = normal[0] / intrinsics[0]
-    made.height = depth * made.facing
-    made.width = depth / intrinsics[0]
-    return made
+def tangent_plane(intrinsics: wp.vec4, row: int, column: int, segment: wp.uint8, depth: float, normal: wp.vec3) -> Plane:
+    """Tangent plane of the surface at a pixel; `depth` is planar [m], `normal` is in camera space."""
+    plane = Plane()
+    plane.segment = segment
+    plane.normal = normal
+    plane.facing = wp.dot(normal, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
+    plane.down = normal[1] / intrinsics[1]
+    plane.right = normal[0] / intrinsics[0]
+    plane.height = depth * plane.facing
+    plane.width = depth / intrinsics[0]
+    return plane
 
 
 @wp.func
-def off_plane(plane: Plane, down: int, right: int, depth: float) -> float:
-    """Distance [m] from a plane of what is seen at a planar depth, so many rows down and columns right of the plane's own."""
+def plane_distance(plane: Plane, down: int, right: int, depth: float) -> float:
+    """Distance [m] from the plane of a surface at planar `depth` [m], seen `down` rows and `right` columns from the plane's own pixel."""
     return wp.abs(depth * (plane.facing + float(down) * plane.down + float(right) * plane.right) - plane.height)

@@ -1,4 +1,4 @@
-"""Points and directions for estimating light: scrambled Sobol' points with an address, and directions drawn by a map's radiance."""
+"""Sampling: Owen-scrambled Sobol' points, importance sampling of environment maps by marginal and conditional CDFs, orthonormal bases."""
 
 import warp as wp
 
@@ -8,29 +8,33 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Chances:
-    """How likely each texel of each map is drawn. Cumulative: a texel's chance is the difference of two neighbours."""
+class EnvironmentCdf:
+    """Importance sampling of environment maps (Pharr, Jakob and Humphreys, Physically Based Rendering): CDFs over texels.
 
-    row: wp.array2d[float]
-    """(map, row + 1), from 0 to 1."""
-    column: wp.array3d[float]
-    """(map, row, column + 1), from 0 to 1 in each row."""
+    A texel's probability is the difference of neighbouring entries of `marginal` times that of `conditional`.
+    """
+
+    marginal: wp.array2d[float]
+    """Over rows: (map, row + 1), from 0 to 1."""
+    conditional: wp.array3d[float]
+    """Over the columns of each row: (map, row, column + 1), from 0 to 1."""
 
 
 @wp.struct
-class LightSample:
-    """A direction from which light may come."""
+class EnvironmentSample:
+    """A direction towards the environment map, sampled for next-event estimation."""
 
     direction: wp.vec3
-    """Unit, in the map's frame."""
-    density: float
-    """Probability per solid angle [1/sr]."""
+    """Unit vector, in the map's frame or in the world."""
+    pdf: float
+    """Probability density over solid angle [1/sr]."""
     radiance: wp.vec3
-    """What comes from there, as `kernels.render.lighting.path_tracing` weights it."""
+    """Radiance from this direction over its density, times its MIS weight; set by `path_tracing.sample_direct_light`."""
 
 
 @wp.func
-def reversed_bits(x: wp.uint32) -> wp.uint32:
+def reverse_bits(x: wp.uint32) -> wp.uint32:
+    """The 32 bits of `x` in reverse order."""
     y = (x >> wp.uint32(16)) | (x << wp.uint32(16))
     y = ((y >> wp.uint32(8)) & wp.uint32(0x00FF00FF)) | ((y & wp.uint32(0x00FF00FF)) << wp.uint32(8))
     y = ((y >> wp.uint32(4)) & wp.uint32(0x0F0F0F0F)) | ((y & wp.uint32(0x0F0F0F0F)) << wp.uint32(4))
@@ -39,8 +43,11 @@ def reversed_bits(x: wp.uint32) -> wp.uint32:
 
 
 @wp.func
-def carried(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
-    """Laine and Karras' permutation (2011), with Vegdahl's constants (2021): a bit depends on the bits below it alone."""
+def permute_laine_karras(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
+    """Laine-Karras permutation (2011) with Vegdahl's constants (2021): hash-based Owen scrambling of reversed bits.
+
+    Each bit of the result depends on the bits below it alone.
+    """
     y = x ^ (x * wp.uint32(0x3D20ADEA))
     y = y + seed
     y = y * ((seed >> wp.uint32(16)) | wp.uint32(1))
@@ -49,8 +56,8 @@ def carried(x: wp.uint32, seed: wp.uint32) -> wp.uint32:
 
 
 @wp.func
-def pascal(x: wp.uint32) -> wp.uint32:
-    """Bits times Pascal's matrix, modulo 2: with its bits reversed, number `x` of the second dimension of Sobol' (Ahmed, 2024)."""
+def multiply_pascal(x: wp.uint32) -> wp.uint32:
+    """Pascal's matrix modulo 2 times the bits of `x`: the second Sobol' dimension of index `x`, with its bits reversed (Ahmed, 2024)."""
     y = x ^ (x >> wp.uint32(16))
     y = y ^ ((y >> wp.uint32(8)) & wp.uint32(0x00FF00FF))
     y = y ^ ((y >> wp.uint32(4)) & wp.uint32(0x0F0F0F0F))
@@ -60,15 +67,15 @@ def pascal(x: wp.uint32) -> wp.uint32:
 
 @wp.func
 def sobol_point(index: int) -> wp.vec2:
-    """Point of the two-dimensional Sobol' sequence in (0, 1)²: aligned runs of 2^k points fill the unit square evenly (Sobol', 1967)."""
-    x = reversed_bits(wp.uint32(index)) >> wp.uint32(8)
-    y = reversed_bits(pascal(wp.uint32(index))) >> wp.uint32(8)
+    """Point of the two-dimensional Sobol' sequence in (0, 1)² (Sobol', 1967): aligned runs of 2^k indices are stratified."""
+    x = reverse_bits(wp.uint32(index)) >> wp.uint32(8)
+    y = reverse_bits(multiply_pascal(wp.uint32(index))) >> wp.uint32(8)
     return wp.vec2((float(x) + 0.5) * UNIT, (float(y) + 0.5) * UNIT)
 
 
 @wp.func
-def around(axis: wp.vec3, local: wp.vec3) -> wp.vec3:
-    """`local`, carried from a frame with z up to one whose z is the unit vector `axis` (Duff et al., 2017)."""
+def rotate_to_axis(axis: wp.vec3, local: wp.vec3) -> wp.vec3:
+    """Transform `local` from a frame with z up into the orthonormal basis whose z is the unit vector `axis` (Duff et al., 2017)."""
     side = float(1.0)
     if axis[2] < 0.0:
         side = float(-1.0)
@@ -81,53 +88,53 @@ def around(axis: wp.vec3, local: wp.vec3) -> wp.vec3:
 
 @wp.func
 def scrambled_point(key: wp.uint64, index: int, dimension: int) -> wp.vec2:
-    """Point `index` of the two-dimensional Sobol' sequence in [0, 1)², shuffled and Owen-scrambled anew for each (key, dimension).
+    """Shuffled, Owen-scrambled Sobol' point `index` in [0, 1)² (Burley, 2020); each (key, dimension) has its own scrambling.
 
-    Any aligned run of 2^k indices fills the square evenly; points of different dimensions or keys are unrelated (Burley, 2020).
+    Aligned runs of 2^k indices stay stratified; points of different dimensions or keys are uncorrelated.
     """
     bits = mix(key + wp.uint64(dimension + 1) * GAMMA)
     order = wp.uint32(bits)
     across = wp.uint32(bits >> wp.uint64(32))
     down = (across ^ (order << wp.uint32(15)) ^ (order >> wp.uint32(17))) * wp.uint32(0x31848BAB)
-    # Carried on the reversed index, as for the points: a run of indices stays a run.
-    rest = reversed_bits(carried(reversed_bits(wp.uint32(index)), order))
-    x = reversed_bits(carried(rest, across))
-    y = reversed_bits(carried(pascal(rest), down))
+    # The shuffle is an Owen scrambling of the index, so that an aligned run of indices stays an aligned run.
+    rest = reverse_bits(permute_laine_karras(reverse_bits(wp.uint32(index)), order))
+    x = reverse_bits(permute_laine_karras(rest, across))
+    y = reverse_bits(permute_laine_karras(multiply_pascal(rest), down))
     return wp.vec2(float(x >> wp.uint32(8)) * UNIT, float(y >> wp.uint32(8)) * UNIT)
 
 
 @wp.func
-def texel_density(chances: Chances, light: int, row: int, column: int) -> float:
-    """Probability per solid angle of directions in a texel [1/sr]."""
-    rows = chances.column.shape[1]
-    columns = chances.column.shape[2] - 1
-    chance = chances.row[light, row + 1] - chances.row[light, row]
-    chance *= chances.column[light, row, column + 1] - chances.column[light, row, column]
+def texel_pdf(cdf: EnvironmentCdf, light: int, row: int, column: int) -> float:
+    """Probability density over solid angle of the directions in a texel [1/sr]."""
+    rows = cdf.conditional.shape[1]
+    columns = cdf.conditional.shape[2] - 1
+    probability = cdf.marginal[light, row + 1] - cdf.marginal[light, row]
+    probability *= cdf.conditional[light, row, column + 1] - cdf.conditional[light, row, column]
     # cos a - cos b without cancellation, times the texel's azimuth.
     band = 2.0 * wp.sin((float(row) + 0.5) / float(rows) * wp.PI) * wp.sin(0.5 / float(rows) * wp.PI)
-    return chance * float(columns) / (band * wp.TAU)
+    return probability * float(columns) / (band * wp.TAU)
 
 
 @wp.func
-def light_density(chances: Chances, light: int, direction: wp.vec3) -> float:
-    """Probability per solid angle with which `sample_light` gives a unit direction in the map's frame [1/sr]."""
-    rows = chances.column.shape[1]
-    columns = chances.column.shape[2] - 1
+def environment_pdf(cdf: EnvironmentCdf, light: int, direction: wp.vec3) -> float:
+    """Probability density over solid angle with which `sample_environment` returns a unit direction in the map's frame [1/sr]."""
+    rows = cdf.conditional.shape[1]
+    columns = cdf.conditional.shape[2] - 1
     v = wp.acos(wp.clamp(direction[2], -1.0, 1.0)) / wp.PI
     u = wp.atan2(direction[1], direction[0]) / wp.TAU + 0.5
     row = wp.clamp(int(v * float(rows)), 0, rows - 1)
     column = wp.clamp(int(u * float(columns)), 0, columns - 1)
-    return texel_density(chances, light, row, column)
+    return texel_pdf(cdf, light, row, column)
 
 
 @wp.func
-def find_row(chances: Chances, light: int, u: float) -> int:
-    """Row r with row[r] <= u < row[r + 1]."""
+def invert_marginal(cdf: EnvironmentCdf, light: int, u: float) -> int:
+    """Invert the marginal CDF by bisection: the row r with marginal[r] <= u < marginal[r + 1]."""
     low = int(0)
-    high = chances.row.shape[1] - 1
+    high = cdf.marginal.shape[1] - 1
     while high - low > 1:
         middle = (low + high) // 2
-        if chances.row[light, middle] <= u:
+        if cdf.marginal[light, middle] <= u:
             low = middle
         else:
             high = middle
@@ -135,13 +142,13 @@ def find_row(chances: Chances, light: int, u: float) -> int:
 
 
 @wp.func
-def find_column(chances: Chances, light: int, row: int, u: float) -> int:
-    """Column c with column[c] <= u < column[c + 1] in a row."""
+def invert_conditional(cdf: EnvironmentCdf, light: int, row: int, u: float) -> int:
+    """Invert a row's conditional CDF by bisection: the column c with conditional[c] <= u < conditional[c + 1]."""
     low = int(0)
-    high = chances.column.shape[2] - 1
+    high = cdf.conditional.shape[2] - 1
     while high - low > 1:
         middle = (low + high) // 2
-        if chances.column[light, row, middle] <= u:
+        if cdf.conditional[light, row, middle] <= u:
             low = middle
         else:
             high = middle
@@ -149,22 +156,25 @@ def find_column(chances: Chances, light: int, row: int, u: float) -> int:
 
 
 @wp.func
-def sample_light(chances: Chances, light: int, u: wp.vec2) -> LightSample:
-    """A direction drawn by the map's luminance times solid angle, evenly within a texel, from two numbers in [0, 1)."""
-    rows = chances.column.shape[1]
-    columns = chances.column.shape[2] - 1
-    row = find_row(chances, light, u[0])
-    column = find_column(chances, light, row, u[1])
-    before = chances.row[light, row]
-    down = (u[0] - before) / (chances.row[light, row + 1] - before)
-    before = chances.column[light, row, column]
-    right = (u[1] - before) / (chances.column[light, row, column + 1] - before)
+def sample_environment(cdf: EnvironmentCdf, light: int, u: wp.vec2) -> EnvironmentSample:
+    """Sample a direction in proportion to the texels' weights (luminance times solid angle), uniformly within a texel.
+
+    `u` is uniform in [0, 1)²; see `stages.render.light_tables.environment_cdf` for the weights.
+    """
+    rows = cdf.conditional.shape[1]
+    columns = cdf.conditional.shape[2] - 1
+    row = invert_marginal(cdf, light, u[0])
+    column = invert_conditional(cdf, light, row, u[1])
+    before = cdf.marginal[light, row]
+    down = (u[0] - before) / (cdf.marginal[light, row + 1] - before)
+    before = cdf.conditional[light, row, column]
+    right = (u[1] - before) / (cdf.conditional[light, row, column + 1] - before)
     upper = wp.cos(float(row) / float(rows) * wp.PI)
     lower = wp.cos(float(row + 1) / float(rows) * wp.PI)
     z = upper + down * (lower - upper)
     radius = wp.sqrt(wp.max(1.0 - z * z, 0.0))
     azimuth = ((float(column) + right) / float(columns) - 0.5) * wp.TAU
-    made = LightSample()
-    made.direction = wp.vec3(radius * wp.cos(azimuth), radius * wp.sin(azimuth), z)
-    made.density = texel_density(chances, light, row, column)
-    return made
+    sample = EnvironmentSample()
+    sample.direction = wp.vec3(radius * wp.cos(azimuth), radius * wp.sin(azimuth), z)
+    sample.pdf = texel_pdf(cdf, light, row, column)
+    return sample

@@ -1,48 +1,47 @@
-"""What a surface reflects of a light map, without its main light, if nothing stands in the way: known without any ray."""
+"""Unoccluded environment lighting without any ray: SH irradiance for the diffuse lobe, a prefiltered map for the specular one.
+
+It is the denominator of the ratio estimator in `coarse_paths`.
+"""
 
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.brdf import Brdf, coat_share, even_gloss
-from synpick_warp.kernels.render.lighting.environment import FLAT_HARMONIC, Lights, diffuse_irradiance, reflected_radiance, turned
+from synpick_warp.kernels.render.lighting.brdf import Brdf, SplitRadiance, coat_albedo, specular_albedo
+from synpick_warp.kernels.render.lighting.environment import SH_CONSTANT, Lights, prefiltered_radiance, rotate_z, sh_irradiance
 
 wp.set_module_options({"enable_backward": False})
 
-LEAST_EVEN = wp.constant(0.05)
-"""Unhindered light counts as at least this share of the map's mean, so that ratios stay small."""
-
-
-@wp.struct
-class Light:
-    """Light that a surface reflects to the camera: diffuse without its colour, and gloss."""
-
-    diffuse: wp.vec3
-    between: wp.vec3
-    gloss: wp.vec3
+MIN_UNOCCLUDED = wp.constant(0.05)
+"""Unoccluded light is at least this fraction of the map's mean, so that visibility ratios stay bounded."""
 
 
 @wp.func
-def brighter(value: wp.vec3, least: wp.vec3) -> wp.vec3:
-    return wp.vec3(wp.max(value[0], least[0]), wp.max(value[1], least[1]), wp.max(value[2], least[2]))
+def max_channels(a: wp.vec3, b: wp.vec3) -> wp.vec3:
+    """Maximum of each channel."""
+    return wp.vec3(wp.max(a[0], b[0]), wp.max(a[1], b[1]), wp.max(a[2], b[2]))
 
 
 @wp.func
-def even_light(lights: Lights, light: int, turn: float, brdf: Brdf) -> Light:
-    """What a surface reflects of a map, without its main light, that nothing hides: diffuse by harmonics, gloss by blurred reflections."""
-    made = Light()
-    mean = LEAST_EVEN * lights.irradiance[light, 0] * FLAT_HARMONIC
-    sky = brighter(diffuse_irradiance(lights, light, turned(brdf.normal, -turn)), mean)
-    made.diffuse = ((1.0 - coat_share(brdf, brdf.albedo)) / wp.PI) * sky
+def unoccluded_light(lights: Lights, light: int, yaw: float, brdf: Brdf) -> SplitRadiance:
+    """Radiance reflected from an unoccluded environment map without its sun; nothing is indirect.
+
+    Diffuse by spherical harmonics, specular by the split-sum approximation (Karis, 2013). `light` is the index of the map, rotated by `yaw`
+    [rad] about +z.
+    """
+    radiance = SplitRadiance()
+    floor = MIN_UNOCCLUDED * lights.irradiance[light, 0] * SH_CONSTANT
+    irradiance = max_channels(sh_irradiance(lights, light, rotate_z(brdf.normal, -yaw)), floor)
+    radiance.diffuse = ((1.0 - coat_albedo(brdf, brdf.albedo)) / wp.PI) * irradiance
     mirrored = 2.0 * wp.dot(brdf.normal, brdf.outgoing) * brdf.normal - brdf.outgoing
-    seen = brighter(reflected_radiance(lights, light, turned(mirrored, -turn), brdf.roughness), mean / wp.PI)
-    made.gloss = wp.cw_mul(even_gloss(brdf), seen)
-    return made
+    prefiltered = max_channels(prefiltered_radiance(lights, light, rotate_z(mirrored, -yaw), brdf.roughness), floor / wp.PI)
+    radiance.specular = wp.cw_mul(specular_albedo(brdf), prefiltered)
+    return radiance
 
 
 @wp.func
-def ratio(light: wp.vec3, even: wp.vec3) -> wp.vec3:
-    """Component by component; 1 where there is nothing to compare with."""
-    made = wp.vec3(1.0, 1.0, 1.0)
+def visibility_ratio(light: wp.vec3, unoccluded: wp.vec3) -> wp.vec3:
+    """Ratio of light to unoccluded light, by channel; 1 where the unoccluded light is 0."""
+    result = wp.vec3(1.0, 1.0, 1.0)
     for i in range(3):
-        if even[i] > 0.0:
-            made[i] = light[i] / even[i]
-    return made
+        if unoccluded[i] > 0.0:
+            result[i] = light[i] / unoccluded[i]
+    return result

@@ -1,44 +1,56 @@
-"""What the renderer needs to know of a light map: main light, diffuse irradiance, blurred reflections, exposure."""
+"""Tables that lighting precomputes: per environment map its sun, SH irradiance, prefiltered specular map, exposure and sampling CDFs;
+once per device the directional albedo of the GGX lobe."""
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import warp as wp
 
-from synpick_warp.kernels.render.lighting.environment import REFLECTION_LEVELS
+from synpick_warp.kernels.render.lighting.brdf import ALBEDO_COLUMNS, ALBEDO_ROWS, AlbedoTables, measure_albedo_kernel
+from synpick_warp.kernels.render.lighting.environment import PREFILTER_LEVELS
+from synpick_warp.kernels.render.lighting.sampling import EnvironmentCdf
 from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
 from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS, draw_sun_disc, extract_sun, replace_sun
 from synpick_warp.scenes.types import EnvironmentMap
 
-REFLECTION_ROWS = 32
-"""Rows of the blurred reflections: the sharpest lobe kept is wider than a texel of 5.6°."""
+PREFILTER_ROWS = 32
+"""Rows of the prefiltered specular map: its sharpest lobe is wider than a texel of 5.6°."""
 COSINE_LOBE = np.array([np.pi] + [2.0 * np.pi / 3.0] * 3 + [np.pi / 4.0] * 5)
-"""Convolution with the cosine, by spherical harmonic (Ramamoorthi and Hanrahan, 2001)."""
+"""Convolution with the clamped cosine, by spherical harmonic (Ramamoorthi and Hanrahan, 2001)."""
+HORIZON_WEIGHT = 0.15
+"""Importance of light from the horizon relative to luminance; light from the zenith has 1 more."""
+MEAN_STEPS = 4096
+"""Steps of the integral over the albedo table, which is smooth between nodes."""
 
 
 @dataclass(frozen=True, eq=False)
-class LightTable:
-    """One light map, ready for `kernels.render.lighting.environment.Lights`."""
+class EnvironmentTables:
+    """Precomputed tables of one environment map; see `kernels.render.lighting.environment.Lights`."""
 
-    background: np.ndarray
-    """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: all light of the map, with a set's sun as a disc."""
-    rest: np.ndarray
-    """The same without the main light."""
-    reflection: np.ndarray
-    """(levels, REFLECTION_ROWS, 2 REFLECTION_ROWS, 3) float32."""
+    radiance: np.ndarray
+    """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: the whole map, with the sun of its sIBL set drawn as a disc."""
+    sunless: np.ndarray
+    """(BACKGROUND_ROWS, 2 BACKGROUND_ROWS, 3) float32: the map without its sun."""
+    prefiltered: np.ndarray
+    """(PREFILTER_LEVELS, PREFILTER_ROWS, 2 PREFILTER_ROWS, 3) float32."""
     irradiance: np.ndarray
-    """(9, 3) float32."""
-    main_direction: np.ndarray
-    """(3) float32, unit."""
-    main_irradiance: np.ndarray
-    """(3) float32; zero: no main light."""
-    main_spread: float
+    """(9, 3) float32: coefficients of spherical harmonics."""
+    sun_direction: np.ndarray
+    """(3) float32, unit vector towards the sun."""
+    sun_irradiance: np.ndarray
+    """(3) float32, on a surface that faces the sun; zero: no sun."""
+    sun_radius: float
+    """Tangent of the sun's angular radius."""
     exposure: float
+    """Factor that brings the map's radiance to display range."""
 
 
-def harmonics(directions: np.ndarray) -> np.ndarray:
-    """The nine real spherical harmonics up to order 2 at unit directions (..., 3), in the order of `diffuse_irradiance`."""
+def sh_basis(directions: np.ndarray) -> np.ndarray:
+    """The nine real spherical harmonics up to order 2 (..., 9) at unit directions (..., 3), in the order of `sh_irradiance`."""
     x, y, z = np.moveaxis(directions, -1, 0)
     return np.stack(
         [
@@ -56,59 +68,125 @@ def harmonics(directions: np.ndarray) -> np.ndarray:
     )
 
 
-def blurred_reflections(radiance: np.ndarray) -> np.ndarray:
-    """The map seen in rough mirrors: means over GGX lobes with the mirror seen from its normal (Karis, 2014).
+def prefilter_specular(radiance: np.ndarray) -> np.ndarray:
+    """Prefiltered specular map: the map convolved with GGX lobes, view direction = normal = reflection (split sum; Karis, 2013).
 
     Args:
         radiance: (rows, 2 rows, 3).
 
     Returns:
-        (REFLECTION_LEVELS, rows, 2 rows, 3).
+        (PREFILTER_LEVELS, rows, 2 rows, 3), for growing roughness.
     """
     rows = radiance.shape[0]
-    directions, solid = map_directions(rows)
+    directions, solid_angles = map_directions(rows)
     incoming = directions.reshape(-1, 3)
     levels = []
-    for level in range(int(REFLECTION_LEVELS)):
-        alpha2 = ((level + 1.0) / int(REFLECTION_LEVELS)) ** 4
-        # All columns of a row see the map alike, turned: one lobe a row, correlated along the columns by the Fourier transform.
+    for level in range(int(PREFILTER_LEVELS)):
+        alpha2 = ((level + 1.0) / int(PREFILTER_LEVELS)) ** 4
+        # All columns of a row have the same lobe, rotated: one lobe per row, correlated along the columns by the Fourier transform.
         axes = directions[:, 0]
         cosine = axes @ incoming.T
         half2 = (1.0 + cosine) / 2.0
-        lobe = np.where(cosine > 0.0, cosine * alpha2 / (half2 * (alpha2 - 1.0) + 1.0) ** 2, 0.0) * solid.reshape(-1)
+        lobe = np.where(cosine > 0.0, cosine * alpha2 / (half2 * (alpha2 - 1.0) + 1.0) ** 2, 0.0) * solid_angles.reshape(-1)
         lobe = (lobe / lobe.sum(axis=1, keepdims=True)).reshape(rows, rows, 2 * rows)
         spectrum = np.einsum("aij,ijc->ajc", np.conj(np.fft.fft(lobe, axis=2)), np.fft.fft(radiance, axis=1), optimize=True)
         levels.append(np.fft.ifft(spectrum, axis=1).real)
     return np.maximum(np.stack(levels), 0.0)
 
 
-def light_table(light: EnvironmentMap, ground: np.ndarray | None) -> LightTable:
-    """Analyse one light map.
+def precompute_environment(light: EnvironmentMap, ground: np.ndarray | None) -> EnvironmentTables:
+    """Precompute the tables of one environment map.
 
     Args:
         light: The map.
-        ground: Linear albedo (3) of the table, which takes the place of the map below the horizon; None: no table.
+        ground: Linear albedo (3) of the table, which replaces the map below the horizon in unoccluded lighting; None: no table.
     """
-    background = resize_map(light.radiance, BACKGROUND_ROWS)
-    directions, solid = map_directions(BACKGROUND_ROWS)
-    rest, direction, irradiance, spread = extract_sun(background) if light.sun is None else replace_sun(background, light.sun)
+    radiance = resize_map(light.radiance, BACKGROUND_ROWS)
+    directions, solid_angles = map_directions(BACKGROUND_ROWS)
+    sunless, direction, irradiance, radius = extract_sun(radiance) if light.sun is None else replace_sun(radiance, light.sun)
     if light.sun is not None:
-        background = rest + draw_sun_disc((rest < background).any(axis=2), direction, irradiance, spread)
-    if spread > MAX_SUN_ANGULAR_RADIUS:
-        rest, irradiance = background, np.zeros(3)
-    upward = np.maximum(directions[..., 2], 0.0) * solid
-    upward_irradiance = (background * upward[..., None]).sum(axis=(0, 1))
-    # What surfaces would see: the table hides the map below the horizon.
-    even = rest if ground is None else np.where(directions[..., 2:] < 0.0, ground * upward_irradiance / np.pi, rest)
-    coefficients = np.einsum("ijk,ijc->kc", harmonics(directions) * solid[..., None], even) * COSINE_LOBE[:, None]
+        radiance = sunless + draw_sun_disc((sunless < radiance).any(axis=2), direction, irradiance, radius)
+    if radius > MAX_SUN_ANGULAR_RADIUS:
+        sunless, irradiance = radiance, np.zeros(3)
+    upward = np.maximum(directions[..., 2], 0.0) * solid_angles
+    upward_irradiance = (radiance * upward[..., None]).sum(axis=(0, 1))
+    # What unoccluded surfaces face: the table hides the map below the horizon.
+    unoccluded = sunless if ground is None else np.where(directions[..., 2:] < 0.0, ground * upward_irradiance / np.pi, sunless)
+    coefficients = np.einsum("ijk,ijc->kc", sh_basis(directions) * solid_angles[..., None], unoccluded) * COSINE_LOBE[:, None]
     white = max(float(upward_irradiance @ LUMINANCE) / np.pi, 1e-9)
-    return LightTable(
-        background=background.astype(np.float32),
-        rest=rest.astype(np.float32),
-        reflection=blurred_reflections(resize_map(even, REFLECTION_ROWS)).astype(np.float32),
+    return EnvironmentTables(
+        radiance=radiance.astype(np.float32),
+        sunless=sunless.astype(np.float32),
+        prefiltered=prefilter_specular(resize_map(unoccluded, PREFILTER_ROWS)).astype(np.float32),
         irradiance=coefficients.astype(np.float32),
-        main_direction=direction.astype(np.float32),
-        main_irradiance=irradiance.astype(np.float32),
-        main_spread=spread,
+        sun_direction=direction.astype(np.float32),
+        sun_irradiance=irradiance.astype(np.float32),
+        sun_radius=radius,
         exposure=WHITE_VALUE / white,
     )
+
+
+def environment_cdf(radiance: np.ndarray, table: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Marginal and conditional CDF of a map's texels, weighted by luminance times solid angle; uniform where the map is black.
+
+    Low light has less weight, because most lit surfaces face up and totes have walls. With a table, light from below the horizon has
+    none, because the table blocks it.
+
+    The map is looked up bilinearly, which spreads light half a texel beyond a lamp's edge. So a texel is weighted by the mean of the
+    interpolated map over it: no direction with light has probability 0.
+
+    Args:
+        radiance: (rows, 2 rows, 3).
+        table: Whether a table hides the map below the horizon.
+
+    Returns:
+        Marginal (rows + 1) and conditional (rows, 2 rows + 1), both float32.
+    """
+    rows, columns = radiance.shape[:2]
+    directions, solid_angles = map_directions(rows)
+    height = directions[..., 2]
+    importance = np.where(height > 0.0, height, 0.0) + HORIZON_WEIGHT
+    if table:
+        # The texels next to the horizon reach below it.
+        importance[height < -np.pi / rows] = 0.0
+    luminance = radiance.astype(np.float64) @ LUMINANCE
+    # Mean of the linear interpolation over a texel: 1/8, 3/4, 1/8.
+    luminance = 0.75 * luminance + 0.125 * (np.roll(luminance, 1, axis=1) + np.roll(luminance, -1, axis=1))
+    padded = np.pad(luminance, ((1, 1), (0, 0)), mode="edge")
+    weight = (0.75 * luminance + 0.125 * (padded[:-2] + padded[2:])) * solid_angles * importance
+    if weight.sum() <= 0.0:
+        weight = solid_angles * importance
+    conditional = np.zeros((rows, columns + 1))
+    conditional[:, 1:] = np.cumsum(np.where(weight.sum(axis=1, keepdims=True) > 0.0, weight, 1.0), axis=1)
+    marginal = np.concatenate([[0.0], np.cumsum(weight.sum(axis=1))])
+    return (marginal / marginal[-1]).astype(np.float32), (conditional / conditional[:, -1:]).astype(np.float32)
+
+
+def build_environment_cdf(radiance: np.ndarray, device: wp.Device, table: bool = False) -> Any:
+    """The struct `EnvironmentCdf` of maps (map, rows, 2 rows, 3); `table`: whether a table hides them below the horizon."""
+    marginals, conditionals = zip(*(environment_cdf(map_radiance, table) for map_radiance in radiance), strict=True)
+    cdf = EnvironmentCdf()
+    cdf.marginal = wp.array(np.stack(marginals), dtype=wp.float32, device=device)
+    cdf.conditional = wp.array(np.stack(conditionals), dtype=wp.float32, device=device)
+    return cdf
+
+
+def measure_albedo(device: wp.Device) -> Any:
+    """The struct `AlbedoTables`: directional albedo of the GGX lobe, measured by Monte Carlo; cached per device."""
+    return _measure_albedo(device.alias)
+
+
+@functools.cache
+def _measure_albedo(alias: str) -> Any:
+    """Devices have no hash; their aliases do."""
+    device: wp.Device = wp.get_device(alias)
+    tables = AlbedoTables()
+    tables.directional = wp.empty((int(ALBEDO_ROWS), int(ALBEDO_COLUMNS)), dtype=wp.vec2, device=device)
+    wp.launch(measure_albedo_kernel, dim=tables.directional.shape, outputs=[tables.directional], device=device)
+    # With t = √μ, 2 ∫ a μ dμ = 4 ∫ a t³ dt, of the table as kernels interpolate it.
+    directional = tables.directional.numpy().astype(np.float64)
+    root = (np.arange(MEAN_STEPS) + 0.5) / MEAN_STEPS
+    nodes = np.arange(directional.shape[1]) / (directional.shape[1] - 1)
+    mean = [[4.0 * np.mean(np.interp(root, nodes, part) * root**3) for part in row.T] for row in directional]
+    tables.mean = wp.array(mean, dtype=wp.vec2, device=device)
+    return tables

@@ -1,52 +1,53 @@
-"""The reference picture by path tracing."""
+"""Path-traced reference renderer."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.kernels.render.lighting.path_tracing import BOTH, PathRules, trace_paths_kernel
+from synpick_warp.configs.schema import Render
+from synpick_warp.kernels.render.lighting.path_tracing import COMBINED, PathRules, trace_paths_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.scene import RenderScene
 
 ROULETTE = 2
-"""Scatterings before dim paths may end early: the first ones carry most of the light."""
+"""First bounce with Russian roulette: the first bounces carry most of the light."""
 
 
-def path_rules(config: Config, samples: int, roulette: int) -> Any:
-    """The struct `PathRules`."""
+def make_path_rules(render: Render, seed: int, samples: int, roulette: int) -> Any:
+    """The struct `PathRules` with light and BRDF sampling combined and without path regularization."""
     rules = PathRules()
     rules.samples = samples
-    rules.bounces = config.render.bounces
+    rules.bounces = render.bounces
     rules.roulette = roulette
-    rules.strategy = int(BOTH)
-    rules.seed = config.bake.seed
+    rules.strategy = int(COMBINED)
+    rules.seed = seed
     return rules
 
 
 class ReferenceRenderer:
     """Renders linear radiance by path tracing; `shade` only launches."""
 
-    def __init__(self, config: Config, scene: RenderScene) -> None:
+    def __init__(self, render: Render, seed: int, scene: RenderScene) -> None:
         """
         Args:
-            config: All settings; `render.samples` and `render.bounces` count.
+            render: Render settings: `samples` and `bounces`.
+            seed: Seed of the data set.
             scene: Constant data.
         """
         self.scene = scene
-        self.rules = path_rules(config, config.render.samples, ROULETTE)
+        self.rules = make_path_rules(render, seed, render.samples, ROULETTE)
 
     def shade(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
-        """Pictures of the views.
+        """Render the radiance of a batch of views.
 
         Args:
             snapshot: The worlds.
-            bodies: The struct `ViewBodies`, prepared for these views.
-            gbuffer: Not read: each path has a hit of its own.
+            bodies: The struct `ViewBodies` of these views.
+            gbuffer: Not read: each path traces its own camera ray.
             views: The struct `Views`.
-            image: The struct `ShadedImage`; its `radiance` is written, which is that of whole pixels.
+            image: The struct `ShadedImage`; its `radiance` is written, which is anti-aliased.
         """
         scene = self.scene
         inputs = [scene.paths, scene.cameras, scene.grid, snapshot.episode, snapshot.light, snapshot.light_yaw]
