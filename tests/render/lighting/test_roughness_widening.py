@@ -1,4 +1,4 @@
-"""Normals that differ within a pixel widen the lobe of what it shows: highlights on small curved things do not sparkle."""
+"""Specular anti-aliasing: the variance of normals in a pixel widens its GGX lobe: highlights on small curved objects do not sparkle."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import pytest
 import trimesh
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.materials import MOST_WIDENING, PIXEL_VARIANCE, widened_roughness
+from synpick_warp.kernels.render.lighting.materials import MAX_WIDENING, PIXEL_VARIANCE, widen_roughness
 from synpick_warp.scenes.types import Material, TriangleMesh
 from synpick_warp.stages.render import scene
-from synpick_warp.stages.render.scene import normal_bend
+from synpick_warp.stages.render.scene import normal_gradient
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, camera, entry, render, sun
 
 RADIUS = 6.0
@@ -19,72 +19,73 @@ SHINY = Material(color=(0.9, 0.9, 0.9), texture=None, metallic=1.0, roughness=0.
 
 def cylinder(radius: float) -> TriangleMesh:
     """A tube without lids, with smooth normals [m]."""
-    made = trimesh.creation.cylinder(radius=radius, height=0.2, sections=48, cap=False)
-    vertices = np.asarray(made.vertices)
-    out = np.hypot(vertices[:, 0], vertices[:, 1]) > 0.5 * radius
-    faces = np.asarray(made.faces)[out[made.faces].all(axis=1)]
+    tube = trimesh.creation.cylinder(radius=radius, height=0.2, sections=48, cap=False)
+    vertices = np.asarray(tube.vertices)
+    outer = np.hypot(vertices[:, 0], vertices[:, 1]) > 0.5 * radius
+    faces = np.asarray(tube.faces)[outer[tube.faces].all(axis=1)]
     normals = vertices * (1.0, 1.0, 0.0) / radius
     uv = np.zeros((len(vertices), 2), np.float32)
     return TriangleMesh(vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32), uv)
 
 
-def test_normals_turn_by_one_radian_per_radius_each_way_that_a_surface_bends():
-    np.testing.assert_allclose(normal_bend(ball(0.05, 2)), np.sqrt(2.0) / 0.05, rtol=1e-4)
+def test_normal_gradient_is_the_curvature():
+    # One radian per radius along each curved direction; the norm adds both in quadrature.
+    np.testing.assert_allclose(normal_gradient(ball(0.05, 2)), np.sqrt(2.0) / 0.05, rtol=1e-4)
     tube = cylinder(0.05)
     assert len(tube.faces) == 96
-    np.testing.assert_allclose(normal_bend(tube), 1.0 / 0.05, rtol=1e-4)
-    np.testing.assert_allclose(normal_bend(box(0.1, 0.2, 0.3)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(normal_gradient(tube), 1.0 / 0.05, rtol=1e-4)
+    np.testing.assert_allclose(normal_gradient(box(0.1, 0.2, 0.3)), 0.0, atol=1e-5)
 
 
-def test_a_triangle_without_area_does_not_bend():
+def test_degenerate_triangles_have_no_normal_gradient():
     flat = ball(0.05, 0)
     flat.faces[0] = flat.faces[0][[0, 0, 1]]
-    assert normal_bend(flat)[0] == 0.0
+    assert normal_gradient(flat)[0] == 0.0
 
 
 @wp.kernel
 def widen_kernel(
     # In:
-    roughness: wp.array[float],
-    spread: wp.array[float],
+    roughness: wp.array[float],  # (sample)
+    normal_spread: wp.array[float],  # (sample) [rad]
     # Out:
-    widened_out: wp.array[float],
+    widened_out: wp.array[float],  # (sample)
 ):
-    """`widened_roughness`."""
+    """`widen_roughness`."""
     i = wp.tid()
-    widened_out[i] = widened_roughness(roughness[i], spread[i])
+    widened_out[i] = widen_roughness(roughness[i], normal_spread[i])
 
 
-def test_squared_widths_add_up_to_a_bound(device):
+def test_squared_widths_add_up_to_max_widening(device):
     roughness, spread = (grid.ravel().astype(np.float32) for grid in np.meshgrid(np.linspace(0.0, 1.0, 11), [0.0, 1e-3, 0.1, 1.0, 100.0]))
     widened = wp.zeros(roughness.size, dtype=float, device=device)
     inputs = [wp.array(values, device=device) for values in (roughness, spread)]
     wp.launch(widen_kernel, dim=roughness.size, inputs=inputs, outputs=[widened], device=device)
-    added = np.minimum(float(PIXEL_VARIANCE) * spread.astype(np.float64) ** 2, float(MOST_WIDENING))
+    added = np.minimum(float(PIXEL_VARIANCE) * spread.astype(np.float64) ** 2, float(MAX_WIDENING))
     np.testing.assert_allclose(widened.numpy(), np.minimum(roughness.astype(np.float64) ** 4 + added, 1.0) ** 0.25, atol=2e-6)
 
 
 def brightness_while_moving(device, light) -> np.ndarray:
-    """Mean radiance of the picture of a metal ball, RADIUS px large, as it moves by quarters of a pixel (8,)."""
+    """Mean radiance (8) of images of a metal ball, of radius RADIUS px, that moves by a quarter of a pixel per image."""
     view = camera(32, 24, 120.0, (0.0, 0.0, 1.0))
     means = []
     for step in range(8):
-        place = (step / 4 / 120.0, step / 9 / 120.0, 0.0, *UPRIGHT)
-        toy = ToyScene([entry(ball(RADIUS / 120.0, 4), SHINY)], [[(0, place)]], (view,), lights=(light,))
+        pose = (step / 4 / 120.0, step / 9 / 120.0, 0.0, *UPRIGHT)
+        toy = ToyScene([entry(ball(RADIUS / 120.0, 4), SHINY)], [[(0, pose)]], (view,), lights=(light,))
         picture = render(toy, device)
         means.append(np.where(picture.instance[0][..., None] == 1, picture.radiance[0], 0.0).mean())
     return np.array(means)
 
 
-def test_a_highlight_smaller_than_a_pixel_is_neither_lost_nor_sparkles(device, monkeypatch):
+def test_subpixel_highlights_are_neither_lost_nor_sparkle(device, monkeypatch):
     rows, sky, strength = 128, 0.3, 3e4
     light = sun((0.3, 0.2, 1.0), sky, strength, rows)
-    # A mirroring ball sends a quarter of what its disc receives to every side.
+    # A mirroring ball reflects light uniformly: in each direction a quarter of what its disc receives.
     row = np.unravel_index(light.radiance[..., 0].argmax(), light.radiance.shape[:2])[0]
     irradiance = strength * (np.pi / rows) ** 2 * np.sin(np.pi * (row + 0.5) / rows)
     truth = 0.9 * RADIUS**2 * (irradiance / 4.0 + np.pi * sky) / (32 * 24)
     steady = brightness_while_moving(device, light)
     assert steady.mean() == pytest.approx(truth, rel=0.12)
     assert np.abs(steady / truth - 1.0).max() < 0.35
-    monkeypatch.setattr(scene, "normal_bend", lambda mesh: np.zeros(len(mesh.faces), np.float32))
+    monkeypatch.setattr(scene, "normal_gradient", lambda mesh: np.zeros(len(mesh.faces), np.float32))
     assert brightness_while_moving(device, light).mean() < 0.6 * truth

@@ -1,0 +1,94 @@
+"""Variance-guided denoiser on synthetic input: shrinkage, edges, noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from synpick_warp.device import pick_device
+from tests.harness.denoise_probe import FlatDenoiser, shrink_kernel
+
+colors = st.tuples(*[st.floats(0.0, 10.0)] * 3)
+
+
+@given(wide=colors, narrow=colors, variance=st.floats(0.0, 20.0))
+def test_shrinkage_follows_the_narrow_kernel_beyond_its_variance(wide, narrow, variance):
+    arrays = [wp.array([value], dtype=wp.vec3, device="cpu") for value in (wide, narrow)]
+    result = wp.empty(1, dtype=wp.vec3, device="cpu")
+    wp.launch(shrink_kernel, 1, [*arrays, wp.array([variance], dtype=wp.float32, device="cpu")], [result], device="cpu")
+    wide, narrow = np.array(wide), np.array(narrow)
+    square = float((narrow - wide) @ (0.2126, 0.7152, 0.0722)) ** 2
+    expected = wide if square <= variance else wide + (1.0 - variance / square) * (narrow - wide)
+    # Where both are nearly equal, rounding decides.
+    if abs(square - variance) > 1e-4 * (1.0 + variance):
+        np.testing.assert_allclose(result.numpy()[0], expected, rtol=1e-3, atol=1e-3)
+    if variance == 0.0 and square > 1e-3:
+        np.testing.assert_allclose(result.numpy()[0], narrow, rtol=1e-5, atol=1e-5)
+
+
+@settings(max_examples=10)
+@given(width=st.integers(1, 40), height=st.integers(1, 30), seed=st.integers(0, 100))
+def test_constant_visibility_ratios_are_kept_up_to_the_border(width, height, seed):
+    # Unoccluded light of any strength, of which the same fraction arrives everywhere.
+    flat = FlatDenoiser(width, height, pick_device("cpu"))
+    rng = np.random.default_rng(seed)
+    for name, ratio in (("diffuse", 0.7), ("specular", 0.4)):
+        unoccluded = rng.uniform(0.2, 2.0, (height, width, 3))
+        flat.assign(f"unoccluded_{name}", unoccluded)
+        flat.assign(name, ratio * unoccluded)
+    flat.assign("indirect", np.full((height, width), 0.3))
+    result = flat.run()
+    for name, expected in (("diffuse", 0.7), ("specular", 0.4), ("indirect", 0.3)):
+        np.testing.assert_allclose(result[name], expected, rtol=1e-4)
+
+
+def test_steps_without_noise_stay_sharp_and_noise_is_averaged():
+    flat = FlatDenoiser(64, 48, pick_device("cpu"))
+    ones = np.ones((48, 64))
+    for name in ("unoccluded_diffuse", "unoccluded_specular"):
+        flat.assign(name, ones)
+    step = np.where(np.arange(64) < 32, 0.2, 1.0)[None] * ones
+    noise = np.random.default_rng(0).choice([0.0, 1.0], size=(48, 64))
+    flat.assign("diffuse", step)
+    flat.assign("specular", noise)
+    result = flat.run()
+    # A block is 4 coarse pixels wide, smoothing adds one on each side.
+    np.testing.assert_allclose(result["diffuse"][:, :28], 0.2, atol=0.02)
+    np.testing.assert_allclose(result["diffuse"][:, 38:], 1.0, atol=0.02)
+    assert (np.diff(result["diffuse"][24, :, 0]) > -0.01).all()
+    # 256 coarse pixels in the wide kernel: a sixteenth of the noise, except where a narrower kernel is chosen.
+    inside = result["specular"][8:40, 8:56, 0]
+    assert inside.std() < 0.3 * noise.std()
+    assert inside.mean() == pytest.approx(noise[4:44, 4:60].mean(), abs=0.03)
+
+
+def test_larger_variance_scale_widens_the_kernel():
+    """Rare bright samples: a block with some of them looks bright, unless its variance is scaled up, because its estimate is too low."""
+    flat = FlatDenoiser(64, 48, pick_device("cpu"))
+    for name in ("unoccluded_diffuse", "unoccluded_specular"):
+        flat.assign(name, np.ones((48, 64)))
+    rare = 20.0 * (np.random.default_rng(0).uniform(size=(48, 64)) < 0.05)
+    flat.assign("diffuse", rare)
+    deviation = [flat.run(scale)["diffuse"][8:40, 8:56, 0].std() for scale in (0.0, 0.5, 1.0, 2.0, 1e9)]
+    assert (np.diff(deviation) < 0.0).all()
+    # At one end single blocks, at the other kernels of 256 coarse pixels.
+    assert deviation[-1] == pytest.approx(rare.std() / 16.0, rel=0.4)
+    assert deviation[0] > 3.0 * deviation[-1]
+
+
+def test_other_bodies_and_other_depths_do_not_mix():
+    flat = FlatDenoiser(32, 32, pick_device("cpu"))
+    for name in ("unoccluded_diffuse", "unoccluded_specular"):
+        flat.assign(name, np.ones((32, 32)))
+    left = np.arange(32)[None] * np.ones((32, 1)) < 16
+    segment = np.where(left, 1, 2).astype(np.uint8)
+    flat.guide.segment.assign(segment[None])
+    flat.assign("diffuse", np.where(left, 0.2, 0.9))
+    np.testing.assert_allclose(flat.run()["diffuse"][..., 0], np.where(left, 0.2, 0.9), rtol=1e-5)
+    # The same body in another plane counts little: SAME_BODY_WEIGHT.
+    flat.guide.segment.fill_(1)
+    flat.guide.depth.assign(np.where(left, 1.0, 1.5)[None].astype(np.float32))
+    np.testing.assert_allclose(flat.run()["diffuse"][..., 0], np.where(left, 0.2, 0.9), atol=0.05)
