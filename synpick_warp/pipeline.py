@@ -42,7 +42,7 @@ from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewB
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
 from synpick_warp.stages.perception.segment import SCRATCH, count_views, perception_sizes
-from synpick_warp.stages.render.denoised import FAST_SCRATCH, cell_sizes
+from synpick_warp.stages.render.denoised import DENOISED_SCRATCH, scratch_sizes
 from synpick_warp.stages.render.layers import MOTIONS, MOVING
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
 from synpick_warp.stages.render.postprocess import SpreadArrays, has_spread
@@ -289,6 +289,6 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
         groups += [(kind, plan_sizes(config.sight, room, looks), 1) for kind in (VoteArrays, CYCLES)]
     rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
     if config.render.mode == FAST:
-        cells = views | cell_sizes(config, *config.cameras.resolution)
-        rows += [row for kind, copies in FAST_SCRATCH for row in memory_table(kind, cells) for _ in range(copies)]
+        sizes = views | scratch_sizes(config.render, *config.cameras.resolution)
+        rows += [row for kind, copies in DENOISED_SCRATCH for row in memory_table(kind, sizes) for _ in range(copies)]
     return rows + ring * memory_table(LayerBuffers, views, config.render.layers)

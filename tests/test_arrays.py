@@ -14,7 +14,15 @@ from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewB
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays
 from synpick_warp.stages.perception.segment import SegmentationScratch, count_views
-from synpick_warp.stages.render.denoised import GATHERED, GUIDE, SHARES, Edges, ShadowArrays, cell_paths, cell_sizes
+from synpick_warp.stages.render.denoised import (
+    COARSE_LIGHT,
+    GUIDE,
+    RATIO_IMAGES,
+    Edges,
+    ShadowArrays,
+    paths_per_coarse_pixel,
+    scratch_sizes,
+)
 from synpick_warp.stages.render.layers import MOTIONS
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch
 from synpick_warp.stages.render.raster import VISIBILITY_BUFFER
@@ -44,8 +52,8 @@ MOVING = [
     BoundaryBuffers,
     BoundaryScratch,
     GUIDE,
-    GATHERED,
-    SHARES,
+    COARSE_LIGHT,
+    RATIO_IMAGES,
     ShadowArrays,
     Edges,
     VISIBILITY_BUFFER,
@@ -138,7 +146,7 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
     [(0, 8, (6, 8, 6, 8)), (0, 960, (3, 480, 6, 960)), (0, 1920, (2, 384, 3, 960)), (3, 8, (2, 3, 6, 8)), (64, 8, (1,) * 4)],
 )
 def test_cells_cover_the_image(cell, width, shape):
-    sizes = cell_sizes(settings(render__cell=cell), width, 6)
+    sizes = scratch_sizes(settings(render__cell=cell).render, width, 6)
     assert tuple(sizes[name] for name in ("cell_row", "cell_column", "shadow_row", "shadow_column")) == shape
 
 
@@ -146,8 +154,8 @@ def test_cells_cover_the_image(cell, width, shape):
     ("cell", "width", "paths"), [(0, 320, 2), (0, 480, 2), (0, 481, 1), (0, 640, 1), (0, 960, 2), (0, 1920, 2), (1, 1920, 1)]
 )
 def test_small_cells_have_one_path_and_wider_ones_two(cell, width, paths):
-    assert cell_paths(settings(render__cell=cell), width) == paths
-    assert cell_paths(settings(render__cell=cell, render__cell_paths=5), width) == 5
+    assert paths_per_coarse_pixel(settings(render__cell=cell).render, width) == paths
+    assert paths_per_coarse_pixel(settings(render__cell=cell, render__cell_paths=5).render, width) == 5
 
 
 def test_the_reference_has_no_cells():

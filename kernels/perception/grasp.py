@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.materials import Surfaces, mesh_surface
+from synpick_warp.kernels.render.lighting.materials import Surfaces, interpolate_surface
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies
 from synpick_warp.kernels.structs import PickData
@@ -85,7 +85,7 @@ def smooth_normal_kernel(
                 triangle = gbuffer.triangle[view, row, column]
                 barycentric = gbuffer.barycentric[view, row, column]
                 # Of the surface only the normal counts; the pixel's width matters to textures.
-                surface = mesh_surface(meshes, surfaces, bodies, view, instance, triangle, barycentric, -wp.normalize(ray), 0.0)
+                surface = interpolate_surface(meshes, surfaces, bodies, view, instance, triangle, barycentric, -wp.normalize(ray), 0.0)
                 total += surface.normal
     normal_out[world] = total
 

@@ -108,8 +108,8 @@ class LightTable:
 
 def name_lights(names: list[str], lights: Any) -> LightTable:
     """The table of light maps, from their names and the struct `Lights`."""
-    shines = lights.main_irradiance.numpy().max(axis=1, keepdims=True) > 0.0
-    return LightTable(np.array(names), np.where(shines, lights.main_direction.numpy(), 0.0).astype(np.float32))
+    shines = lights.sun_irradiance.numpy().max(axis=1, keepdims=True) > 0.0
+    return LightTable(np.array(names), np.where(shines, lights.sun_direction.numpy(), 0.0).astype(np.float32))
 
 
 class HostCopy:

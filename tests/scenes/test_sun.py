@@ -14,7 +14,7 @@ from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VA
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS, SOLAR_ANGULAR_RADIUS, draw_sun_disc, extract_sun, replace_sun
 from synpick_warp.scenes.types import EnvironmentMap, Sun
-from synpick_warp.stages.render.light_tables import harmonics, light_table
+from synpick_warp.stages.render.light_tables import precompute_environment, sh_basis
 from tests.worlds import toy_scene
 
 ROWS = 64
@@ -139,15 +139,15 @@ def test_the_real_set(real_lights):
     brightest = np.unravel_index((light.radiance @ LUMINANCE).argmax(), light.radiance.shape[:2])
     assert light.sun.direction @ map_directions(512)[0][brightest] > np.cos(np.radians(3.0))
     np.testing.assert_allclose(light.sun.irradiance / np.pi, 1.5 * srgb_to_linear(np.array((255, 214, 170)) / 255))
-    table, alone = light_table(light, None), light_table(EnvironmentMap("kiara", light.radiance), None)
+    table, alone = precompute_environment(light, None), precompute_environment(EnvironmentMap("kiara", light.radiance), None)
     # The glow around it is wide: no main light, all stays in the map, and facing it is as bright as the set says.
-    assert table.main_spread > MAX_SUN_ANGULAR_RADIUS
-    assert not table.main_irradiance.any()
-    assert table.rest.tobytes() == table.background.tobytes()
-    rest = replace_sun(alone.background.astype(np.float64), light.sun)[0]
-    gained = facing(table.background, light.sun.direction) - facing(rest, light.sun.direction)
+    assert table.sun_radius > MAX_SUN_ANGULAR_RADIUS
+    assert not table.sun_irradiance.any()
+    assert table.sunless.tobytes() == table.radiance.tobytes()
+    rest = replace_sun(alone.radiance.astype(np.float64), light.sun)[0]
+    gained = facing(table.radiance, light.sun.direction) - facing(rest, light.sun.direction)
     np.testing.assert_allclose(gained, light.sun.irradiance, rtol=0.01)
-    assert facing(table.background, light.sun.direction) @ LUMINANCE > facing(alone.background, light.sun.direction) @ LUMINANCE
+    assert facing(table.radiance, light.sun.direction) @ LUMINANCE > facing(alone.radiance, light.sun.direction) @ LUMINANCE
 
 
 def clipped(direction, radius: float = 3.0, value: float = 20.0, rows: int = 128) -> np.ndarray:
@@ -168,25 +168,25 @@ SUN = Sun(np.array([0.48, -0.64, 0.6]), np.array([30.0, 20.0, 10.0]))
 def test_a_plane_that_faces_the_sun_gets_the_sun_and_the_rest_alone():
     """The clipped disc is gone from diffuse light, reflections and background; the sun stands there instead."""
     light = EnvironmentMap("set", clipped(SUN.direction), SUN)
-    table = light_table(light, None)
-    np.testing.assert_allclose(table.main_direction, SUN.direction, rtol=1e-6)
-    np.testing.assert_allclose(table.main_irradiance, SUN.irradiance, rtol=1e-6)
+    table = precompute_environment(light, None)
+    np.testing.assert_allclose(table.sun_direction, SUN.direction, rtol=1e-6)
+    np.testing.assert_allclose(table.sun_irradiance, SUN.irradiance, rtol=1e-6)
     rest, _, taken, _ = extract_sun(light.radiance.astype(np.float64))
     assert taken.min() > 0.1
-    np.testing.assert_allclose(harmonics(SUN.direction) @ table.irradiance, facing(rest, SUN.direction), rtol=0.03)
-    total = harmonics(SUN.direction) @ table.irradiance + table.main_irradiance
+    np.testing.assert_allclose(sh_basis(SUN.direction) @ table.irradiance, facing(rest, SUN.direction), rtol=0.03)
+    total = sh_basis(SUN.direction) @ table.irradiance + table.sun_irradiance
     np.testing.assert_allclose(total, facing(rest, SUN.direction) + SUN.irradiance, rtol=0.01)
-    np.testing.assert_allclose(facing(table.background, SUN.direction), facing(rest, SUN.direction) + SUN.irradiance, rtol=0.01)
-    assert table.reflection.max() < 3.0
+    np.testing.assert_allclose(facing(table.radiance, SUN.direction), facing(rest, SUN.direction) + SUN.irradiance, rtol=0.01)
+    assert table.prefiltered.max() < 3.0
 
 
 def test_exposure_and_table_know_the_sun():
     light = EnvironmentMap("set", clipped(SUN.direction), SUN)
-    upward = facing(light_table(light, None).background, np.array([0.0, 0.0, 1.0]))
-    np.testing.assert_allclose(light_table(light, None).exposure, WHITE_VALUE * np.pi / (upward @ LUMINANCE), rtol=0.01)
+    upward = facing(precompute_environment(light, None).radiance, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_allclose(precompute_environment(light, None).exposure, WHITE_VALUE * np.pi / (upward @ LUMINANCE), rtol=0.01)
     # From below comes what the table sends back; a downward plane sees nothing else.
     ground = np.array([0.2, 0.3, 0.4])
-    below = harmonics(np.array([0.0, 0.0, -1.0])) @ light_table(light, ground).irradiance
+    below = sh_basis(np.array([0.0, 0.0, -1.0])) @ precompute_environment(light, ground).irradiance
     np.testing.assert_allclose(below, ground * upward, rtol=0.1)
 
 
@@ -194,16 +194,16 @@ def test_a_map_that_holds_its_sun_whole_keeps_its_light():
     weak = Sun(SUN.direction, SUN.irradiance * 1e-4)
     light = EnvironmentMap("set", clipped(SUN.direction, value=4000.0), weak)
     taken = extract_sun(resize_map(light.radiance, BACKGROUND_ROWS))[2]
-    table = light_table(light, None)
-    np.testing.assert_allclose(table.main_irradiance @ LUMINANCE, taken @ LUMINANCE, rtol=1e-4)
-    np.testing.assert_allclose(table.main_irradiance / table.main_irradiance[0], weak.irradiance / weak.irradiance[0], rtol=1e-5)
+    table = precompute_environment(light, None)
+    np.testing.assert_allclose(table.sun_irradiance @ LUMINANCE, taken @ LUMINANCE, rtol=1e-4)
+    np.testing.assert_allclose(table.sun_irradiance / table.sun_irradiance[0], weak.irradiance / weak.irradiance[0], rtol=1e-5)
 
 
 def test_a_sun_over_an_even_map_is_as_wide_as_the_sun():
-    table = light_table(EnvironmentMap("set", np.ones((64, 128, 3), np.float32), SUN), None)
-    assert table.main_spread == pytest.approx(SOLAR_ANGULAR_RADIUS)
-    np.testing.assert_allclose(harmonics(SUN.direction) @ table.irradiance, np.pi, rtol=1e-3)
-    assert 0.05 < light_table(EnvironmentMap("set", clipped(SUN.direction), SUN), None).main_spread < 0.09
+    table = precompute_environment(EnvironmentMap("set", np.ones((64, 128, 3), np.float32), SUN), None)
+    assert table.sun_radius == pytest.approx(SOLAR_ANGULAR_RADIUS)
+    np.testing.assert_allclose(sh_basis(SUN.direction) @ table.irradiance, np.pi, rtol=1e-3)
+    assert 0.05 < precompute_environment(EnvironmentMap("set", clipped(SUN.direction), SUN), None).sun_radius < 0.09
 
 
 @given(z=st.floats(1e-3, 1.0), azimuth=st.floats(-np.pi, np.pi), spread=st.floats(0.0, 0.5))
@@ -233,11 +233,11 @@ def test_hills_hide_their_part_of_the_disc():
 def test_maps_without_a_sun_are_as_before():
     light = EnvironmentMap("map", clipped(SUN.direction))
     rest, direction, irradiance, _ = extract_sun(resize_map(light.radiance, BACKGROUND_ROWS))
-    table = light_table(light, None)
-    np.testing.assert_allclose(table.main_direction, direction, rtol=1e-6)
-    np.testing.assert_allclose(table.main_irradiance, irradiance, rtol=1e-6)
-    assert facing(table.background, direction) == pytest.approx(facing(light.radiance, direction), rel=0.01)
-    assert table.background.shape == (BACKGROUND_ROWS, 2 * BACKGROUND_ROWS, 3)
+    table = precompute_environment(light, None)
+    np.testing.assert_allclose(table.sun_direction, direction, rtol=1e-6)
+    np.testing.assert_allclose(table.sun_irradiance, irradiance, rtol=1e-6)
+    assert facing(table.radiance, direction) == pytest.approx(facing(light.radiance, direction), rel=0.01)
+    assert table.radiance.shape == (BACKGROUND_ROWS, 2 * BACKGROUND_ROWS, 3)
     assert facing(rest, direction)[0] < facing(light.radiance, direction)[0]
 
 

@@ -227,10 +227,10 @@ def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], objec
     }
     if isinstance(shading, DenoisedRenderer):
         stages |= {
-            "gather light": lambda: shading.gather(snapshot, bodies, gbuffer, views),
-            "filter light": lambda: shading.filter(views),
-            "shadows of the main light": lambda: shading.cast_shadows(snapshot, bodies, gbuffer, views),
-            "shade": lambda: shading.light(snapshot, bodies, gbuffer, views, image.radiance),
+            "coarse paths": lambda: shading.trace_coarse_paths(snapshot, bodies, gbuffer, views),
+            "denoise": lambda: shading.denoise(views),
+            "sun shadows": lambda: shading.trace_shadows(snapshot, bodies, gbuffer, views),
+            "shade": lambda: shading.shade_pixels(snapshot, bodies, gbuffer, views, image.radiance),
         }
         if shading.antialias:
             stages["anti-alias"] = lambda: shading.smooth(bodies, gbuffer, views, image)

@@ -8,7 +8,7 @@ ray costs no light; what textures show is filtered already.
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.plane_distance import Plane, off_plane, pixel_plane
+from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     RAY_REGISTERS,
@@ -234,7 +234,7 @@ def like_corner(
                 right = corner % 2 - own % 2
                 apart = NEARNESS * wp.length(wp.vec2(float(right) - offset[0], float(down) - offset[1]))
                 if hit.segment != Segment.NOTHING:
-                    apart += off_plane(plane, down, right, gbuffer.depth[view, r, c]) / plane.width
+                    apart += plane_distance(plane, down, right, gbuffer.depth[view, r, c]) / plane.width
                 if apart < least:
                     least = apart
                     best = corner
@@ -286,7 +286,7 @@ def mix_edges_kernel(
             normal = wp.vec3(0.0, 0.0, 0.0)
             if hit.segment != Segment.NOTHING:
                 normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, view, hit, views.instances)
-            plane = pixel_plane(intrinsics, r, c, wp.uint8(hit.segment), hit.depth, normal)
+            plane = tangent_plane(intrinsics, r, c, wp.uint8(hit.segment), hit.depth, normal)
             plane.height = hit.depth * wp.dot(normal, ray)
             best = like_corner(gbuffer, grid, view, row, column, own, offset, hit, plane)
             wp.atomic_or(mix_inout, view, r, c, wp.uint32(best ^ own) << wp.uint32(BITS * sample))

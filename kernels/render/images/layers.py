@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.color import srgb_byte
-from synpick_warp.kernels.render.lighting.materials import Surface, Surfaces, base_color, mesh_surface, table_surface
+from synpick_warp.kernels.render.lighting.materials import Surface, Surfaces, interpolate_surface, make_table_surface, sample_base_color
 from synpick_warp.kernels.render.visibility.camera import NEAR_PLANE, Cameras, ImageGrid, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Meshes, ViewBodies, body_of
 
@@ -102,11 +102,11 @@ def hit_surface(
     to_camera = -wp.normalize(cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0)))
     segment = int(gbuffer.segment[view, row, column])
     if segment == Segment.TABLE:
-        return table_surface(meshes, to_camera)
+        return make_table_surface(meshes, to_camera)
     triangle = gbuffer.triangle[view, row, column]
     barycentric = gbuffer.barycentric[view, row, column]
     width = gbuffer.depth[view, row, column] / cameras.intrinsics[camera][0]
-    return mesh_surface(meshes, surfaces, bodies, view, body_of(segment, instances), triangle, barycentric, to_camera, width)
+    return interpolate_surface(meshes, surfaces, bodies, view, body_of(segment, instances), triangle, barycentric, to_camera, width)
 
 
 @wp.kernel
@@ -158,7 +158,7 @@ def draw_albedo_kernel(
     color = wp.vec3(0.0, 0.0, 0.0)
     if int(gbuffer.segment[view, row, column]) != Segment.NOTHING:
         surface = hit_surface(meshes, surfaces, cameras, bodies, gbuffer, view, row, column, views.camera[view], views.instances)
-        color = base_color(surfaces, surface)
+        color = sample_base_color(surfaces, surface)
     albedo_out[view, row, column] = wp.vec3ub(srgb_byte(color[0]), srgb_byte(color[1]), srgb_byte(color[2]))
 
 

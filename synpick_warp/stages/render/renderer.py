@@ -40,9 +40,9 @@ class Renderer:
         self.gbuffer = allocate_struct(GBUFFER, sizes, scene.device)
         self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
         if config.render.mode == REFERENCE:
-            self.shading: DenoisedRenderer | ReferenceRenderer = ReferenceRenderer(config, scene)
+            self.shading: DenoisedRenderer | ReferenceRenderer = ReferenceRenderer(config.render, config.bake.seed, scene)
         else:
-            self.shading = DenoisedRenderer(config, scene, views)
+            self.shading = DenoisedRenderer(config.render, config.bake.seed, scene, views)
         self.rasterizer = Rasterizer(scene, 1000.0 / config.bop.depth_scale, views)
         self.layer_renderer = LayerRenderer(config, scene, instances, views)
         self.postprocessor = PostProcessor(config, scene, views)

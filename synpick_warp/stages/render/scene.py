@@ -18,9 +18,7 @@ from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
-from synpick_warp.stages.render.chances import build_chances
-from synpick_warp.stages.render.gloss import measure_gloss
-from synpick_warp.stages.render.light_tables import light_table
+from synpick_warp.stages.render.light_tables import build_environment_cdf, measure_albedo, precompute_environment
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +130,7 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     surfaces.normal = wp.array(np.concatenate([corner_values(s.normals, s) for s in shapes]), dtype=wp.vec3, device=device)
     surfaces.uv = wp.array(np.concatenate([corner_values(s.uv, s) for s in shapes]), dtype=wp.vec2, device=device)
     surfaces.uv_density = wp.array(np.concatenate([uv_density(s) for s in shapes]), dtype=wp.float32, device=device)
-    surfaces.bend = wp.array(np.concatenate([normal_bend(s) for s in shapes]), dtype=wp.float32, device=device)
+    surfaces.normal_gradient = wp.array(np.concatenate([normal_gradient(s) for s in shapes]), dtype=wp.float32, device=device)
     surfaces.color = wp.array(srgb_to_linear(np.array([m.color for m in materials])), dtype=wp.vec3, device=device)
     surfaces.metallic = wp.array([m.metallic for m in materials], dtype=wp.float32, device=device)
     surfaces.roughness = wp.array([m.roughness for m in materials], dtype=wp.float32, device=device)
@@ -140,13 +138,13 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     surfaces.first_texel = wp.array(first_texel, dtype=wp.int32, device=device)
     surfaces.texture_levels = wp.array([len(chain) for chain in chains], dtype=wp.int32, device=device)
     surfaces.texel = wp.array(np.concatenate(texels) if texels else np.zeros(1, np.uint32), dtype=wp.uint32, device=device)
-    surfaces.gloss = measure_gloss(device)
+    surfaces.albedo = measure_albedo(device)
     surfaces.linear = wp.array(srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=device)
     return surfaces
 
 
-def normal_bend(mesh: TriangleMesh) -> np.ndarray:
-    """How fast the interpolated normal turns along each triangle (F) float32 [rad/m]: the Frobenius norm of its gradient there."""
+def normal_gradient(mesh: TriangleMesh) -> np.ndarray:
+    """Frobenius norm of the interpolated normal's gradient along each triangle (F) float32 [rad/m]."""
     edges, turns = (np.diff(values[mesh.faces].astype(np.float64), axis=1) for values in (mesh.vertices, mesh.normals))
     # A gradient G takes edges E, as columns, to the turns G E of the normal along them: |G|² is the trace of (EᵀE)⁻¹ (GE)ᵀ(GE).
     gram, turned = (rows @ rows.transpose(0, 2, 1) for rows in (edges, turns))
@@ -180,16 +178,16 @@ def build_grid(width: int, height: int) -> Any:
 
 def build_lights(maps: tuple[EnvironmentMap, ...], ground: np.ndarray | None, exposure: float, device: wp.Device) -> Any:
     """The struct `Lights`; `exposure` multiplies the automatic exposure, `ground` is the table's linear albedo."""
-    tables = [light_table(light, ground) for light in maps]
+    tables = [precompute_environment(light, ground) for light in maps]
     lights = Lights()
     lights.maps = len(tables)
-    backgrounds = np.stack([t.background for t in tables] + [t.rest for t in tables])
-    lights.background = wp.array(backgrounds, dtype=wp.vec3, device=device)
-    lights.reflection = wp.array(np.stack([t.reflection for t in tables]), dtype=wp.vec3, device=device)
+    radiance = np.stack([t.radiance for t in tables] + [t.sunless for t in tables])
+    lights.radiance = wp.array(radiance, dtype=wp.vec3, device=device)
+    lights.prefiltered = wp.array(np.stack([t.prefiltered for t in tables]), dtype=wp.vec3, device=device)
     lights.irradiance = wp.array(np.stack([t.irradiance for t in tables]), dtype=wp.vec3, device=device)
-    lights.main_direction = wp.array(np.stack([t.main_direction for t in tables]), dtype=wp.vec3, device=device)
-    lights.main_irradiance = wp.array(np.stack([t.main_irradiance for t in tables]), dtype=wp.vec3, device=device)
-    lights.main_spread = wp.array([t.main_spread for t in tables], dtype=wp.float32, device=device)
+    lights.sun_direction = wp.array(np.stack([t.sun_direction for t in tables]), dtype=wp.vec3, device=device)
+    lights.sun_irradiance = wp.array(np.stack([t.sun_irradiance for t in tables]), dtype=wp.vec3, device=device)
+    lights.sun_radius = wp.array([t.sun_radius for t in tables], dtype=wp.float32, device=device)
     lights.exposure = wp.array([exposure * t.exposure for t in tables], dtype=wp.float32, device=device)
     return lights
 
@@ -224,7 +222,7 @@ def build_render_scene(
     paths.table = table
     paths.surfaces = build_surfaces(shapes, materials, device)
     paths.lights = build_lights(lights, ground, config.render.exposure, device)
-    paths.chances = build_chances(paths.lights.background.numpy(), device, config.render.table)
+    paths.cdf = build_environment_cdf(paths.lights.radiance.numpy(), device, config.render.table)
     return RenderScene(
         meshes=meshes,
         surfaces=paths.surfaces,

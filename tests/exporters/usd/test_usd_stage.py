@@ -239,12 +239,12 @@ def test_no_light_counts_twice(irradiance, rows, sharpness):
     """Map and sun are those of the pictures, whether the sun is a light of its own or a disc in its map."""
     light = sunny(30.0, 50.0, irradiance, sharpness, rows)
     rest, beam, spread = separate_sun(light)
-    table = light_tables.light_table(light, None)
-    assert spread == pytest.approx(table.main_spread, rel=1e-4)
+    table = light_tables.precompute_environment(light, None)
+    assert spread == pytest.approx(table.sun_radius, rel=1e-4)
     assert (spread > MAX_SUN_ANGULAR_RADIUS) == (not beam.any()) == (sharpness == 100.0)
-    np.testing.assert_allclose(beam, table.main_irradiance, rtol=1e-5)
+    np.testing.assert_allclose(beam, table.sun_irradiance, rtol=1e-5)
     near = map_directions(256)[0] @ light.sun.direction > np.cos(np.radians(15.0))
-    found, expected = resize_map(rest, 256), table.rest
+    found, expected = resize_map(rest, 256), table.sunless
     np.testing.assert_allclose(found[~near], expected[~near], rtol=1e-4)
     solid = map_directions(256)[1]
     parts = [(image * solid[..., None])[near].sum(axis=0) for image in (found, expected)]
@@ -263,5 +263,5 @@ def test_wide_suns_are_in_the_map_alone(rows):
     "light", [*skies(), sunny(30.0, 50.0), replace(sunny(30.0, 50.0, sharpness=100.0), name="wide")], ids=lambda light: light.name
 )
 def test_brightness_is_that_of_the_pictures(light):
-    expected = light_tables.light_table(light, None).exposure
+    expected = light_tables.precompute_environment(light, None).exposure
     assert make_stage_light(0, light, 1.5).intensity == pytest.approx(1.5 * expected, rel=0.03)
