@@ -61,9 +61,9 @@ class ShadowArrays:
 class Edges:
     """Squares between the centres of four pixels that anti-aliasing works on."""
 
-    place: wp.array = device_array("view", "segment", "segment_square", dtype=wp.int32)
-    """Row times columns plus column of each; a segment is a run of tiles of squares."""
-    number: wp.array = device_array("view", "segment", dtype=wp.int32)
+    place: wp.array = device_array("view", "chunk", "chunk_square", dtype=wp.int32)
+    """Row times columns plus column of each; a chunk is a run of tiles of squares."""
+    number: wp.array = device_array("view", "chunk", dtype=wp.int32)
     """How many there are."""
 
 
@@ -91,8 +91,8 @@ def scratch_sizes(render: Render, width: int, height: int) -> dict[str, int]:
         "cell_column": -(-width // size),
         "shadow_row": -(-height // shadow),
         "shadow_column": -(-width // shadow),
-        "segment": chunks,
-        "segment_square": int(CHUNK_TILES) * int(TILE_PIXELS),
+        "chunk": chunks,
+        "chunk_square": int(CHUNK_TILES) * int(TILE_PIXELS),
     }
 
 
