@@ -1,126 +1,198 @@
-"""Constants that several kernels share, in groups, so that a kernel's parameters stay readable."""
+"""Constants of kernels, grouped into structs by subject; `stages.constants` fills them from settings and catalog."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 
-# The cup's tilt among the gripper's coordinates and degrees of freedom: x, y, z, tilt.
+# Index of the cup's tilt among the gripper's coordinates and degrees of freedom: x, y, z, tilt.
 TILT = wp.constant(3)
 
 
 @wp.struct
 class LayoutData:
-    """Where a world's things lie in the model's arrays; see scenes.build.Layout."""
+    """Sizes and offsets of one world in the model's flat arrays; see `scenes.build.Layout`."""
 
     instances: int
+    """Capacity for objects of an episode."""
     single_slots: int
+    """Body slots for objects of one collision shape; they come first."""
     slots: int
+    """All body slots."""
     gripper_bodies: int
+    """Bodies of the gripper, which precede the slots: shaft and cup."""
     gripper_dofs: int
+    """Degrees of freedom of the gripper: x, y, z, tilt."""
     bodies: int
+    """Bodies of a world."""
     coords: int
+    """Joint coordinates of a world: the gripper's, then 7 a slot."""
     dofs: int
+    """Degrees of freedom of a world: the gripper's, then 6 a slot."""
     shapes: int
+    """Collision shapes of a world."""
     finger_shape: int
+    """Index of the gripper shaft's shape in its world."""
     cup_shape: int
+    """Index of the cup's shape in its world."""
 
 
 @wp.struct
 class CatalogData:
-    """What the simulation knows of each catalog entry: `area` is the product of the two larger extents of its mesh's box [m²]."""
+    """Properties of the catalog's objects; arrays are (entry)."""
 
     count: int
+    """Objects in the catalog."""
     volume: wp.array[float]
+    """Volume of the collision shape [m³]."""
     radius: wp.array[float]
+    """Radius of the bounding sphere about the origin [m]."""
     mass: wp.array[float]
+    """Mass [kg]."""
     area: wp.array[float]
+    """Product of the two larger side lengths of the mesh's bounding box [m²]."""
     diagonal: wp.array[float]
+    """Diagonal of that box [m]."""
     compound: wp.array[int]
+    """1: several convex pieces, in a compound slot; 0: one, in a single slot."""
     variant: wp.array[int]
+    """Body variant of the object in the slots of its class."""
     empty_single: int
+    """Variant of an empty single slot."""
     empty_compound: int
+    """Variant of an empty compound slot."""
     empty_mass: float
+    """Mass of an empty slot's body [kg]."""
 
 
 @wp.struct
 class DropData:
-    """How objects are drawn and dropped."""
+    """Parameters of sampling and dropping objects, and of sampling the light; see `configs.schema`."""
 
     volume: float
+    """Budget for the total volume of an episode's objects [m³]."""
     move_repeats: int
+    """1: an object may occur several times in mode MOVE."""
     pick_repeats: int
+    """The same for the picking modes."""
     clearance: float
+    """Gap between bounding spheres in the drop column [m]."""
     spread: float
+    """Fraction of the free opening over which drop positions spread."""
     rim_length: float
+    """Opening of the tote at the rim along x [m]."""
     rim_width: float
+    """The same along y [m]."""
     rim_height: float
+    """Height of the rim [m]."""
     gravity: float
+    """Gravitational acceleration [m/s²]."""
     gripper_home: wp.vec3
+    """Wrist position while the gripper waits [m]."""
     lights: int
+    """Environment maps."""
     turn_lights: int
+    """1: sample the yaw of environment maps."""
     exposure_spread: float
+    """Half-width of the sampled exposure range [EV]."""
 
 
 @wp.struct
 class SettleData:
-    """When a pile is at rest, and what is dropped again. Times in ticks."""
+    """When a pile counts as at rest, and what is dropped again; see `configs.schema.Settle`."""
 
     min_ticks: int
+    """Shortest time from drop to rest [ticks]."""
     max_ticks: int
+    """Longest [ticks]."""
     rest_ticks: int
+    """Consecutive ticks at rest that are needed."""
     stuck_ticks: int
+    """Time in deep penetration after which an object is dropped again [ticks]."""
     late_ticks: int
+    """Time from which the relaxed threshold applies [ticks]."""
     rest_threshold: float
+    """Largest displacement of an object at rest in a tick [m]."""
     relaxed_rest_threshold: float
+    """The same from `late_ticks` on [m]."""
     stuck_depth: float
+    """Penetration from which an object counts as stuck [m]."""
     max_redrops: int
+    """Re-drops after which an arrangement is resampled."""
 
 
 @wp.struct
 class ModeData:
-    """How episodes get their mode: shares of PICK and of PICK or TARGET among all, from 0 to 1."""
+    """Distribution of the modes of episodes."""
 
     pick_share: float
+    """Probability of PICK."""
     pick_or_target_share: float
+    """Probability of PICK or TARGET."""
 
 
 @wp.struct
 class MoveData:
-    """The gripper's task and controller in move mode."""
+    """Mode MOVE: parameters of setpoints and impedance control; mass, gravity, step and TCP offset serve the picking modes, too."""
 
     stiffness: float
+    """Stiffness [N/m]."""
     damping: float
+    """Damping [N·s/m]."""
     force: float
+    """Largest force of the impedance control [N]."""
     speed: float
+    """Speed of the setpoint [m/s]."""
     corner: wp.vec3
+    """TCP at the corner with positive x and y [m]."""
     start_height: float
+    """Height of the TCP above the first corner at the first frame [m]."""
     waypoints: int
+    """Corners to visit."""
     mass: float
+    """Mass of shaft and cup [kg]."""
     gravity: float
+    """Gravitational acceleration [m/s²]."""
     step: float
+    """Time step [s]."""
     tcp_offset: float
+    """Distance from wrist axis to TCP [m]."""
 
 
 @wp.struct
 class PickData:
-    """The gripper's task and controller in the modes PICK and TARGET. Lengths of time in steps."""
+    """Picking modes: parameters of tasks and impedance control; see `configs.schema.Pick`."""
 
     stiffness: float
+    """Stiffness [N/m]."""
     damping: float
+    """Damping [N·s/m]."""
     force: float
+    """Largest force of the impedance control [N]."""
     appear_height: float
+    """Height above the grasp at which the gripper appears [m]."""
     speed: float
+    """Speed of the setpoint in APPROACH [m/s]."""
     near: float
+    """Distance before the grasp point at which APPROACH ends [m]."""
     near_speed: float
+    """Speed of the setpoint in DESCEND [m/s]."""
     press_steps: int
+    """Duration of PRESS [steps]."""
     lift_height: float
+    """Height of the lift [m]."""
     lift_speed: float
+    """Speed of the setpoint in LIFT [m/s]."""
     failures: int
+    """Failed attempts that end an episode."""
     floor: float
+    """Height below which an object is lost [m]."""
     tilt_limit: float
+    """Largest tilt of the cup [rad]."""
     forgive: int
+    """1: a success in mode TARGET resets the count of failures."""
     random_after_failure: int
+    """1: after a failure in mode TARGET the next target is sampled at random."""
 
 
 @wp.struct
@@ -141,25 +213,39 @@ class PerceptionData:
 
 @wp.struct
 class SuctionData:
-    """The cup's rays and seals; see configs.schema.Suction. Angles in radians.
-
-    `tilt_inertia` is what a torque of one step meets at the tilt axis: its drive, implicit in velocity and position [kg·m²].
-    """
+    """The cup's rays and seals; see `configs.schema.Suction`."""
 
     rays: int
+    """Rays on the ring."""
     radius: float
+    """Radius of the ring [m]."""
     reach: float
+    """Length of the rays [m]."""
     tolerated_misses: int
+    """Rays of a good seal that may miss."""
     good_force: float
+    """Break force of a good seal [N]."""
     poor_force: float
+    """Break force of any other seal [N]."""
     stiffness: float
+    """Stiffness [N/m]."""
     damping: float
+    """Damping [N·s/m]."""
     twist_stiffness: float
+    """Stiffness against twist [N·m/rad]."""
     twist_damping: float
+    """Damping of twist and swing [N·m·s/rad]."""
     swing_limit: float
+    """Angle of free swing [rad]."""
     swing_stiffness: float
+    """Stiffness beyond it [N·m/rad]."""
     tcp_offset: float
+    """Distance from wrist axis to TCP [m]."""
     finger_mass: float
+    """Mass of the gripper shaft [kg]."""
     cup_mass: float
+    """Mass of the cup [kg]."""
     tilt_inertia: float
+    """Effective inertia about the wrist axis in one step: armature and the drive, which is implicit in velocity and position [kg·m²]."""
     step: float
+    """Time step [s]."""

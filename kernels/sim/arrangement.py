@@ -1,4 +1,4 @@
-"""Which objects a world gets, and where they fall from."""
+"""Episode start: assign episodes to worlds, sample mode, objects and light, and stack the objects above the tote to be dropped."""
 
 import warp as wp
 
@@ -9,12 +9,12 @@ from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData, Mode
 
 wp.set_module_options({"enable_backward": False})
 
-# Draws before an arrangement without repeats is taken as complete; each draw finds a new object with
+# Samples after which an arrangement without repeats counts as complete; each sample finds a new object with
 # probability 1 / entries at least, so 4,096 miss one with probability e^-8 at 512 entries.
 MAX_SAMPLES = wp.constant(4096)
-# Empty slots wait here, far below everything [m].
+# Height of unused body slots, far below everything [m].
 PARKED_HEIGHT = wp.constant(-100.0)
-# Numbers that one drop takes from its stream: x, y and three for the rotation.
+# Samples of the random stream that one drop uses: x, y and three for the rotation.
 DROP_SAMPLES = wp.constant(5)
 
 
@@ -22,26 +22,28 @@ DROP_SAMPLES = wp.constant(5)
 def assign_episodes_kernel(
     # Scene:
     worlds: int,
-    episodes: wp.array[int],
+    episodes: wp.array[int],  # (episode)
     tries: int,
     # State:
-    arrangement_id_inout: wp.array[wp.vec2i],
-    phase_inout: wp.array[int],
-    ending_inout: wp.array[int],
-    next_episode_inout: wp.array[int],
+    arrangement_id_inout: wp.array[wp.vec2i],  # (world)
+    phase_inout: wp.array[int],  # (world)
+    ending_inout: wp.array[int],  # (world)
+    next_episode_inout: wp.array[int],  # (one)
 ):
-    """Worlds whose episode is over take the next of `episodes`; an episode that delivered nothing is drawn again where it was.
+    """Assign episodes to free worlds in order: the next of `episodes`, or the same one again if it ended without delivery.
 
-    One thread walks over the worlds, so that numbers go to worlds in corner_order.
+    `arrangement_id` receives (episode index, arrangement index): the arrangement index counts the resamples of an episode, up to
+    `tries` - 1; -1, 0 stands for no episode. Phases become START or IDLE. A single thread (dim 1) loops over the worlds, so that
+    worlds receive episodes in order.
     """
     following = next_episode_inout[0]
     for world in range(worlds):
         phase = phase_inout[world]
         episode = arrangement_id_inout[world][0]
-        redraw = arrangement_id_inout[world][1]
-        again = phase == Phase.OVER and not delivers(ending_inout[world]) and redraw + 1 < tries
-        if again:
-            arrangement_id_inout[world] = wp.vec2i(episode, redraw + 1)
+        arrangement = arrangement_id_inout[world][1]
+        resample = phase == Phase.OVER and not delivers(ending_inout[world]) and arrangement + 1 < tries
+        if resample:
+            arrangement_id_inout[world] = wp.vec2i(episode, arrangement + 1)
             phase_inout[world] = Phase.START
         elif phase == Phase.OVER or phase == Phase.EMPTY:
             if following < episodes.shape[0]:
@@ -62,22 +64,22 @@ def sample_modes_kernel(
     seed: wp.uint64,
     mode: ModeData,
     # State:
-    arrangement_id: wp.array[wp.vec2i],
-    phase: wp.array[int],
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    phase: wp.array[int],  # (world)
     # Out:
-    mode_out: wp.array[int],
+    mode_out: wp.array[int],  # (world)
 ):
-    """Draw the mode of worlds that start an episode: PICK if u < p, else TARGET if u < p + t, else MOVE, with shares p and t of the modes.
+    """Sample the mode of starting episodes: PICK if u < p, else TARGET if u < p + t, else MOVE, with fractions p and t of the modes.
 
-    u is the first number of the stream (seed, episode, 0, Stream.MODE): another arrangement of the episode has the same mode.
+    u is the first sample of the stream (seed, episode, 0, Stream.MODE): a resampled arrangement of the episode has the same mode.
     """
     world = wp.tid()
     if phase[world] != Phase.START:
         return
-    number = uniform(stream_key(seed, arrangement_id[world][0], 0, Stream.MODE), 0)
-    if number < mode.pick_share:
+    u = uniform(stream_key(seed, arrangement_id[world][0], 0, Stream.MODE), 0)
+    if u < mode.pick_share:
         mode_out[world] = Mode.PICK
-    elif number < mode.pick_or_target_share:
+    elif u < mode.pick_or_target_share:
         mode_out[world] = Mode.TARGET
     else:
         mode_out[world] = Mode.MOVE
@@ -85,17 +87,19 @@ def sample_modes_kernel(
 
 @wp.func
 def clear_catalog_indices(catalog_index: wp.array2d[int], world: int, instances: int):
+    """Set all instances of a world to -1: no object."""
     for instance in range(instances):
         catalog_index[world, instance] = -1
 
 
 @wp.func
 def is_sampled(catalog_index: wp.array2d[int], world: int, count: int, candidate: int) -> bool:
-    found = bool(False)
+    """True if the first `count` instances of a world contain the object `candidate`."""
+    result = bool(False)
     for instance in range(count):
         if catalog_index[world, instance] == candidate:
-            found = True
-    return found
+            result = True
+    return result
 
 
 @wp.kernel
@@ -106,18 +110,19 @@ def sample_objects_kernel(
     catalog: CatalogData,
     drop: DropData,
     # State:
-    arrangement_id: wp.array[wp.vec2i],
-    mode: wp.array[int],
-    phase_inout: wp.array[int],
-    ending_inout: wp.array[int],
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    mode: wp.array[int],  # (world)
+    phase_inout: wp.array[int],  # (world)
+    ending_inout: wp.array[int],  # (world)
     # Out:
-    catalog_index_out: wp.array2d[int],
-    body_slot_out: wp.array2d[int],
+    catalog_index_out: wp.array2d[int],  # (world, instance)
+    body_slot_out: wp.array2d[int],  # (world, instance)
 ):
-    """Draw objects, uniformly, until the next one would exceed the volume budget V: Σ volume ≤ V.
+    """Sample objects uniformly until the next one would exceed the volume budget V: Σ volume ≤ V.
 
-    The first object may be drawn several times, until one fits. Objects take slots of their kind in the corner_order drawn; if a
-    kind runs out, the episode ends with an overflow and is drawn again.
+    `catalog_index` receives the object of each instance (-1: none), `body_slot` its body. Objects take slots of their class, single
+    body or compound, in the order of sampling; if a class runs out of slots, the episode ends with ARRANGEMENT_OVERFLOW. The first
+    object is resampled until one fits.
     """
     world = wp.tid()
     phase = phase_inout[world]
@@ -134,23 +139,23 @@ def sample_objects_kernel(
     total = float(0.0)
     overflow = bool(False)
     open = bool(True)
-    for draw in range(MAX_SAMPLES):
+    for sample in range(MAX_SAMPLES):
         if open:
-            candidate = uniform_index(key, draw, catalog.count)
-            known = repeats == 0 and is_sampled(catalog_index_out, world, count, candidate)
+            candidate = uniform_index(key, sample, catalog.count)
+            repeated = repeats == 0 and is_sampled(catalog_index_out, world, count, candidate)
             fits = total + catalog.volume[candidate] <= drop.volume
-            if not known and not fits and count > 0:
+            if not repeated and not fits and count > 0:
                 open = False
-            if not known and fits:
-                body_slot = singles
+            if not repeated and fits:
+                slot = singles
                 if catalog.compound[candidate] == 1:
-                    body_slot = layout.single_slots + compounds
+                    slot = layout.single_slots + compounds
                     compounds += 1
                 else:
                     singles += 1
                 overflow = overflow or singles > layout.single_slots or compounds > layout.slots - layout.single_slots
                 catalog_index_out[world, count] = candidate
-                body_slot_out[world, count] = body_slot
+                body_slot_out[world, count] = slot
                 total += catalog.volume[candidate]
                 count += 1
             if overflow or count == layout.instances or (repeats == 0 and count == catalog.count):
@@ -167,16 +172,17 @@ def sample_lights_kernel(
     seed: wp.uint64,
     drop: DropData,
     # State:
-    arrangement_id: wp.array[wp.vec2i],
-    phase: wp.array[int],
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    phase: wp.array[int],  # (world)
     # Out:
-    light_out: wp.array[int],
-    light_yaw_out: wp.array[float],
-    light_exposure_out: wp.array[float],
+    light_out: wp.array[int],  # (world)
+    light_yaw_out: wp.array[float],  # (world) [rad]
+    light_exposure_out: wp.array[float],  # (world) [EV]
 ):
-    """Draw the light map of worlds that start an episode, its turn about the vertical and its exposure.
+    """Sample the environment map of starting episodes, its yaw [rad] and its exposure value [EV].
 
-    With the numbers u_i of the stream (seed, episode, redraw, Stream.LIGHT): turn = 2π u_1, exposure = s (2 u_2 - 1) stops for a spread s.
+    With the samples u_i of the stream (seed, episode, arrangement, Stream.LIGHT): map by u_0, yaw = 2π u_1, exposure = s (2 u_2 - 1) for
+    a spread s.
     """
     world = wp.tid()
     if phase[world] != Phase.START:
@@ -189,7 +195,10 @@ def sample_lights_kernel(
 
 @wp.func
 def drop_pose(key: wp.uint64, index: int, radius: float, height: float, drop: DropData) -> wp.transform:
-    """A random pose at a height: spread over the part of the rim's opening that the bounding sphere can use."""
+    """Sample a drop pose at a height [m]: uniform rotation, position uniform over a fraction of the rim's opening.
+
+    The opening is reduced by the object's bounding radius [m]; `index` counts the drops of the stream.
+    """
     first = index * DROP_SAMPLES
     x = (2.0 * uniform(key, first) - 1.0) * drop.spread * wp.max(0.0, 0.5 * drop.rim_length - radius)
     y = (2.0 * uniform(key, first + 1) - 1.0) * drop.spread * wp.max(0.0, 0.5 * drop.rim_width - radius)
@@ -198,7 +207,7 @@ def drop_pose(key: wp.uint64, index: int, radius: float, height: float, drop: Dr
 
 @wp.func
 def write_body(joint_q: wp.array[float], joint_qd: wp.array[float], first_q: int, first_qd: int, pose: wp.transform):
-    """Put a free body at a pose, at rest."""
+    """Write the joint coordinates of a free body at a pose [m] and clear its velocity; its joints begin at `first_q` and `first_qd`."""
     p = wp.transform_get_translation(pose)
     r = wp.transform_get_rotation(pose)
     for axis in range(3):
@@ -216,29 +225,30 @@ def reset_worlds_kernel(
     catalog: CatalogData,
     drop: DropData,
     # State:
-    phase: wp.array[int],
+    phase: wp.array[int],  # (world)
     # Out:
-    variant_out: wp.array[int],
-    joint_q_out: wp.array[float],
-    joint_qd_out: wp.array[float],
-    joint_f_out: wp.array[float],
-    restarted_out: wp.array[wp.bool],
-    progress_out: wp.array[wp.vec4i],
-    stuck_out: wp.array2d[int],
+    variant_out: wp.array[int],  # (body)
+    joint_q_out: wp.array[float],  # (coord) [m, rad]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+    joint_f_out: wp.array[float],  # (dof) [N, N·m]
+    restarted_out: wp.array[wp.bool],  # (world_and_global)
+    progress_out: wp.array[wp.vec4i],  # (world) [ticks]
+    stuck_out: wp.array2d[int],  # (world, instance) [ticks]
 ):
-    """Worlds that start, and worlds without an episode: empty all slots, park them, and send the gripper home.
+    """Reset worlds in the phases START, IDLE and OVER: all body slots empty and parked, the gripper at home.
 
-    A parked body's weight is cancelled by a force m g. Elsewhere variants are -1: nothing changes.
+    `variant` receives each slot's empty variant, or -1 (no change) in other worlds; `restarted` is True for reset worlds. A force m g on
+    each parked body cancels its weight.
     """
     world = wp.tid()
     fresh = phase[world] == Phase.START or phase[world] == Phase.IDLE or phase[world] == Phase.OVER
     restarted_out[world] = fresh
     body = world * layout.bodies + layout.gripper_bodies
-    for s in range(layout.slots):
-        variant_out[body + s] = -1
+    for slot in range(layout.slots):
+        variant_out[body + slot] = -1
     if not fresh:
         return
-    # Ticks since the drop, ticks at rest, re-drops, guide walls standing.
+    # Ticks since the drop, ticks at rest, re-drops, whether the guide walls stand.
     progress_out[world] = wp.vec4i(0, 0, 0, 1)
     for instance in range(layout.instances):
         stuck_out[world, instance] = 0
@@ -250,12 +260,12 @@ def reset_worlds_kernel(
     for axis in range(3):
         joint_q_out[q + axis] = drop.gripper_home[axis]
     parked = wp.transform(wp.vec3(0.0, 0.0, PARKED_HEIGHT), wp.quat_identity())
-    for s in range(layout.slots):
-        variant_out[body + s] = catalog.empty_single
-        if s >= layout.single_slots:
-            variant_out[body + s] = catalog.empty_compound
-        first = qd + layout.gripper_dofs + 6 * s
-        write_body(joint_q_out, joint_qd_out, q + layout.gripper_dofs + 7 * s, first, parked)
+    for slot in range(layout.slots):
+        variant_out[body + slot] = catalog.empty_single
+        if slot >= layout.single_slots:
+            variant_out[body + slot] = catalog.empty_compound
+        first = qd + layout.gripper_dofs + 6 * slot
+        write_body(joint_q_out, joint_qd_out, q + layout.gripper_dofs + 7 * slot, first, parked)
         for axis in range(6):
             joint_f_out[first + axis] = 0.0
         joint_f_out[first + 2] = catalog.empty_mass * drop.gravity
@@ -269,17 +279,17 @@ def drop_objects_kernel(
     catalog: CatalogData,
     drop: DropData,
     # State:
-    arrangement_id: wp.array[wp.vec2i],
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    phase_inout: wp.array[int],
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    phase_inout: wp.array[int],  # (world)
     # Out:
-    variant_out: wp.array[int],
-    joint_q_out: wp.array[float],
-    joint_qd_out: wp.array[float],
-    joint_f_out: wp.array[float],
+    variant_out: wp.array[int],  # (body)
+    joint_q_out: wp.array[float],  # (coord) [m, rad]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+    joint_f_out: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Give slots their objects and stack these above the tote in a column of bounding spheres, at rest.
+    """Assign objects to their body slots and stack them above the tote in a column of bounding spheres, at rest; phase becomes SETTLE.
 
     Height of sphere i: z_i = rim + r_i + Σ_{j<i} (2 r_j + clearance).
     """
@@ -290,13 +300,15 @@ def drop_objects_kernel(
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.DROP)
     height = drop.rim_height
     for instance in range(layout.instances):
-        e = catalog_index[world, instance]
-        if e >= 0:
-            s = body_slot[world, instance]
-            variant_out[body + s] = catalog.variant[e]
-            q = world * layout.coords + layout.gripper_dofs + 7 * s
-            qd = world * layout.dofs + layout.gripper_dofs + 6 * s
-            write_body(joint_q_out, joint_qd_out, q, qd, drop_pose(key, instance, catalog.radius[e], height + catalog.radius[e], drop))
+        index = catalog_index[world, instance]
+        if index >= 0:
+            slot = body_slot[world, instance]
+            variant_out[body + slot] = catalog.variant[index]
+            q = world * layout.coords + layout.gripper_dofs + 7 * slot
+            qd = world * layout.dofs + layout.gripper_dofs + 6 * slot
+            write_body(
+                joint_q_out, joint_qd_out, q, qd, drop_pose(key, instance, catalog.radius[index], height + catalog.radius[index], drop)
+            )
             joint_f_out[qd + 2] = 0.0
-            height += 2.0 * catalog.radius[e] + drop.clearance
+            height += 2.0 * catalog.radius[index] + drop.clearance
     phase_inout[world] = Phase.SETTLE

@@ -1,4 +1,4 @@
-"""What the suction cup catches: rays from its tcp against the world's own objects."""
+"""Suction test: rays cast from a ring on the suction cup's rim decide which objects it engages, and how strong the seals are."""
 
 import warp as wp
 
@@ -8,58 +8,62 @@ from synpick_warp.kernels.structs import LayoutData, PickData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
 
-# The ray hits nothing.
+# Ray distance that stands for no hit.
 MISS = wp.constant(-1.0)
-# The cup's place among a world's bodies.
+# Index of the cup among a world's bodies; the gripper shaft ("finger") is 0.
 CUP = wp.constant(1)
 
 
 @wp.struct
 class SurfaceData:
-    """Surfaces that the rays hit, by catalog index e: convex pieces first_piece[e] to first_piece[e + 1], planes of a piece likewise."""
+    """Object surfaces for ray casts, by catalog index e: convex pieces as half-spaces, or triangle meshes."""
 
     first_piece: wp.array[int]
+    """(entry + 1): convex pieces of object e are first_piece[e] to first_piece[e + 1] - 1."""
     first_plane: wp.array[int]
+    """(piece + 1): planes of piece p are first_plane[p] to first_plane[p + 1] - 1."""
     plane: wp.array[wp.vec4]
-    """Outward unit normal n and d [m] in the object's frame; inside is n·x ≤ d."""
+    """(plane): outward unit normal n and d [m] in the object's frame; inside is n·x ≤ d."""
     mesh: wp.array[wp.uint64]
-    """Visual meshes, read if `use_mesh` is 1."""
+    """(entry): ids of the visual meshes, used if `use_mesh` is 1."""
     use_mesh: int
+    """1: cast against visual meshes; 0: against convex pieces."""
     radius: wp.array[float]
-    """No point of the surface is farther from the object's origin [m]."""
+    """(entry): radius of the bounding sphere about the object's origin [m]."""
 
 
 @wp.func
-def tcp_pose(cup: wp.transform, tcp_offset: float) -> wp.transform:
-    """Frame at the cup's tcp with the cup's axes; the tcp lies at (0, 0, -tcp) in the cup's frame."""
-    return cup * wp.transform(wp.vec3(0.0, 0.0, -tcp_offset), wp.quat_identity())
+def tcp_pose(cup_in_world: wp.transform, tcp_offset: float) -> wp.transform:
+    """Pose of the TCP frame in the world: the cup's axes at (0, 0, -tcp_offset) [m] in the cup's frame."""
+    return cup_in_world * wp.transform(wp.vec3(0.0, 0.0, -tcp_offset), wp.quat_identity())
 
 
 @wp.func
 def ray_start(ray: int, suction: SuctionData) -> wp.vec3:
-    """Start of a ray in the tcp's frame [m]: on the circle at angle 2 π ray / rays, the first on +x."""
+    """Origin of a ray in the TCP frame [m]: on the circle at angle 2 π ray / rays, the first on +x."""
     angle = TAU * float(ray) / float(suction.rays)
     return wp.vec3(suction.radius * wp.cos(angle), suction.radius * wp.sin(angle), 0.0)
 
 
 @wp.func
-def clip_piece(start: wp.vec3, way: wp.vec3, reach: float, first: int, last: int, plane: wp.array[wp.vec4]) -> float:
-    """Where the ray enters a convex piece [m], 0 if it starts inside, MISS if it does not within its reach.
+def clip_piece(start: wp.vec3, direction: wp.vec3, reach: float, first: int, last: int, plane: wp.array[wp.vec4]) -> float:
+    """Intersect a ray with a convex polytope (slab test; Cyrus and Beck, 1978).
 
-    Of t in [0, reach], each half-space n·(start + t way) ≤ d leaves an interval; the ray hits where their intersection begins.
+    Of t in [0, reach], each half-space n·(start + t direction) ≤ d leaves an interval; the ray hits where their intersection begins.
+    Returns the distance [m], 0 if the ray starts inside, MISS if there is no hit within reach.
     """
     enter = float(0.0)
     leave = float(reach)
     for row in range(first, last):
         half = plane[row]
         normal = wp.vec3(half[0], half[1], half[2])
-        room = half[3] - wp.dot(normal, start)
-        slope = wp.dot(normal, way)
+        distance = half[3] - wp.dot(normal, start)
+        slope = wp.dot(normal, direction)
         if slope < 0.0:
-            enter = wp.max(enter, room / slope)
+            enter = wp.max(enter, distance / slope)
         elif slope > 0.0:
-            leave = wp.min(leave, room / slope)
-        elif room < 0.0:
+            leave = wp.min(leave, distance / slope)
+        elif distance < 0.0:
             return MISS
         if enter > leave:
             return MISS
@@ -67,22 +71,22 @@ def clip_piece(start: wp.vec3, way: wp.vec3, reach: float, first: int, last: int
 
 
 @wp.func
-def cast_ray(start: wp.vec3, way: wp.vec3, reach: float, pose: wp.transform, catalog_index: int, surface: SurfaceData) -> float:
-    """Distance to an object's surface along a ray given in the world [m], or MISS.
+def cast_ray(start: wp.vec3, direction: wp.vec3, reach: float, pose: wp.transform, catalog_index: int, surface: SurfaceData) -> float:
+    """Distance to the surface of an object at a pose, along a ray in the world's frame [m], or MISS.
 
-    A mesh is hit where the ray first meets a triangle, from either side: a ray that starts inside hits where it leaves.
+    A mesh is hit at the ray's first intersection with a triangle, from either side: a ray that starts inside hits where it leaves.
     """
     inverse = wp.transform_inverse(pose)
     local = wp.transform_point(inverse, start)
-    direction = wp.transform_vector(inverse, way)
+    local_direction = wp.transform_vector(inverse, direction)
     nearest = float(MISS)
     if surface.use_mesh != 0:
-        query = wp.mesh_query_ray(surface.mesh[catalog_index], local, direction, reach)
+        query = wp.mesh_query_ray(surface.mesh[catalog_index], local, local_direction, reach)
         if query.result:
             nearest = query.t
         return nearest
     for piece in range(surface.first_piece[catalog_index], surface.first_piece[catalog_index + 1]):
-        distance = clip_piece(local, direction, reach, surface.first_plane[piece], surface.first_plane[piece + 1], surface.plane)
+        distance = clip_piece(local, local_direction, reach, surface.first_plane[piece], surface.first_plane[piece + 1], surface.plane)
         if distance >= 0.0 and (nearest < 0.0 or distance < nearest):
             nearest = distance
     return nearest
@@ -90,7 +94,7 @@ def cast_ray(start: wp.vec3, way: wp.vec3, reach: float, pose: wp.transform, cat
 
 @wp.func
 def suction_begins(phase: int, task: int, steps: int, pick: PickData) -> bool:
-    """Whether the cup's time to press is up."""
+    """True at the end of the last tick of task PRESS, when suction is switched on."""
     return phase == Phase.ACT and task == Task.PRESS and steps >= pick.press_steps
 
 
@@ -102,48 +106,48 @@ def count_seal_rays_kernel(
     suction: SuctionData,
     surface: SurfaceData,
     # State:
-    phase: wp.array[int],
-    task: wp.array[int],
-    steps: wp.array[int],
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
+    phase: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    steps: wp.array[int],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
     # Out:
-    hits_out: wp.array[int],
-    engaged_bits_out: wp.array[wp.uint32],
+    hits_out: wp.array[int],  # (world)
+    engaged_bits_out: wp.array[wp.uint32],  # (world)
 ):
-    """Where the suction begins: how many rays hit an object, and the objects hit as bits of instances.
+    """Cast the suction rays where suction is switched on: count the rays that hit, and set bit i for every instance i that is hit.
 
-    Rays run from a circle at the tcp along the cup's -z, as far as they reach: x_k = tcp + r (cos a, sin a, 0), a = 2 π k / rays. Each
-    catches the nearest object on its way, the first of several at the same distance. Nothing but the world's own objects stops a ray.
+    Rays run from a circle about the TCP along the cup's -z: x_k = tcp + r (cos a, sin a, 0), a = 2 π k / rays. Each engages the
+    nearest object within reach, the first of several at the same distance. Only the world's own objects are tested.
     """
     world = wp.tid()
     if not suction_begins(phase[world], task[world], steps[world], pick):
         return
     body = world * layout.bodies
-    tcp = tcp_pose(body_q[body + CUP], suction.tcp_offset)
-    way = wp.transform_vector(tcp, wp.vec3(0.0, 0.0, -1.0))
+    tcp_in_world = tcp_pose(body_q[body + CUP], suction.tcp_offset)
+    direction = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, -1.0))
     hits = int(0)
-    engaged_bits = wp.uint32(0)
+    engaged = wp.uint32(0)
     for ray in range(suction.rays):
-        start = wp.transform_point(tcp, ray_start(ray, suction))
+        start = wp.transform_point(tcp_in_world, ray_start(ray, suction))
         nearest = float(MISS)
         hit = int(-1)
         for instance in range(layout.instances):
-            e = catalog_index[world, instance]
-            if e >= 0:
+            index = catalog_index[world, instance]
+            if index >= 0:
                 pose = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
-                # No point of the ray is farther from its start than it reaches.
-                if wp.length(wp.transform_get_translation(pose) - start) <= surface.radius[e] + suction.reach:
-                    distance = cast_ray(start, way, suction.reach, pose, e, surface)
+                # Bounding-sphere test: no point of the ray is farther from its start than its reach.
+                if wp.length(wp.transform_get_translation(pose) - start) <= surface.radius[index] + suction.reach:
+                    distance = cast_ray(start, direction, suction.reach, pose, index, surface)
                     if distance >= 0.0 and (nearest < 0.0 or distance < nearest):
                         nearest = distance
                         hit = instance
         if hit >= 0:
             hits += 1
-            engaged_bits = engaged_bits | (wp.uint32(1) << wp.uint32(hit))
+            engaged = engaged | (wp.uint32(1) << wp.uint32(hit))
     hits_out[world] = hits
-    engaged_bits_out[world] = engaged_bits
+    engaged_bits_out[world] = engaged
 
 
 @wp.kernel
@@ -153,23 +157,23 @@ def engage_seals_kernel(
     pick: PickData,
     suction: SuctionData,
     # State:
-    phase: wp.array[int],
-    task: wp.array[int],
-    steps: wp.array[int],
-    body_slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
+    phase: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    steps: wp.array[int],  # (world)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
     # In:
-    hits: wp.array[int],
-    engaged_bits: wp.array[wp.uint32],
+    hits: wp.array[int],  # (world)
+    engaged_bits: wp.array[wp.uint32],  # (world)
     # Out:
-    attached_out: wp.array2d[int],
-    object_in_tcp_out: wp.array2d[wp.transform],
-    seal_force_out: wp.array2d[float],
-    break_force_out: wp.array[float],
+    attached_out: wp.array2d[int],  # (world, instance)
+    object_in_tcp_out: wp.array2d[wp.transform],  # (world, instance) [m]
+    seal_force_out: wp.array2d[float],  # (world, instance) [N]
+    break_force_out: wp.array[float],  # (world) [N]
 ):
-    """Where the suction begins: join every object that was engaged_bits to the tcp as it lies there, object_in_tcp = tcp⁻¹ object.
+    """Attach every engaged object where suction is switched on, at its current pose: object_in_tcp = tcp_in_world⁻¹ object_in_world.
 
-    The seals bear `good_force` if no more rays miss than are tolerated, else `poor_force`.
+    The break force is `good_force` if at most `tolerated_misses` rays miss, else `poor_force`; seal forces begin at 0.
     """
     world, instance = wp.tid()
     if not suction_begins(phase[world], task[world], steps[world], pick):
@@ -179,8 +183,8 @@ def engage_seals_kernel(
     if (engaged_bits[world] & (wp.uint32(1) << wp.uint32(instance))) == wp.uint32(0):
         return
     body = world * layout.bodies
-    tcp = tcp_pose(body_q[body + CUP], suction.tcp_offset)
-    pose = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
+    tcp_in_world = tcp_pose(body_q[body + CUP], suction.tcp_offset)
+    object_in_world = body_q[body + layout.gripper_bodies + body_slot[world, instance]]
     attached_out[world, instance] = 1
-    object_in_tcp_out[world, instance] = wp.transform_inverse(tcp) * pose
+    object_in_tcp_out[world, instance] = wp.transform_inverse(tcp_in_world) * object_in_world
     seal_force_out[world, instance] = 0.0

@@ -1,4 +1,4 @@
-"""When an episode ends."""
+"""Endings: decide when an episode is over, and whether it is delivered."""
 
 import warp as wp
 
@@ -21,16 +21,16 @@ def judge_tasks_kernel(
     move: MoveData,
     pick: PickData,
     # State:
-    phase: wp.array[int],
-    mode: wp.array[int],
-    catalog_index: wp.array2d[int],
-    waypoint: wp.array[int],
-    task: wp.array[int],
-    failures: wp.array[int],
+    phase: wp.array[int],  # (world)
+    mode: wp.array[int],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    waypoint: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    failures: wp.array[int],  # (world)
     # Out:
-    ending_out: wp.array[int],
+    ending_out: wp.array[int],  # (world)
 ):
-    """What an episode that goes well ends with: the gripper has been everywhere; no object is left; too many attempts have failed."""
+    """Write the `Ending` of episodes that complete: all waypoints reached, no object left, or too many failed attempts."""
     world = wp.tid()
     if phase[world] != Phase.ACT:
         return
@@ -52,7 +52,7 @@ def judge_tasks_kernel(
 
 @wp.func
 def is_finite(pose: wp.transform) -> bool:
-    """Whether a body's position is a number."""
+    """True if no coordinate of a body's position is infinite or NaN."""
     p = wp.transform_get_translation(pose)
     return wp.isfinite(p[0] + p[1] + p[2])
 
@@ -63,16 +63,20 @@ def judge_episodes_kernel(
     layout: LayoutData,
     settle: SettleData,
     # State:
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
-    solver_overflow: wp.array[wp.bool],
-    sight_overflow: wp.array[int],
-    progress: wp.array[wp.vec4i],
-    phase_inout: wp.array[int],
-    ending_inout: wp.array[int],
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+    solver_overflow: wp.array[wp.bool],  # (world)
+    perception_overflow: wp.array[int],  # (world)
+    progress: wp.array[wp.vec4i],  # (world) [ticks]
+    phase_inout: wp.array[int],  # (world)
+    ending_inout: wp.array[int],  # (world)
 ):
-    """End the episodes that have an ending, and those that failed: a failure counts for more."""
+    """Move worlds whose episode has an ending to phase OVER; failures override the endings of `judge_tasks_kernel`.
+
+    Failures, each overriding those before it: not settled in time, an overflow of contour points in perception, an overflow of
+    contacts or constraint rows in the solver, a pose that is not finite.
+    """
     world = wp.tid()
     phase = phase_inout[world]
     if phase != Phase.SETTLE and phase != Phase.ACT:
@@ -80,7 +84,7 @@ def judge_episodes_kernel(
     ending = ending_inout[world]
     if phase == Phase.SETTLE and (progress[world][0] >= settle.max_ticks or progress[world][2] > settle.max_redrops):
         ending = Ending.UNSETTLED
-    if sight_overflow[world] != 0:
+    if perception_overflow[world] != 0:
         ending = Ending.SIGHT_OVERFLOW
     if solver_overflow[world]:
         ending = Ending.SOLVER_OVERFLOW

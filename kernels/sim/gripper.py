@@ -1,4 +1,8 @@
-"""Where the gripper is to be: corners of the tote in turn when moving, a grasp and a lift when picking."""
+"""Gripper control: setpoint generation (tote corners, or approach and lift), impedance control, and the yaw of the shaft.
+
+The gripper is a vertical shaft ("finger" in settings and data sets) with three prismatic joints, and a suction cup that tilts about the
+wrist axis at the shaft's lower end. Setpoints are positions of the wrist; the TCP lies `tcp_offset` below it when the cup is upright.
+"""
 
 import warp as wp
 
@@ -8,13 +12,13 @@ from synpick_warp.kernels.structs import TILT, LayoutData, MoveData, PickData
 
 wp.set_module_options({"enable_backward": False})
 
-# The tote has four corners; each round visits all of them.
+# Waypoints of a round: the four corners of the tote.
 ROUND = wp.constant(4)
 
 
 @wp.func
 def tote_corner(code: int, corner: wp.vec3) -> wp.vec3:
-    """Corner 0 to 3: bit 0 is the sign of x, bit 1 that of y."""
+    """Corner 0 to 3 of the tote, mirrored from `corner` [m]: bit 0 of the code negates x, bit 1 negates y."""
     x = corner[0]
     y = corner[1]
     if (code & 1) == 1:
@@ -31,20 +35,20 @@ def begin_moving_kernel(
     layout: LayoutData,
     move: MoveData,
     # State:
-    arrangement_id: wp.array[wp.vec2i],
-    mode: wp.array[int],
-    phase: wp.array[int],
-    frame_inout: wp.array[int],
-    joint_q_inout: wp.array[float],
-    joint_qd_inout: wp.array[float],
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    mode: wp.array[int],  # (world)
+    phase: wp.array[int],  # (world)
+    frame_inout: wp.array[int],  # (world)
+    joint_q_inout: wp.array[float],  # (coord) [m, rad]
+    joint_qd_inout: wp.array[float],  # (dof) [m/s, rad/s]
     # Out:
-    corner_order_out: wp.array2d[int],
-    setpoint_out: wp.array[wp.vec3],
-    waypoint_out: wp.array[int],
+    corner_order_out: wp.array2d[int],  # (world, waypoint)
+    setpoint_out: wp.array[wp.vec3],  # (world) [m]
+    waypoint_out: wp.array[int],  # (world)
 ):
-    """Count frames. When a world of mode MOVE begins to act: draw the corner_order of the corners, put the gripper above the first.
+    """Count frames; in the first frame of mode MOVE, sample the order of the corners and place the gripper above the first one.
 
-    Each round is a Fisher-Yates shuffle of the four corners.
+    The order is a Fisher-Yates shuffle of the four corners for each round. `frame` is -1 outside of phase ACT, and counts from 0 in it.
     """
     world = wp.tid()
     if phase[world] != Phase.ACT:
@@ -71,7 +75,7 @@ def begin_moving_kernel(
 
 @wp.func
 def place_gripper(layout: LayoutData, world: int, position: wp.vec3, tilt: float, joint_q: wp.array[float], joint_qd: wp.array[float]):
-    """Put a world's gripper somewhere, at rest."""
+    """Write a world's gripper joints: wrist at `position` [m], cup at `tilt` [rad], velocities zero."""
     for axis in range(3):
         joint_q[world * layout.coords + axis] = position[axis]
     joint_q[world * layout.coords + TILT] = tilt
@@ -81,23 +85,23 @@ def place_gripper(layout: LayoutData, world: int, position: wp.vec3, tilt: float
 
 @wp.func
 def step_towards(setpoint: wp.vec3, target: wp.vec3, stride: float) -> wp.vec3:
-    """The setpoint, moved towards the target by a stride, and no farther than to it."""
-    way = target - setpoint
-    distance = wp.length(way)
+    """Setpoint moved by `stride` towards the target [m], without overshoot."""
+    direction = target - setpoint
+    distance = wp.length(direction)
     if distance <= stride:
         return target
-    return setpoint + way * (stride / distance)
+    return setpoint + direction * (stride / distance)
 
 
 @wp.func
 def task_setpoint(task: int, point: wp.vec3, normal: wp.vec3, pick: PickData, tcp_offset: float) -> wp.vec3:
-    """Where the tilt axis is to be at the end of a task [m]: so that the cup's tip is at the grasp point, before it, or above it."""
-    axis = point + tcp_offset * normal
+    """Wrist position at the end of a task [m]: with the TCP at the grasp point, before it (APPROACH), or above it (LIFT)."""
+    wrist = point + tcp_offset * normal
     if task == Task.APPROACH:
-        return axis + pick.near * normal
+        return wrist + pick.near * normal
     if task == Task.LIFT:
-        return axis + wp.vec3(0.0, 0.0, pick.lift_height)
-    return axis
+        return wrist + wp.vec3(0.0, 0.0, pick.lift_height)
+    return wrist
 
 
 @wp.kernel
@@ -106,20 +110,21 @@ def advance_setpoints_kernel(
     move: MoveData,
     pick: PickData,
     # State:
-    phase: wp.array[int],
-    mode: wp.array[int],
-    corner_order: wp.array2d[int],
-    point: wp.array[wp.vec3],
-    normal: wp.array[wp.vec3],
-    task_inout: wp.array[int],
-    steps_inout: wp.array[int],
-    waypoint_inout: wp.array[int],
-    setpoint_inout: wp.array[wp.vec3],
+    phase: wp.array[int],  # (world)
+    mode: wp.array[int],  # (world)
+    corner_order: wp.array2d[int],  # (world, waypoint)
+    point: wp.array[wp.vec3],  # (world) [m]
+    normal: wp.array[wp.vec3],  # (world)
+    task_inout: wp.array[int],  # (world)
+    steps_inout: wp.array[int],  # (world)
+    waypoint_inout: wp.array[int],  # (world)
+    setpoint_inout: wp.array[wp.vec3],  # (world) [m]
 ):
-    """Move the goals on by one step, at constant speed.
+    """Advance the setpoints by one step of physics, at constant speed.
 
-    Moving: towards the next corner. Picking: APPROACH to `near` before the grasp point, then DESCEND along the normal, then PRESS, where
-    it waits, as after a LIFT; these two are ended by the tick.
+    Mode MOVE: towards the next corner; a reached one increments `waypoint`. Picking: APPROACH to `near` before the grasp point, then
+    DESCEND along the normal, then PRESS without motion. The ends of PRESS and LIFT are detected once a tick, by
+    `tasks.advance_tasks_kernel`.
     """
     world = wp.tid()
     if phase[world] != Phase.ACT:
@@ -155,9 +160,9 @@ def advance_setpoints_kernel(
 def impedance_force(
     offset: wp.vec3, velocity: wp.vec3, stiffness: float, damping: float, max_force: float, mass: float, dt: float
 ) -> wp.vec3:
-    """Force of a spring-damper, implicit in the velocity, at most `max_force` in size.
+    """Impedance control: force of a spring-damper from position to setpoint, implicit in the velocity, clamped to a norm of `max_force`.
 
-    F = (k (x_goal - x - dt v) - d v) / (1 + (d dt + k dt²) / m): the force that k (x_goal - x') - d v' gives with the
+    F = (k (x_setpoint - x - dt v) - d v) / (1 + (d dt + k dt²) / m): the force that k (x_setpoint - x') - d v' gives with the
     velocity v' = v + dt F / m and position x' = x + dt v' at the end of the step. Stable for every mass.
     """
     force = (stiffness * (offset - dt * velocity) - damping * velocity) / (1.0 + (damping * dt + stiffness * dt * dt) / mass)
@@ -174,16 +179,19 @@ def drive_gripper_kernel(
     move: MoveData,
     pick: PickData,
     # State:
-    phase: wp.array[int],
-    mode: wp.array[int],
-    task: wp.array[int],
-    setpoint: wp.array[wp.vec3],
-    joint_q: wp.array[float],
-    joint_qd: wp.array[float],
+    phase: wp.array[int],  # (world)
+    mode: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    setpoint: wp.array[wp.vec3],  # (world) [m]
+    joint_q: wp.array[float],  # (coord) [m, rad]
+    joint_qd: wp.array[float],  # (dof) [m/s, rad/s]
     # Out:
-    joint_f_out: wp.array[float],
+    joint_f_out: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Pull the gripper after its setpoint: F = impedance + m g. At home it only bears its weight."""
+    """Write the gripper's joint forces: impedance control plus gravity compensation m g; without a task, gravity compensation only.
+
+    Of `joint_f`, the gripper's x, y, z and tilt are written; the tilt joint has a drive of its own and receives 0.
+    """
     world = wp.tid()
     q = world * layout.coords
     qd = world * layout.dofs
@@ -204,13 +212,16 @@ def drive_gripper_kernel(
 @wp.kernel
 def set_yaw_kernel(
     # Scene:
-    finger_joint: wp.array[int],
+    finger_joint: wp.array[int],  # (world)
     # In:
-    yaw: wp.array[float],
+    yaw: wp.array[float],  # (world) [rad]
     # Out:
-    joint_child_out: wp.array[wp.transform],
+    joint_child_out: wp.array[wp.transform],  # (joint) [m]
 ):
-    """Turn each finger by its yaw ψ about z against the axes of its joint: the joint's frame lies in the finger's at R_z(-ψ)."""
+    """Set the yaw ψ of every gripper shaft about z: the child frame of its joint is R_z(-ψ) in the shaft's frame.
+
+    Yaw is a property of the joint, not a degree of freedom, so that x, y and z of the joint stay the world's axes.
+    """
     world = wp.tid()
-    turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -yaw[world])
-    joint_child_out[finger_joint[world]] = wp.transform(wp.vec3(0.0, 0.0, 0.0), turn)
+    rotation = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), -yaw[world])
+    joint_child_out[finger_joint[world]] = wp.transform(wp.vec3(0.0, 0.0, 0.0), rotation)

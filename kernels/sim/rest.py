@@ -1,4 +1,4 @@
-"""Whether a world's pile is at rest, and what must be dropped again."""
+"""Settling: penetration and displacement of objects, re-drops, and the decision that a pile is at rest."""
 
 import warp as wp
 
@@ -9,29 +9,32 @@ from synpick_warp.kernels.structs import CatalogData, DropData, LayoutData, Sett
 
 wp.set_module_options({"enable_backward": False})
 
-# An object whose origin is lower than this has left the tote through its floor or beside it [m].
+# Height of an object's origin below which it has left the tote, through its floor or beside it [m].
 BELOW_FLOOR = wp.constant(-0.01)
-# Collision shapes that are to touch nothing are this much higher, above whatever falls [m].
+# Offset of collision shapes that must not touch anything: above whatever falls [m].
 SHAPES_AWAY = wp.constant(1000.0)
 
 
 @wp.kernel
 def measure_penetration_kernel(
     # State:
-    contact_count: wp.array[int],
-    shape0: wp.array[int],
-    shape1: wp.array[int],
-    point0: wp.array[wp.vec3],
-    point1: wp.array[wp.vec3],
-    normal: wp.array[wp.vec3],
-    margin0: wp.array[float],
-    margin1: wp.array[float],
-    shape_body: wp.array[int],
-    body_q: wp.array[wp.transform],
+    contact_count: wp.array[int],  # (one)
+    shape0: wp.array[int],  # (contact)
+    shape1: wp.array[int],  # (contact)
+    point0: wp.array[wp.vec3],  # (contact) [m]
+    point1: wp.array[wp.vec3],  # (contact) [m]
+    normal: wp.array[wp.vec3],  # (contact)
+    margin0: wp.array[float],  # (contact) [m]
+    margin1: wp.array[float],  # (contact) [m]
+    shape_body: wp.array[int],  # (shape)
+    body_q: wp.array[wp.transform],  # (body) [m]
     # Out:
-    penetration_out: wp.array[float],
+    penetration_out: wp.array[float],  # (body) [m]
 ):
-    """Deepest penetration of each body [m]: max over its contacts of margin_0 + margin_1 - n·(p_1 - p_0)."""
+    """Deepest penetration of each body [m]: max over its contacts of margin_0 + margin_1 - n·(p_1 - p_0).
+
+    One thread a contact; `penetration` must be cleared before.
+    """
     contact = wp.tid()
     if contact >= contact_count[0]:
         return
@@ -60,33 +63,33 @@ def measure_displacement_kernel(
     layout: LayoutData,
     catalog: CatalogData,
     # State:
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
-    previous_pose_inout: wp.array2d[wp.transform],
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+    previous_pose_inout: wp.array2d[wp.transform],  # (world, instance) [m]
     # Out:
-    displacement_out: wp.array2d[float],
+    displacement_out: wp.array2d[float],  # (world, instance) [m]
 ):
-    """How far any point of an object moved since the last tick, at most [m]: |Δp| + θ r, with the rotation's angle θ.
+    """Displacement of each object over the last tick [m]: the bound |Δp| + θ r on the motion of its points, with rotation angle θ.
 
-    Over a tick, not an instant: a solver that has not converged makes a pile buzz about its place without going anywhere.
+    r is the bounding radius. Over a tick instead of by velocity: a solver that has not converged makes a pile vibrate in place.
     """
     world, instance = wp.tid()
-    e = catalog_index[world, instance]
-    if e < 0:
+    index = catalog_index[world, instance]
+    if index < 0:
         return
     pose = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]
-    turn = wp.transform_inverse(previous_pose_inout[world, instance]) * pose
-    displacement = wp.length(wp.transform_get_translation(pose) - wp.transform_get_translation(previous_pose_inout[world, instance]))
-    q = wp.transform_get_rotation(turn)
+    relative = wp.transform_inverse(previous_pose_inout[world, instance]) * pose
+    distance = wp.length(wp.transform_get_translation(pose) - wp.transform_get_translation(previous_pose_inout[world, instance]))
+    q = wp.transform_get_rotation(relative)
     angle = 2.0 * wp.atan2(wp.length(wp.vec3(q[0], q[1], q[2])), wp.abs(q[3]))
-    displacement_out[world, instance] = displacement + angle * catalog.radius[e]
+    displacement_out[world, instance] = distance + angle * catalog.radius[index]
     previous_pose_inout[world, instance] = pose
 
 
 @wp.func
 def is_outside(position: wp.vec3, drop: DropData) -> bool:
-    """Whether an object's origin has left the tote."""
+    """True if an object's origin [m] lies below the floor, or beside the rim's opening and below the rim."""
     beside = wp.abs(position[0]) > 0.5 * drop.rim_length or wp.abs(position[1]) > 0.5 * drop.rim_width
     return position[2] < BELOW_FLOOR or (beside and position[2] < drop.rim_height)
 
@@ -100,21 +103,21 @@ def redrop_objects_kernel(
     drop: DropData,
     settle: SettleData,
     # State:
-    arrangement_id: wp.array[wp.vec2i],
-    phase: wp.array[int],
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
-    penetration: wp.array[float],
-    stuck_inout: wp.array2d[int],
-    progress_inout: wp.array[wp.vec4i],
-    joint_q_inout: wp.array[float],
-    joint_qd_inout: wp.array[float],
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    phase: wp.array[int],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+    penetration: wp.array[float],  # (body) [m]
+    stuck_inout: wp.array2d[int],  # (world, instance) [ticks]
+    progress_inout: wp.array[wp.vec4i],  # (world) [ticks]
+    joint_q_inout: wp.array[float],  # (coord) [m, rad]
+    joint_qd_inout: wp.array[float],  # (dof) [m/s, rad/s]
 ):
-    """Drop again what left the tote, or penetrates something deeply for some time, one above the other; guide walls come back.
+    """Drop objects again that left the tote or were stuck, that is, in deep penetration for longer than `stuck_ticks`.
 
-    `progress` holds ticks since the drop, ticks at rest, re-drops, and whether the guide walls stand. `arrangement_id` is (episode,
-    redraw).
+    They are stacked one above the other, and the guide walls return. `progress` holds ticks since the drop, ticks at rest, re-drops, and
+    whether the guide walls stand; `stuck` counts each instance's ticks in deep penetration.
     """
     world = wp.tid()
     if phase[world] != Phase.SETTLE:
@@ -124,18 +127,18 @@ def redrop_objects_kernel(
     height = drop.rim_height
     body = world * layout.bodies + layout.gripper_bodies
     for instance in range(layout.instances):
-        e = catalog_index[world, instance]
-        if e >= 0:
-            s = body_slot[world, instance]
+        index = catalog_index[world, instance]
+        if index >= 0:
+            slot = body_slot[world, instance]
             stuck = stuck_inout[world, instance] + 1
-            if penetration[body + s] < settle.stuck_depth:
+            if penetration[body + slot] < settle.stuck_depth:
                 stuck = 0
-            if stuck > settle.stuck_ticks or is_outside(wp.transform_get_translation(body_q[body + s]), drop):
+            if stuck > settle.stuck_ticks or is_outside(wp.transform_get_translation(body_q[body + slot]), drop):
                 stuck = 0
-                pose = drop_pose(key, progress[2], catalog.radius[e], height + catalog.radius[e], drop)
-                height += 2.0 * catalog.radius[e] + drop.clearance
-                q = world * layout.coords + layout.gripper_dofs + 7 * s
-                write_body(joint_q_inout, joint_qd_inout, q, world * layout.dofs + layout.gripper_dofs + 6 * s, pose)
+                pose = drop_pose(key, progress[2], catalog.radius[index], height + catalog.radius[index], drop)
+                height += 2.0 * catalog.radius[index] + drop.clearance
+                q = world * layout.coords + layout.gripper_dofs + 7 * slot
+                write_body(joint_q_inout, joint_qd_inout, q, world * layout.dofs + layout.gripper_dofs + 6 * slot, pose)
                 progress = wp.vec4i(progress[0], -1, progress[2] + 1, 1)
             stuck_inout[world, instance] = stuck
     progress_inout[world] = progress
@@ -147,14 +150,14 @@ def judge_rest_kernel(
     layout: LayoutData,
     settle: SettleData,
     # State:
-    catalog_index: wp.array2d[int],
-    displacement: wp.array2d[float],
-    phase_inout: wp.array[int],
-    progress_inout: wp.array[wp.vec4i],
+    catalog_index: wp.array2d[int],  # (world, instance)
+    displacement: wp.array2d[float],  # (world, instance) [m]
+    phase_inout: wp.array[int],  # (world)
+    progress_inout: wp.array[wp.vec4i],  # (world) [ticks]
 ):
-    """Count ticks at rest; after enough of them take the guide walls away, and after as many again let the gripper act.
+    """Count ticks at rest; after `rest_ticks` of them remove the guide walls, after as many again begin phase ACT.
 
-    Rest is no object moving by more than `rest_shift` in a tick; from `late_ticks` on, `last_shift` will do.
+    A pile is at rest if no object's displacement exceeds `rest_threshold`, or `relaxed_rest_threshold` after `late_ticks`.
     """
     world = wp.tid()
     if phase_inout[world] != Phase.SETTLE:
@@ -180,23 +183,23 @@ def judge_rest_kernel(
 @wp.kernel
 def flag_lost_pairs_kernel(
     # Scene:
-    room: int,
+    capacity: int,
     # State:
-    pair_count: wp.array[int],
+    pair_count: wp.array[int],  # (one)
     # Out:
-    overflow_out: wp.array[wp.bool],
+    overflow_out: wp.array[wp.bool],  # (world)
 ):
-    """Flag all worlds if the broad phase found more pairs of near shapes than it has room for: any world's may be lost."""
+    """Flag all worlds if the broad phase found more shape pairs than its capacity: pairs of any world may be lost."""
     world = wp.tid()
-    if pair_count[0] > room:
+    if pair_count[0] > capacity:
         overflow_out[world] = True
 
 
 @wp.func
 def shape_pose(collides: bool) -> wp.transform:
-    """Where on its body, or in its world, a collision shape is: in place, or far above, where it touches nothing.
+    """Local pose of a collision shape that can be disabled: identity, or far above, where it touches nothing.
 
-    Moved, not switched off: Newton's all-pairs broad phase reads a shape's collision flag when it is made, and never again.
+    Moved instead of disabled by its flag: Newton's all-pairs broad phase reads a shape's collision flag only once, when it is built.
     """
     height = SHAPES_AWAY
     if collides:
@@ -208,12 +211,12 @@ def shape_pose(collides: bool) -> wp.transform:
 def set_guides_kernel(
     # Scene:
     layout: LayoutData,
-    guide_shapes: wp.array[int],
+    guide_shapes: wp.array[int],  # (guide)
     # State:
-    progress: wp.array[wp.vec4i],
+    progress: wp.array[wp.vec4i],  # (world) [ticks]
     # Out:
-    shape_transform_out: wp.array[wp.transform],
+    shape_transform_out: wp.array[wp.transform],  # (shape) [m]
 ):
-    """Put the guide walls of each world in place, or far above."""
+    """Enable the guide walls of worlds whose `progress` says that they stand, and disable the others, by their shapes' poses."""
     world, guide = wp.tid()
     shape_transform_out[world * layout.shapes + guide_shapes[guide]] = shape_pose(progress[world][3] == 1)

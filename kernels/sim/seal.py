@@ -1,4 +1,13 @@
-"""What holds objects to the cup: seals, each a spring-damper that breaks, and contacts that it replaces."""
+"""Suction seals: breakable implicit spring-dampers between the cup and the attached objects, which replace contacts between the two.
+
+Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z_in_X`:
+
+- world: z up.
+- tcp: at the tool centre point (TCP), the centre of the cup's rim, with the cup's axes; +z points into the gripper, +y is the wrist axis.
+- object: the object's body frame.
+- grip: fixed to the object; coincides with tcp while the seal is at rest. `object_in_tcp`, stored when the seal engages, equals
+  `object_in_grip` ever after, hence `grip_in_world = object_in_world * inverse(object_in_tcp)`.
+"""
 
 import warp as wp
 
@@ -7,157 +16,166 @@ from synpick_warp.kernels.structs import TILT, LayoutData, SuctionData
 
 wp.set_module_options({"enable_backward": False})
 
-# A contact that is not to act is this far from touching [m]; stages.sim.physics makes the solver skip contacts far nearer than that.
+# Gap of a contact that must not act [m]; stages.sim.physics makes the solver skip contacts with far smaller gaps.
 APART = wp.constant(1.0)
 
 
 @wp.struct
 class InverseMass:
-    """How a unit wrench at the tcp accelerates a point and a frame there: a symmetric 6 x 6 matrix in blocks of 3 x 3."""
+    """Inverse effective mass at the TCP: the 6 x 6 matrix W with acceleration = W wrench, symmetric, in blocks of 3 x 3.
+
+    The operational-space inverse inertia J M⁻¹ Jᵀ (Khatib, 1987).
+    """
 
     linear: wp.mat33
-    """Acceleration of the point by a force [1/kg]."""
+    """Linear acceleration by a force [1/kg]."""
     mixed: wp.mat33
-    """Acceleration of the point by a torque; transposed, angular acceleration by a force [1/(kg·m)]."""
+    """Linear acceleration by a torque; transposed, angular acceleration by a force [1/(kg·m)]."""
     angular: wp.mat33
     """Angular acceleration by a torque [1/(kg·m²)]."""
 
 
 @wp.struct
 class RotationError:
-    """How far an object is turned from where it was grip_in_world, and what the seal has against it."""
+    """Elastic response of a seal to its rotation error: the rotation from the cup's axes to those of the grip frame."""
 
     torque: wp.vec3
-    """On the object, without damping [N·m]."""
+    """Elastic torque on the object, without damping, in the world's axes [N·m]."""
     stiffness: wp.mat33
-    """[N·m/rad]"""
+    """Derivative of the torque, negated [N·m/rad]."""
 
 
 @wp.struct
 class Wrench:
-    """On the object, at the tcp, in the world's axes."""
+    """Wrench on the object at the TCP, in the world's axes."""
 
     force: wp.vec3
+    """[N]"""
     torque: wp.vec3
+    """[N·m]"""
 
 
 @wp.func
-def object_inverse_mass(inverse_mass: float, inverse_inertia: wp.mat33, lever: wp.vec3) -> InverseMass:
-    """Of a free body at `lever` from its centre of mass, with the inverse inertia in the world's axes.
+def object_inverse_mass(inverse_mass: float, inverse_inertia: wp.mat33, arm: wp.vec3) -> InverseMass:
+    """Inverse effective mass of a free body at a point with moment arm r = `arm` [m] from its centre of mass.
 
-    A force F accelerates the point by F/m + (I⁻¹ (r x F)) x r, a torque T by (I⁻¹ T) x r.
+    A force F accelerates the point by F/m + (I⁻¹ (r x F)) x r, a torque T by (I⁻¹ T) x r. The inverse inertia is in the world's axes.
     """
-    cross = wp.skew(lever)
-    made = InverseMass()
-    made.mixed = -cross * inverse_inertia
-    made.linear = inverse_mass * wp.identity(n=3, dtype=float) + made.mixed * cross
-    made.angular = inverse_inertia
-    return made
+    cross = wp.skew(arm)
+    result = InverseMass()
+    result.mixed = -cross * inverse_inertia
+    result.linear = inverse_mass * wp.identity(n=3, dtype=float) + result.mixed * cross
+    result.angular = inverse_inertia
+    return result
 
 
 @wp.func
-def gripper_inverse_mass(suction: SuctionData, axis: wp.vec3, lever: wp.vec3, seals: int) -> InverseMass:
-    """Of an n-th of the gripper at `lever` from the tilt axis: it slides as a whole, and turns about the axis against its drive.
+def gripper_inverse_mass(suction: SuctionData, wrist_axis: wp.vec3, arm: wp.vec3, seals: int) -> InverseMass:
+    """Inverse effective mass of the gripper at `arm` [m] from the wrist, times the number of seals.
 
-    With n seals that pull at the same mass, each may reckon with an n-th of it. An approximation, which shapes how a seal swings in,
-    not what it bears: sliding and tilting are taken as independent.
+    The gripper translates as a whole and tilts about the wrist axis against its drive. With n seals that pull at the same mass, each
+    is given an n-th of it. An approximation that shapes how a seal's oscillation decays, not the force that it bears: translation and
+    tilt are taken as independent.
     """
-    way = wp.cross(axis, lever)
+    direction = wp.cross(wrist_axis, arm)
     slide = float(seals) / (suction.finger_mass + suction.cup_mass)
     tilt = float(seals) / suction.tilt_inertia
-    made = InverseMass()
-    made.linear = slide * wp.identity(n=3, dtype=float) + tilt * wp.outer(way, way)
-    made.mixed = tilt * wp.outer(way, axis)
-    made.angular = tilt * wp.outer(axis, axis)
-    return made
+    result = InverseMass()
+    result.linear = slide * wp.identity(n=3, dtype=float) + tilt * wp.outer(direction, direction)
+    result.mixed = tilt * wp.outer(direction, wrist_axis)
+    result.angular = tilt * wp.outer(wrist_axis, wrist_axis)
+    return result
 
 
 @wp.func
 def add_inverse_masses(a: InverseMass, b: InverseMass) -> InverseMass:
-    """Of one body against the other."""
-    made = InverseMass()
-    made.linear = a.linear + b.linear
-    made.mixed = a.mixed + b.mixed
-    made.angular = a.angular + b.angular
-    return made
+    """Inverse effective mass of the relative motion of two bodies."""
+    result = InverseMass()
+    result.linear = a.linear + b.linear
+    result.mixed = a.mixed + b.mixed
+    result.angular = a.angular + b.angular
+    return result
 
 
 @wp.func
-def rotation_error(cup: wp.quat, grip_in_world: wp.quat, suction: SuctionData) -> RotationError:
-    """Twist and swing of the frame in which the object was grip_in_world, against the cup's.
+def rotation_error(cup: wp.quat, grip: wp.quat, suction: SuctionData) -> RotationError:
+    """Swing-twist decomposition of the rotation from the cup's axes to those of the grip frame, and the elastic torque against it.
 
     With the relative rotation q: twist φ = 2 atan2(q_z, q_w) about the cup's axis z; swing θ between z and the turned z', about
-    n = z x z' / |z x z'|. Torque -k_twist φ z - k_swing (θ - break_force) n, the latter beyond the break_force only.
+    n = z x z' / |z x z'|. Torque -k_twist φ z - k_swing (θ - limit) n, the latter beyond the limit only. Both rotations lead to the world.
     """
-    relative = wp.quat_inverse(cup) * grip_in_world
+    relative = wp.quat_inverse(cup) * grip
     if relative[3] < 0.0:
         relative = -relative
     axis = wp.quat_rotate(cup, wp.vec3(0.0, 0.0, 1.0))
-    made = RotationError()
-    made.torque = -suction.twist_stiffness * 2.0 * wp.atan2(relative[2], relative[3]) * axis
-    made.stiffness = suction.twist_stiffness * wp.outer(axis, axis)
+    result = RotationError()
+    result.torque = -suction.twist_stiffness * 2.0 * wp.atan2(relative[2], relative[3]) * axis
+    result.stiffness = suction.twist_stiffness * wp.outer(axis, axis)
     turned = wp.quat_rotate(relative, wp.vec3(0.0, 0.0, 1.0))
     sine = wp.sqrt(turned[0] * turned[0] + turned[1] * turned[1])
     beyond = wp.atan2(sine, turned[2]) - suction.swing_limit
     if beyond > 0.0 and sine > 0.0:
         normal = wp.quat_rotate(cup, wp.vec3(-turned[1] / sine, turned[0] / sine, 0.0))
-        made.torque = made.torque - suction.swing_stiffness * beyond * normal
-        made.stiffness = made.stiffness + suction.swing_stiffness * wp.outer(normal, normal)
-    return made
+        result.torque = result.torque - suction.swing_stiffness * beyond * normal
+        result.stiffness = result.stiffness + suction.swing_stiffness * wp.outer(normal, normal)
+    return result
 
 
 @wp.func
 def seal_wrench(
-    offset: wp.vec3, turn: RotationError, velocity: wp.vec3, spin: wp.vec3, response: InverseMass, suction: SuctionData
+    offset: wp.vec3, error: RotationError, velocity: wp.vec3, angular_velocity: wp.vec3, inverse_mass: InverseMass, suction: SuctionData
 ) -> Wrench:
     """Wrench w on the object of a spring-damper that is implicit in offset and velocity at the end of the step h.
 
-    w = K (e + h u') + D u' with u' = u - h W w, hence (1 + h (h K + D) W) w = K e + (h K + D) u. Offset e and velocity u are the tcp's
-    against the object's point and frame there, W is the sum of both responses. Stable for every mass, stiffness and damping.
+    w = K (e + h u') + D u' with u' = u - h W w, hence (1 + h (h K + D) W) w = K e + (h K + D) u. Offset e and velocity u are those of the
+    tcp frame relative to the grip frame, W is the sum of both inverse effective masses. Stable for every mass, stiffness and damping.
     """
     h = suction.step
     one = wp.identity(n=3, dtype=float)
-    pull = h * suction.stiffness + suction.damping
-    hold = h * turn.stiffness + suction.twist_damping * one
-    force = suction.stiffness * offset + pull * velocity
-    torque = turn.torque + hold * spin
-    # Blocks of the 6 x 6 system, solved for the torque first.
-    upper = wp.inverse(one + (h * pull) * response.linear)
-    right = (h * pull) * response.mixed
-    left = h * hold * wp.transpose(response.mixed) * upper
-    lower = one + h * hold * response.angular - left * right
-    made = Wrench()
-    made.torque = wp.inverse(lower) * (torque - left * force)
-    made.force = upper * (force - right * made.torque)
-    return made
+    linear_gain = h * suction.stiffness + suction.damping
+    angular_gain = h * error.stiffness + suction.twist_damping * one
+    force = suction.stiffness * offset + linear_gain * velocity
+    torque = error.torque + angular_gain * angular_velocity
+    # Blocks of the 6 x 6 system, solved for the torque first (Schur complement).
+    upper = wp.inverse(one + (h * linear_gain) * inverse_mass.linear)
+    right = (h * linear_gain) * inverse_mass.mixed
+    left = h * angular_gain * wp.transpose(inverse_mass.mixed) * upper
+    lower = one + h * angular_gain * inverse_mass.angular - left * right
+    result = Wrench()
+    result.torque = wp.inverse(lower) * (torque - left * force)
+    result.force = upper * (force - right * result.torque)
+    return result
 
 
 @wp.func
 def tension_and_shear(force: wp.vec3, axis: wp.vec3) -> float:
-    """Tension and shear [N]: size of the force on the object without the part that presses it against the cup."""
+    """Seal force [N] that is compared with the break force: norm of the force on the object without compression along the cup's axis."""
     return wp.length(force - wp.min(wp.dot(force, axis), 0.0) * axis)
 
 
 @wp.func
-def release_seal(attached: wp.array2d[int], joint_f: wp.array[float], world: int, instance: int, first_dof: int):
-    """Let go of an instance whose six degrees of freedom begin at `first_dof`."""
+def break_seal(attached: wp.array2d[int], joint_f: wp.array[float], world: int, instance: int, first_dof: int):
+    """Detach an instance and clear the joint forces of its six degrees of freedom, which begin at `first_dof`."""
     attached[world, instance] = 0
     for axis in range(6):
         joint_f[first_dof + axis] = 0.0
 
 
 @wp.func
-def apply_wrench(wrench: Wrench, arm: wp.vec3, lever: wp.vec3, hinge: wp.vec3, joint_f: wp.array[float], gripper: int, first: int):
-    """Write a wrench at the tcp to the object's degrees of freedom from `first`, and add the opposite to the gripper's.
+def apply_wrench(
+    wrench: Wrench, object_arm: wp.vec3, wrist_arm: wp.vec3, wrist_axis: wp.vec3, joint_f: wp.array[float], gripper_dof: int, first_dof: int
+):
+    """Write a wrench at the TCP to the object's six joint forces, and subtract it from the gripper's four: x, y, z and tilt.
 
-    `arm` leads to the tcp from the object's centre of mass, `lever` from the tilt axis. What would turn the finger its joint bears.
+    The moment arms lead to the TCP, from the object's centre of mass and from the wrist [m]. The torque about other axes than the
+    wrist's is borne by the gripper's joint.
     """
-    torque = wrench.torque + wp.cross(arm, wrench.force)
+    torque = wrench.torque + wp.cross(object_arm, wrench.force)
     for axis in range(3):
-        joint_f[first + axis] = wrench.force[axis]
-        joint_f[first + 3 + axis] = torque[axis]
-        joint_f[gripper + axis] = joint_f[gripper + axis] - wrench.force[axis]
-    joint_f[gripper + TILT] = joint_f[gripper + TILT] - wp.dot(hinge, wrench.torque + wp.cross(lever, wrench.force))
+        joint_f[first_dof + axis] = wrench.force[axis]
+        joint_f[first_dof + 3 + axis] = torque[axis]
+        joint_f[gripper_dof + axis] = joint_f[gripper_dof + axis] - wrench.force[axis]
+    joint_f[gripper_dof + TILT] = joint_f[gripper_dof + TILT] - wp.dot(wrist_axis, wrench.torque + wp.cross(wrist_arm, wrench.force))
 
 
 @wp.kernel
@@ -165,21 +183,25 @@ def apply_seal_forces_kernel(
     # Scene:
     layout: LayoutData,
     suction: SuctionData,
-    body_com: wp.array[wp.vec3],
-    body_inv_mass: wp.array[float],
-    body_inv_inertia: wp.array[wp.mat33],
+    body_com: wp.array[wp.vec3],  # (body) [m]
+    body_inv_mass: wp.array[float],  # (body) [1/kg]
+    body_inv_inertia: wp.array[wp.mat33],  # (body) [1/(kg·m²)]
     # State:
-    body_slot: wp.array2d[int],
-    object_in_tcp: wp.array2d[wp.transform],
-    break_force: wp.array[float],
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
-    attached_inout: wp.array2d[int],
-    seal_force_inout: wp.array2d[float],
-    peak_force_inout: wp.array[float],
-    joint_f_inout: wp.array[float],
+    body_slot: wp.array2d[int],  # (world, instance)
+    object_in_tcp: wp.array2d[wp.transform],  # (world, instance) [m]
+    break_force: wp.array[float],  # (world) [N]
+    body_q: wp.array[wp.transform],  # (body) [m]
+    body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
+    attached_inout: wp.array2d[int],  # (world, instance)
+    seal_force_inout: wp.array2d[float],  # (world, instance) [N]
+    peak_force_inout: wp.array[float],  # (world) [N]
+    joint_f_inout: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Wrench of every seal on its object, and the opposite on the gripper; a seal whose force exceeds the break force breaks instead."""
+    """Apply every seal's wrench to its object and the opposite to the gripper; break seals whose force exceeds the break force.
+
+    `seal_force` receives this step's force of each seal, that of a breaking one included, and 0 without a seal; `peak_force` its
+    maximum over seals and steps since it was cleared.
+    """
     world = wp.tid()
     seals = int(0)
     for instance in range(layout.instances):
@@ -188,69 +210,76 @@ def apply_seal_forces_kernel(
     if seals == 0:
         return
     cup = world * layout.bodies + CUP
-    tcp = tcp_pose(body_q[cup], suction.tcp_offset)
-    place = wp.transform_get_translation(tcp)
-    axis = wp.transform_vector(tcp, wp.vec3(0.0, 0.0, 1.0))
-    hinge = wp.transform_vector(tcp, wp.vec3(0.0, 1.0, 0.0))
-    lever = place - wp.transform_get_translation(body_q[cup])
-    spin = wp.spatial_bottom(body_qd[cup])
-    velocity = wp.spatial_top(body_qd[cup]) + wp.cross(spin, place - wp.transform_point(body_q[cup], body_com[cup]))
-    gripper = gripper_inverse_mass(suction, hinge, lever, seals)
-    dof = world * layout.dofs
+    tcp_in_world = tcp_pose(body_q[cup], suction.tcp_offset)
+    tcp = wp.transform_get_translation(tcp_in_world)
+    cup_axis = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, 1.0))
+    wrist_axis = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 1.0, 0.0))
+    wrist_arm = tcp - wp.transform_get_translation(body_q[cup])
+    angular_velocity = wp.spatial_bottom(body_qd[cup])
+    velocity = wp.spatial_top(body_qd[cup]) + wp.cross(angular_velocity, tcp - wp.transform_point(body_q[cup], body_com[cup]))
+    gripper_inverse = gripper_inverse_mass(suction, wrist_axis, wrist_arm, seals)
+    gripper_dof = world * layout.dofs
     for instance in range(layout.instances):
         if attached_inout[world, instance] != 0:
-            s = body_slot[world, instance]
-            body = world * layout.bodies + layout.gripper_bodies + s
+            slot = body_slot[world, instance]
+            body = world * layout.bodies + layout.gripper_bodies + slot
             grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
-            arm = place - wp.transform_point(body_q[body], body_com[body])
-            turned = wp.quat_to_matrix(wp.transform_get_rotation(body_q[body]))
-            own = object_inverse_mass(body_inv_mass[body], turned * body_inv_inertia[body] * wp.transpose(turned), arm)
-            rate = wp.spatial_bottom(body_qd[body])
-            slip = velocity - wp.spatial_top(body_qd[body]) - wp.cross(rate, arm)
-            turn = rotation_error(wp.transform_get_rotation(tcp), wp.transform_get_rotation(grip_in_world), suction)
-            wrench = seal_wrench(
-                place - wp.transform_get_translation(grip_in_world), turn, slip, spin - rate, add_inverse_masses(own, gripper), suction
+            object_arm = tcp - wp.transform_point(body_q[body], body_com[body])
+            rotation = wp.quat_to_matrix(wp.transform_get_rotation(body_q[body]))
+            object_inverse = object_inverse_mass(
+                body_inv_mass[body], rotation * body_inv_inertia[body] * wp.transpose(rotation), object_arm
             )
-            seal_force = tension_and_shear(wrench.force, axis)
-            first = dof + layout.gripper_dofs + 6 * s
-            seal_force_inout[world, instance] = seal_force
-            peak_force_inout[world] = wp.max(peak_force_inout[world], seal_force)
-            if seal_force > break_force[world]:
-                release_seal(attached_inout, joint_f_inout, world, instance, first)
+            object_angular_velocity = wp.spatial_bottom(body_qd[body])
+            slip = velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_angular_velocity, object_arm)
+            error = rotation_error(wp.transform_get_rotation(tcp_in_world), wp.transform_get_rotation(grip_in_world), suction)
+            wrench = seal_wrench(
+                tcp - wp.transform_get_translation(grip_in_world),
+                error,
+                slip,
+                angular_velocity - object_angular_velocity,
+                add_inverse_masses(object_inverse, gripper_inverse),
+                suction,
+            )
+            force = tension_and_shear(wrench.force, cup_axis)
+            first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
+            seal_force_inout[world, instance] = force
+            peak_force_inout[world] = wp.max(peak_force_inout[world], force)
+            if force > break_force[world]:
+                break_seal(attached_inout, joint_f_inout, world, instance, first_dof)
             else:
-                apply_wrench(wrench, arm, lever, hinge, joint_f_inout, dof, first)
+                apply_wrench(wrench, object_arm, wrist_arm, wrist_axis, joint_f_inout, gripper_dof, first_dof)
 
 
 @wp.func
 def is_attached(layout: LayoutData, world: int, body: int, body_slot: wp.array2d[int], attached: wp.array2d[int]) -> bool:
-    """Whether a seal holds the body, which is not the gripper's."""
-    found = bool(False)
-    s = body - world * layout.bodies - layout.gripper_bodies
+    """True if a seal holds the body, which must not be the gripper's."""
+    result = bool(False)
+    slot = body - world * layout.bodies - layout.gripper_bodies
     for instance in range(layout.instances):
-        if attached[world, instance] != 0 and body_slot[world, instance] == s:
-            found = True
-    return found
+        if attached[world, instance] != 0 and body_slot[world, instance] == slot:
+            result = True
+    return result
 
 
 @wp.kernel
 def ignore_attached_contacts_kernel(
     # Scene:
     layout: LayoutData,
-    shape_body: wp.array[int],
+    shape_body: wp.array[int],  # (shape)
     # State:
-    contact_count: wp.array[int],
-    body_slot: wp.array2d[int],
-    attached: wp.array2d[int],
-    shape0: wp.array[int],
-    shape1: wp.array[int],
+    contact_count: wp.array[int],  # (one)
+    body_slot: wp.array2d[int],  # (world, instance)
+    attached: wp.array2d[int],  # (world, instance)
+    shape0: wp.array[int],  # (contact)
+    shape1: wp.array[int],  # (contact)
     # Out:
-    margin_out: wp.array[float],
+    margin_out: wp.array[float],  # (contact) [m]
 ):
-    """Pull contacts of a cup with what is_attached on it so far apart that the solver makes no rows for them: they would fight the seal.
+    """Disable contacts between a cup and its attached objects, which would fight the seal: set their margin to -APART.
 
-    The collision pipeline writes all margins anew each time, and has by then kept what it matches the next contacts with. Taking the
-    shapes away instead would make one pair of bodies of all such contacts of all worlds, and the solver's time grows with a pair's
-    square.
+    The solver makes no constraint rows for contacts that far apart. The collision pipeline writes all margins anew each time, after it
+    has stored what it matches the next step's contacts with. Disabling the shapes instead would put all such contacts of all worlds
+    into one pair of bodies, and the solver's time grows with the square of a pair's contacts.
     """
     contact = wp.tid()
     if contact >= contact_count[0] or shape0[contact] < 0 or shape1[contact] < 0:

@@ -1,4 +1,4 @@
-"""What leaves a tick: the snapshot for pictures and a few numbers a world for the host."""
+"""Output of a tick: the snapshot for rendering, the previous frame's poses, and the status rows that the host reads."""
 
 import warp as wp
 
@@ -14,26 +14,27 @@ def take_snapshot_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    phase: wp.array[int],
-    ending: wp.array[int],
-    arrangement_id: wp.array[wp.vec2i],
-    frame: wp.array[int],
-    task: wp.array[int],
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
+    phase: wp.array[int],  # (world)
+    ending: wp.array[int],  # (world)
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    frame: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
     # Out:
-    live_out: wp.array[int],
-    episode_out: wp.array[int],
-    frame_out: wp.array[int],
-    catalog_index_out: wp.array2d[int],
-    pose_out: wp.array2d[wp.transform],
-    fixture_pose_out: wp.array2d[wp.transform],
-    fixture_visible_out: wp.array2d[int],
+    live_out: wp.array[int],  # (world)
+    episode_out: wp.array[int],  # (world)
+    frame_out: wp.array[int],  # (world)
+    catalog_index_out: wp.array2d[int],  # (world, instance)
+    pose_out: wp.array2d[wp.transform],  # (world, instance) [m]
+    fixture_pose_out: wp.array2d[wp.transform],  # (world, fixture) [m]
+    fixture_visible_out: wp.array2d[int],  # (world, fixture)
 ):
-    """Copy what pictures need. A tick is a frame while the gripper acts, and once more when it has finished.
+    """Copy episode, frame, catalog indices and poses of objects and fixtures into the snapshot.
 
-    The gripper is not in the picture while it LOOKs: it then waits at home.
+    `live` is 1 if the tick is a frame: in phase ACT, and in the tick in which a delivered episode ends. The gripper is invisible during
+    task LOOK, while it waits at home. Fixtures are tote, gripper shaft ("finger") and cup.
     """
     world = wp.tid()
     live = int(0)
@@ -57,17 +58,22 @@ def take_snapshot_kernel(
 
 @wp.struct
 class FramePoses:
-    """What a frame must tell the next one: parts of a snapshot."""
+    """Part of a snapshot that the next one repeats as its previous frame; members as in `stages.buffers.LastFrame`."""
 
     live: wp.array[int]
+    """(world): 1 if the tick is a frame."""
     episode: wp.array[int]
+    """(world): episode index."""
     frame: wp.array[int]
+    """(world): frame index in the episode."""
     catalog_index: wp.array2d[int]
+    """(world, instance): object of each instance; -1: none."""
     pose: wp.array2d[wp.transform]
-    """Object to world [m]."""
+    """(world, instance): object to world [m]."""
     fixture_pose: wp.array2d[wp.transform]
-    """Fixture to world [m]."""
+    """(world, fixture): fixture to world [m]."""
     fixture_visible: wp.array2d[int]
+    """(world, fixture): 0 if it is not rendered."""
 
 
 @wp.kernel
@@ -76,15 +82,15 @@ def link_frames_kernel(
     now: FramePoses,
     # Out:
     last_inout: FramePoses,
-    follows_out: wp.array[int],
-    catalog_index_out: wp.array2d[int],
-    pose_out: wp.array2d[wp.transform],
-    fixture_pose_out: wp.array2d[wp.transform],
-    fixture_visible_out: wp.array2d[int],
+    follows_out: wp.array[int],  # (world)
+    catalog_index_out: wp.array2d[int],  # (world, instance)
+    pose_out: wp.array2d[wp.transform],  # (world, instance) [m]
+    fixture_pose_out: wp.array2d[wp.transform],  # (world, fixture) [m]
+    fixture_visible_out: wp.array2d[int],  # (world, fixture)
 ):
-    """Put the last tick's poses beside this one's, and keep these for the next.
+    """Copy the last tick's poses into this snapshot as its previous frame, for optical and scene flow, then store this tick's.
 
-    A frame follows the last one if that was the frame before it in the same episode: an episode's first frame follows none.
+    `follows` is 1 if the last tick was the preceding frame of the same episode; the first frame of an episode follows none.
     """
     world = wp.tid()
     follows = int(0)
@@ -110,25 +116,25 @@ def link_frames_kernel(
 @wp.kernel
 def pack_status_kernel(
     # State:
-    live: wp.array[int],
-    phase: wp.array[int],
-    ending: wp.array[int],
-    arrangement_id: wp.array[wp.vec2i],
-    frame: wp.array[int],
-    mode: wp.array[int],
-    task: wp.array[int],
-    attempt: wp.array[int],
-    outcome: wp.array[int],
-    target: wp.array[int],
-    hits: wp.array[int],
-    engaged_bits: wp.array[wp.uint32],
-    attached_bits: wp.array[wp.uint32],
-    peak_force: wp.array[float],
+    live: wp.array[int],  # (world)
+    phase: wp.array[int],  # (world)
+    ending: wp.array[int],  # (world)
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    frame: wp.array[int],  # (world)
+    mode: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    attempt: wp.array[int],  # (world)
+    outcome: wp.array[int],  # (world)
+    target: wp.array[int],  # (world)
+    hits: wp.array[int],  # (world)
+    engaged_bits: wp.array[wp.uint32],  # (world)
+    attached_bits: wp.array[wp.uint32],  # (world)
+    peak_force: wp.array[float],  # (world) [N]
     # Out:
-    status_out: wp.array2d[int],
-    measure_out: wp.array2d[float],
+    status_out: wp.array2d[int],  # (world, status)
+    measure_out: wp.array2d[float],  # (world, measure)
 ):
-    """Gather the few numbers of each world that the host reads."""
+    """Pack the columns of `Status` and `Measure` of each world, which the host reads after each tick."""
     world = wp.tid()
     status_out[world, Status.PHASE] = phase[world]
     status_out[world, Status.ENDING] = ending[world]

@@ -1,4 +1,7 @@
-"""What physics does in every step, written down for trajectories."""
+"""Step log: poses, velocities, contact and seal forces of every physics step, for trajectories.
+
+A "place" is an instance; the gripper shaft and the cup follow the instances.
+"""
 
 import warp as wp
 
@@ -7,16 +10,16 @@ from synpick_warp.kernels.structs import LayoutData
 
 wp.set_module_options({"enable_backward": False})
 
-# Counts of a newton in sums of contact forces: integers, so that no corner_order of threads changes a sum. A count is 1 µN, the largest sum
+# Fixed-point scale of sums of contact forces: integer sums do not depend on the order of threads. A count is 1 µN, the largest sum
 # 9e12 N.
 COUNTS_PER_NEWTON = wp.constant(1048576.0)
-# Columns of these sums: the vector's x, y and z, then the sizes.
+# Column of these sums with the sum of magnitudes; columns 0 to 2 hold the vector sum.
 MAGNITUDE = wp.constant(3)
 
 
 @wp.func
 def body_of(layout: LayoutData, world: int, place: int, catalog_index: wp.array2d[int], body_slot: wp.array2d[int]) -> int:
-    """Index of the body in a place of a record: of an instance, or after these of the finger and the cup; -1: no such instance."""
+    """Body index of a place: of an instance, then of the gripper shaft and the cup; -1: no such instance."""
     if place >= layout.instances:
         return world * layout.bodies + place - layout.instances
     if catalog_index[world, place] < 0:
@@ -26,7 +29,7 @@ def body_of(layout: LayoutData, world: int, place: int, catalog_index: wp.array2
 
 @wp.func
 def add_force(body: int, force: wp.vec3, total: wp.array2d[wp.int64]):
-    """Add a contact's force [N] to a body's sums."""
+    """Add a contact force [N] to a body's fixed-point sums."""
     for axis in range(3):
         wp.atomic_add(total, body, axis, wp.int64(wp.rint(force[axis] * COUNTS_PER_NEWTON)))
     wp.atomic_add(total, body, MAGNITUDE, wp.int64(wp.rint(wp.length(force) * COUNTS_PER_NEWTON)))
@@ -35,17 +38,17 @@ def add_force(body: int, force: wp.vec3, total: wp.array2d[wp.int64]):
 @wp.kernel
 def sum_contacts_kernel(
     # Scene:
-    shape_body: wp.array[int],
+    shape_body: wp.array[int],  # (shape)
     # State:
-    contact_count: wp.array[int],
-    shape0: wp.array[int],
-    shape1: wp.array[int],
+    contact_count: wp.array[int],  # (one)
+    shape0: wp.array[int],  # (contact)
+    shape1: wp.array[int],  # (contact)
     # In:
-    contact_force: wp.array[wp.spatial_vector],
+    contact_force: wp.array[wp.spatial_vector],  # (contact) [N, N·m]
     # Out:
-    total_inout: wp.array2d[wp.int64],
+    total_inout: wp.array2d[wp.int64],  # (body, column)
 ):
-    """Add the force of each contact, which is that on its first shape, to the sums of the one body and its opposite to the other's."""
+    """Sum contact forces by body: each contact's force acts on its first shape, the opposite on the second. One thread a contact."""
     contact = wp.tid()
     if contact >= contact_count[0]:
         return
@@ -67,11 +70,11 @@ def save_impedance_force_kernel(
     layout: LayoutData,
     weight: float,
     # State:
-    joint_f: wp.array[float],
+    joint_f: wp.array[float],  # (dof) [N, N·m]
     # Out:
-    force_out: wp.array[wp.vec3],
+    force_out: wp.array[wp.vec3],  # (world) [N]
 ):
-    """The force that draws the gripper to its setpoint, before the seals add theirs: what acts on it but for the weight it bears."""
+    """Save the gripper's impedance force [N], before seal forces are added: its joint forces without gravity compensation."""
     world = wp.tid()
     first = world * layout.dofs
     force_out[world] = wp.vec3(joint_f[first], joint_f[first + 1], joint_f[first + 2] - weight)
@@ -83,27 +86,27 @@ def record_motion_kernel(
     layout: LayoutData,
     step: int,
     # State:
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
-    body_qd: wp.array[wp.spatial_vector],
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
+    body_qd: wp.array[wp.spatial_vector],  # (body) [m/s, rad/s]
     # Out:
-    pose_out: wp.array3d[wp.transform],
-    velocity_out: wp.array3d[wp.vec3],
-    spin_out: wp.array3d[wp.vec3],
+    pose_out: wp.array3d[wp.transform],  # (world, step, place) [m]
+    velocity_out: wp.array3d[wp.vec3],  # (world, step, place) [m/s]
+    angular_velocity_out: wp.array3d[wp.vec3],  # (world, step, place) [rad/s]
 ):
-    """Where objects, finger and cup are at the end of a step, and how they move; NaN for an instance that is not in the scene."""
+    """Record poses and velocities of objects, gripper shaft and cup at the end of a step; NaN for instances that are not in the scene."""
     world, place = wp.tid()
     body = body_of(layout, world, place, catalog_index, body_slot)
     if body < 0:
-        nothing = wp.vec3(wp.nan, wp.nan, wp.nan)
-        pose_out[world, step, place] = wp.transform(nothing, wp.quat(wp.nan, wp.nan, wp.nan, wp.nan))
-        velocity_out[world, step, place] = nothing
-        spin_out[world, step, place] = nothing
+        unknown = wp.vec3(wp.nan, wp.nan, wp.nan)
+        pose_out[world, step, place] = wp.transform(unknown, wp.quat(wp.nan, wp.nan, wp.nan, wp.nan))
+        velocity_out[world, step, place] = unknown
+        angular_velocity_out[world, step, place] = unknown
         return
     pose_out[world, step, place] = body_q[body]
     velocity_out[world, step, place] = wp.spatial_top(body_qd[body])
-    spin_out[world, step, place] = wp.spatial_bottom(body_qd[body])
+    angular_velocity_out[world, step, place] = wp.spatial_bottom(body_qd[body])
 
 
 @wp.kernel
@@ -111,42 +114,44 @@ def record_forces_kernel(
     # Scene:
     layout: LayoutData,
     step: int,
-    share: float,
+    substep_fraction: float,
     # State:
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    attached: wp.array2d[int],
-    seal_force: wp.array2d[float],
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    attached: wp.array2d[int],  # (world, instance)
+    seal_force: wp.array2d[float],  # (world, instance) [N]
     # In:
-    total: wp.array2d[wp.int64],
+    total: wp.array2d[wp.int64],  # (body, column)
     # Out:
-    contact_force_out: wp.array3d[wp.vec3],
-    contact_load_out: wp.array3d[float],
-    seal_force_out: wp.array3d[float],
-    attached_out: wp.array3d[wp.uint8],
+    contact_force_out: wp.array3d[wp.vec3],  # (world, step, place) [N]
+    contact_load_out: wp.array3d[float],  # (world, step, place) [N]
+    seal_force_out: wp.array3d[float],  # (world, step, instance) [N]
+    attached_out: wp.array3d[wp.uint8],  # (world, step, instance)
 ):
-    """What acted on objects, finger and cup in a step; NaN for an instance that is not in the scene.
+    """Record contact and seal forces of a step; NaN for instances that are not in the scene.
 
-    Contact forces are a mean over the step's solver steps, whose forces were summed: `share` is 1 / their number.
+    `contact_force` receives the vector sum over a body's contacts, `contact_load` the sum of magnitudes; both are means over the
+    solver's substeps, whose forces `total` sums: `substep_fraction` is 1 / substeps. `attached` receives 1 if a seal holds the instance
+    at the step's end.
     """
     world, place = wp.tid()
     body = body_of(layout, world, place, catalog_index, body_slot)
     force = wp.vec3(wp.nan, wp.nan, wp.nan)
-    size = float(wp.nan)
+    magnitude = float(wp.nan)
     if body >= 0:
-        scale = share / COUNTS_PER_NEWTON
+        scale = substep_fraction / COUNTS_PER_NEWTON
         force = wp.vec3(scale * float(total[body, 0]), scale * float(total[body, 1]), scale * float(total[body, 2]))
-        size = scale * float(total[body, MAGNITUDE])
+        magnitude = scale * float(total[body, MAGNITUDE])
     contact_force_out[world, step, place] = force
-    contact_load_out[world, step, place] = size
+    contact_load_out[world, step, place] = magnitude
     if place < layout.instances:
-        bears = float(wp.nan)
-        hangs = int(0)
+        seal = float(wp.nan)
+        holds = int(0)
         if body >= 0:
-            bears = seal_force[world, place]
-            hangs = attached[world, place]
-        seal_force_out[world, step, place] = bears
-        attached_out[world, step, place] = wp.uint8(hangs)
+            seal = seal_force[world, place]
+            holds = attached[world, place]
+        seal_force_out[world, step, place] = seal
+        attached_out[world, step, place] = wp.uint8(holds)
 
 
 @wp.kernel
@@ -154,28 +159,28 @@ def record_gripper_kernel(
     # Scene:
     step: int,
     # State:
-    phase: wp.array[int],
-    mode: wp.array[int],
-    task: wp.array[int],
-    setpoint: wp.array[wp.vec3],
+    phase: wp.array[int],  # (world)
+    mode: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    setpoint: wp.array[wp.vec3],  # (world) [m]
     # In:
-    force: wp.array[wp.vec3],
+    force: wp.array[wp.vec3],  # (world) [N]
     # Out:
-    setpoint_out: wp.array2d[wp.vec3],
-    force_out: wp.array2d[wp.vec3],
-    task_out: wp.array2d[wp.int8],
+    setpoint_out: wp.array2d[wp.vec3],  # (world, step) [m]
+    force_out: wp.array2d[wp.vec3],  # (world, step) [N]
+    task_out: wp.array2d[wp.int8],  # (world, step)
 ):
-    """What the gripper did in a step: its task, its setpoint, which is NaN where it has none, and the force towards it."""
+    """Record the gripper's task, its setpoint (NaN without one) and its impedance force in a step."""
     world = wp.tid()
-    doing = int(Task.NONE)
+    current_task = int(Task.NONE)
     if phase[world] == Phase.ACT:
-        doing = task[world]
-    place = wp.vec3(wp.nan, wp.nan, wp.nan)
-    if phase[world] == Phase.ACT and (mode[world] == Mode.MOVE or doing >= Task.APPROACH):
-        place = setpoint[world]
-    setpoint_out[world, step] = place
+        current_task = task[world]
+    target = wp.vec3(wp.nan, wp.nan, wp.nan)
+    if phase[world] == Phase.ACT and (mode[world] == Mode.MOVE or current_task >= Task.APPROACH):
+        target = setpoint[world]
+    setpoint_out[world, step] = target
     force_out[world, step] = force[world]
-    task_out[world, step] = wp.int8(doing)
+    task_out[world, step] = wp.int8(current_task)
 
 
 @wp.kernel
@@ -183,15 +188,15 @@ def save_drop_poses_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    phase: wp.array[int],
-    progress: wp.array[wp.vec4i],
-    catalog_index: wp.array2d[int],
-    body_slot: wp.array2d[int],
-    body_q: wp.array[wp.transform],
+    phase: wp.array[int],  # (world)
+    progress: wp.array[wp.vec4i],  # (world) [ticks]
+    catalog_index: wp.array2d[int],  # (world, instance)
+    body_slot: wp.array2d[int],  # (world, instance)
+    body_q: wp.array[wp.transform],  # (body) [m]
     # Out:
-    drop_out: wp.array2d[wp.transform],
+    drop_out: wp.array2d[wp.transform],  # (world, instance) [m]
 ):
-    """Where a world's objects begin to fall: their poses before its first tick."""
+    """Save the drop poses of objects: their poses before the first tick of phase SETTLE."""
     world, instance = wp.tid()
     if phase[world] == Phase.SETTLE and progress[world][0] == 0 and catalog_index[world, instance] >= 0:
         drop_out[world, instance] = body_q[world * layout.bodies + layout.gripper_bodies + body_slot[world, instance]]

@@ -1,8 +1,8 @@
-"""How an attempt to pick begins, goes on and ends; what leaves the scene."""
+"""State machine of picking: start, tasks and outcome of attempts, and the removal of objects that were picked or lost."""
 
 import warp as wp
 
-from synpick_warp.codes import Mode, Outcome, Phase, Task
+from synpick_warp.codes import Mode, Outcome, Phase, Removal, Task
 from synpick_warp.kernels.sim.arrangement import PARKED_HEIGHT, write_body
 from synpick_warp.kernels.sim.gripper import place_gripper, task_setpoint
 from synpick_warp.kernels.sim.rest import is_outside, shape_pose
@@ -10,12 +10,9 @@ from synpick_warp.kernels.structs import TILT, DropData, LayoutData, MoveData, P
 
 wp.set_module_options({"enable_backward": False})
 
-# Why an instance has left the scene; 0: it has not.
-PICKED = wp.constant(1)
-LOST = wp.constant(2)
-# Room between objects that have left and are parked, more than any two of them need [m].
+# Distance between parked objects, larger than any object [m].
 PARKED_PITCH = wp.constant(5.0)
-# A setpoint so near to its target has arrived [m]; two kernels may round the target differently.
+# Distance to the target at which a setpoint has arrived [m]; two kernels may round the target differently.
 ARRIVED = wp.constant(1.0e-4)
 
 
@@ -24,22 +21,25 @@ def begin_picking_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    phase: wp.array[int],
-    mode: wp.array[int],
-    frame: wp.array[int],
+    phase: wp.array[int],  # (world)
+    mode: wp.array[int],  # (world)
+    frame: wp.array[int],  # (world)
     # Out:
-    task_out: wp.array[int],
-    steps_out: wp.array[int],
-    attempt_out: wp.array[int],
-    outcome_out: wp.array[int],
-    failures_out: wp.array[int],
-    target_out: wp.array[int],
-    yaw_out: wp.array[float],
-    overflow_out: wp.array[int],
-    removed_out: wp.array2d[int],
-    tilt_out: wp.array[float],
+    task_out: wp.array[int],  # (world)
+    steps_out: wp.array[int],  # (world)
+    attempt_out: wp.array[int],  # (world)
+    outcome_out: wp.array[int],  # (world)
+    failures_out: wp.array[int],  # (world)
+    target_out: wp.array[int],  # (world)
+    yaw_out: wp.array[float],  # (world) [rad]
+    overflow_out: wp.array[int],  # (world)
+    removed_out: wp.array2d[int],  # (world, instance)
+    tilt_out: wp.array[float],  # (coord) [rad]
 ):
-    """Worlds that do not act have no task and a straight gripper; those that begin to act in a mode of picking LOOK."""
+    """Reset the attempt state of worlds outside of phase ACT and in its first frame: there, a picking mode begins with task LOOK.
+
+    The outcome of every world becomes NONE: it is an event of one tick. `tilt` is the drive target of the tilt joint.
+    """
     world = wp.tid()
     outcome_out[world] = Outcome.NONE
     if phase[world] == Phase.ACT and frame[world] > 0:
@@ -61,11 +61,11 @@ def begin_picking_kernel(
 @wp.kernel
 def clear_seals_kernel(
     # State:
-    phase: wp.array[int],
+    phase: wp.array[int],  # (world)
     # Out:
-    attached_out: wp.array2d[int],
+    attached_out: wp.array2d[int],  # (world, instance)
 ):
-    """Nothing hangs on the cup of a world that does not act: not even where the last episode broke off in a lift."""
+    """Detach all objects of worlds outside of phase ACT: the last episode may have ended during a lift."""
     world, instance = wp.tid()
     if phase[world] != Phase.ACT:
         attached_out[world, instance] = 0
@@ -79,16 +79,16 @@ def remove_lost_kernel(
     settle: SettleData,
     pick: PickData,
     # State:
-    phase: wp.array[int],
-    body_slot: wp.array2d[int],
-    displacement: wp.array2d[float],
-    body_q: wp.array[wp.transform],
-    catalog_index_inout: wp.array2d[int],
+    phase: wp.array[int],  # (world)
+    body_slot: wp.array2d[int],  # (world, instance)
+    displacement: wp.array2d[float],  # (world, instance) [m]
+    body_q: wp.array[wp.transform],  # (body) [m]
+    catalog_index_inout: wp.array2d[int],  # (world, instance)
     # Out:
-    removed_out: wp.array2d[int],
-    attached_out: wp.array2d[int],
+    removed_out: wp.array2d[int],  # (world, instance)
+    attached_out: wp.array2d[int],  # (world, instance)
 ):
-    """What fell below the floor, or came to rest beside the tote, leaves the scene while the gripper acts."""
+    """Remove objects in phase ACT that fell below `pick.floor`, or are at rest outside of the tote: LOST."""
     world, instance = wp.tid()
     if phase[world] != Phase.ACT or catalog_index_inout[world, instance] < 0:
         return
@@ -96,7 +96,7 @@ def remove_lost_kernel(
     beside = is_outside(position, drop) and displacement[world, instance] < settle.relaxed_rest_threshold
     if beside or position[2] < pick.floor:
         catalog_index_inout[world, instance] = -1
-        removed_out[world, instance] = LOST
+        removed_out[world, instance] = Removal.LOST
         attached_out[world, instance] = 0
 
 
@@ -105,12 +105,12 @@ def pack_attached_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    catalog_index: wp.array2d[int],
-    attached: wp.array2d[int],
+    catalog_index: wp.array2d[int],  # (world, instance)
+    attached: wp.array2d[int],  # (world, instance)
     # Out:
-    attached_bits_out: wp.array[wp.uint32],
+    attached_bits_out: wp.array[wp.uint32],  # (world)
 ):
-    """Bit i: instance i hangs on the cup."""
+    """Pack the attached instances of each world into a bit mask: bit i is set if instance i is attached."""
     world = wp.tid()
     bits = wp.uint32(0)
     for instance in range(layout.instances):
@@ -121,7 +121,7 @@ def pack_attached_kernel(
 
 @wp.func
 def judge_attempt(target: int, engaged_bits: wp.uint32, attached_bits: wp.uint32) -> int:
-    """Outcome of an attempt from the target and from what was engaged_bits and what still hangs, as bits of instances."""
+    """Outcome of an attempt from the target, the engaged instances and those still attached after the lift, both as bit masks."""
     if attached_bits != wp.uint32(0):
         if target >= 0 and (attached_bits & (wp.uint32(1) << wp.uint32(target))) != wp.uint32(0):
             return Outcome.TARGET_PICKED
@@ -133,7 +133,7 @@ def judge_attempt(target: int, engaged_bits: wp.uint32, attached_bits: wp.uint32
 
 @wp.func
 def count_failures(failures: int, outcome: int, mode: int, pick: PickData) -> int:
-    """Count of failed attempts after one more has ended."""
+    """Count of failed attempts after one more outcome; with `forgive`, a success in mode TARGET resets it."""
     if outcome == Outcome.TARGET_PICKED or outcome == Outcome.OTHER_PICKED:
         if mode == Mode.TARGET and pick.forgive != 0:
             return 0
@@ -147,21 +147,24 @@ def advance_tasks_kernel(
     move: MoveData,
     pick: PickData,
     # State:
-    phase: wp.array[int],
-    mode: wp.array[int],
-    setpoint: wp.array[wp.vec3],
-    point: wp.array[wp.vec3],
-    normal: wp.array[wp.vec3],
-    target: wp.array[int],
-    engaged_bits: wp.array[wp.uint32],
-    attached_bits: wp.array[wp.uint32],
-    task_inout: wp.array[int],
-    steps_inout: wp.array[int],
-    failures_inout: wp.array[int],
+    phase: wp.array[int],  # (world)
+    mode: wp.array[int],  # (world)
+    setpoint: wp.array[wp.vec3],  # (world) [m]
+    point: wp.array[wp.vec3],  # (world) [m]
+    normal: wp.array[wp.vec3],  # (world)
+    target: wp.array[int],  # (world)
+    engaged_bits: wp.array[wp.uint32],  # (world)
+    attached_bits: wp.array[wp.uint32],  # (world)
+    task_inout: wp.array[int],  # (world)
+    steps_inout: wp.array[int],  # (world)
+    failures_inout: wp.array[int],  # (world)
     # Out:
-    outcome_out: wp.array[int],
+    outcome_out: wp.array[int],  # (world)
 ):
-    """At the end of a tick: after PRESS, LIFT; after LIFT, or when a look has found nothing, the outcome, and LOOK again."""
+    """Task transitions at the end of a tick: PRESS to LIFT; LIFT to LOOK with an outcome; LOOK without a target to LOOK.
+
+    `outcome` is written in the tick in which an attempt ends.
+    """
     world = wp.tid()
     if phase[world] != Phase.ACT or mode[world] == Mode.MOVE:
         return
@@ -190,25 +193,25 @@ def end_attempts_kernel(
     layout: LayoutData,
     drop: DropData,
     # State:
-    phase: wp.array[int],
-    task: wp.array[int],
-    attached_bits: wp.array[wp.uint32],
+    phase: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    attached_bits: wp.array[wp.uint32],  # (world)
     # Out:
-    catalog_index_out: wp.array2d[int],
-    removed_out: wp.array2d[int],
-    attached_out: wp.array2d[int],
-    joint_q_out: wp.array[float],
-    joint_qd_out: wp.array[float],
-    tilt_out: wp.array[float],
+    catalog_index_out: wp.array2d[int],  # (world, instance)
+    removed_out: wp.array2d[int],  # (world, instance)
+    attached_out: wp.array2d[int],  # (world, instance)
+    joint_q_out: wp.array[float],  # (coord) [m, rad]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+    tilt_out: wp.array[float],  # (coord) [rad]
 ):
-    """Worlds that LOOK: what hangs on the cup leaves the scene, and the gripper waits at home, upright and out of the picture."""
+    """In worlds at task LOOK, remove attached objects (PICKED) and place the gripper at home, cup upright, out of view."""
     world = wp.tid()
     if phase[world] != Phase.ACT or task[world] != Task.LOOK:
         return
     for instance in range(layout.instances):
         if (attached_bits[world] & (wp.uint32(1) << wp.uint32(instance))) != wp.uint32(0):
             catalog_index_out[world, instance] = -1
-            removed_out[world, instance] = PICKED
+            removed_out[world, instance] = Removal.PICKED
         attached_out[world, instance] = 0
     place_gripper(layout, world, drop.gripper_home, 0.0, joint_q_out, joint_qd_out)
     tilt_out[world * layout.coords + TILT] = 0.0
@@ -219,22 +222,22 @@ def park_removed_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    body_slot: wp.array2d[int],
-    removed: wp.array2d[int],
+    body_slot: wp.array2d[int],  # (world, instance)
+    removed: wp.array2d[int],  # (world, instance)
     # Out:
-    joint_q_out: wp.array[float],
-    joint_qd_out: wp.array[float],
-    joint_f_out: wp.array[float],
+    joint_q_out: wp.array[float],  # (coord) [m, rad]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+    joint_f_out: wp.array[float],  # (dof) [N, N·m]
 ):
-    """Hold what has left the scene far below, each object in a place of its own; within a tick it falls by some centimetres."""
+    """Park removed objects far below, each at its own position, in every tick; within a tick they fall by some centimetres."""
     world, instance = wp.tid()
     if removed[world, instance] == 0:
         return
-    s = body_slot[world, instance]
-    q = world * layout.coords + layout.gripper_dofs + 7 * s
-    qd = world * layout.dofs + layout.gripper_dofs + 6 * s
-    place = wp.vec3(PARKED_PITCH * float(s + 1), 0.0, PARKED_HEIGHT)
-    write_body(joint_q_out, joint_qd_out, q, qd, wp.transform(place, wp.quat_identity()))
+    slot = body_slot[world, instance]
+    q = world * layout.coords + layout.gripper_dofs + 7 * slot
+    qd = world * layout.dofs + layout.gripper_dofs + 6 * slot
+    position = wp.vec3(PARKED_PITCH * float(slot + 1), 0.0, PARKED_HEIGHT)
+    write_body(joint_q_out, joint_qd_out, q, qd, wp.transform(position, wp.quat_identity()))
     for axis in range(6):
         joint_f_out[qd + axis] = 0.0
 
@@ -242,16 +245,16 @@ def park_removed_kernel(
 @wp.kernel
 def begin_attempts_kernel(
     # State:
-    phase: wp.array[int],
-    target: wp.array[int],
-    task_inout: wp.array[int],
-    attempt_inout: wp.array[int],
+    phase: wp.array[int],  # (world)
+    target: wp.array[int],  # (world)
+    task_inout: wp.array[int],  # (world)
+    attempt_inout: wp.array[int],  # (world)
     # Out:
-    steps_out: wp.array[int],
-    hits_out: wp.array[int],
-    engaged_bits_out: wp.array[wp.uint32],
+    steps_out: wp.array[int],  # (world)
+    hits_out: wp.array[int],  # (world)
+    engaged_bits_out: wp.array[wp.uint32],  # (world)
 ):
-    """Worlds that have looked begin an attempt; with a target, they APPROACH it."""
+    """Begin an attempt in worlds at task LOOK after perception; those with a target change to APPROACH."""
     world = wp.tid()
     if phase[world] != Phase.ACT or task_inout[world] != Task.LOOK:
         return
@@ -270,19 +273,19 @@ def place_grippers_kernel(
     move: MoveData,
     pick: PickData,
     # State:
-    phase: wp.array[int],
-    task: wp.array[int],
-    steps: wp.array[int],
-    point: wp.array[wp.vec3],
-    normal: wp.array[wp.vec3],
-    tilt: wp.array[float],
+    phase: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
+    steps: wp.array[int],  # (world)
+    point: wp.array[wp.vec3],  # (world) [m]
+    normal: wp.array[wp.vec3],  # (world)
+    tilt: wp.array[float],  # (world) [rad]
     # Out:
-    setpoint_out: wp.array[wp.vec3],
-    joint_q_out: wp.array[float],
-    joint_qd_out: wp.array[float],
-    tilt_out: wp.array[float],
+    setpoint_out: wp.array[wp.vec3],  # (world) [m]
+    joint_q_out: wp.array[float],  # (coord) [m, rad]
+    joint_qd_out: wp.array[float],  # (dof) [m/s, rad/s]
+    tilt_out: wp.array[float],  # (coord) [rad]
 ):
-    """Where an APPROACH begins, the gripper appears far above the grasp, its cup tilted."""
+    """Place the gripper far above the grasp point, its cup tilted, where an APPROACH begins; the setpoint starts there."""
     world = wp.tid()
     if phase[world] != Phase.ACT or task[world] != Task.APPROACH or steps[world] != 0:
         return
@@ -297,10 +300,10 @@ def set_shaft_collision_kernel(
     # Scene:
     layout: LayoutData,
     # State:
-    mode: wp.array[int],
+    mode: wp.array[int],  # (world)
     # Out:
-    shape_transform_out: wp.array[wp.transform],
+    shape_transform_out: wp.array[wp.transform],  # (shape) [m]
 ):
-    """The finger collides when moving, where the gripper is one rigid body, and not when picking."""
+    """Enable collisions of the gripper shaft in mode MOVE, where the gripper is one rigid body, and disable them in picking modes."""
     world = wp.tid()
     shape_transform_out[world * layout.shapes + layout.finger_shape] = shape_pose(mode[world] == Mode.MOVE)
