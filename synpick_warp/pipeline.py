@@ -278,7 +278,7 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     pixels = visibility_sizes(views["view"], *config.cameras.resolution)
     groups += [(VISIBILITY_BUFFER, pixels, 1), (GBUFFER, pixels | {"view": len(config.cameras.positions)}, 1)]
     if any(kind.needs_physics for kind in load_exporter_classes(config.bake.formats)):
-        groups += [(kind, record_sizes(config, worlds), 1 + RECORDS) for kind in record_kinds(config)]
+        groups += [(kind, record_sizes(worlds, config.physics.steps_per_tick), 1 + RECORDS) for kind in record_kinds(config.trajectory)]
     if MOVING.intersection(config.render.layers):
         groups += [(MOTIONS, views, 1)]
     if has_spread(config):

@@ -1,4 +1,4 @@
-"""From snapshots to FrameBatches: which views there are, rendering in batches, and copies to the host that overlap."""
+"""Frame stream: renders snapshots in batches of views and copies them to the host asynchronously, as FrameBatches."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
 
-# Bytes of one batch's images on a GPU: large enough to fill it, small enough that several batches are in flight.
+# Size of one batch's images on a GPU [bytes]: large enough to fill the GPU, small enough for several batches in flight.
 BATCH_BYTES = 512 << 20
-# Colour, depth, instance id and amodal bits of one pixel.
+# Size of color, depth, segmentation id and amodal bits of one pixel [bytes].
 PIXEL_BYTES = 3 + 2 + 1 + 4
-# What a report has of a snapshot, besides objects and their poses.
+# Arrays of a snapshot that a report copies, besides catalog indices and poses.
 _SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
-# Batches in flight: one is rendered while another is copied and a third is read.
+# Ring size of view batches: one is rendered while another is copied and a third is read.
 RING = 3
 
 
 def views_per_batch(config: Config, device: wp.Device) -> int:
-    """How many views are rendered at once; a setting, or found from device and resolution."""
+    """Count of views rendered at once: `render.views_per_batch`, or chosen by device and resolution."""
     views = len(config.cameras.positions)
     if config.render.views_per_batch:
         return config.render.views_per_batch
@@ -45,7 +45,7 @@ def views_per_batch(config: Config, device: wp.Device) -> int:
 
 
 def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
-    """Extents of the dimensions that `ViewBuffers` and `LayerBuffers` name."""
+    """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`."""
     width, height = config.cameras.resolution
     return {
         "view": views_per_batch(config, device),
@@ -60,33 +60,33 @@ def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
 
 @dataclass(frozen=True, eq=False)
 class TickReport:
-    """What the host knows of one tick."""
+    """Result of one tick on the host, one row a world."""
 
     status: np.ndarray
-    """(world, status) int32; columns: `Status`."""
+    """Status rows (world, status) int32; columns: `Status`."""
     measures: np.ndarray
-    """(world, measure) float32; columns: `Measure`."""
+    """Rows of real numbers (world, measure) float32; columns: `Measure`."""
     catalog_index: np.ndarray
-    """Catalog index (world, instance) int32."""
+    """Object of each instance; -1: none (world, instance) int32."""
     pose: np.ndarray
-    """Object to world (world, instance, 7) float32."""
+    """Object to world: x, y, z [m], quaternion x, y, z, w (world, instance, 7) float32."""
     observation: SimpleNamespace
     """Arrays named and shaped as those of `Observation`; vectors have their components as a last dimension. After the tick's look."""
     plan: SimpleNamespace
-    """The same of `Plan`."""
+    """Arrays of `Plan`, likewise."""
     snapshot: SimpleNamespace = field(default_factory=SimpleNamespace)
-    """The same of `Snapshot`, but for those of its arrays that are above."""
+    """Arrays of `Snapshot` that are not listed above, likewise."""
     tick: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Further arrays (world, ...) for `TickBatch.tick`, if somebody records physics."""
+    """Arrays (world, ...) for `TickBatch.tick`, by name; empty unless physics is recorded."""
     steps: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """The same (world, step, ...) for `TickBatch.steps`."""
+    """Arrays (world, step, ...) for `TickBatch.steps`, likewise."""
 
     def column(self, name: str) -> np.ndarray:
-        """One column of the status table (world) int32."""
+        """Column of the status rows by its name in data sets, such as "phase" or "held" (world) int32."""
         return self.status[:, column_names(Status)[name]]
 
     def measure(self, name: str) -> np.ndarray:
-        """One column of the table of measures (world) float32."""
+        """Column of the measures by its name in data sets, such as "load" (world) float32."""
         return self.measures[:, column_names(Measure)[name]]
 
 
@@ -113,7 +113,7 @@ def name_lights(names: list[str], lights: Any) -> LightTable:
 
 
 class HostCopy:
-    """Host arrays that mirror device arrays: pinned and filled by asynchronous copies on CUDA, the arrays themselves on the CPU."""
+    """Host mirror of device arrays: pinned memory and asynchronous copies on CUDA, the arrays themselves on the CPU."""
 
     def __init__(self, arrays: list[wp.array]) -> None:
         self.source = arrays
@@ -122,7 +122,7 @@ class HostCopy:
         self.done = wp.Event(self.device) if self.device.is_cuda else None
 
     def start(self, stream: wp.Stream | None) -> None:
-        """Begin to copy, on `stream` after what the current stream holds so far; None: on the current stream."""
+        """Begin to copy on `stream`, after the work queued on the current stream; None: on the current stream."""
         if self.done is None:
             return
         if stream is None:
@@ -134,14 +134,14 @@ class HostCopy:
         stream.record_event(self.done)
 
     def wait(self) -> list[np.ndarray]:
-        """Wait until the copies are there, and give them as NumPy arrays (no further copy)."""
+        """Wait for the copies and return them as NumPy arrays (views, no further copy)."""
         if self.done is not None:
             wp.synchronize_event(self.done)
         return [array.numpy() for array in self.target]
 
 
 class TickReader:
-    """Brings to the host what a tick left, but for its pictures: some kilobytes a world."""
+    """Copies the results of a tick to the host, except images: some kilobytes a world."""
 
     def __init__(self, record: TickRecord) -> None:
         first = [record.status.table, record.status.measures, record.snapshot.catalog_index, record.snapshot.pose]
@@ -151,11 +151,11 @@ class TickReader:
         self.copy = HostCopy(first + [getattr(part, name) for part, names in self.parts for name in names] + self.physics)
 
     def start(self) -> None:
-        """Begin to copy what the tick left."""
+        """Begin to copy the results of the tick."""
         self.copy.start(None)
 
     def wait(self) -> TickReport:
-        """The tick's report; its arrays are its own, but for `tick` and `steps`: these are valid until the record is used again."""
+        """Wait for the copy and return the report. It owns its arrays, except `tick` and `steps`: valid until the record is reused."""
         copied = self.copy.wait()
         last = len(copied) - len(self.physics)
         arrays = iter([array.copy() for array in copied[:last]])
@@ -170,10 +170,10 @@ class TickReader:
 
 
 def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> TickBatch:
-    """The frames of a tick, world by world; none: an empty batch.
+    """Select the frames of a tick, in order of worlds; without live worlds the batch is empty.
 
     Args:
-        report: What the host knows of the tick.
+        report: Report of the tick.
         object_ids: obj_id of each catalog entry (entry) int32.
         tick_time: Time between two frames [s].
     """
@@ -192,17 +192,17 @@ def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> 
 
 
 class FrameStream:
-    """Renders the live worlds of a snapshot and yields FrameBatches, each while the next is rendered."""
+    """Renders the live worlds of snapshots as FrameBatches; while one is consumed, the next is rendered (ring buffer)."""
 
     def __init__(self, config: Config, renderer: Renderer, object_ids: np.ndarray, lights: LightTable, device: wp.Device) -> None:
         """Allocate the ring of batches.
 
         Args:
             config: Settings.
-            renderer: Renders and annotates.
+            renderer: Renderer and annotator of views.
             object_ids: obj_id of each catalog entry (entry) int32.
             lights: What is told of the light maps.
-            device: Where rendering happens.
+            device: Device of rendering.
         """
         self.renderer = renderer
         self.object_ids = np.append(object_ids, -1).astype(np.int32)
@@ -230,7 +230,7 @@ class FrameStream:
         self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.buffers]
 
     def render(self, snapshot: Snapshot, report: TickReport) -> Iterator[FrameBatch]:
-        """Yield the tick's views, world by world and camera by camera. A batch is valid until the next is asked for."""
+        """Yield the tick's views, world by world and camera by camera. A batch is valid until the next one is requested."""
         live = np.flatnonzero(report.column("live"))
         world = np.repeat(live, self.cameras).astype(np.int32)
         camera = np.tile(np.arange(self.cameras, dtype=np.int32), len(live))

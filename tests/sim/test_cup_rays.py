@@ -60,7 +60,7 @@ class Cups(KernelWorlds):
         )
         meshes, keep = build_meshes([entry.mesh for entry in ENTRIES.entries], len(ENTRIES), device)
         config = load_config("smoke", {"suction.surface": surface})
-        self.suction = Suction(config, ENTRIES, SimpleNamespace(meshes=meshes, keep=keep), device)
+        self.suction = Suction(config.suction, ENTRIES, SimpleNamespace(meshes=meshes, keep=keep), device)
         self.begin(Phase.ACT)
         self.set(self.state.catalog_index, -1)
         # Slots in an order of their own.

@@ -208,17 +208,17 @@ def run(device):
     start = np.tile(START, (worlds, 1))
     start[WALL] = [floor[0] / 2 - config.gripper.cup_width, 0.0, config.gripper.cup_length + 0.03]
     start[FOLLOW] = [*(config.move.corner * floor / 2), config.move.height + config.gripper.cup_length]
-    goal = start + [OFFSETS.get(world, (0.0, 0.0, 0.0)) for world in range(worlds)]
-    goal[WALL, 0] += 0.5
+    setpoint = start + [OFFSETS.get(world, (0.0, 0.0, 0.0)) for world in range(worlds)]
+    setpoint[WALL, 0] += 0.5
     coordinates = physics.state.joint_q.numpy().reshape(worlds, -1)
     coordinates[:, : build.GRIPPER_DOFS] = np.pad(start, ((0, 0), (0, 1)))
     physics.state.joint_q.assign(coordinates.reshape(-1).astype(np.float32))
     physics.refresh_poses()
-    # The goals of all but one stand still: they have been everywhere.
+    # All setpoints but one are fixed: their waypoints are all reached.
     waypoint = np.full(worlds, simulation.scene.move.waypoints)
     waypoint[FOLLOW] = 0
     order = np.tile([1, 0, 1, 0], (worlds, 1))
-    values = {"phase": np.full(worlds, Phase.ACT), "waypoint": waypoint, "order": order, "goal": goal.astype(np.float32)}
+    values = {"phase": np.full(worlds, Phase.ACT), "waypoint": waypoint, "corner_order": order, "setpoint": setpoint.astype(np.float32)}
     for name, value in values.items():
         getattr(state, name).assign(value)
     arrange.set_guides(simulation.scene, state, physics)

@@ -30,7 +30,7 @@ def turned(device) -> tuple[Physics, np.ndarray, np.ndarray]:
         physics__substeps=1,
         physics__guide_height=0.2,
     )
-    physics = Physics(config, build.build_model(config, catalog(CUBE), device))
+    physics = Physics(config.physics, build.build_model(config, catalog(CUBE), device))
     coordinates = physics.state.joint_q.numpy().reshape(3, -1)
     coordinates[:, : build.GRIPPER_DOFS] = [*PLACE, 0.0]
     physics.refresh_poses()

@@ -321,7 +321,7 @@ def test_the_wrench_is_the_twins_and_what_is_not_held_is_left_alone(seed, held, 
         loads[instance], kept[instance] = load, int(not breaks)
         peak = max(peak, loads[instance])
     meshes = SimpleNamespace(id=wp.zeros(1, dtype=wp.uint64, device=device))
-    suction = Suction(load_config("smoke", {}), catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
+    suction = Suction(load_config("smoke", {}).suction, catalog(CUBE), SimpleNamespace(meshes=meshes, keep=()), device)
     suction.apply_seal_forces(worlds.scene, worlds.state, worlds.seals, worlds.physics, worlds.physics.state)
     scale = np.abs(expected).max()
     np.testing.assert_allclose(worlds.physics.control.joint_f.numpy(), expected, rtol=3e-4, atol=1e-4 * scale)

@@ -68,7 +68,7 @@ def masses(log: Log, objects: Catalog) -> np.ndarray:
 
 
 @pytest.mark.parametrize("run", ["moved", "picked"])
-def test_the_last_step_is_what_the_tick_shows_to_the_bit(run, request):
+def test_the_last_step_is_what_the_tick_shows_to_the_bit(run, request, device):
     log, _ = request.getfixturevalue(run)
     seen = 0
     for row, steps in zip(log.reports, log.steps, strict=True):
@@ -82,7 +82,7 @@ def test_the_last_step_is_what_the_tick_shows_to_the_bit(run, request):
 
 
 @pytest.mark.parametrize("run", ["moved", "picked"])
-def test_what_is_not_there_is_not_a_number(run, request):
+def test_what_is_not_there_is_not_a_number(run, request, device):
     log, _ = request.getfixturevalue(run)
     names = [name for name, values in log.steps[0].items() if values.dtype.kind == "f"]
     for row, steps, before in zip(log.reports[1:], log.steps[1:], log.reports[:-1], strict=True):
@@ -99,7 +99,7 @@ def test_what_is_not_there_is_not_a_number(run, request):
 
 
 @pytest.mark.parametrize("run", ["moved", "picked"])
-def test_momentum_changes_by_contacts_and_weight(run, request):
+def test_momentum_changes_by_contacts_and_weight(run, request, device):
     """m (v' - v) / h = F_contact - m g, in every step of every object that no seal holds: impacts, piles, what the gripper pushes."""
     log, simulation = request.getfixturevalue(run)
     step = simulation.config.physics.step
@@ -169,7 +169,7 @@ def spin(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("run", ["moved", "picked"])
-def test_the_force_is_the_impedance_law_of_goal_pose_and_velocity(run, request):
+def test_the_force_is_the_impedance_law_of_goal_pose_and_velocity(run, request, device):
     """Of the step's goal, and of pose and velocity at its beginning."""
     log, simulation = request.getfixturevalue(run)
     config = simulation.config

@@ -8,9 +8,8 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Ending, Mode, Outcome, Phase, Task
+from synpick_warp.codes import Ending, Mode, Outcome, Phase, Removal, Task
 from synpick_warp.kernels.perception import worklist
-from synpick_warp.kernels.sim import tasks
 from synpick_warp.stages.sim import arrange, gripper
 from tests.worlds.kernel_worlds import KernelWorlds
 
@@ -200,7 +199,7 @@ def test_what_hangs_after_the_lift_leaves_the_scene(device, target, caught, held
     assert worlds.attempts.failures.numpy()[0] == failures
     assert worlds.attempts.task.numpy()[0] == Task.LOOK
     assert worlds.attempts.attached_bits.numpy()[0] == sum(bit << i for i, bit in enumerate(held))
-    assert worlds.attempts.removed.numpy()[0].tolist() == [tasks.PICKED * bit for bit in held]
+    assert worlds.attempts.removed.numpy()[0].tolist() == [Removal.PICKED * bit for bit in held]
     assert worlds.state.catalog_index.numpy()[0].tolist() == [-1 if bit else i for i, bit in enumerate(held)]
     assert not worlds.seals.attached.numpy().any()
     np.testing.assert_allclose(worlds.physics.state.joint_q.numpy()[:4], [3.0, 0.0, 1.0, 0.0])
@@ -247,7 +246,7 @@ def test_what_left_the_tote_is_lost_when_it_lies_or_is_deep(device, place, shift
     worlds.place(0, 1, [*place, 0.0, 0.0, 0.0, 1.0])
     gripper.remove_lost(worlds.scene, worlds.state, worlds.attempts, worlds.seals, worlds.physics)
     assert worlds.state.catalog_index.numpy()[0].tolist() == [0, -1 if lost else 1, 2]
-    assert worlds.attempts.removed.numpy()[0].tolist() == [0, tasks.LOST * lost, 0]
+    assert worlds.attempts.removed.numpy()[0].tolist() == [0, Removal.LOST * lost, 0]
     assert worlds.seals.attached.numpy()[0].tolist() == [1, 1 - lost, 1]
 
 

@@ -81,7 +81,7 @@ def pull(
         steps: How long.
     """
     built = build.build_model(config, catalog, device)
-    physics, layout = Physics(config, built), built.layout
+    physics, layout = Physics(config.physics, built), built.layout
     mass = config.gripper.finger_mass + config.gripper.cup_mass
     laws = np.column_stack([law, np.full(layout.worlds, mass), np.full(layout.worlds, config.physics.step)])
     arrays = [wp.array(laws.astype(np.float32), dtype=float, device=device)]

@@ -1,4 +1,4 @@
-"""New episodes into free worlds: numbers, objects, drop poses; then settling until the pile is at rest."""
+"""Episode life cycle: assign, sample, drop, settle, end. Launches kernels.sim.arrangement, rest and endings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 
 
 def assign_episodes(state: WorldState, episodes: wp.array, tries: int) -> None:
-    """Give worlds whose episode is over the next of the numbers `episodes`, or their own again if it delivered nothing."""
+    """Assign the next of `episodes` (episode) int32 to free worlds, or the same again if it ended without delivery, up to `tries` times."""
     wp.launch(
         arrangement.assign_episodes_kernel,
         dim=1,
@@ -22,7 +22,7 @@ def assign_episodes(state: WorldState, episodes: wp.array, tries: int) -> None:
 
 
 def sample_objects(scene: SceneData, state: WorldState, seed: int) -> None:
-    """Draw mode, objects and light of worlds that start an episode."""
+    """Sample mode, objects and light of starting episodes."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
         arrangement.sample_modes_kernel,
@@ -48,7 +48,7 @@ def sample_objects(scene: SceneData, state: WorldState, seed: int) -> None:
 
 
 def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
-    """Empty the worlds that start, stack the drawn objects above the tote, and load all that into the physics."""
+    """Reset free worlds, stack sampled objects above the tote, and load variants and joint coordinates into the physics."""
     worlds, device = state.phase.shape[0], state.phase.device
     joints = [physics.state.joint_q, physics.state.joint_qd, physics.control.joint_f]
     wp.launch(
@@ -78,7 +78,7 @@ def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: in
 
 
 def measure_penetration(state: WorldState, physics: Physics) -> None:
-    """Deepest penetration of each body, from the contacts of the last step."""
+    """Measure the deepest penetration of each body from the contacts of the last step."""
     contacts = physics.contacts
     state.penetration.zero_()
     wp.launch(
@@ -102,7 +102,7 @@ def measure_penetration(state: WorldState, physics: Physics) -> None:
 
 
 def measure_displacement(scene: SceneData, state: WorldState, physics: Physics) -> None:
-    """How far each instance moved in the last tick."""
+    """Measure the displacement of each instance over the last tick."""
     wp.launch(
         rest.measure_displacement_kernel,
         dim=state.catalog_index.shape,
@@ -113,7 +113,7 @@ def measure_displacement(scene: SceneData, state: WorldState, physics: Physics) 
 
 
 def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
-    """Re-drop what left the tote or is stuck, count ticks at rest, let worlds at rest act."""
+    """Re-drop objects that left the tote or are stuck, count ticks at rest, and begin phase ACT in worlds at rest."""
     measure_penetration(state, physics)
     measure_displacement(scene, state, physics)
     wp.launch(
@@ -147,7 +147,7 @@ def judge_settling(scene: SceneData, state: WorldState, physics: Physics, seed: 
 
 
 def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, physics: Physics) -> None:
-    """End episodes that failed or are finished."""
+    """End episodes that failed or are complete."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
         endings.judge_tasks_kernel,
@@ -186,7 +186,7 @@ def judge_episodes(scene: SceneData, state: WorldState, attempts: AttemptState, 
 
 
 def set_guides(scene: SceneData, state: WorldState, physics: Physics) -> None:
-    """Guide walls stand while a world's objects fall."""
+    """Enable guide walls while a world's objects fall, disable them afterwards."""
     wp.launch(
         rest.set_guides_kernel,
         dim=(state.phase.shape[0], scene.guide_shapes.shape[0]),

@@ -1,4 +1,4 @@
-"""The gripper's tasks: goals, force, and how attempts begin and end."""
+"""Gripper control and attempts: setpoints, impedance control, task transitions. Launches kernels.sim.gripper and tasks."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 
 def begin_moving(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:
-    """Count frames; where a world begins to move, draw the corners' order and put the gripper above the first."""
+    """Count frames; in the first frame of mode MOVE, sample the order of corners and place the gripper above the first."""
     wp.launch(
         gripper.begin_moving_kernel,
         dim=state.phase.shape[0],
@@ -36,7 +36,7 @@ def begin_moving(scene: SceneData, state: WorldState, physics: Physics, seed: in
 def begin_picking(
     scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, physics: Physics
 ) -> None:
-    """Where a world begins to pick, let it look; forget the outcomes of the last tick."""
+    """Reset the attempt state where picking begins, with task LOOK, and clear the outcomes of the last tick."""
     wp.launch(
         tasks.begin_picking_kernel,
         dim=state.phase.shape[0],
@@ -58,12 +58,12 @@ def begin_picking(
 
 
 def clear_seals(state: WorldState, seals: SealState) -> None:
-    """Before a world's objects fall, let go of what hung on its cup."""
+    """Detach all objects in worlds outside of phase ACT."""
     wp.launch(tasks.clear_seals_kernel, dim=seals.attached.shape, inputs=[state.phase], outputs=[seals.attached], device=state.phase.device)
 
 
 def set_shaft_collision(scene: SceneData, state: WorldState, physics: Physics) -> None:
-    """Let the finger collide where the gripper moves, and not where it picks."""
+    """Enable collisions of the gripper shaft in mode MOVE, disable them in picking modes."""
     wp.launch(
         tasks.set_shaft_collision_kernel,
         dim=state.phase.shape[0],
@@ -74,7 +74,7 @@ def set_shaft_collision(scene: SceneData, state: WorldState, physics: Physics) -
 
 
 def drive_gripper(scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics, current: newton.State) -> None:
-    """Move the goals on by one step and set the grippers' forces."""
+    """Advance the setpoints by one step and write the grippers' joint forces."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
         gripper.advance_setpoints_kernel,
@@ -114,7 +114,7 @@ def drive_gripper(scene: SceneData, state: WorldState, attempts: AttemptState, p
 
 
 def remove_lost(scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
-    """Take out of the scene what has left the tote."""
+    """Remove objects that have left the tote."""
     wp.launch(
         tasks.remove_lost_kernel,
         dim=state.catalog_index.shape,
@@ -135,7 +135,7 @@ def remove_lost(scene: SceneData, state: WorldState, attempts: AttemptState, sea
 
 
 def end_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, plan: Plan, physics: Physics) -> None:
-    """Judge lifts that are over, take what was picked out of the scene, and send grippers home."""
+    """Judge lifts that are complete, remove picked objects, and place the grippers at home."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
         tasks.pack_attached_kernel,
@@ -182,7 +182,7 @@ def end_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, se
 
 
 def park_removed(scene: SceneData, state: WorldState, attempts: AttemptState, physics: Physics) -> None:
-    """Keep what has left the scene out of the way."""
+    """Park removed objects."""
     wp.launch(
         tasks.park_removed_kernel,
         dim=state.catalog_index.shape,
@@ -193,7 +193,7 @@ def park_removed(scene: SceneData, state: WorldState, attempts: AttemptState, ph
 
 
 def begin_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, plan: Plan, physics: Physics) -> None:
-    """Where a world has looked, put the gripper above the grasp."""
+    """Begin the planned attempts: place the gripper above the grasp, with the planned yaw and tilt."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
         tasks.begin_attempts_kernel,

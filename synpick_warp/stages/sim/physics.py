@@ -1,4 +1,4 @@
-"""The one place that knows Newton's solver: stepping, and giving worlds new objects without a new model."""
+"""Wrapper of Newton's solver and collision pipeline: time stepping, and new objects in a world without a new model."""
 
 from __future__ import annotations
 
@@ -15,54 +15,54 @@ from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
 
-# Contacts with a larger gap make no rows [m]: none has that the pipeline finds, only those that a hook has pulled apart.
+# Contacts with a larger gap make no constraint rows [m]: only those that a hook has disabled have one, none that the pipeline finds.
 CONTACT_GAP = 0.1
-# A joint limit's row is made when the joint comes this near to it [rad].
+# Distance to a joint limit from which its constraint row is active [rad].
 JOINT_LIMIT_GAP = 0.2
-# On an H200, models of one and two worlds round otherwise than those of 8, 64 and 512, which agree bit by bit.
-LEAST_GPU_WORLDS = 8
+# On an H200, models of one and two worlds round differently from those of 8, 64 and 512, which agree bit by bit.
+MIN_GPU_WORLDS = 8
 
 
 def with_enough_worlds(config: Config, device: wp.Device) -> Config:
-    """The settings with so many worlds that an episode does not depend on their number. Those that get no episode rest.
+    """Settings with at least MIN_GPU_WORLDS worlds on a GPU, so that an episode does not depend on their count; surplus worlds idle.
 
     Args:
         config: All settings.
-        device: Where the worlds will be.
+        device: Device of the simulation.
     """
-    if not device.is_cuda or config.bake.worlds >= LEAST_GPU_WORLDS:
+    if not device.is_cuda or config.bake.worlds >= MIN_GPU_WORLDS:
         return config
-    return replace(config, bake=replace(config.bake, worlds=LEAST_GPU_WORLDS))
+    return replace(config, bake=replace(config.bake, worlds=MIN_GPU_WORLDS))
 
 
 class Watcher(Protocol):
-    """Sees every step. On a GPU it is recorded once, as the hooks of `Physics.tick`."""
+    """Observer of the steps of a tick. On a GPU its launches are captured once in a graph, as those of the hooks of `Physics.tick`."""
 
     def begin_step(self) -> None:
-        """Before a step."""
+        """Called before a step."""
 
     def after_solve(self, contact_f: wp.array) -> None:
-        """After each solver step of it; `contact_f` is each contact's force on its first shape (contact) spatial vector [N]."""
+        """Called after each solver substep; `contact_f` holds each contact's force on its first shape (contact) spatial vector [N]."""
 
     def end_step(self, step: int, current: newton.State) -> None:
-        """After it; `step` is its number in the tick, `current` the state at its end."""
+        """Called after a step; `step` is its index in the tick, `current` the state at its end."""
 
 
 class Physics:
     """Newton's model, state, solver and collision pipeline. `state` is the current state before and after `tick`.
 
-    Targets of drives are laid out as joint coordinates: the cup of world w turns to `control.joint_target_q[w * coords + 3]` [rad].
+    Drive targets are laid out as joint coordinates: `control.joint_target_q[w * coords + 3]` is the tilt target of world w's cup [rad].
     """
 
-    def __init__(self, config: Config, built: build.BuiltModel) -> None:
-        self.config = config
+    def __init__(self, settings: PhysicsConfig, built: build.BuiltModel) -> None:
+        self.settings = settings
         self.layout = built.layout
         self.model = built.model
         self.device = self.model.device
-        physics, worlds = config.physics, built.layout.worlds
+        physics, worlds = settings, built.layout.worlds
         self.model.rigid_contact_max = physics.contacts_per_world * worlds
         self.pipeline = newton.CollisionPipeline(
-            # Matching contacts with those of the step before sorts them, so their order is the same every time.
+            # Matching contacts with those of the previous step sorts them, so that their order is deterministic.
             self.model,
             broad_phase="nxn",
             contact_matching="latest",
@@ -86,14 +86,14 @@ class Physics:
         self._other = self.model.state()
         self.control = self.model.control()
         self._graph: wp.Graph | None = None
-        self._seen = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
+        self._observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
         fingers = np.arange(worlds) * built.layout.bodies_per_world
         self._finger_joint = wp.array(np.argsort(self.model.joint_child.numpy())[fingers], dtype=wp.int32, device=self.device)
 
     def set_yaw(self, yaw: wp.array) -> None:
-        """Turn each finger about the vertical through its origin; the cup turns with it, x, y and z stay the world's axes.
+        """Set the yaw of each gripper shaft and its cup about the vertical through the wrist; x, y and z stay the world's axes.
 
-        Takes effect with the next step, and in body poses with `refresh_poses`. Nothing is read back from the device.
+        Takes effect in the next step, and in body poses after `refresh_poses`. Nothing is read back from the device.
 
         Args:
             yaw: Counter-clockwise from above (world) float32 [rad].
@@ -108,10 +108,10 @@ class Physics:
         self.solver.notify_model_changed(newton.ModelFlags.JOINT_PROPERTIES)
 
     def load(self, variant: wp.array, restarted: wp.array) -> None:
-        """Give body slots new objects and forget the history of restarted worlds. Joint coordinates are already written.
+        """Select body variants and reset solver history and contact matching of restarted worlds, after joint coordinates were written.
 
         Args:
-            variant: Variant of each body, -1 where nothing changes (body) int32.
+            variant: Variant of each body; -1: no change (body) int32.
             restarted: Worlds with new objects (world + 1) bool.
         """
         flags = self.model.select_body_variants(variant)
@@ -121,26 +121,26 @@ class Physics:
         self.refresh_poses()
 
     def refresh_poses(self) -> None:
-        """Body poses from joint coordinates, after these were written."""
+        """Compute body poses from joint coordinates (forward kinematics)."""
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
     def tick(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
     ) -> None:
-        """Advance all worlds by one tick.
+        """Advance all worlds by one tick: `steps_per_tick` steps of `substeps` solver steps, on a GPU as a captured graph.
 
-        Hooks and watcher are recorded once on a GPU, so they must launch the same kernels on the same arrays every time.
+        Hooks and watcher are captured once, so they must launch the same kernels on the same arrays every time.
 
         Args:
-            before_step: Launches what sets the control's forces from a state; runs before each step.
-            after_collide: Launches what edits `contacts` before the solver sees them.
-            watcher: Launches what writes down the steps.
+            before_step: Launches kernels that write the control's forces from a state; runs before each step.
+            after_collide: Launches kernels that edit `contacts` before the solver reads them.
+            watcher: Launches kernels that record the steps.
         """
         if not self.device.is_cuda:
             self._run_steps(before_step, after_collide, watcher)
             return
         if self._graph is None:
-            # The first tick runs eagerly: it loads the kernels and allocates what Newton allocates late.
+            # The first tick runs eagerly: it loads the kernels and triggers Newton's late allocations.
             self._run_steps(before_step, after_collide, watcher)
             with wp.ScopedCapture(device=self.device) as capture:
                 self._run_steps(before_step, after_collide, watcher)
@@ -149,7 +149,7 @@ class Physics:
         wp.capture_launch(self._graph)
 
     def flag_lost_pairs(self) -> None:
-        """What the solver does with contacts and rows that find no room, for the pairs of the broad phase: Newton drops these silently."""
+        """Flag worlds whose broad-phase pairs overflowed: Newton drops these pairs silently, while its solver flags contacts and rows."""
         wp.launch(
             rest.flag_lost_pairs_kernel,
             dim=self.layout.worlds,
@@ -162,7 +162,7 @@ class Physics:
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None, watcher: Watcher | None
     ) -> None:
         current, following = self.state, self._other
-        physics, seen = self.config.physics, self._seen if watcher is not None else None
+        physics, observables = self.settings, self._observables if watcher is not None else None
         for step in range(physics.steps_per_tick):
             if watcher is not None:
                 watcher.begin_step()
@@ -172,10 +172,10 @@ class Physics:
                 self.flag_lost_pairs()
                 if after_collide is not None:
                     after_collide()
-                self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps, observables=seen)
+                self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps, observables=observables)
                 current, following = following, current
                 if watcher is not None:
-                    watcher.after_solve(self._seen.contact_f)
+                    watcher.after_solve(self._observables.contact_f)
             if watcher is not None:
                 watcher.end_step(step, current)
         if current is not self.state:
@@ -183,13 +183,13 @@ class Physics:
 
 
 def _sweep(physics: PhysicsConfig, slots: int, parallel: bool) -> dict[str, Any]:
-    """How the solver sweeps over a world's rows: by colours, in parallel, on a GPU; in order on the CPU, where that is all there is.
+    """Options of the Gauss-Seidel sweep over a world's constraint rows: graph-colored and parallel on a GPU, sequential on the CPU.
 
-    On an H200, 512 worlds take 10.9 ms a step with colours and 14.6 without, and come to rest alike.
+    On an H200, 512 worlds take 10.9 ms a step with colors and 14.6 ms without, and come to rest equally well.
     """
     if not parallel:
         return {"free_body_constraint_max": physics.rows_per_world}
-    # Contacts have rows of their own; what is left of the free bodies' rows are limits of velocity.
+    # Contacts have rows of their own; the remaining rows of free bodies are velocity limits.
     return {
         "solve_mode": "colored",
         "articulated_contact_response": "propagation",

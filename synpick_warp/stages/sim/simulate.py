@@ -1,4 +1,4 @@
-"""All worlds, one tick at a time. Nothing here asks the device for an answer."""
+"""Simulation of all worlds, tick by tick: one tick is one output frame of simulated time. Nothing here waits for the device."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from synpick_warp.kernels.sim import snapshot as pack
 from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.buffers import LastFrame, Snapshot
-from synpick_warp.stages.constants import SceneData, make_scene_data
+from synpick_warp.stages.constants import SceneData, fill, make_scene_data
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.scene import RenderScene
@@ -27,24 +27,24 @@ from synpick_warp.stages.sim.step_log import PhysicsRecord, Recorder
 from synpick_warp.stages.sim.suction import Suction
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 
-# A tick is recorded while the last one's record is still read.
+# Ring size of tick records: one is written while the host reads the previous one.
 RECORDS = 2
 
 
 @dataclass(frozen=True, eq=False)
 class TickRecord:
-    """What one tick leaves for pictures and for the host."""
+    """Output of one tick, for rendering and for the host."""
 
     snapshot: Snapshot
     status: WorldStatus
     observation: Observation
     plan: Plan
     physics: PhysicsRecord | None = None
-    """None: nobody asked for it."""
+    """None: physics is not recorded."""
 
 
 class Simulation:
-    """N worlds that take episodes by number until none is left."""
+    """N worlds that run the episodes of a list until none is left."""
 
     def __init__(
         self,
@@ -61,23 +61,23 @@ class Simulation:
         Args:
             config: Settings.
             catalog: The objects.
-            lights: How many light maps there are to draw from.
-            device: Where everything lies.
-            render_scene: What the gripper's side sees; not needed if all episodes move.
-            episodes: Numbers of the episodes to simulate, in order; None: from 0, as many as are set.
-            records_physics: Whether records have `physics`.
+            lights: Count of environment maps to sample from.
+            device: Device of all arrays.
+            render_scene: Scene that perception renders; not needed if all episodes have mode MOVE.
+            episodes: Indices of the episodes to simulate, in order; None: 0 to `bake.episodes` - 1.
+            records_physics: True if records contain `physics`.
 
         Raises:
-            ValueError: There is nothing to see, but episodes that pick.
+            ValueError: An episode may pick, but there is no `render_scene`.
         """
         self.config = config
         self.device = device
         built = build_model(config, catalog, device)
         self.layout = built.layout
-        self.physics = Physics(config, built)
+        self.physics = Physics(config.physics, built)
         self.scene: SceneData = make_scene_data(config, catalog, built, lights, device)
-        numbers = range(config.bake.episodes) if episodes is None else episodes
-        self.episodes = wp.array(np.asarray(numbers, np.int32), dtype=wp.int32, device=device)
+        indices = range(config.bake.episodes) if episodes is None else episodes
+        self.episodes = wp.array(np.asarray(indices, np.int32), dtype=wp.int32, device=device)
         sizes = world_sizes(config, built.layout.bodies_per_world)
         self.state = allocate(WorldState, sizes, device)
         self.attempts = allocate(AttemptState, sizes, device)
@@ -87,14 +87,16 @@ class Simulation:
         self.last = allocate(LastFrame, sizes, device)
         self.recorder: Recorder | None = None
         if records_physics:
-            self.recorder = Recorder(config, self.scene, self.state, self.attempts, self.seals, self.physics, sizes)
+            self.recorder = Recorder(
+                config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
+            )
         self.records = tuple(self._make_record(sizes) for _ in range(RECORDS))
         self.suction: Suction | None = None
         self.perception: Perception | None = None
         if may_pick(config):
             if render_scene is None:
-                raise ValueError("episodes that pick need a render_scene to look at")
-            self.suction = Suction(config, catalog, render_scene, device)
+                raise ValueError("episodes that pick need a render_scene for perception")
+            self.suction = Suction(config.suction, catalog, render_scene, device)
             self.perception = Perception(
                 config.sight,
                 config.cameras,
@@ -112,7 +114,24 @@ class Simulation:
         return TickRecord(*(allocate(kind, sizes, self.device) for kind in (Snapshot, WorldStatus, Observation, Plan)), physics=physics)
 
     def tick(self, record: TickRecord) -> None:
-        """Hand out episodes, simulate one tick, judge, record what came of it in one of `records`, and look where one must choose."""
+        """Advance all worlds by one tick and write the result to `record`, one of `records`.
+
+        Start episodes, step physics, update tasks, end episodes, copy the snapshot, then plan attempts in worlds whose task is LOOK.
+        """
+        self._arrange()
+        self.physics.tick(self._drive, self._ignore_contacts, self.recorder if self.config.trajectory.steps else None)
+        self._judge()
+        self._take_snapshot(record)
+        if self.recorder is not None and record.physics is not None:
+            self.recorder.take(record.physics)
+        if self.perception is not None:
+            self.perception.perceive(record.snapshot)
+            gripper.begin_attempts(self.scene, self.state, self.attempts, self.plan, self.physics)
+            _copy(record.observation, self.observation)
+            _copy(record.plan, self.plan)
+
+    def _arrange(self) -> None:
+        """Start episodes in free worlds: objects are sampled and dropped."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
         arrange.assign_episodes(state, self.episodes, self.config.settle.tries)
         arrange.sample_objects(scene, state, seed)
@@ -123,7 +142,10 @@ class Simulation:
         self.seals.peak_force.zero_()
         if self.recorder is not None:
             self.recorder.save_drop_poses()
-        physics.tick(self._drive, self._let_go_of_contacts, self.recorder if self.config.trajectory.steps else None)
+
+    def _judge(self) -> None:
+        """Update phases and tasks after physics, remove objects that were picked or lost, and end episodes."""
+        state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
         arrange.judge_settling(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
         gripper.begin_moving(scene, state, physics, seed)
@@ -135,25 +157,17 @@ class Simulation:
         gripper.park_removed(scene, state, self.attempts, physics)
         physics.refresh_poses()
         arrange.judge_episodes(scene, state, self.attempts, self.observation, physics)
-        self._take_snapshot(record)
-        if self.recorder is not None and record.physics is not None:
-            self.recorder.take(record.physics)
-        if self.perception is not None:
-            self.perception.perceive(record.snapshot)
-            gripper.begin_attempts(scene, state, self.attempts, self.plan, physics)
-            _copy(record.observation, self.observation)
-            _copy(record.plan, self.plan)
 
     def _drive(self, current: newton.State) -> None:
-        """Forces before a step."""
+        """Hook before a step: forces of gripper and seals."""
         gripper.drive_gripper(self.scene, self.state, self.attempts, self.plan, self.physics, current)
         if self.recorder is not None:
             self.recorder.save_impedance_force()
         if self.suction is not None:
             self.suction.apply_seal_forces(self.scene, self.state, self.seals, self.physics, current)
 
-    def _let_go_of_contacts(self) -> None:
-        """After contacts were found."""
+    def _ignore_contacts(self) -> None:
+        """Hook after collision detection: contacts that seals replace."""
         if self.suction is not None:
             self.suction.ignore_attached_contacts(self.scene, self.state, self.seals, self.physics)
 
@@ -216,11 +230,8 @@ class Simulation:
 
 
 def _frame_poses(arrays: Snapshot | LastFrame) -> Any:
-    """The struct `FramePoses` of arrays of the same names."""
-    made = pack.FramePoses()
-    for item in fields(LastFrame):
-        setattr(made, item.name, getattr(arrays, item.name))
-    return made
+    """Fill the struct `FramePoses` from arrays of the same names."""
+    return fill(pack.FramePoses, arrays)
 
 
 def _copy(target: Observation | Plan, source: Observation | Plan) -> None:

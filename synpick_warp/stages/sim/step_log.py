@@ -1,4 +1,4 @@
-"""Records what physics does in every step, on the device, for exporters that want more than pictures show."""
+"""Step log: records poses, velocities and forces of every physics step on the device, for trajectory exporters."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Gripper, Trajectory
 from synpick_warp.kernels.sim import step_log
 from synpick_warp.scenes import build
 from synpick_warp.stages.constants import SceneData
@@ -23,65 +23,66 @@ PUBLIC_NAMES = {"seal_force": "seal_load", "attached": "held", "setpoint": "goal
 
 @dataclass(frozen=True, eq=False)
 class StepArrays:
-    """What each step of a tick left. A place is an instance; finger and cup come after the instances."""
+    """Step log of a tick. A place is an instance; gripper shaft and cup follow the instances."""
 
     pose: wp.array = device_array("world", "step", "place", dtype=wp.transformf, unit="m")
-    """Body to world, at the step's end."""
+    """Body to world at the step's end."""
     velocity: wp.array = device_array("world", "step", "place", dtype=wp.vec3f, unit="m/s")
-    """Of the centre of mass."""
+    """Linear velocity of the centre of mass."""
     angular_velocity: wp.array = device_array("world", "step", "place", dtype=wp.vec3f, unit="rad/s")
-    """In the world's axes."""
+    """Angular velocity in the world's axes."""
     contact_force: wp.array = device_array("world", "step", "place", dtype=wp.vec3f, unit="N")
-    """Sum of the forces of all contacts on the body, mean over the step."""
+    """Vector sum of all contact forces on the body, mean over the step."""
     contact_load: wp.array = device_array("world", "step", "place", dtype=wp.float32, unit="N")
-    """Sum of their sizes."""
+    """Sum of their magnitudes, mean over the step."""
     seal_force: wp.array = device_array("world", "step", "instance", dtype=wp.float32, unit="N")
-    """Tension and shear that the instance's seal bore; 0: none holds it."""
+    """Tension and shear of the instance's seal, that of a seal that broke in the step included; 0: no seal."""
     attached: wp.array = device_array("world", "step", "instance", dtype=wp.uint8)
     """1: a seal holds the instance at the step's end."""
     setpoint: wp.array = device_array("world", "step", dtype=wp.vec3f, unit="m")
-    """Where the finger's tilt axis was drawn to in the step; NaN: nowhere."""
+    """Setpoint of the wrist in the step; NaN: none."""
     impedance_force: wp.array = device_array("world", "step", dtype=wp.vec3f, unit="N")
-    """The force that drew it, without the gripper's weight, which is borne."""
+    """Impedance force on the gripper, without gravity compensation."""
     task: wp.array = device_array("world", "step", dtype=wp.int8)
-    """A `Task`, at the step's end."""
+    """`Task` at the step's end."""
 
 
 @dataclass(frozen=True, eq=False)
 class DropArrays:
-    """How the arrangement of each world's episode began."""
+    """Start of each world's arrangement."""
 
     drop_pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
-    """Object to world where it was first dropped."""
+    """Object to world at its first drop."""
     progress: wp.array = device_array("world", dtype=wp.vec4i, unit="ticks")
     """As `WorldState.progress`."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhysicsRecord:
-    """What one tick's physics leaves for the host."""
+    """Physics of one tick, for the host."""
 
     steps: StepArrays | None
     """None: steps are not recorded."""
     drops: DropArrays
 
 
-def record_sizes(config: Config, sizes: dict[str, int]) -> dict[str, int]:
-    """Extents of the dimensions that the dataclasses here name; `sizes` are those of `world_sizes`."""
-    return sizes | {"step": config.physics.steps_per_tick, "place": config.arrangement.max_objects + build.GRIPPER_BODIES}
+def record_sizes(sizes: dict[str, int], steps_per_tick: int) -> dict[str, int]:
+    """Extents of the dimensions of the dataclasses here; `sizes` are those of `world_sizes`."""
+    return sizes | {"step": steps_per_tick, "place": sizes["instance"] + build.GRIPPER_BODIES}
 
 
-def record_kinds(config: Config) -> tuple[type, ...]:
-    """The dataclasses here that a bake with these settings allocates."""
-    return (StepArrays, DropArrays) if config.trajectory.steps else (DropArrays,)
+def record_kinds(settings: Trajectory) -> tuple[type, ...]:
+    """Dataclasses of this module that are allocated under these settings."""
+    return (StepArrays, DropArrays) if settings.steps else (DropArrays,)
 
 
 class Recorder:
-    """Watches the steps of a tick. It launches the same kernels on the same arrays every time, as they are captured in a graph."""
+    """Watcher that records the steps of a tick. Its launches never change, because `Physics.tick` captures them in a graph."""
 
     def __init__(
         self,
-        config: Config,
+        settings: Trajectory,
+        gripper: Gripper,
         scene: SceneData,
         state: WorldState,
         attempts: AttemptState,
@@ -89,34 +90,35 @@ class Recorder:
         physics: Physics,
         sizes: dict[str, int],
     ) -> None:
-        """Allocate what a tick's steps are written into.
+        """Allocate the current record and scratch.
 
         Args:
-            config: Settings; those of `trajectory` say what is recorded.
-            scene: Constants.
-            state: Of the worlds.
-            attempts: Of their grippers.
-            seals: Of their cups.
-            physics: Tells of contact forces, if steps are recorded.
-            sizes: Those of `world_sizes`.
+            settings: Settings of trajectories; `steps` selects whether steps are recorded.
+            gripper: Settings of the gripper; its weight is subtracted from joint forces.
+            scene: Constants of the simulation.
+            state: State of the worlds.
+            attempts: State of their attempts.
+            seals: State of their seals.
+            physics: Source of poses, contact forces and joint forces.
+            sizes: Extents by `world_sizes`.
         """
         self._scene, self._state, self._attempts, self._seals, self._physics = scene, state, attempts, seals, physics
         self._device = state.phase.device
-        self._sizes = record_sizes(config, sizes)
-        self._steps = config.trajectory.steps
+        self._sizes = record_sizes(sizes, physics.settings.steps_per_tick)
+        self._steps = settings.steps
         self._current = self.new_record()
-        self._share = 1.0 / config.physics.substeps
-        self._weight = (config.gripper.finger_mass + config.gripper.cup_mass) * config.physics.gravity
+        self._substep_fraction = 1.0 / physics.settings.substeps
+        self._weight = (gripper.finger_mass + gripper.cup_mass) * physics.settings.gravity
         self._total = wp.zeros((sizes["body"], int(step_log.MAGNITUDE) + 1), dtype=wp.int64, device=self._device)
         self._force = wp.zeros(sizes["world"], dtype=wp.vec3, device=self._device)
 
     def new_record(self) -> PhysicsRecord:
-        """Room for a tick."""
+        """Allocate a record of one tick."""
         steps = allocate(StepArrays, self._sizes, self._device) if self._steps else None
         return PhysicsRecord(steps, allocate(DropArrays, self._sizes, self._device))
 
     def save_drop_poses(self) -> None:
-        """Where objects that have just been dropped begin to fall."""
+        """Save the drop poses of objects that have just been dropped."""
         state = self._state
         wp.launch(
             step_log.save_drop_poses_kernel,
@@ -127,11 +129,11 @@ class Recorder:
         )
 
     def begin_step(self) -> None:
-        """Before a step."""
+        """Clear the sums of contact forces, before a step."""
         self._total.zero_()
 
     def save_impedance_force(self) -> None:
-        """After the impedance force of a step was set, and before the seals add theirs."""
+        """Save the impedance forces of a step, before seal forces are added to the joint forces."""
         if self._steps:
             wp.launch(
                 step_log.save_impedance_force_kernel,
@@ -142,7 +144,7 @@ class Recorder:
             )
 
     def after_solve(self, contact_f: wp.array) -> None:
-        """After a solver step; `contact_f` is each contact's force on its first shape (contact) spatial vector [N]."""
+        """Add the contact forces of a solver substep: the force of each contact on its first shape (contact) spatial vector [N]."""
         contacts = self._physics.contacts
         wp.launch(
             step_log.sum_contacts_kernel,
@@ -159,68 +161,77 @@ class Recorder:
         )
 
     def end_step(self, step: int, current: newton.State) -> None:
-        """Write down a step, by its number in the tick, from the state at its end."""
-        scene, state, seals, made = self._scene, self._state, self._seals, self._current.steps
-        if made is None:
+        """Record step `step` of the tick from the state at its end."""
+        scene, state, seals, log = self._scene, self._state, self._seals, self._current.steps
+        if log is None:
             return
         places = (self._sizes["world"], self._sizes["place"])
         wp.launch(
             step_log.record_motion_kernel,
             dim=places,
             inputs=[scene.layout, step, state.catalog_index, state.body_slot, current.body_q, current.body_qd],
-            outputs=[made.pose, made.velocity, made.angular_velocity],
+            outputs=[log.pose, log.velocity, log.angular_velocity],
             device=self._device,
         )
         wp.launch(
             step_log.record_forces_kernel,
             dim=places,
-            inputs=[scene.layout, step, self._share, state.catalog_index, state.body_slot, seals.attached, seals.seal_force, self._total],
-            outputs=[made.contact_force, made.contact_load, made.seal_force, made.attached],
+            inputs=[
+                scene.layout,
+                step,
+                self._substep_fraction,
+                state.catalog_index,
+                state.body_slot,
+                seals.attached,
+                seals.seal_force,
+                self._total,
+            ],
+            outputs=[log.contact_force, log.contact_load, log.seal_force, log.attached],
             device=self._device,
         )
         wp.launch(
             step_log.record_gripper_kernel,
             dim=self._sizes["world"],
             inputs=[step, state.phase, state.mode, self._attempts.task, state.setpoint, self._force],
-            outputs=[made.setpoint, made.impedance_force, made.task],
+            outputs=[log.setpoint, log.impedance_force, log.task],
             device=self._device,
         )
 
     def take(self, target: PhysicsRecord) -> None:
-        """Copy what the tick left, on the device."""
+        """Copy the current record to `target`, on the device."""
         wp.copy(self._current.drops.progress, self._state.progress)
-        for ours, theirs in ((self._current.steps, target.steps), (self._current.drops, target.drops)):
-            if ours is not None:
-                for item in fields(ours):
-                    wp.copy(getattr(theirs, item.name), getattr(ours, item.name))
+        for source, destination in ((self._current.steps, target.steps), (self._current.drops, target.drops)):
+            if source is not None:
+                for item in fields(source):
+                    wp.copy(getattr(destination, item.name), getattr(source, item.name))
 
 
-def record_arrays(made: PhysicsRecord) -> list[wp.array]:
-    """The arrays of a record, in the order in which `host_record` takes them."""
-    return [getattr(part, item.name) for part in (made.steps, made.drops) if part is not None for item in fields(part)]
+def record_arrays(record: PhysicsRecord) -> list[wp.array]:
+    """List the arrays of a record, in the order that `host_record` expects."""
+    return [getattr(part, item.name) for part in (record.steps, record.drops) if part is not None for item in fields(part)]
 
 
 def host_record(arrays: list[np.ndarray], instances: int) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Arrays by name for `TickBatch.tick` and `TickBatch.steps`.
+    """Convert a record to the arrays of `TickBatch.tick` and `TickBatch.steps`, by their names in data sets.
 
     Args:
-        arrays: What `record_arrays` names, on the host.
-        instances: Room for instances of a world.
+        arrays: Arrays of `record_arrays`, copied to the host.
+        instances: Capacity for instances of a world.
     """
     drops = [item.name for item in fields(DropArrays)]
     names = [item.name for item in fields(StepArrays)] if len(arrays) > len(drops) else []
-    found = dict(zip([*names, *drops], arrays, strict=True))
-    tick = {"drop_pose": found["drop_pose"], "redrops": found["progress"][:, 2]}
-    return tick, _split(found, names, instances)
+    values = dict(zip([*names, *drops], arrays, strict=True))
+    tick = {"drop_pose": values["drop_pose"], "redrops": values["progress"][:, 2]}
+    return tick, _split_places(values, names, instances)
 
 
-def _split(found: Mapping[str, np.ndarray], names: list[str], instances: int) -> dict[str, np.ndarray]:
-    """Objects and gripper apart."""
+def _split_places(arrays: Mapping[str, np.ndarray], names: list[str], instances: int) -> dict[str, np.ndarray]:
+    """Split arrays by place into those of objects and those of the gripper, named `gripper_*`."""
     steps = {}
     for item in fields(StepArrays):
         if item.name not in names:
             continue
-        values = found[item.name]
+        values = arrays[item.name]
         if "place" in item.metadata["array"].shape:
             steps[item.name] = values[:, :, :instances]
             steps[f"gripper_{item.name}"] = values[:, :, instances:]
@@ -230,12 +241,12 @@ def _split(found: Mapping[str, np.ndarray], names: list[str], instances: int) ->
 
 
 def tick_measures(columns: Mapping[str, np.ndarray], instances: int) -> dict[str, np.ndarray]:
-    """More arrays by name for `TickBatch.tick`: of the table of states what tells of physics and attempts, bits as (world, instance).
+    """Select the columns of physics and attempts for `TickBatch.tick`; bit masks are unpacked to (world, instance) uint8.
 
     Args:
-        columns: Name -> column (world) of the tables of states and measures; see `stages.sim.worlds`.
-        instances: Room for instances of a world.
+        columns: Columns (world) of status and measures, by `codes.column_names`.
+        instances: Capacity for instances of a world.
     """
-    made = {name: columns[name] for name in ("phase", "mode", "task", "attempt", "outcome", "target", "hits", "load")}
+    result = {name: columns[name] for name in ("phase", "mode", "task", "attempt", "outcome", "target", "hits", "load")}
     bits = np.arange(instances, dtype=np.int32)
-    return made | {name: (columns[name][:, None] >> bits & 1).astype(np.uint8) for name in ("caught", "held")}
+    return result | {name: (columns[name][:, None] >> bits & 1).astype(np.uint8) for name in ("caught", "held")}

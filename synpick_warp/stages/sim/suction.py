@@ -1,4 +1,4 @@
-"""Suction: what the cup catches, the seals that hold it, and the contacts that these replace."""
+"""Suction gripper: ray test, seal forces, and contacts that the seals replace. Launches kernels.sim.cup_rays and seal."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Suction as SuctionConfig
 from synpick_warp.kernels.sim import cup_rays, seal
 from synpick_warp.scenes.collision.hull_planes import plane_table
 from synpick_warp.scenes.types import Catalog
-from synpick_warp.stages.constants import SceneData
+from synpick_warp.stages.constants import SceneData, fill
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
 
 class Suction:
-    """The cups' rays and seals."""
+    """Suction rays and seals of all cups."""
 
-    def __init__(self, config: Config, catalog: Catalog, render_scene: RenderScene, device: wp.Device) -> None:
-        """Put on the device what the rays hit: collision shapes or visual meshes, as `suction.surface` says.
+    def __init__(self, settings: SuctionConfig, catalog: Catalog, render_scene: RenderScene, device: wp.Device) -> None:
+        """Upload the surfaces that the rays hit: collision shapes or visual meshes, by `settings.surface`.
 
         Args:
-            config: All settings.
+            settings: Settings of suction.
             catalog: The objects.
-            render_scene: Holds the visual meshes.
-            device: Where the rest lies.
+            render_scene: Owner of the visual meshes.
+            device: Device of the surfaces.
         """
         self._meshes = render_scene.keep
-        self.surface = _surface_data(config.suction.surface == "mesh", catalog, render_scene.meshes.id, device)
+        self.surface = _surface_data(settings.surface == "mesh", catalog, render_scene.meshes.id, device)
 
     def count_seal_rays(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
-        """At the end of a tick, where a cup's time to press is up: cast its rays, and join what they catch to the cup."""
+        """Switch suction on where task PRESS is complete: cast the rays and attach the engaged objects. Runs at the end of a tick."""
         task = [state.phase, attempts.task, attempts.steps]
         body_q, device = physics.state.body_q, state.phase.device
         wp.launch(
@@ -53,9 +53,9 @@ class Suction:
         )
 
     def apply_seal_forces(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics, current: newton.State) -> None:
-        """Before a step: pull what hangs on the cups to the tip, and break seals that bear too much.
+        """Add the seals' wrenches to the joint forces of objects and gripper, and break overloaded seals.
 
-        After the gripper's forces have been written: the reactions are added to them.
+        Runs before a step, after the gripper's forces were written.
         """
         model = physics.model
         wp.launch(
@@ -81,7 +81,7 @@ class Suction:
         )
 
     def ignore_attached_contacts(self, scene: SceneData, state: WorldState, seals: SealState, physics: Physics) -> None:
-        """Between collision and solver: cups do not touch what hangs on them."""
+        """Disable contacts between cups and their attached objects. Runs between collision detection and solver."""
         contacts = physics.contacts
         wp.launch(
             seal.ignore_attached_contacts_kernel,
@@ -101,15 +101,16 @@ class Suction:
 
 
 def _surface_data(use_mesh: bool, catalog: Catalog, meshes: wp.array, device: wp.Device) -> Any:
-    """The struct `SurfaceData`; `meshes` are ids of visual meshes, the catalog's entries first."""
+    """Fill `SurfaceData`; `meshes` are ids of visual meshes, those of the catalog first."""
     table = plane_table(catalog)
-    data = cup_rays.SurfaceData()
-    data.first_piece = wp.array(table.first_piece, dtype=wp.int32, device=device)
-    data.first_plane = wp.array(table.first_plane, dtype=wp.int32, device=device)
-    data.plane = wp.array(table.plane, dtype=wp.vec4, device=device)
-    data.mesh = meshes
-    data.use_mesh = int(use_mesh)
     parts = [[entry.mesh] if use_mesh else entry.pieces for entry in catalog.entries]
     radius = [max(np.linalg.norm(part.vertices, axis=1).max() for part in entry) for entry in parts]
-    data.radius = wp.array(np.array(radius), dtype=wp.float32, device=device)
-    return data
+    return fill(
+        cup_rays.SurfaceData,
+        first_piece=wp.array(table.first_piece, dtype=wp.int32, device=device),
+        first_plane=wp.array(table.first_plane, dtype=wp.int32, device=device),
+        plane=wp.array(table.plane, dtype=wp.vec4, device=device),
+        mesh=meshes,
+        use_mesh=use_mesh,
+        radius=wp.array(np.array(radius), dtype=wp.float32, device=device),
+    )

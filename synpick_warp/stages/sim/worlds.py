@@ -1,4 +1,4 @@
-"""Device state of all worlds."""
+"""Simulation state: device arrays of all worlds, one row a world, which persist between ticks."""
 
 from __future__ import annotations
 
@@ -11,101 +11,101 @@ from synpick_warp.codes import Measure, Status
 from synpick_warp.configs.schema import Config
 from synpick_warp.stages.buffers import FIXTURES
 
-# Corners of the tote that a round of moving visits.
+# Waypoints of a round of moving: the corners of the tote.
 CORNERS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class WorldState:
-    """Changes every tick; lives on the device."""
+    """State of the worlds and their objects."""
 
     arrangement_id: wp.array = device_array("world", dtype=wp.vec2i)
-    """Episode number and redraw; episode -1: none."""
+    """Episode index, and index of the arrangement in it: 0, plus 1 for each resample. Episode -1: none."""
     phase: wp.array = device_array("world", dtype=wp.int32)
-    """A `Phase`."""
+    """`Phase`."""
     ending: wp.array = device_array("world", dtype=wp.int32)
-    """An `Ending`."""
+    """`Ending`."""
     mode: wp.array = device_array("world", dtype=wp.int32)
-    """A `Mode`."""
+    """`Mode`."""
     next_episode: wp.array = device_array("one", dtype=wp.int32)
-    """How many of the bake's episode numbers worlds have taken."""
+    """Position in the bake's list of episodes of the next one to start."""
     progress: wp.array = device_array("world", dtype=wp.vec4i, unit="ticks")
     """Ticks since the drop, ticks at rest, re-drops, whether the guide walls stand."""
     catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
-    """Catalog index of each instance; -1: none."""
+    """Object of each instance; -1: none."""
     body_slot: wp.array = device_array("world", "instance", dtype=wp.int32)
-    """Body slot of each instance."""
+    """Body slot of each instance: its body is the slot-th after the gripper's."""
     stuck: wp.array = device_array("world", "instance", dtype=wp.int32, unit="ticks")
-    """How long the instance has been stuck."""
+    """Time in deep penetration."""
     previous_pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     """Object to world, one tick ago."""
     displacement: wp.array = device_array("world", "instance", dtype=wp.float32, unit="m")
-    """How far the instance moved in the last tick."""
+    """Upper bound of the motion of any point of the instance in the last tick."""
     penetration: wp.array = device_array("body", dtype=wp.float32, unit="m")
     """Deepest penetration of each body."""
     variant: wp.array = device_array("body", dtype=wp.int32)
-    """Body variant to select; -1: as it is."""
+    """Body variant to select; -1: no change."""
     restarted: wp.array = device_array("world_and_global", dtype=wp.bool)
-    """Worlds that got new objects this tick; the last entry stands for what belongs to no world."""
+    """Worlds that were reset in this tick; the last element is Newton's global world."""
     frame: wp.array = device_array("world", dtype=wp.int32)
-    """Frames since the gripper began to act; -1: not yet."""
+    """Frame index since phase ACT began; -1: not yet."""
     corner_order: wp.array = device_array("world", "waypoint", dtype=wp.int32)
-    """Corners in the order of their visit."""
+    """Tote corner, 0 to 3, of each waypoint."""
     waypoint: wp.array = device_array("world", dtype=wp.int32)
-    """How many corners the goal has reached."""
+    """Waypoints that the setpoint has reached."""
     setpoint: wp.array = device_array("world", dtype=wp.vec3f, unit="m")
-    """Goal of the finger's tilt axis."""
+    """Setpoint of the wrist, the origin of shaft and cup."""
     light: wp.array = device_array("world", dtype=wp.int32)
-    """Light map of the episode."""
+    """Environment map of the episode."""
     light_yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
-    """Its turn about +z."""
+    """Rotation of the map about +z, counter-clockwise."""
     light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="stops")
-    """Exposure against the automatic one."""
+    """Exposure relative to the automatic one."""
 
 
 @dataclass(frozen=True, eq=False)
 class AttemptState:
-    """What each world's gripper tries to pick, and how far it has come."""
+    """State of each world's attempt to pick."""
 
     task: wp.array = device_array("world", dtype=wp.int32)
-    """A `Task`."""
+    """`Task`."""
     steps: wp.array = device_array("world", dtype=wp.int32, unit="steps")
     """Time since the task began."""
     attempt: wp.array = device_array("world", dtype=wp.int32)
-    """Number of the running attempt in its episode, or of the one that ended in this tick; -1: none yet."""
+    """Index of the attempt in its episode, of the running one or the one that ended in this tick; -1: none yet."""
     outcome: wp.array = device_array("world", dtype=wp.int32)
     """`Outcome` of the attempt that ended in this tick."""
     failures: wp.array = device_array("world", dtype=wp.int32)
-    """Attempts that have failed and count."""
+    """Failed attempts that count."""
     hits: wp.array = device_array("world", dtype=wp.int32)
-    """Rays that hit an object when the suction was switched on."""
+    """Suction rays that hit an object when suction was switched on."""
     engaged_bits: wp.array = device_array("world", dtype=wp.uint32)
-    """Bit i: instance i was caught then."""
+    """Bit i: instance i was engaged, that is, hit by a ray."""
     attached_bits: wp.array = device_array("world", dtype=wp.uint32)
-    """Bit i: instance i hung on the cup at the end of the tick."""
+    """Bit i: instance i was attached to the cup at the end of the tick, before picked objects were removed."""
     removed: wp.array = device_array("world", "instance", dtype=wp.int32)
-    """Whether the instance has left the scene: 0 no, 1 picked, 2 lost."""
+    """`Removal`: why the instance has left the scene."""
 
 
 @dataclass(frozen=True, eq=False)
 class SealState:
-    """What hangs on each world's cup."""
+    """State of the suction seals of each world's cup."""
 
     attached: wp.array = device_array("world", "instance", dtype=wp.int32)
     """1: a seal holds the instance."""
     object_in_tcp: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
-    """Object to the frame at the cup's tip (axes of the cup) when it was caught."""
+    """Object pose in the TCP frame when the seal engaged."""
     seal_force: wp.array = device_array("world", "instance", dtype=wp.float32, unit="N")
-    """Tension and shear that the seal bore in the last step."""
+    """Tension and shear of the seal in the last step, that of a seal that broke in it included; 0: no seal."""
     break_force: wp.array = device_array("world", dtype=wp.float32, unit="N")
     """Break force of every seal of the world."""
     peak_force: wp.array = device_array("world", dtype=wp.float32, unit="N")
-    """Largest load of any seal since the tick began."""
+    """Largest seal force since the tick began, that of a seal that broke included."""
 
 
 @dataclass(frozen=True, eq=False)
 class WorldStatus:
-    """The few numbers of each world that the host reads."""
+    """Status rows of the worlds, read by the host after each tick."""
 
     table: wp.array = device_array("world", "status", dtype=wp.int32)
     """Columns: `Status`."""
@@ -114,7 +114,7 @@ class WorldStatus:
 
 
 def world_sizes(config: Config, bodies_per_world: int) -> dict[str, int]:
-    """Extents of the dimensions that the dataclasses here, `Snapshot` and `Observation` name."""
+    """Extents of the dimensions of the dataclasses here, and of `Snapshot` and `Observation`."""
     worlds = config.bake.worlds
     return {
         "one": 1,
