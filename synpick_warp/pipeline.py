@@ -43,9 +43,9 @@ from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
 from synpick_warp.stages.perception.segment import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.render.denoised import DENOISED_SCRATCH, scratch_sizes
-from synpick_warp.stages.render.layers import MOTIONS, MOVING
+from synpick_warp.stages.render.layers import BODY_MOTIONS, MOTION_LAYERS
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
-from synpick_warp.stages.render.postprocess import SpreadArrays, has_spread
+from synpick_warp.stages.render.postprocess import LensArrays, has_lens_filter
 from synpick_warp.stages.render.raster import VISIBILITY_BUFFER, visibility_sizes
 from synpick_warp.stages.render.renderer import SHADED_IMAGE, Renderer
 from synpick_warp.stages.render.scene import build_render_scene
@@ -279,10 +279,10 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     groups += [(VISIBILITY_BUFFER, pixels, 1), (GBUFFER, pixels | {"view": len(config.cameras.positions)}, 1)]
     if any(kind.needs_physics for kind in load_exporter_classes(config.bake.formats)):
         groups += [(kind, record_sizes(worlds, config.physics.steps_per_tick), 1 + RECORDS) for kind in record_kinds(config.trajectory)]
-    if MOVING.intersection(config.render.layers):
-        groups += [(MOTIONS, views, 1)]
-    if has_spread(config):
-        groups += [(SpreadArrays, views, 1)]
+    if MOTION_LAYERS.intersection(config.render.layers):
+        groups += [(BODY_MOTIONS, views, 1)]
+    if has_lens_filter(config.effects):
+        groups += [(LensArrays, views, 1)]
     if may_pick(config):
         looks = count_views(config.sight, worlds["world"], room, device)
         groups += [(kind, perception_sizes(config.sight, room, looks), 1) for kind in SCRATCH]

@@ -18,12 +18,12 @@ from synpick_warp.stages.render.denoised import (
     COARSE_LIGHT,
     GUIDE,
     RATIO_IMAGES,
-    Edges,
+    FootprintLists,
     ShadowArrays,
     paths_per_coarse_pixel,
     scratch_sizes,
 )
-from synpick_warp.stages.render.layers import MOTIONS
+from synpick_warp.stages.render.layers import BODY_MOTIONS
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch
 from synpick_warp.stages.render.raster import VISIBILITY_BUFFER
 from synpick_warp.stages.render.renderer import SHADED_IMAGE
@@ -33,7 +33,7 @@ from tests.worlds.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
-    "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_square block"
+    "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_footprint block"
 )
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 MOVING = [
@@ -55,11 +55,11 @@ MOVING = [
     COARSE_LIGHT,
     RATIO_IMAGES,
     ShadowArrays,
-    Edges,
+    FootprintLists,
     VISIBILITY_BUFFER,
 ]
 LOOKING = [VIEWS, PerceptionArrays, SegmentationScratch, VoteArrays, CYCLES]
-LAYERS = [LayerBuffers, MOTIONS]
+LAYERS = [LayerBuffers, BODY_MOTIONS]
 DECLARED = MOVING + LOOKING + LAYERS
 
 
@@ -193,5 +193,5 @@ def test_layers_are_in_the_table_if_they_are_asked_for():
     rows = {name: (shape, unit, size) for name, shape, unit, size in describe_arrays(settings(render__layers=["flow", "nocs"]))}
     assert {name for name in rows if name.startswith("LayerBuffers")} == {"LayerBuffers.flow", "LayerBuffers.nocs"}
     assert rows["LayerBuffers.flow"][1] == "px"
-    assert "Motions.rotation" in rows
-    assert not any(name.startswith("Motions") for name, *_ in describe_arrays(settings(render__layers=["nocs"])))
+    assert "BodyMotions.rotation" in rows
+    assert not any(name.startswith("BodyMotions") for name, *_ in describe_arrays(settings(render__layers=["nocs"])))

@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.arrays import device_array
-from synpick_warp.kernels.render.images.camera_effects import Strengths
+from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.layers import LAYER_TABLE, Layer
 
 FIXTURES = ("tote", "finger", "cup")
@@ -76,7 +76,7 @@ class ViewBuffers:
     """px_count_all, px_count_valid, px_count_visib."""
     boxes: wp.array = device_array("view", "instance", "box", "side", dtype=wp.int32, unit="px")
     """bbox_obj and bbox_visib: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty."""
-    effects: wp.array = device_array("view", dtype=Strengths)
+    effects: wp.array = device_array("view", dtype=EffectParameters)
     """Strengths of the camera's effects, in the order of `Effect`; zero: off."""
 
 

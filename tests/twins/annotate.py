@@ -1,4 +1,4 @@
-"""Counts and boxes of instances, straight from images."""
+"""NumPy twin of pixel counts and bounding boxes, computed from full images."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ def box_of(mask: np.ndarray, origin: tuple[int, int] = (0, 0)) -> tuple[int, int
 def count_pixels(
     instance: np.ndarray, depth: np.ndarray, amodal: np.ndarray, canvas: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What annotation must find for one view.
+    """Expected pixel counts and boxes of one view.
 
     Args:
-        instance: Codes (H, W).
+        instance: Segmentation ids (H, W).
         depth: Counts (H, W).
-        amodal: Bits (H, W).
-        canvas: Bits (3H, 3W), of which the middle is the image.
-        count: Instances.
+        amodal: Bit i: instance i (H, W).
+        canvas: Amodal bits (3H, 3W), with the image in the middle.
+        count: Number of instances.
 
     Returns:
         px_count_all, px_count_valid, px_count_visib (count, 3); bbox_obj and bbox_visib (count, 2, 4).
@@ -33,7 +33,7 @@ def count_pixels(
     pixels, boxes = np.zeros((count, 3), int), np.zeros((count, 2, 4), int)
     for i in range(count):
         bit = np.uint32(1) << np.uint32(i)
-        whole, inside, visible = (canvas & bit) != 0, (amodal & bit) != 0, instance == 1 + i
-        pixels[i] = whole.sum(), (inside & (depth != 0)).sum(), visible.sum()
-        boxes[i] = box_of(whole, (-width, -height)), box_of(visible)
+        full, inside, visible = (canvas & bit) != 0, (amodal & bit) != 0, instance == 1 + i
+        pixels[i] = full.sum(), (inside & (depth != 0)).sum(), visible.sum()
+        boxes[i] = box_of(full, (-width, -height)), box_of(visible)
     return pixels, boxes

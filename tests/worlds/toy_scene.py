@@ -140,8 +140,8 @@ class Picture:
     exact_depth: np.ndarray
     """What the pixels' rays met, before rounding [m]."""
     radiance: np.ndarray
-    mix: np.ndarray
-    """Whose radiance a pixel shows (B, H, W) uint32."""
+    resolve: np.ndarray
+    """Anti-aliasing resolve codes, see `ShadedImage` (B, H, W) uint32."""
 
 
 def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
@@ -177,7 +177,7 @@ def render(toy: ToyScene, device: wp.Device) -> Picture:
     renderer.render(snapshot(toy, device), make_views(view_world, view_camera, views, toy.room), out)
     images = {name: getattr(out, name).numpy() for name in ("color", "depth", "instance", "amodal", "pixels", "boxes")}
     shown = renderer.image
-    return Picture(**images, exact_depth=renderer.gbuffer.depth.numpy(), radiance=shown.radiance.numpy(), mix=shown.mix.numpy())
+    return Picture(**images, exact_depth=renderer.gbuffer.depth.numpy(), radiance=shown.radiance.numpy(), resolve=shown.resolve.numpy())
 
 
 def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:

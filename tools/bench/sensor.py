@@ -262,8 +262,7 @@ class _Ours:
         scene, cameras, view = self.renderer.scene, len(factory.cameras), np.arange(count, dtype=np.int32)
         world, camera = (wp.array(v, dtype=wp.int32, device=scene.device) for v in (view // cameras, view % cameras))
         self.views = make_views(world, camera, count, self.renderer.instances)
-        asked = replace(config, render=replace(config.render, layers=LAYERS))
-        self.layer_renderer = LayerRenderer(asked, scene, self.renderer.instances, count)
+        self.layer_renderer = LayerRenderer(LAYERS, None, scene, self.renderer.instances, count)
         self.layers = allocate(LayerBuffers, {"view": count, "row": scene.height, "column": scene.width}, scene.device, LAYERS)
 
     def hits(self) -> None:
@@ -272,7 +271,7 @@ class _Ours:
 
     def hits_and_layers(self) -> None:
         self.hits()
-        self.layer_renderer.draw(self.snapshot, self.renderer.bodies, self.renderer.gbuffer, self.views, self.layers)
+        self.layer_renderer.render(self.snapshot, self.renderer.bodies, self.renderer.gbuffer, self.views, self.layers)
 
     def picture(self) -> None:
         self.renderer.render(self.snapshot, self.views, self.out)

@@ -1,4 +1,4 @@
-"""What a depth camera would measure: disparities to a projector beside the camera, with their noise, steps and holes."""
+"""Structured-light depth sensor model: quantized disparity to a projector beside the camera, with noise, shadow and invalid pixels."""
 
 import warp as wp
 
@@ -11,57 +11,79 @@ from synpick_warp.kernels.rng import normal_pair, pixel_key, view_key
 
 wp.set_module_options({"enable_backward": False})
 
-HALF_PIXEL = wp.constant(0.5)
-"""Two rays of the projector nearer to each other than this [px] are one."""
+SAME_RAY = wp.constant(0.5)
+"""Projector columns that differ by at most this [px] count as the same projector ray."""
+FAR_DEPTH = wp.constant(1.0e9)
+"""Depth of the nearest body in a view without bodies [m]."""
+MIN_DEPTH = wp.constant(1.0e-3)
+"""Smallest depth of a body that is used for a search range [m]: bodies may reach behind the camera."""
 
 
 @wp.struct
-class SensorRules:
-    """See configs.sensors.DepthSensor. Angles in radians."""
+class SensorParameters:
+    """Parameters of the sensor model; see configs.sensors.DepthSensor."""
 
     seed: wp.uint64
+    """Seed of the bake."""
     baseline: float
+    """From the camera to the projector, to the right [m]."""
     disparity_step: float
+    """Quantization step of disparity [px]."""
     near: float
     far: float
+    """Measuring range of depth [m]."""
     noise: float
+    """Axial noise at `noise_distance` [m]."""
     noise_growth: float
+    """Growth of axial noise with the square of depth [1/m]."""
     noise_distance: float
+    """Depth of least noise [m]."""
     noise_angle: float
+    """Growth of axial noise with the angle of incidence [m^1.5]."""
     lateral_noise: float
+    """Standard deviation of the pixel that is measured instead [px]."""
     grazing_cosine: float
-    """Cosine of the largest angle of incidence."""
+    """Cosine of the largest angle of incidence that is measured."""
     edge_width: int
+    """Half width of the matching window [px]."""
     edge_step: float
+    """Disparity difference within the window that invalidates a pixel [px]."""
     shadows: int
+    """1: pixels that the projector does not light are invalid."""
     counts_per_meter: float
+    """Depth counts in a metre."""
 
 
 @wp.func
-def disparity_at(gbuffer: GBuffer, gain: float, view: int, row: int, column: int) -> float:
-    """Disparity of what a pixel sees [px], 0 where it sees nothing; `gain` is focal length times baseline [px m]."""
+def disparity_at(gbuffer: GBuffer, focal_baseline: float, view: int, row: int, column: int) -> float:
+    """Disparity of a pixel's surface d = f b / z [px], 0 without surface; `focal_baseline` is f b [px m]."""
     if int(gbuffer.segment[view, row, column]) == Segment.NOTHING:
         return 0.0
-    return gain / gbuffer.depth[view, row, column]
+    return focal_baseline / gbuffer.depth[view, row, column]
 
 
 @wp.func
-def near_an_edge(gbuffer: GBuffer, grid: ImageGrid, sensor: SensorRules, gain: float, view: int, row: int, column: int) -> bool:
-    """Whether a pixel of the window about this one has another disparity: no match is found, or one of another surface."""
-    here = disparity_at(gbuffer, gain, view, row, column)
+def near_discontinuity(
+    gbuffer: GBuffer, grid: ImageGrid, sensor: SensorParameters, focal_baseline: float, view: int, row: int, column: int
+) -> bool:
+    """Edge invalidation: True if disparities within the matching window differ by more than the threshold from the centre's.
+
+    A window over two surfaces has no match, or that of the wrong surface.
+    """
+    here = disparity_at(gbuffer, focal_baseline, view, row, column)
     for down in range(-sensor.edge_width, sensor.edge_width + 1):
         for right in range(-sensor.edge_width, sensor.edge_width + 1):
             at_row = wp.clamp(row + down, 0, grid.height - 1)
             at_column = wp.clamp(column + right, 0, grid.width - 1)
-            if wp.abs(disparity_at(gbuffer, gain, view, at_row, at_column) - here) > sensor.edge_step:
+            if wp.abs(disparity_at(gbuffer, focal_baseline, view, at_row, at_column) - here) > sensor.edge_step:
                 return True
     return False
 
 
 @wp.func
-def nearest_body(bodies: ViewBodies, view: int) -> float:
-    """Least planar depth that a body of the view may have [m]."""
-    nearest = float(1.0e9)
+def min_body_depth(bodies: ViewBodies, view: int) -> float:
+    """Lower bound of the planar depth of all bodies of the view [m]."""
+    nearest = float(FAR_DEPTH)
     for body in range(bodies.mesh.shape[1]):
         if bodies.mesh[view, body] >= 0:
             nearest = wp.min(nearest, bodies.near[view, body])
@@ -69,25 +91,27 @@ def nearest_body(bodies: ViewBodies, view: int) -> float:
 
 
 @wp.func
-def in_shadow(gbuffer: GBuffer, bodies: ViewBodies, grid: ImageGrid, gain: float, view: int, row: int, column: int) -> bool:
-    """Whether something hides the projector, which stands to the camera's right.
+def in_projector_shadow(
+    gbuffer: GBuffer, bodies: ViewBodies, grid: ImageGrid, focal_baseline: float, view: int, row: int, column: int
+) -> bool:
+    """Shadow test against the projector, to the camera's right: True if a surface in the same image row occludes it.
 
-    The projector's column of a pixel is its own less its disparity. A pixel k columns to the right whose disparity is larger by k
-    lies on the same ray of the projector and is nearer to it.
+    The projector column of a pixel is its own column less its disparity. A pixel k columns to the right whose disparity is larger by k
+    lies on the same projector ray and is nearer to the projector. The largest disparity of any body bounds the search.
     """
-    here = disparity_at(gbuffer, gain, view, row, column)
-    most = gain / wp.max(nearest_body(bodies, view), 1.0e-3) - here
-    reach = wp.min(int(wp.ceil(most)), grid.width - 1 - column)
+    here = disparity_at(gbuffer, focal_baseline, view, row, column)
+    max_difference = focal_baseline / wp.max(min_body_depth(bodies, view), MIN_DEPTH) - here
+    reach = wp.min(int(wp.ceil(max_difference)), grid.width - 1 - column)
     for right in range(1, reach + 1):
-        more = disparity_at(gbuffer, gain, view, row, column + right) - here
-        if wp.abs(more - float(right)) <= HALF_PIXEL:
+        difference = disparity_at(gbuffer, focal_baseline, view, row, column + right) - here
+        if wp.abs(difference - float(right)) <= SAME_RAY:
             return True
     return False
 
 
 @wp.func
-def depth_deviation(sensor: SensorRules, depth: float, cosine: float) -> float:
-    """Standard deviation of a measured depth [m], for the cosine of the angle of incidence; the law of configs.sensors.DepthSensor."""
+def axial_noise(sensor: SensorParameters, depth: float, cosine: float) -> float:
+    """Standard deviation of a measured depth [m] for the cosine of the angle of incidence; the law of configs.sensors.DepthSensor."""
     off = depth - sensor.noise_distance
     angle = wp.acos(wp.clamp(cosine, 0.0, 1.0))
     ratio = angle / (wp.HALF_PI - angle)
@@ -95,39 +119,40 @@ def depth_deviation(sensor: SensorRules, depth: float, cosine: float) -> float:
 
 
 @wp.func
-def measured_depth(sensor: SensorRules, gain: float, depth: float) -> float:
-    """The depth whose disparity is a whole number of steps [m]; 0: out of the sensor's reach."""
+def quantize_depth(sensor: SensorParameters, focal_baseline: float, depth: float) -> float:
+    """Depth whose disparity is rounded to the nearest multiple of the step [m]; 0: outside of the measuring range."""
     if depth < sensor.near or depth > sensor.far:
         return 0.0
-    steps = wp.rint(gain / (depth * sensor.disparity_step))
+    steps = wp.rint(focal_baseline / (depth * sensor.disparity_step))
     if steps < 1.0:
         return 0.0
-    return gain / (steps * sensor.disparity_step)
+    return focal_baseline / (steps * sensor.disparity_step)
 
 
 @wp.kernel
-def draw_depth_sensor_kernel(
+def render_depth_sensor_kernel(
     # Scene:
     meshes: Meshes,
     surfaces: Surfaces,
     cameras: Cameras,
     grid: ImageGrid,
     # State:
-    episode: wp.array[int],
-    frame: wp.array[int],
+    episode: wp.array[int],  # (world)
+    frame: wp.array[int],  # (world)
     # In:
-    sensor: SensorRules,
+    sensor: SensorParameters,
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: Views,
     first: int,
     # Out:
-    depth_sensor_out: wp.array3d[wp.uint16],
+    depth_sensor_out: wp.array3d[wp.uint16],  # (view, row, column) [counts]
 ):
-    """Depth in counts as a sensor measures it, 0: hole. d = f b / (z + σ n), rounded to steps; n is standard normal.
+    """Simulate a structured-light depth image: disparity d = f b / (z + σ n), rounded to steps; n is standard normal.
 
-    z is that of a pixel that lies off by lateral noise. Holes: no surface, grazing rays, edges, what the projector does not reach.
-    Numbers are those of the stream (seed, episode, frame, camera, DEPTH_NOISE) and the pixel, so each picture has noise of its own.
+    z is the depth of a pixel displaced by lateral noise, σ its axial noise. `depth_sensor_out` receives f b / d in counts, 0 for invalid
+    pixels (holes): no surface, grazing incidence, depth discontinuities, projector shadow, outside of the measuring range. n is of the
+    random number stream (seed, episode, frame, camera, DEPTH_NOISE) and the pixel, so each image has noise of its own.
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
@@ -136,25 +161,25 @@ def draw_depth_sensor_kernel(
     camera = views.camera[view]
     world = views.world[view]
     key = pixel_key(view_key(sensor.seed, episode[world], frame[world], camera, Stream.DEPTH_NOISE), row * grid.width + column)
-    shift = sensor.lateral_noise * normal_pair(key, 0)
-    at_row = wp.clamp(row + int(wp.rint(shift[0])), 0, grid.height - 1)
-    at_column = wp.clamp(column + int(wp.rint(shift[1])), 0, grid.width - 1)
+    displacement = sensor.lateral_noise * normal_pair(key, 0)
+    at_row = wp.clamp(row + int(wp.rint(displacement[0])), 0, grid.height - 1)
+    at_column = wp.clamp(column + int(wp.rint(displacement[1])), 0, grid.width - 1)
     if int(gbuffer.segment[view, at_row, at_column]) == Segment.NOTHING:
         return
     intrinsics = cameras.intrinsics[camera]
-    gain = intrinsics[0] * sensor.baseline
+    focal_baseline = intrinsics[0] * sensor.baseline
     depth = gbuffer.depth[view, at_row, at_column]
     surface = hit_surface(meshes, surfaces, cameras, bodies, gbuffer, view, at_row, at_column, camera, views.instances)
     ray = wp.normalize(cameras.to_world[camera] * camera_ray(intrinsics, at_row, at_column, wp.vec2(0.0, 0.0)))
     cosine = wp.abs(wp.dot(surface.face_normal, ray))
     if cosine < sensor.grazing_cosine:
         return
-    if near_an_edge(gbuffer, grid, sensor, gain, view, at_row, at_column):
+    if near_discontinuity(gbuffer, grid, sensor, focal_baseline, view, at_row, at_column):
         return
     if sensor.shadows != 0:
-        if in_shadow(gbuffer, bodies, grid, gain, view, at_row, at_column):
+        if in_projector_shadow(gbuffer, bodies, grid, focal_baseline, view, at_row, at_column):
             return
-    noisy = depth + depth_deviation(sensor, depth, cosine) * normal_pair(key, 2)[0]
-    counts = wp.rint(sensor.counts_per_meter * measured_depth(sensor, gain, noisy))
+    noisy = depth + axial_noise(sensor, depth, cosine) * normal_pair(key, 2)[0]
+    counts = wp.rint(sensor.counts_per_meter * quantize_depth(sensor, focal_baseline, noisy))
     if counts <= MAX_COUNTS:
         depth_sensor_out[view, row, column] = wp.uint16(counts)

@@ -1,4 +1,7 @@
-"""Layers of a view beside colour, depth and instances, from its hits: normals, base colour, places on objects, classes, motion."""
+"""Annotation layers (AOVs) computed from the G-buffer: normals, albedo, NOCS, class ids, optical flow and scene flow.
+
+`synpick_warp.layers` has the table of layers, and says what to touch to add one.
+"""
 
 import warp as wp
 
@@ -12,54 +15,55 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Motions:
-    """Scratch, one row a view and body: where the points of the body were in the frame before, in the camera's axes."""
+class BodyMotions:
+    """Scratch, one row a view and body: rigid motion from this frame back to the previous one, in the camera's axes."""
 
     known: wp.array2d[int]
-    """1: the body was in the picture in the frame before, as part of the same episode."""
+    """1: the body was in the scene in the previous frame, of the same episode (view, body)."""
     rotation: wp.array2d[wp.mat33]
-    """Rotation from now to then, minus the identity."""
+    """Rotation R from the current to the previous orientation, minus the identity (view, body)."""
     origin: wp.array2d[wp.vec3]
-    """Origin of the body now [m]."""
-    shift: wp.array2d[wp.vec3]
-    """From there to its origin then [m]."""
+    """Current origin of the body (view, body) [m]."""
+    displacement: wp.array2d[wp.vec3]
+    """From the current origin to the previous one (view, body) [m]."""
 
 
 @wp.func
 def rotation_of(pose: wp.transformf) -> wp.mat33d:
-    """A pose's rotation, in float64."""
+    """Rotation matrix of a pose, in float64."""
     q = wp.transform_get_rotation(pose)
     return wp.quat_to_matrix(wp.normalize(wp.quatd(wp.float64(q[0]), wp.float64(q[1]), wp.float64(q[2]), wp.float64(q[3]))))
 
 
 @wp.func
 def position_of(pose: wp.transformf) -> wp.vec3d:
-    """A pose's translation, in float64 [m]."""
+    """Translation of a pose, in float64 [m]."""
     p = wp.transform_get_translation(pose)
     return wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
 
 
 @wp.kernel
-def prepare_motions_kernel(
+def compute_motions_kernel(
     # Scene:
     cameras: Cameras,
     # State:
-    catalog_index: wp.array2d[int],
-    pose: wp.array2d[wp.transformf],
-    fixture_pose: wp.array2d[wp.transformf],
-    follows: wp.array[int],
-    last_catalog_index: wp.array2d[int],
-    last_pose: wp.array2d[wp.transformf],
-    last_fixture_pose: wp.array2d[wp.transformf],
-    last_fixture_visible: wp.array2d[int],
+    catalog_index: wp.array2d[int],  # (world, instance)
+    pose: wp.array2d[wp.transformf],  # (world, instance) [m]
+    fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
+    follows: wp.array[int],  # (world)
+    last_catalog_index: wp.array2d[int],  # (world, instance)
+    last_pose: wp.array2d[wp.transformf],  # (world, instance) [m]
+    last_fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
+    last_fixture_visible: wp.array2d[int],  # (world, fixture)
     # In:
     views: Views,
     # Out:
-    motions_out: Motions,
+    motions_out: BodyMotions,
 ):
-    """Relative motion of each body: p_then - p = (R_then R⁻¹ - 1) (p - o) + (o_then - o), in float64, stored in float32.
+    """Relative rigid motion of each body: p_then - p = (R_then R⁻¹ - 1) (p - o) + (o_then - o), in float64, stored in float32.
 
-    Differences are stored, not poses, so that the error of a small motion is small.
+    `motions_out` receives R_then R⁻¹ - 1, o and o_then - o, rotated to the camera's axes. Differences are stored instead of poses, so
+    that small motions have small errors.
     """
     view, body = wp.tid()
     world = views.world[view]
@@ -82,7 +86,7 @@ def prepare_motions_kernel(
     rotation = to_camera * rotation_of(then) * wp.transpose(rotation_of(now)) * wp.transpose(to_camera)
     motions_out.rotation[view, body] = wp.mat33(rotation - wp.identity(n=3, dtype=wp.float64))
     motions_out.origin[view, body] = wp.vec3(to_camera * (position_of(now) - cameras.center[views.camera[view]]))
-    motions_out.shift[view, body] = wp.vec3(to_camera * (position_of(then) - position_of(now)))
+    motions_out.displacement[view, body] = wp.vec3(to_camera * (position_of(then) - position_of(now)))
 
 
 @wp.func
@@ -98,7 +102,7 @@ def hit_surface(
     camera: int,
     instances: int,
 ) -> Surface:
-    """Surface that a pixel's ray hit, which must have hit something."""
+    """Surface attributes of a pixel's primary hit, from the G-buffer; the pixel must show a body or the table."""
     to_camera = -wp.normalize(cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0)))
     segment = int(gbuffer.segment[view, row, column])
     if segment == Segment.TABLE:
@@ -110,7 +114,7 @@ def hit_surface(
 
 
 @wp.kernel
-def draw_normals_kernel(
+def render_normals_kernel(
     # Scene:
     meshes: Meshes,
     surfaces: Surfaces,
@@ -122,9 +126,9 @@ def draw_normals_kernel(
     views: Views,
     first: int,
     # Out:
-    normals_out: wp.array3d[wp.vec3],
+    normals_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
-    """The interpolated normal that shading uses, in the camera's axes; zero where nothing is."""
+    """Normal map: the interpolated shading normal in the camera's axes; zero without surface."""
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
@@ -137,7 +141,7 @@ def draw_normals_kernel(
 
 
 @wp.kernel
-def draw_albedo_kernel(
+def render_albedo_kernel(
     # Scene:
     meshes: Meshes,
     surfaces: Surfaces,
@@ -149,9 +153,9 @@ def draw_albedo_kernel(
     views: Views,
     first: int,
     # Out:
-    albedo_out: wp.array3d[wp.vec3ub],
+    albedo_out: wp.array3d[wp.vec3ub],  # (view, row, column)
 ):
-    """Base colour: material times texture, filtered over the pixel; black where nothing is."""
+    """Albedo map: base colour, material times texture filtered over the pixel, as sRGB bytes; black without surface."""
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
@@ -163,7 +167,7 @@ def draw_albedo_kernel(
 
 
 @wp.kernel
-def draw_nocs_kernel(
+def render_nocs_kernel(
     # Scene:
     meshes: Meshes,
     grid: ImageGrid,
@@ -173,54 +177,56 @@ def draw_nocs_kernel(
     views: Views,
     first: int,
     # Out:
-    nocs_out: wp.array3d[wp.vec3],
+    nocs_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
-    """Normalised object coordinates (Wang et al., 2019): (p - c) / |u - l| + 1/2, c = (l + u) / 2, l and u the mesh's bounds.
+    """NOCS map, normalized object coordinates (Wang et al., 2019): (p - c) / |u - l| + 1/2, c = (l + u) / 2, l and u the mesh's bounds.
 
-    No place on an object of any extent gives 0 in all three, which stands for no instance.
+    Zero stands for no instance: no point of an object with an extent has 0 in all three components.
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
     segment = int(gbuffer.segment[view, row, column])
-    place = wp.vec3(0.0, 0.0, 0.0)
+    coordinates = wp.vec3(0.0, 0.0, 0.0)
     if segment != Segment.NOTHING and segment <= views.instances:
         mesh = bodies.mesh[view, segment - 1]
         lower = meshes.lower[mesh]
         upper = meshes.upper[mesh]
         barycentric = gbuffer.barycentric[view, row, column]
         point = wp.mesh_eval_position(meshes.id[mesh], gbuffer.triangle[view, row, column], barycentric[0], barycentric[1])
-        place = (point - 0.5 * (lower + upper)) / wp.length(upper - lower) + wp.vec3(0.5, 0.5, 0.5)
-    nocs_out[view, row, column] = place
+        coordinates = (point - 0.5 * (lower + upper)) / wp.length(upper - lower) + wp.vec3(0.5, 0.5, 0.5)
+    nocs_out[view, row, column] = coordinates
 
 
 @wp.kernel
-def draw_classes_kernel(
+def render_classes_kernel(
     # Scene:
     grid: ImageGrid,
-    obj_id: wp.array[int],
+    obj_id: wp.array[int],  # (entry)
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: Views,
     first: int,
     # Out:
-    classes_out: wp.array3d[wp.uint16],
+    classes_out: wp.array3d[wp.uint16],  # (view, row, column)
 ):
-    """obj_id of the instance that is seen, 0 where none is."""
+    """Semantic segmentation: the class id, obj_id, of the visible instance; 0 without instance."""
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
     segment = int(gbuffer.segment[view, row, column])
-    number = int(0)
+    class_id = int(0)
     if segment != Segment.NOTHING and segment <= views.instances:
-        number = obj_id[bodies.mesh[view, segment - 1]]
-    classes_out[view, row, column] = wp.uint16(number)
+        class_id = obj_id[bodies.mesh[view, segment - 1]]
+    classes_out[view, row, column] = wp.uint16(class_id)
 
 
 @wp.func
-def motion_at(motions: Motions, gbuffer: GBuffer, view: int, row: int, column: int, ray: wp.vec3, follows: int, instances: int) -> wp.vec3:
-    """From the point that a pixel's ray met to where it was in the frame before, in the camera's axes [m]; NaN if unknown."""
+def point_displacement(
+    motions: BodyMotions, gbuffer: GBuffer, view: int, row: int, column: int, ray: wp.vec3, follows: int, instances: int
+) -> wp.vec3:
+    """Displacement from a pixel's surface point to its position in the previous frame, in the camera's axes [m]; NaN: unknown."""
     unknown = wp.vec3(wp.NAN, wp.NAN, wp.NAN)
     segment = int(gbuffer.segment[view, row, column])
     if segment == Segment.NOTHING or follows == 0:
@@ -231,57 +237,58 @@ def motion_at(motions: Motions, gbuffer: GBuffer, view: int, row: int, column: i
     if motions.known[view, body] == 0:
         return unknown
     point = gbuffer.depth[view, row, column] * ray
-    return motions.rotation[view, body] * (point - motions.origin[view, body]) + motions.shift[view, body]
+    return motions.rotation[view, body] * (point - motions.origin[view, body]) + motions.displacement[view, body]
 
 
 @wp.kernel
-def draw_scene_flow_kernel(
+def render_scene_flow_kernel(
     # Scene:
     cameras: Cameras,
     grid: ImageGrid,
     # State:
-    follows: wp.array[int],
+    follows: wp.array[int],  # (world)
     # In:
-    motions: Motions,
+    motions: BodyMotions,
     gbuffer: GBuffer,
     views: Views,
     first: int,
     # Out:
-    scene_flow_out: wp.array3d[wp.vec3],
+    scene_flow_out: wp.array3d[wp.vec3],  # (view, row, column) [m]
 ):
-    """Displacement of the surface point to the frame before, in the camera's axes [m]."""
+    """Backward scene flow: displacement of the surface point to the previous frame, in the camera's axes [m]; NaN: unknown."""
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
     ray = camera_ray(cameras.intrinsics[views.camera[view]], row, column, wp.vec2(0.0, 0.0))
-    scene_flow_out[view, row, column] = motion_at(motions, gbuffer, view, row, column, ray, follows[views.world[view]], views.instances)
+    displacement = point_displacement(motions, gbuffer, view, row, column, ray, follows[views.world[view]], views.instances)
+    scene_flow_out[view, row, column] = displacement
 
 
 @wp.kernel
-def draw_flow_kernel(
+def render_flow_kernel(
     # Scene:
     cameras: Cameras,
     grid: ImageGrid,
     # State:
-    follows: wp.array[int],
+    follows: wp.array[int],  # (world)
     # In:
-    motions: Motions,
+    motions: BodyMotions,
     gbuffer: GBuffer,
     views: Views,
     first: int,
     # Out:
-    flow_out: wp.array3d[wp.vec2],
+    flow_out: wp.array3d[wp.vec2],  # (view, row, column) [px]
 ):
-    """Optical flow to the frame before [px]: f_x ((x + d_x) / (z + d_z) - x / z) = f_x (d_x - (x / z) d_z) / (z + d_z), rows alike.
+    """Backward optical flow [px]: f_x ((x + d_x) / (z + d_z) - x / z) = f_x (d_x - (x / z) d_z) / (z + d_z), rows alike.
 
-    NaN where the displacement d is, and where the point was behind the camera.
+    NaN where the displacement d is unknown, and where the point was behind the camera.
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
     intrinsics = cameras.intrinsics[views.camera[view]]
     ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
-    d = motion_at(motions, gbuffer, view, row, column, ray, follows[views.world[view]], views.instances)
+    d = point_displacement(motions, gbuffer, view, row, column, ray, follows[views.world[view]], views.instances)
     depth = gbuffer.depth[view, row, column] + d[2]
     flow = wp.vec2(wp.NAN, wp.NAN)
     if depth > NEAR_PLANE:

@@ -1,4 +1,4 @@
-"""Counts and boxes of every instance of a batch of views."""
+"""Pixel counts and bounding boxes of every instance, for a batch of views."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.images.boxes_counts import (
-    clear_annotation_kernel,
-    close_boxes_kernel,
-    count_inside_kernel,
-    count_outside_kernel,
+    clear_boxes_counts_kernel,
+    count_border_pixels_kernel,
+    count_image_pixels_kernel,
+    reset_empty_boxes_kernel,
 )
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.render.scene import RenderScene
 
 GPU_THREADS = 1024
-"""Threads that share one instance's pixels: enough to hide the latency of their reads, few enough that atomics do not crowd."""
+"""Threads per instance on a GPU: enough to hide the latency of their reads, few enough that atomic operations do not contend."""
 
 
 def annotate(scene: RenderScene, bodies: Any, views: Any, out: ViewBuffers) -> None:
-    """Fill `out.pixels` and `out.boxes` of the views from their images and, beyond the border, from rays.
+    """Compute `out.pixels` and `out.boxes` of the views from their images and, beyond the image border, by rays.
 
     Args:
         scene: Constant data.
@@ -30,19 +30,19 @@ def annotate(scene: RenderScene, bodies: Any, views: Any, out: ViewBuffers) -> N
     """
     instances = out.pixels.shape[1]
     threads = GPU_THREADS if scene.device.is_cuda else 1
-    wp.launch(clear_annotation_kernel, dim=(views.count, instances), outputs=[out.pixels, out.boxes], device=scene.device)
+    wp.launch(clear_boxes_counts_kernel, dim=(views.count, instances), outputs=[out.pixels, out.boxes], device=scene.device)
     wp.launch(
-        count_inside_kernel,
+        count_image_pixels_kernel,
         dim=(views.count, instances, threads),
         inputs=[scene.grid, bodies, out.instance, out.depth, out.amodal, threads],
         outputs=[out.pixels, out.boxes],
         device=scene.device,
     )
     wp.launch(
-        count_outside_kernel,
+        count_border_pixels_kernel,
         dim=(views.count, instances, threads),
         inputs=[scene.meshes, scene.cameras, scene.grid, bodies, views, threads],
         outputs=[out.pixels, out.boxes],
         device=scene.device,
     )
-    wp.launch(close_boxes_kernel, dim=(views.count, instances, 2), outputs=[out.boxes], device=scene.device)
+    wp.launch(reset_empty_boxes_kernel, dim=(views.count, instances, 2), outputs=[out.boxes], device=scene.device)

@@ -9,7 +9,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.configs.schema import Render
-from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, find_edges_kernel, mix_edges_kernel
+from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, find_footprints_kernel, resolve_footprints_kernel
 from synpick_warp.kernels.render.lighting.coarse_grid import LANE_COLUMNS, LANE_STRIDE, CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, trace_coarse_paths_kernel
 from synpick_warp.kernels.render.lighting.denoise import RatioImages, choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
@@ -39,8 +39,8 @@ FIREFLY_CLAMP = 8.0
 surfaces is added to the limit. Twice as much is 0.5 % brighter and 0.1 dB farther from the reference."""
 ROULETTE = 1
 """First bounce with Russian roulette: few paths are long, since many neighbours share them."""
-EDGE_THREADS = 128
-"""Threads that share the edges of a chunk on a GPU: it has some hundred samples."""
+FOOTPRINT_THREADS = 128
+"""Threads that share the list of a chunk on a GPU: it has some hundred samples."""
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column", units={"depth": "m"})
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
@@ -58,16 +58,16 @@ class ShadowArrays:
 
 
 @dataclass(frozen=True, eq=False)
-class Edges:
-    """Squares between the centres of four pixels that anti-aliasing works on."""
+class FootprintLists:
+    """Lists of the AA footprints, squares between the centres of four pixels, that anti-aliasing resolves."""
 
-    place: wp.array = device_array("view", "chunk", "chunk_square", dtype=wp.int32)
-    """Row times columns plus column of each; a chunk is a run of tiles of squares."""
-    number: wp.array = device_array("view", "chunk", dtype=wp.int32)
-    """How many there are."""
+    footprint: wp.array = device_array("view", "chunk", "chunk_footprint", dtype=wp.int32)
+    """Row * columns + column of each; a chunk is a run of tiles of footprints with a list of its own."""
+    count: wp.array = device_array("view", "chunk", dtype=wp.int32)
+    """Footprints in each list."""
 
 
-DENOISED_SCRATCH = ((GUIDE, 1), (COARSE_LIGHT, 2), (RATIO_IMAGES, 2), (ShadowArrays, 1), (Edges, 1))
+DENOISED_SCRATCH = ((GUIDE, 1), (COARSE_LIGHT, 2), (RATIO_IMAGES, 2), (ShadowArrays, 1), (FootprintLists, 1))
 """Arrays that `DenoisedRenderer` allocates, and how many of each."""
 
 
@@ -85,14 +85,14 @@ def scratch_sizes(render: Render, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions of `DENOISED_SCRATCH` other than the view, for images of `width` x `height` px."""
     size = coarse_size(render, width)
     shadow = max(1, size // 2)
-    chunks = -(-square_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
+    chunks = -(-footprint_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
     return {
         "cell_row": -(-height // size),
         "cell_column": -(-width // size),
         "shadow_row": -(-height // shadow),
         "shadow_column": -(-width // shadow),
         "chunk": chunks,
-        "chunk_square": int(CHUNK_TILES) * int(TILE_PIXELS),
+        "chunk_footprint": int(CHUNK_TILES) * int(TILE_PIXELS),
     }
 
 
@@ -106,8 +106,8 @@ def build_coarse_grid(image: Any, size: int, window: int) -> Any:
     return coarse
 
 
-def square_grid(width: int, height: int) -> Any:
-    """The struct `ImageGrid` of the squares between pixels' centres, and of the halves of such at an image's rim."""
+def footprint_grid(width: int, height: int) -> Any:
+    """The struct `ImageGrid` of AA footprints, with the halves of footprints at the image border."""
     return build_grid(width + 1, height + 1)
 
 
@@ -143,8 +143,8 @@ class DenoisedRenderer:
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, scene.device) for _ in range(2))
         self.shadows = allocate(ShadowArrays, sizes, scene.device)
         self.antialias = render.antialias
-        self.squares = square_grid(scene.width, scene.height)
-        self.edges = allocate(Edges, sizes, scene.device)
+        self.footprints = footprint_grid(scene.width, scene.height)
+        self.footprint_lists = allocate(FootprintLists, sizes, scene.device)
 
     def shade(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
         """Render the radiance of a batch of views.
@@ -194,19 +194,19 @@ class DenoisedRenderer:
         self._launch(shade_kernel, scene.grid, views, inputs, [radiance])
 
     def smooth(self, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
-        """Which pixels' radiance those on edges show: `mix` of the struct `ShadedImage`."""
-        scene, edges = self.scene, self.edges
-        edges.number.zero_()
+        """Anti-alias by coverage rays: writes `resolve` of the struct `ShadedImage`."""
+        scene, lists = self.scene, self.footprint_lists
+        lists.count.zero_()
         # Atomics of a launch on the CPU hold in one thread alone, so these are not cut into pieces.
-        inputs = [scene.cameras, scene.grid, self.squares, gbuffer, image.radiance, views]
-        outputs = [image.mix, edges.place, edges.number]
-        squares = views.count * self.squares.tiles * int(TILE_PIXELS)
-        wp.launch(find_edges_kernel, dim=squares, inputs=inputs, outputs=outputs, device=scene.device, block_dim=BLOCK)
-        threads = EDGE_THREADS if scene.device.is_cuda else int(SAMPLES)
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.squares, bodies, gbuffer, edges.place, edges.number]
+        inputs = [scene.cameras, scene.grid, self.footprints, gbuffer, image.radiance, views]
+        outputs = [image.resolve, lists.footprint, lists.count]
+        footprints = views.count * self.footprints.tiles * int(TILE_PIXELS)
+        wp.launch(find_footprints_kernel, dim=footprints, inputs=inputs, outputs=outputs, device=scene.device, block_dim=BLOCK)
+        threads = FOOTPRINT_THREADS if scene.device.is_cuda else int(SAMPLES)
+        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.footprints, bodies, gbuffer, lists.footprint, lists.count]
         inputs += [views, threads]
-        samples = views.count * edges.number.shape[1] * threads
-        wp.launch(mix_edges_kernel, dim=samples, inputs=inputs, outputs=[image.mix], device=scene.device, block_dim=BLOCK)
+        samples = views.count * lists.count.shape[1] * threads
+        wp.launch(resolve_footprints_kernel, dim=samples, inputs=inputs, outputs=[image.resolve], device=scene.device, block_dim=BLOCK)
 
     def _launch(self, kernel: wp.Kernel, grid: Any, views: Any, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel over all pixels of a grid in all views."""

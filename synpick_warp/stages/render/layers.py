@@ -1,131 +1,117 @@
-"""Layers of a batch of views: those that the settings name, drawn from the hits of the renderer."""
+"""Annotation layers (AOVs) of a batch of views: those named in `render.layers`, computed from the G-buffer."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import warp as wp
 
 from synpick_warp.arrays import allocate_struct, struct_arrays
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.sensors import DepthSensor
 from synpick_warp.errors import CatalogError
-from synpick_warp.kernels.render.images.depth_sensor import draw_depth_sensor_kernel
+from synpick_warp.kernels.render.images.depth_sensor import SensorParameters, render_depth_sensor_kernel
 from synpick_warp.kernels.render.images.layers import (
-    Motions,
-    draw_albedo_kernel,
-    draw_classes_kernel,
-    draw_flow_kernel,
-    draw_nocs_kernel,
-    draw_normals_kernel,
-    draw_scene_flow_kernel,
-    prepare_motions_kernel,
+    BodyMotions,
+    compute_motions_kernel,
+    render_albedo_kernel,
+    render_classes_kernel,
+    render_flow_kernel,
+    render_nocs_kernel,
+    render_normals_kernel,
+    render_scene_flow_kernel,
 )
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.stages.buffers import FIXTURES, LayerBuffers, Snapshot
 from synpick_warp.stages.launch import launch_pixels
-from synpick_warp.stages.render.depth_sensor import sensor_rules
 from synpick_warp.stages.render.scene import RenderScene
 
-MOST_CLASS = 65535
-"""Largest obj_id that the layer of classes can hold."""
-MOVING = {"flow", "scene_flow"}
-"""Layers that need motions."""
+MAX_CLASS = 65535
+"""Largest obj_id that fits into the layer `classes`."""
+MOTION_LAYERS = {"flow", "scene_flow"}
+"""Layers computed from the motions of bodies."""
+BODY_MOTIONS = struct_arrays(BodyMotions, "view", "body", units={"origin": "m", "displacement": "m"})
 
 
-MOTIONS = struct_arrays(Motions, "view", "body", units={"origin": "m", "shift": "m"})
+def sensor_parameters(settings: DepthSensor, seed: int, depth_scale: float) -> Any:
+    """The struct `SensorParameters`, for a bake's seed and its depth scale [mm per count]."""
+    result = SensorParameters()
+    for name in ("baseline", "disparity_step", "noise", "noise_growth", "noise_distance", "noise_angle", "lateral_noise"):
+        setattr(result, name, getattr(settings, name))
+    result.seed = seed
+    result.near, result.far = settings.distances
+    result.grazing_cosine = math.cos(math.radians(settings.grazing_angle))
+    result.edge_width, result.edge_step = settings.edge_width, settings.edge_step
+    result.shadows = int(settings.shadows)
+    result.counts_per_meter = 1000.0 / depth_scale
+    return result
 
 
 class LayerRenderer:
-    """Draws layers. Owns its scratch; `draw` only launches, so a CUDA graph can capture it."""
+    """Renders annotation layers. Owns its scratch; `render` only launches, so a CUDA graph can capture it."""
 
-    def __init__(self, config: Config, scene: RenderScene, instances: int, views: int) -> None:
-        """Allocate scratch, if motion is asked for.
+    def __init__(self, names: tuple[str, ...], sensor: Any, scene: RenderScene, instances: int, views: int) -> None:
+        """Allocate scratch, if a layer needs motions.
 
         Args:
-            config: All settings; `render.layers` counts.
+            names: Layers to render, from `layers.LAYER_TABLE`.
+            sensor: The struct `SensorParameters`.
             scene: Constant data.
-            instances: Room for instances of a world.
-            views: Most views of a batch.
+            instances: Instance capacity of a world.
+            views: Largest number of views in a batch.
 
         Raises:
-            CatalogError: Classes are asked for, and an obj_id does not fit into 16 bits or means none.
+            CatalogError: `names` has classes, and an obj_id is 0 or does not fit into 16 bits.
         """
         self.scene = scene
-        self.names = config.render.layers
-        if "classes" in self.names:
-            wrong = [number for number in scene.obj_id.numpy().tolist() if not 0 < number <= MOST_CLASS]
+        self.names = names
+        self.sensor = sensor
+        if "classes" in names:
+            wrong = [obj_id for obj_id in scene.obj_id.numpy().tolist() if not 0 < obj_id <= MAX_CLASS]
             if wrong:
-                raise CatalogError(
-                    f"object {wrong[0]} has no place in the layer classes, which holds 1 to {MOST_CLASS}; renumber the model"
-                )
-        self.sensor = sensor_rules(config)
+                raise CatalogError(f"object {wrong[0]} has no place in the layer classes, which holds 1 to {MAX_CLASS}; renumber the model")
         self.motions = None
-        if MOVING.intersection(self.names):
-            self.motions = allocate_struct(MOTIONS, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
+        if MOTION_LAYERS.intersection(names):
+            self.motions = allocate_struct(BODY_MOTIONS, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
 
-    def draw(
-        self,
-        snapshot: Snapshot,
-        bodies: Any,
-        gbuffer: Any,
-        views: Any,
-        out: LayerBuffers,
-    ) -> None:
-        """Draw the layers of the views.
+    def render(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any, out: LayerBuffers) -> None:
+        """Render the layers of a batch of views.
 
         Args:
             snapshot: The worlds.
-            bodies: The struct `ViewBodies`, prepared for these views.
-            gbuffer: The struct `GBuffer` of the pixels' centres.
+            bodies: The struct `ViewBodies`, set up for these views.
+            gbuffer: The struct `GBuffer` of these views.
             views: The struct `Views`.
-            out: Its arrays of the layers asked for are written.
+            out: The arrays of the named layers are written.
         """
-        scene, names = self.scene, self.names
+        scene = self.scene
+        if self.motions is not None:
+            self.compute_motions(snapshot, views)
         surface = [scene.meshes, scene.surfaces, scene.cameras, scene.grid, bodies, gbuffer, views]
-        if "normals" in names:
-            self._launch(draw_normals_kernel, views.count, surface, out.normals)
-        if "albedo" in names:
-            self._launch(draw_albedo_kernel, views.count, surface, out.albedo)
-        if "nocs" in names:
-            self._launch(draw_nocs_kernel, views.count, [scene.meshes, scene.grid, bodies, gbuffer, views], out.nocs)
-        if "classes" in names:
-            self._launch(draw_classes_kernel, views.count, [scene.grid, scene.obj_id, bodies, gbuffer, views], out.classes)
-        if "depth_sensor" in names:
-            inputs = [
-                scene.meshes,
-                scene.surfaces,
-                scene.cameras,
-                scene.grid,
-                snapshot.episode,
-                snapshot.frame,
-                self.sensor,
-                bodies,
-                gbuffer,
-                views,
-            ]
-            self._launch(draw_depth_sensor_kernel, views.count, inputs, out.depth_sensor)
-        if self.motions is None:
-            return
-        self.prepare_motions(snapshot, views)
+        sensor = [scene.meshes, scene.surfaces, scene.cameras, scene.grid, snapshot.episode, snapshot.frame]
+        sensor += [self.sensor, bodies, gbuffer, views]
         motion = [scene.cameras, scene.grid, snapshot.follows, self.motions, gbuffer, views]
-        if "flow" in names:
-            self._launch(draw_flow_kernel, views.count, motion, out.flow)
-        if "scene_flow" in names:
-            self._launch(draw_scene_flow_kernel, views.count, motion, out.scene_flow)
+        objects = [scene.meshes, scene.grid, bodies, gbuffer, views]
+        classes = [scene.grid, scene.obj_id, bodies, gbuffer, views]
+        count = views.count
+        launches = {
+            "normals": lambda: self._launch(render_normals_kernel, count, surface, out.normals),
+            "albedo": lambda: self._launch(render_albedo_kernel, count, surface, out.albedo),
+            "nocs": lambda: self._launch(render_nocs_kernel, count, objects, out.nocs),
+            "classes": lambda: self._launch(render_classes_kernel, count, classes, out.classes),
+            "flow": lambda: self._launch(render_flow_kernel, count, motion, out.flow),
+            "scene_flow": lambda: self._launch(render_scene_flow_kernel, count, motion, out.scene_flow),
+            "depth_sensor": lambda: self._launch(render_depth_sensor_kernel, count, sensor, out.depth_sensor),
+        }
+        for name in self.names:
+            launches[name]()
 
-    def prepare_motions(self, snapshot: Snapshot, views: Any) -> None:
-        """How every body moved since the frame before."""
-        inputs = [
-            self.scene.cameras,
-            snapshot.catalog_index,
-            snapshot.pose,
-            snapshot.fixture_pose,
-            snapshot.follows,
-            snapshot.last_catalog_index,
-        ]
-        inputs += [snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible, views]
+    def compute_motions(self, snapshot: Snapshot, views: Any) -> None:
+        """Compute the motion of every body from this frame back to the previous one."""
+        inputs = [self.scene.cameras, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.follows]
+        inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible, views]
         dim = (views.count, self.motions.known.shape[1])
-        wp.launch(prepare_motions_kernel, dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
+        wp.launch(compute_motions_kernel, dim=dim, inputs=inputs, outputs=[self.motions], device=self.scene.device)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:
         launch_pixels(kernel, count * self.scene.grid.tiles * int(TILE_PIXELS), inputs, [output], self.scene.device)

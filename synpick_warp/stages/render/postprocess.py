@@ -1,4 +1,4 @@
-"""From linear radiance to the bytes of a picture: tone curve, and the camera's effects if the settings name any."""
+"""Post-processing of shaded images to sRGB bytes: exposure, tone map, and camera effects if the settings ask for them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ import warp as wp
 
 from synpick_warp.arrays import allocate, device_array
 from synpick_warp.codes import Tone
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.sensors import effect_ranges
+from synpick_warp.configs.sensors import Effects, effect_ranges
 from synpick_warp.kernels.render.images.antialias import ShadedImage
-from synpick_warp.kernels.render.images.camera_effects import EffectRules, Strengths, draw_effects_kernel
-from synpick_warp.kernels.render.images.postprocess import DevelopRules, develop_effects_kernel, develop_kernel, spread_rows_kernel
+from synpick_warp.kernels.render.images.camera_effects import EffectParameters, EffectRanges, sample_effects_kernel
+from synpick_warp.kernels.render.images.postprocess import (
+    PostProcessSettings,
+    filter_lens_rows_kernel,
+    postprocess_effects_kernel,
+    postprocess_kernel,
+)
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels
@@ -21,79 +25,81 @@ from synpick_warp.stages.render.scene import RenderScene
 
 
 @dataclass(frozen=True, eq=False)
-class SpreadArrays:
-    """Scratch of effects for which a pixel needs its neighbours."""
+class LensArrays:
+    """Scratch of the lens filter, between its two passes."""
 
     radiance: wp.array = device_array("view", "row", "column", dtype=wp.vec3)
-    """Of pixels as they show, after vignette, and after blur and chromatic aberration along the rows."""
+    """Resolved radiance after vignette, and after blur and chromatic aberration along rows."""
 
 
-def has_effects(config: Config) -> bool:
-    """Whether the settings ask for any effect."""
-    return any(any(strengths) for strengths in effect_ranges(config.effects).values())
+def has_effects(effects: Effects) -> bool:
+    """True if any camera effect is on."""
+    return any(any(bounds) for bounds in effect_ranges(effects).values())
 
 
-def has_spread(config: Config) -> bool:
-    """Whether they ask for one that needs a pixel's neighbours."""
-    return any((*config.effects.blur, *config.effects.chromatic_aberration))
+def has_lens_filter(effects: Effects) -> bool:
+    """True if an effect that reads neighbouring pixels is on: blur or chromatic aberration."""
+    return any((*effects.blur, *effects.chromatic_aberration))
 
 
-def effect_rules(config: Config) -> Any:
-    """The struct `EffectRules`."""
-    low, high = zip(*effect_ranges(config.effects).values(), strict=True)
-    rules = EffectRules()
-    rules.seed = config.bake.seed
-    rules.low, rules.high = Strengths(*low), Strengths(*high)
-    return rules
+def make_effect_ranges(effects: Effects, seed: int) -> Any:
+    """The struct `EffectRanges`."""
+    low, high = zip(*effect_ranges(effects).values(), strict=True)
+    result = EffectRanges()
+    result.seed = seed
+    result.low, result.high = EffectParameters(*low), EffectParameters(*high)
+    return result
 
 
 class PostProcessor:
-    """Develops pictures. Owns its scratch; `develop` only launches, so a CUDA graph can capture it."""
+    """Turns radiance into sRGB images. Owns its scratch; `process` only launches, so a CUDA graph can capture it."""
 
-    def __init__(self, config: Config, scene: RenderScene, views: int) -> None:
+    def __init__(self, effects: Effects, tone: str, seed: int, scene: RenderScene, views: int) -> None:
         """Allocate scratch, if an effect needs it.
 
         Args:
-            config: All settings; `effects` and `render.tone` count.
+            effects: Ranges of the camera effects.
+            tone: Tone curve, a setting of `render.tone`.
+            seed: Seed of the bake.
             scene: Constant data.
-            views: Most views of a batch.
+            views: Largest number of views in a batch.
         """
         self.scene = scene
-        self.effects = effect_rules(config) if has_effects(config) else None
-        self.rules = DevelopRules()
-        self.rules.seed = config.bake.seed
-        self.rules.tone = Tone[config.render.tone.upper()]
-        self.rules.spread = int(has_spread(config))
-        self.spread: wp.array | None = None
-        if has_spread(config):
+        self.effects = make_effect_ranges(effects, seed) if has_effects(effects) else None
+        self.settings = PostProcessSettings()
+        self.settings.seed = seed
+        self.settings.tone = Tone[tone.upper()]
+        self.settings.lens_filter = int(has_lens_filter(effects))
+        self.filtered: wp.array | None = None
+        if has_lens_filter(effects):
             sizes = {"view": views, "row": scene.height, "column": scene.width}
-            self.spread = allocate(SpreadArrays, sizes, scene.device).radiance
+            self.filtered = allocate(LensArrays, sizes, scene.device).radiance
 
     def process(self, snapshot: Snapshot, views: Any, image: Any, out: ViewBuffers) -> None:
-        """Colour of the views.
+        """Compute the colour images of a batch of views.
 
         Args:
             snapshot: The worlds.
             views: The struct `Views`.
             image: The struct `ShadedImage`.
-            out: `color` is written, and `effects` if there are any; else these stay zero.
+            out: `color` is written, and `effects` if any effect is on; else it stays zero.
         """
         scene = self.scene
         if self.effects is None:
-            inputs = [scene.grid, scene.lights, snapshot.light, snapshot.light_exposure, views, image, self.rules.tone]
-            self._launch(develop_kernel, views.count, inputs, out.color)
+            inputs = [scene.grid, scene.lights, snapshot.light, snapshot.light_exposure, views, image, self.settings.tone]
+            self._launch(postprocess_kernel, views.count, inputs, out.color)
             return
         inputs = [snapshot.episode, snapshot.frame, self.effects, views]
-        wp.launch(draw_effects_kernel, dim=views.count, inputs=inputs, outputs=[out.effects], device=scene.device)
-        if self.spread is not None:
+        wp.launch(sample_effects_kernel, dim=views.count, inputs=inputs, outputs=[out.effects], device=scene.device)
+        if self.filtered is not None:
             inputs = [scene.cameras, scene.grid, out.effects, views, image]
-            self._launch(spread_rows_kernel, views.count, inputs, self.spread)
-            spread = ShadedImage()
-            spread.radiance, spread.mix = self.spread, image.mix
-            image = spread
+            self._launch(filter_lens_rows_kernel, views.count, inputs, self.filtered)
+            filtered = ShadedImage()
+            filtered.radiance, filtered.resolve = self.filtered, image.resolve
+            image = filtered
         inputs = [scene.cameras, scene.grid, scene.lights, snapshot.episode, snapshot.frame, snapshot.light, snapshot.light_exposure]
-        inputs += [self.rules, out.effects, views, image]
-        self._launch(develop_effects_kernel, views.count, inputs, out.color)
+        inputs += [self.settings, out.effects, views, image]
+        self._launch(postprocess_effects_kernel, views.count, inputs, out.color)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], output: wp.array) -> None:
         launch_pixels(kernel, count * self.scene.grid.tiles * int(TILE_PIXELS), inputs, [output], self.scene.device)

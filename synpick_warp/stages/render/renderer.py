@@ -10,7 +10,7 @@ from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.annotate import annotate
 from synpick_warp.stages.render.denoised import DenoisedRenderer
-from synpick_warp.stages.render.layers import LayerRenderer
+from synpick_warp.stages.render.layers import LayerRenderer, sensor_parameters
 from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
@@ -44,8 +44,9 @@ class Renderer:
         else:
             self.shading = DenoisedRenderer(config.render, config.bake.seed, scene, views)
         self.rasterizer = Rasterizer(scene, 1000.0 / config.bop.depth_scale, views)
-        self.layer_renderer = LayerRenderer(config, scene, instances, views)
-        self.postprocessor = PostProcessor(config, scene, views)
+        sensor = sensor_parameters(config.depth_sensor, config.bake.seed, config.bop.depth_scale)
+        self.layer_renderer = LayerRenderer(config.render.layers, sensor, scene, instances, views)
+        self.postprocessor = PostProcessor(config.effects, config.render.tone, config.bake.seed, scene, views)
 
     def render(
         self,
@@ -72,7 +73,7 @@ class Renderer:
         self.set_up_views(snapshot, views)
         self.rasterize(views, out)
         if layers is not None:
-            self.layer_renderer.draw(snapshot, self.bodies, self.gbuffer, views, layers)
+            self.layer_renderer.render(snapshot, self.bodies, self.gbuffer, views, layers)
         self.shading.shade(snapshot, self.bodies, self.gbuffer, views, self.image)
         self.postprocess(snapshot, views, out)
         annotate(self.scene, self.bodies, views, out)

@@ -1,4 +1,4 @@
-"""Counts and boxes of instances."""
+"""Pixel counts and bounding boxes of instances, against a NumPy twin and known sizes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ VIEW = camera(96, 54, 272.2, (0.0, 0.0, 2.0))
 
 
 def canvas_camera(view: Camera) -> Camera:
-    """The same camera with an image three times as wide and high about the old one."""
+    """The same camera with an image three times as wide and high, centred on the original."""
     matrix = view.matrix.copy()
     matrix[0, 2] += view.width
     matrix[1, 2] += view.height
@@ -24,7 +24,7 @@ def canvas_camera(view: Camera) -> Camera:
 
 
 def check_view(toy: ToyScene, device) -> tuple[np.ndarray, np.ndarray]:
-    """Compare a toy scene's annotation with its twin; returns counts and boxes."""
+    """Compare a toy scene's counts and boxes with those of the NumPy twin, and return them."""
     picture = render(toy, device)
     canvas = render(replace(toy, cameras=(canvas_camera(toy.cameras[0]),)), device)
     pixels, boxes = count_pixels(picture.instance[0], picture.depth[0], picture.amodal[0], canvas.amodal[0], toy.room)
@@ -46,7 +46,7 @@ def test_an_absent_instance_has_no_pixels(device):
     assert boxes[1:].tolist() == [[[0, 0, -1, -1]] * 2] * 3
 
 
-def test_hidden_pixels_count_as_expected_but_not_as_visible(device):
+def test_occluded_pixels_count_as_amodal_but_not_as_visible(device):
     placed = [[(0, (0.0, 0.0, 0.0, *UPRIGHT)), (1, (0.0, 0.0, 0.1, *UPRIGHT))]]
     pixels, boxes = check_view(ToyScene([entry(sheet(0.1, 0.1)), entry(sheet(0.2, 0.2))], placed, (VIEW,)), device)
     assert pixels[0].tolist() == [196, 196, 0]
@@ -55,8 +55,8 @@ def test_hidden_pixels_count_as_expected_but_not_as_visible(device):
 
 
 @pytest.mark.parametrize("place", [(0.34, 0.0), (-0.35, 0.2), (0.0, -0.2), (0.45, 0.0), (0.9, 0.5), (1.3, 0.0)])
-def test_what_leaves_the_image_counts_beyond_its_border(device, place):
-    # Half in, across a corner, just out, far out at the end of the canvas.
+def test_instances_that_leave_the_image_count_beyond_its_border(device, place):
+    # Half inside, across a corner, just outside, far outside at the end of the canvas.
     toy = ToyScene([entry(ball(0.1, 3))], [[(0, (*place, 0.1, *UPRIGHT)), (0, (*place, -0.3, *UPRIGHT))]], (VIEW,))
     pixels, boxes = check_view(toy, device)
     if place == (0.34, 0.0):
@@ -65,7 +65,7 @@ def test_what_leaves_the_image_counts_beyond_its_border(device, place):
         assert boxes[0, 1, 2] == 95
 
 
-def test_what_reaches_behind_the_camera_counts_as_far_as_the_canvas(device):
+def test_instances_that_reach_behind_the_camera_count_up_to_the_canvas(device):
     toy = ToyScene([entry(box(0.02, 0.1, 4.0))], [[(0, (0.1, 0.0, 1.0, *UPRIGHT))]], (VIEW,))
     pixels, _ = check_view(toy, device)
     assert pixels[0, 0] > pixels[0, 1]

@@ -1,4 +1,4 @@
-"""The depth sensor's layer: noise, steps and holes against their laws, on scenes whose depth is known."""
+"""Depth sensor model: noise, disparity quantization and invalid pixels against their laws, on scenes of known depth."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ TOP = 2.0
 """Height of the camera [m]."""
 VIEW = camera(WIDTH, HEIGHT, FOCAL, (0.0, 0.0, TOP))
 COUNT = 1e-4
-"""One count [m]."""
+"""One depth count [m]."""
 PERFECT: dict[str, Any] = {
     "noise": 0.0,
     "noise_growth": 0.0,
@@ -35,18 +35,18 @@ PERFECT: dict[str, Any] = {
     "shadows": False,
     "grazing_angle": 89.0,
 }
-"""A sensor without faults, but for what a test gives it."""
+"""Settings of an ideal sensor; each test switches on one fault."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Of each view."""
+    """Depth images of a batch of views, as measured and as rendered."""
 
     counts: np.ndarray
     clean: np.ndarray
-    """Counts of the clean depth."""
+    """Counts of the rendered depth."""
     exact: np.ndarray
-    """[m]"""
+    """Rendered depth before rounding [m]."""
 
     @property
     def depth(self) -> np.ndarray:
@@ -55,7 +55,7 @@ class Measured:
 
 
 def measure(toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, first_episode: int = 0, **sensor: Any) -> Measured:
-    """Measure every world by every camera, in `frames` batches for frames 0, 1, ..., stacked."""
+    """Simulate the sensor for every world and camera, in `frames` batches for frames 0, 1, ..., stacked."""
     config = replace(toy.settings(), depth_sensor=DepthSensor(**sensor))
     config = replace(config, render=replace(config.render, layers=("depth_sensor",)), bake=replace(config.bake, seed=seed))
     scene = build_render_scene(config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
@@ -65,159 +65,159 @@ def measure(toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, fi
     sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
     images, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, ("depth_sensor",))
     world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
-    lens = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
-    made = snapshot(toy, device)
-    made.episode.assign(first_episode + np.arange(worlds))
-    taken = []
+    camera_index = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
+    worlds_now = snapshot(toy, device)
+    worlds_now.episode.assign(first_episode + np.arange(worlds))
+    frames_measured = []
     for frame in range(frames):
-        made.frame.fill_(frame)
-        renderer.render(made, make_views(world, lens, views, toy.room), images, layers)
-        taken.append(layers.depth_sensor.numpy().copy())
-    return Measured(np.concatenate(taken), images.depth.numpy(), renderer.gbuffer.depth.numpy())
+        worlds_now.frame.fill_(frame)
+        renderer.render(worlds_now, make_views(world, camera_index, views, toy.room), images, layers)
+        frames_measured.append(layers.depth_sensor.numpy().copy())
+    return Measured(np.concatenate(frames_measured), images.depth.numpy(), renderer.gbuffer.depth.numpy())
 
 
 def wall(depth: float, tilt: float = 0.0) -> ToyScene:
-    """A large sheet across the optical axis at a depth [m], turned about the picture's columns by `tilt` [rad]."""
+    """A large sheet across the optical axis at a depth [m], rotated about the image's columns by `tilt` [rad]."""
     turn = (0.0, np.sin(tilt / 2.0), 0.0, np.cos(tilt / 2.0))
     return ToyScene([entry(sheet(4.0, 4.0))], [[(0, (0.0, 0.0, TOP - depth, *turn))]], (VIEW,), config=Config())
 
 
 def deviation(depth: float, angle: float = 0.0, **given: float) -> float:
-    """The law of Nguyen et al. (2012) [m]."""
+    """Axial noise by the law of Nguyen et al. (2012) [m]."""
     law = {"noise": 0.0012, "noise_growth": 0.0019, "noise_distance": 0.4, "noise_angle": 1e-4} | given
     off = depth - law["noise_distance"]
     return law["noise"] + law["noise_growth"] * off**2 + law["noise_angle"] / depth**0.5 * (angle / (np.pi / 2 - angle)) ** 2
 
 
-def test_a_sensor_without_faults_measures_the_clean_depth(device):
-    found = measure(wall(1.3, 0.6), device, **PERFECT)
-    np.testing.assert_allclose(found.counts.astype(int), found.clean.astype(int), atol=1)
-    np.testing.assert_allclose(found.depth, found.exact, atol=0.6 * COUNT)
+def test_an_ideal_sensor_measures_the_rendered_depth(device):
+    measured = measure(wall(1.3, 0.6), device, **PERFECT)
+    np.testing.assert_allclose(measured.counts.astype(int), measured.clean.astype(int), atol=1)
+    np.testing.assert_allclose(measured.depth, measured.exact, atol=0.6 * COUNT)
 
 
 @pytest.mark.parametrize("depth", [0.6, 1.1, 2.0])
-def test_noise_of_a_wall_grows_with_the_square_of_depth(device, depth):
+def test_axial_noise_grows_with_the_square_of_depth(device, depth):
     noise = {name: getattr(DepthSensor(), name) for name in ("noise", "noise_growth", "noise_angle")}
-    found = measure(wall(depth), device, frames=2, **PERFECT | noise)
-    middle = found.depth[:, 30:66, 50:110]
+    measured = measure(wall(depth), device, frames=2, **PERFECT | noise)
+    middle = measured.depth[:, 30:66, 50:110]
     # Rays within this window meet the wall at up to 7°, whose part of the noise is below 1 %.
     np.testing.assert_allclose(middle.std(), deviation(depth), rtol=0.03)
     np.testing.assert_allclose(middle.mean(), depth, atol=4.0 * deviation(depth) / middle.size**0.5 + COUNT)
-    pairs = found.depth[0].ravel(), found.depth[1].ravel()
+    pairs = measured.depth[0].ravel(), measured.depth[1].ravel()
     assert abs(np.corrcoef(*pairs)[0, 1]) < 0.05
 
 
-def test_noise_grows_with_the_angle_of_incidence(device):
-    found = measure(wall(1.5, np.radians(75.0)), device, **PERFECT | {"noise_angle": 1e-3})
+def test_axial_noise_grows_with_the_angle_of_incidence(device):
+    measured = measure(wall(1.5, np.radians(75.0)), device, **PERFECT | {"noise_angle": 1e-3})
     # The column through the optical axis meets the sheet at 75°, and at that depth.
-    off = (found.depth - found.exact)[0, :, 76:84]
+    off = (measured.depth - measured.exact)[0, :, 76:84]
     np.testing.assert_allclose(off.std(), deviation(1.5, np.radians(75.0), noise=0.0, noise_growth=0.0, noise_angle=1e-3), rtol=0.07)
     straight = measure(wall(1.5), device, **PERFECT | {"noise_angle": 1e-3})
     assert np.abs(straight.depth - straight.exact).max() < 2.0 * COUNT
 
 
 @pytest.mark.parametrize("depth", [0.8, 1.9])
-def test_depth_comes_in_steps_of_disparity(device, depth):
+def test_depth_is_quantized_in_steps_of_disparity(device, depth):
     step, baseline = 0.25, 0.06
-    found = measure(wall(depth, 0.5), device, **PERFECT | {"disparity_step": step, "baseline": baseline})
-    levels = np.unique(found.depth)
+    measured = measure(wall(depth, 0.5), device, **PERFECT | {"disparity_step": step, "baseline": baseline})
+    levels = np.unique(measured.depth)
     number = FOCAL * baseline / (levels * step)
     assert np.abs(number - np.rint(number)).max() < 0.6 * COUNT * number.max() / levels.min()
     near = levels[np.abs(levels - depth) < 0.1]
     expected = near[:-1] * near[1:] * step / (FOCAL * baseline)
     np.testing.assert_allclose(np.diff(near), expected, atol=1.1 * COUNT)
     # Each pixel has the nearest of these levels, by disparity.
-    off = FOCAL * baseline * np.abs(1.0 / found.depth - 1.0 / found.exact)
+    off = FOCAL * baseline * np.abs(1.0 / measured.depth - 1.0 / measured.exact)
     assert off.max() < 0.51 * step
 
 
 @pytest.mark.parametrize(("tilt", "seen"), [(70.0, True), (84.0, False)])
-def test_grazing_surfaces_are_holes(device, tilt, seen):
-    found = measure(wall(1.5, np.radians(tilt)), device, **PERFECT | {"grazing_angle": 78.0})
-    assert found.clean[0, :, 78:82].all()
-    assert (found.counts[0, :, 78:82] > 0).all() == seen
-    assert (found.counts[0, :, 78:82] > 0).any() == seen
+def test_grazing_incidence_is_invalid(device, tilt, seen):
+    measured = measure(wall(1.5, np.radians(tilt)), device, **PERFECT | {"grazing_angle": 78.0})
+    assert measured.clean[0, :, 78:82].all()
+    assert (measured.counts[0, :, 78:82] > 0).all() == seen
+    assert (measured.counts[0, :, 78:82] > 0).any() == seen
 
 
 def step_scene() -> ToyScene:
-    """A wall at 1.5 m, and before it, at 1.2 m, a sheet that covers columns 60 to 99 and rows 28 to 67."""
+    """A wall at 1.5 m, and in front of it, at 1.2 m, a sheet that covers columns 60 to 99 and rows 28 to 67."""
     side = 40.0 / FOCAL * 1.2
     placed = [(0, (0.0, 0.0, TOP - 1.5, *UPRIGHT)), (1, (0.0, 0.0, TOP - 1.2, *UPRIGHT))]
     return ToyScene([entry(sheet(4.0, 4.0)), entry(sheet(side, side))], [placed], (VIEW,))
 
 
-def test_edges_of_disparity_are_holes_on_both_sides(device):
-    found = measure(step_scene(), device, **PERFECT | {"edge_width": 2})
-    near = np.abs(found.exact[0] - 1.2) < 1e-3
+def test_disparity_discontinuities_are_invalid_on_both_sides(device):
+    measured = measure(step_scene(), device, **PERFECT | {"edge_width": 2})
+    near = np.abs(measured.exact[0] - 1.2) < 1e-3
     assert near.sum() == 1600
     wide = np.pad(near, 2, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(wide, (5, 5))
     mixed = windows.any(axis=(2, 3)) & ~windows.all(axis=(2, 3))
-    np.testing.assert_array_equal(found.counts[0] == 0, mixed)
-    # A threshold above the step of disparity, 400 * 0.075 * (1 / 1.2 - 1 / 1.5) = 5 px, sees no edge.
+    np.testing.assert_array_equal(measured.counts[0] == 0, mixed)
+    # A threshold above the step of disparity, 400 * 0.075 * (1 / 1.2 - 1 / 1.5) = 5 px, finds no discontinuity.
     assert measure(step_scene(), device, **PERFECT | {"edge_width": 2, "edge_step": 5.1}).counts.all()
 
 
-def test_what_the_projector_does_not_reach_is_a_hole(device):
+def test_projector_shadow_is_invalid(device):
     # The sheet's disparity is larger by 5 px with this baseline, 10 px with twice as much: the shadow's width on the wall, to the left.
     for baseline, width in ((0.075, 5), (0.15, 10)):
-        found = measure(step_scene(), device, **PERFECT | {"shadows": True, "baseline": baseline})
+        measured = measure(step_scene(), device, **PERFECT | {"shadows": True, "baseline": baseline})
         holes = np.zeros((HEIGHT, WIDTH), bool)
         holes[28:68, 60 - width : 60] = True
-        assert (holes != (found.counts[0] == 0)).sum() <= 40
-        assert (found.counts[0][28:68, 60 - width + 1 : 59] == 0).all()
-        assert (found.counts[0][28:68, 100:] > 0).all()
+        assert (holes != (measured.counts[0] == 0)).sum() <= 40
+        assert (measured.counts[0][28:68, 60 - width + 1 : 59] == 0).all()
+        assert (measured.counts[0][28:68, 100:] > 0).all()
 
 
-def test_a_narrow_thing_has_a_shadow_beside_it_not_behind_it(device):
-    # Two columns wide, 20 px of disparity before the wall: its shadow falls 20 px to the left, and between them the wall is measured.
+def test_a_narrow_body_casts_its_shadow_beside_it(device):
+    # Two columns wide, 20 px more disparity than the wall: its shadow falls 20 px to the left, and the wall in between is measured.
     bar = sheet(2.0 / FOCAL * 0.75, 0.1)
     placed = [(0, (0.0, 0.0, TOP - 1.5, *UPRIGHT)), (1, (0.0, 0.0, TOP - 0.75, *UPRIGHT))]
     toy = ToyScene([entry(sheet(4.0, 4.0)), entry(bar)], [placed], (VIEW,))
-    found = measure(toy, device, **PERFECT | {"shadows": True})
-    holes = np.flatnonzero(found.counts[0, 48] == 0)
-    assert np.abs(found.exact[0, 48, 79:81] - 0.75).max() < 1e-3
+    measured = measure(toy, device, **PERFECT | {"shadows": True})
+    holes = np.flatnonzero(measured.counts[0, 48] == 0)
+    assert np.abs(measured.exact[0, 48, 79:81] - 0.75).max() < 1e-3
     assert 1 <= len(holes) <= 4
     assert np.abs(holes - 59.5).max() <= 2.0
 
 
-def test_no_surface_and_out_of_reach_are_holes(device):
+def test_background_and_depth_out_of_range_are_invalid(device):
     toy = ToyScene([entry(box(0.1, 0.1, 0.1))], [[(0, (0.0, 0.0, TOP - 1.0, *UPRIGHT))]], (VIEW,))
-    found = measure(toy, device, **PERFECT)
-    np.testing.assert_array_equal(found.counts > 0, found.clean > 0)
-    assert (found.counts == 0).any()
+    measured = measure(toy, device, **PERFECT)
+    np.testing.assert_array_equal(measured.counts > 0, measured.clean > 0)
+    assert (measured.counts == 0).any()
     for distances in ((1.2, 5.0), (0.1, 0.5)):
         assert not measure(wall(1.0), device, **PERFECT | {"distances": distances}).counts.any()
 
 
-def test_lateral_noise_makes_edges_ragged_and_leaves_the_rest(device):
-    found = measure(step_scene(), device, **PERFECT | {"lateral_noise": 0.7})
-    off = np.abs(found.depth - found.exact)[0] > 0.1
+def test_lateral_noise_changes_depth_only_near_silhouettes(device):
+    measured = measure(step_scene(), device, **PERFECT | {"lateral_noise": 0.7})
+    off = np.abs(measured.depth - measured.exact)[0] > 0.1
     assert off[26:70, 58:102].sum() > 50
     assert not off[:24].any()
     assert not off[32:64, 66:94].any()
 
 
-def test_each_frame_has_noise_of_its_own_and_an_address_always_the_same(device):
+def test_noise_follows_from_seed_episode_frame_and_camera_alone(device):
     toy = wall(1.2)
     toy.cameras, toy.placed = (VIEW, VIEW), toy.placed * 2
-    found = measure(toy, device, frames=2)
-    assert found.counts.shape == (8, HEIGHT, WIDTH)
-    assert len({view.tobytes() for view in found.counts}) == 8
-    np.testing.assert_array_equal(found.counts, measure(toy, device, frames=2).counts)
-    assert (measure(toy, device, seed=1).counts != found.counts[:4]).any(axis=(1, 2)).all()
+    measured = measure(toy, device, frames=2)
+    assert measured.counts.shape == (8, HEIGHT, WIDTH)
+    assert len({view.tobytes() for view in measured.counts}) == 8
+    np.testing.assert_array_equal(measured.counts, measure(toy, device, frames=2).counts)
+    assert (measure(toy, device, seed=1).counts != measured.counts[:4]).any(axis=(1, 2)).all()
     # World 1 alone, as episode 1: its views are those of the batch of both worlds.
     toy.placed = toy.placed[1:]
-    np.testing.assert_array_equal(measure(toy, device, first_episode=1).counts, found.counts[2:4])
+    np.testing.assert_array_equal(measure(toy, device, first_episode=1).counts, measured.counts[2:4])
 
 
-def test_a_real_sensors_picture_is_whole_but_for_its_holes(device):
-    found = measure(step_scene(), device)
-    seen = found.counts[0] > 0
+def test_default_sensor_measures_most_pixels_accurately(device):
+    measured = measure(step_scene(), device)
+    seen = measured.counts[0] > 0
     assert 0.85 < seen.mean() < 1.0
-    off = (found.depth - found.exact)[0]
+    off = (measured.depth - measured.exact)[0]
     # Steps at 1.5 m are 9 mm wide with this short focal length, and noise is 3.5 mm.
     assert np.nanpercentile(np.abs(off), 99) < 0.02
     assert abs(np.nanmean(off)) < 0.003
-    # The clean layer stays what it is.
-    np.testing.assert_allclose(found.clean[0] * COUNT, found.exact[0], atol=0.51 * COUNT)
+    # The rendered depth is unchanged.
+    np.testing.assert_allclose(measured.clean[0] * COUNT, measured.exact[0], atol=0.51 * COUNT)

@@ -1,4 +1,4 @@
-"""From radiance to bytes: tone curves, and effects of the camera, against laws and a NumPy twin."""
+"""Post-processing: tone curves and camera effects against their laws and a NumPy twin."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from synpick_warp.configs.sensors import Effects, effect_ranges
 from synpick_warp.device import pick_device
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.render.images.antialias import ShadedImage
-from synpick_warp.kernels.render.images.camera_effects import Strengths
+from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.pipeline import describe_arrays
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
@@ -35,24 +35,24 @@ GAIN = 0.5
 
 
 @dataclass(frozen=True)
-class Addresses:
-    """Of each view: episode, frame, camera."""
+class ViewKeys:
+    """Episode, frame and camera of each view: the key of its random number stream."""
 
     episode: list[int]
     frame: list[int]
     camera: list[int]
 
 
-ONE = Addresses([3], [5], [0])
+ONE = ViewKeys([3], [5], [0])
 
 
-def config_of(tone: str = "linear", seed: int = 7, **effects: Any) -> Config:
+def make_config(tone: str = "linear", seed: int = 7, **effects: Any) -> Config:
     config = Config(effects=Effects(**effects))
     return replace(config, render=replace(config.render, tone=tone), bake=replace(config.bake, seed=seed))
 
 
-def developed(radiance: np.ndarray, config: Config, at: Addresses = ONE, stops: float = 0.0, lens=LENS) -> tuple[np.ndarray, np.ndarray]:
-    """Bytes (B, H, W, 3) and strengths (B, E) of pictures whose radiance is (H, W, 3); each view has a world of its own."""
+def postprocess(radiance: np.ndarray, config: Config, at: ViewKeys = ONE, stops: float = 0.0, lens=LENS) -> tuple[np.ndarray, np.ndarray]:
+    """sRGB bytes (B, H, W, 3) and effect parameters (B, E) of an image of radiance (H, W, 3); each view has a world of its own."""
     device = pick_device("cpu")
     views = len(at.episode)
     lights = Lights()
@@ -62,23 +62,24 @@ def developed(radiance: np.ndarray, config: Config, at: Addresses = ONE, stops: 
         cameras=build_cameras((lens,) * 9, device), grid=build_grid(width, height), lights=lights, width=width, height=height, device=device
     )
 
-    def numbers(values: list[Any], kind: Any = wp.int32) -> wp.array:
+    def device_array(values: list[Any], kind: Any = wp.int32) -> wp.array:
         return wp.array(values, dtype=kind, device=device)
 
     world = SimpleNamespace(
-        episode=numbers(at.episode),
-        frame=numbers(at.frame),
-        light=numbers([0] * views),
-        light_exposure=numbers([stops] * views, wp.float32),
+        episode=device_array(at.episode),
+        frame=device_array(at.frame),
+        light=device_array([0] * views),
+        light_exposure=device_array([stops] * views, wp.float32),
     )
     out = SimpleNamespace(
-        color=wp.zeros((views, height, width), dtype=wp.vec3ub, device=device), effects=wp.zeros(views, dtype=Strengths, device=device)
+        color=wp.zeros((views, height, width), dtype=wp.vec3ub, device=device),
+        effects=wp.zeros(views, dtype=EffectParameters, device=device),
     )
-    picture = ShadedImage()
-    picture.radiance = wp.array(np.repeat(radiance[None] / GAIN, views, axis=0), dtype=wp.vec3, device=device)
-    picture.mix = wp.zeros((views, height, width), dtype=wp.uint32, device=device)
-    batch = make_views(numbers(list(range(views))), numbers(at.camera), views, 0)
-    PostProcessor(config, scene, views).process(world, batch, picture, out)
+    image = ShadedImage()
+    image.radiance = wp.array(np.repeat(radiance[None] / GAIN, views, axis=0), dtype=wp.vec3, device=device)
+    image.resolve = wp.zeros((views, height, width), dtype=wp.uint32, device=device)
+    batch = make_views(device_array(list(range(views))), device_array(at.camera), views, 0)
+    PostProcessor(config.effects, config.render.tone, config.bake.seed, scene, views).process(world, batch, image, out)
     return out.color.numpy(), out.effects.numpy()
 
 
@@ -86,18 +87,18 @@ def linear(color: np.ndarray) -> np.ndarray:
     return srgb_to_linear(color / 255.0)
 
 
-def even(value: float | tuple[float, float, float], width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+def uniform_image(value: float | tuple[float, float, float], width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     return np.ones((height, width, 3)) * value
 
 
-def strength(effects: np.ndarray, name: str) -> Any:
+def parameter(effects: np.ndarray, name: str) -> Any:
     return effects[..., Effect[name.upper()]]
 
 
 # ---- tone ----
 
 
-def test_names_are_those_of_the_kernels():
+def test_effect_settings_have_the_order_of_the_codes():
     assert tuple(effect_ranges(Effects())) == names(Effect)
 
 
@@ -110,16 +111,16 @@ def curve(x: np.ndarray, tone: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("tone", names(Tone))
-def test_tone_curves_are_those_of_their_laws(tone):
+def test_tone_curves_follow_their_laws(tone):
     values = np.linspace(0.0, 4.0, WIDTH * HEIGHT * 3).reshape(HEIGHT, WIDTH, 3)
-    color, effects = developed(values, config_of(tone), stops=0.5)
+    color, effects = postprocess(values, make_config(tone), stops=0.5)
     expected = 255.0 * linear_to_srgb(np.clip(curve(2.0**0.5 * values, tone), 0.0, 1.0))
     np.testing.assert_allclose(color[0], expected, atol=0.501)
     assert not effects.any()
 
 
 def test_all_tone_curves_keep_middle_grey_and_shoulder_is_the_default():
-    grey = {tone: developed(even(0.18), config_of(tone))[0] for tone in names(Tone)}
+    grey = {tone: postprocess(uniform_image(0.18), make_config(tone))[0] for tone in names(Tone)}
     assert all((color == np.rint(255.0 * linear_to_srgb(0.18))).all() for color in grey.values())
     assert Config().render.tone == "shoulder"
 
@@ -127,29 +128,29 @@ def test_all_tone_curves_keep_middle_grey_and_shoulder_is_the_default():
 # ---- one effect at a time ----
 
 
-def test_without_effects_there_is_no_scratch_and_with_none_that_touches_light_the_bytes_are_the_same():
+def test_effects_that_do_not_touch_radiance_leave_the_bytes_alone():
     device = pick_device("cpu")
     scene = SimpleNamespace(width=8, height=8, device=device)
-    plain = PostProcessor(Config(), scene, 2)
-    assert plain.effects is plain.spread is None
+    plain = PostProcessor(Effects(), "shoulder", 0, scene, 2)
+    assert plain.effects is plain.filtered is None
     values = np.random.default_rng(1).uniform(0.0, 2.0, (HEIGHT, WIDTH, 3))
-    color, effects = developed(values, config_of("shoulder", jpeg_quality=(30, 90)))
-    np.testing.assert_array_equal(color, developed(values, config_of("shoulder"))[0])
-    assert 30 <= strength(effects, "jpeg_quality")[0] <= 90
+    color, effects = postprocess(values, make_config("shoulder", jpeg_quality=(30, 90)))
+    np.testing.assert_array_equal(color, postprocess(values, make_config("shoulder"))[0])
+    assert 30 <= parameter(effects, "jpeg_quality")[0] <= 90
 
 
-def test_exposure_and_white_balance_are_gains_of_the_drawn_stops():
-    at = Addresses(list(range(6)), [0] * 6, [0] * 6)
-    color, effects = developed(even(0.3), config_of(exposure_jitter=1.0, white_balance_jitter=0.4), at)
-    stops = [strength(effects, "exposure") + part for part in (strength(effects, "red"), 0.0, strength(effects, "blue"))]
+def test_exposure_and_white_balance_are_gains_of_the_sampled_exposure_values():
+    at = ViewKeys(list(range(6)), [0] * 6, [0] * 6)
+    color, effects = postprocess(uniform_image(0.3), make_config(exposure_jitter=1.0, white_balance_jitter=0.4), at)
+    stops = [parameter(effects, "exposure") + part for part in (parameter(effects, "red"), 0.0, parameter(effects, "blue"))]
     np.testing.assert_allclose(linear(color)[:, 9, 9], 0.3 * 2.0 ** np.stack(stops, axis=-1), rtol=0.02)
-    assert np.ptp(strength(effects, "red") - strength(effects, "blue")) > 0.1
+    assert np.ptp(parameter(effects, "red") - parameter(effects, "blue")) > 0.1
 
 
-def test_a_vignette_takes_its_share_in_the_corner_and_none_in_the_middle():
+def test_vignette_darkens_the_corner_by_its_fraction_and_spares_the_centre():
     lens = replace(LENS, matrix=np.array([[60.0, 0.0, 30.0], [0.0, 60.0, 24.0], [0.0, 0.0, 1.0]]))
-    color, effects = developed(even(0.5), config_of(vignette=(0.6, 0.6)), lens=lens)
-    np.testing.assert_allclose(strength(effects, "vignette"), 0.6)
+    color, effects = postprocess(uniform_image(0.5), make_config(vignette=(0.6, 0.6)), lens=lens)
+    np.testing.assert_allclose(parameter(effects, "vignette"), 0.6)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
 
     def fourth(column: Any, row: Any) -> Any:
@@ -164,47 +165,47 @@ def test_a_vignette_takes_its_share_in_the_corner_and_none_in_the_middle():
 
 def blob(row: float, column: float) -> np.ndarray:
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    return even(0.9 * np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / 8.0)[..., None])
+    return uniform_image(0.9 * np.exp(-((rows - row) ** 2 + (columns - column) ** 2) / 8.0)[..., None])
 
 
-def place(values: np.ndarray) -> np.ndarray:
+def centroid(values: np.ndarray) -> np.ndarray:
     """Centre of mass: row and column."""
     return np.array([(values * grid).sum() / values.sum() for grid in np.mgrid[: values.shape[0], : values.shape[1]]])
 
 
-def test_chromatic_aberration_moves_red_out_and_blue_in_and_leaves_green():
-    picture = blob(7.0, 9.0)
-    plain, _ = developed(picture, config_of())
-    color, _ = developed(picture, config_of(chromatic_aberration=(2.0, 2.0)))
+def test_chromatic_aberration_magnifies_red_and_shrinks_blue():
+    image = blob(7.0, 9.0)
+    plain, _ = postprocess(image, make_config())
+    color, _ = postprocess(image, make_config(chromatic_aberration=(2.0, 2.0)))
     np.testing.assert_array_equal(color[..., 1], plain[..., 1])
-    at = place(linear(plain)[0, ..., 1])
-    # From the middle of the picture, pixel (19.5, 35.5), in proportion to the distance, 2 px in the corner.
+    at = centroid(linear(plain)[0, ..., 1])
+    # From the middle of the image, pixel (19.5, 35.5), in proportion to the distance, 2 px in the corner.
     outward = (at - (19.5, 35.5)) / np.hypot(20.0, 36.0) * 2.0
     assert np.abs(outward).min() > 0.5
     for channel, sign in ((0, 1.0), (2, -1.0)):
-        np.testing.assert_allclose(place(linear(color)[0, ..., channel]) - at, sign * outward, atol=0.05)
+        np.testing.assert_allclose(centroid(linear(color)[0, ..., channel]) - at, sign * outward, atol=0.05)
 
 
-def test_a_blur_keeps_the_light_and_spreads_it_as_its_sigma_says():
-    point = even(0.0)
+def test_blur_is_a_normalized_gaussian_of_its_sigma():
+    point = uniform_image(0.0)
     point[20, 36] = 20.0
-    color, effects = developed(point, config_of(blur=(1.5, 2.5)))
+    color, effects = postprocess(point, make_config(blur=(1.5, 2.5)))
     values = linear(color)[0, ..., 1]
-    sigma = float(strength(effects, "blur")[0])
+    sigma = float(parameter(effects, "blur")[0])
     assert 1.5 < sigma < 2.5
     np.testing.assert_allclose(values.sum(), 20.0, rtol=0.02)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     for grid, middle in ((rows, 20), (columns, 36)):
         # The Gaussian ends at three sigma, which takes 3 % of its variance.
         np.testing.assert_allclose((values * (grid - middle) ** 2).sum() / values.sum(), 0.973 * sigma**2, rtol=0.04)
-    assert (developed(even(0.4), config_of(blur=(3.0, 3.0)))[0] == developed(even(0.4), config_of())[0]).all()
+    assert (postprocess(uniform_image(0.4), make_config(blur=(3.0, 3.0)))[0] == postprocess(uniform_image(0.4), make_config())[0]).all()
 
 
-def test_noise_follows_its_law():
+def test_sensor_noise_follows_its_law():
     shot, read = 0.03, 0.008
     size = {"width": 240, "height": 160}
     for value in (0.08, 0.3, 0.8):
-        color, _ = developed(even(value, **size), config_of(shot_noise=(shot, shot), read_noise=(read, read)))
+        color, _ = postprocess(uniform_image(value, **size), make_config(shot_noise=(shot, shot), read_noise=(read, read)))
         values = linear(color)[0]
         variance = shot**2 * value + read**2
         np.testing.assert_allclose(values.mean(axis=(0, 1)), value, atol=4.0 * np.sqrt(variance / values[..., 0].size) + 1e-4)
@@ -215,26 +216,26 @@ def test_noise_follows_its_law():
         assert abs(np.corrcoef(values[:, 1:, 0].ravel(), values[:, :-1, 0].ravel())[0, 1]) < 0.03
 
 
-def test_read_noise_does_not_depend_on_light_and_shot_noise_vanishes_without():
-    dark, _ = developed(even(0.0), config_of(shot_noise=(0.1, 0.1)))
+def test_read_noise_is_constant_and_shot_noise_vanishes_in_the_dark():
+    dark, _ = postprocess(uniform_image(0.0), make_config(shot_noise=(0.1, 0.1)))
     assert not dark.any()
-    values = [linear(developed(even(v, 200, 200), config_of(read_noise=(0.02, 0.02)))[0]).std() for v in (0.2, 0.7)]
+    values = [linear(postprocess(uniform_image(v, 200, 200), make_config(read_noise=(0.02, 0.02)))[0]).std() for v in (0.2, 0.7)]
     np.testing.assert_allclose(values, 0.02, rtol=0.03)
 
 
 # ---- all effects ----
 
 
-def twin(picture: np.ndarray, strengths: np.ndarray, lens=LENS) -> np.ndarray:
-    """What comes before noise, in float64: vignette, exposure, blur, chromatic aberration, one after the other."""
-    get = dict(zip(names(Effect), strengths.astype(np.float64), strict=True))
-    height, width = picture.shape[:2]
+def lens_twin(image: np.ndarray, parameters: np.ndarray, lens=LENS) -> np.ndarray:
+    """NumPy twin of lens and exposure in float64: vignette, exposure, blur and chromatic aberration in sequence."""
+    get = dict(zip(names(Effect), parameters.astype(np.float64), strict=True))
+    height, width = image.shape[:2]
     (fx, _, cx), (_, fy, cy) = lens.matrix[:2]
     rows, columns = np.mgrid[:height, :width] + 0.5
     corner = np.array([max(cx, width - cx), max(cy, height - cy)])
     fourth = (1.0 + ((columns - cx) / fx) ** 2 + ((rows - cy) / fy) ** 2) ** -2
     last = (1.0 + (corner[0] / fx) ** 2 + (corner[1] / fy) ** 2) ** -2
-    lit = picture * (1.0 - get["vignette"] * (1.0 - fourth) / (1.0 - last))[..., None]
+    lit = image * (1.0 - get["vignette"] * (1.0 - fourth) / (1.0 - last))[..., None]
     lit = lit * 2.0 ** (get["exposure"] + np.array([get["red"], 0.0, get["blue"]]))
     result = np.zeros_like(lit)
     for channel, sign in enumerate((1.0, 0.0, -1.0)):
@@ -245,7 +246,7 @@ def twin(picture: np.ndarray, strengths: np.ndarray, lens=LENS) -> np.ndarray:
 
 
 def resample(values: np.ndarray, center: float, scale: float, sigma: float) -> np.ndarray:
-    """Blur along the last axis, and magnify about `center`."""
+    """Blur along the last axis, then magnify about `center`."""
     size, reach = values.shape[1], int(np.ceil(3.0 * sigma))
     taps = np.arange(-reach, reach + 1)
     weights = np.exp(-0.5 * (taps / sigma) ** 2) if sigma > 0.0 else np.ones(1)
@@ -264,17 +265,17 @@ def resample(values: np.ndarray, center: float, scale: float, sigma: float) -> n
     st.floats(0.0, 1.0),
     st.integers(0, 2**31 - 1),
 )
-def test_lens_and_exposure_are_those_of_the_twin(vignette, aberration, blur, jitter, episode):
-    picture = np.random.default_rng(episode).uniform(0.0, 0.6, (HEIGHT, WIDTH, 3))
-    config = config_of(
+def test_lens_and_exposure_match_the_numpy_twin(vignette, aberration, blur, jitter, episode):
+    image = np.random.default_rng(episode).uniform(0.0, 0.6, (HEIGHT, WIDTH, 3))
+    config = make_config(
         vignette=(vignette, vignette),
         chromatic_aberration=(aberration, aberration),
         blur=(blur, blur),
         exposure_jitter=jitter,
         white_balance_jitter=jitter,
     )
-    color, effects = developed(picture, config, Addresses([episode], [1], [2]))
-    expected = 255.0 * linear_to_srgb(np.clip(twin(picture, effects[0]), 0.0, 1.0))
+    color, effects = postprocess(image, config, ViewKeys([episode], [1], [2]))
+    expected = 255.0 * linear_to_srgb(np.clip(lens_twin(image, effects[0]), 0.0, 1.0))
     np.testing.assert_allclose(color[0], expected, atol=0.52)
 
 
@@ -290,54 +291,57 @@ ALL = {
 }
 
 
-def test_a_view_follows_from_its_address_alone():
-    picture = np.random.default_rng(0).uniform(0.0, 1.2, (HEIGHT, WIDTH, 3))
-    at = Addresses([4, 4, 4, 9, 4], [0, 1, 0, 0, 0], [0, 0, 1, 0, 0])
-    together, effects = developed(picture, config_of("filmic", **ALL), at)
+def test_effects_and_noise_follow_from_seed_episode_frame_and_camera_alone():
+    image = np.random.default_rng(0).uniform(0.0, 1.2, (HEIGHT, WIDTH, 3))
+    at = ViewKeys([4, 4, 4, 9, 4], [0, 1, 0, 0, 0], [0, 0, 1, 0, 0])
+    together, effects = postprocess(image, make_config("filmic", **ALL), at)
     for view in range(4):
-        alone = Addresses([at.episode[view]], [at.frame[view]], [at.camera[view]])
-        color, strengths = developed(picture, config_of("filmic", **ALL), alone)
+        alone = ViewKeys([at.episode[view]], [at.frame[view]], [at.camera[view]])
+        color, parameters = postprocess(image, make_config("filmic", **ALL), alone)
         np.testing.assert_array_equal(color[0], together[view])
-        np.testing.assert_array_equal(strengths[0], effects[view])
+        np.testing.assert_array_equal(parameters[0], effects[view])
     np.testing.assert_array_equal(together[4], together[0])
-    other = developed(picture, config_of("filmic", seed=8, **ALL), Addresses([4], [0], [0]))
-    kinds = [*effects[:4], other[1][0]]
-    assert len({tuple(row) for row in kinds}) == 5
-    # Noise alone differs as well, not only its strength.
-    fixed = config_of(read_noise=(0.1, 0.1))
-    pictures, _ = developed(even(0.5), fixed, at)
-    assert len({picture.tobytes() for picture in (*pictures, developed(even(0.5), config_of(seed=8, read_noise=(0.1, 0.1)), ONE)[0])}) == 5
+    other = postprocess(image, make_config("filmic", seed=8, **ALL), ViewKeys([4], [0], [0]))
+    sampled = [*effects[:4], other[1][0]]
+    assert len({tuple(row) for row in sampled}) == 5
+    # Noise alone differs as well, not only its parameter.
+    fixed = make_config(read_noise=(0.1, 0.1))
+    images, _ = postprocess(uniform_image(0.5), fixed, at)
+    assert (
+        len({image.tobytes() for image in (*images, postprocess(uniform_image(0.5), make_config(seed=8, read_noise=(0.1, 0.1)), ONE)[0])})
+        == 5
+    )
 
 
-def test_effects_change_colour_alone(device):
+def test_effects_change_only_colour(device):
     toy = ToyScene([entry(box(0.3, 0.2, 0.1))], [[(0, (0.02, 0.0, 0.0, *UPRIGHT))]] * 2, (LENS,), table=True)
-    toy.config = config_of("shoulder")
+    toy.config = make_config("shoulder")
     plain = render(toy, device)
-    toy.config = config_of("shoulder", **ALL)
+    toy.config = make_config("shoulder", **ALL)
     changed = render(toy, device)
     assert (changed.color != plain.color).any(axis=(1, 2, 3)).all()
     for name in ("depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance"):
         np.testing.assert_array_equal(getattr(changed, name), getattr(plain, name))
 
 
-def test_strengths_fill_their_ranges_evenly():
+def test_effect_parameters_are_uniform_in_their_ranges():
     views = 2000
-    at = Addresses(list(range(views)), [0] * views, [0] * views)
-    _, effects = developed(np.zeros((1, 1, 3)), config_of(**ALL), at)
+    at = ViewKeys(list(range(views)), [0] * views, [0] * views)
+    _, effects = postprocess(np.zeros((1, 1, 3)), make_config(**ALL), at)
     for name, (low, high) in effect_ranges(Effects(**ALL)).items():
-        values = strength(effects, name)
+        values = parameter(effects, name)
         assert low <= values.min() < low + 0.02 * (high - low)
         assert high - 0.02 * (high - low) < values.max() <= high
         np.testing.assert_allclose(values.mean(), (low + high) / 2.0, atol=0.03 * (high - low))
-    quality = strength(effects, "jpeg_quality")
+    quality = parameter(effects, "jpeg_quality")
     assert set(quality) == set(range(40, 96))
     assert np.abs(np.corrcoef(effects.T) - np.eye(len(Effect))).max() < 0.08
 
 
-def test_scratch_is_declared_if_an_effect_needs_it():
+def test_scratch_of_the_lens_filter_is_declared_only_if_needed():
     for effects, needed in (({}, False), ({"vignette": (0.1, 0.2)}, False), ({"blur": (0.0, 1.0)}, True)):
-        names = {name for name, *_ in describe_arrays(config_of(**effects))}
-        assert ("SpreadArrays.radiance" in names) == needed
+        names = {name for name, *_ in describe_arrays(make_config(**effects))}
+        assert ("LensArrays.radiance" in names) == needed
 
 
 @pytest.mark.parametrize(
@@ -356,12 +360,12 @@ def test_scratch_is_declared_if_an_effect_needs_it():
         ("depth_sensor.baseline", 0.0, r"depth_sensor.baseline .*above 0"),
     ],
 )
-def test_settings_that_make_no_sense_are_reported_in_a_line(key, value, message):
+def test_invalid_settings_are_reported_in_one_line(key, value, message):
     with pytest.raises(ConfigError, match=message) as caught:
         load_config(None, {key: value})
     assert "\n" not in str(caught.value)
 
 
-def test_png_has_no_quality():
+def test_jpeg_quality_needs_jpeg():
     with pytest.raises(ConfigError, match=r"effects.jpeg_quality .*allowed: 0, 0 with bop.color_format png"):
         load_config(None, {"effects.jpeg_quality": [50, 60], "bop.color_format": "png", "bop.split": "test"})
