@@ -26,7 +26,7 @@ FLOOR_DEPTH = 0.1
 MIN_WALL = 0.02
 """Minimum thickness of the walls' collision shapes at the rim [m], for the same reason."""
 INTERIOR_MARGIN = 1e-4
-"""Far more than positions of hits are off by rounding, and less than rays start off a surface [m]."""
+"""Margin between interior and faces [m]: far above the rounding error of hit positions, below the offset of ray origins."""
 GUIDE_THICKNESS = 0.1
 """Thickness of the guide walls [m]."""
 TABLE_SIZE = (10.0, 10.0, 0.1)
@@ -64,7 +64,7 @@ def tote_fixture(tote: Tote) -> Fixture:
 
 
 def tote_interior(tote: Tote) -> Interior:
-    """The room in the visible tote, INTERIOR_MARGIN off its faces; chords cut off its round corners."""
+    """The empty convex interior of the visual mesh, INTERIOR_MARGIN off its faces; chords cut its rounded corners."""
     top = rim_height(tote)
     half = []
     for level in (0.0, top):

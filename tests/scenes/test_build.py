@@ -1,4 +1,4 @@
-"""The model of all worlds: layout arithmetic, room for objects, and objects put into slots."""
+"""The simulation model: layout, number of body slots, and selection of body variants."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def built(device, objects) -> build.BuiltModel:
 # ---- layout ----
 
 
-def test_the_layout_is_the_models(built):
+def test_the_layout_agrees_with_the_model(built):
     layout, model = built.layout, built.model
     assert model.world_count == layout.worlds == WORLDS
     assert model.body_count == WORLDS * layout.bodies_per_world
@@ -52,7 +52,7 @@ def test_the_layout_is_the_models(built):
     np.testing.assert_array_equal(shapes, np.repeat(np.arange(WORLDS), layout.shapes_per_world))
 
 
-def test_gripper_and_slots_stand_where_the_layout_says(built):
+def test_bodies_of_gripper_and_slots_have_the_indices_of_the_layout(built):
     layout, labels = built.layout, [label.split("/")[-1] for label in built.model.body_label]
     for world in range(WORLDS):
         first = world * layout.bodies_per_world
@@ -62,7 +62,7 @@ def test_gripper_and_slots_stand_where_the_layout_says(built):
         assert slots[layout.single_slots :] == [f"compound_{slot}" for slot in range(layout.compound_slots)]
 
 
-def test_joint_coordinates_move_the_body_of_their_slot(built):
+def test_joint_coordinates_place_the_body_of_their_slot(built):
     """Slot s of world w: seven coordinates from w · coords + 4 + 7 s. The gripper: x, y, z, tilt."""
     layout, model = built.layout, built.model
     state = model.state()
@@ -81,7 +81,7 @@ def test_joint_coordinates_move_the_body_of_their_slot(built):
         np.testing.assert_allclose(place[world, 2:], [[world, slot, 7.0] for slot in range(layout.slots)], atol=1e-6)
 
 
-def test_dofs_push_the_body_of_their_slot(device, built):
+def test_dofs_belong_to_the_body_of_their_slot(device, built):
     """A force on the z dof of one slot lifts that body and no other."""
     layout, model = built.layout, built.model
     starts = model.joint_qd_start.numpy()
@@ -104,7 +104,7 @@ def test_guide_shapes_are_the_guide_walls(built):
             np.testing.assert_allclose(np.sort(source.vertices, axis=0), np.sort(wall.vertices, axis=0), atol=1e-6)
 
 
-def test_slots_begin_empty(built):
+def test_slots_are_initially_empty(built):
     layout = built.layout
     mass = built.model.body_mass.numpy().reshape(WORLDS, -1)[:, build.GRIPPER_BODIES :]
     np.testing.assert_allclose(mass, build.EMPTY_MASS)
@@ -116,8 +116,8 @@ def test_slots_begin_empty(built):
 # ---- objects in slots ----
 
 
-def test_a_slot_becomes_the_object_that_is_selected(built, objects):
-    """Every object into the first slot of its kind in world 1: mass, centre of mass, inertia; others keep theirs."""
+def test_a_slot_becomes_the_selected_object(built, objects):
+    """Each object in the first slot of its type in world 1: mass, centre of mass, inertia; others keep theirs."""
     layout, model = built.layout, built.model
     for index, entry in enumerate(objects.entries):
         slot = layout.single_slots if len(entry.pieces) > 1 else 0
@@ -140,30 +140,30 @@ def test_a_slot_becomes_the_object_that_is_selected(built, objects):
         assert model.body_mass.numpy()[body] == pytest.approx(build.EMPTY_MASS)
 
 
-def test_the_grippers_mass_is_the_settings(built):
+def test_the_gripper_has_its_configured_mass(built):
     gripper, mass = config_of().gripper, built.model.body_mass.numpy().reshape(WORLDS, -1)
     np.testing.assert_allclose(mass[:, :2], np.tile([gripper.finger_mass, gripper.cup_mass], (WORLDS, 1)), rtol=1e-6)
 
 
 @pytest.mark.parametrize(("shapes", "kinds"), [((BOX, CUBE), (3, 0)), ((ANGLE,), (0, 3))], ids=("single", "compound"))
-def test_catalogs_of_one_kind(device, shapes, kinds):
+def test_catalogs_with_one_type_of_slot(device, shapes, kinds):
     built = build.build_model(config_of(), catalog(*shapes), device)
     assert (built.layout.single_slots > 0, built.layout.compound_slots > 0) == (kinds[0] > 0, kinds[1] > 0)
     assert built.model.body_count == WORLDS * built.layout.bodies_per_world
     assert built.variant.tolist() == list(range(len(shapes)))
 
 
-# ---- how many slots ----
+# ---- slot counts ----
 
 
 def fake(volume: np.ndarray, compound: np.ndarray, objects: Catalog) -> Catalog:
-    """A catalog of given volumes and kinds."""
+    """A catalog of given volumes and slot types."""
     kinds = objects.entries[:2]
     return Catalog(tuple(dataclasses.replace(kinds[int(kind)], volume=float(size)) for size, kind in zip(volume, compound, strict=True)))
 
 
 def needs(config, volume, compound, episodes: int, *, repeats: bool) -> np.ndarray:
-    """Slots (episode, kind) that the twin's draws take where there is room for all."""
+    """Slots (episode, type) that the twin's draws need with unlimited slots."""
     room = config.arrangement.max_objects
     taken = []
     for episode in range(episodes):
@@ -185,7 +185,7 @@ def needs(config, volume, compound, episodes: int, *, repeats: bool) -> np.ndarr
 
 
 def overflows(taken: np.ndarray, slots: tuple[int, int]) -> float:
-    """Share of draws that find no slot for one of their objects."""
+    """Fraction of draws with an object for which there is no slot."""
     return float((taken > slots).any(axis=1).mean())
 
 
@@ -196,8 +196,8 @@ def overflows(taken: np.ndarray, slots: tuple[int, int]) -> float:
     share=st.sampled_from((0.2, 0.5)),
     mode=st.sampled_from(("pick", "target", "move")),
 )
-def test_slots_hold_all_but_the_accepted_share_of_draws(seed, size, share, mode, objects):
-    """Found by brute force with the twin's draws; also where single objects may exceed the whole budget. One slot fewer would not do."""
+def test_slots_suffice_for_all_but_the_accepted_fraction_of_draws(seed, size, share, mode, objects):
+    """By brute force with the twin's draws, also where single objects may exceed the whole budget. One slot fewer would not suffice."""
     numbers = np.random.default_rng(seed)
     volume, compound = numbers.uniform(0.1 * size, size, 9), (numbers.uniform(size=9) < share).astype(int)
     shortfall, episodes = 0.05, 400
@@ -216,7 +216,7 @@ def test_slots_hold_all_but_the_accepted_share_of_draws(seed, size, share, mode,
         assert slots[1] <= (compound == 1).sum()
 
 
-def test_the_accepted_share_is_that_of_both_kinds_together(objects):
+def test_the_accepted_fraction_is_that_of_both_slot_types_together(objects):
     """Known: two draws, each single or compound with even chances. With a slot of either kind a quarter fails twice, which makes a half."""
     halves = fake(np.full(2, 1e-4), np.array([0, 1]), objects)
     for shortfall, slots in ((0.3, (2, 1)), (0.2, (2, 2))):
@@ -240,7 +240,7 @@ def test_without_repeats_a_budget_for_few_needs_few_slots(objects):
     assert compound > 2
 
 
-def test_the_first_object_is_drawn_again_until_one_fits_and_the_next_that_does_not_ends_the_draw(objects):
+def test_the_first_object_is_redrawn_until_it_fits_and_the_next_that_does_not_fit_ends_the_draw(objects):
     """Known: of a hundred objects only one fits, and it fits twice."""
     volume = np.full(100, 1e-3)
     volume[40] = 1e-4
@@ -264,13 +264,13 @@ def test_the_first_object_is_drawn_again_until_one_fits_and_the_next_that_does_n
         ("mixed", (0, 1, 1), (True, False), {False, True}),
     ],
 )
-def test_rules_of_repeating_that_occur(mode, mix, rules, expected):
+def test_repeat_rules_of_the_possible_modes(mode, mix, rules, expected):
     config = settings(bake__mode=mode, bake__mix=list(mix), pick__repeats=rules[0], move__repeats=rules[1])
     assert build.find_repeat_rules(config) == expected
 
 
-def test_mixed_modes_have_the_slots_of_the_mode_that_needs_most(objects):
-    """Of each kind: picking may need more of one and moving more of the other."""
+def test_mixed_modes_have_enough_slots_for_each_mode(objects):
+    """For each slot type: picking may need more of one and moving more of the other."""
     some = fake(np.full(6, 1e-4), np.array([0, 0, 0, 0, 1, 1]), objects)
     config = {"arrangement__volume": 5.5e-4, "arrangement__max_objects": 12}
     single = [build.count_slots(settings(bake__mode=mode, **config), some) for mode in ("pick", "target", "move")]
@@ -278,7 +278,7 @@ def test_mixed_modes_have_the_slots_of_the_mode_that_needs_most(objects):
     assert build.count_slots(settings(bake__mode="mixed", bake__mix=[1, 1, 0], **config), some) == single[0] == single[1] != single[2]
 
 
-def test_no_kind_takes_more_slots_than_there_is_room_for_objects(objects):
+def test_no_slot_type_exceeds_the_maximum_of_objects(objects):
     config = settings(arrangement__max_objects=4, arrangement__volume=1.0)
     single, compound = build.count_slots(config, fake(np.full(4, 1e-5), np.array([0, 0, 1, 1]), objects))
     assert (single, compound) == (4, 4)
@@ -286,12 +286,12 @@ def test_no_kind_takes_more_slots_than_there_is_room_for_objects(objects):
 
 
 @pytest.mark.parametrize("mode", ["move", "pick"])
-def test_a_budget_below_the_smallest_object_is_a_mistake(objects, mode):
+def test_a_budget_below_the_smallest_object_is_an_error(objects, mode):
     config = settings(arrangement__volume=1e-4, bake__mode=mode)
     with pytest.raises(ConfigError, match=r"volume is 0\.0001 m³, but the smallest object, boxes_3, takes 0\.000125 m³; make it larger"):
         build.count_slots(config, objects)
 
 
-def test_the_same_slots_every_time(objects):
+def test_slot_counts_are_deterministic(objects):
     config = config_of(arrangement__max_objects=12, arrangement__volume=3e-3)
     assert build.count_slots(config, objects) == build.count_slots(config, objects)

@@ -1,4 +1,4 @@
-"""Cameras: known answers."""
+"""Look-at cameras: projections with known answers."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def project(camera, point):
 
 
 def test_the_papers_cameras_have_the_papers_matrix():
-    made = make_cameras(Cameras())
-    assert len(made) == 3
-    for camera in made:
+    cameras = make_cameras(Cameras())
+    assert len(cameras) == 3
+    for camera in cameras:
         assert (camera.width, camera.height) == (1920, 1080)
         assert np.allclose(camera.matrix, [[5444.43, 0, 960], [0, 5444.43, 540], [0, 0, 1]], atol=5e-3)
         assert camera.rotation @ camera.rotation.T == pytest.approx(np.eye(3))
@@ -41,7 +41,7 @@ def test_the_first_camera_looks_straight_down_with_y_up():
     assert project(camera, (0, 0.1, 0)) == pytest.approx((960, 540 - 272.2213), abs=1e-3)
 
 
-def test_the_other_two_have_the_tote_above_the_middle():
+def test_the_other_two_cameras_look_at_the_target_with_the_centre_line_up():
     _, far, near = make_cameras(Cameras())
     for camera, side in ((far, 1.0), (near, -1.0)):
         assert np.allclose(-camera.rotation.T @ camera.translation, (0, side * 0.573, 2.0))
@@ -52,7 +52,7 @@ def test_the_other_two_have_the_tote_above_the_middle():
 
 
 @given(st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-3, 3)] * 3), st.tuples(*[st.floats(-1, 1)] * 3), st.floats(1, 170))
-def test_up_is_up_and_the_target_is_in_the_middle(position, target, up, fov):
+def test_up_vectors_point_up_and_the_target_is_in_the_image_centre(position, target, up, fov):
     forward = np.subtract(target, position)
     if np.linalg.norm(np.cross(forward, up)) < 1e-3 * np.linalg.norm(forward) or np.linalg.norm(forward) < 1e-2:
         return
@@ -65,7 +65,7 @@ def test_up_is_up_and_the_target_is_in_the_middle(position, target, up, fov):
     assert np.degrees(np.arctan(960 / camera.matrix[0, 0])) == pytest.approx(fov / 2)
 
 
-def test_resolution_scales_the_matrix():
+def test_resolution_scales_the_intrinsics():
     (camera,) = make_cameras(replace(ONE, resolution=(640, 360)))
     assert np.allclose(camera.matrix, [[1814.81, 0, 320], [0, 1814.81, 180], [0, 0, 1]], atol=5e-3)
 
@@ -81,7 +81,7 @@ def test_resolution_scales_the_matrix():
         ({"target": (0.0, float("nan"), 0.0)}, "not finite"),
     ],
 )
-def test_impossible_cameras_are_refused(change, words):
+def test_invalid_cameras_are_refused(change, words):
     with pytest.raises(ConfigError, match=words) as caught:
         make_cameras(replace(ONE, **change))
     assert "\n" not in str(caught.value)

@@ -1,3 +1,5 @@
+"""The object catalog: BOP folders, other meshes, mass properties, and errors."""
+
 from __future__ import annotations
 
 import json
@@ -103,7 +105,7 @@ def test_a_bop_folder_in_millimetres(tmp_path):
     assert_physical(two)
 
 
-def test_a_row_counts_if_number_and_diameter_agree(tmp_path):
+def test_a_row_applies_if_id_and_diameter_agree(tmp_path):
     for obj_id in (1, 2, 3):
         write_box(tmp_path / f"obj_{obj_id:06d}.ply")
     size = 0.1 * np.sqrt(3)
@@ -118,13 +120,13 @@ def test_a_row_counts_if_number_and_diameter_agree(tmp_path):
     assert (three.name, three.mass) == ("any size", 0.5)
 
 
-def test_meshes_of_a_users_own_in_metres(tmp_path):
+def test_meshes_that_are_not_bop_models_are_in_metres(tmp_path):
     write_box(tmp_path / "b.ply", (0.1, 0.2, 0.3))
     write_box(tmp_path / "a.obj")
     (tmp_path / "c.glb").write_bytes(trimesh.Scene([trimesh.creation.icosphere(2, 0.04)]).export(file_type="glb"))
     (tmp_path / "notes.txt").write_text("no model")
     (tmp_path / ".hidden.ply").write_text("no model")
-    # Numbers are only counts here: the row is found by name, not by number.
+    # These ids are only positions: rows are matched by name, not by id.
     rows = (ObjectRow(id=1, name="other", diameter=0.1732, mass=9.0), ObjectRow(id=9, name="b", mass=0.7))
     a, b, c = load(config_for(tmp_path, rows), tmp_path)
     assert [(e.obj_id, e.name, e.source) for e in (a, b, c)] == [(1, "a", None), (2, "b", None), (3, "c", None)]
@@ -133,7 +135,7 @@ def test_meshes_of_a_users_own_in_metres(tmp_path):
     assert c.diameter == pytest.approx(0.08, rel=1e-3)
 
 
-def test_other_meshes_beside_bop_models_are_named_as_ignored(tmp_path):
+def test_other_meshes_beside_bop_models_are_reported_as_ignored(tmp_path):
     write_box(tmp_path / "obj_000001.ply")
     write_box(tmp_path / "spare.obj")
     lines: list[str] = []
@@ -141,7 +143,7 @@ def test_other_meshes_beside_bop_models_are_named_as_ignored(tmp_path):
     assert any("1 meshes" in line and "ignored" in line for line in lines)
 
 
-def test_concave_by_volumes_by_row_and_not(tmp_path, monkeypatch):
+def test_concave_by_volume_ratio_or_by_row(tmp_path, monkeypatch):
     asked = {}
 
     def remember(names, meshes, recipes, cache_dir, report):
@@ -171,14 +173,14 @@ def fails(config: Config, cache: Path, *words: str) -> None:
         assert word in str(caught.value)
 
 
-def test_folders_that_are_not_there_or_empty(tmp_path):
+def test_missing_and_empty_folders(tmp_path):
     fails(config_for(tmp_path / "gone"), tmp_path, "gone", "no such folder")
     (tmp_path / "file").write_text("")
     fails(config_for(tmp_path / "file"), tmp_path, "no such folder")
     fails(config_for(tmp_path), tmp_path, "contains no models")
 
 
-def test_two_files_for_one_object(tmp_path):
+def test_duplicate_objects(tmp_path):
     write_box(tmp_path / "obj_000001.ply")
     write_box(tmp_path / "obj_01.ply")
     fails(config_for(tmp_path), tmp_path, "both object 1")
@@ -198,25 +200,25 @@ def test_two_files_for_one_object(tmp_path):
         ((0.1, 0.1, 0.1), (1, 0, 0), ("origin",)),
     ],
 )
-def test_sizes_and_places_that_cannot_be_meant(tmp_path, extents, offset, words):
+def test_wrong_sizes_and_origins(tmp_path, extents, offset, words):
     write_box(tmp_path / "thing.ply", extents, offset)
     fails(config_for(tmp_path), tmp_path, "thing", *words)
 
 
 @pytest.mark.parametrize("mass", [0.0, -1.0, 1e-9, 1e5, np.inf, np.nan])
-def test_a_mass_must_be_one_that_bodies_have(tmp_path, mass):
+def test_masses_out_of_range(tmp_path, mass):
     write_box(tmp_path / "thing.ply")
     said = f"mass {mass:g} kg in its row of the object table; allowed: 1e-07 to 10000 kg"
     fails(config_for(tmp_path, (ObjectRow(name="thing", mass=mass),)), tmp_path, "thing", said)
 
 
-def test_a_density_that_leaves_no_mass(tmp_path):
+def test_a_density_that_gives_no_useful_mass(tmp_path):
     write_box(tmp_path / "thing.ply")
     fails(config_for(tmp_path, density=1e-12), tmp_path, "thing", "mass 1e-15 kg by objects.density")
 
 
 def turned_box(file: Path, extents: tuple[float, float, float], seed: int | None) -> Path:
-    """A box in some rotation: the pose in the file must not count."""
+    """A box in a random orientation, which must not matter."""
     box = trimesh.creation.box(np.array(extents))
     if seed is not None:
         box.apply_transform(trimesh.transformations.random_rotation_matrix(np.random.default_rng(seed).uniform(size=3)))
@@ -238,8 +240,8 @@ def turned_box(file: Path, extents: tuple[float, float, float], seed: int | None
         ((0.3, 0.3, 0.3), ""),
     ],
 )
-def test_objects_that_the_tote_cannot_take(tmp_path, extents, said, seed):
-    """By their tightest box, however they lie in their file. Those that it can take come to rest in simulations."""
+def test_objects_that_do_not_fit_into_the_tote(tmp_path, extents, said, seed):
+    """By their minimum bounding box, in any orientation. Objects that fit come to rest in simulations."""
     write_box(tmp_path / "a.ply")
     turned_box(tmp_path / "thing.ply", extents, seed)
     if said:
@@ -255,7 +257,7 @@ def test_a_small_tote_takes_small_objects(tmp_path):
     fails(replace(config_for(tmp_path), tote=small), tmp_path, "thing", "opening is 0.15 x 0.25 m")
 
 
-def test_objects_that_no_budget_allows_are_named(tmp_path):
+def test_objects_larger_than_the_volume_budget_are_reported(tmp_path):
     write_box(tmp_path / "large.ply", (0.2, 0.2, 0.2))
     write_box(tmp_path / "small.ply")
     lines: list[str] = []
@@ -288,13 +290,13 @@ def test_objects_that_no_budget_allows_are_named(tmp_path):
         ('{"1": {"symmetries_continuous": [{"axis": [0, 0, Infinity], "offset": [0, 0, 0]}]}}', ("finite",)),
     ],
 )
-def test_a_broken_models_info(tmp_path, content, words):
+def test_an_invalid_models_info(tmp_path, content, words):
     write_box(tmp_path / "obj_000001.ply")
     write_info(tmp_path, content)
     fails(config_for(tmp_path), tmp_path, "models_info.json", *words)
 
 
-def test_without_a_models_info_nothing_is_symmetric(tmp_path):
+def test_without_a_models_info_there_are_no_symmetries(tmp_path):
     write_box(tmp_path / "obj_000001.ply")
     (entry,) = load(config_for(tmp_path), tmp_path)
     assert entry.symmetries_discrete == ()

@@ -1,4 +1,4 @@
-"""The embedded objects: closed, of the right size and weight, printed the right way round, and as symmetric as they claim."""
+"""The embedded objects: watertight, with the right sizes, masses, label orientation and symmetries."""
 
 from __future__ import annotations
 
@@ -90,10 +90,10 @@ def corners(raw):
     return raw.mesh.vertices[raw.mesh.faces].astype(np.float64), raw.mesh.uv[raw.mesh.faces].astype(np.float64)
 
 
-def printed(number):
+def printed(obj_id):
     """Corners and texture coordinates of a printed object; of the mug only the outside of its wall, without the handle."""
-    points, uv = corners(OBJECTS[number])
-    if OBJECTS[number].name != "mug":
+    points, uv = corners(OBJECTS[obj_id])
+    if OBJECTS[obj_id].name != "mug":
         return points, uv
     radius = 0.0465
     outside = np.abs(np.hypot(points[..., 0] - points[..., 0].min() - radius, points[..., 1]) - radius).max(axis=1) < 1e-5
@@ -118,10 +118,10 @@ def surface_samples(raw):
 
 def test_ids_masses_and_materials_are_those_of_the_table():
     assert list(OBJECTS) == list(range(1, 22))
-    for number, (mass, _, metallic, roughness) in TABLE.items():
-        raw = OBJECTS[number]
+    for obj_id, (mass, _, metallic, roughness) in TABLE.items():
+        raw = OBJECTS[obj_id]
         assert (raw.mass, raw.material.metallic, raw.material.roughness) == (mass, metallic, roughness)
-        assert raw.concave == (number in CONCAVE)
+        assert raw.concave == (obj_id in CONCAVE)
         assert raw.source is None
     assert len({raw.name for raw in OBJECTS.values()}) == 21
 
@@ -150,7 +150,7 @@ def test_normals_are_units_on_the_outside(raw):
     assert ((normals * flat[:, None]).sum(axis=2) > 0).all()
 
 
-def test_textures_are_pictures_and_are_met(raw):
+def test_textures_have_several_colours_and_are_used(raw):
     texture = raw.material.texture
     assert texture.dtype == np.uint8
     assert texture.shape[2] == 3
@@ -159,18 +159,18 @@ def test_textures_are_pictures_and_are_met(raw):
     assert len(np.unique(surface_samples(raw)[1], axis=0)) >= 3
 
 
-@pytest.mark.parametrize("number", PRINTED)
-def test_print_is_not_mirrored(number):
+@pytest.mark.parametrize("obj_id", PRINTED)
+def test_labels_are_not_mirrored(obj_id):
     """Seen from outside, triangles run counter-clockwise in space and so they must in the picture."""
-    _, uv = printed(number)
+    _, uv = printed(obj_id)
     first, second = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     assert (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] > -1e-9).all()
 
 
-@pytest.mark.parametrize("number", PRINTED)
-def test_print_on_upright_faces_is_upright(number):
+@pytest.mark.parametrize("obj_id", PRINTED)
+def test_labels_on_upright_faces_are_upright(obj_id):
     """On upright faces the picture's v grows with height: for v as a linear function on the triangle, dv/dz > 0."""
-    points, uv = printed(number)
+    points, uv = printed(obj_id)
     normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
     area = np.linalg.norm(normal, axis=1)
     upright = (np.abs(normal[:, 2]) < 1e-3 * area) & (area > 1e-7)
@@ -182,9 +182,9 @@ def test_print_on_upright_faces_is_upright(number):
     assert (slope[:, 2] > 0.1).any()
 
 
-@pytest.mark.parametrize("number", CONCAVE)
-def test_concave_objects_leave_their_hulls_empty(number):
-    mesh = OBJECTS[number].mesh
+@pytest.mark.parametrize("obj_id", CONCAVE)
+def test_concave_objects_fill_little_of_their_hulls(obj_id):
+    mesh = OBJECTS[obj_id].mesh
     assert signed_volume(mesh.vertices, mesh.faces) / ConvexHull(mesh.vertices).volume < 0.6
 
 
@@ -211,12 +211,12 @@ def test_symmetries_keep_shape_and_colour(raw):
 
 
 def test_symmetries_are_those_bop_has():
-    discrete = {number: len(raw.symmetries_discrete) for number, raw in OBJECTS.items() if raw.symmetries_discrete}
+    discrete = {obj_id: len(raw.symmetries_discrete) for obj_id, raw in OBJECTS.items() if raw.symmetries_discrete}
     assert discrete == {1: 1, 16: 7, 19: 1, 20: 1, 21: 3}
-    assert {number for number, raw in OBJECTS.items() if raw.symmetries_continuous} == {13, 18}
+    assert {obj_id for obj_id, raw in OBJECTS.items() if raw.symmetries_continuous} == {13, 18}
 
 
-def test_the_same_objects_come_every_time():
+def test_embedded_objects_are_deterministic():
     for old, new in zip(OBJECTS.values(), procedural_objects(), strict=True):
         for name in ("vertices", "faces", "normals", "uv"):
             assert np.array_equal(getattr(old.mesh, name), getattr(new.mesh, name))
@@ -234,9 +234,9 @@ def test_a_rounded_box_has_the_volume_of_its_parts(x, y, z, share):
     radius = share * min(x, y, z)
     a, b, c = x - 2 * radius, y - 2 * radius, z - 2 * radius
     exact = a * b * c + 2 * radius * (a * b + b * c + c * a) + np.pi * radius**2 * (a + b + c) + 4 / 3 * np.pi * radius**3
-    made = volume(rounded_box((x, y, z), radius, dict.fromkeys(BOX_FACES, NO_TEXTURE), segments=6))
-    assert made == pytest.approx(exact, rel=0.01)
-    assert made <= exact * (1 + 1e-3)
+    result = volume(rounded_box((x, y, z), radius, dict.fromkeys(BOX_FACES, NO_TEXTURE), segments=6))
+    assert result == pytest.approx(exact, rel=0.01)
+    assert result <= exact * (1 + 1e-3)
 
 
 def test_a_cylinder_has_the_volume_of_its_prism():
@@ -251,7 +251,7 @@ def test_a_ring_has_the_volume_of_a_torus():
     assert volume(torus(rings)) == pytest.approx(2 * np.pi**2 * 0.05 * 0.01**2, rel=0.02)
 
 
-def test_edges_of_a_prism_stay_sharp_and_its_side_is_smooth():
+def test_a_prism_has_hard_edges_and_a_smooth_side():
     mesh = make_mesh(solid(np.stack([at_height(rounded_rectangle(0.1, 0.06, 0.02, 8), z) for z in (0.0, 0.1)])), centered=False)
     top = mesh.normals[(mesh.vertices[:, 2] == np.float32(0.1))]
     assert np.allclose(np.sort(np.unique(np.abs(top[:, 2]).round(3))), [0, 1])
@@ -262,7 +262,7 @@ def test_edges_of_a_prism_stay_sharp_and_its_side_is_smooth():
     assert np.allclose(side, [[np.sqrt(0.5), np.sqrt(0.5), 0]], atol=1e-3)
 
 
-def test_a_sheet_returns_each_picture_at_its_place():
+def test_an_atlas_contains_each_image_at_its_rectangle():
     pictures = {name: blank(30, 20, (value, 0, 255 - value)) for name, value in (("a", 10), ("b", 90), ("c", 200))}
     pictures["a"][0] = (0, 255, 0)
     sheet, rects = pack(pictures, 90)

@@ -1,4 +1,4 @@
-"""Light maps: which way is up, what sets hold, and every way in which a file can be bad."""
+"""Environment maps: orientation, sIBL sets, and invalid files."""
 
 from __future__ import annotations
 
@@ -65,12 +65,12 @@ def test_directions_follow_the_convention():
     assert np.allclose(view[32, 0], (-1, 0, 0), atol=0.05)
 
 
-def test_embedded_skies_are_light_from_above():
-    made = load_lights("")
-    assert len(made) >= 6
-    assert [light.name for light in made] == sorted({light.name for light in made})
+def test_embedded_maps_are_brighter_above_the_horizon():
+    maps = load_lights("")
+    assert len(maps) >= 6
+    assert [light.name for light in maps] == sorted({light.name for light in maps})
     weight = np.sin((np.arange(HEIGHT) + 0.5) / HEIGHT * np.pi)[:, None, None]
-    for light in made:
+    for light in maps:
         assert light.radiance.shape == (HEIGHT, 2 * HEIGHT, 3)
         assert light.radiance.dtype == np.float32
         assert np.isfinite(light.radiance).all()
@@ -82,10 +82,10 @@ def test_embedded_skies_are_light_from_above():
         # Smooth across the seam: no column differs more from its neighbour there than anywhere else.
         steps = np.abs(np.diff(light.radiance, axis=1)).max()
         assert np.abs(light.radiance[:, 0] - light.radiance[:, -1]).max() <= steps + 1e-6
-    assert sum(light.radiance.max() > 10 for light in made) >= 4
+    assert sum(light.radiance.max() > 10 for light in maps) >= 4
 
 
-def test_the_low_sun_stands_where_it_is_put():
+def test_the_low_sun_has_its_azimuth_and_elevation():
     sun = next(light for light in skies() if light.name == "low_sun")
     row, column = np.unravel_index(sun.radiance.sum(axis=2).argmax(), sun.radiance.shape[:2])
     x, y, z = map_directions(HEIGHT)[0][row, column]
@@ -93,13 +93,13 @@ def test_the_low_sun_stands_where_it_is_put():
     assert np.degrees(np.arcsin(z)) == pytest.approx(22, abs=2)
 
 
-def test_skies_are_the_same_every_time():
+def test_embedded_maps_are_deterministic():
     for one, other in zip(skies(), skies(), strict=True):
         assert one.name == other.name
         assert np.array_equal(one.radiance, other.radiance)
 
 
-def test_a_file_keeps_its_colours_and_up_and_turns_right_to_negative_azimuth(tmp_path):
+def test_a_file_keeps_colours_and_up_and_its_right_becomes_negative_azimuth(tmp_path):
     image = picture()
     image[0] = (4.0, 2.0, 1.0)
     image[4, 11] = (64.0, 32.0, 8.0)  # right of the middle (columns 7 and 8), just below the horizon
@@ -127,7 +127,7 @@ def test_maps_come_sorted_from_folder_and_subfolders(tmp_path):
     assert [light.name for light in load_lights(str(tmp_path))] == ["a", "b", "c", "room"]
 
 
-def test_a_set_gives_its_reflection_map_times_multi_and_leaves_linear_maps_linear(tmp_path):
+def test_a_set_is_its_reflection_map_times_multi_without_gamma_for_linear_files(tmp_path):
     make_set(tmp_path / "set", multi="3.0", gamma="2.2")
     for place in (tmp_path, tmp_path / "set"):
         (light,) = load_lights(str(place))
@@ -135,7 +135,7 @@ def test_a_set_gives_its_reflection_map_times_multi_and_leaves_linear_maps_linea
         assert np.allclose(light.radiance, 1.5)
 
 
-def test_gamma_decodes_pictures_of_few_bits(tmp_path):
+def test_gamma_is_applied_to_8_bit_images(tmp_path):
     folder = make_set(tmp_path / "set", multi="1.0", gamma="2.0")
     (folder / "ref.hdr").unlink()
     save(folder / "ref.png", np.full((8, 16, 3), 128, np.uint8))
@@ -145,7 +145,7 @@ def test_gamma_decodes_pictures_of_few_bits(tmp_path):
     assert np.allclose(light.radiance, (128 / 255) ** 2)
 
 
-def test_large_maps_are_reduced_and_keep_their_light(tmp_path, monkeypatch):
+def test_large_maps_are_downsampled_with_their_energy(tmp_path, monkeypatch):
     monkeypatch.setattr(lights, "MAX_HEIGHT", 4)
     image = picture(8, 1.0)
     image[2, 2] = 33.0
@@ -157,17 +157,17 @@ def test_large_maps_are_reduced_and_keep_their_light(tmp_path, monkeypatch):
 
 
 def test_real_maps_load(real_lights):
-    made = load_lights(str(real_lights))
-    assert len(made) == 8
-    for light in made:
+    maps = load_lights(str(real_lights))
+    assert len(maps) == 8
+    for light in maps:
         assert light.radiance.shape == (512, 1024, 3)
         assert light.radiance.max() > 5
     plain = cv2.imread(str(real_lights / "sibl_kiara_dawn" / "kiara_1_dawn_1k.hdr"), cv2.IMREAD_UNCHANGED)
-    kiara = next(light for light in made if light.name == "Kiara_Dawn")
+    kiara = next(light for light in maps if light.name == "Kiara_Dawn")
     assert np.allclose(kiara.radiance, 1.2 * plain[:, ::-1, ::-1], rtol=1e-5)
 
 
-def test_no_folder_and_no_maps(tmp_path):
+def test_missing_and_empty_folders(tmp_path):
     refused(tmp_path / "nowhere", "nowhere", "does not exist")
     refused(tmp_path, str(tmp_path), "no environment map")
     (tmp_path / "a.hdr").write_bytes(b"")
@@ -175,7 +175,7 @@ def test_no_folder_and_no_maps(tmp_path):
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.02, 0.5, 0.99])
-def test_a_map_cut_short(tmp_path, capfd, keep):
+def test_a_truncated_map(tmp_path, capfd, keep):
     rng = np.random.default_rng(1)
     save(tmp_path / "a.hdr", rng.random((64, 128, 3)).astype(np.float32))
     data = (tmp_path / "a.hdr").read_bytes()
@@ -184,7 +184,7 @@ def test_a_map_cut_short(tmp_path, capfd, keep):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_map_that_is_something_else(tmp_path):
+def test_a_file_that_is_not_a_map(tmp_path):
     (tmp_path / "a.hdr").write_text("hello, this is no picture")
     refused(tmp_path, "a.hdr", "another format")
     save(tmp_path / "a.hdr", np.ones((8, 12, 3), np.float32))
@@ -194,8 +194,8 @@ def test_a_map_that_is_something_else(tmp_path):
 @pytest.mark.parametrize(
     ("value", "words"), [(np.nan, "not a number"), (np.inf, "infinite"), (-1.0, "negative radiance (-1)")], ids=("nan", "inf", "negative")
 )
-def test_radiance_that_cannot_be(tmp_path, monkeypatch, value, words):
-    """Radiance files cannot hold such numbers, other formats under their name can; the reader is handed one."""
+def test_invalid_radiance(tmp_path, monkeypatch, value, words):
+    """Radiance files cannot contain such values, other formats with their suffix can; the decoder is replaced by one that returns them."""
     image = picture()
     image[3, 5, 1] = value
     (tmp_path / "a.hdr").write_bytes(b"stands for a map")
@@ -209,7 +209,7 @@ def test_a_black_map(tmp_path):
 
 
 @pytest.mark.parametrize("file", ["back.jpg", "ref.hdr", "env.hdr"])
-def test_a_set_without_one_of_its_files(tmp_path, file):
+def test_a_set_with_a_missing_file(tmp_path, file):
     folder = make_set(tmp_path / "set")
     if file == "back.jpg":
         (folder / "room.ibl").write_text(f"[Background]\nBGfile = {file}\n" + (folder / "room.ibl").read_text())
@@ -219,7 +219,7 @@ def test_a_set_without_one_of_its_files(tmp_path, file):
 
 @pytest.mark.parametrize("value", ["-1", "0", "nan", "inf", "bright"])
 @pytest.mark.parametrize("key", ["multi", "gamma"])
-def test_a_set_with_a_bad_number(tmp_path, key, value):
+def test_a_set_with_an_invalid_number(tmp_path, key, value):
     make_set(tmp_path / "set", **{key: value})
     refused(tmp_path, "room.ibl", f"REF{key} = {value}", "positive")
 
@@ -237,7 +237,7 @@ def test_a_set_that_overflows(tmp_path):
         ('[Reflection]\nREFfile = "ref.hdr"\nREFmap = 2\n', "REFmap = 2"),
     ],
 )
-def test_a_set_file_that_says_too_little(tmp_path, text, words):
+def test_invalid_set_files(tmp_path, text, words):
     folder = make_set(tmp_path / "set")
     (folder / "room.ibl").write_text(text)
     refused(tmp_path, "room.ibl", words)

@@ -1,3 +1,5 @@
+"""Mesh import: PLY, OBJ and GLB, materials, vertex colours, and invalid files."""
+
 from __future__ import annotations
 
 import json
@@ -93,7 +95,7 @@ def test_texture_coordinates_at_the_faces_split_vertices(tmp_path):
     assert signed_volume(mesh.vertices, mesh.faces) == pytest.approx(1 / 6)
 
 
-def test_an_inside_out_mesh_is_turned(tmp_path):
+def test_an_inside_out_mesh_is_flipped(tmp_path):
     file = tmp_path / "a.ply"
     file.write_text(ascii_ply(CORNERS, [face[::-1] for face in FACES]))
     mesh, _ = read_mesh(file, 1.0)
@@ -101,7 +103,7 @@ def test_an_inside_out_mesh_is_turned(tmp_path):
     assert mesh.normals[1, 0] > 0.0
 
 
-def test_inside_out_normals_turn_with_their_triangles(tmp_path):
+def test_inside_out_normals_are_flipped_with_their_triangles(tmp_path):
     inward = [(*corner, *(0.25 - np.array(corner))) for corner in CORNERS]
     file = tmp_path / "a.ply"
     file.write_text(ascii_ply(inward, [face[::-1] for face in FACES], ("x", "y", "z", "nx", "ny", "nz")))
@@ -109,7 +111,7 @@ def test_inside_out_normals_turn_with_their_triangles(tmp_path):
     assert np.all(np.einsum("vi,vi->v", mesh.normals, mesh.vertices - 0.25) > 0.0)
 
 
-def test_stray_vertices_and_collapsed_triangles_go(tmp_path):
+def test_unused_vertices_and_degenerate_triangles_are_dropped(tmp_path):
     file = tmp_path / "a.ply"
     file.write_text(ascii_ply([(9, 9, 9), *CORNERS], [*[tuple(i + 1 for i in face) for face in FACES], (1, 1, 2)]))
     mesh, _ = read_mesh(file, 1.0)
@@ -179,7 +181,7 @@ def test_srgb_and_back(value):
         ("1", 1, (255, 255, 255)),
     ],
 )
-def test_every_kind_of_picture_becomes_rgb(mode, value, expected):
+def test_images_of_any_mode_become_rgb(mode, value, expected):
     array = rgb8(Image.new(mode, (3, 2), value))
     assert array.shape == (2, 3, 3)
     assert array.dtype == np.uint8
@@ -209,7 +211,7 @@ def textured_box(color, **material) -> trimesh.Trimesh:
     return box
 
 
-def test_a_glb_brings_its_material(tmp_path):
+def test_a_glb_has_its_material(tmp_path):
     box = textured_box((200, 10, 10), metallicFactor=0.7, roughnessFactor=0.2)
     mesh, finish = read_mesh(glb(tmp_path, box), 1.0)
     assert np.allclose(mesh.uv, box.visual.uv, atol=1e-6)
@@ -226,7 +228,7 @@ def test_base_color_factors_of_a_glb_are_linear(tmp_path):
     assert (finish.metallic, finish.roughness) == (1.0, 1.0)
 
 
-def test_parts_of_a_glb_are_joined_where_they_stand(tmp_path):
+def test_parts_of_a_glb_are_merged_with_their_transforms(tmp_path):
     red, plain = textured_box((200, 10, 10), metallicFactor=1.0), trimesh.creation.box((0.1, 0.1, 0.1))
     plain.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=(0, 255, 0, 255), metallicFactor=0.0))
     plain.apply_translation((0.3, 0, 0))
@@ -251,7 +253,7 @@ def test_parts_with_one_material_share_its_texture(tmp_path):
     assert np.all(finish.texture == (1, 2, 3))
 
 
-def test_a_mirrored_part_stays_outward(tmp_path):
+def test_a_reflected_part_keeps_outward_orientation(tmp_path):
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.creation.box((0.1, 0.2, 0.3)), transform=np.diag((-2.0, 1.0, 1.0, 1.0)))
     file = tmp_path / "a.glb"
@@ -283,7 +285,7 @@ f 2/1 3/2 4/3
 """
 
 
-def test_an_obj_with_its_picture(tmp_path):
+def test_an_obj_with_an_image(tmp_path):
     (tmp_path / "a.obj").write_text(OBJ)
     (tmp_path / "a.mtl").write_text("newmtl skin\nKd 0 0 0\nmap_Kd skin.png\n")
     picture(tmp_path / "skin.png")
@@ -304,7 +306,7 @@ def test_an_obj_with_a_plain_color(tmp_path):
 
 
 @pytest.mark.parametrize("missing", ["a.mtl", "skin.png"])
-def test_what_an_obj_names_must_be_there(tmp_path, missing):
+def test_files_that_an_obj_refers_to_must_exist(tmp_path, missing):
     (tmp_path / "a.obj").write_text(OBJ)
     if missing != "a.mtl":
         (tmp_path / "a.mtl").write_text("newmtl skin\nmap_Kd skin.png\n")
@@ -338,7 +340,7 @@ GOOD = ascii_ply(CORNERS, FACES)
         ("a.glb", "", "not readable"),
     ],
 )
-def test_bad_files_are_one_clear_line(tmp_path, name, content, message):
+def test_invalid_files_are_one_line(tmp_path, name, content, message):
     file = tmp_path / name
     file.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(CatalogError, match=message) as caught:
@@ -347,7 +349,7 @@ def test_bad_files_are_one_clear_line(tmp_path, name, content, message):
     assert "\n" not in str(caught.value)
 
 
-def test_a_texture_needs_coordinates_and_a_readable_picture(tmp_path):
+def test_a_texture_needs_coordinates_and_a_readable_image(tmp_path):
     file = tmp_path / "a.ply"
     file.write_text(ascii_ply(CORNERS, FACES, comment="comment TextureFile t.png"))
     picture(tmp_path / "t.png")
@@ -358,14 +360,14 @@ def test_a_texture_needs_coordinates_and_a_readable_picture(tmp_path):
         read_mesh(file, 1.0)
 
 
-def test_repeating_textures_cannot_be_joined(tmp_path):
+def test_repeating_textures_cannot_be_put_into_an_atlas(tmp_path):
     one, two = textured_box((1, 2, 3)), textured_box((4, 5, 6))
     two.visual.uv = 3.0 * two.visual.uv
     with pytest.raises(CatalogError, match="repeats"):
         read_mesh(glb(tmp_path, one, two), 1.0)
 
 
-def test_normals_where_triangles_cancel():
+def test_normals_where_triangles_cancel_out():
     vertices = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0)], np.float32)
     normals = smooth_normals(vertices, np.array([(0, 1, 2), (0, 2, 1)]))
     assert np.array_equal(normals, [(0, 0, 1)] * 3)

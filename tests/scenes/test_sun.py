@@ -1,4 +1,4 @@
-"""Suns of sIBL sets: where they stand, what they shine, and that no light counts twice."""
+"""Sun extraction, and suns of sIBL sets: direction, irradiance, and that no light counts twice."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ ROWS = 64
 
 
 def bright_picture(u: float, v: float, value: float = 200.0) -> np.ndarray:
-    """A dim picture with a bright pixel at shares u to the right and v down."""
+    """A dim map with a bright pixel at image coordinates u (right) and v (down) in 0..1."""
     image = np.full((ROWS, 2 * ROWS, 3), 0.5, np.float32)
     image[int(v * ROWS), int(u * 2 * ROWS)] = value
     return image
 
 
 def loaded(folder, lines: str, image: np.ndarray) -> EnvironmentMap:
-    """A set with these lines in its section Sun, as `load_lights` has it."""
+    """Load a set with these lines in its section Sun."""
     assert cv2.imwrite(str(folder / "ref.hdr"), image[..., ::-1].copy())
     (folder / "room.ibl").write_text(f'[Reflection]\nREFfile = "ref.hdr"\n[Sun]\n{lines}')
     (light,) = load_lights(str(folder))
@@ -39,7 +39,7 @@ def loaded(folder, lines: str, image: np.ndarray) -> EnvironmentMap:
     ("u", "v", "expected"),
     [
         (0.5, 0.25, (1, 0, 1)),  # the picture's middle is +x
-        (0.75, 0.25, (0, -1, 1)),  # right of it for who stands inside is -y
+        (0.75, 0.25, (0, -1, 1)),  # right of it, as seen from inside, is -y
         (0.25, 0.25, (0, 1, 1)),
         (0.0, 0.25, (-1, 0, 1)),
         (1.0, 0.25, (-1, 0, 1)),
@@ -54,7 +54,7 @@ def test_u_and_v_grow_right_and_down(tmp_path, u, v, expected):
 
 
 @given(u=st.floats(0.0, 0.999), v=st.floats(0.03, 0.47))
-def test_a_set_and_its_map_agree_where_the_sun_is(u, v, tmp_path_factory):
+def test_the_sun_of_a_set_is_at_the_bright_pixel_of_its_map(u, v, tmp_path_factory):
     light = loaded(tmp_path_factory.mktemp("set"), f"SUNu = {u}\nSUNv = {v}\n", bright_picture(u, v))
     brightest = np.unravel_index(light.radiance.sum(axis=2).argmax(), light.radiance.shape[:2])
     assert light.sun is not None
@@ -62,7 +62,7 @@ def test_a_set_and_its_map_agree_where_the_sun_is(u, v, tmp_path_factory):
     assert map_directions(ROWS)[0][brightest] @ light.sun.direction >= np.cos(np.pi / ROWS / np.sqrt(2.0)) - 1e-6
 
 
-def test_colour_is_srgb_and_multi_makes_a_white_sheet_that_bright(tmp_path):
+def test_colour_is_srgb_and_multi_is_the_radiance_of_a_white_surface(tmp_path):
     even = np.ones((8, 16, 3), np.float32)
     sun = loaded(tmp_path, "SUNcolor = 255,188,0\nSUNmulti = 1.5\nSUNu = 0.5\nSUNv = 0.2\n", even).sun
     np.testing.assert_allclose(sun.irradiance / np.pi, (1.5, 1.5 * srgb_to_linear(188 / 255), 0.0))
@@ -101,7 +101,7 @@ def test_sets_without_a_sun(tmp_path, lines):
         ("SUNcolor = white", "3 numbers"),
     ],
 )
-def test_bad_numbers_are_one_clear_line(tmp_path, line, words):
+def test_invalid_numbers_are_one_line(tmp_path, line, words):
     with pytest.raises(LightError) as caught:
         loaded(tmp_path, f"SUNu = 0.5\nSUNv = 0.2\n{line}\n", np.ones((8, 16, 3), np.float32))
     message = str(caught.value)
@@ -112,19 +112,19 @@ def test_bad_numbers_are_one_clear_line(tmp_path, line, words):
 
 
 @pytest.mark.parametrize(("there", "missing"), [("SUNu", "SUNv"), ("SUNv", "SUNu")])
-def test_half_a_place_is_refused(tmp_path, there, missing):
+def test_a_position_with_one_coordinate_is_refused(tmp_path, there, missing):
     with pytest.raises(LightError, match=f"room.ibl has {there} alone; a sun needs SUNu and SUNv, or neither"):
         loaded(tmp_path, f"{there} = 0.2\n", np.ones((8, 16, 3), np.float32))
 
 
 @pytest.mark.parametrize(("degrees", "believed"), [(0.0, True), (7.0, True), (14.0, False), (90.0, False)])
-def test_the_map_decides_where_the_set_misses_its_bright_place(tmp_path, degrees, believed):
+def test_a_sun_that_misses_the_maps_bright_place_is_ignored(tmp_path, degrees, believed):
     u, v = 0.30 + 0.5 / (2 * ROWS), 0.4
     light = loaded(tmp_path, f"SUNu = {u}\nSUNv = {v - degrees / 180 if degrees < 45 else 1 - v}\n", bright_picture(u, v))
     assert (light.sun is not None) == believed
 
 
-def test_any_of_the_brightest_places_will_do(tmp_path):
+def test_any_bright_place_of_the_map_supports_a_sun(tmp_path):
     image = bright_picture(0.2, 0.3, 4.0)
     image[int(0.3 * ROWS), int(0.8 * 2 * ROWS)] = 3.0
     assert loaded(tmp_path, "SUNu = 0.8\nSUNv = 0.3\n", image).sun is not None
@@ -165,7 +165,7 @@ def facing(radiance: np.ndarray, normal: np.ndarray) -> np.ndarray:
 SUN = Sun(np.array([0.48, -0.64, 0.6]), np.array([30.0, 20.0, 10.0]))
 
 
-def test_a_plane_that_faces_the_sun_gets_the_sun_and_the_rest_alone():
+def test_a_plane_that_faces_the_sun_receives_the_sun_and_the_rest_once():
     """The clipped disc is gone from diffuse light, reflections and background; the sun stands there instead."""
     light = EnvironmentMap("set", clipped(SUN.direction), SUN)
     table = precompute_environment(light, None)
@@ -180,7 +180,7 @@ def test_a_plane_that_faces_the_sun_gets_the_sun_and_the_rest_alone():
     assert table.prefiltered.max() < 3.0
 
 
-def test_exposure_and_table_know_the_sun():
+def test_exposure_and_table_include_the_sun():
     light = EnvironmentMap("set", clipped(SUN.direction), SUN)
     upward = facing(precompute_environment(light, None).radiance, np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(precompute_environment(light, None).exposure, WHITE_VALUE * np.pi / (upward @ LUMINANCE), rtol=0.01)
@@ -190,7 +190,7 @@ def test_exposure_and_table_know_the_sun():
     np.testing.assert_allclose(below, ground * upward, rtol=0.1)
 
 
-def test_a_map_that_holds_its_sun_whole_keeps_its_light():
+def test_a_map_with_an_unclipped_sun_keeps_its_luminance():
     weak = Sun(SUN.direction, SUN.irradiance * 1e-4)
     light = EnvironmentMap("set", clipped(SUN.direction, value=4000.0), weak)
     taken = extract_sun(resize_map(light.radiance, BACKGROUND_ROWS))[2]
@@ -207,7 +207,7 @@ def test_a_sun_over_an_even_map_is_as_wide_as_the_sun():
 
 
 @given(z=st.floats(1e-3, 1.0), azimuth=st.floats(-np.pi, np.pi), spread=st.floats(0.0, 0.5))
-def test_a_disc_gives_its_irradiance_and_stays_above_the_horizon(z, azimuth, spread):
+def test_a_sun_disc_has_its_irradiance_and_stays_above_the_horizon(z, azimuth, spread):
     across = np.sqrt(1.0 - z * z)
     direction = np.array([across * np.cos(azimuth), across * np.sin(azimuth), z])
     disc = draw_sun_disc(np.zeros((ROWS, 2 * ROWS), bool), direction, SUN.irradiance, spread)
@@ -217,7 +217,7 @@ def test_a_disc_gives_its_irradiance_and_stays_above_the_horizon(z, azimuth, spr
     assert towards.min() > np.cos(max(np.arctan(spread), np.pi / ROWS)) - 1e-9
 
 
-def test_hills_hide_their_part_of_the_disc():
+def test_hills_occlude_their_part_of_the_disc():
     """The half of the map on the +y side is dark: all light comes from the other, and as much as before."""
     direction = np.array([0.8, 0.0, 0.6])
     bright = map_directions(ROWS)[0][..., 1] < 0.0
@@ -230,7 +230,7 @@ def test_hills_hide_their_part_of_the_disc():
     np.testing.assert_allclose(draw_sun_disc(np.zeros_like(bright), direction, SUN.irradiance, 0.2), whole)
 
 
-def test_maps_without_a_sun_are_as_before():
+def test_without_a_set_the_sun_is_extracted_from_the_map():
     light = EnvironmentMap("map", clipped(SUN.direction))
     rest, direction, irradiance, _ = extract_sun(resize_map(light.radiance, BACKGROUND_ROWS))
     table = precompute_environment(light, None)
@@ -241,7 +241,7 @@ def test_maps_without_a_sun_are_as_before():
     assert facing(rest, direction)[0] < facing(light.radiance, direction)[0]
 
 
-def test_the_sets_sun_throws_the_shadow_in_its_colour(device):
+def test_the_sun_of_a_set_casts_a_shadow_in_its_colour(device):
     """A small sheet 0.1 m above a large one; the set's sun at 45° over +x, red, over an even map: light returns where it does not reach."""
     view = toy_scene.camera(64, 48, 200.0, (0.0, 0.0, 2.0))
     flat, above = (0.0, 0.0, 0.0, *toy_scene.UPRIGHT), (0.0, 0.0, 0.1, *toy_scene.UPRIGHT)

@@ -1,4 +1,4 @@
-"""Textures as users bring them: any depth, channels and size; meshes that are not unwrapped, or badly."""
+"""Texture import: any bit depth, channels and size; missing or invalid texture coordinates."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def ply(rows, *, textured: bool) -> str:
 @pytest.mark.parametrize("channels", [1, 3, 4])
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (37, 50)])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_pictures_of_any_depth_channels_and_size(tmp_path, channels, size, dtype):
+def test_images_of_any_bit_depth_channels_and_size(tmp_path, channels, size, dtype):
     """Each pixel to the byte above its value or the one below; with alpha 0, the colour is still there."""
     largest = np.iinfo(dtype).max
     pixels = np.random.default_rng(0).integers(0, largest + 1, (*size, channels)).astype(dtype)
@@ -92,7 +92,7 @@ def test_a_mesh_without_texture_needs_no_coordinates(tmp_path):
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-1e30", "10001"])
-def test_texture_coordinates_that_cannot_be_meant(tmp_path, value):
+def test_invalid_texture_coordinates(tmp_path, value):
     Image.new("RGB", (4, 2)).save(tmp_path / "t.png")
     rows = [f"{corner} 0.5 0.5" for corner in CORNERS]
     (tmp_path / "a.ply").write_text(ply([*rows[:3], f"{CORNERS[3]} {value} 0.5"], textured=True))

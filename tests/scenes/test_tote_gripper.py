@@ -1,4 +1,4 @@
-"""Tote and gripper: measured with rays; what collides is where it looks to be."""
+"""Tote and gripper, measured with rays: visual meshes and collision shapes agree."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_the_flange_reaches_the_outer_size_at_the_rim():
         assert seen((x, 0.05, 1.0), DOWN) == pytest.approx(1.0 - TOP, abs=1e-6)
 
 
-def test_nothing_stands_inside():
+def test_the_inside_of_the_tote_is_empty():
     vertices = tote_fixture(TOTE).mesh.vertices
     share = np.clip(vertices[:, 2] / TOP, 0, 1)
     for axis in (0, 1):
@@ -103,12 +103,12 @@ def test_nothing_stands_inside():
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), DOWN])
 @pytest.mark.parametrize("height", [0.001, 0.07, 0.15, TOP - 0.001])
-def test_what_collides_is_what_is_seen(direction, height):
+def test_collision_shapes_coincide_with_the_visual_mesh(direction, height):
     origin = (0.011, 0.017, height)
     assert felt(tote_colliders(TOTE), origin, direction) == pytest.approx(seen(origin, direction), abs=2e-6)
 
 
-def test_colliders_are_convex_and_thick():
+def test_collision_shapes_are_convex_and_thick():
     floor, *walls = tote_colliders(TOTE)
     for piece in (floor, *walls, *guide_walls(TOTE, 2.0)):
         assert convex(piece)
@@ -122,7 +122,7 @@ def test_colliders_are_convex_and_thick():
 
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(1e-4, 1.0))
-def test_the_inside_is_free_and_its_walls_are_full(x, y, share):
+def test_collision_shapes_leave_the_inside_free_and_fill_the_walls(x, y, share):
     half = [(low + share * (high - low)) / 2 for low, high in zip(TOTE.floor_size, TOTE.rim_size, strict=True)]
     within = np.array([[2 * x * (half[0] - 1e-4), 2 * y * (half[1] - 1e-4), share * TOP]])
     radius = CORNER_RADIUS + share * min(high - low for low, high in zip(TOTE.floor_size, TOTE.rim_size, strict=True)) / 2
@@ -157,7 +157,7 @@ def test_guide_walls_stand_on_the_rim_flush_with_the_opening():
         ({"outer_size": (0.615, 0.373, 0.01)}, "tote.outer_size"),
     ],
 )
-def test_impossible_totes_are_refused(change, field):
+def test_invalid_totes_are_refused(change, field):
     for build in (tote_fixture, tote_colliders):
         with pytest.raises(ConfigError, match=field):
             build(replace(TOTE, **change))
@@ -208,16 +208,16 @@ def areas(patch):
 
 
 @given(width=st.floats(0.1, 1.0), depth=st.floats(0.1, 1.0), share=st.floats(0.1, 0.9), segments=st.integers(2, 8), below=st.booleans())
-def test_strips_close_a_ring_as_a_fan_does(width, depth, share, segments, below):
+def test_strips_cover_the_same_area_as_a_fan(width, depth, share, segments, below):
     # The rectangle without what its round corners lack.
     radius = share * min(width, depth) / 2
     ring = at_height(rounded_rectangle(width, depth, radius, segments), 0.3)
-    made, fan = (areas(close(ring, below=below)) for close in (strips, cap))
+    strip, fan = (areas(close(ring, below=below)) for close in (strips, cap))
     sign = -1.0 if below else 1.0
-    assert (sign * made > 0.0).all()
-    np.testing.assert_allclose(made.sum(), fan.sum(), rtol=1e-9)
+    assert (sign * strip > 0.0).all()
+    np.testing.assert_allclose(strip.sum(), fan.sum(), rtol=1e-9)
     round_corner = segments * np.sin(np.pi / 2 / segments) / 2 * radius**2
-    np.testing.assert_allclose(sign * made.sum(), width * depth - 4 * (radius**2 - round_corner), rtol=1e-9)
+    np.testing.assert_allclose(sign * strip.sum(), width * depth - 4 * (radius**2 - round_corner), rtol=1e-9)
 
 
 @pytest.mark.parametrize("segments", [2, 3, 6])
