@@ -115,7 +115,7 @@ def find_repeat_rules(config: Config) -> set[bool]:
 
 
 def _draw_trials(volume: np.ndarray, budget: float, capacity: int, repeats: bool) -> np.ndarray:
-    """Draw arrangements as kernels.sim.arrangement.draw_objects_kernel does: catalog indices (SLOT_TRIALS, capacity), -1 after the last."""
+    """Draw as kernels.sim.arrangement.sample_objects_kernel does: catalog indices (SLOT_TRIALS, capacity), -1 after the last."""
     rng = np.random.default_rng(0)
     drawn = np.full((SLOT_TRIALS, capacity), -1, dtype=np.int32)
     total = np.zeros(SLOT_TRIALS)

@@ -167,7 +167,7 @@ def needs(config, volume, compound, episodes: int, *, repeats: bool) -> np.ndarr
     room = config.arrangement.max_objects
     taken = []
     for episode in range(episodes):
-        drawn = arrangement.draw_objects(
+        drawn = arrangement.sample_objects(
             0,
             episode,
             0,
