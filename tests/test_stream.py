@@ -207,9 +207,10 @@ def test_a_tick_that_is_stopped_early_leaves_nothing_behind(device):
 # ---- sizes ----
 
 
-def test_batch_sizes(device):
-    assert views_per_batch(config_of(), device) == 3
-    assert views_per_batch(config_of(render__views_per_batch=17), device) == 17
+def test_batch_sizes():
+    cpu = SimpleNamespace(is_cuda=False)
+    assert views_per_batch(config_of(), cpu) == 3
+    assert views_per_batch(config_of(render__views_per_batch=17), cpu) == 17
     gpu = SimpleNamespace(is_cuda=True)
     assert views_per_batch(config_of(), gpu) == 3 * WORLDS
     huge = settings(bake__worlds=1000, cameras__resolution=[1920, 1080])
@@ -219,9 +220,10 @@ def test_batch_sizes(device):
 
 
 def test_view_sizes_are_those_of_the_buffers(device):
+    views = views_per_batch(config_of(), device)
     buffers = allocate(ViewBuffers, view_sizes(config_of(), device), device)
-    assert buffers.color.shape == (3, 6, 8)
-    assert buffers.pixels.shape == (3, ROOM, 3)
+    assert buffers.color.shape == (views, 6, 8)
+    assert buffers.pixels.shape == (views, ROOM, 3)
     pixel = sum(wp.types.type_size_in_bytes(getattr(buffers, name).dtype) for name in ("color", "depth", "instance", "amodal"))
     assert pixel == stream.PIXEL_BYTES
 
@@ -291,13 +293,13 @@ def test_a_report_has_every_array_under_its_name(device):
     assert report.measure("load").tolist() == list(range(WORLDS))
 
 
-def test_on_the_processor_a_host_copy_is_the_array_itself(device):
+def test_a_host_copy_is_the_array_itself_on_the_cpu_and_a_copy_on_a_gpu(device):
     array = wp.array(np.arange(4.0), dtype=float, device=device)
     copy = HostCopy([array])
     copy.start(None)
     (seen,) = copy.wait()
     array.fill_(3.0)
-    assert seen.tolist() == [3.0] * 4
+    assert seen.tolist() == ([0.0, 1.0, 2.0, 3.0] if device.is_cuda else [3.0] * 4)
 
 
 def test_run_boundaries_are_those_of_the_batchs_own_images(device):

@@ -33,6 +33,7 @@ def turned(device) -> tuple[Physics, np.ndarray, np.ndarray]:
     physics = Physics(config.physics, build.build_model(config, catalog(CUBE), device))
     coordinates = physics.state.joint_q.numpy().reshape(3, -1)
     coordinates[:, : build.GRIPPER_DOFS] = [*PLACE, 0.0]
+    physics.state.joint_q.assign(coordinates.reshape(-1))
     physics.refresh_poses()
     force = np.zeros((3, physics.layout.dofs_per_world), np.float32)
     physics.tick(lambda current: None)
@@ -41,7 +42,9 @@ def turned(device) -> tuple[Physics, np.ndarray, np.ndarray]:
     poses = physics.state.body_q.numpy().reshape(3, -1, 7)[:, :2].copy()
     force[:, :3] = FORCE
     physics.control.joint_f.assign(force.reshape(-1))
-    physics.control.joint_target_q.numpy().reshape(3, -1)[:, 3] = TILT
+    targets = physics.control.joint_target_q.numpy().reshape(3, -1)
+    targets[:, 3] = TILT
+    physics.control.joint_target_q.assign(targets.reshape(-1))
     for _ in range(STEPS):
         physics.tick(lambda current: None)
     return physics, poses, physics.state.joint_q.numpy().reshape(3, -1)[:, : build.GRIPPER_DOFS].copy()

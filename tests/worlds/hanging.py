@@ -13,10 +13,10 @@ from synpick_warp.arrays import allocate
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.constants import make_scene_data
-from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.suction import Suction
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, world_sizes
 from tests.twins.raycast import rotation_of
+from tests.worlds.eager_physics import EagerPhysics
 from tests.worlds.small_worlds import catalog, settings
 
 Size = tuple[float, float, float]
@@ -45,7 +45,7 @@ class Hanging:
         self.inertia = np.stack([entry.inertia for entry in entries]).reshape(self.worlds, self.instances, 3, 3)
         objects = Catalog(entries)
         built = build.build_model(self.config, objects, device)
-        self.layout, self.physics = built.layout, Physics(self.config.physics, built)
+        self.layout, self.physics = built.layout, EagerPhysics(self.config.physics, built)
         self.scene = make_scene_data(self.config, objects, built, 1, device)
         extents = world_sizes(self.config, built.layout.bodies_per_world)
         self.state, self.attempts, self.seals = (allocate(kind, extents, device) for kind in (WorldState, AttemptState, SealState))
@@ -70,6 +70,7 @@ class Hanging:
         coordinates = self.physics.state.joint_q.numpy().reshape(self.worlds, -1)
         coordinates[:, :first] = (0.0, 0.0, HEIGHT, 0.0)
         coordinates[:, first : first + 7 * self.instances] = np.concatenate([tip + place, turn], axis=2).reshape(self.worlds, -1)
+        self.physics.state.joint_q.assign(coordinates.reshape(-1))
         self.physics.state.joint_qd.zero_()
         self.physics.control.joint_f.zero_()
         self.physics.load(self.state.variant, self.state.restarted)
@@ -99,6 +100,7 @@ class Hanging:
         if self.carried:
             force[:, :3] = (pick.stiffness * (offset - step * velocity) - pick.damping * velocity) / gain
             force[:, 2] += self.gripper_mass * self.config.physics.gravity
+        self.physics.control.joint_f.assign(force.reshape(-1))
         self.suction.apply_seal_forces(self.scene, self.state, self.seals, self.physics, current)
 
     def ignore(self) -> None:
