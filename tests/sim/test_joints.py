@@ -61,7 +61,7 @@ def test_fingers_and_cups_turn_about_the_vertical_where_they_are(turned):
 
 def test_turned_grippers_are_pushed_along_the_worlds_axes(turned):
     physics, _, last = turned
-    gripper, time = physics.config.gripper, STEPS * physics.config.physics.step
+    gripper, time = settings().gripper, STEPS * physics.settings.step
     way = FORCE * time**2 / (2 * (gripper.finger_mass + gripper.cup_mass))
     # The cup's mass, which swings as the cup tilts, pulls at the finger a little.
     np.testing.assert_allclose(last[:, :3] - PLACE, np.tile(way, (3, 1)), atol=0.5 * gripper.cup_mass * gripper.cup_length)
