@@ -276,7 +276,7 @@ def test_an_error_leaves_whole_scenes_only(tmp_path, monkeypatch, baked, share):
     monkeypatch.setattr(BopExporter, "write_views", failing)
     out = tmp_path / "set"
     with pytest.raises(OutputError, match="no more"):
-        run_bake(tiny(), out, SilentProgress())
+        run_bake(tiny(render__views_per_batch=CAMERAS), out, SilentProgress())
     split = out / baked.config.bop.split
     for scene in sorted(split.iterdir()) if split.exists() else []:
         whole = {path.relative_to(scene) for path in scene.rglob("*")}
