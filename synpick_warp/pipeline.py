@@ -40,8 +40,8 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.images import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
-from synpick_warp.stages.perception.segment import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.render.denoised import DENOISED_SCRATCH, scratch_sizes
 from synpick_warp.stages.render.layers import BODY_MOTIONS, MOTION_LAYERS
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
@@ -284,9 +284,9 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     if has_lens_filter(config.effects):
         groups += [(LensArrays, views, 1)]
     if may_pick(config):
-        looks = count_views(config.sight, worlds["world"], room, device)
-        groups += [(kind, perception_sizes(config.sight, room, looks), 1) for kind in SCRATCH]
-        groups += [(kind, plan_sizes(config.sight, room, looks), 1) for kind in (VoteArrays, CYCLES)]
+        count = count_views(config.sight, worlds["world"], room, device)
+        groups += [(kind, perception_sizes(config.sight, room, count), 1) for kind in SCRATCH]
+        groups += [(kind, plan_sizes(config.sight, room, count), 1) for kind in (VoteArrays, CYCLES)]
     rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
     if config.render.mode == FAST:
         sizes = views | scratch_sizes(config.render, *config.cameras.resolution)

@@ -11,9 +11,9 @@ from synpick_warp.arrays import StructArrays, allocate, allocate_struct, device_
 from synpick_warp.device import pick_device
 from synpick_warp.pipeline import describe_arrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
+from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan, SegmentationScratch
+from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays
-from synpick_warp.stages.perception.segment import SegmentationScratch, count_views
 from synpick_warp.stages.render.denoised import (
     COARSE_LIGHT,
     GUIDE,

@@ -1,1 +1,1 @@
-"""Device code of perception and grasp planning: segmentation, contours, suction points, clutter graph, grasps."""
+"""Device code of perception and grasp planning: segmentation, contours, grasp points, occlusion votes, clutter graph, grasp poses."""

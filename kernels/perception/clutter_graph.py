@@ -1,4 +1,7 @@
-"""The clutter graph: edges from votes, and the heaviest acyclic subset of those that run in cycles."""
+"""Clutter graph: edges from occlusion votes, made acyclic by a minimum feedback arc set, and its transitive closure (ancestors).
+
+An edge runs from the upper object to the lower one. Sets of instances are bit masks, so a world has at most 32.
+"""
 
 import warp as wp
 
@@ -8,43 +11,45 @@ from synpick_warp.kernels.structs import PerceptionData
 wp.set_module_options({"enable_backward": False})
 
 CERTAIN = wp.constant(1.0e30)
-"""Gain of placing an object that no edge enters, or none leaves: it costs nothing."""
+"""Gain of placing a source or a sink of the graph, which removes no edge."""
 
 
 @wp.struct
 class Cycles:
-    """Scratch, one row a view: one strongly connected component at a time."""
+    """Scratch: one strongly connected component at a time, per view."""
 
     member: wp.array2d[int]
-    """Its instances, ascending."""
+    """Its instances, in ascending order (view, instance)."""
     weight: wp.array3d[float]
-    """weight[a, b]: that of the edge from member b, above, to member a; 0: none."""
+    """weight[a, b]: weight of the edge from member b, above, to member a; 0: no edge (view, instance, instance)."""
     rank: wp.array2d[int]
-    """Place of each member in the order that was found, the uppermost first."""
+    """Position of each member in the linear order, the uppermost first (view, instance)."""
     best: wp.array2d[float]
-    """Weight of the heaviest acyclic subset among the members in a set; bit k of the index stands for member k."""
+    """Dynamic programming table: maximum weight of an acyclic subgraph of each set of members; bit k of the index stands for member k
+    (view, subset)."""
 
 
 @wp.func
 def bit(instance: int) -> wp.uint32:
+    """Bit mask of one instance."""
     return wp.uint32(1) << wp.uint32(instance)
 
 
 @wp.func
-def edge_weight(votes: wp.array3d[float], world: int, lower: int, upper: int, least: float) -> float:
-    """Weight of the edge from `upper` to `lower`: the votes for it, less those for its opposite; fewer than `least` are none."""
+def edge_weight(votes: wp.array3d[float], world: int, lower: int, upper: int, min_votes: float) -> float:
+    """Weight of the edge from `upper` to `lower`: its votes minus those of the opposite edge, at least 0; fewer than `min_votes` are 0."""
     votes_for = votes[world, lower, upper]
     votes_against = votes[world, upper, lower]
-    if votes_for < least:
+    if votes_for < min_votes:
         return 0.0
-    if votes_against < least:
+    if votes_against < min_votes:
         return votes_for
     return wp.max(votes_for - votes_against, 0.0)
 
 
 @wp.func
-def close_paths(above: wp.array2d[wp.uint32], world: int, instances: int, ancestors: wp.array2d[wp.uint32]):
-    """Transitive closure of a graph (Warshall, 1962)."""
+def close_graph(above: wp.array2d[wp.uint32], world: int, instances: int, ancestors: wp.array2d[wp.uint32]):
+    """Transitive closure of a graph (Warshall, 1962): write to `ancestors` the instances from which a path leads to each instance."""
     for i in range(instances):
         ancestors[world, i] = above[world, i]
     for k in range(instances):
@@ -54,8 +59,11 @@ def close_paths(above: wp.array2d[wp.uint32], world: int, instances: int, ancest
 
 
 @wp.func
-def gather_cycle(ancestors: wp.array2d[wp.uint32], world: int, first: int, instances: int, view: int, cycles: Cycles) -> int:
-    """List the instances that have paths to `first` and from it; return their number, 0 if there are none or `first` is not the least."""
+def gather_component(ancestors: wp.array2d[wp.uint32], world: int, first: int, instances: int, view: int, cycles: Cycles) -> int:
+    """List the strongly connected component of `first` in `cycles.member` and return its size.
+
+    0 if `first` is on no cycle or is not the smallest index of its component, which is then listed at another call.
+    """
     size = int(0)
     for i in range(instances):
         if (ancestors[world, first] & bit(i)) != wp.uint32(0) and (ancestors[world, i] & bit(first)) != wp.uint32(0):
@@ -68,7 +76,7 @@ def gather_cycle(ancestors: wp.array2d[wp.uint32], world: int, first: int, insta
 
 @wp.func
 def best_last(view: int, subset: int, size: int, cycles: Cycles):
-    """The member of a set that is best placed below all others of it, the least of equal ones, and the weight that is kept."""
+    """Member of a set that is best placed last, below all others of the set, ties by index; and the maximum weight then kept."""
     last = int(-1)
     most = float(-1.0)
     for v in range(size):
@@ -85,9 +93,10 @@ def best_last(view: int, subset: int, size: int, cycles: Cycles):
 
 @wp.func
 def rank_exactly(view: int, size: int, cycles: Cycles):
-    """Order the members so that the edges that run downward weigh most: f(S) = max over v in S of f(S - v) + Σ over u in S of w(u → v).
+    """Minimum feedback arc set by dynamic programming over subsets (as Held and Karp, 1962; Lawler, 1964), in 2^size steps and places.
 
-    Takes 2^size steps and places (Lawler, 1964).
+    Maximum weight of downward edges among the members of S: f(S) = max over v in S of f(S - v) + Σ over u in S of w(u → v).
+    Writes `cycles.best` and the optimal order to `cycles.rank`.
     """
     cycles.best[view, 0] = 0.0
     for subset in range(1, 1 << size):
@@ -102,11 +111,11 @@ def rank_exactly(view: int, size: int, cycles: Cycles):
 
 @wp.func
 def rank_greedily(view: int, size: int, cycles: Cycles):
-    """Order the members one by one: who has nothing above comes first, who has nothing below comes last, else first who gains most.
+    """Greedy feedback arc set (after Eades, Lin and Smyth, 1993): sources first, sinks last, else the member of largest gain first.
 
-    The gain is the weight of the edges that leave a member less that of those that enter it, among members without a place; equal ones
-    go by index. Gains sum to zero, so each choice keeps at least what it drops: at least half of all weight is kept (after Eades, Lin and
-    Smyth, 1993).
+    The gain is the weight of the edges that leave a member minus that of the edges that enter it, among unplaced members; ties go by
+    index. Gains sum to zero, so each choice keeps at least the weight it removes: at least half of the total weight is kept. Writes
+    `cycles.rank`.
     """
     for v in range(size):
         cycles.rank[view, v] = -1
@@ -142,19 +151,19 @@ def rank_greedily(view: int, size: int, cycles: Cycles):
 @wp.kernel
 def order_clutter_kernel(
     # Scene:
-    sight: PerceptionData,
+    perception: PerceptionData,
     # In:
     views: Views,
-    votes: wp.array3d[float],
+    votes: wp.array3d[float],  # (world, instance, instance)
     # Out:
     cycles_out: Cycles,
-    above_out: wp.array2d[wp.uint32],
-    ancestors_out: wp.array2d[wp.uint32],
+    above_out: wp.array2d[wp.uint32],  # (world, instance)
+    ancestors_out: wp.array2d[wp.uint32],  # (world, instance)
 ):
-    """The clutter graph of each view's world, without cycles, and its transitive closure.
+    """Build the acyclic clutter graph of each view's world (`above`: bit masks of direct predecessors) and its closure (`ancestors`).
 
-    w(j → i) = max(v_ij - v_ji, 0), where v are votes, and 0 where they are fewer than `min_votes`. In every strongly connected component
-    the heaviest acyclic subset of edges is kept; in components of more than `exact_cycle` objects a greedy one.
+    w(j → i) = max(v_ij - v_ji, 0) with votes v, 0 where they are fewer than `min_votes`. In every strongly connected component the
+    acyclic subset of maximum weight is kept; in components of more than `exact_cycle` objects a greedy one.
     """
     view = wp.tid()
     world = views.world[view]
@@ -164,18 +173,18 @@ def order_clutter_kernel(
     for i in range(instances):
         edges = wp.uint32(0)
         for j in range(instances):
-            if edge_weight(votes, world, i, j, sight.min_votes) > 0.0:
+            if edge_weight(votes, world, i, j, perception.min_votes) > 0.0:
                 edges = edges | bit(j)
         above_out[world, i] = edges
-    close_paths(above_out, world, instances, ancestors_out)
+    close_graph(above_out, world, instances, ancestors_out)
     for first in range(instances):
-        size = gather_cycle(ancestors_out, world, first, instances, view, cycles_out)
+        size = gather_component(ancestors_out, world, first, instances, view, cycles_out)
         if size > 0:
             for a in range(size):
                 for b in range(size):
-                    weight = edge_weight(votes, world, cycles_out.member[view, a], cycles_out.member[view, b], sight.min_votes)
+                    weight = edge_weight(votes, world, cycles_out.member[view, a], cycles_out.member[view, b], perception.min_votes)
                     cycles_out.weight[view, a, b] = weight
-            if size <= sight.exact_cycle:
+            if size <= perception.exact_cycle:
                 rank_exactly(view, size, cycles_out)
             else:
                 rank_greedily(view, size, cycles_out)
@@ -184,4 +193,4 @@ def order_clutter_kernel(
                     if cycles_out.weight[view, a, b] > 0.0 and cycles_out.rank[view, b] > cycles_out.rank[view, a]:
                         i = cycles_out.member[view, a]
                         above_out[world, i] = above_out[world, i] ^ bit(cycles_out.member[view, b])
-    close_paths(above_out, world, instances, ancestors_out)
+    close_graph(above_out, world, instances, ancestors_out)

@@ -1,7 +1,9 @@
-"""Connected components of the pixels of each instance, their sizes, and the largest of each instance.
+"""Connected-component labeling (8-connectivity) by parallel union-find, with component sizes and the largest component of each instance.
 
-Images are flat here: pixel = row * width + column. A thread works on a strip of a row, so that runs of equal pixels are joined and
-counted in registers and few atomics are left. All atomics are on integers: the order of threads does not show in the result.
+Labels follow Playne and Hawick (2018): every pixel points to a pixel with a smaller index, atomic min unites trees, and the root, the
+smallest index of a component, is its label. Images are flat here: pixel = row * width + column. A thread processes a strip of a row, so
+that runs of equal ids are joined and counted in registers and few atomics remain. All atomics are on integers: the result does not depend
+on the order of threads.
 """
 
 import warp as wp
@@ -14,12 +16,12 @@ STRIP = wp.constant(32)
 """Pixels of a strip."""
 NO_COMPONENT = wp.constant(-1)
 LAST_PIXEL = wp.constant(wp.int64(0x7FFFFFFF))
-"""Larger than the index of any pixel; also the mask of the bits that `pack_key` keeps it in."""
+"""Upper bound of pixel indices; also the bit mask of the index in a packed key."""
 PIXEL_BITS = wp.constant(wp.int64(31))
 
 
 @wp.func
-def strip_of(index: int, height: int, strips: int) -> tuple[int, int, int]:
+def split_index(index: int, height: int, strips: int) -> tuple[int, int, int]:
     """(view, row, strip) of a flat index."""
     line = index // strips
     view = line // height
@@ -28,40 +30,43 @@ def strip_of(index: int, height: int, strips: int) -> tuple[int, int, int]:
 
 @wp.func
 def pack_key(value: wp.int64, pixel: int) -> wp.int64:
-    """A key whose maximum belongs to the largest value and, of equal ones, to the least pixel; positive for values above 0."""
+    """Sort key for an argmax by atomic max: largest value first, then the smallest pixel index. Positive for values above 0."""
     return (value << PIXEL_BITS) | (LAST_PIXEL - wp.int64(pixel))
 
 
 @wp.func
 def unpack_pixel(key: wp.int64) -> int:
-    """The pixel of a key of `pack_key`."""
+    """Pixel index of a key of `pack_key`."""
     return int(LAST_PIXEL - (key & LAST_PIXEL))
 
 
 @wp.func
-def instance_segment(segment: wp.array2d[wp.uint8], view: int, pixel: int, instances: int) -> int:
-    """1 + instance where the pixel shows one, else 0."""
-    found = int(segment[view, pixel])
-    if found > instances:
+def instance_id(segment: wp.array2d[wp.uint8], view: int, pixel: int, instances: int) -> int:
+    """1 + instance, or 0 where the segmentation id is no instance."""
+    result = int(segment[view, pixel])
+    if result > instances:
         return 0
-    return found
+    return result
 
 
 @wp.kernel
 def label_strips_kernel(
     # In:
     views: Views,
-    segment: wp.array2d[wp.uint8],
+    segment: wp.array2d[wp.uint8],  # (view, pixel)
     width: int,
     height: int,
     strips: int,
     first: int,
     # Out:
-    component_out: wp.array2d[int],
-    area_out: wp.array2d[int],
+    component_out: wp.array2d[int],  # (view, pixel)
+    area_out: wp.array2d[int],  # (view, pixel) [px]
 ):
-    """Name each pixel by the first one of its run of equal codes within its strip; sizes to 0. One thread a strip."""
-    view, row, strip = strip_of(wp.tid() + first, height, strips)
+    """Initialize union-find: label each pixel by the first pixel of its run of equal ids in its strip, and set areas to 0.
+
+    One thread a strip; -1 where there is no instance.
+    """
+    view, row, strip = split_index(wp.tid() + first, height, strips)
     if views.world[view] < 0:
         return
     column = strip * STRIP
@@ -69,36 +74,36 @@ def label_strips_kernel(
     start = int(0)
     before = int(0)
     for i in range(wp.min(STRIP, width - column)):
-        here = instance_segment(segment, view, pixel + i, views.instances)
+        here = instance_id(segment, view, pixel + i, views.instances)
         if here != before:
             start = pixel + i
         before = here
-        name = int(NO_COMPONENT)
+        label = int(NO_COMPONENT)
         if here > 0:
-            name = start
-        component_out[view, pixel + i] = name
+            label = start
+        component_out[view, pixel + i] = label
         area_out[view, pixel + i] = 0
 
 
 @wp.func
-def root_of(component: wp.array2d[int], view: int, pixel: int) -> int:
-    """Follow the names until one names itself."""
+def find_root(component: wp.array2d[int], view: int, pixel: int) -> int:
+    """Find of union-find: follow the labels until a pixel is its own label."""
     root = pixel
-    above = component[view, root]
-    while above != root:
-        root = above
-        above = component[view, root]
+    parent = component[view, root]
+    while parent != root:
+        root = parent
+        parent = component[view, root]
     return root
 
 
 @wp.func
 def unite(component: wp.array2d[int], view: int, a: int, b: int):
-    """Join the trees of two pixels; the larger root gets the smaller one's name, so that the least pixel of all stays the root.
+    """Union of union-find: link the larger root of two pixels to the smaller one, so that the smallest pixel index stays the root.
 
-    If another thread has hung the larger root elsewhere meanwhile, the tree where it was hung is joined as well.
+    If another thread has linked the larger root to a third tree in the meantime, that tree is united as well.
     """
-    low = root_of(component, view, a)
-    high = root_of(component, view, b)
+    low = find_root(component, view, a)
+    high = find_root(component, view, b)
     while low != high:
         if low > high:
             lower = high
@@ -108,20 +113,20 @@ def unite(component: wp.array2d[int], view: int, a: int, b: int):
         if old == high:
             high = low
         else:
-            low = root_of(component, view, low)
-            high = root_of(component, view, old)
+            low = find_root(component, view, low)
+            high = find_root(component, view, old)
 
 
 @wp.kernel
 def merge_strips_kernel(
     # In:
     views: Views,
-    segment: wp.array2d[wp.uint8],
+    segment: wp.array2d[wp.uint8],  # (view, pixel)
     width: int,
     # Out:
-    component_inout: wp.array2d[int],
+    component_inout: wp.array2d[int],  # (view, pixel)
 ):
-    """Join runs of equal codes with the strip to the left and with the row above, 8 neighbours, once for every pair of runs."""
+    """Unite runs of equal ids with the strip to the left and with the row above, including diagonals, once for every pair of runs."""
     view, row, strip = wp.tid()
     if views.world[view] < 0:
         return
@@ -130,21 +135,21 @@ def merge_strips_kernel(
     above_left = int(0)
     above = int(0)
     if begin > 0:
-        left = instance_segment(segment, view, row * width + begin - 1, views.instances)
+        left = instance_id(segment, view, row * width + begin - 1, views.instances)
         if row > 0:
-            above_left = instance_segment(segment, view, (row - 1) * width + begin - 1, views.instances)
+            above_left = instance_id(segment, view, (row - 1) * width + begin - 1, views.instances)
     if row > 0:
-        above = instance_segment(segment, view, (row - 1) * width + begin, views.instances)
+        above = instance_id(segment, view, (row - 1) * width + begin, views.instances)
     for column in range(begin, wp.min(begin + STRIP, width)):
         pixel = row * width + column
-        here = instance_segment(segment, view, pixel, views.instances)
+        here = instance_id(segment, view, pixel, views.instances)
         above_right = int(0)
         if row > 0 and column + 1 < width:
-            above_right = instance_segment(segment, view, pixel - width + 1, views.instances)
+            above_right = instance_id(segment, view, pixel - width + 1, views.instances)
         if here > 0:
             if column == begin and left == here:
                 unite(component_inout, view, pixel - 1, pixel)
-            # What the left pixel sees above itself is its own to join.
+            # Skip neighbours above that the left pixel of the same run has already united.
             if above == here:
                 if left != here or above_left != here:
                     unite(component_inout, view, pixel - width, pixel)
@@ -164,10 +169,10 @@ def measure_components_kernel(
     views: Views,
     width: int,
     # Out:
-    component_inout: wp.array2d[int],
-    area_out: wp.array2d[int],
+    component_inout: wp.array2d[int],  # (view, pixel)
+    area_out: wp.array2d[int],  # (view, pixel) [px]
 ):
-    """Name each pixel by the root of its component, and count pixels there: area[root] = sum over its runs of their lengths."""
+    """Path compression: replace each label by its root; and accumulate the component's size at the root, one atomic a run."""
     view, row, strip = wp.tid()
     if views.world[view] < 0:
         return
@@ -176,16 +181,16 @@ def measure_components_kernel(
     root = int(NO_COMPONENT)
     count = int(0)
     for pixel in range(begin, wp.min(begin + STRIP, (row + 1) * width)):
-        name = component_inout[view, pixel]
-        # All pixels of a run but its first have the first one's name, as `label_strips_kernel` gave it.
-        if name != run:
+        label = component_inout[view, pixel]
+        # All pixels of a run but its first still have the first one as label, from `label_strips_kernel`.
+        if label != run:
             if count > 0:
                 wp.atomic_add(area_out, view, root, count)
             count = 0
             run = int(NO_COMPONENT)
-            if name >= 0:
+            if label >= 0:
                 run = pixel
-                root = root_of(component_inout, view, name)
+                root = find_root(component_inout, view, label)
         if run >= 0:
             component_inout[view, pixel] = root
             count += 1
@@ -197,12 +202,12 @@ def measure_components_kernel(
 def find_largest_kernel(
     # In:
     views: Views,
-    segment: wp.array2d[wp.uint8],
-    area: wp.array2d[int],
+    segment: wp.array2d[wp.uint8],  # (view, pixel)
+    area: wp.array2d[int],  # (view, pixel) [px]
     # Out:
-    largest_key_out: wp.array2d[wp.int64],
+    largest_key_out: wp.array2d[wp.int64],  # (view, instance)
 ):
-    """Key of each instance's largest component: the maximum of `pack_key(area, root)` over its roots. The keys begin as 0."""
+    """Argmax of the component size of each instance: max over its roots of pack_key(area, root). Keys must be 0 at the start."""
     view, pixel = wp.tid()
     if views.world[view] < 0:
         return
@@ -215,11 +220,11 @@ def find_largest_kernel(
 def unpack_largest_kernel(
     # In:
     views: Views,
-    largest_key: wp.array2d[wp.int64],
+    largest_key: wp.array2d[wp.int64],  # (view, instance)
     # Out:
-    largest_out: wp.array2d[int],
+    largest_out: wp.array2d[int],  # (view, instance)
 ):
-    """Root of each instance's largest component; -1: the instance is not visible."""
+    """Label of each instance's largest component; -1: the instance is not visible, or the view is unused."""
     view, instance = wp.tid()
     largest_out[view, instance] = NO_COMPONENT
     if views.world[view] >= 0 and largest_key[view, instance] > wp.int64(0):

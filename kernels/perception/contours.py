@@ -1,4 +1,4 @@
-"""Outer contours of the largest component of each instance, and the centroid of what they enclose."""
+"""Border following (Suzuki and Abe, 1985): outer contour of each instance's largest component, and the centroid of its polygon."""
 
 import warp as wp
 
@@ -8,32 +8,37 @@ from synpick_warp.kernels.render.visibility.camera import Views
 wp.set_module_options({"enable_backward": False})
 
 NORTH_WEST = wp.constant(3)
-"""Where the search around a contour's first pixel begins: nothing lies to the west of it."""
+"""Direction in which the search around a contour's first pixel begins: that pixel has no neighbour to its west."""
 NO_DIRECTION = wp.constant(-1)
 COUNTER_CLOCKWISE = wp.constant(1)
 CLOCKWISE = wp.constant(-1)
 
 
 @wp.struct
-class Polygon:
-    """Sums over a closed chain of points (u, v) [px], relative to its first point; exact, for whole numbers."""
+class PolygonMoments:
+    """Exact integer moments of a closed polygon (Green's theorem), for vertices (u, v) [px] relative to its first vertex."""
 
     cross: wp.int64
-    """Sum of c = u₁ v₂ - u₂ v₁ over its edges: twice its area."""
+    """Twice the signed area: sum of c = u₁ v₂ - u₂ v₁ over the edges."""
     cross_u: wp.int64
-    """Sum of c (u₁ + u₂)."""
+    """Six times the first moment in u: sum of c (u₁ + u₂) over the edges."""
     cross_v: wp.int64
+    """Six times the first moment in v."""
     u: wp.int64
-    """Sum of u over its points."""
+    """Sum of u over the vertices."""
     v: wp.int64
+    """Sum of v over the vertices."""
     last_u: int
+    """u of the last vertex."""
     last_v: int
+    """v of the last vertex."""
     points: int
+    """Number of vertices."""
 
 
 @wp.func
-def with_point(polygon: Polygon, u: int, v: int) -> Polygon:
-    """The sums after one more point. Edges from and to the first point add nothing, for it is the origin."""
+def add_vertex(polygon: PolygonMoments, u: int, v: int) -> PolygonMoments:
+    """Moments with one more vertex. Edges from and to the first vertex contribute nothing because it is the origin."""
     result = polygon
     cross = wp.int64(polygon.last_u) * wp.int64(v) - wp.int64(u) * wp.int64(polygon.last_v)
     result.cross += cross
@@ -48,8 +53,8 @@ def with_point(polygon: Polygon, u: int, v: int) -> Polygon:
 
 
 @wp.func
-def centroid_of(polygon: Polygon) -> wp.vec2d:
-    """Σ c (p₁ + p₂) / (3 Σ c); the mean of the points where they enclose nothing."""
+def polygon_centroid(polygon: PolygonMoments) -> wp.vec2d:
+    """Centroid Σ c (p₁ + p₂) / (3 Σ c); the mean of the vertices where the area is zero."""
     if polygon.cross != wp.int64(0):
         whole = wp.float64(3.0) * wp.float64(polygon.cross)
         return wp.vec2d(wp.float64(polygon.cross_u) / whole, wp.float64(polygon.cross_v) / whole)
@@ -59,7 +64,7 @@ def centroid_of(polygon: Polygon) -> wp.vec2d:
 
 @wp.func
 def next_direction(neighbours: int, start: int, turn: int) -> int:
-    """The first of the 8 directions, from `start` on, whose bit is set."""
+    """First of the 8 directions, from `start` on in the sense of rotation `turn`, whose bit is set in `neighbours`; -1: none."""
     for i in range(8):
         direction = (start + turn * i) & 7
         if (neighbours >> direction) & 1 != 0:
@@ -71,19 +76,19 @@ def next_direction(neighbours: int, start: int, turn: int) -> int:
 def trace_contours_kernel(
     # In:
     views: Views,
-    patch: wp.array2d[wp.uint16],
-    largest: wp.array2d[int],
+    patch: wp.array2d[wp.uint16],  # (view, pixel)
+    largest: wp.array2d[int],  # (view, instance)
     width: int,
     # Out:
-    contour_out: wp.array3d[wp.vec2i],
-    contour_length_out: wp.array2d[int],
-    centroid_out: wp.array2d[wp.vec2],
-    overflow_out: wp.array[int],
+    contour_out: wp.array3d[wp.vec2i],  # (view, instance, point) [px]
+    contour_length_out: wp.array2d[int],  # (view, instance)
+    centroid_out: wp.array2d[wp.vec2],  # (world, instance) [px]
+    overflow_out: wp.array[int],  # (world)
 ):
-    """Follow each outer border (Suzuki and Abe, 1985): turn counter-clockwise from where we came to the next pixel of the component.
+    """Follow each outer border: from the previous pixel, turn counter-clockwise to the next pixel of the component.
 
-    It begins at the component's least index, which is its topmost pixel and of those the leftmost, and ends when the first step
-    would be made again. Every step reads one word. A contour longer than its room is cut there, and its world told.
+    It begins at the component's smallest index, which is the leftmost of its topmost pixels, and ends when the first step would repeat.
+    Every step reads one patch word. A contour longer than its capacity is truncated, and its world's overflow flag is set to 1.
     """
     view, instance = wp.tid()
     world = views.world[view]
@@ -97,19 +102,19 @@ def trace_contours_kernel(
     start_column = origin - start_row * width
     neighbours = int(patch[view, origin]) >> SEGMENT_BITS
     direction = next_direction(neighbours, NORTH_WEST, CLOCKWISE)
-    # The pixel from which the border comes back to its start: the last one.
+    # Offset of the pixel from which the border returns to its start: the last contour point.
     last_u = direction_column(direction)
     last_v = direction_row(direction)
     u = int(0)
     v = int(0)
-    polygon = Polygon()
+    polygon = PolygonMoments()
     following = bool(True)
     while following:
         if polygon.points == contour_out.shape[2]:
             overflow_out[world] = 1
             break
         contour_out[view, instance, polygon.points] = wp.vec2i(start_column + u, start_row + v)
-        polygon = with_point(polygon, u, v)
+        polygon = add_vertex(polygon, u, v)
         if direction == NO_DIRECTION:
             break
         direction = next_direction(neighbours, direction + 1, COUNTER_CLOCKWISE)
@@ -121,5 +126,5 @@ def trace_contours_kernel(
         direction = (direction + 4) & 7
         neighbours = int(patch[view, origin + v * width + u]) >> SEGMENT_BITS
     contour_length_out[view, instance] = polygon.points
-    centroid = centroid_of(polygon)
+    centroid = polygon_centroid(polygon)
     centroid_out[world, instance] = wp.vec2(float(start_column) + float(centroid[0]), float(start_row) + float(centroid[1]))

@@ -1,7 +1,7 @@
-"""Exact Euclidean distance of the pixels of each instance's largest component to the nearest pixel that is not of it.
+"""Exact Euclidean distance transform of each instance's largest component: distance to the nearest pixel outside the component.
 
-Separable, as all such transforms: d²(x, y) = min over x' of (x - x')² + g²(x', y), g the distance within column x'. A *patch* is the
-largest component of an instance; one word a pixel holds which patch it is of and which of its neighbours are of the same.
+Separable (Meijster et al., 2000): d²(x, y) = min over x' of (x - x')² + g²(x', y), with the distance g within column x'. A *patch* is
+the largest component of an instance; one word a pixel stores its patch and which of its 8 neighbours belong to the same patch.
 """
 
 import warp as wp
@@ -14,15 +14,15 @@ EAST = wp.constant(0)
 NORTH = wp.constant(2)
 WEST = wp.constant(4)
 SOUTH = wp.constant(6)
-"""Directions count counter-clockwise in the image, from east (0) over north (2) and west (4) to south-east (7)."""
+"""Chain-code directions, counter-clockwise in the image, from east (0) through north (2) and west (4) to south-east (7)."""
 SEGMENT_BITS = wp.constant(8)
-"""The low byte of a patch word is 1 + instance, 0: of no patch; bit 8 + d above it: the neighbour in direction d is of the same patch."""
+"""The low byte of a patch word is 1 + instance, 0: no patch; bit 8 + d: the neighbour in direction d belongs to the same patch."""
 SEGMENT_MASK = wp.constant(255)
 
 
 @wp.func
 def direction_column(direction: int) -> int:
-    """Column of the neighbour in a direction, minus the pixel's own."""
+    """Column offset of the neighbour in a direction."""
     if direction == NORTH or direction == SOUTH:
         return 0
     if direction > NORTH and direction < SOUTH:
@@ -32,7 +32,7 @@ def direction_column(direction: int) -> int:
 
 @wp.func
 def direction_row(direction: int) -> int:
-    """Row of the neighbour in a direction, minus the pixel's own."""
+    """Row offset of the neighbour in a direction."""
     if direction == EAST or direction == WEST:
         return 0
     if direction < WEST:
@@ -46,29 +46,29 @@ def mark_patches_kernel(
     grid: ImageGrid,
     # In:
     views: Views,
-    segment: wp.array2d[wp.uint8],
-    component: wp.array2d[int],
-    largest: wp.array2d[int],
+    segment: wp.array2d[wp.uint8],  # (view, pixel)
+    component: wp.array2d[int],  # (view, pixel)
+    largest: wp.array2d[int],  # (view, instance)
     first: int,
     # Out:
-    patch_out: wp.array2d[wp.uint16],
+    patch_out: wp.array2d[wp.uint16],  # (view, pixel)
 ):
-    """Patch word of each pixel: 1 + instance, and a bit for each of the 8 neighbours in the same component. Beyond the border: no."""
+    """Patch word of each pixel: 1 + instance, and a bit for each of the 8 neighbours in the same component; none beyond the border."""
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column) or views.world[view] < 0:
         return
     pixel = row * grid.width + column
-    name = component[view, pixel]
+    label = component[view, pixel]
     word = int(0)
-    if name >= 0:
+    if label >= 0:
         here = int(segment[view, pixel])
-        if largest[view, here - 1] == name:
+        if largest[view, here - 1] == label:
             word = here
             for direction in range(8):
                 x = column + direction_column(direction)
                 y = row + direction_row(direction)
-                if x >= 0 and y >= 0 and x < grid.width and y < grid.height:
-                    if component[view, y * grid.width + x] == name:
+                if in_image(grid, y, x):
+                    if component[view, y * grid.width + x] == label:
                         word = word | (1 << (direction + SEGMENT_BITS))
     patch_out[view, pixel] = wp.uint16(word)
 
@@ -79,11 +79,14 @@ def measure_columns_kernel(
     grid: ImageGrid,
     # In:
     views: Views,
-    patch: wp.array2d[wp.uint16],
+    patch: wp.array2d[wp.uint16],  # (view, pixel)
     # Out:
-    gap_out: wp.array2d[int],
+    gap_out: wp.array2d[int],  # (view, pixel)
 ):
-    """256 g + (1 + instance) for pixels of a patch, else 0: g [px] the distance to the nearest pixel of the column that is not of it."""
+    """First pass, down and up each column: 256 g + (1 + instance) in patches, else 0.
+
+    g [px] is the distance to the nearest pixel of the column outside the patch.
+    """
     view, column = wp.tid()
     if views.world[view] < 0:
         return
@@ -112,8 +115,8 @@ def measure_columns_kernel(
 
 
 @wp.func
-def gap_in(gap: wp.array2d[int], view: int, row: int, column: int, width: int, segment: int) -> int:
-    """Distance to the nearest pixel not of a patch, within a column and from a pixel; 0 if that pixel is not of it."""
+def read_gap(gap: wp.array2d[int], view: int, row: int, column: int, width: int, segment: int) -> int:
+    """Distance g within a column at a pixel; 0 if the pixel is outside the image or the patch `segment`."""
     if column < 0 or column >= width:
         return 0
     word = gap[view, row * width + column]
@@ -128,24 +131,24 @@ def measure_rows_kernel(
     grid: ImageGrid,
     # In:
     views: Views,
-    gap: wp.array2d[int],
+    gap: wp.array2d[int],  # (view, pixel)
     first: int,
     # Out:
-    distance_out: wp.array2d[float],
+    distance_out: wp.array2d[float],  # (view, pixel) [px]
 ):
-    """d = sqrt(min over x' of (x - x')² + g²(x')) [px], searched outwards until (x - x')² alone is as large; 0 outside of patches."""
+    """Second pass: d = sqrt(min over x' of (x - x')² + g²(x')), searched outward until (x - x')² alone is as large; 0 outside patches."""
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column) or views.world[view] < 0:
         return
     word = gap[view, row * grid.width + column]
     segment = word & SEGMENT_MASK
-    least = word >> SEGMENT_BITS
-    least = least * least
+    square = word >> SEGMENT_BITS
+    square = square * square
     offset = int(1)
-    while offset * offset < least:
-        left = gap_in(gap, view, row, column - offset, grid.width, segment)
-        right = gap_in(gap, view, row, column + offset, grid.width, segment)
+    while offset * offset < square:
+        left = read_gap(gap, view, row, column - offset, grid.width, segment)
+        right = read_gap(gap, view, row, column + offset, grid.width, segment)
         nearer = wp.min(left, right)
-        least = wp.min(least, offset * offset + nearer * nearer)
+        square = wp.min(square, offset * offset + nearer * nearer)
         offset += 1
-    distance_out[view, row * grid.width + column] = wp.sqrt(float(least))
+    distance_out[view, row * grid.width + column] = wp.sqrt(float(square))

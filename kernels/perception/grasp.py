@@ -1,4 +1,4 @@
-"""Where and how the cup meets the target: grasp point, smoothed normal, and the gripper's inverse kinematics."""
+"""Grasp pose of the target in the world: grasp point, smoothed surface normal, and the gripper's inverse kinematics."""
 
 import warp as wp
 
@@ -10,14 +10,15 @@ from synpick_warp.kernels.structs import PickData
 wp.set_module_options({"enable_backward": False})
 
 UPRIGHT = wp.constant(1.0e-6)
-"""A normal whose horizontal part is shorter is vertical: what is left of it is rounding, and has no direction."""
+"""A unit normal with a shorter horizontal part counts as vertical: the remainder is rounding error without a direction."""
 
 
 @wp.func
 def gripper_angles(normal: wp.vec3) -> wp.vec2:
-    """Yaw ψ of the finger in (-π/2, π/2] and tilt θ of the cup [rad]: (sin θ cos ψ, sin θ sin ψ, cos θ) = normal; 0, 0 if that is vertical.
+    """Inverse kinematics: yaw ψ of the shaft in (-π/2, π/2] and tilt θ of the cup [rad] for a unit normal; (0, 0) if it is vertical.
 
-    The tilt axis, (-sin ψ, cos ψ, 0), is perpendicular to the normal. Half a turn of yaw is enough, as the cup tilts both ways.
+    (sin θ cos ψ, sin θ sin ψ, cos θ) = normal. The wrist axis (-sin ψ, cos ψ, 0) is perpendicular to the normal. Half a turn of yaw is
+    enough because the cup tilts both ways.
     """
     across = wp.length(wp.vec2(normal[0], normal[1]))
     if across < UPRIGHT:
@@ -33,7 +34,7 @@ def gripper_angles(normal: wp.vec3) -> wp.vec2:
 
 @wp.func
 def limit_normal(normal: wp.vec3, limit: float) -> wp.vec3:
-    """A normal of any length as a unit vector, turned up to an angle of at most `limit` [rad] with the vertical; zero: the vertical."""
+    """Unit vector along a normal of any length, clamped to an angle of at most `limit` [rad] from the vertical; vertical if it is zero."""
     length = wp.length(normal)
     if length == 0.0:
         return wp.vec3(0.0, 0.0, 1.0)
@@ -59,16 +60,16 @@ def smooth_normal_kernel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: Views,
-    component: wp.array3d[int],
-    largest: wp.array2d[int],
-    suction: wp.array2d[wp.vec2i],
-    target: wp.array[int],
+    component: wp.array3d[int],  # (view, row, column)
+    largest: wp.array2d[int],  # (view, instance)
+    grasp_pixel: wp.array2d[wp.vec2i],  # (world, instance) [px]
+    target: wp.array[int],  # (world)
     # Out:
-    normal_out: wp.array[wp.vec3],
+    normal_out: wp.array[wp.vec3],  # (world)
 ):
-    """n = Σ n_p over the pixels p within `window` columns and rows of the suction point that show the target's largest component.
+    """Sum n = Σ n_p over the pixels p of the target's largest component within `window` columns and rows of its grasp pixel.
 
-    n_p is the interpolated unit normal of the surface, towards the camera. Not a unit vector yet; the order of the sum is fixed.
+    n_p is the interpolated unit shading normal, facing the camera. n is not normalized; the order of the sum is fixed.
     """
     view = wp.tid()
     world = views.world[view]
@@ -76,7 +77,7 @@ def smooth_normal_kernel(
         return
     instance = target[world]
     camera = views.camera[view]
-    p = suction[world, instance]
+    p = grasp_pixel[world, instance]
     total = wp.vec3(0.0, 0.0, 0.0)
     for row in range(wp.max(p[1] - window, 0), wp.min(p[1] + window + 1, grid.height)):
         for column in range(wp.max(p[0] - window, 0), wp.min(p[0] + window + 1, grid.width)):
@@ -84,7 +85,7 @@ def smooth_normal_kernel(
                 ray = cameras.to_world[camera] * camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
                 triangle = gbuffer.triangle[view, row, column]
                 barycentric = gbuffer.barycentric[view, row, column]
-                # Of the surface only the normal counts; the pixel's width matters to textures.
+                # Only the normal is used; the pixel width (0) affects texture filtering alone.
                 surface = interpolate_surface(meshes, surfaces, bodies, view, instance, triangle, barycentric, -wp.normalize(ray), 0.0)
                 total += surface.normal
     normal_out[world] = total
@@ -95,31 +96,30 @@ def frame_grasp_kernel(
     # Scene:
     cameras: Cameras,
     pick: PickData,
-    # State:
-    normal_inout: wp.array[wp.vec3],
     # In:
     gbuffer: GBuffer,
     views: Views,
-    suction: wp.array2d[wp.vec2i],
-    target: wp.array[int],
+    grasp_pixel: wp.array2d[wp.vec2i],  # (world, instance) [px]
+    target: wp.array[int],  # (world)
     # Out:
-    point_out: wp.array[wp.vec3],
-    yaw_out: wp.array[float],
-    tilt_out: wp.array[float],
+    normal_inout: wp.array[wp.vec3],  # (world)
+    point_out: wp.array[wp.vec3],  # (world) [m]
+    yaw_out: wp.array[float],  # (world) [rad]
+    tilt_out: wp.array[float],  # (world) [rad]
 ):
-    """Grasp point c + Rᵀ (d · ray) [m], d the depth of the suction point; unit normal within the tilt's limit; yaw and tilt for it [rad].
+    """Grasp pose: point c + Rᵀ (d · ray) with planar depth d of the grasp pixel; unit normal within the tilt limit; its yaw and tilt.
 
-    Worlds without a target keep what they had.
+    Worlds without a target keep their values.
     """
     view = wp.tid()
     world = views.world[view]
     if world < 0 or target[world] < 0:
         return
     camera = views.camera[view]
-    p = suction[world, target[world]]
+    p = grasp_pixel[world, target[world]]
     ray = camera_ray(cameras.intrinsics[camera], p[1], p[0], wp.vec2(0.0, 0.0)) * gbuffer.depth[view, p[1], p[0]]
-    away = wp.vec3d(wp.float64(ray[0]), wp.float64(ray[1]), wp.float64(ray[2]))
-    point_out[world] = wp.vec3(cameras.center[camera] + wp.transpose(cameras.rotation[camera]) * away)
+    position = wp.vec3d(wp.float64(ray[0]), wp.float64(ray[1]), wp.float64(ray[2]))
+    point_out[world] = wp.vec3(cameras.center[camera] + wp.transpose(cameras.rotation[camera]) * position)
     normal = limit_normal(normal_inout[world], pick.tilt_limit)
     angles = gripper_angles(normal)
     normal_inout[world] = normal

@@ -1,4 +1,4 @@
-"""Where to suck each instance: pole of inaccessibility, centroid, the point half-way, and the rule that chooses among them."""
+"""Suction grasp point of each instance in the image: pole of inaccessibility, centroid, their midpoint, and the choice among them."""
 
 import warp as wp
 
@@ -10,7 +10,7 @@ from synpick_warp.kernels.structs import CatalogData, PerceptionData
 wp.set_module_options({"enable_backward": False})
 
 SQUARE_UNITS = wp.constant(16777216.0)
-"""Squared depths are summed as whole multiples of 2⁻²⁴ m², so that the order of the summands does not matter."""
+"""Squared depths are summed as integer multiples of 2⁻²⁴ m², so that the sum does not depend on the order of threads."""
 
 
 @wp.kernel
@@ -18,12 +18,12 @@ def clear_sums_kernel(
     # In:
     views: Views,
     # Out:
-    largest_key_out: wp.array2d[wp.int64],
-    pole_key_out: wp.array2d[wp.int64],
-    square_out: wp.array2d[wp.int64],
-    overflow_out: wp.array[int],
+    largest_key_out: wp.array2d[wp.int64],  # (view, instance)
+    pole_key_out: wp.array2d[wp.int64],  # (view, instance)
+    square_out: wp.array2d[wp.int64],  # (view, instance) [2⁻²⁴ m²]
+    overflow_out: wp.array[int],  # (world)
 ):
-    """Maxima and sums of every view and instance to 0, and no contour of the worlds looked at has overflowed."""
+    """Reset the maxima and sums of every view and instance, and the contour overflow flags of the worlds in the batch, to 0."""
     view, instance = wp.tid()
     largest_key_out[view, instance] = wp.int64(0)
     pole_key_out[view, instance] = wp.int64(0)
@@ -36,17 +36,17 @@ def clear_sums_kernel(
 def measure_patches_kernel(
     # In:
     views: Views,
-    patch: wp.array2d[wp.uint16],
-    distance: wp.array2d[float],
-    depth: wp.array2d[float],
+    patch: wp.array2d[wp.uint16],  # (view, pixel)
+    distance: wp.array2d[float],  # (view, pixel) [px]
+    depth: wp.array2d[float],  # (view, pixel) [m]
     width: int,
     # Out:
-    pole_key_out: wp.array2d[wp.int64],
-    square_out: wp.array2d[wp.int64],
+    pole_key_out: wp.array2d[wp.int64],  # (view, instance)
+    square_out: wp.array2d[wp.int64],  # (view, instance) [2⁻²⁴ m²]
 ):
-    """Per patch: the maximum of `pack_key(d², pixel)` over its pixels, and Σ z² in units of 2⁻²⁴ m². Both begin as 0.
+    """Reduce each patch: pole of inaccessibility as max over its pixels of pack_key(d², pixel), and Σ z². Both must be 0 at the start.
 
-    d² is a whole number and comes back from its float32 root as long as d < 1600 px; beyond, neighbouring squares may count as equal.
+    d² is an integer and is recovered exactly from its float32 root for d < 1600 px; beyond, neighbouring squares may compare as equal.
     """
     view, row, strip = wp.tid()
     if views.world[view] < 0:
@@ -75,17 +75,17 @@ def measure_patches_kernel(
 
 
 @wp.func
-def nearest_pixel(point: wp.vec2) -> wp.vec2i:
-    """Column and row of the pixel whose centre is nearest; halves go to the even one."""
+def round_to_pixel(point: wp.vec2) -> wp.vec2i:
+    """Column and row of the pixel with the nearest centre; ties go to the even index."""
     return wp.vec2i(int(wp.rint(point[0])), int(wp.rint(point[1])))
 
 
 @wp.func
-def distance_at(component: wp.array2d[int], distance: wp.array2d[float], view: int, width: int, name: int, point: wp.vec2) -> float:
-    """Distance to the contour [px] at the pixel nearest to a point; 0 where that is not of the component."""
-    pixel = nearest_pixel(point)
+def distance_at(component: wp.array2d[int], distance: wp.array2d[float], view: int, width: int, label: int, point: wp.vec2) -> float:
+    """Distance to the contour [px] at the pixel nearest to a point; 0 if that pixel lies outside the component."""
+    pixel = round_to_pixel(point)
     index = pixel[1] * width + pixel[0]
-    if component[view, index] != name:
+    if component[view, index] != label:
         return 0.0
     return distance[view, index]
 
@@ -94,34 +94,37 @@ def distance_at(component: wp.array2d[int], distance: wp.array2d[float], view: i
 def measure_points_kernel(
     # Scene:
     catalog: CatalogData,
-    intrinsics: wp.array[wp.vec4],
+    intrinsics: wp.array[wp.vec4],  # (camera) [px]
     # State:
-    entry: wp.array2d[int],
+    catalog_index: wp.array2d[int],  # (world, instance)
     # In:
     views: Views,
-    component: wp.array2d[int],
-    area: wp.array2d[int],
-    largest: wp.array2d[int],
-    distance: wp.array2d[float],
-    pole_key: wp.array2d[wp.int64],
-    square: wp.array2d[wp.int64],
+    component: wp.array2d[int],  # (view, pixel)
+    area: wp.array2d[int],  # (view, pixel) [px]
+    largest: wp.array2d[int],  # (view, instance)
+    distance: wp.array2d[float],  # (view, pixel) [px]
+    pole_key: wp.array2d[wp.int64],  # (view, instance)
+    square: wp.array2d[wp.int64],  # (view, instance) [2⁻²⁴ m²]
     width: int,
     # Out:
-    visible_out: wp.array2d[int],
-    share_out: wp.array2d[float],
-    pole_out: wp.array2d[wp.vec2],
-    centroid_inout: wp.array2d[wp.vec2],
-    distances_out: wp.array2d[wp.vec3],
+    visible_out: wp.array2d[int],  # (world, instance) [px]
+    visible_fraction_out: wp.array2d[float],  # (world, instance)
+    pole_out: wp.array2d[wp.vec2],  # (world, instance) [px]
+    centroid_inout: wp.array2d[wp.vec2],  # (world, instance) [px]
+    distances_out: wp.array2d[wp.vec3],  # (world, instance) [px]
 ):
-    """Pixels, share = Σ (z / fx) (z / fy) / expected area, pole, and distance to the contour of pole, centroid c and (pole + c) / 2."""
+    """Visible pixels, visible fraction Σ (z / fx) (z / fy) / expected area, pole p, and distances to the contour at p, c and (p + c) / 2.
+
+    c is the centroid. Instances that are not visible get 0 pixels, fraction 0, distances 0, and points (-1, -1).
+    """
     view, instance = wp.tid()
     world = views.world[view]
     if world < 0:
         return
-    name = largest[view, instance]
-    if name < 0:
+    label = largest[view, instance]
+    if label < 0:
         visible_out[world, instance] = 0
-        share_out[world, instance] = 0.0
+        visible_fraction_out[world, instance] = 0.0
         pole_out[world, instance] = wp.vec2(-1.0, -1.0)
         centroid_inout[world, instance] = wp.vec2(-1.0, -1.0)
         distances_out[world, instance] = wp.vec3(0.0, 0.0, 0.0)
@@ -132,13 +135,13 @@ def measure_points_kernel(
     row = pixel // width
     pole = wp.vec2(float(pixel - row * width), float(row))
     centroid = centroid_inout[world, instance]
-    visible_out[world, instance] = area[view, name]
-    share_out[world, instance] = float(surface) / catalog.area[entry[world, instance]]
+    visible_out[world, instance] = area[view, label]
+    visible_fraction_out[world, instance] = float(surface) / catalog.area[catalog_index[world, instance]]
     pole_out[world, instance] = pole
     distances_out[world, instance] = wp.vec3(
         distance[view, pixel],
-        distance_at(component, distance, view, width, name, centroid),
-        distance_at(component, distance, view, width, name, 0.5 * (pole + centroid)),
+        distance_at(component, distance, view, width, label, centroid),
+        distance_at(component, distance, view, width, label, 0.5 * (pole + centroid)),
     )
 
 
@@ -146,45 +149,46 @@ def measure_points_kernel(
 def choose_grasp_points_kernel(
     # Scene:
     catalog: CatalogData,
-    sight: PerceptionData,
+    perception: PerceptionData,
     # State:
-    entry: wp.array2d[int],
+    catalog_index: wp.array2d[int],  # (world, instance)
     # In:
     views: Views,
-    visible: wp.array2d[int],
-    pole: wp.array2d[wp.vec2],
-    centroid: wp.array2d[wp.vec2],
-    distances: wp.array2d[wp.vec3],
-    hit_depth: wp.array3d[float],
+    visible: wp.array2d[int],  # (world, instance) [px]
+    pole: wp.array2d[wp.vec2],  # (world, instance) [px]
+    centroid: wp.array2d[wp.vec2],  # (world, instance) [px]
+    distances: wp.array2d[wp.vec3],  # (world, instance) [px]
+    hit_depth: wp.array3d[float],  # (view, row, column) [m]
     # Out:
-    middle_out: wp.array2d[wp.vec2],
-    suction_out: wp.array2d[wp.vec2i],
-    depth_out: wp.array2d[float],
+    midpoint_out: wp.array2d[wp.vec2],  # (world, instance) [px]
+    grasp_pixel_out: wp.array2d[wp.vec2i],  # (world, instance) [px]
+    depth_out: wp.array2d[float],  # (world, instance) [m]
 ):
-    """With r = distance / pole's distance: of centroid and middle the one with the larger r, if r > center_share; else the pole.
+    """Grasp point: of centroid and midpoint the one with the larger r = distance / pole's distance if r > center_share; else the pole.
 
-    The centroid wins a tie. Above heavy_mass [kg] the share asked for is heavy_center_share (Periyasamy et al., 2021).
+    The centroid wins ties. For objects above heavy_mass [kg] the threshold is heavy_center_share (Periyasamy et al., 2021). Writes the
+    midpoint, the pixel of the grasp point and its planar depth; (-1, -1) and depth 0 for instances that are not visible.
     """
     view, instance = wp.tid()
     world = views.world[view]
     if world < 0:
         return
-    middle_out[world, instance] = 0.5 * (pole[world, instance] + centroid[world, instance])
+    midpoint_out[world, instance] = 0.5 * (pole[world, instance] + centroid[world, instance])
     if visible[world, instance] == 0:
-        suction_out[world, instance] = wp.vec2i(-1, -1)
+        grasp_pixel_out[world, instance] = wp.vec2i(-1, -1)
         depth_out[world, instance] = 0.0
         return
-    share = sight.center_share
-    if catalog.mass[entry[world, instance]] > sight.heavy_mass:
-        share = sight.heavy_center_share
-    found = distances[world, instance]
+    threshold = perception.center_share
+    if catalog.mass[catalog_index[world, instance]] > perception.heavy_mass:
+        threshold = perception.heavy_center_share
+    d = distances[world, instance]
     point = centroid[world, instance]
-    ratio = found[1] / found[0]
-    if found[2] > found[1]:
-        point = middle_out[world, instance]
-        ratio = found[2] / found[0]
-    if ratio <= share:
+    ratio = d[1] / d[0]
+    if d[2] > d[1]:
+        point = midpoint_out[world, instance]
+        ratio = d[2] / d[0]
+    if ratio <= threshold:
         point = pole[world, instance]
-    pixel = nearest_pixel(point)
-    suction_out[world, instance] = pixel
+    pixel = round_to_pixel(point)
+    grasp_pixel_out[world, instance] = pixel
     depth_out[world, instance] = hit_depth[view, pixel[1], pixel[0]]

@@ -1,4 +1,4 @@
-"""Votes along contours for what lies above what: a nearer neighbour across a contour hides the object that the contour encloses."""
+"""Occlusion votes along contours: a nearer neighbour on the other side of a contour occludes the object that the contour encloses."""
 
 import warp as wp
 
@@ -9,19 +9,19 @@ from synpick_warp.kernels.structs import CatalogData, PerceptionData
 wp.set_module_options({"enable_backward": False})
 
 TANGENT_REACH = wp.constant(3)
-"""A contour's direction at a point is that from so many points before it to as many after it: from one to the next there are eight only."""
+"""Contour tangents are central differences over this many points to each side; adjacent points have only eight directions."""
 CONTOUR_LANES = wp.constant(128)
-"""Threads that share a contour; neighbours take neighbouring points."""
+"""Threads of a contour; neighbouring threads process neighbouring points."""
 NOWHERE = wp.constant(-(1 << 20))
-"""Extent of a contour without points, in every direction: short of any pixel."""
+"""Identity of the maximum in `bound_contours_kernel` [px]: less than the extent of any pixel."""
 FULL = wp.constant(0)
 DEEP = wp.constant(1)
-"""Kinds of votes."""
+"""Indices of the kinds of votes."""
 
 
 @wp.func
-def seen_instance(gbuffer: GBuffer, view: int, row: int, column: int, instances: int) -> int:
-    """The instance that a pixel shows; -1: none."""
+def visible_instance(gbuffer: GBuffer, view: int, row: int, column: int, instances: int) -> int:
+    """Instance visible at a pixel; -1: none."""
     segment = int(gbuffer.segment[view, row, column])
     if segment < 1 or segment > instances:
         return -1
@@ -30,10 +30,10 @@ def seen_instance(gbuffer: GBuffer, view: int, row: int, column: int, instances:
 
 @wp.func
 def contour_normal(contour: wp.array3d[wp.vec2i], view: int, instance: int, point: int, length: int) -> wp.vec2:
-    """Unit normal of an outer contour at a point, out of the object, as (column, row); zero where the contour turns back.
+    """Outward unit normal (column, row) of an outer contour at a point; zero where the tangent vanishes.
 
-    Outer contours of OpenCV run counter-clockwise as one sees them, rows growing downward: from the direction (t_x, t_y) the object lies
-    to the left, and n = (-t_y, t_x) / |t|. So the two sides of a thin part get opposite normals though they are the same pixels.
+    OpenCV's outer contours run counter-clockwise in the displayed image, with rows growing downward: the object lies to the left of the
+    tangent t, and n = (-t_y, t_x) / |t|. So the two sides of a thin part have opposite normals even where they share pixels.
     """
     before = contour[view, instance, (point + length - TANGENT_REACH % length) % length]
     after = contour[view, instance, (point + TANGENT_REACH) % length]
@@ -47,7 +47,7 @@ def contour_normal(contour: wp.array3d[wp.vec2i], view: int, instance: int, poin
 
 
 @wp.func
-def beside(point: wp.vec2i, normal: wp.vec2, offset: float, grid: ImageGrid) -> wp.vec2i:
+def offset_pixel(point: wp.vec2i, normal: wp.vec2, offset: float, grid: ImageGrid) -> wp.vec2i:
     """The pixel (column, row) nearest to point + offset · normal; (-1, -1) outside the image."""
     column = int(wp.floor(float(point[0]) + offset * normal[0] + 0.5))
     row = int(wp.floor(float(point[1]) + offset * normal[1] + 0.5))
@@ -58,10 +58,10 @@ def beside(point: wp.vec2i, normal: wp.vec2, offset: float, grid: ImageGrid) -> 
 
 @wp.func
 def is_in_reach(q: wp.vec2i, reach: float, extent: wp.vec4i, contour: wp.array3d[wp.vec2i], view: int, instance: int, length: int) -> bool:
-    """Whether max over c of |c - q| ≤ reach [px], c being the points of an instance's contour; true of a contour without points.
+    """True if max over c of |c - q| ≤ reach [px], for the points c of an instance's contour; True for a contour without points.
 
-    A contour touches each side of its box, so its farthest point is no nearer than the farthest side and no farther than the farthest
-    corner: it is walked only where the reach lies between the two.
+    Bounding-box test first: a contour touches each side of its box, so its farthest point is at least as far as the farthest side and at
+    most as far as the farthest corner. The points are tested only if the reach lies between these two.
     """
     across = wp.max(wp.max(q[0] + extent[0], extent[2] - q[0]), 0)
     down = wp.max(wp.max(q[1] + extent[1], extent[3] - q[1]), 0)
@@ -83,29 +83,32 @@ def bound_contours_kernel(
     # Scene:
     catalog: CatalogData,
     cameras: Cameras,
-    sight: PerceptionData,
+    perception: PerceptionData,
     # State:
-    entry: wp.array2d[int],
+    catalog_index: wp.array2d[int],  # (world, instance)
     # In:
     views: Views,
-    contour: wp.array3d[wp.vec2i],
-    contour_length: wp.array2d[int],
-    depth: wp.array2d[float],
+    contour: wp.array3d[wp.vec2i],  # (view, instance, point) [px]
+    contour_length: wp.array2d[int],  # (view, instance)
+    depth: wp.array2d[float],  # (world, instance) [m]
     # Out:
-    extent_out: wp.array2d[wp.vec4i],
-    reach_out: wp.array2d[float],
+    extent_out: wp.array2d[wp.vec4i],  # (view, instance) [px]
+    reach_out: wp.array2d[float],  # (view, instance) [px]
 ):
-    """extent[j] = max over the contour of (-column, -row, column, row); reach[j] = reach · diagonal_j · f_x / depth_j [px].
+    """Bounding box of each contour, and reach of each instance.
 
-    The extents begin at NOWHERE. An instance without an entry shows no pixel, so nobody asks for its reach.
+    extent[j] = max over the contour of (-column, -row, column, row), which must be NOWHERE at the start;
+    reach[j] = reach · diagonal_j · f_x / depth_j, unwritten for instances without a catalog entry, which are never visible.
     """
     view, instance, lane = wp.tid()
     world = views.world[view]
     if world < 0:
         return
-    e = entry[world, instance]
+    e = catalog_index[world, instance]
     if lane == 0 and e >= 0:
-        reach_out[view, instance] = sight.reach * catalog.diagonal[e] * cameras.intrinsics[views.camera[view]][0] / depth[world, instance]
+        reach_out[view, instance] = (
+            perception.reach * catalog.diagonal[e] * cameras.intrinsics[views.camera[view]][0] / depth[world, instance]
+        )
     extent = wp.vec4i(NOWHERE, NOWHERE, NOWHERE, NOWHERE)
     length = contour_length[view, instance]
     for point in range(lane, length, CONTOUR_LANES):
@@ -119,25 +122,25 @@ def bound_contours_kernel(
 def count_votes_kernel(
     # Scene:
     grid: ImageGrid,
-    sight: PerceptionData,
+    perception: PerceptionData,
     # In:
     gbuffer: GBuffer,
     views: Views,
-    component: wp.array3d[int],
-    largest: wp.array2d[int],
-    contour: wp.array3d[wp.vec2i],
-    contour_length: wp.array2d[int],
-    depth: wp.array2d[float],
-    extent: wp.array2d[wp.vec4i],
-    reach: wp.array2d[float],
+    component: wp.array3d[int],  # (view, row, column)
+    largest: wp.array2d[int],  # (view, instance)
+    contour: wp.array3d[wp.vec2i],  # (view, instance, point) [px]
+    contour_length: wp.array2d[int],  # (view, instance)
+    depth: wp.array2d[float],  # (world, instance) [m]
+    extent: wp.array2d[wp.vec4i],  # (view, instance) [px]
+    reach: wp.array2d[float],  # (view, instance) [px]
     # Out:
-    count_out: wp.array4d[int],
+    count_out: wp.array4d[int],  # (view, instance, instance, kind)
 ):
-    """count[i, j, kind]: points of i's contour at which j lies nearer to the camera.
+    """count[i, j, kind]: number of points of i's contour at which j occludes i. Counts must be 0 at the start.
 
-    At a point p with normal n, p - o n must show the largest component of i and q = p + o n another instance j, with a smaller depth; o
-    is the contour's offset. The vote is deep where j lies lower than i's suction point by more than `deep_distance`. It does not count
-    where a point of j's contour is farther from q than j's reach: what is seen is then too large for j, which true masks hardly ever are.
+    At a point p with normal n, the pixel p - o n must belong to the largest component of i, and q = p + o n to another instance j with a
+    smaller depth; o is the contour offset. The vote is deep if j at q lies below i's grasp point by more than `deep_distance`. A vote is
+    rejected if a point of j's contour is farther from q than j's reach: the mask is then too large for j, which true masks hardly ever are.
     """
     view, instance, lane = wp.tid()
     world = views.world[view]
@@ -147,14 +150,14 @@ def count_votes_kernel(
     for point in range(lane, contour_length[view, instance], CONTOUR_LANES):
         p = contour[view, instance, point]
         normal = contour_normal(contour, view, instance, point, contour_length[view, instance])
-        inside = beside(p, normal, -sight.contour_offset, grid)
-        q = beside(p, normal, sight.contour_offset, grid)
+        inside = offset_pixel(p, normal, -perception.contour_offset, grid)
+        q = offset_pixel(p, normal, perception.contour_offset, grid)
         if inside[0] >= 0 and q[0] >= 0 and component[view, inside[1], inside[0]] == largest[view, instance]:
-            j = seen_instance(gbuffer, view, q[1], q[0], instances)
+            j = visible_instance(gbuffer, view, q[1], q[0], instances)
             d = gbuffer.depth[view, q[1], q[0]]
             if j >= 0 and j != instance and d < gbuffer.depth[view, inside[1], inside[0]]:
                 if is_in_reach(q, reach[view, j], extent[view, j], contour, view, j, contour_length[view, j]):
-                    if d > depth[world, instance] + sight.deep_distance:
+                    if d > depth[world, instance] + perception.deep_distance:
                         wp.atomic_add(count_out, view, instance, j, DEEP, 1)
                     else:
                         wp.atomic_add(count_out, view, instance, j, FULL, 1)
@@ -163,17 +166,17 @@ def count_votes_kernel(
 @wp.kernel
 def weigh_votes_kernel(
     # Scene:
-    sight: PerceptionData,
+    perception: PerceptionData,
     # In:
     views: Views,
-    count: wp.array4d[int],
+    count: wp.array4d[int],  # (view, instance, instance, kind)
     # Out:
-    votes_out: wp.array3d[float],
+    votes_out: wp.array3d[float],  # (world, instance, instance)
 ):
-    """votes[i, j] = full + deep_weight · deep."""
+    """Weighted sum votes[i, j] = full + deep_weight · deep."""
     view, instance, neighbour = wp.tid()
     world = views.world[view]
     if world < 0:
         return
     deep = float(count[view, instance, neighbour, DEEP])
-    votes_out[world, instance, neighbour] = float(count[view, instance, neighbour, FULL]) + sight.deep_weight * deep
+    votes_out[world, instance, neighbour] = float(count[view, instance, neighbour, FULL]) + perception.deep_weight * deep

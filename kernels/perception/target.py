@@ -1,4 +1,4 @@
-"""Which object is picked next."""
+"""Choice of the target: the instance to pick next, by its ancestors in the clutter graph and its visibility."""
 
 import warp as wp
 
@@ -11,8 +11,8 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def drawn_instance(visible: wp.array2d[int], world: int, key: wp.uint64, index: int) -> int:
-    """One of the visible instances, each as likely as the others; -1: none is visible."""
+def sample_visible(visible: wp.array2d[int], world: int, key: wp.uint64, index: int) -> int:
+    """Uniform random choice among the visible instances, by sample `index` of the stream `key`; -1: none is visible."""
     instances = visible.shape[1]
     count = int(0)
     for i in range(instances):
@@ -20,36 +20,36 @@ def drawn_instance(visible: wp.array2d[int], world: int, key: wp.uint64, index: 
             count += 1
     if count == 0:
         return -1
-    left = uniform_index(key, index, count)
+    remaining = uniform_index(key, index, count)
     chosen = int(-1)
     for i in range(instances):
         if visible[world, i] > 0:
-            if left == 0:
+            if remaining == 0:
                 chosen = i
-            left -= 1
+            remaining -= 1
     return chosen
 
 
 @wp.func
-def ranked_instance(
+def rank_visible(
     visible: wp.array2d[int],
-    share: wp.array2d[float],
+    visible_fraction: wp.array2d[float],
     ancestors: wp.array2d[wp.uint32],
     world: int,
     sign: float,
 ) -> int:
-    """The visible instance with the least sign · (objects above), among equals with the largest sign · share, then the first; or -1."""
+    """Visible instance with the smallest sign · (number of ancestors), then the largest sign · fraction, then the smallest index; or -1."""
     chosen = int(-1)
     least = float(0.0)
     largest = float(0.0)
     for i in range(visible.shape[1]):
         if visible[world, i] > 0:
             count = sign * float(wp.bit_count(ancestors[world, i]))
-            seen = sign * share[world, i]
-            if chosen < 0 or count < least or (count == least and seen > largest):
+            fraction = sign * visible_fraction[world, i]
+            if chosen < 0 or count < least or (count == least and fraction > largest):
                 chosen = i
                 least = count
-                largest = seen
+                largest = fraction
     return chosen
 
 
@@ -58,23 +58,23 @@ def choose_target_kernel(
     # Scene:
     seed: wp.uint64,
     pick: PickData,
-    # State:
-    address: wp.array[wp.vec2i],
-    mode: wp.array[int],
-    attempt: wp.array[int],
-    outcome: wp.array[int],
+    # State: worlds, attempts
+    arrangement_id: wp.array[wp.vec2i],  # (world)
+    mode: wp.array[int],  # (world)
+    attempt: wp.array[int],  # (world)
+    outcome: wp.array[int],  # (world)
     # In:
     views: Views,
-    visible: wp.array2d[int],
-    share: wp.array2d[float],
-    ancestors: wp.array2d[wp.uint32],
+    visible: wp.array2d[int],  # (world, instance) [px]
+    visible_fraction: wp.array2d[float],  # (world, instance)
+    ancestors: wp.array2d[wp.uint32],  # (world, instance)
     # Out:
-    target_out: wp.array[int],
+    target_out: wp.array[int],  # (world)
 ):
-    """The visible instance with the fewest objects above, ties by the largest share; in mode TARGET with the most, ties by the smallest.
+    """Visible instance with the fewest ancestors, ties by the largest visible fraction; in mode TARGET the most, ties by the smallest.
 
-    With `random_after_failure`, after an attempt that failed in this tick, mode TARGET draws one of the visible ones instead: the number
-    of the coming attempt is the draw's index. -1: nothing is visible.
+    With `random_after_failure`, mode TARGET samples a visible instance uniformly after an attempt that failed in this tick; the index
+    of the coming attempt is the sample's index in the stream. -1: no instance is visible.
     """
     view = wp.tid()
     world = views.world[view]
@@ -82,10 +82,10 @@ def choose_target_kernel(
         return
     chosen = int(-1)
     if mode[world] != Mode.TARGET:
-        chosen = ranked_instance(visible, share, ancestors, world, 1.0)
+        chosen = rank_visible(visible, visible_fraction, ancestors, world, 1.0)
     elif pick.random_after_failure != 0 and outcome[world] >= Outcome.DROPPED:
-        key = stream_key(seed, address[world][0], address[world][1], Stream.TARGETS)
-        chosen = drawn_instance(visible, world, key, attempt[world] + 1)
+        key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.TARGETS)
+        chosen = sample_visible(visible, world, key, attempt[world] + 1)
     else:
-        chosen = ranked_instance(visible, share, ancestors, world, -1.0)
+        chosen = rank_visible(visible, visible_fraction, ancestors, world, -1.0)
     target_out[world] = chosen

@@ -1,4 +1,4 @@
-"""Which worlds look, in batches, without asking the host how many there are."""
+"""Worklist of the worlds to observe, processed in batches; its length stays on the device."""
 
 import warp as wp
 
@@ -12,52 +12,55 @@ def list_worlds_kernel(
     # Scene:
     worlds: int,
     # State:
-    phase: wp.array[int],
-    task: wp.array[int],
+    phase: wp.array[int],  # (world)
+    task: wp.array[int],  # (world)
     # Out:
-    looker_out: wp.array[int],
-    count_out: wp.array[int],
-    first_out: wp.array[int],
-    left_out: wp.array[int],
+    worklist_out: wp.array[int],  # (world)
+    length_out: wp.array[int],  # (one)
+    next_out: wp.array[int],  # (one)
+    remaining_out: wp.array[int],  # (one)
 ):
-    """List the worlds that LOOK, in order, and begin with the first. One thread walks over the worlds."""
+    """Stream compaction: list the acting worlds whose task is LOOK, in order, by a single thread.
+
+    `length` receives the length of the worklist, `next` the index of its first unprocessed item (0), `remaining` the number of these.
+    """
     count = int(0)
     for world in range(worlds):
         if phase[world] == Phase.ACT and task[world] == Task.LOOK:
-            looker_out[count] = world
+            worklist_out[count] = world
             count += 1
-    count_out[0] = count
-    first_out[0] = 0
-    left_out[0] = count
+    length_out[0] = count
+    next_out[0] = 0
+    remaining_out[0] = count
 
 
 @wp.kernel
 def take_batch_kernel(
-    # State:
-    looker: wp.array[int],
-    count: wp.array[int],
-    first: wp.array[int],
+    # In:
+    worklist: wp.array[int],  # (world)
+    length: wp.array[int],  # (one)
+    next_item: wp.array[int],  # (one)
     # Out:
-    world_out: wp.array[int],
+    world_out: wp.array[int],  # (view)
 ):
-    """The next worlds become the views of a batch; -1: no world is left for the view."""
+    """Assign the next worlds of the worklist to the views of a batch; -1: the view is unused."""
     view = wp.tid()
-    number = first[0] + view
+    item = next_item[0] + view
     world_out[view] = -1
-    if number < count[0]:
-        world_out[view] = looker[number]
+    if item < length[0]:
+        world_out[view] = worklist[item]
 
 
 @wp.kernel
 def advance_batch_kernel(
     # Scene:
-    batch_size: int,
-    # State:
-    count: wp.array[int],
+    views: int,
+    # In:
+    length: wp.array[int],  # (one)
     # Out:
-    first_inout: wp.array[int],
-    left_out: wp.array[int],
+    next_inout: wp.array[int],  # (one)
+    remaining_out: wp.array[int],  # (one)
 ):
-    """Go on behind the batch."""
-    first_inout[0] = first_inout[0] + batch_size
-    left_out[0] = wp.max(count[0] - first_inout[0], 0)
+    """Advance the worklist by one batch; the loop ends when `remaining` is 0."""
+    next_inout[0] = next_inout[0] + views
+    remaining_out[0] = wp.max(length[0] - next_inout[0], 0)

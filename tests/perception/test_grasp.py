@@ -119,12 +119,11 @@ class GraspHarness:
         }
         self.arrays, self.observation = allocate(PerceptionArrays, sizes, device), allocate(Observation, sizes, device)
         self.grasp = allocate(Plan, sizes, device)
-        world, camera_index = wp.array(range(views), dtype=wp.int32, device=device), wp.zeros(views, dtype=wp.int32, device=device)
+        world, camera_index = (wp.array(values, dtype=wp.int32, device=device) for values in (range(views), [0] * views))
         batch = make_views(world, camera_index, views, instances)
         renderer.set_up_views(snapshot(toy, device), batch)
         renderer.rasterize(batch, allocate(ViewBuffers, sizes, device))
-        gbuffer = renderer.gbuffer
-        self.ids, self.depth = gbuffer.segment.numpy().astype(int) - 1, gbuffer.depth.numpy()
+        self.ids, self.depth = renderer.gbuffer.segment.numpy().astype(int) - 1, renderer.gbuffer.depth.numpy()
         self.expected = planning.segment(self.ids, self.depth, instances)
         self.arrays.component.assign(self.expected["component"])
         self.arrays.largest.assign(self.expected["largest"])
@@ -136,21 +135,13 @@ class GraspHarness:
         filled(self.worlds.scene.perception, {**planning.SETTINGS, "normal_window": window})
         self.worlds.scene.pick.tilt_limit = tilt_limit
         self.scene = self.worlds.scene
-        self.images: Any = SimpleNamespace(
-            render_scene=scene,
-            views=batch,
-            arrays=self.arrays,
-            gbuffer=gbuffer,
-            bodies=renderer.bodies,
-            cameras=scene.cameras,
-            grid=scene.grid,
-        )
-        self.planner = GraspPlanner(toy.settings().sight, self.images, device)
+        self.images: Any = SimpleNamespace(scene=scene, views=batch, bodies=renderer.bodies, gbuffer=renderer.gbuffer)
+        self.planner = GraspPlanner(toy.settings().sight, self.images, self.arrays)
 
     def plan_grasps(self) -> Plan:
         self.observation.grasp_pixel.assign(self.grasp_pixel)
-        self.planner.smooth_normal(self.scene, self.images, self.observation, self.grasp)
-        self.planner.frame_grasp(self.scene, self.images, self.observation, self.grasp)
+        self.planner.smooth_normal(self.scene, self.observation, self.grasp)
+        self.planner.frame_grasp(self.scene, self.observation, self.grasp)
         return self.grasp
 
 
@@ -266,7 +257,7 @@ def test_the_whole_planner(device):
         getattr(harness.observation, name).assign(harness.expected[name])
     harness.grasp.target.fill_(7)
     worlds.state.mode.assign(np.array([Mode.PICK, Mode.TARGET, Mode.PICK, Mode.PICK]))
-    harness.planner.plan(harness.scene, harness.images, worlds.state, attempts, harness.observation, harness.grasp, 0)
+    harness.planner.plan(harness.scene, worlds.state, attempts, harness.observation, harness.grasp, 0)
     assert harness.observation.above.numpy().tolist() == [[0b10, 0, 0, 0], [0, 0b01, 0, 0], [0] * 4, [0] * 4]
     assert harness.grasp.target.numpy().tolist() == [1, 1, -1, 7]
     np.testing.assert_allclose(harness.grasp.normal.numpy()[:2], [(np.sin(0.1), 0, np.cos(0.1)), (0, 0, 1)], atol=1e-5)

@@ -1,9 +1,6 @@
-"""Grasp points: pole of inaccessibility, choice among the three candidates, visible fractions; and the G-buffer of perception."""
+"""Grasp points: pole of inaccessibility, choice among the three candidates, and visible fractions."""
 
 from __future__ import annotations
-
-from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,15 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.codes import Segment
-from synpick_warp.configs.schema import Config
-from synpick_warp.scenes.cameras import make_cameras
-from synpick_warp.scenes.types import Catalog, Fixture
-from synpick_warp.stages.perception import segment
-from synpick_warp.stages.render.scene import build_render_scene
 from tests.twins import perception
 from tests.twins.perception import SegmenterHarness
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, entry, render, snapshot
 
 WIDTH, HEIGHT = 64, 48
 
@@ -58,9 +48,9 @@ def blob(seed: int) -> np.ndarray:
 
 
 def test_square_is_grasped_at_its_center(harness):
-    codes = empty()
-    codes[10:31, 20:41] = 1
-    harness.observe(codes)
+    segments = empty()
+    segments[10:31, 20:41] = 1
+    harness.observe(segments)
     found = candidates(harness)
     assert found["pole"].tolist() == found["centroid"].tolist() == found["midpoint"].tolist() == [30.0, 20.0]
     assert found["distances"].tolist() == [11.0, 11.0, 11.0]
@@ -69,9 +59,9 @@ def test_square_is_grasped_at_its_center(harness):
 
 def test_first_of_equal_poles_is_kept_and_the_centroid_is_preferred(harness):
     """A long bar has a row of equal poles; the centroid, at the same distance from the contour, is chosen."""
-    codes = empty()
-    codes[10:21, 5:46] = 1
-    harness.observe(codes)
+    segments = empty()
+    segments[10:21, 5:46] = 1
+    harness.observe(segments)
     found = candidates(harness)
     assert found["pole"].tolist() == [10.0, 15.0]
     assert found["centroid"].tolist() == [25.0, 15.0]
@@ -81,20 +71,20 @@ def test_first_of_equal_poles_is_kept_and_the_centroid_is_preferred(harness):
 
 def test_pole_is_chosen_if_the_centroid_lies_outside(harness):
     """An L with arms of 5 and 9 px: its centroid and the midpoint lie outside."""
-    codes = empty()
-    codes[4:44, 4:13], codes[39:44, 4:60] = 1, 1
-    harness.observe(codes)
+    segments = empty()
+    segments[4:44, 4:13], segments[39:44, 4:60] = 1, 1
+    harness.observe(segments)
     found = candidates(harness)
-    assert codes[tuple(np.rint(found["centroid"][::-1]).astype(int))] == 0
+    assert segments[tuple(np.rint(found["centroid"][::-1]).astype(int))] == 0
     assert found["distances"][:2].tolist() == [5.0, 0.0]
     assert found["grasp_pixel"].tolist() == found["pole"].tolist() == [8, 8]
 
 
 def test_midpoint_is_chosen_if_it_is_farther_from_the_contour(harness):
     """A large square with a thin tail that shifts the centroid."""
-    codes = empty()
-    codes[4:25, 4:25], codes[12:17, 25:63] = 1, 1
-    harness.observe(codes)
+    segments = empty()
+    segments[4:25, 4:25], segments[12:17, 25:63] = 1, 1
+    harness.observe(segments)
     found = candidates(harness)
     pole, centroid, middle = found["distances"]
     assert pole == 11.0
@@ -103,18 +93,18 @@ def test_midpoint_is_chosen_if_it_is_farther_from_the_contour(harness):
     assert 0.4 < middle / pole <= 0.8
     assert found["grasp_pixel"].tolist() == [14, 14]
     harness.mass[0] = 0.9
-    harness.observe(codes)
+    harness.observe(segments)
     assert harness.result("grasp_pixel").tolist() == np.rint(found["midpoint"]).astype(int).tolist() != [14, 14]
     harness.mass[0] = 0.8
-    harness.observe(codes)
+    harness.observe(segments)
     assert harness.result("grasp_pixel").tolist() == [14, 14]
 
 
 def test_a_hole_moves_the_pole_off_the_centroid(harness):
-    codes = empty()
-    codes[4:45, 10:51] = 1
-    codes[22:27, 28:33] = 0
-    harness.observe(codes)
+    segments = empty()
+    segments[4:45, 10:51] = 1
+    segments[22:27, 28:33] = 0
+    harness.observe(segments)
     found = candidates(harness)
     assert found["centroid"].tolist() == [30.0, 24.0]
     assert found["distances"][1] == 0.0
@@ -123,9 +113,9 @@ def test_a_hole_moves_the_pole_off_the_centroid(harness):
 
 
 def test_hidden_instances_have_no_grasp_point(harness):
-    codes = empty()
-    codes[4:9, 4:9] = 2
-    harness.observe(codes)
+    segments = empty()
+    segments[4:9, 4:9] = 2
+    harness.observe(segments)
     harness.observe(empty())
     for instance in range(2):
         assert harness.result("grasp_pixel", instance).tolist() == [-1, -1]
@@ -136,7 +126,7 @@ def test_hidden_instances_have_no_grasp_point(harness):
 def test_results_do_not_depend_on_the_previous_observation(harness):
     large, small = empty(), empty()
     large[4:40, 4:40], small[40:45, 50:57] = 1, 1
-    fresh = SegmenterHarness(harness.stage.render_scene.device, WIDTH, HEIGHT, instances=2)
+    fresh = SegmenterHarness(harness.images.scene.device, WIDTH, HEIGHT, instances=2)
     fresh.observe(small)
     harness.observe(large)
     harness.observe(small)
@@ -146,11 +136,11 @@ def test_results_do_not_depend_on_the_previous_observation(harness):
 
 @given(seed=st.integers(0, 2**32 - 1), mass=st.sampled_from([0.1, 1.0]))
 def test_same_as_reference(seed, mass, shared):
-    harness, codes = shared, blob(seed)
+    harness, segments = shared, blob(seed)
     harness.mass[:] = mass
-    harness.observe(codes)
-    labels = perception.label_components(codes, 2)
-    mask = labels == perception.largest_label(labels, codes, 0)
+    harness.observe(segments)
+    labels = perception.label_components(segments, 2)
+    mask = labels == perception.largest_label(labels, segments, 0)
     expected = perception.choose_grasp_point(mask, mass, harness.config.sight)
     found = candidates(harness)
     assert found["pole"].tolist() == expected["pole"].tolist()
@@ -165,10 +155,10 @@ def test_same_as_reference(seed, mass, shared):
 @given(seed=st.integers(0, 2**32 - 1))
 def test_pole_is_within_a_pixel_of_the_exact_distance_transform(seed, shared):
     """The pole is a maximum of OpenCV's distance transform, within a pixel, and its distance equals that maximum."""
-    harness, codes = shared, blob(seed)
-    harness.observe(codes)
-    labels = perception.label_components(codes, 2)
-    mask = (labels == perception.largest_label(labels, codes, 0)).astype(np.uint8)
+    harness, segments = shared, blob(seed)
+    harness.observe(segments)
+    labels = perception.label_components(segments, 2)
+    mask = (labels == perception.largest_label(labels, segments, 0)).astype(np.uint8)
     exact = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     best = np.argwhere(exact > exact.max() - 1e-3)[:, ::-1]
     assert np.linalg.norm(best - harness.result("pole"), axis=1).min() <= 1.0
@@ -180,105 +170,31 @@ def test_pole_is_within_a_pixel_of_the_exact_distance_transform(seed, shared):
 
 def test_visible_fraction_of_a_sheet_is_its_area_over_the_expected_area(harness):
     """Half of the expected area is visible, at a distance of 1.5 m."""
-    codes = empty()
-    codes[8:28, 10:40] = 1
+    segments = empty()
+    segments[8:28, 10:40] = 1
     fx, fy = harness.focal
     harness.area[0] = 2.0 * (30 * 1.5 / fx) * (20 * 1.5 / fy)
-    harness.observe(codes, depth=1.5)
+    harness.observe(segments, depth=1.5)
     assert harness.result("visible_fraction") == pytest.approx(0.5, rel=1e-5)
     assert harness.result("depth") == 1.5
 
 
 def test_visible_fraction_sums_the_depths_of_the_largest_component_alone(harness):
     rng = np.random.default_rng(5)
-    codes = blob(5)
-    codes[0, 0] = 1
-    depth = rng.uniform(0.5, 3.0, codes.shape).astype(np.float32)
-    harness.observe(codes, depth=depth)
-    labels = perception.label_components(codes, 2)
-    inside = labels == perception.largest_label(labels, codes, 0)
+    segments = blob(5)
+    segments[0, 0] = 1
+    depth = rng.uniform(0.5, 3.0, segments.shape).astype(np.float32)
+    harness.observe(segments, depth=depth)
+    labels = perception.label_components(segments, 2)
+    inside = labels == perception.largest_label(labels, segments, 0)
     fx, fy = harness.focal
-    assert inside.sum() < (codes == 1).sum()
+    assert inside.sum() < (segments == 1).sum()
     assert harness.result("visible_fraction") == pytest.approx((depth[inside].astype(float) ** 2).sum() / (fx * fy) / 0.01, rel=1e-6)
     column, row = harness.result("grasp_pixel")
     assert harness.result("depth") == depth[row, column]
 
 
-# ---- G-buffer ----
-
-
-def toy(resolution: tuple[int, int]) -> ToyScene:
-    """Two worlds with boxes and balls in a tote, and the gripper in front of them."""
-    config = Config()
-    config = replace(config, cameras=replace(config.cameras, resolution=resolution))
-    tote = Fixture(box(0.5, 0.3, 0.02), GREY)
-    placed = [
-        [(0, (0.05, 0.02, 0.06, 0.1, 0.2, 0.0, 0.97)), (1, (-0.08, 0.03, 0.05, *UPRIGHT))],
-        [(1, (0.0, 0.0, 0.05, *UPRIGHT)), (0, (0.04, 0.0, 0.1, *UPRIGHT)), (0, (-0.1, -0.05, 0.05, *UPRIGHT))],
-    ]
-    gripper = (Fixture(box(0.1, 0.1, 0.3), GREY), Fixture(box(0.04, 0.04, 0.05), GREY))
-    poses = ((0.0, 0.0, 0.0, *UPRIGHT), (0.0, 0.0, 0.4, *UPRIGHT), (0.0, 0.0, 0.2, *UPRIGHT))
-    cameras = make_cameras(config.cameras)[:1]
-    return ToyScene(
-        [entry(box(0.1, 0.06, 0.04)), entry(ball(0.04, 3))],
-        placed,
-        cameras,
-        fixtures=(tote, *gripper),
-        fixture_poses=poses,
-        fixtures_visible=(1, 0, 0),
-        config=config,
-        table=True,
-    )
-
-
-def test_gbuffer_equals_the_renderers_without_gripper(device):
-    resolution = (96, 54)
-    scene = toy(resolution)
-    expected = render(scene, device)
-    assert set(np.unique(expected.instance)) == {1, 2, 3, Segment.TOTE, Segment.TABLE}
-    # The gripper is in the scene and the cameras have another resolution; perception uses neither.
-    config = replace(
-        scene.settings(),
-        sight=replace(scene.config.sight, resolution=resolution, views=3),
-        cameras=replace(scene.config.cameras, resolution=(192, 108)),
-    )
-    cameras = make_cameras(config.cameras)
-    shared = build_render_scene(config, Catalog(tuple(scene.entries)), scene.fixtures, cameras, scene.lights, device)
-    segmenter = segment.Segmenter(config.sight, config.cameras, shared, 4, scene.room)
-    segmenter.views.world.assign([1, -1, 0])
-    segmenter.gbuffer.segment.fill_(77)
-    scene.fixtures_visible = (1, 1, 1)
-    segmenter.render(snapshot(scene, device))
-    code, depth = segmenter.gbuffer.segment.numpy(), segmenter.gbuffer.depth.numpy()
-    for view, world in ((0, 1), (2, 0)):
-        assert (code[view] == expected.instance[world]).all()
-        # The renderer rasterizes triangles; perception casts rays through BVHs.
-        np.testing.assert_allclose(depth[view], expected.exact_depth[world], rtol=1e-6)
-    assert (code[1] == 77).all()
-    assert segmenter.views.camera.numpy().tolist() == [0, -1, 0]
-
-
 def test_a_batch_without_worlds_writes_nothing(device):
-    """All views are unused at the start."""
     harness = SegmenterHarness(device, WIDTH, HEIGHT, worlds=2)
-    assert harness.stage.views.world.numpy().tolist() == [-1, -1]
     harness.observe(worlds=[])
     assert (harness.observation.grasp_pixel.numpy() == 0).all()
-
-
-# ---- batches ----
-
-
-def test_number_of_views():
-    config = Config()
-    cpu, cuda = SimpleNamespace(is_cuda=False), SimpleNamespace(is_cuda=True)
-    assert segment.count_views(config.sight, 64, 21, cpu) == segment.CPU_VIEWS
-    each = segment.view_bytes(config.sight, 21)
-    assert 1920 * 1080 * 30 < each < 1920 * 1080 * 40
-    views = segment.count_views(config.sight, 64, 21, cuda)
-    assert views * each <= segment.GPU_BYTES < (views + 1) * each
-    asked = replace(config, sight=replace(config.sight, views=7))
-    assert segment.count_views(asked.sight, 64, 21, cpu) == 7
-    assert segment.count_views(config.sight, 2, 21, cuda) == 2
-    vast = replace(config, sight=replace(config.sight, resolution=(8192, 8192)))
-    assert segment.count_views(vast.sight, 64, 21, cpu) == 1

@@ -173,7 +173,7 @@ def test_unused_views_write_nothing(device):
     assert votes[0, 0, 1] == 40
     assert (votes[1] == 7.0).all()
     harness.observation.above.fill_(3)
-    harness.planner.order_clutter(harness.scene, harness.images, harness.observation)
+    harness.planner.order_clutter(harness.scene, harness.observation)
     assert harness.observation.above.numpy().tolist() == [[2, 0, 0, 0, 0], [3] * 5]
 
 

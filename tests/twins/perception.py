@@ -10,56 +10,67 @@ import cv2
 import numpy as np
 import warp as wp
 
-from synpick_warp.arrays import allocate
+from synpick_warp.arrays import allocate, allocate_struct
 from synpick_warp.configs.schema import Config, Sight
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.stages.perception.arrays import Observation
+from synpick_warp.stages.perception.images import perception_sizes
 from synpick_warp.stages.perception.segment import Segmenter
+from synpick_warp.stages.render.scene import build_cameras, build_grid
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEWS
 from synpick_warp.stages.sim.worlds import world_sizes
 
 
 class SegmenterHarness:
     """A `Segmenter` that gets synthetic images of segmentation ids in place of a rendered G-buffer. Instance i is catalog entry i."""
 
-    def __init__(self, device: wp.Device, width: int, height: int, worlds: int = 1, instances: int = 4, **sight) -> None:
+    def __init__(self, device: wp.Device, width: int, height: int, worlds: int = 1, instances: int = 4, **settings) -> None:
         config = Config()
         self.config = replace(
             config,
-            sight=replace(config.sight, resolution=(width, height), views=sight.pop("views", worlds), **sight),
+            sight=replace(config.sight, resolution=(width, height), **settings),
             bake=replace(config.bake, worlds=worlds),
             arrangement=replace(config.arrangement, max_objects=instances),
         )
-        render_scene: Any = SimpleNamespace(device=device, meshes=None, table=None)
-        self.stage = Segmenter(self.config.sight, config.cameras, render_scene, worlds, instances)
+        camera = make_cameras(replace(config.cameras, resolution=(width, height)))[0]
+        self.focal = camera.matrix[[0, 1], [0, 1]]
+        sizes = perception_sizes(self.config.sight, instances, worlds)
+        self.images: Any = SimpleNamespace(
+            scene=SimpleNamespace(device=device, cameras=build_cameras((camera,), device), grid=build_grid(width, height)),
+            views=allocate_struct(VIEWS, sizes, device),
+            gbuffer=allocate_struct(GBUFFER, sizes, device),
+            sizes=sizes,
+        )
+        self.images.views.count, self.images.views.instances = worlds, instances
+        self.segmenter = Segmenter(self.images)
         self.mass, self.area = np.full(instances, 0.1), np.full(instances, 0.01)
         catalog, rules = structs.CatalogData(), structs.PerceptionData()
         catalog.mass = wp.zeros(instances, dtype=float, device=device)
         catalog.area = wp.zeros(instances, dtype=float, device=device)
         for name in ("center_share", "heavy_mass", "heavy_center_share"):
             setattr(rules, name, getattr(self.config.sight, name))
-        self.scene = SimpleNamespace(catalog=catalog, perception=rules)
+        self.scene: Any = SimpleNamespace(catalog=catalog, perception=rules)
         self.catalog_index = wp.array(np.tile(np.arange(instances), (worlds, 1)), dtype=wp.int32, device=device)
         self.observation = allocate(Observation, world_sizes(self.config, 0), device)
-        self.focal = make_cameras(replace(config.cameras, resolution=(width, height)))[0].matrix[[0, 1], [0, 1]]
 
-    def observe(self, *codes: np.ndarray, depth: np.ndarray | float = 2.0, worlds: list[int] | None = None) -> None:
+    def observe(self, *segments: np.ndarray, depth: np.ndarray | float = 2.0, worlds: list[int] | None = None) -> None:
         """Process images of segmentation ids (H, W), one a view, with a depth image or one depth [m]; by default of worlds 0, 1, ..."""
-        stage = self.stage
-        images = stage.gbuffer.segment.numpy()
-        for view, image in enumerate(codes):
+        views, gbuffer = self.images.views, self.images.gbuffer
+        images = gbuffer.segment.numpy()
+        for view, image in enumerate(segments):
             images[view] = image
-        stage.gbuffer.segment.assign(images)
-        stage.gbuffer.depth.assign(np.broadcast_to(np.float32(depth), images.shape))
-        shown = list(range(len(codes))) if worlds is None else worlds
-        stage.views.world.assign(np.array(shown + [-1] * (stage.views.count - len(shown))))
+        gbuffer.segment.assign(images)
+        gbuffer.depth.assign(np.broadcast_to(np.float32(depth), images.shape))
+        world = list(range(len(segments))) if worlds is None else worlds
+        views.world.assign(np.array(world + [-1] * (views.count - len(world))))
         self.scene.catalog.mass.assign(self.mass)
         self.scene.catalog.area.assign(self.area)
-        stage.find_grasp_points(self.scene, self.catalog_index, self.observation)  # type: ignore[arg-type]
+        self.segmenter.find_grasp_points(self.scene, self.catalog_index, self.observation)
 
     def image(self, name: str, view: int = 0) -> np.ndarray:
         """A scratch array of one view."""
-        return getattr(self.stage.arrays, name).numpy()[view]
+        return getattr(self.segmenter.arrays, name).numpy()[view]
 
     def result(self, name: str, instance: int = 0, world: int = 0) -> np.ndarray:
         """A field of an instance's observation."""
@@ -70,19 +81,19 @@ class SegmenterHarness:
         return self.image("contour", view)[instance, : self.image("contour_length", view)[instance]]
 
 
-def label_components(codes: np.ndarray, instances: int) -> np.ndarray:
+def label_components(segments: np.ndarray, instances: int) -> np.ndarray:
     """Connected-component label of each pixel (H, W): the smallest row-major index of the component's pixels; -1: no instance."""
-    result = np.full(codes.shape, -1)
+    result = np.full(segments.shape, -1)
     for instance in range(instances):
-        count, labels = cv2.connectedComponents((codes == instance + 1).astype(np.uint8), connectivity=8)
+        count, labels = cv2.connectedComponents((segments == instance + 1).astype(np.uint8), connectivity=8)
         for label in range(1, count):
             result[labels == label] = np.flatnonzero(labels == label)[0]
     return result
 
 
-def largest_label(labels: np.ndarray, codes: np.ndarray, instance: int) -> int:
+def largest_label(labels: np.ndarray, segments: np.ndarray, instance: int) -> int:
     """Label of an instance's largest component; ties go to the smallest label; -1: not visible."""
-    names, sizes = np.unique(labels[codes == instance + 1], return_counts=True)
+    names, sizes = np.unique(labels[segments == instance + 1], return_counts=True)
     return int(names[np.argmax(sizes)]) if len(names) else -1
 
 

@@ -86,15 +86,10 @@ class PlannerHarness:
         self.gbuffer.depth.assign(depths)
         camera = Camera(width, height, np.array([[FOCAL, 0, width / 2], [0, FOCAL, height / 2], [0, 0, 1.0]]), np.eye(3), np.zeros(3))
         world, camera_index = (wp.array(values, dtype=wp.int32, device=device) for values in (range(self.views), [0] * self.views))
-        views = make_views(world, camera_index, self.views, instances)
         self.images: Any = SimpleNamespace(
-            render_scene=None,
-            arrays=self.arrays,
-            views=views,
+            scene=SimpleNamespace(cameras=build_cameras((camera,), device), grid=build_grid(width, height)),
+            views=make_views(world, camera_index, self.views, instances),
             gbuffer=self.gbuffer,
-            bodies=None,
-            cameras=build_cameras((camera,), device),
-            grid=build_grid(width, height),
         )
         self.expected = segment(ids, depths, instances)
         for name in ("component", "largest", "contour", "contour_length"):
@@ -102,13 +97,13 @@ class PlannerHarness:
         for name in ("visible", "grasp_pixel", "depth", "visible_fraction"):
             getattr(self.observation, name).assign(self.expected[name])
         self.scene = self.worlds.scene
-        self.planner = GraspPlanner(Sight(exact_cycle=self.scene.perception.exact_cycle), self.images, device)
+        self.planner = GraspPlanner(Sight(exact_cycle=self.scene.perception.exact_cycle), self.images, self.arrays)
 
     def votes(self) -> np.ndarray:
         """Occlusion votes (V, I, I)."""
-        self.planner.bound_contours(self.scene, self.images, self.worlds.state, self.observation)
-        self.planner.count_votes(self.scene, self.images, self.observation)
-        self.planner.weigh_votes(self.scene, self.images, self.observation)
+        self.planner.bound_contours(self.scene, self.worlds.state, self.observation)
+        self.planner.count_votes(self.scene, self.observation)
+        self.planner.weigh_votes(self.scene, self.observation)
         return self.observation.votes.numpy()
 
     def graph(self, votes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -117,14 +112,14 @@ class PlannerHarness:
             self.votes()
         else:
             self.observation.votes.assign(votes)
-        self.planner.order_clutter(self.scene, self.images, self.observation)
+        self.planner.order_clutter(self.scene, self.observation)
         bits = np.arange(self.arrays.largest.shape[1])
         return tuple((array.numpy()[..., None] >> bits) & 1 == 1 for array in (self.observation.above, self.observation.ancestors))
 
     def choose(self, seed: int = 0) -> list[int]:
         """Target of each world."""
         worlds = self.worlds
-        self.planner.choose_target(self.scene, self.images, worlds.state, self.attempts, self.observation, self.grasp, seed)
+        self.planner.choose_target(self.scene, worlds.state, self.attempts, self.observation, self.grasp, seed)
         return self.grasp.target.numpy().tolist()
 
 

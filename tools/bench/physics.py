@@ -234,7 +234,7 @@ def _looks(simulation: Simulation, least: float) -> Iterator[Row]:
     simulation.state.phase.fill_(Phase.ACT)
     simulation.attempts.task.fill_(Task.LOOK)
     parts = (
-        (perception.segmenter, "render", "trace"),
+        (perception.images, "render", "trace"),
         (perception.segmenter, "find_grasp_points", "components, distances, contours, suction points"),
         (perception.planner, "plan", "votes, clutter graph, choice, grasp"),
     )
@@ -251,7 +251,7 @@ def _looks(simulation: Simulation, least: float) -> Iterator[Row]:
         while calls < LEAST_REPEATS or sum(watch.seconds(name) for _, _, name in parts) < least:
             perceive_batch()
             calls += 1
-    views = perception.segmenter.views.count
+    views = perception.images.views.count
     yield Row("sight", "views in a batch", views, "")
     for _, _, name in parts:
         yield Row("sight", f"a look: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")

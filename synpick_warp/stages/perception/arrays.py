@@ -14,7 +14,7 @@ from synpick_warp.arrays import device_array
 
 @dataclass(frozen=True, eq=False)
 class PerceptionArrays:
-    """Scratch of one batch: segmentation of each view, which is one image of one world."""
+    """Segmentation of a batch of views, each an image of one world."""
 
     component: wp.array = device_array("view", "row", "column", dtype=wp.int32)
     """Connected-component label (8-connectivity, within one instance): the smallest row-major index of its pixels; -1: no instance."""
@@ -29,6 +29,22 @@ class PerceptionArrays:
     """Outer contour of the largest component, in the order of OpenCV's findContours with CHAIN_APPROX_NONE."""
     contour_length: wp.array = device_array("view", "instance", dtype=wp.int32)
     """Number of contour points."""
+
+
+@dataclass(frozen=True, eq=False)
+class SegmentationScratch:
+    """Intermediate images and sums of segmentation. A patch is the largest component of an instance."""
+
+    patch: wp.array = device_array("view", "row", "column", dtype=wp.uint16)
+    """Low byte: 1 + instance, 0: no patch; bit 8 + d: the neighbour in direction d belongs to the same patch."""
+    gap: wp.array = device_array("view", "row", "column", dtype=wp.int32)
+    """256 x distance within the column [px] + low byte of `patch`."""
+    largest_key: wp.array = device_array("view", "instance", dtype=wp.int64)
+    """Size and label of the largest component, packed by `pack_key`."""
+    pole_key: wp.array = device_array("view", "instance", dtype=wp.int64)
+    """Squared distance [px²] and pixel of the pole, packed by `pack_key`."""
+    square: wp.array = device_array("view", "instance", dtype=wp.int64, unit="2⁻²⁴ m²")
+    """Sum of squared depths over the patch."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,7 @@ from synpick_warp.kernels.perception import worklist
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.perception.plan import GraspPlanner
 from synpick_warp.stages.perception.segment import Segmenter
 from synpick_warp.stages.render.scene import RenderScene
@@ -47,10 +48,11 @@ class Perception:
         self.seed = seed
         self.device = state.phase.device
         worlds, instances = observation.visible.shape
-        self.segmenter = Segmenter(settings, cameras, render_scene, worlds, instances)
-        self.planner = GraspPlanner(settings, self.segmenter, self.device)
+        self.images = PerceptionImages(settings, cameras, render_scene, worlds, instances)
+        self.segmenter = Segmenter(self.images)
+        self.planner = GraspPlanner(settings, self.images, self.segmenter.arrays)
         self._worklist = wp.zeros(worlds, dtype=wp.int32, device=self.device)
-        self._count, self._next, self._remaining = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(3))
+        self._length, self._next, self._remaining = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(3))
         self._graphs: dict[int, wp.Graph] = {}
         self._warm = False
 
@@ -80,28 +82,27 @@ class Perception:
             worklist.list_worlds_kernel,
             dim=1,
             inputs=[self.state.phase.shape[0], self.state.phase, self.attempts.task],
-            outputs=[self._worklist, self._count, self._next, self._remaining],
+            outputs=[self._worklist, self._length, self._next, self._remaining],
             device=self.device,
         )
 
     def perceive_batch(self, snapshot: Snapshot) -> None:
         """Loop body: observe the next worlds of the worklist, one a view, and plan their attempts."""
-        views = self.segmenter.views
-        batch_size = views.count
+        views = self.images.views
         wp.launch(
             worklist.take_batch_kernel,
-            dim=batch_size,
-            inputs=[self._worklist, self._count, self._next],
+            dim=views.count,
+            inputs=[self._worklist, self._length, self._next],
             outputs=[views.world],
             device=self.device,
         )
-        self.segmenter.render(snapshot)
+        self.images.render(snapshot)
         self.segmenter.find_grasp_points(self.scene, snapshot.catalog_index, self.observation)
-        self.planner.plan(self.scene, self.segmenter, self.state, self.attempts, self.observation, self.plan, self.seed)
+        self.planner.plan(self.scene, self.state, self.attempts, self.observation, self.plan, self.seed)
         wp.launch(
             worklist.advance_batch_kernel,
             dim=1,
-            inputs=[batch_size, self._count],
+            inputs=[views.count, self._length],
             outputs=[self._next, self._remaining],
             device=self.device,
         )

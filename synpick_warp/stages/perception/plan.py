@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import warp as wp
 
@@ -21,23 +21,11 @@ from synpick_warp.kernels.perception.occlusion_votes import (
 from synpick_warp.kernels.perception.target import choose_target_kernel
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
-from synpick_warp.stages.render.scene import RenderScene
+from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
 
 VIEW_BLOCK = 32
 """Threads of a block where one thread processes a whole view: small blocks spread few views over many multiprocessors."""
-
-
-class SegmentedViews(Protocol):
-    """Interface to the images of a batch that planning reads; `Segmenter` implements it."""
-
-    render_scene: RenderScene
-    views: Any
-    arrays: PerceptionArrays
-    gbuffer: Any
-    bodies: Any
-    cameras: Any
-    grid: Any
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,107 +51,93 @@ def plan_sizes(settings: schema.Sight, instances: int, views: int) -> dict[str, 
 class GraspPlanner:
     """Chooses a target and its suction grasp for the worlds of a batch. Owns its scratch; `plan` only launches kernels."""
 
-    def __init__(self, settings: schema.Sight, images: SegmentedViews, device: wp.Device) -> None:
+    def __init__(self, settings: schema.Sight, images: PerceptionImages, arrays: PerceptionArrays) -> None:
         """Allocate scratch for the views and instances of a batch.
 
         Args:
             settings: Settings of perception.
-            images: Images of a batch; at most 32 instances, one bit each.
-            device: Device of the arrays.
+            images: G-buffers of a batch; unused views have world -1; at most 32 instances, one bit each.
+            arrays: Components and contours of the batch.
         """
-        self.views, instances = images.arrays.largest.shape
-        sizes = plan_sizes(settings, instances, self.views)
-        self.device = device
-        self.voting = allocate(VoteArrays, sizes, device)
-        self.cycles = allocate_struct(CYCLES, sizes, device)
+        self.images, self.arrays = images, arrays
+        self.device = arrays.largest.device
+        self.views, self.instances = arrays.largest.shape
+        sizes = plan_sizes(settings, self.instances, self.views)
+        self.voting = allocate(VoteArrays, sizes, self.device)
+        self.cycles = allocate_struct(CYCLES, sizes, self.device)
 
-    def plan(
-        self,
-        scene: SceneData,
-        images: SegmentedViews,
-        state: WorldState,
-        attempts: AttemptState,
-        observation: Observation,
-        plan: Plan,
-        seed: int,
-    ) -> None:
+    def plan(self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int) -> None:
         """Write votes and clutter graph to `observation`, target and grasp to `plan`, for the worlds of the batch.
 
         Args:
             scene: Constants.
-            images: G-buffer, components and contours; unused views have world -1.
             state: State of the worlds.
             attempts: State of the attempts; `outcome` belongs to the attempt that ended in this tick.
             observation: Visibility, grasp points and depths are read.
             plan: Written; a world without a visible instance gets target -1 and keeps the rest.
             seed: Seed of the random choice of targets.
         """
-        self.bound_contours(scene, images, state, observation)
-        self.count_votes(scene, images, observation)
-        self.weigh_votes(scene, images, observation)
-        self.order_clutter(scene, images, observation)
-        self.choose_target(scene, images, state, attempts, observation, plan, seed)
-        self.smooth_normal(scene, images, observation, plan)
-        self.frame_grasp(scene, images, observation, plan)
+        self.bound_contours(scene, state, observation)
+        self.count_votes(scene, observation)
+        self.weigh_votes(scene, observation)
+        self.order_clutter(scene, observation)
+        self.choose_target(scene, state, attempts, observation, plan, seed)
+        self.smooth_normal(scene, observation, plan)
+        self.frame_grasp(scene, observation, plan)
 
-    def bound_contours(self, scene: SceneData, images: SegmentedViews, state: WorldState, observation: Observation) -> None:
+    def bound_contours(self, scene: SceneData, state: WorldState, observation: Observation) -> None:
         """Compute each contour's bounding box, and its instance's reach."""
-        arrays, (views, instances) = images.arrays, images.arrays.largest.shape
+        images, arrays = self.images, self.arrays
         self.voting.extent.fill_(int(NOWHERE))
-        inputs = [scene.catalog, images.cameras, scene.perception, state.catalog_index, images.views]
+        inputs = [scene.catalog, images.scene.cameras, scene.perception, state.catalog_index, images.views]
         inputs += [arrays.contour, arrays.contour_length, observation.depth]
-        dim = (views, instances, int(CONTOUR_LANES))
-        wp.launch(bound_contours_kernel, dim=dim, inputs=inputs, outputs=[self.voting.extent, self.voting.reach], device=self.device)
+        self._launch_contours(bound_contours_kernel, inputs, [self.voting.extent, self.voting.reach])
 
-    def count_votes(self, scene: SceneData, images: SegmentedViews, observation: Observation) -> None:
+    def count_votes(self, scene: SceneData, observation: Observation) -> None:
         """Count the occlusion votes along every contour, by kind."""
-        arrays, (views, instances) = images.arrays, images.arrays.largest.shape
-        self.voting.count.zero_()
-        inputs = [images.grid, scene.perception, images.gbuffer, images.views, arrays.component, arrays.largest]
-        inputs += [arrays.contour, arrays.contour_length, observation.depth, self.voting.extent, self.voting.reach]
-        dim = (views, instances, int(CONTOUR_LANES))
-        wp.launch(count_votes_kernel, dim=dim, inputs=inputs, outputs=[self.voting.count], device=self.device)
+        images, arrays, voting = self.images, self.arrays, self.voting
+        voting.count.zero_()
+        inputs = [images.scene.grid, scene.perception, images.gbuffer, images.views, arrays.component, arrays.largest]
+        inputs += [arrays.contour, arrays.contour_length, observation.depth, voting.extent, voting.reach]
+        self._launch_contours(count_votes_kernel, inputs, [voting.count])
 
-    def weigh_votes(self, scene: SceneData, images: SegmentedViews, observation: Observation) -> None:
+    def weigh_votes(self, scene: SceneData, observation: Observation) -> None:
         """Sum the votes by weight."""
-        views, instances = images.arrays.largest.shape
-        inputs = [scene.perception, images.views, self.voting.count]
-        dim = (views, instances, instances)
+        inputs = [scene.perception, self.images.views, self.voting.count]
+        dim = (self.views, self.instances, self.instances)
         wp.launch(weigh_votes_kernel, dim=dim, inputs=inputs, outputs=[observation.votes], device=self.device)
 
-    def order_clutter(self, scene: SceneData, images: SegmentedViews, observation: Observation) -> None:
+    def order_clutter(self, scene: SceneData, observation: Observation) -> None:
         """Build the acyclic clutter graph and its transitive closure."""
-        inputs = [scene.perception, images.views, observation.votes]
-        self._launch(order_clutter_kernel, inputs, [self.cycles, observation.above, observation.ancestors])
+        inputs = [scene.perception, self.images.views, observation.votes]
+        self._launch_views(order_clutter_kernel, inputs, [self.cycles, observation.above, observation.ancestors])
 
     def choose_target(
-        self,
-        scene: SceneData,
-        images: SegmentedViews,
-        state: WorldState,
-        attempts: AttemptState,
-        observation: Observation,
-        plan: Plan,
-        seed: int,
+        self, scene: SceneData, state: WorldState, attempts: AttemptState, observation: Observation, plan: Plan, seed: int
     ) -> None:
         """Choose the instance to pick."""
         inputs = [wp.uint64(seed), scene.pick, state.arrangement_id, state.mode, attempts.attempt, attempts.outcome]
-        inputs += [images.views, observation.visible, observation.visible_fraction, observation.ancestors]
-        self._launch(choose_target_kernel, inputs, [plan.target])
+        inputs += [self.images.views, observation.visible, observation.visible_fraction, observation.ancestors]
+        self._launch_views(choose_target_kernel, inputs, [plan.target])
 
-    def smooth_normal(self, scene: SceneData, images: SegmentedViews, observation: Observation, plan: Plan) -> None:
+    def smooth_normal(self, scene: SceneData, observation: Observation, plan: Plan) -> None:
         """Sum the normals in the window around the target's grasp point."""
-        arrays, render_scene = images.arrays, images.render_scene
-        inputs = [render_scene.meshes, render_scene.surfaces, images.cameras, images.grid, scene.perception.normal_window]
-        inputs += [images.bodies, images.gbuffer, images.views, arrays.component, arrays.largest]
-        inputs += [observation.grasp_pixel, plan.target]
-        self._launch(smooth_normal_kernel, inputs, [plan.normal])
+        images, arrays = self.images, self.arrays
+        inputs = [images.scene.meshes, images.scene.surfaces, images.scene.cameras, images.scene.grid, scene.perception.normal_window]
+        inputs += [images.bodies, images.gbuffer, images.views, arrays.component, arrays.largest, observation.grasp_pixel, plan.target]
+        self._launch_views(smooth_normal_kernel, inputs, [plan.normal])
 
-    def frame_grasp(self, scene: SceneData, images: SegmentedViews, observation: Observation, plan: Plan) -> None:
+    def frame_grasp(self, scene: SceneData, observation: Observation, plan: Plan) -> None:
         """Compute the grasp point in the world, its unit normal, and the gripper's angles."""
-        inputs = [images.cameras, scene.pick, plan.normal, images.gbuffer, images.views, observation.grasp_pixel, plan.target]
-        self._launch(frame_grasp_kernel, inputs, [plan.point, plan.yaw, plan.tilt])
+        images = self.images
+        inputs = [images.scene.cameras, scene.pick, images.gbuffer, images.views, observation.grasp_pixel, plan.target]
+        self._launch_views(frame_grasp_kernel, inputs, [plan.normal, plan.point, plan.yaw, plan.tilt])
 
-    def _launch(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+    def _launch_views(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel with one thread a view."""
         wp.launch(kernel, dim=self.views, inputs=inputs, outputs=outputs, device=self.device, block_dim=VIEW_BLOCK)
+
+    def _launch_contours(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel with `CONTOUR_LANES` threads a contour."""
+        dim = (self.views, self.instances, int(CONTOUR_LANES))
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

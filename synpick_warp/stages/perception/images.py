@@ -1,0 +1,103 @@
+"""Perception images: G-buffers of camera 0 without the gripper, for batches of worlds, entirely on the device."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import warp as wp
+
+from synpick_warp.arrays import allocate_struct, memory_table
+from synpick_warp.configs import schema
+from synpick_warp.errors import ConfigError
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.render.visibility.gbuffer import trace_sample_kernel
+from synpick_warp.kernels.render.visibility.view_setup import aim_views_kernel
+from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.launch import launch_pixels
+from synpick_warp.stages.perception.arrays import PerceptionArrays, SegmentationScratch
+from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, body_sizes, set_up_views
+
+CPU_BYTES = 512 * 2**20
+GPU_BYTES = 2 * 2**30
+"""Scratch that the views of a batch may take if `sight.views` is 0."""
+CPU_VIEWS = 4
+"""Maximum number of views on the CPU in that case: larger batches gain nothing there, and unused views still cost a little."""
+CENTER = wp.vec2(0.0, 0.0)
+"""Offset of rays through the pixel centres [px]."""
+SCRATCH = (VIEWS, VIEW_BODIES, GBUFFER, PerceptionArrays, SegmentationScratch)
+"""Declarations of the arrays of a batch."""
+
+
+def perception_sizes(settings: schema.Sight, instances: int, views: int) -> dict[str, int]:
+    """Extents of the dimensions of the declarations in `SCRATCH`."""
+    width, height = settings.resolution
+    sizes = {"view": views, "instance": instances, "row": height, "column": width, "point": settings.contour_points}
+    return sizes | body_sizes(instances, width, height)
+
+
+def view_bytes(settings: schema.Sight, instances: int) -> int:
+    """Scratch of one view [bytes]."""
+    sizes = perception_sizes(settings, instances, 1)
+    return sum(row[3] for kind in SCRATCH for row in memory_table(kind, sizes))
+
+
+def count_views(settings: schema.Sight, worlds: int, instances: int, device: wp.Device) -> int:
+    """Views of a batch: the setting, or as many as fit into the memory budget; never more than there are worlds."""
+    views = settings.views
+    if views == 0:
+        each = view_bytes(settings, instances)
+        views = GPU_BYTES // each if device.is_cuda else min(CPU_BYTES // each, CPU_VIEWS)
+    return min(max(views, 1), worlds)
+
+
+class PerceptionImages:
+    """Renders the G-buffers of a batch of worlds. Owns its scratch; `render` only launches kernels, so a CUDA graph can capture it.
+
+    Attributes:
+        scene: The renderer's scene with camera 0 alone, at the resolution of perception.
+        views: The struct `Views` of the batch. The caller fills `views.world` (view): each world once; -1: the view is unused.
+        bodies: The struct `ViewBodies` of the batch.
+        gbuffer: The struct `GBuffer` of the batch.
+        sizes: Extents of the dimensions of the declarations in `SCRATCH`.
+    """
+
+    def __init__(self, settings: schema.Sight, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int) -> None:
+        """Allocate scratch.
+
+        Args:
+            settings: Settings of perception.
+            cameras: Settings of the cameras; the resolution is that of `settings`.
+            render_scene: Meshes, materials and table of the renderer; its cameras are not used.
+            worlds: Number of worlds.
+            instances: Instance capacity of a world, at most 32.
+
+        Raises:
+            ConfigError: A batch has more pixels than 31 bits can count.
+        """
+        device = render_scene.device
+        count = count_views(settings, worlds, instances, device)
+        width, height = settings.resolution
+        grid = build_grid(width, height)
+        self.pixels = count * grid.tiles * int(TILE_PIXELS)
+        if self.pixels >= 2**31:
+            raise ConfigError(f"sight.views is {count}; of {width} x {height} px that is more than 2³¹ pixels; take fewer")
+        camera = make_cameras(replace(cameras, resolution=settings.resolution))[:1]
+        self.scene = replace(render_scene, cameras=build_cameras(camera, device), grid=grid, camera_count=1)
+        self.sizes = perception_sizes(settings, instances, count)
+        self.views: Any = allocate_struct(VIEWS, self.sizes, device)
+        self.views.world.fill_(-1)
+        self.views.count, self.views.instances = count, instances
+        self.bodies: Any = allocate_struct(VIEW_BODIES, self.sizes, device)
+        self.gbuffer: Any = allocate_struct(GBUFFER, self.sizes, device)
+        self.fixture_visible = wp.array([[1, 0, 0]] * worlds, dtype=wp.int32, device=device)
+
+    def render(self, snapshot: Snapshot) -> None:
+        """Cast one ray through each pixel of each view's world, without gripper shaft and cup. Unused views keep their content."""
+        scene, views = self.scene, self.views
+        wp.launch(aim_views_kernel, dim=views.count, outputs=[views], device=scene.device)
+        set_up_views(scene, scene.cameras, scene.grid, snapshot, self.fixture_visible, views, self.bodies)
+        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.bodies, views, CENTER]
+        launch_pixels(trace_sample_kernel, self.pixels, inputs, [self.gbuffer], scene.device)
