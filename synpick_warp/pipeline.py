@@ -55,6 +55,7 @@ from synpick_warp.stages.sim.simulate import RECORDS, Simulation
 from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, name_lights, tick_batch, view_sizes
+from synpick_warp.stages.timing import scope
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +135,8 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
 def _fill(config: Config, output: OutputFolder, kinds: tuple[type[Exporter], ...], summary: BakeSummary, progress: Progress) -> None:
     """Generate the remaining episodes, then the indices over all."""
     needs_physics = any(kind.needs_physics for kind in kinds)
-    factory = build_factory(config, progress, output.remaining, needs_physics) if output.remaining else None
+    with scope("build"):
+        factory = build_factory(config, progress, output.remaining, needs_physics) if output.remaining else None
     writers = config.bake.writers or len(os.sched_getaffinity(0))
     with WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
         started = time.perf_counter()
@@ -143,7 +145,8 @@ def _fill(config: Config, output: OutputFolder, kinds: tuple[type[Exporter], ...
             try:
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights), pool)
                 _Run(config, factory, exporters, partial(output.commit, exporters, pool), summary, progress).run()
-                pool.wait()
+                with scope("wait for writers"):
+                    pool.wait()
                 exporters.close()
             except BaseException:
                 pool.abort()
@@ -151,7 +154,8 @@ def _fill(config: Config, output: OutputFolder, kinds: tuple[type[Exporter], ...
                 raise
         if not summary.stopped:
             progress.stage("finishing files")
-            finalize_data_set(output.out, config, kinds, pool)
+            with scope("finalize"):
+                finalize_data_set(output.out, config, kinds, pool)
         summary.wall_seconds = time.perf_counter() - started
 
 
@@ -180,14 +184,13 @@ class _Run:
         readers = [TickReader(record) for record in simulation.records]
         self.progress.stage("compiling kernels, dropping objects")
         with StopRequest() as stop:
-            simulation.tick(simulation.records[0])
-            readers[0].start()
+            self._simulate(readers, 0)
             current = 0
             while not stop.number:
                 following = (current + 1) % RECORDS
-                simulation.tick(simulation.records[following])
-                readers[following].start()
-                report = readers[current].wait()
+                self._simulate(readers, following)
+                with scope("wait for tick"):
+                    report = readers[current].wait()
                 self._hand_over(report, simulation.records[current].snapshot)
                 phase = report.column("phase")
                 self.meter.show(int(np.isin(phase, (Phase.SETTLE, Phase.ACT)).sum()))
@@ -196,19 +199,29 @@ class _Run:
                 current = following
         self.summary.stopped = stop.number
 
+    def _simulate(self, readers: list[TickReader], record: int) -> None:
+        """Enqueue a tick and its copy to the host."""
+        simulation = self.factory.simulation
+        with scope("simulate", simulation.device):
+            simulation.tick(simulation.records[record])
+        readers[record].start()
+
     def _hand_over(self, report: TickReport, snapshot: Snapshot) -> None:
         """Hand a tick's frames, views and episode ends to the exporters."""
         physics = self.config.physics
         batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
         if len(batch):
-            self.exporters.write_ticks(batch)
+            with scope("hand over ticks"):
+                self.exporters.write_ticks(batch)
         if self.exporters.needs_views:
             for views in self.factory.stream.render(snapshot, report):
-                self.exporters.write_views(views)
+                with scope("hand over views"):
+                    self.exporters.write_views(views)
                 self.summary.views += len(views)
         records = self.factory.log.see(report)
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
-            self._end(report, world, records[int(report.column("episode")[world])])
+            with scope("end episode"):
+                self._end(report, world, records[int(report.column("episode")[world])])
 
     def _end(self, report: TickReport, world: int, record: EpisodeRecord) -> None:
         row = episode_row(self.config, report, world, record)

@@ -21,6 +21,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
+from synpick_warp.stages import timing
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import QUICK, catalog, settings
 
@@ -87,10 +88,17 @@ def baked(tmp_path_factory) -> Baked:
 # ---- the same bytes ----
 
 
-def test_the_same_settings_give_the_same_bytes(baked, tmp_path):
-    again = Baked(tmp_path / "again")
+def test_the_same_settings_give_the_same_bytes_with_a_profile_too(baked, tmp_path):
+    with timing.record() as recorder:
+        again = Baked(tmp_path / "again")
     assert again.files() == baked.files()
     assert len(again.files()) > 100
+    calls = {path[-1]: stage.calls for path, stage in recorder.times.items()}
+    assert calls["end episode"] >= EPISODES
+    assert calls["simulate"] == calls["wait for tick"] + 1
+    # One batch has the views of a world's frame.
+    assert calls["render"] == calls["wait for images"] == calls["hand over views"] == again.summary.views // CAMERAS
+    assert recorder.times["simulate",].host < recorder.wall
 
 
 @pytest.mark.parametrize("worlds", [1, 4])

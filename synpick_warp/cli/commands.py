@@ -87,6 +87,12 @@ def bake(
         str | None, Parameter(help="i/n: only episodes with index % n == i, such as 0/4; combine the data sets with merge.")
     ] = None,
     set_: SetOption = None,
+    profile: Annotated[
+        bool, Parameter(negative=(), help="Print the time of each stage at the end, and write a Chrome trace (see --profile-out).")
+    ] = False,
+    profile_out: Annotated[
+        Path | None, Parameter(help="Trace file of --profile, for ui.perfetto.dev (default: OUT-profile.json beside the data set).")
+    ] = None,
 ) -> int:
     """Simulate, render and write a data set. After an interruption, the same command resumes with the remaining episodes.
 
@@ -107,7 +113,12 @@ def bake(
         "bake.formats": None if formats is None else [name.strip() for name in formats.split(",")],
     }
     resolved = _resolve(config, given, resolution, set_)
-    return _bake(resolved, out, parse_shard(shard, resolved.bake.episodes) if shard is not None else (0, 1))
+    part = parse_shard(shard, resolved.bake.episodes) if shard is not None else (0, 1)
+    if not profile and profile_out is None:
+        return _bake(resolved, out, part)
+    trace = profile_out or out.with_name(f"{out.name}-profile.json")
+    check_trace_file(trace, out)
+    return _bake_profiled(resolved, out, part, trace)
 
 
 @app.command
@@ -269,6 +280,35 @@ def _resolve(config: str | None, given: dict[str, object], resolution: str | Non
     if resolution is not None:
         overrides["cameras.resolution"] = parse_resolution(resolution)
     return load_config(config, overrides, source=COMMAND_LINE)
+
+
+def check_trace_file(trace: Path, out: Path) -> None:
+    """Check that a trace can be written, and not into the data set.
+
+    Raises:
+        ConfigError: The file is inside the data set, or its folder does not exist.
+    """
+    if trace.resolve().is_relative_to(out.resolve()):
+        raise ConfigError(f"--profile-out is {trace}, inside the data set {out}; name a file outside of it")
+    if trace.is_dir() or (trace.parent != out.parent and not trace.parent.is_dir()):
+        raise ConfigError(f"--profile-out is {trace}; allowed: a file in an existing folder")
+
+
+def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], trace: Path) -> int:
+    """Bake with the profiler on; print the table and write the trace."""
+    from synpick_warp.cli.display import make_console, print_profile
+    from synpick_warp.exporters.writing.files import output_error
+    from synpick_warp.stages.timing import record
+
+    with record() as recorder:
+        code = _bake(config, out, shard)
+    print_profile(make_console(), recorder)
+    try:
+        recorder.write_trace(trace)
+    except OSError as error:
+        raise output_error(trace, error) from error
+    print(f"trace: {trace}")
+    return code
 
 
 def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:

@@ -19,6 +19,7 @@ from synpick_warp.progress import Progress
 if TYPE_CHECKING:
     from synpick_warp.codes import Ending, Outcome
     from synpick_warp.episodes import BakeSummary, EpisodeRow
+    from synpick_warp.stages.timing import Recorder
 
 PLAIN_WIDTH = 120
 """Width of tables without a terminal [characters]."""
@@ -128,6 +129,30 @@ def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:
     for ending, advice in sorted(summary.remedies.items()):
         console.print(f"{_words(ending)}: {advice}", markup=False, soft_wrap=True)
     console.print(f"data set: {out}", markup=False, soft_wrap=True)
+
+
+def print_profile(console: Console, recorder: Recorder) -> None:
+    """Print the time of each stage; nested stages are indented. Device time stands only where a GPU measured it."""
+    times = recorder.times
+    on_device = any(stage.device > 0.0 for stage in times.values())
+    table = Table("stage", "calls", "total s", "mean ms", "% of wall", *(("device s",) if on_device else ()))
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for path in sorted(times, key=lambda path: [-times[path[:end]].host for end in range(1, len(path) + 1)]):
+        stage = times[path]
+        cells = [
+            f"{stage.calls:,}",
+            f"{stage.host:.3f}",
+            f"{1e3 * stage.host / stage.calls:.3f}",
+            f"{100.0 * stage.host / recorder.wall:.1f}",
+        ]
+        table.add_row("  " * (len(path) - 1) + path[-1], *cells, *((f"{stage.device:.3f}",) if on_device else ()))
+    rest = recorder.wall - sum(stage.host for path, stage in times.items() if len(path) == 1)
+    table.add_row("other", "", f"{rest:.3f}", "", f"{100.0 * rest / recorder.wall:.1f}", *(("",) if on_device else ()))
+    console.print(table)
+    console.print(
+        f"wall time: {recorder.wall:.3f} s; stages are those of the main process; host time, where no device is named", markup=False
+    )
 
 
 def _listing(rows: Sequence[EpisodeRow]) -> Table:

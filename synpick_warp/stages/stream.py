@@ -20,6 +20,7 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
+from synpick_warp.stages.timing import scope
 
 # Size of one batch's images on a GPU [bytes]: large enough to fill the GPU, small enough for several batches in flight.
 BATCH_BYTES = 512 << 20
@@ -254,14 +255,17 @@ class FrameStream:
         padded[:, : len(world)] = world, camera
         rows.assign(padded)
         views = make_views(rows[0], rows[1], len(world), self.instances)
-        self.renderer.render(snapshot, views, self.buffers[slot], self.layer_buffers[slot])
-        list_boundaries(self.boundary_scratch, len(world), self.buffers[slot], self.boundaries[slot])
+        with scope("render", self.device):
+            self.renderer.render(snapshot, views, self.buffers[slot], self.layer_buffers[slot])
+            list_boundaries(self.boundary_scratch, len(world), self.buffers[slot], self.boundaries[slot])
         self.copies[slot].start(self.copy_stream)
 
     def _collect(self, waiting: tuple[int, slice], world: np.ndarray, camera: np.ndarray, report: TickReport) -> FrameBatch:
         slot, part = waiting
         count = part.stop - part.start
-        arrays = {name: array[:count] for name, array in zip(self.images + self.layers, self.copies[slot].wait(), strict=True)}
+        with scope("wait for images"):
+            copied = self.copies[slot].wait()
+        arrays = {name: array[:count] for name, array in zip(self.images + self.layers, copied, strict=True)}
         worlds = world[part]
         frame = report.column("frame")[worlds]
         light, turn = report.snapshot.light[worlds], report.snapshot.light_yaw[worlds]

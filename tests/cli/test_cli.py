@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.load import load_config
 from synpick_warp.episodes import BakeSummary, EpisodeRow
 from synpick_warp.errors import OutputError
+from synpick_warp.stages import timing
 
 
 def finished(number: int) -> BakeSummary:
@@ -151,6 +153,38 @@ def test_formats_and_share_are_passed_on(tmp_path, bakes):
 )
 def test_formats_and_shares_that_are_not_there(tmp_path, bakes, capsys, option, said):
     assert mistake(capsys, "bake", "--device=cpu", f"--out={tmp_path}", option) == said
+
+
+def test_a_profile_is_a_table_and_a_trace_beside_the_data_set(tmp_path, bakes, capsys, monkeypatch):
+    run = bakes.run_bake
+
+    def profiled(*arguments):
+        for _ in range(3):
+            with timing.scope("simulate"), timing.scope("inner"):
+                pass
+        return run(*arguments)
+
+    monkeypatch.setattr(bakes, "run_bake", profiled)
+    assert main(["bake", "--device=cpu", f"--out={tmp_path / 'set'}", "--profile"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = {cells[1].strip(): cells[2:] for line in lines if len(cells := line.split("│")) > 5}
+    assert (rows["simulate"][0].strip(), rows["inner"][0].strip()) == ("3", "3")
+    assert "other" in rows
+    assert lines[-1] == f"trace: {tmp_path / 'set-profile.json'}"
+    events = json.loads((tmp_path / "set-profile.json").read_text())["traceEvents"]
+    assert [event["name"] for event in events if event["ph"] == "X"] == ["inner", "simulate"] * 3
+    assert main(["bake", "--device=cpu", f"--out={tmp_path / 'set'}", f"--profile-out={tmp_path / 'trace.json'}"]) == 0
+    assert (tmp_path / "trace.json").is_file()
+    assert timing.scope("a") is timing.scope("b")
+
+
+def test_a_trace_is_never_written_into_the_data_set(tmp_path, bakes, capsys):
+    out = tmp_path / "set"
+    said = mistake(capsys, "bake", "--device=cpu", f"--out={out}", f"--profile-out={out / 'trace.json'}")
+    assert said == f"--profile-out is {out / 'trace.json'}, inside the data set {out}; name a file outside of it"
+    said = mistake(capsys, "bake", "--device=cpu", f"--out={out}", f"--profile-out={tmp_path / 'no' / 'trace.json'}")
+    assert said.endswith("allowed: a file in an existing folder")
+    assert not bakes.calls
 
 
 def test_a_stopped_bake_says_how_to_go_on(tmp_path, bakes, capsys):
