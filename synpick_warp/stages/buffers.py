@@ -69,7 +69,7 @@ class ViewBuffers:
     depth: wp.array = device_array("view", "row", "column", dtype=wp.uint16, unit="depth_scale")
     """Planar depth in counts of the depth scale; 0: no surface, or farther than 65,535 counts."""
     instance: wp.array = device_array("view", "row", "column", dtype=wp.uint8)
-    """0, 1 + instance_id, or a code of `frames`."""
+    """Instance segmentation: 1 + instance_id, or a `Segment`."""
     amodal: wp.array = device_array("view", "row", "column", dtype=wp.uint32)
     """Bit i: the ray hits instance i."""
     pixels: wp.array = device_array("view", "instance", "count", dtype=wp.int32, unit="px")
@@ -77,7 +77,7 @@ class ViewBuffers:
     boxes: wp.array = device_array("view", "instance", "box", "side", dtype=wp.int32, unit="px")
     """bbox_obj and bbox_visib: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty."""
     effects: wp.array = device_array("view", dtype=EffectParameters)
-    """Strengths of the camera's effects, in the order of `Effect`; zero: off."""
+    """Camera-effect parameters of each view, by `Effect`; zero: off."""
 
 
 def _declare_layer(layer: Layer) -> Any:

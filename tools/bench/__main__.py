@@ -233,7 +233,7 @@ def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], objec
             "shade": lambda: shading.shade_pixels(snapshot, bodies, gbuffer, views, image.radiance),
         }
         if shading.antialias:
-            stages["anti-alias"] = lambda: shading.smooth(bodies, gbuffer, views, image)
+            stages["anti-alias"] = lambda: shading.resolve_footprints(bodies, gbuffer, views, image)
     else:
         stages["trace paths"] = lambda: shading.shade(snapshot, bodies, gbuffer, views, image)
     return stages | {

@@ -161,7 +161,7 @@ class DenoisedRenderer:
         self.trace_shadows(snapshot, bodies, gbuffer, views)
         self.shade_pixels(snapshot, bodies, gbuffer, views, image.radiance)
         if self.antialias:
-            self.smooth(bodies, gbuffer, views, image)
+            self.resolve_footprints(bodies, gbuffer, views, image)
 
     def trace_coarse_paths(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
         """Coarse path pass: guide image and light of coarse pixels."""
@@ -193,7 +193,7 @@ class DenoisedRenderer:
         inputs += [self.guide, self.ratios, self.shadows.filtered, views]
         self._launch(shade_kernel, scene.grid, views, inputs, [radiance])
 
-    def smooth(self, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
+    def resolve_footprints(self, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
         """Anti-alias by coverage rays: writes `resolve` of the struct `ShadedImage`."""
         scene, lists = self.scene, self.footprint_lists
         lists.count.zero_()
