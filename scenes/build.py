@@ -174,7 +174,6 @@ def _add_gripper(world: newton.ModelBuilder, gripper: Gripper, shape: newton.Mod
     The impedance controller compensates their weight.
     """
     dof = newton.ModelBuilder.JointDofConfig
-    free = {"limit_lower": -np.inf, "limit_upper": np.inf, "armature": 0.0}
     finger = world.add_link(
         mass=gripper.finger_mass,
         inertia=wp.mat33(np.diag(rod_inertia(gripper.finger_mass, gripper.finger_length))),
@@ -189,12 +188,21 @@ def _add_gripper(world: newton.ModelBuilder, gripper: Gripper, shape: newton.Mod
         lock_inertia=True,
         label="cup",
     )
-    axes = [dof(axis=axis, **free) for axis in (newton.Axis.X, newton.Axis.Y, newton.Axis.Z)]
+    axes = [dof(axis=axis, limit_lower=-np.inf, limit_upper=np.inf, armature=0.0) for axis in (newton.Axis.X, newton.Axis.Y, newton.Axis.Z)]
     slide = world.add_joint_d6(-1, finger, linear_axes=axes)
     limit = np.radians(gripper.tilt_limit)
-    drive = {"target_ke": gripper.tilt_stiffness, "target_kd": gripper.tilt_damping, "effort_limit": gripper.tilt_torque}
-    tilt = world.add_joint_revolute(finger, cup, axis=newton.Axis.Y, limit_lower=-limit, limit_upper=limit, armature=CUP_ARMATURE, **drive)
-    world.add_articulation([slide, tilt], label="gripper")
+    wrist = world.add_joint_revolute(
+        finger,
+        cup,
+        axis=newton.Axis.Y,
+        target_ke=gripper.tilt_stiffness,
+        target_kd=gripper.tilt_damping,
+        limit_lower=-limit,
+        limit_upper=limit,
+        effort_limit=gripper.tilt_torque,
+        armature=CUP_ARMATURE,
+    )
+    world.add_articulation([slide, wrist], label="gripper")
     finger_shape = world.add_shape_convex_hull(finger, mesh=_hull(finger_collider(gripper)), cfg=shape)
     cup_shape = world.add_shape_convex_hull(cup, mesh=_hull(cup_collider(gripper)), cfg=shape)
     world.add_shape_collision_filter_pair(finger_shape, cup_shape)

@@ -115,14 +115,14 @@ def _read_own(obj_id: int, file: Path, config: Config) -> RawObject:
     return _raw(obj_id, file, mesh, material, row, config.objects)
 
 
-def _raw(obj_id: int, file: Path, mesh: TriangleMesh, material: FileMaterial, row: ObjectRow | None, objects: Objects) -> RawObject:
+def _raw(obj_id: int, file: Path, mesh: TriangleMesh, given: FileMaterial, row: ObjectRow | None, objects: Objects) -> RawObject:
     """Combine mesh file and row. Material properties of the file have priority over the row, the row over the section objects."""
     defaults = row or objects
     material = Material(
-        material.color,
-        material.texture,
-        defaults.metallic if material.metallic is None else material.metallic,
-        defaults.roughness if material.roughness is None else material.roughness,
+        given.color,
+        given.texture,
+        defaults.metallic if given.metallic is None else given.metallic,
+        defaults.roughness if given.roughness is None else given.roughness,
     )
     return RawObject(
         obj_id=obj_id,

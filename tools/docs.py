@@ -122,7 +122,7 @@ def _section(title: str, kind: type[Any], prefix: str) -> str:
 
 def main() -> None:
     """Write the generated files."""
-    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
+    argparse.ArgumentParser(description="Generate the documentation that follows from code.").parse_args()
     SETTINGS_REFERENCE.write_text(settings_reference(), encoding="utf-8")
     print(f"wrote {SETTINGS_REFERENCE.relative_to(ROOT)}")
 
