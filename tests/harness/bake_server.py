@@ -92,8 +92,8 @@ class BakeServer:
 
 def arguments(request: dict) -> list[str]:
     """Command-line arguments of a request."""
-    given = QUICK | TINY | request.get("settings", {})
-    settings = [part for key, value in given.items() for part in ("--set", f"{key}={json.dumps(value)}")]
+    overrides = QUICK | TINY | request.get("settings", {})
+    settings = [part for key, value in overrides.items() for part in ("--set", f"{key}={json.dumps(value)}")]
     return ["bake", "--out", request["out"], "--config", "smoke", *settings, *request.get("arguments", [])]
 
 

@@ -1,4 +1,4 @@
-"""BOP data sets, written by the real pool from frames of boxes, and read back with OpenCV and json."""
+"""BOP writer: data sets written by the real pool from views of boxes, read back with OpenCV and json."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def light_of(episode: int) -> dict[str, object]:
 
 
 def rows():
-    """Every view of the data set: its batch, its scene and its number."""
+    """Every view of the data set: its batch, scene and frame."""
     for batch in batches(1, EPISODES, FRAMES, LENSES):
         yield batch, f"{3 * int(batch.episode[0]) + int(batch.camera[0]):06d}", int(batch.frame[0])
 
@@ -65,7 +65,7 @@ def split(dataset) -> Path:
     return dataset / "train_pbr"
 
 
-def test_the_tree_is_bops_and_nothing_else(dataset, split):
+def test_folder_tree_is_exactly_bops(dataset, split):
     assert {path.name for path in dataset.iterdir()} == {
         "camera.json",
         "dataset_info.md",
@@ -95,7 +95,7 @@ def test_the_tree_is_bops_and_nothing_else(dataset, split):
         assert {path.name for path in (scene / "mask_visib").iterdir()} == masks
 
 
-def test_pictures_and_masks_come_back(split):
+def test_images_and_masks_read_back(split):
     for batch, scene, frame in rows():
         depth = cv2.imread(str(split / scene / "depth" / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED)
         assert depth.dtype == np.uint16
@@ -104,14 +104,14 @@ def test_pictures_and_masks_come_back(split):
         assert np.median(np.abs(color.astype(int) - batch.color[0])) <= 3
         for index, instance in enumerate(np.flatnonzero(OBJECT_IDS >= 0)):
             name = f"{frame:06d}_{index:06d}.png"
-            whole = cv2.imread(str(split / scene / "mask" / name), cv2.IMREAD_UNCHANGED)
-            seen = cv2.imread(str(split / scene / "mask_visib" / name), cv2.IMREAD_UNCHANGED)
-            assert whole.dtype == seen.dtype == np.uint8
-            np.testing.assert_array_equal(whole, np.where(batch.amodal[0] >> np.uint32(instance) & 1, 255, 0))
-            np.testing.assert_array_equal(seen, np.where(batch.instance[0] == 1 + instance, 255, 0))
+            amodal = cv2.imread(str(split / scene / "mask" / name), cv2.IMREAD_UNCHANGED)
+            visible = cv2.imread(str(split / scene / "mask_visib" / name), cv2.IMREAD_UNCHANGED)
+            assert amodal.dtype == visible.dtype == np.uint8
+            np.testing.assert_array_equal(amodal, np.where(batch.amodal[0] >> np.uint32(instance) & 1, 255, 0))
+            np.testing.assert_array_equal(visible, np.where(batch.instance[0] == 1 + instance, 255, 0))
 
 
-def test_camera_and_poses_are_in_millimetres_and_lead_from_model_to_camera(split):
+def test_cameras_and_model_to_camera_poses_in_millimetres(split):
     corners = np.array([[0.08, -0.05, 0.03], [0.0, 0.01, -0.02]])
     for _, scene, frame in rows():
         camera = load(split / scene / "scene_camera.json")[str(frame)]
@@ -130,8 +130,8 @@ def test_camera_and_poses_are_in_millimetres_and_lead_from_model_to_camera(split
             pose = poses(int(scene) // 3, frame)[record["instance_id"]].astype(np.float64)
             world = trimesh.transformations.quaternion_matrix(pose[[6, 3, 4, 5]])[:3, :3] @ corners.T + pose[:3, None]
             expected = 1000 * (lens.rotation @ world + lens.translation[:, None])
-            found = np.reshape(record["cam_R_m2c"], (3, 3)) @ (1000 * corners.T) + np.reshape(record["cam_t_m2c"], (3, 1))
-            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+            transformed = np.reshape(record["cam_R_m2c"], (3, 3)) @ (1000 * corners.T) + np.reshape(record["cam_t_m2c"], (3, 1))
+            np.testing.assert_allclose(transformed, expected, rtol=0, atol=1e-9)
 
 
 def test_counts_and_boxes(split):
@@ -139,9 +139,9 @@ def test_counts_and_boxes(split):
         infos = load(split / scene / "scene_gt_info.json")[str(frame)]
         assert len(infos) == 3
         for info, instance in zip(infos, np.flatnonzero(OBJECT_IDS >= 0), strict=True):
-            whole, valid, visible = batch.pixels[0, instance].tolist()
-            assert (info["px_count_all"], info["px_count_valid"], info["px_count_visib"]) == (whole, valid, visible)
-            assert info["visib_fract"] == visible / whole
+            total, valid, visible = batch.pixels[0, instance].tolist()
+            assert (info["px_count_all"], info["px_count_valid"], info["px_count_visib"]) == (total, valid, visible)
+            assert info["visib_fract"] == visible / total
             ys, xs = np.nonzero(batch.instance[0] == 1 + instance)
             if visible:
                 assert info["bbox_visib"] == [xs.min(), ys.min(), np.ptp(xs), np.ptp(ys)]
@@ -151,8 +151,8 @@ def test_counts_and_boxes(split):
                 assert info["bbox_visib"] == info["bbox_obj"] == [-1, -1, -1, -1]
 
 
-def test_the_frames_reach_the_interesting_cases(split):
-    """An object that leaves the picture to the left, and one that is partly hidden."""
+def test_views_cover_clipped_and_occluded_objects(split):
+    """One object is clipped by the left border, another is partly hidden."""
     infos = [info for scene in split.iterdir() for view in load(scene / "scene_gt_info.json").values() for info in view]
     assert any(info["bbox_obj"][0] < 0 and info["px_count_visib"] for info in infos)
     assert any(0 < info["visib_fract"] < 0.9 and info["bbox_obj"][0] >= 0 for info in infos)
@@ -168,16 +168,16 @@ def test_coco_masks_and_boxes(split):
         for frame, infos in load(scene / "scene_gt_info.json").items():
             for index, (info, record) in enumerate(zip(infos, load(scene / "scene_gt.json")[frame], strict=True)):
                 name = f"{int(frame):06d}_{index:06d}.png"
-                whole, seen = (cv2.imread(str(scene / kind / name), cv2.IMREAD_UNCHANGED) > 0 for kind in ("mask", "mask_visib"))
-                if seen.any():
-                    expected.append((int(frame), record["obj_id"], whole, seen, info))
+                amodal, visible = (cv2.imread(str(scene / one / name), cv2.IMREAD_UNCHANGED) > 0 for one in ("mask", "mask_visib"))
+                if visible.any():
+                    expected.append((int(frame), record["obj_id"], amodal, visible, info))
         assert len(expected) == len(coco["annotations"])
-        for annotation, (frame, obj_id, whole, seen, info) in zip(coco["annotations"], expected, strict=True):
-            assert (annotation["image_id"], annotation["category_id"], annotation["area"]) == (frame, obj_id, seen.sum())
-            ys, xs = np.nonzero(whole)
+        for annotation, (frame, obj_id, amodal, visible, info) in zip(coco["annotations"], expected, strict=True):
+            assert (annotation["image_id"], annotation["category_id"], annotation["area"]) == (frame, obj_id, visible.sum())
+            ys, xs = np.nonzero(amodal)
             assert annotation["bbox"] == [xs.min(), ys.min(), np.ptp(xs) + 1, np.ptp(ys) + 1]
             assert annotation["ignore"] == (info["visib_fract"] < 0.1)
-            np.testing.assert_array_equal(decode(annotation["segmentation"]["counts"], *annotation["segmentation"]["size"]), seen)
+            np.testing.assert_array_equal(decode(annotation["segmentation"]["counts"], *annotation["segmentation"]["size"]), visible)
 
 
 def test_targets_count_visible_instances(dataset, split):
@@ -188,9 +188,9 @@ def test_targets_count_visible_instances(dataset, split):
     for scene, frame in views:
         infos = load(split / f"{scene:06d}" / "scene_gt_info.json")[str(frame)]
         truth = load(split / f"{scene:06d}" / "scene_gt.json")[str(frame)]
-        seen = [record["obj_id"] for record, info in zip(truth, infos, strict=True) if info["visib_fract"] >= 0.1]
+        visible = [record["obj_id"] for record, info in zip(truth, infos, strict=True) if info["visib_fract"] >= 0.1]
         expected += [
-            {"im_id": frame, "inst_count": seen.count(obj_id), "obj_id": obj_id, "scene_id": scene} for obj_id in sorted(set(seen))
+            {"im_id": frame, "inst_count": visible.count(obj_id), "obj_id": obj_id, "scene_id": scene} for obj_id in sorted(set(visible))
         ]
     assert localize == expected
     assert {target["inst_count"] for target in localize} == {1, 2}
@@ -202,7 +202,7 @@ def test_camera_file(dataset):
 
 
 @pytest.mark.parametrize("folder", ["models", "models_eval"])
-def test_models_are_plain_ply_in_millimetres(dataset, folder):
+def test_models_are_toolkit_compatible_ply_in_millimetres(dataset, folder):
     infos = load(dataset / folder / "models_info.json")
     for obj_id, size in SIZES.items():
         path = dataset / folder / f"obj_{obj_id:06d}.ply"
@@ -218,12 +218,12 @@ def test_models_are_plain_ply_in_millimetres(dataset, folder):
     assert "comment TextureFile obj_000003.png" in (dataset / folder / "obj_000003.ply").read_bytes().split(b"end_header")[0].decode()
 
 
-def test_the_same_frames_give_the_same_bytes_whatever_the_number_of_processes(dataset, tmp_path):
+def test_bytes_do_not_depend_on_the_number_of_processes(dataset, tmp_path):
     for processes in (0, 2):
         assert digests(make(tmp_path / str(processes), processes)) == digests(dataset)
 
 
-def test_effects_that_are_on_are_told_and_a_views_jpeg_quality_is_its_own(tmp_path):
+def test_active_effects_are_recorded_and_jpeg_quality_is_per_view(tmp_path):
     effects = Effects(exposure_jitter=1.0, blur=(0.0, 2.0), jpeg_quality=(5, 40))
     export(BopExporter, tmp_path / "set", replace(config(), effects=effects), (0,), 0)
     for scene in range(3):
@@ -233,7 +233,7 @@ def test_effects_that_are_on_are_told_and_a_views_jpeg_quality_is_its_own(tmp_pa
             first = float(10 * scene + frame)
             assert record["effects"] == {"exposure": first, "blur": first + 5, "jpeg_quality": first + 8}
             assert record["light"] == light_of(0)
-            picture = next(batch.color[0] for batch, name, number in rows() if name == f"{scene:06d}" and number == frame)
+            picture = next(batch.color[0] for batch, name, index in rows() if name == f"{scene:06d}" and index == frame)
             quality = (cv2.IMWRITE_JPEG_QUALITY, int(first) + 8)
             expected = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), quality)[1].tobytes()
             assert (folder / "rgb" / f"{frame:06d}.jpg").read_bytes() == expected
@@ -247,7 +247,7 @@ def test_png_colour_without_masks_and_coco(tmp_path):
     assert names == {"rgb", "depth", "scene_camera.json", "scene_gt.json", "scene_gt_info.json"}
 
 
-def test_an_episode_that_never_ended_is_left_out(tmp_path):
+def test_an_episode_without_end_is_not_committed(tmp_path):
     with exporting(BopExporter, tmp_path / "set", config()) as exporter:
         exporter.write_constants()
         for batch in batches(5, (1,), 2, LENSES):
@@ -257,7 +257,7 @@ def test_an_episode_that_never_ended_is_left_out(tmp_path):
     assert load(tmp_path / "set/test_targets_bop19.json") == load(tmp_path / "set/test_targets_bop24.json") == []
 
 
-def lose_a_writer(out: Path) -> None:
+def kill_a_writer(out: Path) -> None:
     with exporting(BopExporter, out, config()) as exporter:
         exporter.write_constants()
         pool = export_context(exporter).pool
@@ -268,13 +268,13 @@ def lose_a_writer(out: Path) -> None:
             feed(exporter, (1,))
 
 
-def test_a_killed_writer_is_reported_and_whole_scenes_stay(tmp_path):
+def test_a_killed_writer_is_reported_and_committed_scenes_stay(tmp_path):
     with pytest.raises(OutputError, match="a writer process was ended by SIGKILL"):
-        lose_a_writer(tmp_path)
+        kill_a_writer(tmp_path)
     assert sorted(path.name for path in (tmp_path / "train_pbr").iterdir()) == ["000000", "000001", "000002"]
 
 
-def lose_a_frame(out: Path) -> None:
+def omit_a_frame(out: Path) -> None:
     with exporting(BopExporter, out, config()) as exporter:
         exporter.write_constants()
         for batch in batches(5, (0,), 3, LENSES):
@@ -283,7 +283,7 @@ def lose_a_frame(out: Path) -> None:
         finish(exporter)
 
 
-def test_records_come_in_any_order_and_each_frame_once(tmp_path):
+def test_annotation_blocks_are_sorted_and_checked_for_completeness(tmp_path):
     settings = SceneSettings("train_pbr", 3, 4, 3, ".jpg", True, (5,))
     for frames in ((2, 0, 1), (2, 0, 1, 0), (2, 0)):
         scene, place = tmp_path / "hidden", tmp_path / "-".join(map(str, frames))
@@ -306,9 +306,9 @@ def test_records_come_in_any_order_and_each_frame_once(tmp_path):
         assert not (place / ANNOTATIONS).exists()
 
 
-def test_a_missing_frame_is_no_whole_scene(tmp_path):
+def test_a_scene_with_a_missing_frame_is_not_committed(tmp_path):
     with pytest.raises(OutputError, match="has 3 of 4 frames"):
-        lose_a_frame(tmp_path)
+        omit_a_frame(tmp_path)
     assert list((tmp_path / "train_pbr").iterdir()) == []
 
 
@@ -322,7 +322,7 @@ def small_disk(tmp_path):
     subprocess.run(["umount", folder], check=True)
 
 
-def test_a_full_disk_ends_the_bake_with_one_line(small_disk):
+def test_a_full_disk_is_reported_in_one_line(small_disk):
     with pytest.raises(OutputError, match=r"cannot write .*: No space left on device") as caught:
         make(small_disk, episodes=tuple(range(20)), color_format="png")
     assert "\n" not in str(caught.value)
@@ -330,7 +330,7 @@ def test_a_full_disk_ends_the_bake_with_one_line(small_disk):
         assert len(list((scene / "rgb").iterdir())) == len(load(scene / "scene_gt.json")) == FRAMES
 
 
-def test_output_folders_that_cannot_be_used(tmp_path):
+def test_unusable_output_folders_are_refused(tmp_path):
     (tmp_path / "file").write_text("")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "note").write_text("")
@@ -345,7 +345,7 @@ def test_output_folders_that_cannot_be_used(tmp_path):
     assert digests(tmp_path) == before
 
 
-def test_preparing_leaves_nothing_behind(tmp_path):
+def test_checking_an_output_folder_leaves_nothing_behind(tmp_path):
     check_output_folder(tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "c").mkdir()
@@ -353,7 +353,7 @@ def test_preparing_leaves_nothing_behind(tmp_path):
     assert list((tmp_path / "c").iterdir()) == []
 
 
-def from_file(path: Path) -> Catalog:
+def catalog_from_file(path: Path) -> Catalog:
     entry = catalog().entries[0]
     return Catalog((type(entry)(**{**entry.__dict__, "source": path}),))
 
@@ -366,9 +366,9 @@ def test_bop_models_are_copied_byte_for_byte(tmp_path):
     info = {"diameter": 197.98, "min_x": -80.0, "note": "kept"}
     (source / "models_info.json").write_text(json.dumps({"3": info}))
     with pytest.raises(CatalogError, match=r"names the texture label\.png"):
-        write_models(tmp_path / "without", from_file(source / "obj_000003.ply"))
+        write_models(tmp_path / "without", catalog_from_file(source / "obj_000003.ply"))
     (source / "label.png").write_bytes(b"any bytes")
-    write_models(tmp_path / "models", from_file(source / "obj_000003.ply"))
+    write_models(tmp_path / "models", catalog_from_file(source / "obj_000003.ply"))
     assert (tmp_path / "models/obj_000003.ply").read_bytes() == model
     assert (tmp_path / "models/label.png").read_bytes() == b"any bytes"
     assert load(tmp_path / "models/models_info.json") == {"3": info}

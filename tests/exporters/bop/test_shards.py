@@ -1,4 +1,4 @@
-"""Shards, written by the real pool from frames of boxes, and read back with webdataset, tarfile, OpenCV and pycocotools."""
+"""Webdataset shards written by the real pool from views of boxes, read back with webdataset, tarfile, OpenCV and pycocotools."""
 
 from __future__ import annotations
 
@@ -28,12 +28,10 @@ FRAMES = 3
 SCENES = (0, 1, 2, 6, 7, 8)
 LENSES = cameras()
 LAYERS = ("flow", "classes")
-KINDS = ("rgb.jpg", "depth.png", "camera.json", "gt.json", "gt_info.json", "mask.json", "mask_visib.json")
+ENTRIES = ("rgb.jpg", "depth.png", "camera.json", "gt.json", "gt_info.json", "mask.json", "mask_visib.json")
 
 
 class TestShardsContract(ExporterContract):
-    """Shards are whole or not there."""
-
     exporter_class = ShardsExporter
 
     @classmethod
@@ -52,7 +50,7 @@ def split(dataset) -> Path:
 
 
 def samples(split: Path) -> dict[str, dict[str, bytes]]:
-    """All views by key, as `webdataset.WebDataset` reads them; but for its opener, which leaves files open."""
+    """All views by key, as `webdataset.WebDataset` reads them, but without its opener, which leaves files open."""
     with contextlib.ExitStack() as stack:
         shards = [{"url": str(path), "stream": stack.enter_context(path.open("rb"))} for path in sorted(split.glob("shard-*.tar"))]
         read = list(tariterators.group_by_keys(tariterators.tar_file_expander(shards)))
@@ -65,35 +63,35 @@ def decode(data: bytes) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
-def test_there_is_one_shard_a_scene_and_what_bop_has_beside_scenes(dataset, split):
+def test_one_shard_per_scene_and_bops_common_files(dataset, split):
     assert {path.name for path in split.iterdir()} == {"key_to_shard.json", *(f"shard-{scene:06d}.tar" for scene in SCENES)}
     assert {path.name for path in dataset.iterdir()} == {"camera.json", "dataset_info.md", "models", "models_eval", "train_pbr_web"}
 
 
-def test_webdataset_reads_what_the_frames_hold(split):
+def test_webdataset_reads_back_the_views(split):
     views = samples(split)
     assert list(views) == [f"{scene:06d}_{frame:06d}" for scene in SCENES for frame in range(FRAMES)]
     for batch in batches(1, EPISODES, FRAMES, LENSES):
         view = views[f"{3 * int(batch.episode[0]) + int(batch.camera[0]):06d}_{int(batch.frame[0]):06d}"]
-        assert {name for name in view if not name.startswith("__")} == set(KINDS)
+        assert {name for name in view if not name.startswith("__")} == set(ENTRIES)
         np.testing.assert_array_equal(decode(view["depth.png"]), batch.depth[0])
         assert np.median(np.abs(decode(view["rgb.jpg"])[..., ::-1].astype(int) - batch.color[0])) <= 3
         truth = json.loads(view["gt.json"])
         assert [record["instance_id"] for record in truth] == [0, 2, 3]
         for index, record in enumerate(truth):
             instance = record["instance_id"]
-            for kind, expected in (("mask", batch.amodal[0] >> np.uint32(instance) & 1), ("mask_visib", batch.instance[0] == 1 + instance)):
-                np.testing.assert_array_equal(toolkit_mask(json.loads(view[f"{kind}.json"])[str(index)]), expected)
+            for name, expected in (("mask", batch.amodal[0] >> np.uint32(instance) & 1), ("mask_visib", batch.instance[0] == 1 + instance)):
+                np.testing.assert_array_equal(toolkit_mask(json.loads(view[f"{name}.json"])[str(index)]), expected)
 
 
 def toolkit_mask(record: dict) -> np.ndarray:
-    """As bop_toolkit_lib.pycoco_utils.rle_to_binary_mask: in turn False and True, down the columns."""
+    """Decode like bop_toolkit_lib.pycoco_utils.rle_to_binary_mask: column-major runs that alternate between False and True."""
     counts = record["counts"]
     return np.repeat(np.arange(len(counts)) % 2 == 1, counts).reshape(record["size"], order="F")
 
 
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
-def test_a_view_says_the_same_as_the_folders_of_bop(split, tmp_path):
+def test_views_equal_those_of_the_bop_format(split, tmp_path):
     folders = export(BopExporter, tmp_path / "set", config(), EPISODES) / "train_pbr"
     for key, view in samples(split).items():
         scene, frame = key.split("_")
@@ -116,27 +114,27 @@ def test_a_view_says_the_same_as_the_folders_of_bop(split, tmp_path):
                     assert infos[int(index)]["px_count_visib"] == coco.area(compressed)
 
 
-def test_layers_lie_with_their_views_and_are_bops(tmp_path):
+def test_layers_equal_those_of_the_bop_format(tmp_path):
     folders = export(BopExporter, tmp_path / "bop", config(LAYERS), (2,)) / "train_pbr"
     views = samples(export(ShardsExporter, tmp_path / "shards", config(LAYERS), (2,)) / "train_pbr_web")
     assert list(views) == [f"{scene:06d}_{frame:06d}" for scene in (6, 7, 8) for frame in range(FRAMES)]
     for key, view in views.items():
         scene, frame = key.split("_")
-        assert [name for name in view if not name.startswith("__")] == [*KINDS, "flow.png", "classes.png"]
+        assert [name for name in view if not name.startswith("__")] == [*ENTRIES, "flow.png", "classes.png"]
         for name in LAYERS:
             assert view[f"{name}.png"] == (folders / scene / name / f"{frame}.png").read_bytes()
 
 
-def test_keys_lead_to_shards(split):
+def test_key_index_leads_to_shards(split):
     keys = json.loads((split / "key_to_shard.json").read_text())
     assert list(keys) == list(samples(split))
-    for key, number in keys.items():
-        with tarfile.open(split / f"shard-{number:06d}.tar") as shard:
-            for kind in KINDS:
-                assert shard.extractfile(f"{key}.{kind}").read()
+    for key, index in keys.items():
+        with tarfile.open(split / f"shard-{index:06d}.tar") as shard:
+            for entry in ENTRIES:
+                assert shard.extractfile(f"{key}.{entry}").read()
 
 
-def test_tar_files_hold_nothing_of_the_machine_and_end_as_they_must(split):
+def test_tar_files_are_reproducible_and_well_formed(split):
     for path in split.glob("*.tar"):
         with tarfile.open(path) as shard:
             for info in shard:
@@ -144,14 +142,17 @@ def test_tar_files_hold_nothing_of_the_machine_and_end_as_they_must(split):
         data = path.read_bytes()
         assert len(data) % 512 == 0
         assert not any(data[-1024:])
-        made = io.BytesIO()
-        with tarfile.open(fileobj=io.BytesIO(data)) as shard, tarfile.open(fileobj=made, mode="w", format=tarfile.USTAR_FORMAT) as again:
+        copy = io.BytesIO()
+        with (
+            tarfile.open(fileobj=io.BytesIO(data)) as shard,
+            tarfile.open(fileobj=copy, mode="w", format=tarfile.USTAR_FORMAT) as again,
+        ):
             for info in shard:
                 again.addfile(info, shard.extractfile(info))
-        assert made.getvalue().rstrip(b"\0") == data.rstrip(b"\0")
+        assert copy.getvalue().rstrip(b"\0") == data.rstrip(b"\0")
 
 
-def test_a_view_without_objects_is_there(tmp_path):
+def test_views_without_objects_are_written(tmp_path):
     with exporting(ShardsExporter, tmp_path, config()) as exporter:
         exporter.write_constants()
         for batch in batches(5, (1,), 1, LENSES):
@@ -168,8 +169,8 @@ def test_a_view_without_objects_is_there(tmp_path):
 def test_png_colour_without_masks(tmp_path):
     out = export(ShardsExporter, tmp_path, config(split="test", color_format="png", masks=False), (0,), frames=1)
     with tarfile.open(out / "test_web" / "shard-000000.tar") as shard:
-        kinds = ("rgb.png", "depth.png", "camera.json", "gt.json", "gt_info.json")
-        assert shard.getnames() == [f"000000_000000.{kind}" for kind in kinds]
+        entries = ("rgb.png", "depth.png", "camera.json", "gt.json", "gt_info.json")
+        assert shard.getnames() == [f"000000_000000.{entry}" for entry in entries]
         np.testing.assert_array_equal(
             decode(shard.extractfile("000000_000000.rgb.png").read())[..., ::-1], next(batches(1, (0,), 1, LENSES)).color[0]
         )
@@ -194,11 +195,11 @@ def test_a_long_scene_has_several_shards(tmp_path, dataset, monkeypatch):
     views = samples(split)
     for key, view in samples(dataset / "train_pbr_web").items():
         if key in views:
-            assert all(view[kind] == views[key][kind] for kind in KINDS)
+            assert all(view[entry] == views[key][entry] for entry in ENTRIES)
     assert len(views) == 3 * FRAMES
 
 
-def test_an_empty_data_set_has_an_empty_list(tmp_path):
+def test_an_empty_data_set_has_an_empty_key_index(tmp_path):
     with exporting(ShardsExporter, tmp_path, config()) as exporter:
         exporter.write_constants()
         assert finish(exporter) == [Path("train_pbr_web/key_to_shard.json")]
@@ -206,7 +207,7 @@ def test_an_empty_data_set_has_an_empty_list(tmp_path):
     assert set(digests(tmp_path / "train_pbr_web")) == {"key_to_shard.json"}
 
 
-def test_constants_that_bop_has_as_well_are_named_once(tmp_path):
+def test_files_shared_with_the_bop_format_are_listed_once(tmp_path):
     with exporting(ShardsExporter, tmp_path, config()) as exporter:
         constants = Exporters((BopExporter, ShardsExporter), export_context(exporter)).write_constants()
     assert sorted(map(str, constants)) == ["camera.json", "dataset_info.md", "models", "models_eval"]

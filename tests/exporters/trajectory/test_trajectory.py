@@ -1,4 +1,4 @@
-"""The zarr store: the exporters' contract, and everything in it as plain zarr reads it, against what was in memory."""
+"""Zarr store: exporter contract, and its content as read by plain zarr, compared with the batches that were written."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.worlds.trajectories import ATTEMPT, STEP_COUNT, UNSEEN, config, ends,
 EPISODES = (0, 4)
 FRAMES = 2 * SPOOL_TICKS + 3
 INSTANCES = 4
-"""One more than the index of the last that box_views has."""
+"""1 + the largest instance index in box_views."""
 
 
 class TestContract(ExporterContract):
@@ -45,14 +45,14 @@ def arrays(group: zarr.Group) -> dict[str, zarr.Array]:
     return {path: member for path, member in group.members(max_depth=None) if isinstance(member, zarr.Array)}
 
 
-def taken(episode: int) -> list:
-    """The episode's ticks, as memory has them."""
+def written_batches(episode: int) -> list:
+    """Tick batches of an episode."""
     return list(ticks((episode,), FRAMES))
 
 
 @pytest.mark.parametrize("episode", EPISODES)
-def test_ticks_are_those_in_memory(store, episode):
-    group, batches = store[f"{tables.EPISODES}/{episode:06d}/ticks"], taken(episode)
+def test_ticks_equal_the_batches(store, episode):
+    group, batches = store[f"{tables.EPISODES}/{episode:06d}/ticks"], written_batches(episode)
     assert set(group.array_keys()) == set(tables.TICKS.arrays)
     for name in tables.TICKS.arrays:
         memory = np.concatenate([batch.tick.get(name, getattr(batch, name, None)) for batch in batches])
@@ -64,8 +64,8 @@ def test_ticks_are_those_in_memory(store, episode):
 
 
 @pytest.mark.parametrize("episode", EPISODES)
-def test_steps_are_those_in_memory(store, episode):
-    group, batches = store[f"{tables.EPISODES}/{episode:06d}/steps"], taken(episode)
+def test_steps_equal_the_batches(store, episode):
+    group, batches = store[f"{tables.EPISODES}/{episode:06d}/steps"], written_batches(episode)
     assert set(group.array_keys()) == set(tables.STEPS.arrays)
     for name in set(tables.STEPS.arrays) - {"time"}:
         memory = np.concatenate([batch.steps[name][0] for batch in batches])
@@ -74,7 +74,7 @@ def test_steps_are_those_in_memory(store, episode):
         np.testing.assert_array_equal(group[name][:], memory, err_msg=name)
 
 
-def test_a_steps_time_is_at_its_end(store):
+def test_step_times_are_ends_of_steps(store):
     episode = store[f"{tables.EPISODES}/000004"]
     step, time = store.attrs["step"], episode["steps/time"][:]
     assert len(time) == FRAMES * STEP_COUNT
@@ -82,7 +82,7 @@ def test_a_steps_time_is_at_its_end(store):
     np.testing.assert_allclose(np.diff(time.reshape(FRAMES, STEP_COUNT)), step, rtol=1e-9)
 
 
-def test_what_an_episode_says_of_itself(store):
+def test_episode_attributes_and_arrangement(store):
     episode = store[f"{tables.EPISODES}/000004"]
     attributes = dict(episode.attrs)
     light = attributes.pop("light")
@@ -101,24 +101,24 @@ def test_what_an_episode_says_of_itself(store):
     }
     np.testing.assert_array_equal(episode["arrangement/object_id"][:], box_views.OBJECT_IDS[:INSTANCES])
     np.testing.assert_array_equal(episode["arrangement/mass"][:], [0.3, np.nan, 0.3, 0.3])
-    drops = taken(4)[0].tick["drop_pose"][0, :INSTANCES]
+    drops = written_batches(4)[0].tick["drop_pose"][0, :INSTANCES]
     drops[1] = np.nan
     np.testing.assert_array_equal(episode["arrangement/drop_pose"][:], drops)
 
 
 def test_attempts_as_columns(store):
     attempts = store[f"{tables.EPISODES}/000000/attempts"]
-    found = {name: attempts[name][:].tolist() for name in attempts.array_keys()}
-    lines = [json.loads(line) for line in bytes(found.pop("record")).splitlines()]
+    columns = {name: attempts[name][:].tolist() for name in attempts.array_keys()}
+    lines = [json.loads(line) for line in bytes(columns.pop("record")).splitlines()]
     assert lines == [ATTEMPT, UNSEEN]
-    assert found["outcome"] == [Outcome.TARGET_PICKED, Outcome.NOTHING_SEEN]
-    assert (found["target"], found["object_id"], found["frame"], found["end_frame"]) == ([2, -1], [7, -1], [1, 6], [5, 7])
-    assert (found["point"][0], found["normal"][0], found["yaw"][0], found["tilt"][0]) == ([0.1, 0.2, 0.3], [0, 0, 1], 0.25, -0.5)
-    assert np.isnan(found["point"][1]).all()
-    assert np.isnan(found["yaw"][1])
-    assert found["caught"] == [[False, False, True, False], [False] * 4]
-    assert found["picked"] == [[False, False, True, True], [False] * 4]
-    np.testing.assert_array_equal(found["load"], [[0.0, 3.25], [np.nan, np.nan]])
+    assert columns["outcome"] == [Outcome.TARGET_PICKED, Outcome.NOTHING_SEEN]
+    assert (columns["target"], columns["object_id"], columns["frame"], columns["end_frame"]) == ([2, -1], [7, -1], [1, 6], [5, 7])
+    assert (columns["point"][0], columns["normal"][0], columns["yaw"][0], columns["tilt"][0]) == ([0.1, 0.2, 0.3], [0, 0, 1], 0.25, -0.5)
+    assert np.isnan(columns["point"][1]).all()
+    assert np.isnan(columns["yaw"][1])
+    assert columns["caught"] == [[False, False, True, False], [False] * 4]
+    assert columns["picked"] == [[False, False, True, True], [False] * 4]
+    np.testing.assert_array_equal(columns["load"], [[0.0, 3.25], [np.nan, np.nan]])
 
 
 def test_an_episode_without_attempts_has_empty_columns(tmp_path):
@@ -134,9 +134,9 @@ def test_an_episode_without_attempts_has_empty_columns(tmp_path):
     assert set(attempts.array_keys()) == set(tables.ATTEMPTS.arrays)
 
 
-def test_columns_of_attempts_have_the_tables_types():
-    made = make_attempt_arrays([ATTEMPT], 4)
-    assert {name: values.dtype.str for name, values in made.items()} == {name: one.dtype for name, one in tables.ATTEMPTS.arrays.items()}
+def test_columns_of_attempts_have_the_schemas_types():
+    columns = make_attempt_arrays([ATTEMPT], 4)
+    assert {name: values.dtype.str for name, values in columns.items()} == {name: one.dtype for name, one in tables.ATTEMPTS.arrays.items()}
 
 
 def test_objects_and_cameras(store):
@@ -152,12 +152,12 @@ def test_objects_and_cameras(store):
     assert cameras["resolution"][:].tolist() == [[lens.width, lens.height] for lens in lenses]
 
 
-def test_every_array_says_what_it_is(store):
-    """Unit, meaning, and a name for each dimension; every group a description."""
-    found = arrays(store)
+def test_every_array_has_unit_description_and_dimension_names(store):
+    """And every group has a description."""
+    stored = arrays(store)
     once, each = (sum(len(doc.arrays) for doc in docs.values()) for docs in (tables.CONSTANT_GROUPS, tables.EPISODE_GROUPS))
-    assert len(found) == once + len(EPISODES) * each
-    for path, array in found.items():
+    assert len(stored) == once + len(EPISODES) * each
+    for path, array in stored.items():
         assert array.attrs["unit"], path
         assert array.attrs["description"].endswith("."), path
         names = array.metadata.dimension_names
@@ -171,14 +171,14 @@ def test_every_array_says_what_it_is(store):
             assert group.attrs["description"].endswith("."), path
 
 
-def test_dimensions_of_one_name_have_one_extent(store):
-    """Within an episode, as xarray wants it, but for what is of no fixed number."""
+def test_equally_named_dimensions_have_equal_sizes(store):
+    """Within an episode, as xarray requires."""
     for episode in EPISODES:
         extents: dict[str, set[int]] = {}
         for array in arrays(store[f"{tables.EPISODES}/{episode:06d}"]).values():
             for name, extent in zip(array.metadata.dimension_names, array.shape, strict=True):
                 extents.setdefault(name, set()).add(extent)
-        assert {name: len(found) for name, found in extents.items()} == dict.fromkeys(extents, 1)
+        assert {name: len(sizes) for name, sizes in extents.items()} == dict.fromkeys(extents, 1)
 
 
 def test_the_store_is_sharded_and_compressed_by_zstd(store):
@@ -188,11 +188,11 @@ def test_the_store_is_sharded_and_compressed_by_zstd(store):
     assert pose.metadata.zarr_format == 3
 
 
-def test_two_writes_are_identical_whatever_writes_them(tmp_path, folder):
+def test_bytes_do_not_depend_on_processes_or_order(tmp_path, folder):
     assert digests(write_set(tmp_path, config(), EPISODES[::-1], FRAMES, processes=0)) == digests(folder)
 
 
-def test_without_steps_there_are_ticks_alone(tmp_path):
+def test_without_recorded_steps_there_is_no_group_of_steps(tmp_path):
     write_set(tmp_path, config(steps=False), (0,), 3, steps=False)
     episode = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000", mode="r")
     assert set(episode.group_keys()) == set(tables.EPISODE_GROUPS) - {"steps"}
@@ -207,7 +207,7 @@ def test_missing_frames_are_an_error(tmp_path):
             exporter.end_episode(ends((0,), 3)[0], lambda: None)
 
 
-def test_an_array_that_nothing_describes_is_an_error(tmp_path):
+def test_an_array_missing_from_the_schema_is_an_error(tmp_path):
     (batch,) = ticks((0,), 1)
     batch.steps["magic"] = batch.steps["goal"]
     with exporting(TrajectoryExporter, tmp_path, config()) as exporter, pytest.raises(ValueError, match="magic"):
@@ -216,15 +216,15 @@ def test_an_array_that_nothing_describes_is_an_error(tmp_path):
 
 @given(ticks=st.integers(0, 5000), chunk=st.integers(1, 64), chunks=st.integers(1, 64), rows=st.integers(1, 40))
 @settings(max_examples=200)
-def test_files_are_whole_chunks_of_whole_ticks_and_no_larger_than_needed(ticks, chunk, chunks, rows):
-    made, shard = chunk_layout(trajectories.config(chunk_ticks=chunk, shard_chunks=chunks).trajectory, ticks, rows)
-    assert made == chunk * rows
-    assert shard % made == 0
-    assert shard <= chunks * made
-    assert shard - made < max(1, ticks * rows)
+def test_shards_hold_whole_chunks_of_whole_ticks_and_no_more_than_needed(ticks, chunk, chunks, rows):
+    rows_per_chunk, shard = chunk_layout(trajectories.config(chunk_ticks=chunk, shard_chunks=chunks).trajectory, ticks, rows)
+    assert rows_per_chunk == chunk * rows
+    assert shard % rows_per_chunk == 0
+    assert shard <= chunks * rows_per_chunk
+    assert shard - rows_per_chunk < max(1, ticks * rows)
 
 
-def test_an_episode_without_instances_has_empty_axes(tmp_path):
+def test_an_episode_without_instances_has_empty_dimensions(tmp_path):
     (batch,) = ticks((0,), 1)
     batch.object_id.fill(-1)
     with exporting(TrajectoryExporter, tmp_path, config(), processes=0) as exporter:

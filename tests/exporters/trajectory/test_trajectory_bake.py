@@ -1,4 +1,4 @@
-"""A bake with the format zarr: the laws of motion hold in what is read back, and the number of worlds changes no byte of it."""
+"""Bake in zarr format: recorded trajectories obey the laws of motion, and bytes do not depend on the number of worlds."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TOOL = "tools.checks.trajectory"
 
 @pytest.fixture(scope="module")
 def mixed() -> Config:
-    """One episode that picks and others of any mode, in some seconds."""
+    """Settings of a mixed bake that takes some seconds and includes an episode of picking."""
     return settings(
         **SHORT
         | {
@@ -49,11 +49,11 @@ def mixed() -> Config:
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory, mixed) -> Path:
-    """A finished bake of boxes; beside it one of another number of worlds."""
+    """A finished bake of boxes; beside it the same with another number of worlds."""
     folder = tmp_path_factory.mktemp("bake") / "set"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
-        # Nobody asks for pictures.
+        # No format needs images.
         patch.setattr(FrameStream, "render", lambda *_: pytest.fail("views were rendered"))
         run_bake(mixed, folder, SilentProgress())
         run_bake(replace(mixed, bake=replace(mixed.bake, worlds=3)), folder.with_name("again"), SilentProgress())
@@ -67,7 +67,7 @@ def check(monkeypatch, *arguments: object) -> int:
     return ended.value.code
 
 
-def test_another_number_of_worlds_gives_the_same_bytes(out):
+def test_bytes_do_not_depend_on_the_number_of_worlds(out):
     assert digests(out / "trajectory.zarr") == digests(out.with_name("again") / "trajectory.zarr")
 
 
@@ -86,7 +86,7 @@ def test_the_laws_of_motion_hold(out, monkeypatch, capsys):
         ("steps/seal_load", "largest load of a tick"),
     ],
 )
-def test_what_is_wrong_is_found(out, tmp_path, monkeypatch, capsys, array, what):
+def test_corrupted_arrays_violate_the_laws_of_motion(out, tmp_path, monkeypatch, capsys, array, what):
     picking = next(episode for episode in synpick_warp.open(out).values() if episode.attributes["mode"] != "move")
     shutil.copytree(out, tmp_path / "set")
     one = zarr.open_array(tmp_path / "set" / f"trajectory.zarr/episodes/{picking.number:06d}" / array, mode="r+")
@@ -117,11 +117,11 @@ def test_what_is_opened_is_what_was_baked(out, mixed):
         there = episode.ticks["object_id"][:] >= 0
         assert (there[0].sum(), there[-1].sum()) == (row["objects"], row["left"])
         assert episode.steps["time"].shape == (16 * row["frames"],)
-        kinds = episode.arrangement["object_id"][:]
-        np.testing.assert_allclose(episode.arrangement["mass"][:], [data.objects[kind - 1].mass for kind in kinds])
+        obj_ids = episode.arrangement["object_id"][:]
+        np.testing.assert_allclose(episode.arrangement["mass"][:], [data.objects[obj_id - 1].mass for obj_id in obj_ids])
 
 
-def test_the_table_of_memory_counts_what_is_recorded(mixed):
+def test_the_memory_table_counts_recorded_arrays(mixed):
     """What a tick is written into, and two records; none for formats that ask for none."""
     mixed = replace(mixed, bake=replace(mixed.bake, device="cpu"))  # A GPU gets at least eight worlds.
     rows = [row for row in pipeline.describe_arrays(mixed) if row[0] == "StepArrays.pose"]

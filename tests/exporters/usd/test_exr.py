@@ -1,4 +1,4 @@
-"""EXR files: read back by a decoder written from the format's description, and by OpenEXR's own where it is installed."""
+"""OpenEXR encoder: read back by a decoder written from the specification, and by the OpenEXR library if installed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from synpick_warp.exporters.usd.exr import encode_exr
 
 
 def decode(data: bytes) -> np.ndarray:
-    """(H, W, 3) of a file with 32-bit channels B, G, R and ZIP."""
+    """Decode a file with 32-bit channels B, G, R and ZIP compression to (H, W, 3)."""
     assert struct.unpack_from("<2i", data) == (20000630, 2)
     at, attributes = 8, {}
     while data[at]:
@@ -45,28 +45,28 @@ def decode(data: bytes) -> np.ndarray:
     return image
 
 
-def picture(height: int, width: int, seed: int, noisy: bool) -> np.ndarray:
-    """Several orders of magnitude, or large even places."""
+def make_image(height: int, width: int, seed: int, noisy: bool) -> np.ndarray:
+    """Image with values over several orders of magnitude, or with large even areas."""
     noise = np.exp(np.random.default_rng(seed).normal(0.0, 4.0, (height, width, 3))).astype(np.float32)
     return noise if noisy else np.round(np.log(noise)).astype(np.float32) ** 2
 
 
 @given(st.integers(1, 40), st.integers(1, 20), st.integers(0, 1000), st.booleans())
-def test_pixels_come_back(height, width, seed, noisy):
-    image = picture(height, width, seed, noisy)
+def test_round_trip(height, width, seed, noisy):
+    image = make_image(height, width, seed, noisy)
     data = encode_exr(image)
     np.testing.assert_array_equal(decode(data), image)
     assert encode_exr(image) == data
 
 
-def test_even_places_are_packed():
+def test_even_areas_are_compressed():
     assert len(encode_exr(np.ones((64, 128, 3), np.float32))) < 2000
 
 
 @pytest.mark.parametrize("noisy", [False, True])
-def test_the_formats_own_library_reads_it(tmp_path, noisy):
+def test_the_openexr_library_reads_it(tmp_path, noisy):
     library = pytest.importorskip("OpenEXR")
-    image = picture(37, 50, 1, noisy)
+    image = make_image(37, 50, 1, noisy)
     (tmp_path / "map.exr").write_bytes(encode_exr(image))
     file = library.File(str(tmp_path / "map.exr"))
     np.testing.assert_array_equal(file.channels()["RGB"].pixels, image)
@@ -74,6 +74,6 @@ def test_the_formats_own_library_reads_it(tmp_path, noisy):
 
 
 @pytest.mark.parametrize("shape", [(4, 4), (4, 4, 4), (0, 4, 3)])
-def test_other_images_are_refused(shape):
+def test_unsupported_images_are_refused(shape):
     with pytest.raises(ValueError, match="no EXR"):
         encode_exr(np.zeros(shape, np.float32))

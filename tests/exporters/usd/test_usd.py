@@ -1,4 +1,4 @@
-"""USD data sets as files: the exporters' contract, assets, references, and what USD's validators say."""
+"""USD data sets as files: exporter contract, assets, references, and USD's own validators."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def folder(tmp_path_factory, config) -> Path:
 
 
 def layers(folder: Path) -> list[Path]:
-    """Every file that USD reads."""
+    """All layer files."""
     return sorted(folder.rglob("*.usdc"))
 
 
@@ -67,13 +67,13 @@ except OutputError as error:
 """
 
 
-def test_a_file_that_is_cut_short_is_an_error(tmp_path):
-    """In a process of its own, since the limit holds for all that one writes."""
-    done = subprocess.run((sys.executable, "-c", LIMITED, str(tmp_path / "thing.usdc")), capture_output=True, text=True)
-    assert done.stderr == f"cannot write {tmp_path / 'thing.usdc'}: File too large; free space or rights there\n"
+def test_a_truncated_file_is_an_error(tmp_path):
+    """In a separate process, since the file size limit applies to the whole process."""
+    limited = subprocess.run((sys.executable, "-c", LIMITED, str(tmp_path / "thing.usdc")), capture_output=True, text=True)
+    assert limited.stderr == f"cannot write {tmp_path / 'thing.usdc'}: File too large; free space or rights there\n"
 
 
-def test_an_episode_is_a_file_and_assets_are_shared(folder):
+def test_one_file_per_episode_and_shared_assets(folder):
     names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assert names == {
         "000000.usdc",
@@ -91,8 +91,8 @@ def test_two_bakes_are_identical(tmp_path, folder, config):
     assert digests(again) == digests(folder)
 
 
-def test_all_references_are_relative_and_lead_somewhere(folder):
-    found = set()
+def test_references_are_relative_and_resolve(folder):
+    referenced = set()
     for path in layers(folder):
         for asset in Sdf.Layer.FindOrOpen(str(path)).GetExternalAssetDependencies():
             assert Path(asset).is_relative_to(folder)
@@ -101,12 +101,12 @@ def test_all_references_are_relative_and_lead_somewhere(folder):
         _, _, missing = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
         assert missing == []
         layers_used, assets, _ = UsdUtils.ComputeAllDependencies(Sdf.AssetPath(str(path)))
-        found |= {Path(layer.realPath) for layer in layers_used} | {Path(asset) for asset in assets}
-    # The map that no episode has is not referenced.
-    assert {path.resolve() for path in folder.rglob("*") if path.is_file()} - found == {folder / "assets/lights/light_000.exr"}
+        referenced |= {Path(layer.realPath) for layer in layers_used} | {Path(asset) for asset in assets}
+    # The environment map that no episode uses is not referenced.
+    assert {path.resolve() for path in folder.rglob("*") if path.is_file()} - referenced == {folder / "assets/lights/light_000.exr"}
 
 
-def test_a_data_set_may_be_moved(tmp_path, folder):
+def test_a_data_set_can_be_moved(tmp_path, folder):
     place = tmp_path / "elsewhere"
     place.mkdir()
     for path in folder.rglob("*"):
@@ -118,25 +118,25 @@ def test_a_data_set_may_be_moved(tmp_path, folder):
 
 def test_validators_find_nothing(folder):
     for path in layers(folder):
-        assert list(complaints(path)) == []
+        assert list(validation_errors(path)) == []
 
 
-def complaints(path: Path) -> Iterator[str]:
-    """What `usdchecker` would print: all validators that there are; in USD 26 they took the place of `UsdUtils.ComplianceChecker`."""
+def validation_errors(path: Path) -> Iterator[str]:
+    """Messages of all registered validators, as `usdchecker` prints them (USD 26; earlier: `UsdUtils.ComplianceChecker`)."""
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert len(validators) > 20
     for error in UsdValidation.ValidationContext(validators).Validate(Usd.Stage.Open(str(path))):
         yield f"{error.GetName()}: {error.GetMessage()}"
 
 
-def test_validators_would_find_something(tmp_path):
+def test_validators_find_a_broken_reference(tmp_path):
     stage = Usd.Stage.CreateNew(str(tmp_path / "bad.usda"))
     UsdGeom.Xform.Define(stage, "/Root").GetPrim().GetReferences().AddReference("./nowhere.usdc")
     stage.Save()
-    assert list(complaints(tmp_path / "bad.usda"))
+    assert list(validation_errors(tmp_path / "bad.usda"))
 
 
-def test_stages_say_their_units_and_times(folder, config):
+def test_stages_state_units_and_time_codes(folder, config):
     for path in layers(folder):
         stage = Usd.Stage.Open(str(path))
         assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
@@ -147,12 +147,12 @@ def test_stages_say_their_units_and_times(folder, config):
     rate = 1.0 / (config.physics.step * config.physics.steps_per_tick)
     assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == pytest.approx(rate)
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, usd_sets.FRAMES - 1)
-    facts = stage.GetDefaultPrim().GetCustomData()
-    assert facts.items() >= {"episode": 4, "redraw": 0, "frames": usd_sets.FRAMES, "ending": "emptied"}.items()
+    metadata = stage.GetDefaultPrim().GetCustomData()
+    assert metadata.items() >= {"episode": 4, "redraw": 0, "frames": usd_sets.FRAMES, "ending": "emptied"}.items()
 
 
 @pytest.mark.parametrize("entry", CATALOG.entries, ids=lambda entry: entry.name)
-def test_objects_have_their_meshes_and_surfaces(folder, entry):
+def test_objects_have_their_meshes_and_materials(folder, entry):
     stage = Usd.Stage.Open(str(folder / f"assets/obj_{entry.obj_id:06d}.usdc"))
     root = stage.GetDefaultPrim()
     assert root.GetCustomDataByKey("obj_id") == entry.obj_id
@@ -183,9 +183,9 @@ def test_objects_have_their_meshes_and_surfaces(folder, entry):
     assert reader.GetInput("varname").Get() == "st"
 
 
-def test_every_visible_mesh_has_a_surface_and_every_collider_friction(folder, config):
+def test_every_visible_mesh_has_a_material_and_every_collider_friction(folder, config):
     stage = Usd.Stage.Open(str(folder / "000000.usdc"))
-    seen = solid = 0
+    visible = solid = 0
     for prim in stage.Traverse():
         binding = UsdShade.MaterialBindingAPI(prim)
         if prim.HasAPI(UsdPhysics.CollisionAPI):
@@ -196,13 +196,13 @@ def test_every_visible_mesh_has_a_surface_and_every_collider_friction(folder, co
             if prim.IsA(UsdGeom.Mesh):
                 assert UsdPhysics.MeshCollisionAPI(prim).GetApproximationAttr().Get() == "convexHull"
         elif prim.IsA(UsdGeom.Gprim):
-            seen += 1
+            visible += 1
             assert binding.ComputeBoundMaterial()[0].ComputeSurfaceSource()[0]
     # Table, tote, finger, cup and three objects; a box, nine pieces, two, and four of the objects of which one has two.
-    assert (seen, solid) == (7, 1 + 9 + 2 + 4)
+    assert (visible, solid) == (7, 1 + 9 + 2 + 4)
 
 
-def test_without_a_table_in_the_pictures_it_only_collides(tmp_path):
+def test_a_table_that_is_not_rendered_only_collides(tmp_path):
     folder = usd_sets.write_set(tmp_path / "set", usd_sets.settings(render__table=False), CATALOG, frames=2)
     stage = Usd.Stage.Open(str(folder / "000000.usdc"))
     table = stage.GetPrimAtPath("/Episode/Table")
@@ -212,7 +212,7 @@ def test_without_a_table_in_the_pictures_it_only_collides(tmp_path):
     np.testing.assert_allclose(bounds.GetMax(), (10.0, 10.0, -0.0045), atol=1e-6)
 
 
-def test_lights_are_named_after_their_maps(folder):
+def test_dome_light_has_name_file_and_exposure_of_its_map(folder):
     stage = Usd.Stage.Open(str(folder / "000000.usdc"))
     dome = UsdLux.DomeLight.Get(stage, "/Episode/Lights/Dome")
     assert dome.GetPrim().GetDisplayName() == "mixed_lamps"

@@ -1,4 +1,4 @@
-"""A bake in BOP and USD at once: what USD's cameras see of USD's bodies is what BOP's masks show, pixel by pixel."""
+"""A bake in BOP and USD formats: bodies projected by USD's cameras match BOP's masks pixel by pixel."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from synpick_warp import pipeline
 from synpick_warp.configs.schema import Config
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
-from tests.exporters.usd.test_usd import complaints
+from tests.exporters.usd.test_usd import validation_errors
 from tests.harness.exporter_contract import digests
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import catalog, settings
 
 CAMERAS = 3
 NEAR = 0.02
-"""Pixels whose centre is so near to an outline may be in or out [px]: USD's lenses have 32 bits."""
+"""Tolerance at outlines [px]: pixels whose centres are nearer may be in or out, as USD's camera parameters have 32 bits."""
 
 
 @pytest.fixture(scope="module")
@@ -58,23 +58,23 @@ def out(tmp_path_factory, picking) -> Path:
     return folder
 
 
-def test_another_number_of_worlds_gives_the_same_bytes(out):
+def test_bytes_do_not_depend_on_the_number_of_worlds(out):
     assert (out / "usd/000000.usdc").exists()
     assert digests(out / "usd") == digests(out.with_name("again") / "usd")
 
 
 def test_validators_find_nothing(out):
     for path in sorted((out / "usd").rglob("*.usdc")):
-        assert list(complaints(path)) == []
+        assert list(validation_errors(path)) == []
 
 
 @pytest.mark.parametrize("camera", range(CAMERAS))
-def test_usd_shows_what_the_masks_show(out, picking, camera):
+def test_projected_bodies_match_the_masks(out, picking, camera):
     stage = Usd.Stage.Open(str(out / "usd/000000.usdc"))
     scene = out / picking.bop.split / f"{camera:06d}"
     truth = json.loads((scene / "scene_gt.json").read_text())
     assert stage.GetEndTimeCode() == len(truth) - 1
-    seen = 0
+    mask_pixels = 0
     for frame in range(len(truth)):
         lens = UsdGeom.Camera.Get(stage, f"/Episode/Cameras/camera_{camera}").GetCamera(frame).frustum
         view = np.array(lens.ComputeViewMatrix() * lens.ComputeProjectionMatrix())
@@ -86,19 +86,19 @@ def test_usd_shows_what_the_masks_show(out, picking, camera):
             depth = inside(prim, frame, view, mask.shape)
             assert not (mask & (depth < -NEAR)).any()
             assert not (~mask & (depth > NEAR)).any()
-            seen += mask.sum()
-    assert seen > 1000
+            mask_pixels += mask.sum()
+    assert mask_pixels > 1000
 
 
 def visible_objects(stage: Usd.Stage, frame: int) -> dict[int, Usd.Prim]:
-    """Prims of the objects that are there, by instance_id."""
+    """Prims of the visible objects, by instance_id."""
     prims = stage.GetPrimAtPath("/Episode/Objects").GetChildren()
-    there = [prim for prim in prims if UsdGeom.Imageable(prim).ComputeVisibility(frame) != UsdGeom.Tokens.invisible]
-    return {prim.GetCustomDataByKey("instance_id"): prim for prim in there}
+    visible = [prim for prim in prims if UsdGeom.Imageable(prim).ComputeVisibility(frame) != UsdGeom.Tokens.invisible]
+    return {prim.GetCustomDataByKey("instance_id"): prim for prim in visible}
 
 
 def inside(prim: Usd.Prim, frame: int, view: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """How far inside an object's outline the centres of pixels lie (H, W) [px]; negative: outside. Its pieces are convex."""
+    """Signed distance of pixel centres to an object's outline (H, W) [px], positive inside; the object is a union of convex pieces."""
     height, width = shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     best = np.full(shape, -np.inf)
@@ -112,7 +112,7 @@ def inside(prim: Usd.Prim, frame: int, view: np.ndarray, shape: tuple[int, int])
     return best
 
 
-def test_some_object_was_picked(out):
-    """Otherwise the test above would not see anything vanish."""
+def test_an_object_was_picked(out):
+    """Otherwise the test above would not cover objects that disappear."""
     rows = [json.loads(line) for line in (out / "episodes.jsonl").read_text().splitlines()]
     assert sum(row["picked"] for row in rows) > 0

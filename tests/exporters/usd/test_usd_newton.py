@@ -1,4 +1,4 @@
-"""Newton reads USD episodes back: the same bodies, masses, poses at the first frame, and collision shapes."""
+"""Newton imports USD episodes: same bodies, masses, poses of the first frame, and collision shapes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ PRESENT = [instance for instance, obj_id in enumerate(usd_sets.OBJECT_IDS) if ob
 
 @pytest.fixture(scope="module")
 def read(tmp_path_factory) -> newton.ModelBuilder:
-    """What Newton makes of an episode."""
+    """Builder of an episode imported by Newton."""
     folder = usd_sets.write_set(tmp_path_factory.mktemp("newton") / "set", CONFIG, CATALOG)
     builder = newton.ModelBuilder()
-    found = builder.add_usd(str(folder / "000000.usdc"))
-    assert found["up_axis"] == newton.Axis.Z
-    assert (found["mass_unit"], found["linear_unit"]) == (1.0, 1.0)
-    assert found["duration"] == usd_sets.FRAMES - 1
+    info = builder.add_usd(str(folder / "000000.usdc"))
+    assert info["up_axis"] == newton.Axis.Z
+    assert (info["mass_unit"], info["linear_unit"]) == (1.0, 1.0)
+    assert info["duration"] == usd_sets.FRAMES - 1
     return builder
 
 
@@ -42,7 +42,7 @@ def body_of(read: newton.ModelBuilder, name: str) -> int:
 
 
 def colliders(read: newton.ModelBuilder, body: int) -> list[int]:
-    """Shapes of a body that collide."""
+    """Colliding shapes of a body."""
     flag = newton.ShapeFlags.COLLIDE_SHAPES
     return [shape for shape in range(read.shape_count) if read.shape_body[shape] == body and read.shape_flags[shape] & flag]
 
@@ -59,7 +59,7 @@ def sort(vertices: np.ndarray) -> np.ndarray:
     return vertices[np.lexsort(rounded.T)]
 
 
-def test_there_are_the_same_bodies(read):
+def test_bodies_are_the_same(read):
     names = {"/Episode/Gripper/Finger", "/Episode/Gripper/Cup", *(f"/Episode/Objects/instance_{instance:02d}" for instance in PRESENT)}
     assert set(read.body_label) == names
     assert read.body_count == len(names)
@@ -67,28 +67,28 @@ def test_there_are_the_same_bodies(read):
 
 
 @pytest.mark.parametrize("instance", PRESENT)
-def test_objects_weigh_and_stand_as_they_did(read, instance):
+def test_objects_have_mass_inertia_and_pose(read, instance):
     body, entry = body_of(read, f"Objects/instance_{instance:02d}"), entry_of(instance)
     assert read.body_mass[body] == pytest.approx(entry.mass)
     np.testing.assert_allclose(read.body_com[body], entry.center_of_mass, atol=1e-7)
     np.testing.assert_allclose(np.reshape(read.body_inertia[body], (3, 3)), entry.inertia, atol=1e-6 * np.trace(entry.inertia))
-    same_pose(np.array(read.body_q[body]), TICK.pose[0, instance])
+    assert_same_pose(np.array(read.body_q[body]), TICK.pose[0, instance])
 
 
 @pytest.mark.parametrize(("name", "row", "mass"), [("Finger", 1, CONFIG.gripper.finger_mass), ("Cup", 2, CONFIG.gripper.cup_mass)])
-def test_the_gripper_is_moved_by_others(read, name, row, mass):
+def test_gripper_bodies_are_kinematic(read, name, row, mass):
     body = body_of(read, f"Gripper/{name}")
     assert read.body_mass[body] == pytest.approx(mass)
     assert read.body_flags[body] & newton.BodyFlags.KINEMATIC
-    same_pose(np.array(read.body_q[body]), TICK.fixture_pose[0, row])
+    assert_same_pose(np.array(read.body_q[body]), TICK.fixture_pose[0, row])
 
 
-def same_pose(found: np.ndarray, expected: np.ndarray) -> None:
-    np.testing.assert_allclose(found[:3], expected[:3], atol=1e-6)
-    assert abs(found[3:] @ expected[3:]) == pytest.approx(1.0, abs=1e-6)
+def assert_same_pose(pose: np.ndarray, expected: np.ndarray) -> None:
+    np.testing.assert_allclose(pose[:3], expected[:3], atol=1e-6)
+    assert abs(pose[3:] @ expected[3:]) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_collision_shapes_come_back_vertex_by_vertex(read):
+def test_collision_shapes_have_the_same_vertices(read):
     expected = {body_of(read, f"Objects/instance_{instance:02d}"): entry_of(instance).pieces for instance in PRESENT}
     expected[body_of(read, "Gripper/Finger")] = (finger_collider(CONFIG.gripper),)
     expected[body_of(read, "Gripper/Cup")] = (cup_collider(CONFIG.gripper),)
@@ -107,7 +107,7 @@ def test_the_table_is_a_box(read):
     np.testing.assert_allclose(np.array(read.shape_transform[box])[:3], [0, 0, -CONFIG.tote.wall - TABLE_SIZE[2]], atol=1e-6)
 
 
-def test_shapes_have_the_bakes_friction_and_gap(read):
+def test_shapes_have_friction_and_contact_gap(read):
     solid = [shape for body in range(-1, read.body_count) for shape in colliders(read, body)]
     np.testing.assert_allclose([read.shape_material_mu[shape] for shape in solid], CONFIG.physics.friction, rtol=1e-6)
     assert {read.shape_material_restitution[shape] for shape in solid} == {0.0}
@@ -125,8 +125,8 @@ def test_visible_meshes_do_not_collide(read):
     assert dict(shown) == {-1: 2} | dict.fromkeys(range(read.body_count), 1)
 
 
-def test_the_bakes_own_model_has_the_same_shapes(read, device):
-    """The model that was simulated, without its guide walls, which are gone at the first frame."""
+def test_the_simulated_model_has_the_same_shapes(read, device):
+    """Compared without its guide walls, which are disabled at the first frame."""
     built = build.build_model(usd_sets.settings(bake__worlds=1, arrangement__max_objects=4), CATALOG, device)
     model, layout = built.model, built.layout
     bodies = model.shape_body.numpy()

@@ -1,4 +1,4 @@
-"""What a USD episode shows: poses, visibility, cameras and light, read with USD's own functions."""
+"""Layers of USD episodes: poses, visibility, cameras and lights, read with USD's own functions."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TICKS = usd_sets.episode_ticks(0)
 ROWS = 64
 
 
-def spooled(folder, ticks=TICKS) -> np.ndarray:
+def spool_ticks(folder, ticks=TICKS) -> np.ndarray:
     """The ticks as a writer process reads them."""
     spool = TickSpool(folder / "ticks", ticks[0].object_id.shape[1])
     for batch in ticks:
@@ -40,10 +40,10 @@ def spooled(folder, ticks=TICKS) -> np.ndarray:
 
 
 def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[EnvironmentMap, ...] = skies()[:2]) -> Usd.Stage:
-    """The stage of an episode, without its assets."""
-    made = tuple(make_stage_light(index, light, 1.0) for index, light in enumerate(lights))
-    facts = EpisodeMetadata(0, 0, len(rows), "emptied")
-    layer = make_episode_layer(rows, facts, EpisodeSettings(15.0, 9.81, cameras, made, {1: "one", 2: "two", 3: "three"}))
+    """Open the stage of an episode, without its assets."""
+    stage_lights = tuple(make_stage_light(index, light, 1.0) for index, light in enumerate(lights))
+    metadata = EpisodeMetadata(0, 0, len(rows), "emptied")
+    layer = make_episode_layer(rows, metadata, EpisodeSettings(15.0, 9.81, cameras, stage_lights, {1: "one", 2: "two", 3: "three"}))
     for prim in layer.rootPrims["Episode"].nameChildren.values():
         for each in (prim, *prim.nameChildren.values()):
             each.referenceList.ClearEdits()
@@ -54,7 +54,7 @@ def open_episode(rows: np.ndarray, cameras=LENSES, lights: tuple[EnvironmentMap,
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory) -> np.ndarray:
-    return spooled(tmp_path_factory.mktemp("ticks"))
+    return spool_ticks(tmp_path_factory.mktemp("ticks"))
 
 
 @pytest.fixture(scope="module")
@@ -63,37 +63,37 @@ def stage(rows):
 
 
 def matrix(pose: np.ndarray) -> np.ndarray:
-    """A pose (7) as a matrix (4, 4) that turns columns."""
+    """Convert a pose (7) to a matrix (4, 4) for column vectors."""
     x, y, z, w = pose[3:].astype(np.float64)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    made = np.eye(4)
-    made[:3, :3] += 2 * w * cross + 2 * cross @ cross
-    made[:3, 3] = pose[:3]
-    return made
+    result = np.eye(4)
+    result[:3, :3] += 2 * w * cross + 2 * cross @ cross
+    result[:3, 3] = pose[:3]
+    return result
 
 
-def placed(prim: Usd.Prim, time: float) -> np.ndarray:
-    """Where a prim is (4, 4), for columns."""
+def world_matrix(prim: Usd.Prim, time: float) -> np.ndarray:
+    """Local-to-world matrix of a prim (4, 4), for column vectors."""
     return np.array(UsdGeom.XformCache(time).GetLocalToWorldTransform(prim)).T
 
 
 @pytest.mark.parametrize("instance", np.flatnonzero(usd_sets.OBJECT_IDS >= 0).tolist())
-def test_objects_are_where_they_were_at_every_tick(stage, instance):
+def test_object_poses_and_visibility_at_every_tick(stage, instance):
     prim = stage.GetPrimAtPath(f"/Episode/Objects/instance_{instance:02d}")
     for frame, batch in enumerate(TICKS):
         present = batch.object_id[0, instance] >= 0
         assert (UsdGeom.Imageable(prim).ComputeVisibility(frame) == UsdGeom.Tokens.inherited) == present
         if present:
-            np.testing.assert_allclose(placed(prim, frame), matrix(batch.pose[0, instance]), atol=5e-7)
+            np.testing.assert_allclose(world_matrix(prim, frame), matrix(batch.pose[0, instance]), atol=5e-7)
 
 
 @pytest.mark.parametrize("index", range(3))
-def test_fixtures_are_where_they_were_at_every_tick(stage, index):
+def test_fixture_poses_and_visibility_at_every_tick(stage, index):
     prim = stage.GetPrimAtPath(list(FIXTURES.values())[index])
     for frame, batch in enumerate(TICKS):
-        seen = UsdGeom.Imageable(prim).ComputeVisibility(frame) == UsdGeom.Tokens.inherited
-        assert seen == bool(batch.fixture_visible[0, index])
-        np.testing.assert_allclose(placed(prim, frame), matrix(batch.fixture_pose[0, index]), atol=5e-7)
+        visible = UsdGeom.Imageable(prim).ComputeVisibility(frame) == UsdGeom.Tokens.inherited
+        assert visible == bool(batch.fixture_visible[0, index])
+        np.testing.assert_allclose(world_matrix(prim, frame), matrix(batch.fixture_pose[0, index]), atol=5e-7)
 
 
 def test_visibility_changes_at_the_tick_and_not_before(stage):
@@ -103,13 +103,13 @@ def test_visibility_changes_at_the_tick_and_not_before(stage):
     assert prim.GetVisibilityAttr().GetTimeSamples() == [0.0, usd_sets.PICKED_FRAME]
 
 
-def test_physics_engines_find_the_first_frame_without_a_time(stage):
+def test_default_values_are_the_first_frame(stage):
     for instance in (0, 2, 3):
         prim = stage.GetPrimAtPath(f"/Episode/Objects/instance_{instance:02d}")
-        np.testing.assert_allclose(placed(prim, Usd.TimeCode.Default()), matrix(TICKS[0].pose[0, instance]), atol=5e-7)
+        np.testing.assert_allclose(world_matrix(prim, Usd.TimeCode.Default()), matrix(TICKS[0].pose[0, instance]), atol=5e-7)
 
 
-def test_what_rests_has_no_samples_and_quaternions_do_not_jump(stage):
+def test_resting_prims_have_no_samples_and_quaternions_are_continuous(stage):
     resting = UsdGeom.Xformable(stage.GetPrimAtPath("/Episode/Objects/instance_03"))
     assert not resting.TransformMightBeTimeVarying()
     orient = stage.GetPrimAtPath("/Episode/Objects/instance_00").GetAttribute("xformOp:orient")
@@ -118,7 +118,7 @@ def test_what_rests_has_no_samples_and_quaternions_do_not_jump(stage):
     assert all(first @ second > 0.9 for first, second in pairwise(values))
 
 
-def test_instances_are_named_in_every_way(stage):
+def test_instances_have_all_ids_and_labels(stage):
     prims = stage.GetPrimAtPath("/Episode/Objects").GetChildren()
     assert [prim.GetName() for prim in prims] == ["instance_00", "instance_02", "instance_03"]
     for prim, instance, obj_id in zip(prims, (0, 2, 3), (3, 1, 2), strict=True):
@@ -136,7 +136,7 @@ SKEW = Camera(640, 400, np.array([[900.0, 0, 301.5], [0, 850.0, 222.25], [0, 0, 
     st.integers(0, 3),
     st.tuples(*[st.floats(-0.4, 0.4)] * 3),
 )
-def test_usd_projects_as_the_cameras_do(tmp_path_factory, index, point):
+def test_usd_cameras_project_like_ours(tmp_path_factory, index, point):
     lenses = (*LENSES, SKEW)
     stage = _cameras_stage(tmp_path_factory, lenses)
     camera = lenses[index]
@@ -149,7 +149,7 @@ STAGES: list[Usd.Stage] = []
 
 def _cameras_stage(tmp_path_factory, lenses) -> Usd.Stage:
     if not STAGES:
-        STAGES.append(open_episode(spooled(tmp_path_factory.mktemp("cameras")), lenses))
+        STAGES.append(open_episode(spool_ticks(tmp_path_factory.mktemp("cameras")), lenses))
     return STAGES[0]
 
 
@@ -161,7 +161,7 @@ def project(stage: Usd.Stage, index: int, camera: Camera, point: np.ndarray) -> 
     return (shown[0] + 1.0) / 2.0 * camera.width, (1.0 - shown[1]) / 2.0 * camera.height
 
 
-def test_films_are_36_mm_wide_and_products_know_the_resolution(stage):
+def test_aperture_is_36_mm_and_render_products_have_the_resolution(stage):
     for index, camera in enumerate(LENSES):
         lens = UsdGeom.Camera.Get(stage, f"/Episode/Cameras/camera_{index}")
         # Tenths of a unit of one metre.
@@ -174,7 +174,7 @@ def test_films_are_36_mm_wide_and_products_know_the_resolution(stage):
 
 
 def sunny(azimuth: float, polar: float, irradiance: float = 3.0, sharpness: float = 3000.0, rows: int = ROWS) -> EnvironmentMap:
-    """A dim map with a bright place, and a sun that stands for it. A sharpness of 100 is too wide for a light of its own."""
+    """A dim map with a bright region, and the sun that replaces it. A sharpness of 100 is too wide for a distant light."""
     a, p = np.radians(azimuth), np.radians(polar)
     toward = np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
     radiance = 0.2 + 30.0 * np.exp(sharpness * (map_directions(rows)[0] @ toward - 1.0))[..., None] * np.array([1.0, 0.9, 0.7])
@@ -182,7 +182,7 @@ def sunny(azimuth: float, polar: float, irradiance: float = 3.0, sharpness: floa
 
 
 @pytest.mark.parametrize(("azimuth", "polar"), [(0.0, 60.0), (90.0, 45.0), (-130.0, 20.0), (170.0, 75.0)])
-def test_the_dome_shows_its_map_where_the_pictures_do(tmp_path, rows, azimuth, polar):
+def test_the_dome_light_has_the_orientation_of_the_renderer(tmp_path, rows, azimuth, polar):
     light = replace(sunny(azimuth, polar), sun=None)
     (tmp_path / "lights").mkdir()
     write_light_maps(tmp_path, (light, light))
@@ -194,14 +194,14 @@ def test_the_dome_shows_its_map_where_the_pictures_do(tmp_path, rows, azimuth, p
     longitude = np.pi - (column + 0.5) / picture.shape[1] * 2 * np.pi
     latitude = np.pi / 2 - (row + 0.5) / picture.shape[0] * np.pi
     local = np.array([np.cos(latitude) * np.sin(longitude), np.sin(latitude), np.cos(latitude) * np.cos(longitude)])
-    found = placed(stage.GetPrimAtPath("/Episode/Lights/Dome"), 0)[:3, :3] @ local
+    direction = world_matrix(stage.GetPrimAtPath("/Episode/Lights/Dome"), 0)[:3, :3] @ local
     a, p = np.radians(azimuth) + usd_sets.YAW, np.radians(polar)
     expected = np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)])
-    assert np.degrees(np.arccos(found @ expected)) < 180.0 / ROWS
+    assert np.degrees(np.arccos(direction @ expected)) < 180.0 / ROWS
 
 
-def test_the_dome_is_turned_as_usd_would_turn_it(rows):
-    """USD's own correction for z up finds that it is there already, and on a bare dome is the same operation."""
+def test_the_dome_light_is_oriented_by_usds_own_operation(rows):
+    """OrientToStageUpAxis changes nothing, and adds the same operation to a dome light without one."""
     stage = open_episode(rows)
     dome = UsdLux.DomeLight.Get(stage, "/Episode/Lights/Dome")
     names = [op.GetOpName() for op in UsdGeom.Xformable(dome).GetOrderedXformOps()]
@@ -214,18 +214,18 @@ def test_the_dome_is_turned_as_usd_would_turn_it(rows):
 
 
 @pytest.mark.parametrize(("azimuth", "polar"), [(0.0, 60.0), (90.0, 45.0), (-130.0, 20.0)])
-def test_suns_shine_from_where_they_stand(rows, azimuth, polar):
+def test_distant_lights_have_direction_angle_and_irradiance_of_the_sun(rows, azimuth, polar):
     light = sunny(azimuth, polar)
     stage = open_episode(rows, lights=(light, light))
     sun = UsdLux.DistantLight.Get(stage, "/Episode/Lights/Sun")
-    found = placed(sun.GetPrim(), 0)[:3, :3] @ [0.0, 0.0, -1.0]
+    direction = world_matrix(sun.GetPrim(), 0)[:3, :3] @ [0.0, 0.0, -1.0]
     a, p = np.radians(azimuth) + usd_sets.YAW, np.radians(polar)
-    np.testing.assert_allclose(found, -np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)]), atol=1e-6)
+    np.testing.assert_allclose(direction, -np.array([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)]), atol=1e-6)
     assert sun.GetNormalizeAttr().Get()
     assert np.radians(sun.GetAngleAttr().Get() / 2) == pytest.approx(np.arctan(separate_sun(light)[2]), rel=1e-5)
     irradiance = np.array(sun.GetColorAttr().Get()) * sun.GetIntensityAttr().Get()
-    made = make_stage_light(0, light, 1.0)
-    np.testing.assert_allclose(irradiance, made.intensity * np.array(made.sun_irradiance), rtol=1e-5)
+    described = make_stage_light(0, light, 1.0)
+    np.testing.assert_allclose(irradiance, described.intensity * np.array(described.sun_irradiance), rtol=1e-5)
 
 
 def test_maps_without_a_sun_have_none(stage):
@@ -235,8 +235,8 @@ def test_maps_without_a_sun_have_none(stage):
 @pytest.mark.parametrize("irradiance", [0.01, 3.0, 100.0])
 @pytest.mark.parametrize("rows", [256, 512])
 @pytest.mark.parametrize("sharpness", [100.0, 3000.0])
-def test_no_light_counts_twice(irradiance, rows, sharpness):
-    """Map and sun are those of the pictures, whether the sun is a light of its own or a disc in its map."""
+def test_map_and_sun_are_separated_like_in_the_renderer(irradiance, rows, sharpness):
+    """Both for suns that become distant lights and for wide ones that stay discs in the map."""
     light = sunny(30.0, 50.0, irradiance, sharpness, rows)
     rest, beam, spread = separate_sun(light)
     table = light_tables.precompute_environment(light, None)
@@ -244,16 +244,16 @@ def test_no_light_counts_twice(irradiance, rows, sharpness):
     assert (spread > MAX_SUN_ANGULAR_RADIUS) == (not beam.any()) == (sharpness == 100.0)
     np.testing.assert_allclose(beam, table.sun_irradiance, rtol=1e-5)
     near = map_directions(256)[0] @ light.sun.direction > np.cos(np.radians(15.0))
-    found, expected = resize_map(rest, 256), table.sunless
-    np.testing.assert_allclose(found[~near], expected[~near], rtol=1e-4)
+    separated, expected = resize_map(rest, 256), table.sunless
+    np.testing.assert_allclose(separated[~near], expected[~near], rtol=1e-4)
     solid = map_directions(256)[1]
-    parts = [(image * solid[..., None])[near].sum(axis=0) for image in (found, expected)]
+    parts = [(image * solid[..., None])[near].sum(axis=0) for image in (separated, expected)]
     np.testing.assert_allclose(*parts, rtol=5e-3)
     if beam.any():
-        np.testing.assert_allclose(found, expected, rtol=1e-4)
+        np.testing.assert_allclose(separated, expected, rtol=1e-4)
 
 
-def test_wide_suns_are_in_the_map_alone(rows):
+def test_wide_suns_stay_in_the_map(rows):
     light = sunny(30.0, 50.0, sharpness=100.0)
     stage = open_episode(rows, lights=(light, light))
     assert not stage.GetPrimAtPath("/Episode/Lights/Sun")
@@ -262,6 +262,6 @@ def test_wide_suns_are_in_the_map_alone(rows):
 @pytest.mark.parametrize(
     "light", [*skies(), sunny(30.0, 50.0), replace(sunny(30.0, 50.0, sharpness=100.0), name="wide")], ids=lambda light: light.name
 )
-def test_brightness_is_that_of_the_pictures(light):
+def test_intensity_matches_the_renderers_exposure(light):
     expected = light_tables.precompute_environment(light, None).exposure
     assert make_stage_light(0, light, 1.5).intensity == pytest.approx(1.5 * expected, rel=0.03)

@@ -44,8 +44,8 @@ def test_round_trip_by_opencv(image):
 @pytest.mark.parametrize("strip_bytes", [0, 30, 45, 1 << 20])
 def test_strip_size_does_not_matter(strip_bytes, monkeypatch):
     monkeypatch.setattr(png, "_STRIP_BYTES", strip_bytes)
-    for shape, kind in (((7, 5), np.uint16), ((7, 5, 3), np.uint8), ((1, 1), np.uint8)):
-        image = np.random.default_rng(0).integers(0, np.iinfo(kind).max, shape, kind)
+    for shape, dtype in (((7, 5), np.uint16), ((7, 5, 3), np.uint8), ((1, 1), np.uint8)):
+        image = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, shape, dtype)
         np.testing.assert_array_equal(read(encode_png(image)), image)
 
 
