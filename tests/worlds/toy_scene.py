@@ -188,6 +188,5 @@ def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
     out = allocate(ViewBuffers, sizes, device)
     zero = wp.zeros(1, dtype=wp.int32, device=device)
     views = make_views(zero, zero, 1, toy.room)
-    renderer.set_up_views(snapshot(toy, device), views)
-    renderer.rasterize(views, out)
+    renderer.render_gbuffer(snapshot(toy, device), views, out)
     return out, renderer

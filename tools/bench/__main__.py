@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -38,8 +39,7 @@ from synpick_warp.exporters.registry import Exporters, load_exporter_classes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.pipeline import Factory, build_factory, run_bake
 from synpick_warp.progress import SilentProgress
-from synpick_warp.stages.render.annotate import annotate
-from synpick_warp.stages.render.denoised import DenoisedRenderer
+from synpick_warp.stages import timing
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
@@ -191,11 +191,16 @@ def _render(config: Config, factory: Factory, least: float) -> Iterator[Row]:
     device, cameras = simulation.device, len(factory.cameras)
     count = min(stream.batch, simulation.layout.worlds * cameras)
     yield Row("render", "views in a batch", count, "")
-    spent = {}
-    for name, launch in _render_stages(factory, count).items():
-        spent[name] = seconds_per_call(launch, device, least / 4, BURST) / count
-        yield Row("render", f"a view: {name}", 1e3 * spent[name], "ms")
-    yield Row("render", "views, ground truth alone", 1.0 / (spent["prepare bodies"] + spent["find hits"] + spent["annotate"]), "1/s")
+    views, out, renderer = _first_views(factory, count), stream.buffers[0], stream.renderer
+
+    def render() -> None:
+        renderer.render(simulation.records[0].snapshot, views, out)
+
+    spent = {name: seconds / count for name, seconds in _time_passes(render, device, least).items()}
+    spent["all"] = seconds_per_call(render, device, least / 4, BURST) / count
+    for name, seconds in spent.items():
+        yield Row("render", f"a view: {name}", 1e3 * seconds, "ms")
+    yield Row("render", "views, ground truth alone", 1.0 / (spent["set up views"] + spent["rasterize"] + spent["annotate"]), "1/s")
     yield Row("render", "views, all stages", 1.0 / spent["all"], "1/s")
     if device.is_cuda:
         size = sum(array.capacity for array in stream.copies[0].source)
@@ -213,34 +218,25 @@ def _render(config: Config, factory: Factory, least: float) -> Iterator[Row]:
     yield Row("render", "views, all stages and copies", worlds * cameras / seconds, "1/s")
 
 
-def _render_stages(factory: Factory, count: int) -> dict[str, Callable[[], object]]:
-    """Launches of each stage of a batch of `count` views, by name, in order; "all" is all of them."""
-    simulation, renderer, out = factory.simulation, factory.stream.renderer, factory.stream.buffers[0]
-    cameras, snapshot, shading = len(factory.cameras), simulation.records[0].snapshot, renderer.shading
-    bodies, gbuffer, image = renderer.bodies, renderer.gbuffer, renderer.image
-    view = np.arange(count, dtype=np.int32)
-    world, camera = (wp.array(values, dtype=wp.int32, device=simulation.device) for values in (view // cameras, view % cameras))
-    views = make_views(world, camera, count, renderer.instances)
-    stages: dict[str, Callable[[], object]] = {
-        "prepare bodies": lambda: renderer.set_up_views(snapshot, views),
-        "find hits": lambda: renderer.rasterize(views, out),
-    }
-    if isinstance(shading, DenoisedRenderer):
-        stages |= {
-            "coarse paths": lambda: shading.trace_coarse_paths(snapshot, bodies, gbuffer, views),
-            "denoise": lambda: shading.denoise(views),
-            "sun shadows": lambda: shading.trace_shadows(snapshot, bodies, gbuffer, views),
-            "shade": lambda: shading.shade_pixels(snapshot, bodies, gbuffer, views, image.radiance),
-        }
-        if shading.antialias:
-            stages["anti-alias"] = lambda: shading.resolve_footprints(bodies, gbuffer, views, image)
-    else:
-        stages["trace paths"] = lambda: shading.shade(snapshot, bodies, gbuffer, views, image)
-    return stages | {
-        "develop": lambda: renderer.postprocess(snapshot, views, out),
-        "annotate": lambda: annotate(renderer.scene, renderer.bodies, views, out),
-        "all": lambda: renderer.render(snapshot, views, out),
-    }
+def _first_views(factory: Factory, count: int) -> Any:
+    """The struct `Views` of the first `count` views: world by world and camera by camera."""
+    cameras, renderer, view = len(factory.cameras), factory.stream.renderer, np.arange(count, dtype=np.int32)
+    world, camera = (wp.array(values, dtype=wp.int32, device=renderer.scene.device) for values in (view // cameras, view % cameras))
+    return make_views(world, camera, count, renderer.instances)
+
+
+def _time_passes(render: Callable[[], None], device: wp.Device, least: float) -> dict[str, float]:
+    """Mean time [s] of each timing scope of `render`, by name, the scopes around it first."""
+    render()
+    wp.synchronize_device(device)
+    with timing.record() as recorder:
+        started = time.perf_counter()
+        while time.perf_counter() - started < least:
+            for _ in range(BURST):
+                render()
+            wp.synchronize_device(device)
+    times = recorder.times.items()
+    return {": ".join(path): (stage.device if device.is_cuda else stage.host) / stage.calls for path, stage in times}
 
 
 class _StageTimes(SilentProgress):

@@ -120,11 +120,11 @@ def _build_model(
     # As ours: built once and with care, for speed of the rays.
     builder.default_bvh_cfg.mesh_constructor = builder.default_bvh_cfg.shape_constructor = "sah"
     shape = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
-    host = {name: getattr(snapshot, name).numpy() for name in ("entry", "pose", "fixture_pose", "fixture_visible")}
+    host = {name: getattr(snapshot, name).numpy() for name in ("catalog_index", "pose", "fixture_pose", "fixture_visible")}
     codes = []
     for world in range(worlds):
         builder.begin_world()
-        for instance, entry in enumerate(host["entry"][world]):
+        for instance, entry in enumerate(host["catalog_index"][world]):
             if entry >= 0:
                 _add_body(builder, objects[entry], catalog.entries[entry].material, host["pose"][world, instance], shape)
                 codes.append(1 + instance)
@@ -266,8 +266,7 @@ class _Ours:
         self.layers = allocate(LayerBuffers, {"view": count, "row": scene.height, "column": scene.width}, scene.device, LAYERS)
 
     def hits(self) -> None:
-        self.renderer.set_up_views(self.snapshot, self.views)
-        self.renderer.rasterize(self.views, self.out)
+        self.renderer.render_gbuffer(self.snapshot, self.views, self.out)
 
     def hits_and_layers(self) -> None:
         self.hits()

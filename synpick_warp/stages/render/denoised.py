@@ -20,6 +20,7 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import BLOCK, launch_pixels
 from synpick_warp.stages.render.reference import make_path_rules
 from synpick_warp.stages.render.scene import RenderScene, build_grid
+from synpick_warp.stages.timing import scope
 
 MIN_COARSE_COLUMNS = 384
 """Default size of coarse pixels: an image's width has at least this many, and fewer than twice as many. At full HD they are 1.9 mm wide at
@@ -156,12 +157,18 @@ class DenoisedRenderer:
             views: The struct `Views`.
             image: The struct `ShadedImage`; written.
         """
-        self.trace_coarse_paths(snapshot, bodies, gbuffer, views)
-        self.denoise(views)
-        self.trace_shadows(snapshot, bodies, gbuffer, views)
-        self.shade_pixels(snapshot, bodies, gbuffer, views, image.radiance)
+        device = self.scene.device
+        with scope("trace coarse paths", device):
+            self.trace_coarse_paths(snapshot, bodies, gbuffer, views)
+        with scope("denoise", device):
+            self.denoise(views)
+        with scope("sun shadows", device):
+            self.trace_shadows(snapshot, bodies, gbuffer, views)
+        with scope("shade pixels", device):
+            self.shade_pixels(snapshot, bodies, gbuffer, views, image.radiance)
         if self.antialias:
-            self.resolve_footprints(bodies, gbuffer, views, image)
+            with scope("anti-alias", device):
+                self.resolve_footprints(bodies, gbuffer, views, image)
 
     def trace_coarse_paths(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
         """Coarse path pass: guide image and light of coarse pixels."""

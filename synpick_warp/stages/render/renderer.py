@@ -16,6 +16,7 @@ from synpick_warp.stages.render.raster import Rasterizer
 from synpick_warp.stages.render.reference import ReferenceRenderer
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, set_up_views
+from synpick_warp.stages.timing import scope
 
 SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
 
@@ -48,14 +49,8 @@ class Renderer:
         self.layer_renderer = LayerRenderer(config.render.layers, sensor, scene, instances, views)
         self.postprocessor = PostProcessor(config.effects, config.render.tone, config.bake.seed, scene, views)
 
-    def render(
-        self,
-        snapshot: Snapshot,
-        views: Any,
-        out: ViewBuffers,
-        layers: LayerBuffers | None = None,
-    ) -> None:
-        """Render and annotate a batch of views.
+    def render(self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None) -> None:
+        """Render and annotate a batch of views: the one place that knows the order of the passes.
 
         Args:
             snapshot: The worlds.
@@ -70,23 +65,22 @@ class Renderer:
             raise ValueError(f"{views.count} views in a batch; this renderer has scratch for {self.views}")
         if views.count == 0:
             return
-        self.set_up_views(snapshot, views)
-        self.rasterize(views, out)
+        device = self.scene.device
+        self.render_gbuffer(snapshot, views, out)
         if layers is not None:
-            self.layer_renderer.render(snapshot, self.bodies, self.gbuffer, views, layers)
-        self.shading.shade(snapshot, self.bodies, self.gbuffer, views, self.image)
-        self.postprocess(snapshot, views, out)
-        annotate(self.scene, self.bodies, views, out)
+            with scope("layers", device):
+                self.layer_renderer.render(snapshot, self.bodies, self.gbuffer, views, layers)
+        with scope("shade", device):
+            self.shading.shade(snapshot, self.bodies, self.gbuffer, views, self.image)
+        with scope("post-process", device):
+            self.postprocessor.process(snapshot, views, self.image, out)
+        with scope("annotate", device):
+            annotate(self.scene, self.bodies, views, out)
 
-    def set_up_views(self, snapshot: Snapshot, views: Any) -> None:
-        """Camera-space transforms, order and tile masks of every view's bodies."""
+    def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers) -> None:
+        """First part of `render`: the G-buffer, and the images of depth, instances and amodal bits."""
         scene = self.scene
-        set_up_views(scene, scene.cameras, scene.grid, snapshot, snapshot.fixture_visible, views, self.bodies)
-
-    def rasterize(self, views: Any, out: ViewBuffers) -> None:
-        """G-buffer, and the images of depth, instances and amodal bits."""
-        self.rasterizer.rasterize(self.bodies, views, self.gbuffer, out)
-
-    def postprocess(self, snapshot: Snapshot, views: Any, out: ViewBuffers) -> None:
-        """Radiance to bytes."""
-        self.postprocessor.process(snapshot, views, self.image, out)
+        with scope("set up views", scene.device):
+            set_up_views(scene, scene.cameras, scene.grid, snapshot, snapshot.fixture_visible, views, self.bodies)
+        with scope("rasterize", scene.device):
+            self.rasterizer.rasterize(self.bodies, views, self.gbuffer, out)
