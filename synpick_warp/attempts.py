@@ -1,4 +1,7 @@
-"""Follows the worlds tick by tick on the host: which attempts to pick they made, and what became of an episode's objects."""
+"""Attempt log: builds the records of attempts.jsonl and the counts of each episode from the reports of all ticks, on the host.
+
+Fields of the record dataclasses are the JSON keys, which are public: `caught` lists the engaged instances, `load` the peak seal forces.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.codes import Ending, Mode, Outcome, Phase, Task
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Suction
 from synpick_warp.stages.stream import TickReport
 
 DIGITS, PLACES = 6, 6
 """Significant digits and decimal places of the numbers in a record; more would be noise of single precision."""
-LOAD_PLACES = 4
-"""Decimal places of a load: a tenth of a millinewton."""
+FORCE_PLACES = 4
+"""Decimal places of a seal force [N]."""
 
 Vector = tuple[float, ...]
 
@@ -38,7 +41,7 @@ class InstanceObservation:
     above: tuple[int, ...]
     """Instances from which an edge of the clutter graph runs to this one."""
     all_above: tuple[int, ...]
-    """Instances from which a path does."""
+    """Instances from which a path runs to this one."""
 
 
 @dataclass(frozen=True)
@@ -48,50 +51,50 @@ class ObservationRecord:
     resolution: tuple[int, int]
     """Width and height of the perception image [px]."""
     instances: tuple[InstanceObservation, ...]
-    """Those that were in the scene, visible or not."""
+    """Instances in the scene, visible or not."""
     votes: tuple[tuple[int, int, float], ...]
-    """(i, j, votes): what the contour of i says for j lying above it; only votes that are not 0."""
+    """(i, j, votes): occlusion votes of the contour of i for j lying above it; only nonzero ones."""
 
 
 @dataclass(frozen=True)
 class AttemptRecord:
-    """One try to pick. Of a look that found nothing there is no target, nor what follows from one (None)."""
+    """One attempt to pick. Target and grasp are None if perception found no visible object."""
 
     episode: int
     attempt: int
-    """Its number in the episode, from 0."""
+    """Index in the episode."""
     mode: str
     frame: int
-    """The frame from which was chosen; its image does not show the gripper."""
+    """Frame on which perception ran; its image does not show the gripper."""
     end_frame: int
-    """The frame at which the attempt had ended."""
+    """Frame in which the attempt had ended."""
     outcome: Outcome
     target: int | None
     object_id: int | None
-    """Of the target."""
+    """obj_id of the target."""
     point: Vector | None
     """Grasp point [m]."""
     normal: Vector | None
-    """Unit normal there."""
+    """Unit surface normal at the grasp point."""
     yaw: float | None
-    """Of the finger about the vertical [rad]."""
+    """Yaw of the gripper shaft about the vertical [rad]."""
     tilt: float | None
-    """Of the cup about the finger's y axis [rad]."""
+    """Tilt of the cup about the wrist axis, the shaft's y axis [rad]."""
     rays: int
     hits: int
-    """Rays that hit an object when the suction was switched on."""
+    """Rays that hit an object when suction was switched on."""
     good_seal: bool
-    """Whether no more rays missed than settings tolerate, which is never all of them, so that the seals were strong."""
+    """True if at most `suction.tolerated_misses` rays missed, so that seals had the break force of a good seal."""
     caught: tuple[int, ...]
-    """Instances that the rays hit."""
+    """Engaged instances: those that rays hit."""
     picked: tuple[int, ...]
     """Instances that left the scene on the cup."""
     load: Vector
-    """Largest load of any seal [N] in each tick of the lift; in the first the suction was switched on at its end, so that is 0."""
+    """Peak seal force [N] in each tick of the lift, that of a seal that broke included; 0 in the first, which ends as suction begins."""
     sight: ObservationRecord
 
     def line(self) -> str:
-        """The record as one line of JSON, with its end.
+        """Serialize the record as one line of JSON with line break.
 
         Raises:
             ValueError: A number is not finite.
@@ -106,13 +109,13 @@ class AttemptRecord:
 
 @dataclass(frozen=True)
 class EpisodeRecord:
-    """What an episode did with its objects. An episode that delivers nothing has no objects and no attempts."""
+    """Attempts and object counts of an episode; empty if the episode ended without delivery."""
 
     mode: str
     objects: int = 0
     """Instances at the first frame."""
     left: int = 0
-    """Instances at the last."""
+    """Instances at the last frame."""
     attempts: tuple[AttemptRecord, ...] = ()
 
     @property
@@ -122,42 +125,44 @@ class EpisodeRecord:
 
     @property
     def lost(self) -> int:
-        """Instances that left it otherwise."""
+        """Instances that left the scene otherwise."""
         return self.objects - self.left - self.picked
 
 
 @dataclass
 class _Running:
-    """An arrangement that is being acted on."""
+    """Episode in phase ACT."""
 
     episode: int
     objects: int
     attempts: list[AttemptRecord] = field(default_factory=list)
-    begun: dict[str, Any] | None = None
-    """What the running attempt's look says of its record."""
-    load: list[float] = field(default_factory=list)
+    planned: dict[str, Any] | None = None
+    """Fields of the running attempt that are known from perception; None: no attempt runs."""
+    forces: list[float] = field(default_factory=list)
+    """Peak seal force of each tick of the running lift [N]."""
 
 
 class AttemptLog:
-    """Makes records of the reports of all ticks."""
+    """State machine that turns the reports of all ticks into episode records."""
 
-    def __init__(self, config: Config, object_ids: np.ndarray) -> None:
-        """Follow worlds from their first tick on.
+    def __init__(self, suction: Suction, resolution: tuple[int, int], object_ids: np.ndarray) -> None:
+        """Start with no episode running.
 
         Args:
-            config: Settings.
+            suction: Settings of suction.
+            resolution: Width and height of the perception image [px].
             object_ids: obj_id of each catalog entry (entry) int32.
         """
         self.object_ids = object_ids
-        self.resolution = config.sight.resolution
-        self.rays, self.tolerated_misses = config.suction.rays, config.suction.tolerated_misses
+        self.resolution = resolution
+        self.rays, self.tolerated_misses = suction.rays, suction.tolerated_misses
         self._running: dict[int, _Running] = {}
 
-    def see(self, report: TickReport) -> dict[int, EpisodeRecord]:
-        """Follow one tick; reports come in the order of ticks.
+    def update(self, report: TickReport) -> dict[int, EpisodeRecord]:
+        """Process the report of one tick; reports must come in the order of ticks.
 
         Returns:
-            By number, every episode that ended in this tick, whether it delivers or will be drawn again.
+            Records of all episodes that ended in this tick by episode index, with or without delivery.
 
         Raises:
             ValueError: An attempt ends that is not the one that began last: reports are missing.
@@ -167,74 +172,74 @@ class AttemptLog:
         for world in np.flatnonzero((phase == Phase.ACT) | (phase == Phase.OVER)).tolist():
             running = self._running.get(world)
             if running is None:
-                running = self._running[world] = _Running(_number(report, "episode", world), int((report.catalog_index[world] >= 0).sum()))
-            self._follow(running, report, world)
+                running = self._running[world] = _Running(_status(report, "episode", world), int((report.catalog_index[world] >= 0).sum()))
+            self._update_attempt(running, report, world)
             if phase[world] == Phase.OVER:
-                ended[running.episode] = self._hand_over(report, world)
-            elif _number(report, "task", world) == Task.LOOK:
-                running.load = []
-                running.begun = self._begin(running.episode, report, world)
+                ended[running.episode] = self._finish_episode(report, world)
+            elif _status(report, "task", world) == Task.LOOK:
+                running.forces = []
+                running.planned = self._begin_attempt(running.episode, report, world)
         return ended
 
-    def _follow(self, running: _Running, report: TickReport, world: int) -> None:
-        """What the tick adds to the running attempt."""
-        outcome = Outcome(_number(report, "outcome", world))
+    def _update_attempt(self, running: _Running, report: TickReport, world: int) -> None:
+        """Record the peak force of a lift, and the end of an attempt."""
+        outcome = Outcome(_status(report, "outcome", world))
         lifted = outcome not in (Outcome.NONE, Outcome.NOTHING_SEEN)
-        if lifted or _number(report, "task", world) == Task.LIFT:
-            running.load.append(round(float(report.measure("load")[world]), LOAD_PLACES))
+        if lifted or _status(report, "task", world) == Task.LIFT:
+            running.forces.append(round(float(report.measure("load")[world]), FORCE_PLACES))
         if outcome is not Outcome.NONE:
-            self._end(running, report, world, outcome)
+            self._end_attempt(running, report, world, outcome)
 
-    def _hand_over(self, report: TickReport, world: int) -> EpisodeRecord:
-        """The world's episode is over: what it did; nothing if it delivers nothing."""
-        running, mode = self._running.pop(world), Mode(_number(report, "mode", world)).name.lower()
-        if not Ending(_number(report, "ending", world)).delivers:
+    def _finish_episode(self, report: TickReport, world: int) -> EpisodeRecord:
+        """Return the record of the episode that ended in a world; empty without delivery."""
+        running, mode = self._running.pop(world), Mode(_status(report, "mode", world)).name.lower()
+        if not Ending(_status(report, "ending", world)).delivers:
             return EpisodeRecord(mode)
         return EpisodeRecord(mode, running.objects, int((report.catalog_index[world] >= 0).sum()), tuple(running.attempts))
 
-    def _begin(self, episode: int, report: TickReport, world: int) -> dict[str, Any]:
-        """What is known of an attempt when its world has been looked at."""
+    def _begin_attempt(self, episode: int, report: TickReport, world: int) -> dict[str, Any]:
+        """Return the fields of an attempt that are known after perception."""
         target = int(report.plan.target[world])
         record = {
             "episode": episode,
-            "attempt": _number(report, "attempt", world) + 1,
-            "mode": Mode(_number(report, "mode", world)).name.lower(),
-            "frame": _number(report, "frame", world),
-            "sight": self._sight(report, world),
+            "attempt": _status(report, "attempt", world) + 1,
+            "mode": Mode(_status(report, "mode", world)).name.lower(),
+            "frame": _status(report, "frame", world),
+            "sight": self._observation(report, world),
         }
         grasp = dict.fromkeys(("target", "object_id", "point", "normal", "yaw", "tilt"))
         if target >= 0:
-            vectors = {name: _tidy_vector(getattr(report.plan, name)[world]) for name in ("point", "normal")}
-            angles = {name: _tidy(getattr(report.plan, name)[world]) for name in ("yaw", "tilt")}
+            vectors = {name: _round_vector(getattr(report.plan, name)[world]) for name in ("point", "normal")}
+            angles = {name: _round(getattr(report.plan, name)[world]) for name in ("yaw", "tilt")}
             grasp = {"target": target, "object_id": self._object_id(report, world, target), **vectors, **angles}
         return record | grasp
 
-    def _end(self, running: _Running, report: TickReport, world: int, outcome: Outcome) -> None:
-        begun, number = running.begun, _number(report, "attempt", world)
-        if begun is None or begun["attempt"] != number:
-            raise ValueError(f"attempt {number} of episode {running.episode} ends, but none that is followed has that number")
+    def _end_attempt(self, running: _Running, report: TickReport, world: int, outcome: Outcome) -> None:
+        planned, attempt = running.planned, _status(report, "attempt", world)
+        if planned is None or planned["attempt"] != attempt:
+            raise ValueError(f"attempt {attempt} of episode {running.episode} ends, but its begin is not in the log")
         seen = outcome is not Outcome.NOTHING_SEEN
-        hits = _number(report, "hits", world) if seen else 0
+        hits = _status(report, "hits", world) if seen else 0
         running.attempts.append(
             AttemptRecord(
-                **begun,
-                end_frame=_number(report, "frame", world),
+                **planned,
+                end_frame=_status(report, "frame", world),
                 outcome=outcome,
                 rays=self.rays,
                 hits=hits,
                 good_seal=self.rays - hits <= self.tolerated_misses,
-                caught=_instances(_number(report, "caught", world)) if seen else (),
-                picked=_instances(_number(report, "held", world)),
-                load=tuple(running.load),
+                caught=_instances(_status(report, "caught", world)) if seen else (),
+                picked=_instances(_status(report, "held", world)),
+                load=tuple(running.forces),
             )
         )
-        running.begun = None
+        running.planned = None
 
-    def _sight(self, report: TickReport, world: int) -> ObservationRecord:
+    def _observation(self, report: TickReport, world: int) -> ObservationRecord:
         present = np.flatnonzero(report.catalog_index[world] >= 0)
         votes = report.observation.votes[world][np.ix_(present, present)]
         lower, upper = np.nonzero(votes)
-        pairs = zip(present[lower].tolist(), present[upper].tolist(), _tidy_vector(votes[lower, upper]), strict=True)
+        pairs = zip(present[lower].tolist(), present[upper].tolist(), _round_vector(votes[lower, upper]), strict=True)
         instances = tuple(self._instance(report, world, instance) for instance in present.tolist())
         return ObservationRecord(self.resolution, instances, tuple(pairs))
 
@@ -244,13 +249,13 @@ class AttemptLog:
             instance=instance,
             object_id=self._object_id(report, world, instance),
             visible=int(row["visible"]),
-            share=_tidy(row["visible_fraction"]),
-            pole=_tidy_vector(row["pole"]),
-            centroid=_tidy_vector(row["centroid"]),
-            middle=_tidy_vector(row["midpoint"]),
-            distances=_tidy_vector(row["distances"]),
+            share=_round(row["visible_fraction"]),
+            pole=_round_vector(row["pole"]),
+            centroid=_round_vector(row["centroid"]),
+            middle=_round_vector(row["midpoint"]),
+            distances=_round_vector(row["distances"]),
             suction=tuple(row["grasp_pixel"].tolist()),
-            depth=_tidy(row["depth"]),
+            depth=_round(row["depth"]),
             above=_instances(int(row["above"])),
             all_above=_instances(int(row["ancestors"])),
         )
@@ -259,19 +264,20 @@ class AttemptLog:
         return int(self.object_ids[report.catalog_index[world, instance]])
 
 
-def _number(report: TickReport, name: str, world: int) -> int:
+def _status(report: TickReport, name: str, world: int) -> int:
+    """Column of a world's status row."""
     return int(report.column(name)[world])
 
 
 def _instances(bits: int) -> tuple[int, ...]:
-    """Instances whose bits are set in 32 bits, signed or not."""
+    """Unpack a mask of 32 bits, signed or not, to the indices of set bits."""
     return tuple(instance for instance in range(32) if bits >> instance & 1)
 
 
-def _tidy(value: float) -> float:
-    """A number with the digits that are kept; never -0."""
+def _round(value: float) -> float:
+    """Round to DIGITS significant digits and PLACES decimal places; never -0."""
     return round(float(f"{value:.{DIGITS}g}"), PLACES) + 0.0
 
 
-def _tidy_vector(values: np.ndarray) -> Vector:
-    return tuple(map(_tidy, values.tolist()))
+def _round_vector(values: np.ndarray) -> Vector:
+    return tuple(map(_round, values.tolist()))

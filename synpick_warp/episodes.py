@@ -1,4 +1,4 @@
-"""What became of a bake's episodes: rows of the list, lines of the summary, and how both are read back from records."""
+"""Episode rows of episodes.jsonl and the summary of a bake."""
 
 from __future__ import annotations
 
@@ -18,35 +18,34 @@ PLACES = 6
 
 
 class EpisodeRow(NamedTuple):
-    """One line of the summary."""
+    """One line of episodes.jsonl and of the summary; the fields are the JSON keys. Counts are 0 if the episode ended without delivery."""
 
     episode: int
     redraw: int
-    """How often the episode was drawn again before."""
+    """Index of the arrangement: how often it was resampled before."""
     ending: Ending
     frames: int
     seconds: float
     """Simulated time from the first frame to the last [s]."""
     mode: str
-    """What follows is 0 if the episode delivered nothing."""
     objects: int
-    """At the first frame."""
+    """Objects at the first frame."""
     attempts: int
     picked: int
-    """Objects."""
+    """Objects that left the scene on the cup."""
     lost: int
     """Objects that left the scene otherwise."""
     left: int
     """Objects at the last frame."""
 
     def as_json(self) -> dict[str, Any]:
-        """As the data set's list of episodes has it."""
+        """Convert to a line of episodes.jsonl."""
         row = {**self._asdict(), "ending": self.ending.name.lower()}
         return {**row, "sentence": self.ending.sentence}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> EpisodeRow:
-        """From the data set's list of episodes."""
+        """Convert from a line of episodes.jsonl."""
         values: dict[str, Any] = {name: row[name] for name in cls._fields}
         values["ending"] = Ending[row["ending"].upper()]
         return cls(**values)
@@ -54,48 +53,48 @@ class EpisodeRow(NamedTuple):
 
 @dataclass
 class BakeSummary:
-    """What a bake made, with what was there before it."""
+    """Totals of a bake, committed episodes of earlier runs included."""
 
     total: int = 0
-    """Episodes that there are to be."""
+    """Episodes of the complete data set."""
     episodes: list[EpisodeRow] = field(default_factory=list)
     views: int = 0
-    """Made by this bake."""
+    """Views written by this run."""
     wall_seconds: float = 0.0
-    """From the first tick to the last file [s]."""
+    """Time from the first tick to the last file [s]."""
     redraws: int = 0
-    """Arrangements that ended in a way that delivers nothing, and were drawn again."""
+    """Arrangements that ended without delivery and were resampled."""
     redrawn: dict[Ending, int] = field(default_factory=dict)
-    """The same, by ending."""
+    """These arrangements, by ending."""
     remedies: dict[Ending, str] = field(default_factory=dict)
     """Advice against these endings, where a setting cures them; see `remedy`."""
     outcomes: Counter[Outcome] = field(default_factory=Counter)
-    """Attempts, by outcome."""
+    """Attempts by outcome."""
     resumed: int = 0
-    """Episodes that were whole before."""
+    """Episodes committed by earlier runs."""
     stopped: int = 0
-    """Number of the signal that stopped the bake before its end; 0: none."""
+    """Signal that stopped the bake before its end; 0: none."""
 
     def take_record(self, record: Mapping[str, Any]) -> None:
-        """Count an episode that was whole before."""
+        """Add an episode that an earlier run committed."""
         self.episodes.append(EpisodeRow.from_json(record["row"]))
         self.outcomes.update(Outcome[attempt["outcome"].upper()] for attempt in record["attempts"])
         self.resumed += 1
 
-    def take_redraw(self, ending: Ending) -> None:
-        """Count an arrangement that delivered nothing and will be drawn again."""
+    def take_resample(self, ending: Ending) -> None:
+        """Add an arrangement that ended without delivery and will be resampled."""
         self.redraws += 1
         self.redrawn[ending] = self.redrawn.get(ending, 0) + 1
 
     def take_episode(self, row: EpisodeRow, record: EpisodeRecord) -> None:
-        """Count an episode that has ended."""
+        """Add an episode that has ended."""
         self.episodes.append(row)
         self.episodes.sort()
         self.outcomes.update(attempt.outcome for attempt in record.attempts)
 
 
 def episode_row(config: Config, report: TickReport, world: int, record: EpisodeRecord) -> EpisodeRow:
-    """The row of the episode that ended in a world."""
+    """Build the row of the episode that ended in a world."""
     episode, redraw, frame, ending = (int(report.column(name)[world]) for name in ("episode", "redraw", "frame", "ending"))
     tick = config.physics.step * config.physics.steps_per_tick
     return EpisodeRow(
@@ -113,8 +112,8 @@ def episode_row(config: Config, report: TickReport, world: int, record: EpisodeR
     )
 
 
-def is_redrawn(config: Config, row: EpisodeRow) -> bool:
-    """Whether the episode will come again, with another arrangement."""
+def is_resampled(config: Config, row: EpisodeRow) -> bool:
+    """True if the episode will run again with a resampled arrangement."""
     return not row.ending.delivers and row.redraw + 1 < config.settle.tries
 
 
@@ -134,7 +133,7 @@ def remedy(config: Config, ending: Ending) -> str:
 
 
 def episode_end(config: Config, row: EpisodeRow, record: EpisodeRecord) -> EpisodeEnd:
-    """What exporters are told of it."""
-    if is_redrawn(config, row):
+    """Build the end-of-episode message for exporters; a resampled episode has neither row nor attempts."""
+    if is_resampled(config, row):
         return EpisodeEnd(row.episode, row.redraw, row.frames, int(row.ending))
     return EpisodeEnd(row.episode, row.redraw, row.frames, int(row.ending), row.as_json(), tuple(one.line() for one in record.attempts))

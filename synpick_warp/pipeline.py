@@ -24,7 +24,7 @@ from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
 from synpick_warp.device import pick_device
-from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_redrawn, remedy
+from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes, slot_bytes
@@ -92,11 +92,13 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     scene = build_render_scene(config, catalog, fixtures, cameras, lights, device)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
-    renderer = Renderer(config, scene, config.arrangement.max_objects, view_sizes(config, device)["view"])
+    sizes = view_sizes(config, device)
+    renderer = Renderer(config, scene, config.arrangement.max_objects, sizes["view"])
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
-    stream = FrameStream(config, renderer, object_ids, table, device)
-    return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config, object_ids))
+    tick_time = config.physics.step * config.physics.steps_per_tick
+    stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device)
+    return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.sight.resolution, object_ids))
 
 
 def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, int] = (0, 1)) -> BakeSummary:
@@ -218,7 +220,7 @@ class _Run:
                 with scope("hand over views"):
                     self.exporters.write_views(views)
                 self.summary.views += len(views)
-        records = self.factory.log.see(report)
+        records = self.factory.log.update(report)
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
             with scope("end episode"):
                 self._end(report, world, records[int(report.column("episode")[world])])
@@ -229,8 +231,8 @@ class _Run:
         advice = remedy(self.config, row.ending)
         if advice:
             self.summary.remedies[row.ending] = advice
-        if is_redrawn(self.config, row):
-            self.summary.take_redraw(row.ending)
+        if is_resampled(self.config, row):
+            self.summary.take_resample(row.ending)
             note = f"episode {row.episode}, arrangement {row.redraw + 1}: {row.ending.sentence}"
             self.progress.note(note + (f"; {advice}" if advice else ""))
             self.exporters.end_episode(end, lambda: None)

@@ -13,7 +13,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.codes import Effect, Measure, Phase, Status
-from synpick_warp.configs.schema import LAYERS
+from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.frames import FrameBatch
 from synpick_warp.stages import stream
@@ -74,9 +74,15 @@ def report_of(live: list[int]) -> TickReport:
     return TickReport(status, measures, entry, pose, SimpleNamespace(), SimpleNamespace(), light)
 
 
+def frame_stream(config: Config, renderer: FakeRenderer, device) -> FrameStream:
+    sizes, layers, cameras = view_sizes(config, device), config.render.layers, len(config.cameras.positions)
+    tick_time = config.physics.step * config.physics.steps_per_tick
+    return FrameStream(sizes, layers, cameras, tick_time, renderer, OBJECT_IDS, LIGHTS, device)  # type: ignore[arg-type]
+
+
 def rendered(device, live: list[int], batch: int, **overrides: object) -> tuple[list[dict[str, Any]], FakeRenderer]:
     renderer = FakeRenderer([])
-    frames = FrameStream(config_of(render__views_per_batch=batch, **overrides), renderer, OBJECT_IDS, LIGHTS, device)
+    frames = frame_stream(config_of(render__views_per_batch=batch, **overrides), renderer, device)
     return [copied(made) for made in frames.render("snapshot", report_of(live))], renderer
 
 
@@ -198,7 +204,7 @@ def test_what_a_tick_says_of_its_live_worlds():
 
 def test_a_tick_that_is_stopped_early_leaves_nothing_behind(device):
     """Whoever stops reading a tick's batches gets the next tick's from its first."""
-    frames = FrameStream(config_of(render__views_per_batch=2), FakeRenderer([]), OBJECT_IDS, LIGHTS, device)
+    frames = frame_stream(config_of(render__views_per_batch=2), FakeRenderer([]), device)
     next(frames.render("first", report_of([1] * WORLDS)))
     batches = frames.render("second", report_of([0, 0, 1, 0, 0]))
     assert [int(episode) for made in batches for episode in made.episode] == [22, 22, 22]

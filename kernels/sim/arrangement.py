@@ -120,9 +120,8 @@ def sample_objects_kernel(
 ):
     """Sample objects uniformly until the next one would exceed the volume budget V: Σ volume ≤ V.
 
-    `catalog_index` receives the object of each instance (-1: none), `body_slot` its body. Objects take slots of their class, single
-    body or compound, in the order of sampling; if a class runs out of slots, the episode ends with ARRANGEMENT_OVERFLOW. The first
-    object is resampled until one fits.
+    The first object is resampled until one fits. `catalog_index` receives the objects (-1: none), `body_slot` the next free slot of
+    their class, single or compound; if a class runs out of slots, the episode ends with ARRANGEMENT_OVERFLOW.
     """
     world = wp.tid()
     phase = phase_inout[world]

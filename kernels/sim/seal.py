@@ -55,6 +55,42 @@ class Wrench:
     """[N·m]"""
 
 
+@wp.struct
+class TcpMotion:
+    """Pose and velocity of the tcp frame, in the world's axes."""
+
+    position: wp.vec3
+    """[m]"""
+    rotation: wp.quat
+    """From the tcp frame to the world."""
+    axis: wp.vec3
+    """Unit vector +z: the cup's axis."""
+    wrist_axis: wp.vec3
+    """Unit vector +y: the axis about which the cup tilts."""
+    wrist_arm: wp.vec3
+    """Moment arm from the wrist to the TCP [m]."""
+    velocity: wp.vec3
+    """[m/s]"""
+    angular_velocity: wp.vec3
+    """[rad/s]"""
+
+
+@wp.func
+def tcp_motion(cup_in_world: wp.transform, cup_velocity: wp.spatial_vector, cup_com: wp.vec3, suction: SuctionData) -> TcpMotion:
+    """Motion of the tcp frame from pose and velocity of the cup, whose centre of mass is `cup_com` in its frame [m]."""
+    tcp_in_world = tcp_pose(cup_in_world, suction.tcp_offset)
+    result = TcpMotion()
+    result.position = wp.transform_get_translation(tcp_in_world)
+    result.rotation = wp.transform_get_rotation(tcp_in_world)
+    result.axis = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, 1.0))
+    result.wrist_axis = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 1.0, 0.0))
+    result.wrist_arm = result.position - wp.transform_get_translation(cup_in_world)
+    result.angular_velocity = wp.spatial_bottom(cup_velocity)
+    com_arm = result.position - wp.transform_point(cup_in_world, cup_com)
+    result.velocity = wp.spatial_top(cup_velocity) + wp.cross(result.angular_velocity, com_arm)
+    return result
+
+
 @wp.func
 def object_inverse_mass(inverse_mass: float, inverse_inertia: wp.mat33, arm: wp.vec3) -> InverseMass:
     """Inverse effective mass of a free body at a point with moment arm r = `arm` [m] from its centre of mass.
@@ -210,44 +246,38 @@ def apply_seal_forces_kernel(
     if seals == 0:
         return
     cup = world * layout.bodies + CUP
-    tcp_in_world = tcp_pose(body_q[cup], suction.tcp_offset)
-    tcp = wp.transform_get_translation(tcp_in_world)
-    cup_axis = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 0.0, 1.0))
-    wrist_axis = wp.transform_vector(tcp_in_world, wp.vec3(0.0, 1.0, 0.0))
-    wrist_arm = tcp - wp.transform_get_translation(body_q[cup])
-    angular_velocity = wp.spatial_bottom(body_qd[cup])
-    velocity = wp.spatial_top(body_qd[cup]) + wp.cross(angular_velocity, tcp - wp.transform_point(body_q[cup], body_com[cup]))
-    gripper_inverse = gripper_inverse_mass(suction, wrist_axis, wrist_arm, seals)
+    tcp = tcp_motion(body_q[cup], body_qd[cup], body_com[cup], suction)
+    gripper_inverse = gripper_inverse_mass(suction, tcp.wrist_axis, tcp.wrist_arm, seals)
     gripper_dof = world * layout.dofs
     for instance in range(layout.instances):
         if attached_inout[world, instance] != 0:
             slot = body_slot[world, instance]
             body = world * layout.bodies + layout.gripper_bodies + slot
             grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
-            object_arm = tcp - wp.transform_point(body_q[body], body_com[body])
+            object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
             rotation = wp.quat_to_matrix(wp.transform_get_rotation(body_q[body]))
             object_inverse = object_inverse_mass(
                 body_inv_mass[body], rotation * body_inv_inertia[body] * wp.transpose(rotation), object_arm
             )
             object_angular_velocity = wp.spatial_bottom(body_qd[body])
-            slip = velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_angular_velocity, object_arm)
-            error = rotation_error(wp.transform_get_rotation(tcp_in_world), wp.transform_get_rotation(grip_in_world), suction)
+            slip = tcp.velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_angular_velocity, object_arm)
+            error = rotation_error(tcp.rotation, wp.transform_get_rotation(grip_in_world), suction)
             wrench = seal_wrench(
-                tcp - wp.transform_get_translation(grip_in_world),
+                tcp.position - wp.transform_get_translation(grip_in_world),
                 error,
                 slip,
-                angular_velocity - object_angular_velocity,
+                tcp.angular_velocity - object_angular_velocity,
                 add_inverse_masses(object_inverse, gripper_inverse),
                 suction,
             )
-            force = tension_and_shear(wrench.force, cup_axis)
+            force = tension_and_shear(wrench.force, tcp.axis)
             first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
             seal_force_inout[world, instance] = force
             peak_force_inout[world] = wp.max(peak_force_inout[world], force)
             if force > break_force[world]:
                 break_seal(attached_inout, joint_f_inout, world, instance, first_dof)
             else:
-                apply_wrench(wrench, object_arm, wrist_arm, wrist_axis, joint_f_inout, gripper_dof, first_dof)
+                apply_wrench(wrench, object_arm, tcp.wrist_arm, tcp.wrist_axis, joint_f_inout, gripper_dof, first_dof)
 
 
 @wp.func

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import SimpleNamespace
 from typing import Any
@@ -93,22 +93,22 @@ class TickReport:
 
 @dataclass(frozen=True, eq=False)
 class LightTable:
-    """What is told of each light map."""
+    """Names and sun directions of the environment maps."""
 
     name: np.ndarray
-    """(light) str."""
+    """Name (light) str."""
     direction: np.ndarray
-    """Unit vector towards the main light of the map that is not turned (light, 3) float32; zero: none."""
+    """Unit vector towards the sun (dominant light) of the unrotated map (light, 3) float32; zero: none."""
 
-    def directions(self, light: np.ndarray, turn: np.ndarray) -> np.ndarray:
-        """The same in the world (..., 3) float32, of maps `light` (...) that are turned by `turn` (...) [rad]."""
+    def directions(self, light: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+        """Sun directions in the world (..., 3) float32 of maps `light` (...) with yaw `yaw` (...) [rad]."""
         x, y, z = np.moveaxis(self.direction[light].astype(np.float64), -1, 0)
-        c, s = np.cos(turn), np.sin(turn)
+        c, s = np.cos(yaw), np.sin(yaw)
         return np.stack([c * x - s * y, s * x + c * y, z], axis=-1).astype(np.float32)
 
 
 def name_lights(names: list[str], lights: Any) -> LightTable:
-    """The table of light maps, from their names and the struct `Lights`."""
+    """Build the table of environment maps from their names and the struct `Lights`."""
     shines = lights.sun_irradiance.numpy().max(axis=1, keepdims=True) > 0.0
     return LightTable(np.array(names), np.where(shines, lights.sun_direction.numpy(), 0.0).astype(np.float32))
 
@@ -195,27 +195,39 @@ def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> 
 class FrameStream:
     """Renders the live worlds of snapshots as FrameBatches; while one is consumed, the next is rendered (ring buffer)."""
 
-    def __init__(self, config: Config, renderer: Renderer, object_ids: np.ndarray, lights: LightTable, device: wp.Device) -> None:
+    def __init__(
+        self,
+        sizes: dict[str, int],
+        layers: Collection[str],
+        cameras: int,
+        tick_time: float,
+        renderer: Renderer,
+        object_ids: np.ndarray,
+        lights: LightTable,
+        device: wp.Device,
+    ) -> None:
         """Allocate the ring of batches.
 
         Args:
-            config: Settings.
+            sizes: Extents by `view_sizes`.
+            layers: Names of the layers to render.
+            cameras: Count of cameras.
+            tick_time: Time between two frames [s].
             renderer: Renderer and annotator of views.
             object_ids: obj_id of each catalog entry (entry) int32.
-            lights: What is told of the light maps.
+            lights: Table of the environment maps.
             device: Device of rendering.
         """
         self.renderer = renderer
         self.object_ids = np.append(object_ids, -1).astype(np.int32)
         self.lights = lights
-        self.cameras = len(config.cameras.positions)
-        self.tick_time = config.physics.step * config.physics.steps_per_tick
-        sizes = view_sizes(config, device)
+        self.cameras = cameras
+        self.tick_time = tick_time
         self.batch, self.instances = sizes["view"], sizes["instance"]
         self.device = device
         self.copy_stream = wp.Stream(device) if device.is_cuda else None
         self.images = [item.name for kind in (ViewBuffers, BoundaryBuffers) for item in fields(kind)]
-        self.layers = [item.name for item in fields(LayerBuffers) if item.name in config.render.layers]
+        self.layers = [item.name for item in fields(LayerBuffers) if item.name in layers]
         ring = range(RING if device.is_cuda else 1)
         self.buffers = [allocate(ViewBuffers, sizes, device) for _ in ring]
         self.boundaries = [allocate(BoundaryBuffers, boundary_sizes(sizes), device) for _ in ring]
@@ -236,9 +248,9 @@ class FrameStream:
         world = np.repeat(live, self.cameras).astype(np.int32)
         camera = np.tile(np.arange(self.cameras, dtype=np.int32), len(live))
         waiting: tuple[int, slice] | None = None
-        for number, first in enumerate(range(0, len(world), self.batch)):
+        for index, first in enumerate(range(0, len(world), self.batch)):
             part = slice(first, min(first + self.batch, len(world)))
-            slot = number % len(self.buffers)
+            slot = index % len(self.buffers)
             if waiting is not None and len(self.buffers) == 1:
                 yield self._collect(waiting, world, camera, report)
                 waiting = None

@@ -87,7 +87,7 @@ def test_random_choices_use_their_stream_and_are_uniform(device):
     worlds = 400
     harness = failed(device, worlds, Outcome.DROPPED, 1)
     redraw = np.arange(worlds) % 2
-    harness.worlds.begin(Phase.ACT, redraw=redraw)
+    harness.worlds.begin(Phase.ACT, arrangement=redraw)
     key = rng.stream_key(SEED, np.arange(worlds), redraw, Stream.TARGETS)
     index = rng.uniform_index(key, np.arange(worlds) % 3 + 1, 4)
     found = np.array(choose(harness, Mode.TARGET))

@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,7 +16,7 @@ from synpick_warp.stages.constants import make_scene_data
 from synpick_warp.stages.sim import arrange
 from tests.twins import arrangement
 from tests.worlds import small_worlds
-from tests.worlds.kernel_worlds import KernelWorlds
+from tests.worlds.kernel_worlds import KernelWorlds, arrangement_worlds
 
 WORLDS = 24
 SEED = 2**40 + 3
@@ -39,21 +38,6 @@ def catalogs(draw):
         "drop": {"volume": draw(st.floats(0.01, 3.0)), "move_repeats": draw(st.integers(0, 1)), "pick_repeats": draw(st.integers(0, 1))},
         "mix": draw(st.sampled_from(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (1.0, 1.0, 2.0)))),
     }
-
-
-def made(device, worlds: int = WORLDS, mix: tuple[float, float, float] = (0.0, 0.0, 1.0), **sizes) -> KernelWorlds:
-    """Worlds whose episodes have modes with these weights of pick, target and move."""
-    default = {
-        "volume": np.array([0.1, 0.2, 0.3]),
-        "compound": np.array([0, 1, 0]),
-        "radius": np.array([0.05, 0.1, 0.2]),
-        "instances": 8,
-        "single_slots": 8,
-        "compound_slots": 8,
-    }
-    made_worlds = KernelWorlds(device, worlds, **(default | sizes))
-    made_worlds.scene.mode.pick_share, made_worlds.scene.mode.pick_or_target_share = np.cumsum(mix)[:2] / np.sum(mix)
-    return made_worlds
 
 
 def may_repeat(worlds: KernelWorlds, world: int) -> bool:
@@ -82,7 +66,7 @@ def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangemen
 
 @given(sizes=catalogs(), seed=st.integers(0, 2**63 - 1), first=st.integers(0, 2**30), redraw=st.integers(0, 20))
 def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, redraw, device):
-    worlds = made(device, **sizes)
+    worlds = arrangement_worlds(device, WORLDS, **sizes)
     worlds.begin(Phase.START, first + np.arange(WORLDS), redraw)
     worlds.set(worlds.state.catalog_index, 99)
     arrange.sample_objects(worlds.scene, worlds.state, seed)
@@ -117,7 +101,7 @@ def built(device) -> build.BuiltModel:
 def modes(built, device, mode: str, mix: tuple[float, float, float], episodes: np.ndarray, redraw: object = 0) -> np.ndarray:
     """Mode of each episode, one world an episode, from settings to the device and back."""
     config = small_worlds.settings(bake__mode=mode, bake__mix=list(mix))
-    worlds = made(device, worlds=len(episodes))
+    worlds = arrangement_worlds(device, worlds=len(episodes))
     scene = make_scene_data(config, small_worlds.catalog(), built, 1, device)
     worlds.scene = dataclasses.replace(worlds.scene, mode=scene.mode)
     worlds.begin(Phase.START, episodes, redraw)
@@ -161,7 +145,7 @@ def test_modes_are_drawn_apart_from_objects(device):
     """Where modes differ and the rules of repeating do not, all else of an episode is the same."""
     episodes, objects = np.arange(WORLDS), []
     for mix in ((1.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
-        worlds = made(device, mix=mix, drop={"move_repeats": 1, "pick_repeats": 1})
+        worlds = arrangement_worlds(device, WORLDS, mix=mix, drop={"move_repeats": 1, "pick_repeats": 1})
         worlds.begin(Phase.START, episodes)
         arrange.sample_objects(worlds.scene, worlds.state, SEED)
         objects.append((worlds.state.catalog_index.numpy(), worlds.state.light_yaw.numpy()))
@@ -170,7 +154,7 @@ def test_modes_are_drawn_apart_from_objects(device):
 
 
 def test_a_budget_for_everything_draws_everything_without_repeats(device):
-    worlds = made(device, drop={"volume": 10.0, "move_repeats": 0})
+    worlds = arrangement_worlds(device, WORLDS, drop={"volume": 10.0, "move_repeats": 0})
     worlds.begin(Phase.START)
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
     assert (np.sort(worlds.state.catalog_index.numpy(), axis=1)[:, -3:] == [0, 1, 2]).all()
@@ -178,14 +162,16 @@ def test_a_budget_for_everything_draws_everything_without_repeats(device):
 
 
 def test_the_budget_may_be_met_exactly(device):
-    worlds = made(device, volume=np.array([0.25]), compound=np.array([0]), radius=np.array([0.1]), drop={"volume": 1.0})
+    worlds = arrangement_worlds(
+        device, WORLDS, volume=np.array([0.25]), compound=np.array([0]), radius=np.array([0.1]), drop={"volume": 1.0}
+    )
     worlds.begin(Phase.START)
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
     assert ((worlds.state.catalog_index.numpy() == 0).sum(axis=1) == 4).all()
 
 
 def test_an_object_that_never_fits_is_never_drawn(device):
-    worlds = made(device, drop={"volume": 0.25})
+    worlds = arrangement_worlds(device, WORLDS, drop={"volume": 0.25})
     worlds.begin(Phase.START)
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
     entry = worlds.state.catalog_index.numpy()
@@ -195,7 +181,7 @@ def test_an_object_that_never_fits_is_never_drawn(device):
 
 def test_each_mode_has_its_own_rule_of_repeating(device):
     """One bake: episodes of picking without repeats, episodes of moving with them."""
-    worlds = made(device, worlds=200, mix=(1.0, 1.0, 1.0), drop={"volume": 10.0, "move_repeats": 1, "pick_repeats": 0})
+    worlds = arrangement_worlds(device, worlds=200, mix=(1.0, 1.0, 1.0), drop={"volume": 10.0, "move_repeats": 1, "pick_repeats": 0})
     worlds.begin(Phase.START)
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
     moving = worlds.state.mode.numpy() == Mode.MOVE
@@ -218,7 +204,7 @@ def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
     )
     objects = small_worlds.catalog()
     single, compound = build.count_slots(config, objects)
-    worlds = made(
+    worlds = arrangement_worlds(
         device,
         episodes,
         mix,
@@ -238,7 +224,7 @@ def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
 
 @pytest.mark.parametrize("phase", [Phase.EMPTY, Phase.SETTLE, Phase.ACT, Phase.OVER])
 def test_worlds_at_work_keep_their_objects(device, phase):
-    worlds = made(device)
+    worlds = arrangement_worlds(device, WORLDS)
     worlds.begin(phase)
     worlds.set(worlds.state.catalog_index, 2)
     worlds.set(worlds.state.light, 7)
@@ -259,7 +245,7 @@ def test_worlds_at_work_keep_their_objects(device, phase):
 @given(sizes=catalogs(), spread=st.floats(0.0, 1.0), clearance=st.floats(0.0, 0.05), episode=st.integers(0, 2**30))
 def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance, episode, device):
     sizes["drop"] |= {"spread": spread, "clearance": clearance}
-    worlds = made(device, **sizes)
+    worlds = arrangement_worlds(device, WORLDS, **sizes)
     worlds.begin(Phase.START, episode + np.arange(WORLDS))
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
     over = worlds.state.phase.numpy() == Phase.OVER
@@ -283,7 +269,7 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
 
 
 def test_the_drop_uses_the_whole_spread(device):
-    worlds = made(device, worlds=500, radius=np.full(3, 0.05), drop={"spread": 1.0})
+    worlds = arrangement_worlds(device, worlds=500, radius=np.full(3, 0.05), drop={"spread": 1.0})
     worlds.begin(Phase.START)
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
@@ -293,7 +279,7 @@ def test_the_drop_uses_the_whole_spread(device):
 
 
 def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device):
-    worlds = made(device)
+    worlds = arrangement_worlds(device, WORLDS)
     worlds.begin(Phase.START)
     worlds.set(worlds.physics.state.joint_qd, 1.0)
     worlds.set(worlds.physics.control.joint_f, 7.0)
@@ -323,7 +309,7 @@ def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device)
 
 
 def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
-    worlds = made(device, compound_slots=0)
+    worlds = arrangement_worlds(device, WORLDS, compound_slots=0)
     worlds.begin(Phase.START)
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
@@ -333,82 +319,3 @@ def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
     assert (worlds.state.catalog_index.numpy()[over] == -1).all()
     assert (worlds.coordinates()[over][:, :, 2] == kernels.PARKED_HEIGHT).all()
     assert (worlds.forces()[over][:, :, 2] > 0.0).all()
-
-
-def take(device, phase, ending, address, following: int, *, episodes: int, tries: int):
-    """State after numbers are handed out: phase, ending, address, next number."""
-    worlds = made(device, worlds=len(phase))
-    state = worlds.state
-    for array, values in ((state.phase, phase), (state.ending, ending), (state.arrangement_id, address), (state.next_episode, following)):
-        worlds.set(array, values)
-    arrange.assign_episodes(state, wp.array(np.arange(episodes), dtype=wp.int32, device=device), tries)
-    return (
-        state.phase.numpy().tolist(),
-        state.ending.numpy().tolist(),
-        state.arrangement_id.numpy().tolist(),
-        int(state.next_episode.numpy()[0]),
-    )
-
-
-def test_numbers_are_those_of_the_list(device):
-    worlds = made(device, worlds=3)
-    worlds.begin(Phase.EMPTY, -1)
-    arrange.assign_episodes(worlds.state, wp.array([7, 2], dtype=wp.int32, device=device), 1)
-    assert worlds.state.arrangement_id.numpy().tolist() == [[7, 0], [2, 0], [-1, 0]]
-    assert worlds.state.phase.numpy().tolist() == [Phase.START, Phase.START, Phase.IDLE]
-
-
-def test_empty_worlds_take_numbers_in_order(device):
-    assert take(device, [Phase.EMPTY] * 3, 0, -1, 0, episodes=2, tries=1) == (
-        [Phase.START, Phase.START, Phase.IDLE],
-        [0, 0, 0],
-        [[0, 0], [1, 0], [-1, 0]],
-        2,
-    )
-
-
-def test_an_episode_that_delivered_nothing_is_drawn_again_in_its_world_until_it_is_given_up(device):
-    over = [Phase.OVER] * 4
-    ending = [Ending.UNSETTLED, Ending.FINISHED, Ending.NOT_FINITE, Ending.UNSETTLED]
-    address = [[3, 0], [4, 0], [5, 1], [6, 2]]
-    assert take(device, over, ending, address, 9, episodes=100, tries=3) == (
-        [Phase.START] * 4,
-        [Ending.RUNNING] * 4,
-        [[3, 1], [9, 0], [5, 2], [10, 0]],
-        11,
-    )
-
-
-def test_worlds_at_work_keep_their_numbers(device):
-    phase = [Phase.SETTLE, Phase.ACT, Phase.IDLE]
-    assert take(device, phase, 0, [[0, 0], [1, 0], [-1, 0]], 2, episodes=9, tries=3) == (phase, [0, 0, 0], [[0, 0], [1, 0], [-1, 0]], 2)
-
-
-@given(worlds=st.integers(1, 6), episodes=st.integers(1, 20), tries=st.integers(1, 4), seed=st.integers(0, 2**32 - 1))
-def test_every_episode_ends_once(worlds, episodes, tries, seed, device):
-    """Whatever becomes of episodes, each number is delivered or given up exactly once; then all worlds are idle."""
-    numbers = np.random.default_rng(seed)
-    made_worlds = made(device, worlds=worlds)
-    state = made_worlds.state
-    made_worlds.begin(Phase.EMPTY, -1)
-    started, ended = [], []
-    listed = wp.array(np.arange(episodes), dtype=wp.int32, device=device)
-    for _ in range(8 * episodes * tries):
-        arrange.assign_episodes(state, listed, tries)
-        phase, ending, address = state.phase.numpy(), state.ending.numpy(), state.arrangement_id.numpy()
-        started += [tuple(address[world]) for world in np.flatnonzero(phase == Phase.START)]
-        for world in np.flatnonzero(phase != Phase.IDLE):
-            phase[world], ending[world] = Phase.ACT, Ending.RUNNING
-            if numbers.uniform() < 0.5:
-                phase[world], ending[world] = Phase.OVER, numbers.choice([Ending.FINISHED, Ending.UNSETTLED])
-                if ending[world] == Ending.FINISHED or address[world, 1] == tries - 1:
-                    ended.append(int(address[world, 0]))
-        if (phase == Phase.IDLE).all():
-            break
-        made_worlds.set(state.phase, phase)
-        made_worlds.set(state.ending, ending)
-    assert (state.phase.numpy() == Phase.IDLE).all()
-    assert sorted(ended) == list(range(episodes))
-    assert len(set(started)) == len(started)
-    assert [episode for episode, redraw in started if redraw == 0] == list(range(episodes))
-    assert (state.arrangement_id.numpy()[:, 0] == -1).all()

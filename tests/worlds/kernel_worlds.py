@@ -1,4 +1,4 @@
-"""Worlds without a physics engine: the state and the constants that kernels take, with bodies that stay where they are put."""
+"""Worlds without a physics engine: state and constants of kernels, with bodies at fixed poses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.kernels import structs
-from synpick_warp.stages.constants import SceneData
+from synpick_warp.stages.constants import SceneData, fill
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
@@ -19,10 +19,51 @@ GRIPPER_BODIES, GRIPPER_DOFS = 2, 4
 GUIDES = (6, 7, 8, 9)
 SHAPES = 20
 
+DROP: dict[str, Any] = {
+    "volume": 1.0,
+    "move_repeats": 1,
+    "pick_repeats": 1,
+    "clearance": 0.01,
+    "spread": 0.5,
+    "rim_length": 0.5,
+    "rim_width": 0.3,
+    "rim_height": 0.2,
+    "gravity": 9.81,
+    "gripper_home": wp.vec3(3.0, 0.0, 1.0),
+    "lights": 5,
+    "turn_lights": 1,
+    "exposure_spread": 0.5,
+}
+SETTLE: dict[str, Any] = {
+    "min_ticks": 3,
+    "max_ticks": 100,
+    "rest_ticks": 2,
+    "stuck_ticks": 2,
+    "late_ticks": 50,
+    "rest_threshold": 1e-4,
+    "relaxed_rest_threshold": 1e-3,
+    "stuck_depth": 0.01,
+    "max_redrops": 8,
+}
+MOVE: dict[str, Any] = {
+    "waypoints": 8,
+    "corner": wp.vec3(0.2, 0.1, 0.02),
+    "start_height": 0.3,
+    "tcp_offset": 0.05,
+    "mass": 2.0,
+    "gravity": 9.81,
+    "step": 2e-3,
+    "stiffness": 1000.0,
+    "damping": 60.0,
+    "force": 30.0,
+    "speed": 0.1,
+}
+"""Default members of the structs, overridden by the fields of `KernelWorlds` with the same names in lower case."""
+
 
 @dataclass
 class KernelWorlds:
-    """Sizes and constants; `arrange` functions take `scene`, `state` and `physics`."""
+    """State and constants of worlds; stages take `scene`, `state`, `attempts`, `seals`, `observation`, `plan` and `physics`."""
 
     device: Any
     worlds: int
@@ -47,55 +88,13 @@ class KernelWorlds:
     def __post_init__(self) -> None:
         self.slots = self.single_slots + self.compound_slots
         self.bodies, self.coords, self.dofs = GRIPPER_BODIES + self.slots, GRIPPER_DOFS + 7 * self.slots, GRIPPER_DOFS + 6 * self.slots
-        drop = {
-            "volume": 1.0,
-            "move_repeats": 1,
-            "pick_repeats": 1,
-            "clearance": 0.01,
-            "spread": 0.5,
-            "rim_length": 0.5,
-            "rim_width": 0.3,
-            "rim_height": 0.2,
-            "gravity": 9.81,
-            "gripper_home": wp.vec3(3.0, 0.0, 1.0),
-            "lights": 5,
-            "turn_lights": 1,
-            "exposure_spread": 0.5,
-            **self.drop,
-        }
-        settle = {
-            "min_ticks": 3,
-            "max_ticks": 100,
-            "rest_ticks": 2,
-            "stuck_ticks": 2,
-            "late_ticks": 50,
-            "rest_threshold": 1e-4,
-            "relaxed_rest_threshold": 1e-3,
-            "stuck_depth": 0.01,
-            "max_redrops": 8,
-            **self.settle,
-        }
-        move = {
-            "waypoints": 8,
-            "corner": wp.vec3(0.2, 0.1, 0.02),
-            "start_height": 0.3,
-            "tcp_offset": 0.05,
-            "mass": 2.0,
-            "gravity": 9.81,
-            "step": 2e-3,
-            "stiffness": 1000.0,
-            "damping": 60.0,
-            "force": 30.0,
-            "speed": 0.1,
-            **self.move,
-        }
         self.scene = SceneData(
             self._layout(),
             self._catalog(),
-            filled(structs.DropData(), drop),
-            filled(structs.SettleData(), settle),
-            filled(structs.ModeData(), {"pick_share": 0.0, "pick_or_target_share": 0.0}),
-            filled(structs.MoveData(), move),
+            fill(structs.DropData, **(DROP | self.drop)),
+            fill(structs.SettleData, **(SETTLE | self.settle)),
+            fill(structs.ModeData, pick_share=0.0, pick_or_target_share=0.0),
+            fill(structs.MoveData, **(MOVE | self.move)),
             filled(structs.PickData(), self.pick),
             structs.PerceptionData(),
             structs.SuctionData(),
@@ -107,7 +106,7 @@ class KernelWorlds:
             "world_and_global": self.worlds + 1,
             "instance": self.instances,
             "body": self.worlds * self.bodies,
-            "waypoint": move["waypoints"],
+            "waypoint": self.scene.move.waypoints,
         }
         self.state = allocate(WorldState, sizes, self.device)
         self.attempts = allocate(AttemptState, sizes, self.device)
@@ -117,26 +116,19 @@ class KernelWorlds:
         self.physics = self._physics()
 
     def _layout(self) -> Any:
-        return filled(
-            structs.LayoutData(),
-            {
-                "instances": self.instances,
-                "single_slots": self.single_slots,
-                "slots": self.slots,
-                "gripper_bodies": GRIPPER_BODIES,
-                "gripper_dofs": GRIPPER_DOFS,
-                "bodies": self.bodies,
-                "coords": self.coords,
-                "dofs": self.dofs,
-                "shapes": SHAPES,
-                "finger_shape": 10,
-                "cup_shape": 11,
-            },
+        return fill(
+            structs.LayoutData,
+            self,
+            gripper_bodies=GRIPPER_BODIES,
+            gripper_dofs=GRIPPER_DOFS,
+            shapes=SHAPES,
+            finger_shape=10,
+            cup_shape=11,
         )
 
     def _catalog(self) -> Any:
         compound = np.asarray(self.compound, np.int32)
-        # Position among the entries of its kind, as scenes.build numbers variants.
+        # Variants as in scenes.build: position among the objects of the same slot class.
         variant = np.where(compound == 1, np.cumsum(compound), np.cumsum(1 - compound)) - 1
         columns = {
             "volume": (self.volume, float),
@@ -148,41 +140,39 @@ class KernelWorlds:
             "variant": (variant, int),
         }
         arrays = {name: wp.array(np.asarray(values), dtype=dtype, device=self.device) for name, (values, dtype) in columns.items()}
-        return filled(
-            structs.CatalogData(),
-            {
-                "count": len(compound),
-                **arrays,
-                "empty_single": int((compound == 0).sum()),
-                "empty_compound": int(compound.sum()),
-                "empty_mass": 0.1,
-            },
+        return fill(
+            structs.CatalogData,
+            count=len(compound),
+            empty_single=int((compound == 0).sum()),
+            empty_compound=int(compound.sum()),
+            empty_mass=0.1,
+            **arrays,
         )
 
     def _physics(self) -> Any:
-        def made(per_world: int, dtype: Any = float) -> wp.array:
+        def zeros(per_world: int, dtype: Any = float) -> wp.array:
             return wp.zeros(self.worlds * per_world, dtype=dtype, device=self.device)
 
-        body_q = made(self.bodies, wp.transform)
+        body_q = zeros(self.bodies, wp.transform)
         body_q.fill_(wp.transform_identity())
         contacts = SimpleNamespace(rigid_contact_max=0)
         return SimpleNamespace(
-            state=SimpleNamespace(joint_q=made(self.coords), joint_qd=made(self.dofs), body_q=body_q),
-            control=SimpleNamespace(joint_f=made(self.dofs), joint_target_q=made(self.coords)),
-            solver=SimpleNamespace(constraint_overflow=made(1, wp.bool)),
-            model=SimpleNamespace(shape_transform=made(SHAPES, wp.transform), shape_body=made(SHAPES, int)),
+            state=SimpleNamespace(joint_q=zeros(self.coords), joint_qd=zeros(self.dofs), body_q=body_q),
+            control=SimpleNamespace(joint_f=zeros(self.dofs), joint_target_q=zeros(self.coords)),
+            solver=SimpleNamespace(constraint_overflow=zeros(1, wp.bool)),
+            model=SimpleNamespace(shape_transform=zeros(SHAPES, wp.transform), shape_body=zeros(SHAPES, int)),
             contacts=contacts,
             load=lambda variant, restarted: None,
         )
 
     def set(self, array: wp.array, values: Any) -> None:
-        """Write an array of the state."""
+        """Write values, broadcast, to an array of the state."""
         array.assign(np.broadcast_to(np.asarray(values, array.numpy().dtype), array.numpy().shape).copy())
 
-    def begin(self, phase: int, episodes: Any = None, redraw: Any = 0) -> None:
-        """All worlds in a phase; world w has episode w."""
+    def begin(self, phase: int, episodes: Any = None, arrangement: Any = 0) -> None:
+        """Set the phase and arrangement of all worlds; by default world w has episode w."""
         episodes = np.arange(self.worlds) if episodes is None else episodes
-        self.set(self.state.arrangement_id, np.stack(np.broadcast_arrays(episodes, redraw), axis=-1))
+        self.set(self.state.arrangement_id, np.stack(np.broadcast_arrays(episodes, arrangement), axis=-1))
         self.set(self.state.phase, phase)
 
     def coordinates(self) -> np.ndarray:
@@ -194,14 +184,29 @@ class KernelWorlds:
         return self.physics.control.joint_f.numpy().reshape(self.worlds, -1)[:, GRIPPER_DOFS:].reshape(self.worlds, self.slots, 6)
 
     def place(self, world: int, instance: int, pose: Any) -> None:
-        """Put an instance's body at a pose (7)."""
+        """Write the pose (7) of an instance's body."""
         body_q = self.physics.state.body_q.numpy()
         body_q[world * self.bodies + GRIPPER_BODIES + self.state.body_slot.numpy()[world, instance]] = pose
         self.physics.state.body_q.assign(body_q)
 
 
 def filled(struct: Any, values: dict[str, Any]) -> Any:
-    """A struct with its fields set."""
+    """Set members of a struct; return it."""
     for name, value in values.items():
         setattr(struct, name, value)
     return struct
+
+
+def arrangement_worlds(device: Any, worlds: int, mix: tuple[float, float, float] = (0.0, 0.0, 1.0), **sizes: Any) -> KernelWorlds:
+    """Worlds with three objects, whose modes are sampled with these weights of pick, target and move."""
+    default = {
+        "volume": np.array([0.1, 0.2, 0.3]),
+        "compound": np.array([0, 1, 0]),
+        "radius": np.array([0.05, 0.1, 0.2]),
+        "instances": 8,
+        "single_slots": 8,
+        "compound_slots": 8,
+    }
+    result = KernelWorlds(device, worlds, **(default | sizes))
+    result.scene.mode.pick_share, result.scene.mode.pick_or_target_share = np.cumsum(mix)[:2] / np.sum(mix)
+    return result

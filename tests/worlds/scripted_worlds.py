@@ -16,9 +16,15 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.stream import TickReport
+from tests.worlds.small_worlds import settings
 
 Ticks = Iterator[None]
 """A script: each yield is a tick."""
+
+ROOM = 4
+OBJECT_IDS = np.array([3, 8, 21], np.int32)
+CONFIG = settings(bake__mode="mixed", arrangement__max_objects=ROOM, sight__resolution=[64, 48], suction__tolerated_misses=1)
+RAYS = CONFIG.suction.rays
 
 
 class World:
@@ -109,7 +115,7 @@ def play(script: dict[World, Ticks], log: AttemptLog) -> dict[tuple[int, int], E
         for world, runs in zip(script, running, strict=True):
             if not runs:
                 world.now(phase=Phase.IDLE, live=0, outcome=0)
-        found |= {(tick, episode): record for episode, record in log.see(report(list(script))).items()}
+        found |= {(tick, episode): record for episode, record in log.update(report(list(script))).items()}
     raise AssertionError("a script does not end")
 
 
@@ -130,3 +136,13 @@ def report(side_by_side: list[World]) -> TickReport:
 def bits(*instances: int) -> int:
     """One bit an instance."""
     return sum(1 << instance for instance in instances)
+
+
+def new_world(device: Any) -> World:
+    """A world with the settings `CONFIG`."""
+    return World(CONFIG, device)
+
+
+def run(*scripts: tuple[World, Ticks]) -> dict[tuple[int, int], EpisodeRecord]:
+    """Play scripts side by side into a new log; see `play`."""
+    return play(dict(scripts), AttemptLog(CONFIG.suction, CONFIG.sight.resolution, OBJECT_IDS))

@@ -26,6 +26,7 @@ from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.step_log import PhysicsRecord, Recorder
 from synpick_warp.stages.sim.suction import Suction
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
+from synpick_warp.stages.timing import scope
 
 # Ring size of tick records: one is written while the host reads the previous one.
 RECORDS = 2
@@ -76,8 +77,8 @@ class Simulation:
         self.layout = built.layout
         self.physics = Physics(config.physics, built)
         self.scene: SceneData = make_scene_data(config, catalog, built, lights, device)
-        indices = range(config.bake.episodes) if episodes is None else episodes
-        self.episodes = wp.array(np.asarray(indices, np.int32), dtype=wp.int32, device=device)
+        indices = np.asarray(range(config.bake.episodes) if episodes is None else episodes, np.int32)
+        self.episodes = wp.array(indices, dtype=wp.int32, device=device)
         sizes = world_sizes(config, built.layout.bodies_per_world)
         self.state = allocate(WorldState, sizes, device)
         self.attempts = allocate(AttemptState, sizes, device)
@@ -97,17 +98,8 @@ class Simulation:
             if render_scene is None:
                 raise ValueError("episodes that pick need a render_scene for perception")
             self.suction = Suction(config.suction, catalog, render_scene, device)
-            self.perception = Perception(
-                config.sight,
-                config.cameras,
-                config.bake.seed,
-                render_scene,
-                self.scene,
-                self.state,
-                self.attempts,
-                self.observation,
-                self.plan,
-            )
+            state = (self.scene, self.state, self.attempts, self.observation, self.plan)
+            self.perception = Perception(config.sight, config.cameras, config.bake.seed, render_scene, *state)
 
     def _make_record(self, sizes: dict[str, int]) -> TickRecord:
         physics = self.recorder.new_record() if self.recorder is not None else None
@@ -118,17 +110,22 @@ class Simulation:
 
         Start episodes, step physics, update tasks, end episodes, copy the snapshot, then plan attempts in worlds whose task is LOOK.
         """
-        self._arrange()
-        self.physics.tick(self._drive, self._ignore_contacts, self.recorder if self.config.trajectory.steps else None)
-        self._judge()
-        self._take_snapshot(record)
-        if self.recorder is not None and record.physics is not None:
-            self.recorder.take(record.physics)
+        with scope("arrange", self.device):
+            self._arrange()
+        with scope("physics", self.device):
+            self.physics.tick(self._drive, self._ignore_contacts, self.recorder if self.config.trajectory.steps else None)
+        with scope("judge", self.device):
+            self._judge()
+        with scope("snapshot", self.device):
+            self._take_snapshot(record)
+            if self.recorder is not None and record.physics is not None:
+                self.recorder.take(record.physics)
         if self.perception is not None:
-            self.perception.perceive(record.snapshot)
-            gripper.begin_attempts(self.scene, self.state, self.attempts, self.plan, self.physics)
-            _copy(record.observation, self.observation)
-            _copy(record.plan, self.plan)
+            with scope("perceive", self.device):
+                self.perception.perceive(record.snapshot)
+                gripper.begin_attempts(self.scene, self.state, self.attempts, self.plan, self.physics)
+                _copy(record.observation, self.observation)
+                _copy(record.plan, self.plan)
 
     def _arrange(self) -> None:
         """Start episodes in free worlds: objects are sampled and dropped."""
