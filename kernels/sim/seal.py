@@ -92,16 +92,18 @@ def tcp_motion(cup_in_world: wp.transform, cup_velocity: wp.spatial_vector, cup_
 
 
 @wp.func
-def object_inverse_mass(inverse_mass: float, inverse_inertia: wp.mat33, arm: wp.vec3) -> InverseMass:
+def object_inverse_mass(object_rotation: wp.quat, inverse_mass: float, inverse_inertia: wp.mat33, arm: wp.vec3) -> InverseMass:
     """Inverse effective mass of a free body at a point with moment arm r = `arm` [m] from its centre of mass.
 
-    A force F accelerates the point by F/m + (I⁻¹ (r x F)) x r, a torque T by (I⁻¹ T) x r. The inverse inertia is in the world's axes.
+    A force F accelerates the point by F/m + (I⁻¹ (r x F)) x r, a torque T by (I⁻¹ T) x r, with the inverse inertia I⁻¹ in the world's
+    axes. The argument `inverse_inertia` is in the body's axes.
     """
+    rotation = wp.quat_to_matrix(object_rotation)
     cross = wp.skew(arm)
     result = InverseMass()
-    result.mixed = -cross * inverse_inertia
+    result.angular = rotation * inverse_inertia * wp.transpose(rotation)
+    result.mixed = -cross * result.angular
     result.linear = inverse_mass * wp.identity(n=3, dtype=float) + result.mixed * cross
-    result.angular = inverse_inertia
     return result
 
 
@@ -255,21 +257,15 @@ def apply_seal_forces_kernel(
             body = world * layout.bodies + layout.gripper_bodies + slot
             grip_in_world = body_q[body] * wp.transform_inverse(object_in_tcp[world, instance])
             object_arm = tcp.position - wp.transform_point(body_q[body], body_com[body])
-            rotation = wp.quat_to_matrix(wp.transform_get_rotation(body_q[body]))
-            object_inverse = object_inverse_mass(
-                body_inv_mass[body], rotation * body_inv_inertia[body] * wp.transpose(rotation), object_arm
-            )
+            rotation = wp.transform_get_rotation(body_q[body])
+            object_inverse = object_inverse_mass(rotation, body_inv_mass[body], body_inv_inertia[body], object_arm)
             object_angular_velocity = wp.spatial_bottom(body_qd[body])
             slip = tcp.velocity - wp.spatial_top(body_qd[body]) - wp.cross(object_angular_velocity, object_arm)
             error = rotation_error(tcp.rotation, wp.transform_get_rotation(grip_in_world), suction)
-            wrench = seal_wrench(
-                tcp.position - wp.transform_get_translation(grip_in_world),
-                error,
-                slip,
-                tcp.angular_velocity - object_angular_velocity,
-                add_inverse_masses(object_inverse, gripper_inverse),
-                suction,
-            )
+            offset = tcp.position - wp.transform_get_translation(grip_in_world)
+            angular_slip = tcp.angular_velocity - object_angular_velocity
+            inverse_mass = add_inverse_masses(object_inverse, gripper_inverse)
+            wrench = seal_wrench(offset, error, slip, angular_slip, inverse_mass, suction)
             force = tension_and_shear(wrench.force, tcp.axis)
             first_dof = gripper_dof + layout.gripper_dofs + 6 * slot
             seal_force_inout[world, instance] = force
