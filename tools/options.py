@@ -1,4 +1,4 @@
-"""Command-line options, result rows, tables and JSON output that all tools share."""
+"""Command-line options, report rows, tables and JSON output shared by all tools."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 
 INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
+"""Exit code after Ctrl-C: 128 + SIGINT, as in shells."""
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "device": {"default": "auto", "help": "cpu, cuda:N or auto (default: auto)"},
     "models": {"default": "", "help": "folder of BOP models (default: the embedded objects)"},
     "lights": {"default": "", "help": "folder of light maps (default: the embedded skies)"},
     "seed": {"type": int, "default": 0, "help": "seed of all random numbers (default: 0)"},
     "set": {"action": "append", "default": [], "metavar": "SECTION.KEY=VALUE", "help": "any other setting; may be repeated"},
-    "json": {"type": Path, "metavar": "FILE", "help": "also write the numbers to this file"},
+    "json": {"type": Path, "metavar": "FILE", "help": "also write the results to this file"},
 }
-"""Options that mean the same in every tool."""
+"""Options with the same meaning in every tool, as arguments of `add_argument`."""
 SETTINGS = {"device": "bake.device", "models": "bake.models", "lights": "bake.lights", "seed": "bake.seed"}
-"""Shared options that are settings."""
+"""Setting that each shared option overrides."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One line of a report: a measured number and, where it must keep one, its bound."""
+    """Row of a report: a measured value, and its bound if it has one."""
 
     name: str
     value: float
@@ -43,20 +43,20 @@ class Row:
     bound: str = ""
     holds: bool = True
     part: str = ""
-    """Group of lines that it belongs to."""
+    """Group that the row belongs to."""
 
     @property
     def verdict(self) -> str:
-        """Whether the bound holds; empty without a bound."""
+        """Result of the bound check: "holds" or "VIOLATED"; empty without a bound."""
         return "" if not self.bound else "holds" if self.holds else "VIOLATED"
 
-    def record(self) -> dict[str, Any]:
-        """Fields for JSON, which has no NaN."""
+    def to_dict(self) -> dict[str, Any]:
+        """Fields for JSON; None for NaN and infinity, which JSON does not have."""
         return asdict(self) | {"value": self.value if math.isfinite(self.value) else None}
 
 
 def make_parser(doc: str | None, *shared: str) -> argparse.ArgumentParser:
-    """Parser described by the first line of a module's docstring, with these of the shared options."""
+    """Argument parser with the shared options `shared`, described by the first line of the docstring `doc`."""
     parser = argparse.ArgumentParser(description=(doc or "").partition("\n")[0])
     for name in shared:
         parser.add_argument(f"--{name}", **OPTIONS[name])
@@ -64,7 +64,7 @@ def make_parser(doc: str | None, *shared: str) -> argparse.ArgumentParser:
 
 
 def configure(options: argparse.Namespace, fixed: Mapping[str, object], defaults: Mapping[str, object] | None = None) -> Config:
-    """Settings of a tool: its own defaults, then `--set`, then shared options and what the tool fixes.
+    """Load the settings of a tool: `defaults`, overridden by `--set`, then by shared options, then by `fixed`.
 
     Raises:
         ConfigError: A setting is unknown or out of its range.
@@ -74,8 +74,8 @@ def configure(options: argparse.Namespace, fixed: Mapping[str, object], defaults
     return load_config(None, overrides | dict(fixed), source=COMMAND_LINE)
 
 
-def names_of(allowed: Iterable[str], noun: str) -> Callable[[str], tuple[str, ...]]:
-    """Type of an option that takes several names, separated by commas."""
+def make_names_parser(allowed: Iterable[str], noun: str) -> Callable[[str], tuple[str, ...]]:
+    """Type (for `add_argument`) of an option that takes comma-separated names out of `allowed`; `noun` is for its error message."""
     choices = tuple(allowed)
 
     def parse(text: str) -> tuple[str, ...]:
@@ -88,13 +88,13 @@ def names_of(allowed: Iterable[str], noun: str) -> Callable[[str], tuple[str, ..
 
 
 def fail(tool: str, error: SynpickError | str) -> int:
-    """Print a user's mistake as one line; returns the exit code."""
+    """Print a user error as one line; returns the exit code 2."""
     print(f"{tool}: {error}", file=sys.stderr)
     return 2
 
 
 def print_machine(console: Console, machine: Iterable[tuple[str, str]]) -> None:
-    """Print what a measurement ran on."""
+    """Print the table of the machine that was measured: (name, value) pairs."""
     table = Table(show_header=False, box=None)
     for name, value in machine:
         table.add_row(name, value)
@@ -102,7 +102,7 @@ def print_machine(console: Console, machine: Iterable[tuple[str, str]]) -> None:
 
 
 def print_rows(console: Console, heading: str, title: str, rows: Iterable[Row]) -> None:
-    """Print rows with bounds and verdicts; numbers without a unit are counts."""
+    """Print a table of rows with bounds and verdicts; whole numbers without a unit are printed as counts."""
     table = Table(heading, "", "unit", "bound", "", title=title)
     table.columns[1].justify = "right"
     for row in rows:
@@ -112,6 +112,6 @@ def print_rows(console: Console, heading: str, title: str, rows: Iterable[Row]) 
 
 
 def write_json(path: Path | None, record: Any) -> None:
-    """Write a record, if a file was named."""
+    """Write `record` as JSON to `path`; None: write nothing."""
     if path is not None:
         path.write_text(json.dumps(record, indent=1) + "\n")

@@ -1,1 +1,1 @@
-"""Benchmarks: `python -m tools.bench`."""
+"""Benchmarks of simulation, perception, rendering and writing: `python -m tools.bench`."""

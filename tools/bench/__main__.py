@@ -163,7 +163,9 @@ def _worlds(config: Config, factory: Factory, least: float, parts: tuple[str, ..
 
 def _share_of_a_bake(config: Config, values: dict[str, float]) -> Iterator[Row]:
     """What looks and plans take of a tick in which every world picks and is rendered, if all that was measured."""
-    looks, step, rate = (values.get(name) for name in ("looks and plans, a tick", "picking: a step of all worlds", "views, all stages"))
+    looks, step, rate = (
+        values.get(name) for name in ("perception and planning, a tick", "picking: a step of all worlds", "views, all stages")
+    )
     if looks is not None and step and rate:
         views = 1e3 * config.bake.worlds * len(config.cameras.positions) / rate
         share = looks / (step * config.physics.steps_per_tick + views)

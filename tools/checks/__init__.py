@@ -1,1 +1,1 @@
-"""Checks: data sets, trajectories, determinism, device code."""
+"""Checks of data sets, trajectories, determinism, rendering across devices, and device code."""

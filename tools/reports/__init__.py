@@ -1,1 +1,1 @@
-"""Reports: measured behaviour of piles, picking and pictures."""
+"""Reports on settled piles, picking sequences and image quality, with bounds."""
