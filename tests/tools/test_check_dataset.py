@@ -1,4 +1,4 @@
-"""The check of data sets: it passes a right one, and fails each kind of wrong one, by the right measure."""
+"""Consistency check of data sets: it passes a correct one, and finds each type of damage by the right measure."""
 
 from __future__ import annotations
 
@@ -19,23 +19,24 @@ from tests.harness.exporter_contract import export
 from tests.worlds.box_views import cameras, config
 from tools.checks import dataset as tool
 
-LENSES = cameras(240, 180)
+CAMERAS = cameras(240, 180)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Path:
+def baked(tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("check") / "set"
-    return export(BopExporter, out, config(), (0,), 0, 2, LENSES)
+    return export(BopExporter, out, config(), (0,), 0, 2, CAMERAS)
 
 
 @pytest.fixture
-def dataset(made, tmp_path) -> Path:
+def dataset(baked, tmp_path) -> Path:
     tool.read_json.cache_clear()
     tool.read_model.cache_clear()
-    return Path(shutil.copytree(made, tmp_path / "set"))
+    return Path(shutil.copytree(baked, tmp_path / "set"))
 
 
 def violated(dataset: Path) -> set[str]:
+    """Names of the measures that exceed their bound."""
     return {name for name, measure in vars(tool.check(dataset, 6)).items() if not measure.holds}
 
 
@@ -56,18 +57,18 @@ def edit_images(pattern: str, edit: Callable[[np.ndarray], np.ndarray]) -> Calla
     return damage
 
 
-def add_to(key: str, place: int | None, value: float) -> Callable[[dict], None]:
+def add_to(key: str, index: int | None, value: float) -> Callable[[dict], None]:
     def edit(content: dict) -> None:
         record = content["0"][1]
-        if place is None:
+        if index is None:
             record[key] += value
         else:
-            record[key][place] += value
+            record[key][index] += value
 
     return edit
 
 
-def turn_inside_out(content: dict) -> None:
+def negate_rotation(content: dict) -> None:
     content["0"][0]["cam_R_m2c"] = [-value for value in content["0"][0]["cam_R_m2c"]]
 
 
@@ -88,7 +89,7 @@ def scale_models(scene: Path) -> None:
         mesh.export(path)
 
 
-def test_a_right_data_set_passes(dataset):
+def test_a_correct_data_set_passes(dataset):
     assert violated(dataset) == set()
 
 
@@ -109,16 +110,16 @@ SHIFTED_MASKS = edit_images("mask*/*_000001.png", lambda image: np.roll(image, 1
         (edit_json("scene_gt_info.json", add_to("px_count_valid", None, 1)), {"count_valid"}),
         (edit_json("scene_gt_info.json", add_to("px_count_visib", None, -1)), {"count_visible", "fraction"}),
         (edit_json("scene_gt_info.json", add_to("visib_fract", None, 1e-6)), {"fraction"}),
-        (edit_json("scene_gt_info.json", add_to("bbox_obj", 0, 2)), {"box_whole"}),
+        (edit_json("scene_gt_info.json", add_to("bbox_obj", 0, 2)), {"box_amodal"}),
         (edit_json("scene_gt_info.json", add_to("bbox_visib", 3, 1)), {"box_visible"}),
         (edit_json("scene_gt_info.json", lambda content: content["0"].pop()), {"missing"}),
         (edit_json("scene_gt_coco.json", shorten_run), {"coco"}),
         (edit_json("scene_gt_coco.json", lambda content: content["annotations"].pop()), {"coco"}),
-        (edit_json("scene_gt.json", turn_inside_out), {"rotation"}),
-        (scale_models, {"depth", "mask", "visible", "count_all", "box_whole"}),
+        (edit_json("scene_gt.json", negate_rotation), {"rotation"}),
+        (scale_models, {"depth", "mask", "visible", "count_all", "box_amodal"}),
     ],
 )
-def test_every_kind_of_damage_is_found(dataset, damage, measures):
+def test_each_type_of_damage_is_found(dataset, damage, measures):
     if measures == {"missing"}:
         for scene in (dataset / "train_pbr").iterdir():
             damage(scene)
@@ -131,12 +132,12 @@ def test_every_kind_of_damage_is_found(dataset, damage, measures):
     assert measures <= violated(dataset)
 
 
-def test_a_pose_of_one_camera_that_is_off_by_a_micrometre_and_a_half_is_found(dataset):
+def test_a_pose_error_of_one_and_a_half_micrometres_in_one_camera_is_found(dataset):
     edit_json("scene_gt.json", add_to("cam_t_m2c", 2, 1.5e-3))(dataset / "train_pbr" / "000001")
     assert violated(dataset) == {"world"}
 
 
-def test_a_missing_picture_is_found(dataset):
+def test_a_missing_image_is_found(dataset):
     (dataset / "train_pbr/000002/rgb/000001.jpg").unlink()
     assert violated(dataset) == {"missing"}
 
@@ -157,19 +158,19 @@ def test_exit_codes(dataset, tmp_path):
     assert (none.returncode, none.stderr) == (2, f"check_dataset: {tmp_path / 'none'} has no scene\n")
 
 
-def test_rays_hit_a_known_triangle():
+def test_ray_casting_hits_a_known_triangle():
     """A triangle across the optical axis, tilted: depth 1000 + x at the point (x, y)."""
     corners = np.array([[[-100.0, -100, 900], [100, -100, 1100], [0, 100, 1000]]])
-    hit = tool.cast(corners, np.array([[100.0, 0, 20], [0, 100, 15], [0, 0, 1]]), 30, 40).inside(30, 40)
+    hit = tool.cast_rays(corners, np.array([[100.0, 0, 20], [0, 100, 15], [0, 0, 1]]), 30, 40).crop(30, 40)
     rows, columns = np.nonzero(np.isfinite(hit))
     slope = (columns + 0.5 - 20) / 100
     np.testing.assert_allclose(hit[rows, columns], 1000 / (1 - slope), rtol=1e-12)
     assert len(rows) == pytest.approx(200, abs=12)  # Half of 200 x 200 mm at a metre, 100 px/m/m.
 
 
-def test_rays_count_what_lies_outside_of_the_picture():
+def test_silhouettes_extend_beyond_the_image():
     corners = np.array([[[-400.0, -100, 1000], [0, -100, 1000], [-400, 300, 1000]], [[0, -100, 1000], [0, 300, 1000], [-400, 300, 1000]]])
-    hit = tool.cast(corners, np.array([[100.0, 0, 20], [0, 100, 15], [0, 0, 1]]), 30, 40)
+    hit = tool.cast_rays(corners, np.array([[100.0, 0, 20], [0, 100, 15], [0, 0, 1]]), 30, 40)
     assert hit.box() == [-20, 5, 39, 39]
     assert np.isfinite(hit.depth).all()
-    assert np.isfinite(hit.inside(30, 40)).sum() == 20 * 25
+    assert np.isfinite(hit.crop(30, 40)).sum() == 20 * 25

@@ -1,4 +1,4 @@
-"""The checker of device code: what it accepts, and that it finds each fault."""
+"""Static check of device code: accepts correct code, and finds each type of fault."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def add_kernel(
 
 
 def check(tmp_path: Path, capsys, kernels: str, stage: str = "", elsewhere: str = "") -> list[str]:
-    """Lay out a tree, check it, and return the rules broken, as line: rule."""
+    """Write a source tree, check it, and return its faults as "line: rule"."""
     for folder, text in (("kernels", kernels), ("synpick_warp/stages", stage), ("scenes", elsewhere)):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / "add.py").write_text(text)
@@ -63,7 +63,7 @@ def check(tmp_path: Path, capsys, kernels: str, stage: str = "", elsewhere: str 
     return [line.split("add.py:")[1] for line in lines]
 
 
-def test_good_code_passes(tmp_path, capsys):
+def test_correct_code_passes(tmp_path, capsys):
     assert check(tmp_path, capsys, GOOD, stage="wp.launch(add_kernel, dim=1)") == []
 
 
@@ -76,49 +76,49 @@ def test_good_code_passes(tmp_path, capsys):
         ("import warp as wp\n", "import numpy as np\n", "3: kernels import Warp, codes and other kernels only, not numpy"),
         ("synpick_warp.kernels.other", "synpick_warp.scenes.other", "5: kernels import Warp, codes and other kernels only, not "),
         ("add_kernel(", "add(", "21: the kernel add must end in _kernel"),
-        ("def put_twice(", "def put_kernel(", "16: put_kernel is no kernel"),
+        ("def put_twice(", "def put_kernel(", "16: put_kernel is not a kernel"),
         ('    """x += v."""\n', "", "21: add_kernel needs a docstring"),
         ("    scale: float,\n", "    scale,\n", "23: scale needs an annotation"),
-        ("    fields_out: Fields,\n", "    fields_out: Fields = None,\n", "21: add_kernel may have plain parameters without defaults only"),
+        ("    fields_out: Fields,\n", "    fields_out: Fields = None,\n", "21: add_kernel can only have plain parameters without defaults"),
         ("    scale: float,\n", "    scale: float,\n" * 11, "21: add_kernel has 17 parameters; at most 16"),
         ("place_inout", "place", "26: add_kernel writes to place; its name must end in _out or _inout"),
         ("place_inout[i] +=", "local[1] =", "26: add_kernel never writes to place_inout"),
         ("total_out", "total", "31: add_kernel writes to total; its name must end in _out or _inout"),
         ("sum_out", "sum", "30: add_kernel writes to sum; its name must end in _out or _inout"),
-        ("    # Scene:\n", "", "22: scale stands under no group; head it by a comment"),
+        ("    # Scene:\n", "", "22: scale has no group; put it below a comment"),
         ("    # In:\n", "    # Scene:\n", "27: groups come once, in the order Scene, State, In, Out"),
-        ("    # Out:\n", "", "29: sum_out stands under # In:; what ends in _out belongs under # Out:"),
-        ("    # In:\n    offset: wp.vec3,\n    # Out:\n", "    # Out:\n    offset: wp.vec3,\n", "28: offset stands under # Out:; "),
+        ("    # Out:\n", "", "29: sum_out is in the group # In:; names ending in _out, and no others, belong to the group # Out:"),
+        ("    # In:\n    offset: wp.vec3,\n    # Out:\n", "    # Out:\n    offset: wp.vec3,\n", "28: offset is in the group # Out:; "),
     ],
 )
 def test_each_fault_is_found(tmp_path, capsys, old, new, fault):
     assert old in GOOD
-    assert any(found.startswith(fault) for found in check(tmp_path, capsys, GOOD.replace(old, new)))
+    assert any(line.startswith(fault) for line in check(tmp_path, capsys, GOOD.replace(old, new)))
 
 
-GIVEN = "[scale, state.speed, state.place, wp.vec3(offset)]"
-RESULTS = "[self.out.sum, total, buffers['fields']]"
+INPUTS = "[scale, state.speed, state.place, wp.vec3(offset)]"
+OUTPUTS = "[self.out.sum, total, buffers['fields']]"
 
 
 @pytest.mark.parametrize(
     ("body", "faults"),
     [
-        (f"wp.launch(add_kernel, dim=1, inputs={GIVEN}, outputs={RESULTS})", []),
-        (f"inputs = [scale, speed, place]; inputs += [offset]\n    launch_pixels(add_kernel, 9, inputs, {RESULTS}, device)", []),
-        (f"some = [state.speed, state.place]\n    launch_pixels(add_kernel, 9, [scale, *some, offset], {RESULTS}, device)", []),
+        (f"wp.launch(add_kernel, dim=1, inputs={INPUTS}, outputs={OUTPUTS})", []),
+        (f"inputs = [scale, speed, place]; inputs += [offset]\n    launch_pixels(add_kernel, 9, inputs, {OUTPUTS}, device)", []),
+        (f"some = [state.speed, state.place]\n    launch_pixels(add_kernel, 9, [scale, *some, offset], {OUTPUTS}, device)", []),
         (
-            f"wp.launch(add_kernel, dim=1, inputs=[scale, place, speed, offset], outputs={RESULTS})",
+            f"wp.launch(add_kernel, dim=1, inputs=[scale, place, speed, offset], outputs={OUTPUTS})",
             ["2: add_kernel takes speed where place is given; place belongs elsewhere", "2: add_kernel takes place where speed is given; "],
         ),
-        (f"wp.launch(add_kernel, dim=1, inputs=[scale, speed], outputs={RESULTS})", ["2: add_kernel takes 7 arguments, not 5"]),
+        (f"wp.launch(add_kernel, dim=1, inputs=[scale, speed], outputs={OUTPUTS})", ["2: add_kernel takes 7 arguments, not 5"]),
         ("self._launch(add_kernel, [offset], [total, fields, sum])", ["2: add_kernel takes sum where total is given; total belongs"]),
     ],
 )
 def test_swapped_and_missing_arguments_are_found(tmp_path, capsys, body, faults):
-    found = check(tmp_path, capsys, GOOD, stage=f"def run():\n    {body}\n")
-    assert len(found) >= len(faults)
-    assert (found == []) == (faults == [])
-    assert all(any(line.startswith(fault) for line in found) for fault in faults)
+    lines = check(tmp_path, capsys, GOOD, stage=f"def run():\n    {body}\n")
+    assert len(lines) >= len(faults)
+    assert (lines == []) == (faults == [])
+    assert all(any(line.startswith(fault) for line in lines) for fault in faults)
 
 
 @pytest.mark.parametrize("call", ["wp.launch(add_kernel, dim=1)", "wp.launch_tiled(add_kernel, dim=[1])", "warp.launch(add_kernel, dim=1)"])

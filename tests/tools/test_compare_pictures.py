@@ -1,4 +1,4 @@
-"""tools/checks/compare_pictures.py: what counts as a difference, and that devices are compared, or that it says why they are not."""
+"""Comparison of rendered outputs between devices: differences and tolerances per output, and error messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE
 from synpick_warp.stages.buffers import ViewBuffers
 from tools.checks import compare_pictures as tool
 
-FEW = (
+FEW_STEPS = (
     "--set",
     "arrangement.volume=1e-3",
     "--set",
@@ -27,10 +27,10 @@ FEW = (
     "--set",
     "settle.rest_ticks=2",
 )
-"""One object, and as few steps as bring it to rest."""
+"""Settings: one object, and as few steps as bring it to rest."""
 
 
-def numbers(difference) -> tuple[float, ...]:
+def values(difference) -> tuple[float, ...]:
     return difference.differing, difference.mean, difference.largest, difference.beyond
 
 
@@ -47,7 +47,7 @@ def test_equal_outputs_do_not_differ():
         ("flow", np.full((1, 2, 5, 2), np.nan, np.float32)),
     ):
         difference = tool.compare(FAST, name, array, array.copy())
-        assert numbers(difference) == (0.0, 0.0, 0.0, 0.0)
+        assert values(difference) == (0.0, 0.0, 0.0, 0.0)
         assert difference.holds
 
 
@@ -57,16 +57,16 @@ def test_a_pixel_differs_if_one_of_its_channels_does():
     b[0, 0, 0] = 255, 0, 0
     b[0, 1, 4] = 1, 2, 0
     # The second differs by no more than the tolerance.
-    assert numbers(tool.compare(FAST, "color", a, b)) == pytest.approx((20.0, 25.7, 255.0, 10.0))
-    assert numbers(tool.compare(FAST, "color", b, a)) == pytest.approx((20.0, 25.7, 255.0, 10.0))
+    assert values(tool.compare(FAST, "color", a, b)) == pytest.approx((20.0, 25.7, 255.0, 10.0))
+    assert values(tool.compare(FAST, "color", b, a)) == pytest.approx((20.0, 25.7, 255.0, 10.0))
     assert not tool.compare(FAST, "color", a, b).holds
 
 
-def test_names_are_equal_or_not():
+def test_labels_are_equal_or_not():
     a = np.zeros((1, 2, 5), np.uint32)
     b = a.copy()
     b[0, 0, 0] = 2**31
-    assert numbers(tool.compare(REFERENCE, "amodal", a, b)) == pytest.approx((10.0, 0.1, 1.0, 10.0))
+    assert values(tool.compare(REFERENCE, "amodal", a, b)) == pytest.approx((10.0, 0.1, 1.0, 10.0))
 
 
 def test_a_rounded_depth_may_be_one_count_off():
@@ -75,23 +75,23 @@ def test_a_rounded_depth_may_be_one_count_off():
     assert not tool.compare(FAST, "depth", a, a + 2).holds
 
 
-def test_known_here_and_unknown_there_is_a_difference():
+def test_nan_on_one_device_only_is_a_difference():
     a = np.full((1, 2, 5, 2), np.nan, np.float32)
     b = a.copy()
     b[0, 1, 2] = 0.0
-    assert numbers(tool.compare(FAST, "flow", a, b)) == pytest.approx((10.0, 0.0, np.inf, 10.0))
+    assert values(tool.compare(FAST, "flow", a, b)) == pytest.approx((10.0, 0.0, np.inf, 10.0))
 
 
-def test_counts_and_boxes_are_compared_one_by_one():
+def test_counts_and_boxes_are_compared_value_by_value():
     a = np.zeros((2, 3, 2, 4), np.int32)
     b = a.copy()
     b[0, 0, 0, 0] = 2
-    assert numbers(tool.compare(FAST, "boxes", a, b)) == pytest.approx((100 / 48, 2 / 48, 2.0, 100 / 48))
+    assert values(tool.compare(FAST, "boxes", a, b)) == pytest.approx((100 / 48, 2 / 48, 2.0, 100 / 48))
 
 
-def test_a_device_and_itself(tmp_path):
+def test_a_device_equals_itself(tmp_path):
     file = tmp_path / "numbers.json"
-    options = ["--devices", "cpu,cpu", "--scenes", "1", "--size", "16x9", "--samples", "2", "--json", str(file), *FEW]
+    options = ["--devices", "cpu,cpu", "--scenes", "1", "--size", "16x9", "--samples", "2", "--json", str(file), *FEW_STEPS]
     assert tool.main(options) == 0
     rows = json.loads(file.read_text())["rows"]
     assert {(row["mode"], row["output"]) for row in rows} == {
@@ -101,19 +101,19 @@ def test_a_device_and_itself(tmp_path):
 
 
 @pytest.mark.skipif(wp.get_cuda_device_count() > 0, reason="this machine has a GPU")
-def test_without_a_gpu_it_says_so(capsys):
+def test_a_missing_gpu_is_an_error(capsys):
     assert tool.main([]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line == "compare_pictures: cuda:0 was requested, but Warp finds no CUDA device here; use --device cpu"
 
 
 @pytest.mark.parametrize("devices", ["cpu", "cpu,cpu,cpu", "cpu,tpu", ""])
-def test_devices_that_are_no_two_devices(capsys, devices):
+def test_invalid_device_lists_are_errors(capsys, devices):
     assert tool.main(["--devices", devices]) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_what_exceeds_its_tolerance_is_an_exit_code_of_its_own(monkeypatch, capsys):
+def test_exceeded_tolerances_exit_with_1(monkeypatch, capsys):
     a = np.zeros((1, 2, 5), np.uint8)
     monkeypatch.setattr(tool, "compare_devices", lambda *_: [tool.compare(FAST, "instance", a, a + 1)])
     assert tool.main(["--devices", "cpu,cpu"]) == 1

@@ -1,4 +1,4 @@
-"""The first difference of two data sets is named: file, and the key, pixel, index or line in it."""
+"""Comparison of data sets: the first difference is reported by file, and by key, pixel, index or line in it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tools.checks import compare_runs as tool
 
 @pytest.fixture
 def runs(tmp_path) -> tuple[Path, Path]:
-    """Two equal folders with a file of every kind."""
+    """Two equal folders with a file of every type."""
     first, second = tmp_path / "a", tmp_path / "b"
     scene = first / "train" / "000004"
     (scene / "depth").mkdir(parents=True)
@@ -116,27 +116,27 @@ def test_equal_folders(runs, capsys):
     assert capsys.readouterr().out.splitlines()[-1] == "no difference"
 
 
-@pytest.mark.parametrize(("edit", "said", "layer", "largest"), CASES, ids=lambda value: getattr(value, "__name__", ""))
-def test_the_first_difference_is_named_and_its_layer_measured(
-    runs, capsys, edit: Callable[[Path], None], said: str, layer: str, largest: float | None
+@pytest.mark.parametrize(("edit", "message", "layer", "largest"), CASES, ids=lambda value: getattr(value, "__name__", ""))
+def test_the_first_difference_and_its_layer_are_reported(
+    runs, capsys, edit: Callable[[Path], None], message: str, layer: str, largest: float | None
 ):
     edit(runs[1])
     assert tool.main([str(path) for path in runs]) == 1
     lines = capsys.readouterr().out.splitlines()
-    assert lines[-1] == f"first difference: {said}"
+    assert lines[-1] == f"first difference: {message}"
     (row,) = (line.split() for line in lines if line.startswith(layer + " "))
-    assert row[1:] == ["1", "1", *(["no", "number"] if largest is None else [f"{largest:g}"])]
+    assert row[1:] == ["1", "1", *(["not", "numeric"] if largest is None else [f"{largest:g}"])]
     assert sum(line.split()[2] == "1" for line in lines[1:-1]) == 1
 
 
-def test_what_counts_most_comes_first(runs):
+def test_settings_are_compared_first(runs):
     for edit, *_ in CASES:
         edit(runs[1])
-    _, said = tool.compare(*runs)
-    assert said == "config.toml: bake.seed: 0 and 5"
+    _, message = tool.compare(*runs)
+    assert message == "config.toml: bake.seed: 0 and 5"
 
 
-def test_settings_that_nothing_depends_on_are_no_difference(runs):
+def test_settings_without_effect_on_files_are_ignored(runs):
     (runs[1] / "config.toml").write_text(config_to_toml(load_config("smoke", {"bake.worlds": 9, "bake.writers": 3})))
     assert tool.compare(*runs)[1] == ""
 

@@ -1,4 +1,4 @@
-"""tools/checks/compare_worlds.py: what counts as the same, and that it says what it cannot simulate."""
+"""Determinism check across world counts: comparison of runs, and error messages."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from tools.checks import compare_worlds as tool
 
-FEW = (
+FEW_STEPS = (
     "--episodes",
     "2",
     "--ticks",
@@ -25,26 +25,26 @@ FEW = (
     "--set",
     "physics.steps_per_tick=4",
 )
-"""One object, and few steps."""
+"""Settings: one object, and few steps."""
 
 
-def tick(entry: int, *x: float) -> tuple[np.ndarray, np.ndarray]:
-    """One object, and poses that differ in x [m]."""
+def tick(catalog_index: int, *x: float) -> tuple[np.ndarray, np.ndarray]:
+    """State after a tick: one object, and poses at the given x [m]."""
     poses = np.zeros((len(x), 7), np.float32)
     poses[:, 0] = x
-    return np.array([entry], np.int32), poses
+    return np.array([catalog_index], np.int32), poses
 
 
-def test_the_same_ticks_are_the_same():
+def test_equal_runs():
     run = {(0, 0): [tick(1, 0.0, 0.1)] * 3, (1, 0): [tick(2, 0.5)]}
     assert tool.compare(run, run) == (4, 0, -1, 0.0)
 
 
-def test_what_only_one_run_came_to_is_not_compared():
+def test_ticks_of_only_one_run_are_not_compared():
     assert tool.compare({(0, 0): [tick(1, 0.0)] * 3, (1, 0): [tick(1, 0.0)]}, {(0, 0): [tick(1, 0.0)] * 2}) == (2, 0, -1, 0.0)
 
 
-def test_the_first_difference_and_the_largest_are_told():
+def test_first_and_largest_difference_are_reported():
     still, moved, far = tick(1, 0.0, 0.1), tick(1, 0.0, 0.102), tick(1, 0.004, 0.1)
     other = {(0, 0): [still, still, moved, far], (1, 0): [still]}
     count, differing, first, largest = tool.compare({(0, 0): [still] * 4, (1, 0): [still]}, other)
@@ -57,8 +57,8 @@ def test_another_object_is_a_difference():
     assert tool.compare({(0, 0): [tick(1, 0.0)]}, {(0, 0): [tick(1, 0.0, 0.0)]})[:3] == (1, 1, 0)
 
 
-def test_episodes_are_the_same_in_any_number_of_worlds(tmp_path):
-    assert tool.main(["--device", "cpu", "--worlds", "2,1", *FEW, "--json", str(tmp_path / "runs.json")]) == 0
+def test_episodes_do_not_depend_on_the_world_count(tmp_path):
+    assert tool.main(["--device", "cpu", "--worlds", "2,1", *FEW_STEPS, "--json", str(tmp_path / "runs.json")]) == 0
     runs = json.loads((tmp_path / "runs.json").read_text())
     assert [(run["worlds"], run["recorded"]) for run in runs] == [(2, False), (2, False), (1, False), (1, True)]
     assert all(run["deterministic"] and not run["differing"] and run["largest"] == 0.0 for run in runs)
@@ -66,13 +66,13 @@ def test_episodes_are_the_same_in_any_number_of_worlds(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "0", "2,x", "2,,3", "-1"])
-def test_wrong_numbers_of_worlds_are_refused(capsys, text):
+def test_invalid_world_counts_are_errors(capsys, text):
     with pytest.raises(SystemExit) as stop:
         tool.main([f"--worlds={text}"])
     assert stop.value.code == 2
-    assert "is no list of numbers of worlds" in capsys.readouterr().err
+    assert "is not a list of world counts" in capsys.readouterr().err
 
 
-def test_models_that_are_not_there_are_named(capsys, tmp_path):
+def test_a_missing_models_folder_is_an_error(capsys, tmp_path):
     assert tool.main(["--device", "cpu", "--models", str(tmp_path / "none")]) == 2
     assert capsys.readouterr().err.startswith("compare_worlds: models folder")

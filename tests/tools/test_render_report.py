@@ -1,4 +1,4 @@
-"""tools/reports/render.py: its numbers, its bounds, its pictures."""
+"""Report on the renderer: rows, bounds, images and contact sheets."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from synpick_warp.stages.buffers import Snapshot
 from tools.reports import render as render_report
 from tools.reports import render_checks, render_piles, render_sheet
 
-FEW = (
+FEW_STEPS = (
     "--device",
     "cpu",
     "--set",
@@ -30,74 +30,88 @@ FEW = (
     "--set",
     "settle.rest_ticks=2",
 )
-"""One object, and as few steps as bring it to rest."""
+"""Settings: one object, and as few steps as bring it to rest."""
 
 
 def shot(level: int, size: tuple[int, int] = (9, 16)):
-    """A grey picture."""
+    """A uniform grey image."""
     return render_checks.Shot(
         np.full((*size, 3), level, np.uint8), np.full((*size, 3), level / 255, np.float32), np.zeros(size, np.uint8), 1.0
     )
 
 
-def test_psnr_of_pictures_that_differ_by_one_grey_level():
-    picture = np.full((4, 4, 3), 100, np.uint8)
-    assert round(render_piles.psnr(picture, picture + 1), 3) == 48.131
-    assert render_piles.psnr(picture, picture) > 100.0
-    assert render_piles.difference(shot(100), shot(98)) == 2.0
+def test_psnr_of_images_that_differ_by_one_grey_level():
+    image = np.full((4, 4, 3), 100, np.uint8)
+    assert round(render_piles.psnr(image, image + 1), 3) == 48.131
+    assert render_piles.psnr(image, image) > 100.0
+    assert render_piles.mean_difference(shot(100), shot(98)) == 2.0
 
 
-def test_a_report_of_one_pile_has_all_lines_and_pictures(tmp_path):
+def test_a_report_of_one_pile_has_all_rows_and_images(tmp_path):
     file, out, sheet = tmp_path / "numbers.json", tmp_path / "pictures", tmp_path / "sheet.png"
-    options = ["--scenes", "1", "--size", "32x18", "--samples", "8", "--json", str(file), "--out", str(out), "--sheet", str(sheet), *FEW]
+    options = [
+        "--scenes",
+        "1",
+        "--size",
+        "32x18",
+        "--samples",
+        "8",
+        "--json",
+        str(file),
+        "--out",
+        str(out),
+        "--sheet",
+        str(sheet),
+        *FEW_STEPS,
+    ]
     code = render_report.main(options)
     rows = {row["name"]: row for row in json.loads(file.read_text())["rows"]}
     assert all(row["holds"] for name, row in rows.items() if name.startswith("reference: "))
     assert code == int(not all(row["holds"] for row in rows.values()))
-    assert rows["fast against reference, mean"]["value"] > 5.0
-    assert rows["fast: frames of a still scene, mean difference"]["value"] < 1.0
+    assert rows["denoised against reference, mean"]["value"] > 5.0
+    assert rows["denoised: frames of a static scene, mean difference"]["value"] < 1.0
     assert rows["reference: paths"]["value"] > 0.0
     assert not [name for name in rows if "against itself" in name]
-    # The one pile is seen under each of the embedded skies, of which there are at least six.
+    # The pile is rendered under each of the embedded skies, which are at least six.
     pictures = sorted(out.iterdir())
     assert len(pictures) >= 6
     assert {cv2.imread(str(picture)).shape for picture in pictures} == {(18, 96, 3)}
     assert cv2.imread(str(sheet)).shape[1] == 3 * (32 * 20 + render_sheet.GAP)
 
 
-def test_a_second_reference_tells_of_noise(tmp_path, monkeypatch):
+def test_a_second_reference_measures_noise(tmp_path, monkeypatch):
     file = tmp_path / "numbers.json"
-    for name in ("furnaces", "planes"):
+    for name in ("measure_furnaces", "measure_planes"):
         monkeypatch.setattr(render_report, name, lambda *_: [])
-    render_report.main(["--scenes", "1", "--size", "16x9", "--samples", "2", "--noise", "--json", str(file), *FEW])
+    render_report.main(["--scenes", "1", "--size", "16x9", "--samples", "2", "--noise", "--json", str(file), *FEW_STEPS])
     (row,) = (row for row in json.loads(file.read_text())["rows"] if row["name"].endswith("reference against itself"))
     assert 5.0 < row["value"] < 90.0
 
 
-def test_a_sheet_has_a_labelled_row_a_map_and_goes_on_beside_itself(tmp_path):
-    pairs = [render_piles.Pair(f"map {number}", shot(100), shot(110), 100 / 255) for number in range(render_sheet.MOST_ROWS + 2)]
-    files = render_sheet.contact_sheets(pairs, tmp_path / "deep" / "sheet.png")
+def test_sheets_have_a_labelled_row_per_pair_and_continue_in_further_files(tmp_path):
+    pairs = [render_piles.Pair(f"map {index}", shot(100), shot(110), 100 / 255) for index in range(render_sheet.MAX_ROWS + 2)]
+    files = render_sheet.write_sheets(pairs, tmp_path / "deep" / "sheet.png")
     assert [file.name for file in files] == ["sheet.png", "sheet-2.png"]
     first, second = (cv2.imread(str(file)) for file in files)
     row = 9 * 40 + render_sheet.GAP + render_sheet.LINE
-    assert first.shape == (render_sheet.LINE + render_sheet.MOST_ROWS * row, 3 * (640 + render_sheet.GAP), 3)
+    assert first.shape == (render_sheet.LINE + render_sheet.MAX_ROWS * row, 3 * (640 + render_sheet.GAP), 3)
     assert second.shape[0] == render_sheet.LINE + 2 * row
     top = 2 * render_sheet.LINE + 5
-    assert [int(first[top, number * (640 + render_sheet.GAP) + 5, 0]) for number in range(3)] == [100, 110, 50]
+    assert [int(first[top, column * (640 + render_sheet.GAP) + 5, 0]) for column in range(3)] == [100, 110, 50]
     assert first[render_sheet.LINE : 2 * render_sheet.LINE].min() < 100  # The label.
     assert pairs[0].bias == pytest.approx(-100.0 / 11.0, rel=1e-4)
 
 
-def test_large_pictures_are_made_smaller():
+def test_large_images_are_shrunk():
     pair = render_piles.Pair("map", shot(10, (72, 1280)), shot(10, (72, 1280)), 1.0)
     assert render_sheet.draw_sheet([pair]).shape == (2 * render_sheet.LINE + 36 + render_sheet.GAP, 3 * (640 + render_sheet.GAP), 3)
 
 
-def test_a_frame_follows_a_snapshot_with_nothing_but_time_and_a_shift(device):
+def test_the_next_frame_displaces_objects_and_keeps_the_rest(device):
     snapshot = allocate(Snapshot, {"world": 1, "instance": 2, "fixture": 3}, device)
     snapshot.frame.fill_(7)
     snapshot.pose.fill_(wp.transform((1.0, 2.0, 3.0), wp.quat_identity()))
-    after = render_piles.following(snapshot, 0.5)
+    after = render_piles.next_frame(snapshot, 0.5)
     assert after.frame.numpy().tolist() == [8]
     assert after.follows.numpy().tolist() == [1]
     assert after.pose.numpy()[0, 1, :3].tolist() == [1.5, 2.0, 3.0]

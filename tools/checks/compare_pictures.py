@@ -1,7 +1,7 @@
-"""Render the same piles on two devices and tell how far every output differs, in both modes of rendering.
+"""Comparison of rendered outputs between two devices: every image and layer of the same piles, in both rendering modes.
 
-Piles settle once, on the first device; then objects creep, so that there is motion to see. Exits with 1 if a difference is larger
-than its tolerance, with 2 if nothing can be compared.
+Piles settle once, on the first device; then objects are displaced by `CREEP`, so that flow is not zero. Exits with 1 if a difference
+exceeds its tolerance, with 2 if nothing can be compared.
 
     python -m tools.checks.compare_pictures --devices cpu,cuda:0 --models DIR --lights DIR --scenes 3 --size 160x90
 """
@@ -33,20 +33,20 @@ from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
 from tools.options import configure, fail, make_parser, write_json
 from tools.reports.render_checks import with_mode
-from tools.reports.render_piles import following, settled
+from tools.reports.render_piles import next_frame, settle_piles
 
 CREEP = 1e-3
-"""How far objects moved since the frame before [m]."""
+"""Displacement of objects since the frame before [m]."""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How far an output may differ."""
+    """Tolerance of one output: a difference per pixel, and the fraction of pixels that may exceed it."""
 
-    apart: float | None
-    """Largest difference that is no difference [the output's unit]; None: names, which are equal or not."""
-    share: float
-    """Most pixels, or numbers, that may differ by more [%]: rays that graze an edge pass it on one side or the other."""
+    difference: float | None
+    """Largest difference that counts as equal [the output's unit]; None: labels, which are equal or not."""
+    max_beyond: float
+    """Pixels, or values, that may differ by more, at most [%]: rounding decides on which side of a silhouette a grazing ray passes."""
     unit: str = ""
 
 
@@ -65,67 +65,68 @@ TOLERANCES = {
     "scene_flow": Tolerance(2e-5, 0.1, "m"),
     "depth_sensor": Tolerance(1.0, 0.5, "counts"),
 }
-"""Of everything but colour, which is the same in both modes."""
-NUMBERS = ("pixels", "boxes", "effects")
-"""Outputs that are no images."""
+"""Tolerances of all outputs but color, which are the same in both modes."""
+TABLES = ("pixels", "boxes", "effects")
+"""Outputs that are not images."""
 COLORS = {FAST: Tolerance(2.0, 1.0, "grey"), REFERENCE: Tolerance(4.0, 2.0, "grey")}
-"""Of colour, by mode: where rounding turns a path's choice, its pixel changes, in the fast picture a little and with its neighbours."""
+"""Tolerances of color, by mode. Where rounding changes a sampled path, its pixel changes; denoising spreads that over neighbours."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How one output differs between two devices."""
+    """Difference of one output between two devices."""
 
     mode: str
     output: str
     differing: float
-    """Pixels, or numbers, that differ at all [%]."""
+    """Pixels, or values, that differ at all [%]."""
     mean: float
-    """Mean absolute difference [unit]; of names, the share that differ."""
+    """Mean absolute difference [unit]; of labels, the fraction that differ."""
     largest: float
-    """Largest difference [unit]; of names 1 if any differ."""
+    """Largest difference [unit]; of labels 1 if any differ."""
     beyond: float
-    """Share that differ by more than the tolerance [%]."""
+    """Pixels, or values, that differ by more than the tolerance [%]."""
     tolerance: Tolerance
 
     @property
     def holds(self) -> bool:
-        return self.beyond <= self.tolerance.share
+        """Whether the difference is within its tolerance."""
+        return self.beyond <= self.tolerance.max_beyond
 
 
 def compare(mode: str, output: str, a: np.ndarray, b: np.ndarray) -> Difference:
     """Compare one output of two devices.
 
     Args:
-        mode: Of rendering.
+        mode: Rendering mode.
         output: Name of the output.
-        a: (B, H, W[, C]) of images, where a pixel differs if any of its channels does; any shape of counts and boxes.
-        b: The same of the other device. Two values that are not numbers are equal.
+        a: Image (view, row, column[, channel]), where a pixel differs if any of its channels does; or counts or boxes of any shape.
+        b: The same from the other device. NaN equals NaN.
     """
     tolerance = COLORS[mode] if output == "color" else TOLERANCES[output]
-    if tolerance.apart is None:
-        apart = (a != b).astype(np.float64)
+    if tolerance.difference is None:
+        difference = (a != b).astype(np.float64)
     else:
-        wide, other = a.astype(np.float64), b.astype(np.float64)
-        apart = np.abs(wide - other)
-        apart[np.isnan(wide) & np.isnan(other)] = 0.0
-        apart[np.isnan(wide) != np.isnan(other)] = np.inf
-    if output not in NUMBERS:
-        apart = apart.reshape(*apart.shape[:3], -1).max(axis=-1)
-    finite = apart[np.isfinite(apart)]
+        first, second = a.astype(np.float64), b.astype(np.float64)
+        difference = np.abs(first - second)
+        difference[np.isnan(first) & np.isnan(second)] = 0.0
+        difference[np.isnan(first) != np.isnan(second)] = np.inf
+    if output not in TABLES:
+        difference = difference.reshape(*difference.shape[:3], -1).max(axis=-1)
+    finite = difference[np.isfinite(difference)]
     return Difference(
         mode,
         output,
-        100.0 * float((apart > 0.0).mean()),
+        100.0 * float((difference > 0.0).mean()),
         float(finite.mean()) if finite.size else 0.0,
-        float(apart.max()),
-        100.0 * float((apart > (tolerance.apart or 0.0)).mean()),
+        float(difference.max()),
+        100.0 * float((difference > (tolerance.difference or 0.0)).mean()),
         tolerance,
     )
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Render, compare, print, and return the exit code."""
+    """Run the command line; returns the exit code."""
     options = _parse(arguments)
     console = Console(highlight=False)
     try:
@@ -145,9 +146,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = make_parser(__doc__, "models", "lights", "seed", "set", "json")
-    parser.add_argument("--devices", default="cpu,cuda:0", help="two devices with a comma between them (default: cpu,cuda:0)")
-    parser.add_argument("--scenes", type=int, default=3, help="piles to render, by all cameras (default: 3)")
-    parser.add_argument("--size", default="160x90", help="width and height of the pictures (default: 160x90)")
+    parser.add_argument("--devices", default="cpu,cuda:0", help="two devices, comma-separated (default: cpu,cuda:0)")
+    parser.add_argument("--scenes", type=int, default=3, help="piles to render by all cameras (default: 3)")
+    parser.add_argument("--size", default="160x90", help="WIDTHxHEIGHT of the images [px] (default: 160x90)")
     parser.add_argument("--samples", type=int, default=8, help="paths per pixel of the reference (default: 8)")
     return parser.parse_args(arguments)
 
@@ -166,35 +167,37 @@ def _config(options: argparse.Namespace, device: str) -> Config:
 
 
 def compare_devices(config: Config, devices: list[Any], console: Console) -> list[Difference]:
-    """All differences, first those of the fast mode.
+    """Render settled piles on both devices and compare all outputs; first those of the denoised mode.
 
     Raises:
         SynpickError: Models or lights cannot be used, or a pile does not come to rest.
     """
     catalog = load_catalog(config, report=console.print)
     lights = load_lights(config.bake.lights)
-    snapshot = following(settled(config, catalog, len(lights), devices[0]), CREEP)
+    snapshot = next_frame(settle_piles(config, catalog, len(lights), devices[0]), CREEP)
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
     differences = []
     for mode in (FAST, REFERENCE):
-        kind = with_mode(config, mode)
+        mode_config = with_mode(config, mode)
         outputs = [
-            render_views(kind, build_render_scene(kind, catalog, fixtures, cameras, lights, device), carried(snapshot, device))
+            render_views(
+                mode_config, build_render_scene(mode_config, catalog, fixtures, cameras, lights, device), copy_snapshot(snapshot, device)
+            )
             for device in devices
         ]
         differences += [compare(mode, name, outputs[0][name], outputs[1][name]) for name in outputs[0]]
     return differences
 
 
-def carried(snapshot: Snapshot, device: Any) -> Snapshot:
-    """The same snapshot on another device."""
+def copy_snapshot(snapshot: Snapshot, device: Any) -> Snapshot:
+    """Copy a snapshot to another device."""
     arrays = {item.name: getattr(snapshot, item.name) for item in fields(Snapshot)}
     return Snapshot(**{name: wp.array(array.numpy(), dtype=array.dtype, device=device) for name, array in arrays.items()})
 
 
 def render_views(config: Config, scene: Any, snapshot: Snapshot) -> dict[str, np.ndarray]:
-    """All outputs of all worlds seen by all cameras, by name."""
+    """Render all worlds by all cameras; returns all images and layers by name."""
     worlds, cameras, device = config.bake.worlds, scene.camera_count, scene.device
     sizes = {"view": worlds * cameras, "row": scene.height, "column": scene.width, "instance": config.arrangement.max_objects}
     sizes |= {"count": 3, "box": 2, "side": 4}
@@ -208,13 +211,13 @@ def render_views(config: Config, scene: Any, snapshot: Snapshot) -> dict[str, np
 
 
 def _print(console: Console, differences: list[Difference], title: str) -> None:
-    table = Table("mode", "output", "differ %", "mean", "largest", "unit", "tolerance", "beyond %", "most %", title=title)
+    table = Table("mode", "output", "differ %", "mean", "largest", "unit", "tolerance", "beyond %", "max %", title=title)
     table.add_column("", min_width=len("VIOLATED"), no_wrap=True)
     for row in differences:
         tolerance = row.tolerance
-        same = "equal" if tolerance.apart is None else f"{tolerance.apart:g}"
+        same = "equal" if tolerance.difference is None else f"{tolerance.difference:g}"
         numbers = (f"{row.differing:.4f}", f"{row.mean:.3g}", f"{row.largest:.3g}", tolerance.unit, same, f"{row.beyond:.4f}")
-        table.add_row(row.mode, row.output, *numbers, f"{tolerance.share:g}", "holds" if row.holds else "VIOLATED")
+        table.add_row(row.mode, row.output, *numbers, f"{tolerance.max_beyond:g}", "holds" if row.holds else "VIOLATED")
     console.print(table)
 
 

@@ -1,8 +1,8 @@
-"""Static checker of device code: prints file:line: rule for each broken rule, and exits with 1 if there are any.
+"""Static check (linter) of device code: prints file:line: rule for each violation, and exits with 1 if there are any.
 
 Kernels: named `foo_kernel`; at most 16 parameters, each annotated, none with a default, in groups headed `# Scene:`,
-`# State:`, `# In:`, `# Out:`, in this order (a word may follow: the owner); arrays that are written end in `_out` or `_inout`, and no
-others; every array carries a comment with the names of its dimensions, as many as it has; a docstring.
+`# State:`, `# In:`, `# Out:`, in this order (the owner may follow); `_out` or `_inout` ends the names of written arrays, and of no
+others; a comment behind every array names its dimensions; a docstring.
 Kernel modules: a docstring, no backward passes, no postponed annotations, no imports but Warp and other kernels.
 Everywhere: `wp.launch` in synpick_warp/stages only, with arguments named as the parameters (`tools.checks.launches`).
 
@@ -29,7 +29,7 @@ HOST_FOLDERS = ("synpick_warp", "scenes", "configs", "tools")
 _GROUP = re.compile(rf"\s*#\s*({'|'.join(GROUPS)}):")
 _ARRAY = re.compile(r"wp\.array(?:([234])d)?\[")
 _SHAPE = re.compile(r"#\s*\(([^)]*)\)")
-_WRITES_FIRST = re.compile(r"wp\.(atomic_\w+|tile_store|tile_atomic_\w+)")
+_WRITING_CALL = re.compile(r"wp\.(atomic_\w+|tile_store|tile_atomic_\w+)")
 
 Fault = tuple[Path, int, str]
 Writes = dict[str, set[int]]
@@ -55,7 +55,7 @@ def check_module(path: Path, tree: ast.Module, writes: Writes) -> Iterator[Fault
         yield path, 1, "a kernel module needs a docstring"
     functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
     kernels = [function for function in functions if decorated(function, "kernel")]
-    if kernels and not any(switches_backward_off(node) for node in tree.body):
+    if kernels and not any(disables_backward(node) for node in tree.body):
         yield path, 1, 'missing: wp.set_module_options({"enable_backward": False})'
     for line, name in imports(tree):
         if name == "__future__.annotations":
@@ -68,7 +68,7 @@ def check_module(path: Path, tree: ast.Module, writes: Writes) -> Iterator[Fault
             yield path, line, rule
     for function in functions:
         if function.name.endswith("_kernel") and function not in kernels:
-            yield path, function.lineno, f"{function.name} is no kernel"
+            yield path, function.lineno, f"{function.name} is not a kernel"
 
 
 def check_kernel(kernel: ast.FunctionDef, lines: list[str], writes: Writes) -> Iterator[tuple[int, str]]:
@@ -82,36 +82,39 @@ def check_kernel(kernel: ast.FunctionDef, lines: list[str], writes: Writes) -> I
         yield kernel.lineno, f"{kernel.name} has {len(parameters)} parameters; at most {MAX_PARAMETERS}: use a struct, or two kernels"
     others = kernel.args
     if others.defaults or others.kw_defaults or others.kwonlyargs or others.posonlyargs or others.vararg or others.kwarg:
-        yield kernel.lineno, f"{kernel.name} may have plain parameters without defaults only"
+        yield kernel.lineno, f"{kernel.name} can only have plain parameters without defaults"
     yield from check_groups(kernel, lines)
     # yield from check_shapes(kernel, lines)
-    surely, perhaps = written_names(kernel, writes)
+    certain, possible = written_names(kernel, writes)
     for parameter in parameters:
         name = parameter.arg
         if parameter.annotation is None:
             yield parameter.lineno, f"{name} needs an annotation"
-        if name in surely and not name.endswith(WRITTEN):
+        if name in certain and not name.endswith(WRITTEN):
             yield parameter.lineno, f"{kernel.name} writes to {name}; its name must end in _out or _inout"
-        if name.endswith(WRITTEN) and name not in surely | perhaps:
+        if name.endswith(WRITTEN) and name not in certain | possible:
             yield parameter.lineno, f"{kernel.name} never writes to {name}"
 
 
 def check_groups(kernel: ast.FunctionDef, lines: list[str]) -> Iterator[tuple[int, str]]:
-    """Every parameter stands under a group's comment, groups come in order, and `_out` parameters stand under Out."""
+    """Faults of parameter groups: no group comment, groups out of order, `_out` parameters outside of the group Out."""
     group = ""
     line = kernel.lineno
     for parameter in kernel.args.args:
-        for number in range(line, parameter.lineno + 1):
-            match = _GROUP.match(lines[number - 1])
+        for comment_line in range(line, parameter.lineno + 1):
+            match = _GROUP.match(lines[comment_line - 1])
             if match:
                 if group and GROUPS.index(match[1]) <= GROUPS.index(group):
-                    yield number, f"groups come once, in the order {', '.join(GROUPS)}"
+                    yield comment_line, f"groups come once, in the order {', '.join(GROUPS)}"
                 group = match[1]
         line = parameter.lineno
         if not group:
-            yield parameter.lineno, f"{parameter.arg} stands under no group; head it by a comment: # Scene:, # State:, # In: or # Out:"
+            yield parameter.lineno, f"{parameter.arg} has no group; put it below a comment: # Scene:, # State:, # In: or # Out:"
         elif parameter.arg.endswith("_out") != (group == "Out") and not parameter.arg.endswith("_inout"):
-            yield parameter.lineno, f"{parameter.arg} stands under # {group}:; what ends in _out belongs under # Out:, and nothing else"
+            yield (
+                parameter.lineno,
+                f"{parameter.arg} is in the group # {group}:; names ending in _out, and no others, belong to the group # Out:",
+            )
 
 
 def check_shapes(kernel: ast.FunctionDef, lines: list[str]) -> Iterator[tuple[int, str]]:
@@ -129,26 +132,26 @@ def check_shapes(kernel: ast.FunctionDef, lines: list[str]) -> Iterator[tuple[in
 
 
 def written_names(function: ast.FunctionDef, writes: Writes) -> tuple[set[str], set[str]]:
-    """Names that the function surely writes through, and names that it hands to functions, which may write, too."""
-    surely: set[str] = set()
-    perhaps: set[str] = set()
+    """Names the function certainly writes to, and names it passes to functions, which might write to them."""
+    certain: set[str] = set()
+    possible: set[str] = set()
     for node in ast.walk(function):
         if isinstance(node, ast.Assign | ast.AugAssign):
             for target in node.targets if isinstance(node, ast.Assign) else [node.target]:
                 if isinstance(target, ast.Subscript | ast.Attribute):
-                    surely.add(base_name(target))
+                    certain.add(base_name(target))
         elif isinstance(node, ast.Call):
             called = ast.unparse(node.func)
-            if _WRITES_FIRST.fullmatch(called) and node.args:
-                surely.add(base_name(node.args[0]))
+            if _WRITING_CALL.fullmatch(called) and node.args:
+                certain.add(base_name(node.args[0]))
             elif not called.startswith("wp."):
-                perhaps |= {base_name(argument) for argument in node.args}
-                surely |= {base_name(node.args[position]) for position in writes.get(called, ()) if position < len(node.args)}
-    return surely, perhaps
+                possible |= {base_name(argument) for argument in node.args}
+                certain |= {base_name(node.args[position]) for position in writes.get(called, ()) if position < len(node.args)}
+    return certain, possible
 
 
 def function_writes(modules: dict[Path, ast.Module]) -> Writes:
-    """What each device function writes to, also by way of others."""
+    """Parameters each device function writes to, directly or through calls (fixed point over the call graph)."""
     nodes = [node for tree in modules.values() for node in ast.walk(tree)]
     functions = [node for node in nodes if isinstance(node, ast.FunctionDef) and decorated(node, "func")]
     writes: Writes = {function.name: set() for function in functions}
@@ -156,11 +159,11 @@ def function_writes(modules: dict[Path, ast.Module]) -> Writes:
     while changed:
         changed = False
         for function in functions:
-            surely, _ = written_names(function, writes)
+            certain, _ = written_names(function, writes)
             arrays = {
                 position
                 for position, parameter in enumerate(function.args.args)
-                if parameter.arg in surely and parameter.annotation is not None and "array" in ast.unparse(parameter.annotation)
+                if parameter.arg in certain and parameter.annotation is not None and "array" in ast.unparse(parameter.annotation)
             }
             changed = changed or not arrays <= writes[function.name]
             writes[function.name] |= arrays
@@ -168,7 +171,7 @@ def function_writes(modules: dict[Path, ast.Module]) -> Writes:
 
 
 def check_launches(root: Path, folder: str) -> Iterator[Fault]:
-    """Launches outside the stages."""
+    """Faults of host modules in `folder`: kernel launches outside the stages."""
     for path in sorted((root / folder).rglob("*.py")):
         if path.relative_to(root).as_posix().startswith(LAUNCHING) or path.is_relative_to(root / "synpick_warp" / "kernels"):
             continue
@@ -178,11 +181,11 @@ def check_launches(root: Path, folder: str) -> Iterator[Fault]:
 
 
 def decorated(function: ast.FunctionDef, kind: str) -> bool:
-    """Whether the function carries @wp.KIND, with or without arguments."""
-    return any(ast.unparse(mark).split("(")[0] in (f"wp.{kind}", f"warp.{kind}") for mark in function.decorator_list)
+    """Whether the function has the decorator @wp.KIND, with or without arguments."""
+    return any(ast.unparse(decorator).split("(")[0] in (f"wp.{kind}", f"warp.{kind}") for decorator in function.decorator_list)
 
 
-def switches_backward_off(node: ast.stmt) -> bool:
+def disables_backward(node: ast.stmt) -> bool:
     """Whether the statement is wp.set_module_options({"enable_backward": False, ...})."""
     if not isinstance(node, ast.Expr) or not isinstance(node.value, ast.Call):
         return False
@@ -194,7 +197,7 @@ def switches_backward_off(node: ast.stmt) -> bool:
 
 
 def imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """(line, full name) of everything imported."""
+    """(line, full name) of each import."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, name.name) for name in node.names)
@@ -203,7 +206,7 @@ def imports(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def base_name(node: ast.expr) -> str:
-    """The variable at the root of a[i].b[j]; empty if there is none."""
+    """Variable at the root of an expression such as a[i].b[j]; empty: none."""
     while isinstance(node, ast.Subscript | ast.Attribute):
         node = node.value
     return node.id if isinstance(node, ast.Name) else ""

@@ -1,7 +1,7 @@
-"""Static check of kernel launches: the name of each argument against the kernel parameter at its position.
+"""Static check of kernel launches: each argument's name against the kernel parameter at its position.
 
 Warp checks dtypes and dimensions of arguments, so two arrays of the same type can be swapped silently. Arguments are read from list
-literals in the call, or from lists that the same function has built with `inputs = [...]` and `inputs += [...]`. An argument's name
+literals in the call, or from lists built in the same function by `inputs = [...]` and `inputs += [...]`. An argument's name
 is the last part of its expression (`state.phase` is `phase`); a parameter's is its own without `_out` or `_inout`.
 """
 
@@ -12,32 +12,33 @@ from collections.abc import Iterator
 from pathlib import Path
 
 LAUNCH_OFFSET = "first"
-"""Parameter that the launchers of `stages.launch` append to the inputs themselves."""
+"""Parameter that the launchers of `stages.launch` append to the inputs."""
 LAUNCHERS = ("wp.launch", "wp.launch_tiled", "launch_pixels", "launch_views")
-"""Functions that launch with the arguments as given; launchers of a class may put further inputs in front."""
+"""Functions that launch with exactly the given arguments; launch methods of a class may prepend inputs."""
 SUFFIXES = ("_inout", "_out")
+"""Suffixes of parameters that a kernel writes to."""
 
 Parameters = dict[str, list[str]]
 """Kernel name -> names of its parameters."""
 Fault = tuple[Path, int, str]
 Lists = dict[str, list[tuple[int, list[ast.expr], bool]]]
-"""Variable -> (line, elements, whether they are appended) of each list literal that is assigned to it."""
+"""Variable -> (line, elements, whether they are appended) of each list literal assigned to it."""
 
 
 def kernel_parameters(modules: dict[Path, ast.Module]) -> Parameters:
-    """Parameter names of every kernel."""
+    """Parameter names of all kernels, by kernel name."""
     functions = (node for tree in modules.values() for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
     return {function.name: [item.arg for item in function.args.args] for function in functions if function.name.endswith("_kernel")}
 
 
 def check_launch_arguments(path: Path, kernels: Parameters) -> Iterator[Fault]:
-    """Launches in one host module whose arguments contradict the kernel's parameter names."""
+    """Faults of one host module: launches whose arguments contradict the kernel's parameter names."""
     for function in ast.walk(ast.parse(path.read_text())):
         if not isinstance(function, ast.FunctionDef):
             continue
-        lists = _lists(function)
+        lists = _find_lists(function)
         for call in ast.walk(function):
-            kernel = _launched(call, kernels)
+            kernel = _launched_kernel(call, kernels)
             if kernel and isinstance(call, ast.Call):
                 arguments = _arguments(call, lists)
                 if arguments is not None:
@@ -50,6 +51,7 @@ def check_launch_arguments(path: Path, kernels: Parameters) -> Iterator[Fault]:
 
 
 def _compare(line: int, kernel: str, arguments: list[ast.expr], names: list[str]) -> Iterator[tuple[int, str]]:
+    """Faults of one launch as (line, rule): a wrong count, or an argument with the name of another parameter."""
     if len(arguments) != len(names):
         yield line, f"{kernel} takes {len(names)} arguments, not {len(arguments)}"
         return
@@ -59,16 +61,16 @@ def _compare(line: int, kernel: str, arguments: list[ast.expr], names: list[str]
             yield arguments[position].lineno, f"{kernel} takes {name} where {argument} is given; {argument} belongs elsewhere"
 
 
-def _launched(call: ast.AST, kernels: Parameters) -> str:
-    """Name of the kernel that a call launches; empty if it launches none."""
+def _launched_kernel(call: ast.AST, kernels: Parameters) -> str:
+    """Name of the kernel launched by a call; empty: none."""
     if not isinstance(call, ast.Call) or "launch" not in ast.unparse(call.func):
         return ""
     names = (_argument_name(argument) for argument in call.args[:1])
     return next((name for name in names if name in kernels), "")
 
 
-def _lists(function: ast.FunctionDef) -> Lists:
-    """List literals that the function assigns to variables."""
+def _find_lists(function: ast.FunctionDef) -> Lists:
+    """List literals assigned or appended to variables of the function."""
     lists: Lists = {}
     for node in ast.walk(function):
         appended = isinstance(node, ast.AugAssign)
@@ -79,13 +81,13 @@ def _lists(function: ast.FunctionDef) -> Lists:
 
 
 def _arguments(call: ast.Call, lists: Lists) -> list[ast.expr] | None:
-    """Inputs and outputs of a launch; None if they cannot be read from the source."""
+    """Expressions of a launch's inputs and outputs; None if the source does not show them."""
     named = [keyword.value for keyword in call.keywords if keyword.arg in ("inputs", "outputs")]
-    plain = [argument for argument in call.args[1:] if isinstance(argument, ast.List) or _argument_name(argument) in lists]
-    if not named and call.args[-1] not in plain and ast.unparse(call.func) not in LAUNCHERS:
-        plain.append(ast.List(elts=[call.args[-1]]))  # The single output of a class's own launcher.
+    positional = [argument for argument in call.args[1:] if isinstance(argument, ast.List) or _argument_name(argument) in lists]
+    if not named and call.args[-1] not in positional and ast.unparse(call.func) not in LAUNCHERS:
+        positional.append(ast.List(elts=[call.args[-1]]))  # The only output of a class's launch method.
     elements: list[ast.expr] = []
-    for value in named or plain:
+    for value in named or positional:
         expanded = _expand(value, call.lineno, lists)
         if expanded is None:
             return None
@@ -94,7 +96,7 @@ def _arguments(call: ast.Call, lists: Lists) -> list[ast.expr] | None:
 
 
 def _expand(value: ast.expr, line: int, lists: Lists) -> list[ast.expr] | None:
-    """Elements of a list literal, or of the variable that holds one at `line`."""
+    """Elements of a list literal, or of a variable with a list at `line`; None: unknown."""
     if isinstance(value, ast.Name):
         before = sorted((item for item in lists.get(value.id, []) if item[0] <= line), key=lambda item: item[0])
         start = max((index for index, item in enumerate(before) if not item[2]), default=None)
@@ -115,7 +117,7 @@ def _expand(value: ast.expr, line: int, lists: Lists) -> list[ast.expr] | None:
 
 
 def _argument_name(argument: ast.expr) -> str:
-    """`scene.layout` -> layout, `wp.uint64(seed)` -> seed, `self.look.world` -> world, `buffers["code"]` -> code."""
+    """Last name of an expression: `scene.layout` -> layout, `wp.uint64(seed)` -> seed, `buffers["code"]` -> code."""
     if isinstance(argument, ast.Call) and len(argument.args) == 1:
         return _argument_name(argument.args[0])
     if isinstance(argument, ast.Attribute):
@@ -126,4 +128,5 @@ def _argument_name(argument: ast.expr) -> str:
 
 
 def _base(name: str) -> str:
+    """Parameter name without its suffix."""
     return next((name.removesuffix(suffix) for suffix in SUFFIXES if name.endswith(suffix)), name)

@@ -1,6 +1,6 @@
-"""Measure the renderer: white furnaces, a plane under a lamp, settled piles in both modes, successive frames of still scenes.
+"""Report on the renderer: white furnace tests, irradiance of a plane under a lamp, denoised against path-traced images, flicker.
 
-Piles settle under the physics; each is seen by camera 0 under the next light map. Exits with 1 if a bound is violated, with 2 if
+Piles settle under the physics; each is rendered by camera 0 under the next light map. Exits with 1 if a bound is violated, with 2 if
 nothing can be rendered.
 
     python -m tools.reports.render --models DIR --lights DIR --scenes 10 --size 480x270 --samples 1024 --out DIR --sheet sheet.png
@@ -22,30 +22,30 @@ from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
 from synpick_warp.viz.preview import write_picture
 from tools.options import configure, fail, make_parser, print_machine, print_rows, write_json
-from tools.reports.render_checks import furnaces, planes
+from tools.reports.render_checks import measure_furnaces, measure_planes
 from tools.reports.render_piles import compare_piles
-from tools.reports.render_sheet import contact_sheets, strip
+from tools.reports.render_sheet import image_strip, write_sheets
 
-PICTURES = (".png", ".jpg", ".jpeg")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure, print, and return the exit code."""
+    """Run the command line; returns the exit code."""
     options = _parse(arguments)
     console = Console(highlight=False)
     started = time.perf_counter()
     try:
-        if options.sheet and options.sheet.suffix.lower() not in PICTURES:
-            raise SynpickError(f"--sheet is {options.sheet}; its name must end in one of {', '.join(PICTURES)}")
+        if options.sheet and options.sheet.suffix.lower() not in IMAGE_SUFFIXES:
+            raise SynpickError(f"--sheet is {options.sheet}; its name must end in one of {', '.join(IMAGE_SUFFIXES)}")
         config = _config(options)
         device = pick_device(config.bake.device)
-        rows = furnaces(config, device) + planes(config, device)
+        rows = measure_furnaces(config, device) + measure_planes(config, device)
         if options.scenes:
-            compared, pairs = compare_piles(config, options.sheet is not None, options.noise, device, console.print)
-            rows += compared
-            for number, pair in enumerate(pairs if options.out else ()):
-                write_picture(options.out / f"scene_{number:02d}_{pair.light}.png", np.concatenate(strip(pair), axis=1)[..., ::-1])
-            for file in contact_sheets(pairs, options.sheet) if options.sheet else ():
+            pile_rows, pairs = compare_piles(config, options.sheet is not None, options.noise, device, console.print)
+            rows += pile_rows
+            for index, pair in enumerate(pairs if options.out else ()):
+                write_picture(options.out / f"scene_{index:02d}_{pair.light}.png", np.concatenate(image_strip(pair), axis=1)[..., ::-1])
+            for file in write_sheets(pairs, options.sheet) if options.sheet else ():
                 console.print(f"wrote {file}")
     except SynpickError as error:
         return fail("reports.render", error)
@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
         "bounces": config.render.bounces,
         "real_objects": bool(options.models),
         "real_lights": bool(options.lights),
-        "rows": [row.record() for row in rows],
+        "rows": [row.to_dict() for row in rows],
     }
     write_json(options.json, record)
     return 0 if all(row.holds for row in rows) else 1
@@ -70,11 +70,11 @@ def main(arguments: list[str] | None = None) -> int:
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json")
     parser.add_argument("--scenes", type=int, default=2, help="piles to compare (default: 2; 0: none)")
-    parser.add_argument("--size", default="240x135", help="width and height of their pictures (default: 240x135)")
+    parser.add_argument("--size", default="240x135", help="WIDTHxHEIGHT of their images [px] (default: 240x135)")
     parser.add_argument("--samples", type=int, default=64, help="paths per pixel of the reference (default: 64)")
-    parser.add_argument("--out", type=Path, help="folder for pictures: denoised, reference, and five times their difference")
+    parser.add_argument("--out", type=Path, help="folder for images: denoised, reference, and five times their difference")
     parser.add_argument("--sheet", type=Path, help="contact sheet of piles under every light map, PNG or JPEG")
-    parser.add_argument("--noise", action="store_true", help="render a second reference, to measure its own noise; takes as long again")
+    parser.add_argument("--noise", action="store_true", help="render a second reference, to measure its noise; doubles the time")
     return parser.parse_args(arguments)
 
 

@@ -1,4 +1,4 @@
-"""What tools/reports/render.py measures of settled piles: the fast picture beside the reference, and successive frames."""
+"""Image quality of settled piles: PSNR and bias of the denoised image against the path-traced reference, and flicker between frames."""
 
 from __future__ import annotations
 
@@ -20,150 +20,151 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from tools.options import Row
-from tools.reports.render_checks import Shot, Studio, bounded, with_mode
+from tools.reports.render_checks import Shot, Studio, bounded_row, with_mode
 
-LEAST_PSNR = 32.0
-"""Fast against reference, mean over scenes [dB]."""
-MOST_BIAS = 1.0
-"""Of the fast picture's mean radiance [%]."""
-BIAS_DRAWS = 8
-"""Of random numbers, over which a fast picture's mean radiance is averaged: one draw is off by half a percent."""
-MOST_FLICKER = 1.0
-"""Mean difference of two successive frames of a still scene [grey levels]."""
+MIN_PSNR = 32.0
+"""Bound of the mean PSNR of denoised images against references [dB]."""
+MAX_BIAS = 1.0
+"""Bound of the bias of the denoised image's mean radiance [%]."""
+BIAS_SAMPLES = 8
+"""Seeds over which a denoised image's mean radiance is averaged: one seed deviates by half a percent."""
+MAX_FLICKER = 1.0
+"""Bound of the mean difference of two successive frames of a static scene [grey levels]."""
 CREEP = 1e-4
-"""How far objects move between two frames in which hardly anything happens [m]."""
-MOST_TICKS = 400
-"""Ticks within which all piles must rest; 27 s."""
+"""Displacement of objects between two almost equal frames [m]."""
+MAX_TICKS = 400
+"""Ticks within which all piles must come to rest: 27 s."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """One pile under one light map in both modes."""
+    """Denoised image and reference of one pile under one light map."""
 
     light: str
-    fast: Shot
+    denoised: Shot
     reference: Shot
     mean: float
-    """Of the fast picture's radiance, over several draws of its random numbers."""
+    """Mean radiance of the denoised image over `BIAS_SAMPLES` seeds."""
 
     @property
     def quality(self) -> float:
-        """Peak signal to noise of the fast picture against the reference [dB]."""
-        return psnr(self.fast.color, self.reference.color)
+        """PSNR of the denoised image against the reference [dB]."""
+        return psnr(self.denoised.color, self.reference.color)
 
     @property
     def bias(self) -> float:
-        """Of the fast picture's mean radiance [%]."""
+        """Relative bias of the denoised image's mean radiance [%]."""
         return 100.0 * (self.mean / float(self.reference.radiance.mean()) - 1.0)
 
 
 def compare_piles(
     config: Config, every_light: bool, noise: bool, device: Any, report: Callable[[str], None]
 ) -> tuple[list[Row], list[Pair]]:
-    """The fast picture of settled piles against the reference, camera 0.
+    """Render settled piles by camera 0 in both modes and compare them; returns rows and image pairs.
 
     Args:
-        config: All settings; one pile a world, seen under the next light map.
-        every_light: Go on with the first piles until all maps have been seen.
-        noise: Render a second reference that differs in its random numbers alone.
+        config: All settings; one pile a world, each under the next light map.
+        every_light: Reuse piles until every light map has been rendered.
+        noise: Render a second reference with another seed, to measure the reference's noise.
         device: Where to render.
-        report: Takes lines about objects.
+        report: Receives messages about objects.
     """
     catalog = load_catalog(config, report=report)
     lights = load_lights(config.bake.lights)
-    snapshot = settled(config, catalog, len(lights), device)
+    snapshot = settle_piles(config, catalog, len(lights), device)
     cameras = make_cameras(config.cameras)[:1]
-    kinds = [with_mode(config, FAST), with_mode(config, REFERENCE)]
+    configs = [with_mode(config, FAST), with_mode(config, REFERENCE)]
     if noise:
-        kinds.append(with_mode(config, REFERENCE, seed=config.bake.seed + 1))
-    fast, reference, *other = (Studio(kind, catalog, cameras, lights, device) for kind in kinds)
+        configs.append(with_mode(config, REFERENCE, seed=config.bake.seed + 1))
+    denoised, reference, *second = (Studio(each, catalog, cameras, lights, device) for each in configs)
     piles = config.bake.worlds
-    rows, pairs, still, moved = [], [], [], []
-    for number in range(max(piles, len(lights)) if every_light else piles):
-        world, light = number % piles, number % len(lights)
+    rows, pairs, static, displaced = [], [], [], []
+    for index in range(max(piles, len(lights)) if every_light else piles):
+        world, light = index % piles, index % len(lights)
         snapshot.light.fill_(light)
-        shots = fast.shoot(snapshot, world, 0), reference.shoot(snapshot, world, 0)
-        pair = Pair(lights[light].name, *shots, mean_radiance(fast, snapshot, world))
+        shots = denoised.render(snapshot, world, 0), reference.render(snapshot, world, 0)
+        pair = Pair(lights[light].name, *shots, mean_radiance(denoised, snapshot, world))
         pairs.append(pair)
         name = f"scene {world}, {pair.light}"
-        noises = [psnr(pair.reference.color, studio.shoot(snapshot, world, 0).color) for studio in other]
+        noises = [psnr(pair.reference.color, studio.render(snapshot, world, 0).color) for studio in second]
         rows += [
-            Row(f"{name}: fast against reference", pair.quality, "dB"),
+            Row(f"{name}: denoised against reference", pair.quality, "dB"),
             *(Row(f"{name}: reference against itself", value, "dB") for value in noises),
             Row(f"{name}: bias of mean radiance", pair.bias, "%"),
         ]
-        if number < piles:
-            for found, shift in ((still, 0.0), (moved, CREEP)):
-                found.append(difference(pair.fast, fast.shoot(following(snapshot, shift), world, 0)))
-    return rows + _summary(config, pairs, still, moved), pairs
+        if index < piles:
+            for differences, displacement in ((static, 0.0), (displaced, CREEP)):
+                frame = denoised.render(next_frame(snapshot, displacement), world, 0)
+                differences.append(mean_difference(pair.denoised, frame))
+    return rows + _summarize(config, pairs, static, displaced), pairs
 
 
 def mean_radiance(studio: Studio, snapshot: Snapshot, world: int) -> float:
-    """Of a world's pictures by camera 0, whose random numbers follow from the episode's number."""
-    # The host's view of an array of the CPU is the array.
+    """Mean radiance of a world by camera 0 over `BIAS_SAMPLES` seeds; the episode index seeds the renderer."""
+    # numpy() of an array on the CPU shares its memory, so it is copied.
     episode = snapshot.episode.numpy().copy()
     means = []
-    for draw in range(BIAS_DRAWS):
-        snapshot.episode.assign(episode + draw)
-        means.append(float(studio.shoot(snapshot, world, 0).radiance.mean()))
+    for offset in range(BIAS_SAMPLES):
+        snapshot.episode.assign(episode + offset)
+        means.append(float(studio.render(snapshot, world, 0).radiance.mean()))
     snapshot.episode.assign(episode)
     return float(np.mean(means))
 
 
-def _summary(config: Config, pairs: list[Pair], still: list[float], moved: list[float]) -> list[Row]:
-    """Means over all pairs, and differences of frames over all piles [grey levels]."""
+def _summarize(config: Config, pairs: list[Pair], static: list[float], displaced: list[float]) -> list[Row]:
+    """Rows over all pairs, and over the frame differences `static` and `displaced` of all piles [grey levels]."""
     width, height = config.cameras.resolution
     seconds = float(np.median([pair.reference.seconds for pair in pairs]))
     mean = float(np.mean([pair.quality for pair in pairs]))
     return [
-        Row("fast against reference, mean", mean, "dB", f">= {LEAST_PSNR:g}", mean >= LEAST_PSNR),
-        Row("fast against reference, least", min(pair.quality for pair in pairs), "dB"),
-        bounded("bias of mean radiance, mean", float(np.mean([pair.bias for pair in pairs])), "%", MOST_BIAS),
-        bounded("bias of mean radiance, largest", max((pair.bias for pair in pairs), key=abs), "%", MOST_BIAS),
-        bounded("fast: frames of a still scene, mean difference", float(np.mean(still)), "grey", MOST_FLICKER),
-        Row(f"fast: the same, objects moved by {1e3 * CREEP:g} mm", float(np.mean(moved)), "grey"),
-        Row("reference: a picture", seconds, "s"),
+        Row("denoised against reference, mean", mean, "dB", f">= {MIN_PSNR:g}", mean >= MIN_PSNR),
+        Row("denoised against reference, min", min(pair.quality for pair in pairs), "dB"),
+        bounded_row("bias of mean radiance, mean", float(np.mean([pair.bias for pair in pairs])), "%", MAX_BIAS),
+        bounded_row("bias of mean radiance, largest", max((pair.bias for pair in pairs), key=abs), "%", MAX_BIAS),
+        bounded_row("denoised: frames of a static scene, mean difference", float(np.mean(static)), "grey", MAX_FLICKER),
+        Row(f"denoised: the same, objects displaced by {1e3 * CREEP:g} mm", float(np.mean(displaced)), "grey"),
+        Row("reference: time per image", seconds, "s"),
         Row("reference: paths", 1e-6 * width * height * config.render.samples / seconds, "million/s"),
     ]
 
 
-def following(snapshot: Snapshot, shift: float) -> Snapshot:
-    """The frame after a snapshot: time went on, and objects moved by `shift` [m] along +x; nothing else did."""
+def next_frame(snapshot: Snapshot, displacement: float) -> Snapshot:
+    """Snapshot of the next frame: a copy with objects displaced along +x by `displacement` [m], and the given one as last frame."""
     arrays = {item.name: getattr(snapshot, item.name).numpy().copy() for item in fields(Snapshot)}
-    for name in ("entry", "pose", "fixture_pose", "fixture_visible"):
+    for name in ("catalog_index", "pose", "fixture_pose", "fixture_visible"):
         arrays[f"last_{name}"] = arrays[name].copy()
     arrays["follows"][:] = 1
     arrays["frame"] += 1
-    arrays["pose"][..., 0] += shift
-    kinds = {name: getattr(snapshot, name) for name in arrays}
-    return Snapshot(**{name: wp.array(array, dtype=kinds[name].dtype, device=kinds[name].device) for name, array in arrays.items()})
+    arrays["pose"][..., 0] += displacement
+    sources = {name: getattr(snapshot, name) for name in arrays}
+    return Snapshot(**{name: wp.array(array, dtype=sources[name].dtype, device=sources[name].device) for name, array in arrays.items()})
 
 
-def difference(a: Shot, b: Shot) -> float:
-    """Mean absolute difference of two pictures [grey levels]."""
+def mean_difference(a: Shot, b: Shot) -> float:
+    """Mean absolute difference of two images [grey levels]."""
     return float(np.abs(a.color.astype(np.int16) - b.color).mean())
 
 
-def settled(config: Config, catalog: Catalog, lights: int, device: Any) -> Snapshot:
-    """Piles at rest, one a world, in the tick in which each begins to act; world w has light map w, w + lights, ...
+def settle_piles(config: Config, catalog: Catalog, lights: int, device: Any) -> Snapshot:
+    """Simulate piles until rest, one a world; returns each in the tick in which it begins to act. World w has light map w % `lights`.
 
     Raises:
-        SynpickError: One does not come to rest.
+        SynpickError: A pile does not come to rest.
     """
-    wanted = config.bake.worlds
+    count = config.bake.worlds
     config = with_enough_worlds(config, device)
     simulation = Simulation(config, catalog, lights, device)
     record = simulation.records[0]
     piles: dict[int, dict[str, np.ndarray]] = {}
-    for _ in range(MOST_TICKS):
+    for _ in range(MAX_TICKS):
         simulation.tick(record)
         host = {item.name: getattr(record.snapshot, item.name).numpy() for item in fields(Snapshot)}
         for world in np.flatnonzero(simulation.state.phase.numpy() == Phase.ACT):
             piles.setdefault(int(world), {name: array[world].copy() for name, array in host.items()})
-        if len(piles) == wanted:
+        if len(piles) == count:
             break
     else:
-        raise SynpickError(f"only {len(piles)} of {wanted} piles came to rest within {MOST_TICKS} ticks; give another seed")
+        raise SynpickError(f"only {len(piles)} of {count} piles came to rest within {MAX_TICKS} ticks; choose another seed")
     for item in fields(Snapshot):
         rows = getattr(record.snapshot, item.name).numpy().copy()
         for world, pile in piles.items():
@@ -174,6 +175,6 @@ def settled(config: Config, catalog: Catalog, lights: int, device: Any) -> Snaps
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Peak signal to noise of two 8-bit pictures [dB]."""
+    """Peak signal-to-noise ratio (PSNR) of two 8-bit images [dB]."""
     error = float(((a.astype(np.float64) - b) ** 2).mean())
     return 10.0 * float(np.log10(255.0**2 / max(error, 1e-9)))

@@ -1,7 +1,7 @@
-"""Measure piles at rest: simulate arrangements until each has settled, and print speeds, penetration, volume and what fell out.
+"""Report on settled piles: speeds, penetration, volume, energy, and objects inside the tote.
 
-A world is at rest in the tick in which it begins to act. Its numbers are taken there; then it gets the next arrangement, so that
-arrangements may outnumber worlds. Exits with 1 if a bound is violated, with 2 if nothing can be simulated.
+Arrangements are simulated until each has settled. A world is measured in the tick in which it begins to act, and then gets the next
+arrangement, so that there may be more arrangements than worlds. Exits with 1 if a bound is violated, with 2 if nothing can be simulated.
 
     python -m tools.reports.rest --models DIR --arrangements 64 --device cpu
 """
@@ -31,38 +31,39 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
 from tools.options import INTERRUPTED, Row, configure, fail, make_parser, print_machine, print_rows, write_json
 
-MOST_SPEED = 0.2
-"""Median of the objects' speeds [mm/s]."""
-MOST_DEPTH = 1.0
-"""99th percentile of the objects' penetration [mm]."""
-LEAST_INSIDE = 99.0
-"""Share of the objects inside the tote [%]."""
-MOST_VOLUME = 7.0
-"""Total volume of an arrangement's collision shapes [l]."""
-HEAP = 0.1
-"""How far above the rim the centre of mass of an object on the heap may lie [m]."""
-SAY_EVERY = 10.0
-"""Time between two lines about how far it is [s]."""
+MAX_SPEED = 0.2
+"""Bound of the median speed of objects [mm/s]."""
+MAX_DEPTH = 1.0
+"""Bound of the 99th percentile of penetration over objects [mm]."""
+MIN_INSIDE = 99.0
+"""Bound of the fraction of objects inside the tote [%]."""
+MAX_VOLUME = 7.0
+"""Bound of the total volume of an arrangement's collision shapes [l]."""
+HEAP_HEIGHT = 0.1
+"""Height above the rim up to which the centre of mass of an object counts as inside [m]."""
+PROGRESS_INTERVAL = 10.0
+"""Time between two progress lines [s]."""
 ROUNDING = 1e-6
 """Relative error of a total volume that was summed in single precision."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pile:
-    """One arrangement at rest. Arrays hold one number an object."""
+    """Measured values of one arrangement at rest. Arrays have one value per object."""
 
     episode: int
     ticks: int
-    """From the drop to rest."""
+    """Ticks from the drop to rest."""
     redrops: int
+    """Objects dropped again."""
     volume: float
-    """[l]"""
+    """Total volume of the collision shapes [l]."""
     energy: float
     """Kinetic energy [J]."""
     tick_speed: np.ndarray
-    """Displacement of the centre of mass over the last tick, by its time [mm/s]."""
+    """Mean speed of the centre of mass over the last tick, by displacement [mm/s]."""
     speed: np.ndarray
-    """Speed of the centre of mass [mm/s]."""
+    """Instantaneous speed of the centre of mass [mm/s]."""
     depth: np.ndarray
     """Deepest penetration [mm]."""
     inside: np.ndarray
@@ -70,17 +71,18 @@ class Pile:
 
 
 @dataclass
-class Findings:
-    """What came of all arrangements."""
+class Results:
+    """Results of all arrangements."""
 
     piles: list[Pile] = field(default_factory=list)
-    redrawn: Counter[str] = field(default_factory=Counter)
-    """Arrangements drawn again, by ending."""
+    resampled: Counter[str] = field(default_factory=Counter)
+    """Arrangements that failed, by ending."""
     given_up: int = 0
+    """Episodes whose last arrangement failed."""
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Measure, print, and return the exit code."""
+    """Run the command line; returns the exit code."""
     options = _parse(arguments)
     console = Console(highlight=False)
     try:
@@ -92,15 +94,15 @@ def main(arguments: list[str] | None = None) -> int:
         simulation = Simulation(config, catalog, 1, device)
     except SynpickError as error:
         return fail("reports.rest", error)
-    findings = Findings()
+    results = Results()
     interrupted = False
     try:
-        settle(simulation, catalog, findings, console.print)
+        settle(simulation, catalog, results, console.print)
     except KeyboardInterrupt:
         interrupted = True
-        print(f"reports.rest: interrupted; {len(findings.piles)} of {config.bake.episodes} arrangements are at rest", file=sys.stderr)
+        print(f"reports.rest: interrupted; {len(results.piles)} of {config.bake.episodes} arrangements are at rest", file=sys.stderr)
     machine = describe_machine(device)
-    rows = report(findings)
+    rows = report(results)
     wall = time.perf_counter() - started
     print_machine(console, machine)
     objects = "the models folder's objects" if config.bake.models else "the embedded objects"
@@ -114,7 +116,7 @@ def main(arguments: list[str] | None = None) -> int:
         "real_objects": bool(options.models),
         "interrupted": interrupted,
         "seconds": wall,
-        "rows": [row.record() for row in rows],
+        "rows": [row.to_dict() for row in rows],
     }
     write_json(options.json, record)
     return INTERRUPTED if interrupted else 0 if all(row.holds for row in rows) else 1
@@ -122,21 +124,21 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = make_parser(__doc__, "models", "device", "seed", "set", "json")
-    parser.add_argument("--arrangements", type=int, default=64, help="how many to settle (default: 64)")
-    parser.add_argument("--worlds", type=int, help="side by side (default: one for each arrangement)")
+    parser.add_argument("--arrangements", type=int, default=64, help="count of arrangements to settle (default: 64)")
+    parser.add_argument("--worlds", type=int, help="worlds simulated in parallel (default: one for each arrangement)")
     return parser.parse_args(arguments)
 
 
 def _config(options: argparse.Namespace) -> Config:
-    # Arrangements of mode move: an object may come several times, and perception is not needed.
+    # Mode move needs no perception; its arrangements may contain an object several times.
     worlds = options.worlds or options.arrangements
     return configure(options, {"bake.mode": "move", "bake.episodes": options.arrangements, "bake.worlds": worlds})
 
 
-def settle(simulation: Simulation, catalog: Catalog, findings: Findings, say: Callable[[str], None]) -> None:
-    """Let every arrangement come to rest or be given up, enter into `findings` what those at rest are like, and say how far it is."""
+def settle(simulation: Simulation, catalog: Catalog, results: Results, report_progress: Callable[[str], None]) -> None:
+    """Simulate until every arrangement is at rest or has failed, and add the measured values to `results`."""
     config = simulation.config
-    said = time.perf_counter()
+    reported = time.perf_counter()
     record = simulation.records[0]
     reader = TickReader(record)
     before: TickReport | None = None
@@ -146,23 +148,23 @@ def settle(simulation: Simulation, catalog: Catalog, findings: Findings, say: Ca
         report = reader.wait()
         phase = report.column("phase")
         for world in np.flatnonzero(phase == Phase.OVER):
-            findings.redrawn[Ending(int(report.column("ending")[world])).name.lower()] += 1
-            findings.given_up += int(report.column("redraw")[world]) + 1 == config.settle.tries
+            results.resampled[Ending(int(report.column("ending")[world])).name.lower()] += 1
+            results.given_up += int(report.column("redraw")[world]) + 1 == config.settle.tries
         resting = np.flatnonzero(phase == Phase.ACT)
         if len(resting):
             assert before is not None  # A pile rests for several ticks before it counts as settled.
-            findings.piles += _measure(simulation, catalog, before, report, resting)
-            _finish(simulation, resting)
+            results.piles += _measure(simulation, catalog, before, report, resting)
+            _finish_episodes(simulation, resting)
         if (phase == Phase.IDLE).all():
             return
-        if time.perf_counter() - said >= SAY_EVERY:
-            said = time.perf_counter()
-            say(f"{len(findings.piles)} of {config.bake.episodes} arrangements at rest")
+        if time.perf_counter() - reported >= PROGRESS_INTERVAL:
+            reported = time.perf_counter()
+            report_progress(f"{len(results.piles)} of {config.bake.episodes} arrangements at rest")
         before = report
 
 
-def _finish(simulation: Simulation, worlds: np.ndarray) -> None:
-    """End the episodes of these worlds as if the gripper had done its work, so that the next tick hands out new ones."""
+def _finish_episodes(simulation: Simulation, worlds: np.ndarray) -> None:
+    """End the episodes of `worlds` as finished, so that the next tick assigns new ones."""
     state = simulation.state
     for array, value in ((state.phase, Phase.OVER), (state.ending, Ending.FINISHED)):
         host = array.numpy()
@@ -171,12 +173,12 @@ def _finish(simulation: Simulation, worlds: np.ndarray) -> None:
 
 
 def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: TickReport, worlds: np.ndarray) -> list[Pile]:
-    """Numbers of these worlds at the end of this tick."""
+    """Measure the piles of `worlds` at the end of the tick `now`; `before` is the report of the tick before."""
     state, layout = simulation.state, simulation.layout
     tick = simulation.config.physics.step * simulation.config.physics.steps_per_tick
     progress, slots = state.progress.numpy(), state.body_slot.numpy()
     body_qd = simulation.physics.state.body_qd
-    assert body_qd is not None  # Newton's models of rigid bodies have it.
+    assert body_qd is not None  # Models with rigid bodies have it.
     depths, velocities = state.penetration.numpy(), body_qd.numpy().astype(np.float64)
     piles = []
     for world in worlds:
@@ -184,13 +186,13 @@ def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: 
         entries = [catalog.entries[index] for index in now.catalog_index[world][instances]]
         bodies = world * layout.bodies_per_world + build.GRIPPER_BODIES + slots[world][instances]
         centers = np.array([entry.center_of_mass for entry in entries])
-        place, turn = place_of(now.pose[world][instances], centers)
-        last, _ = place_of(before.pose[world][instances], centers)
+        position, rotation = transform_points(now.pose[world][instances], centers)
+        last, _ = transform_points(before.pose[world][instances], centers)
         linear, angular = velocities[bodies, :3], velocities[bodies, 3:]
-        spin = np.einsum("nji,nj->ni", turn, angular)
+        body_angular = np.einsum("nji,nj->ni", rotation, angular)
         inertia = np.array([entry.inertia for entry in entries])
         mass = np.array([entry.mass for entry in entries])
-        energy = (mass * (linear**2).sum(axis=1)).sum() + np.einsum("ni,nij,nj->", spin, inertia, spin)
+        energy = (mass * (linear**2).sum(axis=1)).sum() + np.einsum("ni,nij,nj->", body_angular, inertia, body_angular)
         piles.append(
             Pile(
                 episode=int(now.column("episode")[world]),
@@ -198,38 +200,38 @@ def _measure(simulation: Simulation, catalog: Catalog, before: TickReport, now: 
                 redrops=int(progress[world][2]),
                 volume=1e3 * sum(entry.volume for entry in entries),
                 energy=float(0.5 * energy),
-                tick_speed=1e3 * np.linalg.norm(place - last, axis=1) / tick,
+                tick_speed=1e3 * np.linalg.norm(position - last, axis=1) / tick,
                 speed=1e3 * np.linalg.norm(linear, axis=1),
                 depth=1e3 * depths[bodies],
-                inside=is_inside(simulation.config, place),
+                inside=is_inside(simulation.config, position),
             )
         )
     return piles
 
 
-def place_of(pose: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World positions (N, 3) of `point` (N, 3), given in the frames that `pose` (N, 7) places, and these frames' rotations (N, 3, 3)."""
+def transform_points(pose: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Transform points (N, 3) by poses (N, 7: x, y, z, quaternion x, y, z, w); returns positions (N, 3) and rotation matrices (N, 3, 3)."""
     x, y, z, w = pose[:, 3:].astype(np.float64).T
-    turn = np.array(
+    rotation = np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
             [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
             [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
         ]
     ).transpose(2, 0, 1)
-    return pose[:, :3] + np.einsum("nij,nj->ni", turn, point), turn
+    return pose[:, :3] + np.einsum("nij,nj->ni", rotation, point), rotation
 
 
-def is_inside(config: Config, place: np.ndarray) -> np.ndarray:
-    """Whether points (N, 3) lie above the floor, within the rim's opening, and at most `HEAP` above the rim."""
+def is_inside(config: Config, position: np.ndarray) -> np.ndarray:
+    """Whether positions (N, 3) lie above the floor, within the rim's opening, and at most `HEAP_HEIGHT` above the rim."""
     rim = np.array(config.tote.rim_size) / 2
     height = config.tote.outer_size[2] - config.tote.wall
-    return (np.abs(place[:, :2]) < rim).all(axis=1) & (place[:, 2] > 0.0) & (place[:, 2] < height + HEAP)
+    return (np.abs(position[:, :2]) < rim).all(axis=1) & (position[:, 2] > 0.0) & (position[:, 2] < height + HEAP_HEIGHT)
 
 
-def report(findings: Findings) -> list[Row]:
-    """The lines of the report; with no pile at rest the bounds are violated."""
-    piles = findings.piles
+def report(results: Results) -> list[Row]:
+    """Rows of the report; without a pile at rest, bounds are violated."""
+    piles = results.piles
 
     def over_objects(name: str) -> np.ndarray:
         return np.concatenate([getattr(pile, name) for pile in piles]) if piles else np.full(1, np.nan)
@@ -242,32 +244,32 @@ def report(findings: Findings) -> list[Row]:
     inside = 100.0 * float(over_objects("inside").mean())
     return [
         Row("arrangements at rest", len(piles), ""),
-        Row("arrangements given up", findings.given_up, "", "= 0", findings.given_up == 0),
-        *(Row(f"drawn again: {name}", count, "") for name, count in sorted(findings.redrawn.items())),
+        Row("arrangements given up", results.given_up, "", "= 0", results.given_up == 0),
+        *(Row(f"arrangements resampled: {name}", count, "") for name, count in sorted(results.resampled.items())),
         Row("objects", sum(len(pile.speed) for pile in piles), ""),
         Row("objects dropped again", sum(pile.redrops for pile in piles), ""),
         *_percentiles("ticks to rest", ticks, "", (50, 90, 100)),
         Row("total volume, mean", float(volume.mean()), "l"),
-        _bounded("total volume, max", float(volume.max()), "l", MOST_VOLUME * (1 + ROUNDING), f"<= {MOST_VOLUME:g}"),
-        *_percentiles("speed, instantaneous", speed, "mm/s", (50, 90, 99), MOST_SPEED),
-        *_percentiles("speed, by displacement over a tick", tick_speed, "mm/s", (50, 90, 99), MOST_SPEED),
+        _bounded("total volume, max", float(volume.max()), "l", MAX_VOLUME * (1 + ROUNDING), f"<= {MAX_VOLUME:g}"),
+        *_percentiles("speed, instantaneous", speed, "mm/s", (50, 90, 99), MAX_SPEED),
+        *_percentiles("speed, by displacement over a tick", tick_speed, "mm/s", (50, 90, 99), MAX_SPEED),
         *_percentiles("penetration", depth, "mm", (50,)),
-        _bounded("penetration, 99 %", float(np.percentile(depth, 99)), "mm", MOST_DEPTH, f"< {MOST_DEPTH:g}"),
+        _bounded("penetration, 99 %", float(np.percentile(depth, 99)), "mm", MAX_DEPTH, f"< {MAX_DEPTH:g}"),
         *_percentiles("penetration", depth, "mm", (100,)),
-        Row("objects inside the tote", inside, "%", f">= {LEAST_INSIDE:g}", inside >= LEAST_INSIDE),
+        Row("objects inside the tote", inside, "%", f">= {MIN_INSIDE:g}", inside >= MIN_INSIDE),
         *_percentiles("kinetic energy of a world", energy, "µJ", (50, 90, 100)),
     ]
 
 
-def _bounded(name: str, value: float, unit: str, most: float, bound: str) -> Row:
-    return Row(name, value, unit, bound, value < most)  # NaN violates it.
+def _bounded(name: str, value: float, unit: str, limit: float, bound: str) -> Row:
+    return Row(name, value, unit, bound, value < limit)  # NaN violates it.
 
 
-def _percentiles(name: str, values: np.ndarray, unit: str, which: tuple[int, ...], most_median: float | None = None) -> list[Row]:
+def _percentiles(name: str, values: np.ndarray, unit: str, which: tuple[int, ...], max_median: float | None = None) -> list[Row]:
     names = {50: "median", 100: "max"}
     rows = [Row(f"{name}, {names.get(level, f'{level} %')}", float(np.percentile(values, level)), unit) for level in which]
-    if most_median is not None:
-        rows[0] = _bounded(rows[0].name, rows[0].value, unit, most_median, f"< {most_median:g}")
+    if max_median is not None:
+        rows[0] = _bounded(rows[0].name, rows[0].value, unit, max_median, f"< {max_median:g}")
     return rows
 
 

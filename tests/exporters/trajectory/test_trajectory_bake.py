@@ -83,7 +83,7 @@ def test_the_laws_of_motion_hold(out, monkeypatch, capsys):
         ("steps/contact_force", "contacts of all objects against their weight"),
         ("steps/pose", "last step against frame"),
         ("steps/goal", "gripper: force against its law"),
-        ("steps/seal_load", "largest load of a tick"),
+        ("steps/seal_load", "peak force of a tick"),
     ],
 )
 def test_corrupted_arrays_violate_the_laws_of_motion(out, tmp_path, monkeypatch, capsys, array, what):
