@@ -1,4 +1,4 @@
-"""Launching pixel kernels: blocks of whole tiles on the GPU, several threads on the CPU."""
+"""Kernel launches over pixels and views: blocks of whole tiles on the GPU, several threads on the CPU."""
 
 from __future__ import annotations
 
@@ -10,18 +10,12 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-
-BLOCK = 128
-"""Threads of a block: four tiles of 8 x 4 pixels."""
-CHUNKS = 8
-"""Pieces a processor core gets of a launch, so that cores finish together though some tiles cost more."""
-CHUNK_PIXELS = 8192
-"""Smallest piece: launching one costs as much as shading about a hundred pixels."""
+from synpick_warp.kernels.tuning import CPU_PIECE_PIXELS, CPU_PIECES, PIXEL_BLOCK
 
 
 @functools.cache
 def _cores() -> int:
-    """Processor cores that this process may use."""
+    """CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -30,26 +24,26 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(_cores(), thread_name_prefix="pixels")
 
 
-# Threads do not survive a fork: a child starts its own.
+# Threads do not survive a fork: a child process creates its own pool.
 os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:
-    """Launch a kernel over a flat range of pixels; its last input is the range's begin. No two tiles of threads write the same place.
+    """Launch a kernel over a flat range of pixels; no two tiles may write the same element.
 
-    Warp runs a launch on the CPU in the calling thread and releases the interpreter's lock meanwhile; so pieces of the range run
-    side by side, whole tiles each. Which thread takes which piece does not change the result.
+    The kernel's last input is the index of the first pixel. On the CPU, Warp runs a launch in the calling thread and releases the
+    interpreter lock; so pieces of whole tiles run in parallel in a thread pool, which does not change the result.
     """
     if device.is_cuda:
-        wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=BLOCK)
+        wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
         return
-    if _cores() == 1 or pixels <= CHUNK_PIXELS:
+    if _cores() == 1 or pixels <= CPU_PIECE_PIXELS:
         wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device)
         return
-    # Loading a module is not safe from several threads at once.
+    # Loading a module from several threads at once is not safe.
     kernel.module.load(device, 1)
-    tiles = -(-pixels // (CHUNKS * _cores() * int(TILE_PIXELS)))
-    size = max(CHUNK_PIXELS, tiles * int(TILE_PIXELS))
+    tiles = -(-pixels // (CPU_PIECES * _cores() * int(TILE_PIXELS)))
+    size = max(CPU_PIECE_PIXELS, tiles * int(TILE_PIXELS))
 
     def launch_piece(first: int) -> None:
         wp.launch(kernel, dim=min(size, pixels - first), inputs=[*inputs, first], outputs=outputs, device=device)
@@ -58,18 +52,19 @@ def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: li
         pass
 
 
-def launch_views(kernel: wp.Kernel, views: int, each: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:
-    """Launch a kernel over `each` threads for each view; its last input is the range's begin. Threads of a view may write the same place.
+def launch_views(kernel: wp.Kernel, views: int, threads: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:
+    """Launch a kernel over `threads` threads for each view; threads of one view may write the same elements by atomic operations.
 
-    On the CPU, where Warp's atomic operations are none, the threads of a view run one after the other, and views side by side.
+    The kernel's last input is the index of the first thread. On the CPU, where Warp's atomic operations are not atomic, the threads of a
+    view run sequentially, and views in parallel.
     """
     if device.is_cuda:
-        wp.launch(kernel, dim=views * each, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=BLOCK)
+        wp.launch(kernel, dim=views * threads, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
         return
     kernel.module.load(device, 1)
 
     def launch_view(view: int) -> None:
-        wp.launch(kernel, dim=each, inputs=[*inputs, view * each], outputs=outputs, device=device)
+        wp.launch(kernel, dim=threads, inputs=[*inputs, view * threads], outputs=outputs, device=device)
 
     for _ in _pool().map(launch_view, range(views)):
         pass

@@ -9,19 +9,10 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
+from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import (
-    RAY_REGISTERS,
-    GBuffer,
-    Hit,
-    Meshes,
-    Table,
-    ViewBodies,
-    body_of,
-    face_normal,
-    hit_table,
-    trace_bodies,
-)
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal
+from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False})
 

@@ -2,8 +2,9 @@
 
 import warp as wp
 
+from synpick_warp.kernels.render.visibility.bvh_rays import hits_body
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image
-from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies, hits_body
+from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
 
 wp.set_module_options({"enable_backward": False})
 

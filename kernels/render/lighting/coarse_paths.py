@@ -25,11 +25,10 @@ from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, read_hit
 from synpick_warp.kernels.rng import stream_key
+from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-COARSE_PATH_REGISTERS = 56
-"""As `kernels.render.visibility.gbuffer.RAY_REGISTERS`; with paths, a few less are better still."""
 SEQUENCE_PERIOD = wp.constant(16)
 """Coarse pixels share one Sobol' sequence by their Morton index in squares of this width; aligned smaller squares hold aligned runs."""
 INDIRECT_CLAMP = wp.constant(4.0)

@@ -20,20 +20,9 @@ from synpick_warp.kernels.render.lighting.sampling import (
     sample_environment,
     scrambled_point,
 )
+from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, hit_table, is_blocked, trace_camera_ray, trace_ray
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, hit_position, in_image, tile_of, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import (
-    FAR,
-    RAY_OFFSET,
-    Hit,
-    Meshes,
-    Table,
-    ViewBodies,
-    body_of,
-    hit_table,
-    is_blocked,
-    segment_of,
-    trace_camera_ray,
-)
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Meshes, Table, ViewBodies, body_of
 from synpick_warp.kernels.rng import mix, stream_key
 
 wp.set_module_options({"enable_backward": False})
@@ -134,34 +123,6 @@ class Path:
     """Bounces so far, or TERMINATED."""
     width: float
     """Width of the path's footprint at the last vertex [m]."""
-
-
-@wp.func
-def trace_ray(scene: PathScene, bodies: ViewBodies, view: int, instances: int, origin: wp.vec3, direction: wp.vec3) -> Hit:
-    """Closest hit of a world-space ray along a unit vector; `depth` is the distance [m]. `is_blocked` is its any-hit counterpart."""
-    best = Hit()
-    best.segment = Segment.NOTHING
-    best.depth = FAR
-    height = origin[2] - scene.table.height
-    if scene.table.visible != 0 and direction[2] * height < 0.0:
-        best.segment = Segment.TABLE
-        best.depth = -height / direction[2]
-    for rank in range(bodies.present[view]):
-        body = bodies.order[view, rank]
-        sphere = bodies.sphere[view, body]
-        offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
-        closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, best.depth) * direction
-        if wp.dot(closest, closest) < sphere[3]:
-            rotation = bodies.world_rotation[view, body]
-            start = rotation * (origin - bodies.position[view, body])
-            local = rotation * direction
-            query = wp.mesh_query_ray(scene.meshes.id[bodies.mesh[view, body]], start, local, best.depth)
-            if query.result:
-                best.depth = query.t
-                best.triangle = query.face
-                best.barycentric = wp.vec2(query.u, query.v)
-                best.segment = segment_of(body, instances)
-    return best
 
 
 @wp.func
@@ -317,7 +278,7 @@ def extend_path(
         scale = scale / survival
     throughput.diffuse = throughput.diffuse * scale
     throughput.specular = throughput.specular * scale
-    hit = trace_ray(scene, bodies, context.view, context.instances, path.vertex.origin, direction)
+    hit = trace_ray(scene.meshes, scene.table, bodies, context.view, context.instances, path.vertex.origin, direction)
     if hit.segment == Segment.NOTHING:
         radiance = escaped_radiance(scene, rules, context, light, direction, pdf)
         result.radiance = add_light(result.radiance, throughput, radiance, bounce)

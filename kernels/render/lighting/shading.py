@@ -14,11 +14,9 @@ from synpick_warp.kernels.render.lighting.shadows import upsample_shadow
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
+from synpick_warp.kernels.tuning import SHADE_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
-
-SHADE_REGISTERS = 80
-"""Most registers of a thread that shades: it waits less than one that casts rays, and has more to keep."""
 
 
 @wp.func

@@ -14,19 +14,10 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
 from synpick_warp.kernels.render.lighting.environment import Lights, rotate_z
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import rotate_to_axis, sobol_point
+from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import (
-    FAR,
-    RAY_OFFSET,
-    RAY_REGISTERS,
-    GBuffer,
-    Meshes,
-    Table,
-    ViewBodies,
-    face_normal,
-    is_blocked,
-    read_hit,
-)
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Meshes, Table, ViewBodies, face_normal, read_hit
+from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

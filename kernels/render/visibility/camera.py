@@ -1,44 +1,46 @@
-"""Pixels, rays and boxes of pinhole cameras. The one place that knows where in a pixel its ray passes."""
+"""Pinhole cameras (OpenCV convention): pixel tiles, camera rays, projected boxes. The only place that defines where pixel centres are."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 PIXEL_CENTER = wp.constant(0.5)
-"""The ray of pixel (row, column) passes (column + 0.5, row + 0.5), as in OpenCV's and BOP's camera matrices."""
+"""Pixel (row, column) has its centre at (column + 0.5, row + 0.5) in coordinates of the camera matrix, as in BOP."""
 TILE_WIDTH = wp.constant(8)
 TILE_HEIGHT = wp.constant(4)
 TILE_PIXELS = wp.constant(32)
-"""The threads of one warp share a tile of 8 x 4 pixels: their rays visit the same nodes of a mesh's tree."""
+"""A warp's threads share a tile of 8 x 4 pixels: their rays traverse the same BVH nodes."""
 BOX_MARGIN = wp.constant(1.0)
-"""Pixels added around a projected box, against rounding."""
+"""Margin around a projected box [px], against rounding."""
 NEAR_PLANE = wp.constant(1.0e-3)
-"""A corner nearer to the camera's plane than this [m] has no useful projection."""
+"""Points closer to the camera's plane than this [m] are not projected."""
 
 
 @wp.struct
 class Cameras:
-    """Constant, one row a camera."""
+    """Intrinsics and extrinsics. Constant."""
 
     intrinsics: wp.array[wp.vec4]
-    """fx, fy, cx, cy [px]."""
+    """(camera): fx, fy, cx, cy [px]."""
     rotation: wp.array[wp.mat33d]
-    """World to camera."""
+    """(camera): world to camera."""
     center: wp.array[wp.vec3d]
-    """Optical centre in the world [m]."""
+    """(camera): optical centre in the world [m]."""
     to_world: wp.array[wp.mat33]
-    """Camera's axes to the world's, in float32 for the per-pixel kernels."""
+    """(camera): camera to world, in float32 for the per-pixel kernels."""
 
 
 @wp.struct
 class ImageGrid:
-    """Size of the images and of their grid of tiles."""
+    """Size of an image and of its grid of tiles."""
 
     width: int
     height: int
+    """[px]"""
     tile_columns: int
+    """Tiles in a row."""
     tiles: int
-    """Tiles in an image."""
+    """Tiles in the image."""
 
 
 @wp.struct
@@ -57,7 +59,7 @@ class Views:
 
 @wp.func
 def tile_pixel(grid: ImageGrid, index: int) -> tuple[int, int, int]:
-    """(view, row, column) of a flat index that walks views, tiles, and pixels within a tile; row or column may lie outside the image."""
+    """(view, row, column) of a flat thread index in tile order: view, tile, pixel of the tile; the pixel may lie outside the image."""
     lane = index % TILE_PIXELS
     tile = index // TILE_PIXELS
     view = tile // grid.tiles
@@ -77,15 +79,15 @@ def in_image(grid: ImageGrid, row: int, column: int) -> bool:
 
 @wp.func
 def tile_of(grid: ImageGrid, row: int, column: int) -> int:
-    """Number of the tile that holds a pixel."""
+    """Index of the tile that contains a pixel."""
     return (row // TILE_HEIGHT) * grid.tile_columns + column // TILE_WIDTH
 
 
 @wp.func
 def camera_ray(intrinsics: wp.vec4, row: int, column: int, offset: wp.vec2) -> wp.vec3:
-    """Direction ((x - cx) / fx, (y - cy) / fy, 1) in the camera's axes, so that a multiple of it is planar depth.
+    """Camera ray ((x - cx) / fx, (y - cy) / fy, 1) of a pixel in the camera's axes: its parameter is planar depth.
 
-    `offset` [px] is measured from the pixel's centre; zero for depth, identities and masks.
+    `offset` [px] from the pixel's centre; zero for depth, ids and masks.
     """
     x = float(column) + PIXEL_CENTER + offset[0]
     y = float(row) + PIXEL_CENTER + offset[1]
@@ -94,7 +96,7 @@ def camera_ray(intrinsics: wp.vec4, row: int, column: int, offset: wp.vec2) -> w
 
 @wp.func
 def hit_position(cameras: Cameras, camera: int, ray: wp.vec3, depth: float) -> wp.vec3:
-    """Where a camera ray reaches a planar depth, in the world [m]."""
+    """World position of a camera ray at a planar depth [m]."""
     return wp.vec3(cameras.center[camera]) + cameras.to_world[camera] * (depth * ray)
 
 
@@ -107,10 +109,10 @@ def projected_box(
     intrinsics: wp.vec4,
     grid: ImageGrid,
 ) -> wp.vec4i:
-    """Pixels that a box can cover: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: none.
+    """Conservative screen box (x_min, y_min, x_max, y_max) [px] of a bounding box, inclusive; x_max < x_min: empty.
 
-    The box has corners `lower` and `upper` [m] in a frame that `rotation` and `position` carry to the camera's. The result is clipped
-    to one image size beyond each border; it is that whole canvas where a corner lies behind the near plane, and empty where all do.
+    The box has corners `lower` and `upper` [m] in a frame that `rotation` and `position` transform into the camera's. The result is
+    clipped to one image size beyond each border; it is that whole canvas if a corner lies behind the near plane, and empty if all do.
     """
     canvas = wp.vec4i(-grid.width, -grid.height, 2 * grid.width - 1, 2 * grid.height - 1)
     x_min = float(1.0e9)
@@ -143,7 +145,7 @@ def projected_box(
         return wp.vec4i(0, 0, -1, -1)
     if behind > 0:
         return canvas
-    # Clamped before the conversion: an int cannot hold what a corner close to the near plane may project to.
+    # Clamp before converting: the projection of a corner close to the near plane may overflow an int.
     x_min = wp.clamp(x_min - BOX_MARGIN, float(canvas[0]), float(canvas[2] + 1))
     y_min = wp.clamp(y_min - BOX_MARGIN, float(canvas[1]), float(canvas[3] + 1))
     x_max = wp.clamp(x_max + BOX_MARGIN, float(canvas[0] - 1), float(canvas[2]))

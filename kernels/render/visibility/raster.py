@@ -1,8 +1,14 @@
-"""What the rays through the pixels' centres meet: all triangles leave marks at the rays that they meet, and the nearest mark is the hit."""
+"""Triangle rasterizer: a 64-bit visibility buffer (depth, body, triangle) by atomic min, with watertight ray tests at pixel centres.
+
+Passes: clear, rasterize triangles, rasterize blocks of large triangles, resolve to the G-buffer. The result equals that of tracing each
+pixel's ray (`bvh_rays`), and does not depend on the order of threads. The tote and the table, where they always stand, come from a cached
+static background that is rendered once.
+"""
 
 import warp as wp
 
 from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.visibility.bvh_rays import hit_table
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import (
     FAR,
@@ -12,7 +18,6 @@ from synpick_warp.kernels.render.visibility.gbuffer import (
     Meshes,
     Table,
     ViewBodies,
-    hit_table,
     read_hit,
     segment_of,
     store_hit,
@@ -22,29 +27,31 @@ from synpick_warp.kernels.render.visibility.triangles import Footprint, Triangle
 wp.set_module_options({"enable_backward": False})
 
 EMPTY = wp.constant(wp.uint64(0xFFFFFFFFFFFFFFFF))
-"""Mark of a ray that meets no triangle."""
+"""Cleared value of the visibility buffer: no triangle."""
 DEPTH_BITS = wp.constant(wp.uint64(32))
+"""Position of the depth in a visibility key: the upper half, so that the minimum is the nearest sample."""
 TRIANGLE_BITS = wp.constant(wp.uint32(26))
-"""A mark is a ray's planar depth, the row in `ViewBodies` and the triangle's number: the least is the nearest hit."""
+"""Position of the row of `ViewBodies` in the lower half, above the triangle index: it breaks ties of depth."""
 MAX_TRIANGLES = 1 << int(TRIANGLE_BITS)
-"""Most triangles of a mesh."""
-SMALL = wp.constant(256)
-"""Triangles whose box has no more pixels than these are done at once, others block by block: neighbours differ little in size."""
+"""Maximum number of triangles of a mesh."""
+SMALL_PIXELS = wp.constant(256)
+"""Largest screen box [px] of a triangle that one thread rasterizes at once; larger ones are split into blocks, since a warp waits for its
+largest triangle."""
 BLOCK_ROWS = wp.constant(32)
 BLOCK_COLUMNS = wp.constant(256)
-"""Size of such a block [px]; each row is a thread's."""
+"""Size of a block [px]; each of its rows is one work item."""
 
 
 @wp.struct
 class VisibilityBuffer:
-    """Scratch, a row a view."""
+    """Visibility buffer, and the work list of large triangles."""
 
     nearest: wp.array3d[wp.uint64]
-    """Mark of the nearest hit of each pixel's ray."""
+    """(view, row, column): visibility key of the nearest triangle: float32 bits of the planar depth, body, triangle."""
     block: wp.array2d[wp.vec4i]
-    """Blocks of large triangles: number of the body in `ViewBodies.order`, triangle, first row, first column."""
+    """(view, block): rank of the body in `ViewBodies.order`, triangle, first row, first column."""
     blocks: wp.array[int]
-    """How many these would be; those that there is no room for are done at once."""
+    """(view): number of blocks requested; may exceed the capacity, the triangles without space are rasterized at once."""
 
 
 @wp.func
@@ -59,26 +66,30 @@ def write_sample(
     name: wp.uint64,
     bit: wp.uint32,
 ):
-    """Leave a triangle's mark, and its instance's bit, where it meets a pixel's ray. Neither depends on the order of threads."""
+    """Depth test by atomic min where a pixel's ray hits a triangle, and atomic or of the instance's amodal bit.
+
+    `name` is the lower half of the key, `bit` the instance's bit in the amodal image (0: none).
+    """
     weights = ray_weights(triangle, ray)
     if weights[0] >= 0.0:
         depth = triangle.near + wp.dot(weights, wp.vec3(triangle.a[2], triangle.b[2], triangle.c[2]))
         if depth > 0.0:
-            mark = (wp.uint64(wp.cast(depth, wp.uint32)) << DEPTH_BITS) | name
-            # To look first whether that changes anything costs more: a thread waits for what it reads, but not for what it merges.
-            wp.atomic_min(visibility.nearest, view, row, column, mark)
+            key = (wp.uint64(wp.cast(depth, wp.uint32)) << DEPTH_BITS) | name
+            # Reading first, to skip atomics that change nothing, costs more: a thread waits for reads, but not for atomics without result.
+            wp.atomic_min(visibility.nearest, view, row, column, key)
             if bit != wp.uint32(0):
                 wp.atomic_or(amodal, view, row, column, bit)
 
 
 @wp.func
-def sample_id(body: int, triangle: int) -> wp.uint64:
+def sample_name(body: int, triangle: int) -> wp.uint64:
+    """Lower half of a visibility key."""
     return wp.uint64((wp.uint32(body) << TRIANGLE_BITS) | wp.uint32(triangle))
 
 
 @wp.func
 def amodal_bit(body: int, instances: int) -> wp.uint32:
-    """An instance's bit; fixtures have none."""
+    """Bit of an instance in the amodal image; 0 for fixtures."""
     if body < instances:
         return wp.uint32(1) << wp.uint32(body)
     return wp.uint32(0)
@@ -96,8 +107,10 @@ def rasterize_footprint(
     name: wp.uint64,
     bit: wp.uint32,
 ):
-    """`write_sample` for the pixels of a footprint within a range. One loop for rows and columns: neighbouring threads, whose triangles
-    have other rows but about as many pixels, stay together."""
+    """Scanline loop: `write_sample` for the pixels of a footprint within the box `pixels` (x_min, y_min, x_max, y_max, inclusive).
+
+    Rows and columns share one loop, so that the threads of a warp stay together: their triangles differ in rows more than in pixels.
+    """
     row = pixels[1] - 1
     column = int(0)
     last = int(-1)
@@ -115,16 +128,16 @@ def rasterize_footprint(
 
 
 @wp.func
-def list_blocks(visibility: VisibilityBuffer, view: int, number: int, triangle: int, pixels: wp.vec4i) -> bool:
-    """List the blocks of a triangle's pixels; False: there is no room for all of them."""
+def list_blocks(visibility: VisibilityBuffer, view: int, rank: int, triangle: int, pixels: wp.vec4i) -> bool:
+    """Append the blocks of a triangle's box to the work list; False: the capacity does not suffice for all of them."""
     across = (pixels[2] - pixels[0]) // BLOCK_COLUMNS + 1
     blocks = across * ((pixels[3] - pixels[1]) // BLOCK_ROWS + 1)
     place = wp.atomic_add(visibility.blocks, view, blocks)
-    room = wp.min(visibility.block.shape[1] - place, blocks)
-    for i in range(room):
+    free = wp.min(visibility.block.shape[1] - place, blocks)
+    for i in range(free):
         row = pixels[1] + i // across * BLOCK_ROWS
-        visibility.block[view, place + i] = wp.vec4i(number, triangle, row, pixels[0] + i % across * BLOCK_COLUMNS)
-    return room == blocks
+        visibility.block[view, place + i] = wp.vec4i(rank, triangle, row, pixels[0] + i % across * BLOCK_COLUMNS)
+    return free == blocks
 
 
 @wp.kernel
@@ -135,9 +148,9 @@ def clear_visibility_kernel(
     first: int,
     # Out:
     visibility_out: VisibilityBuffer,
-    amodal_out: wp.array3d[wp.uint32],
+    amodal_out: wp.array3d[wp.uint32],  # (view, row, column)
 ):
-    """No marks, no bits, no blocks."""
+    """Clear visibility buffer, amodal bits and the work list. One thread a pixel from flat index `first` on, in tile order."""
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
@@ -160,17 +173,20 @@ def rasterize_triangles_kernel(
     first: int,
     # Out:
     visibility_inout: VisibilityBuffer,
-    amodal_inout: wp.array3d[wp.uint32],
+    amodal_inout: wp.array3d[wp.uint32],  # (view, row, column)
 ):
-    """Small triangles leave their marks, large ones list their blocks. The triangles of each body of a view, in the bodies' order, go
-    round among `threads` threads; a tote that stands as in the backdrop is left out."""
+    """Rasterize small triangles and list the blocks of large ones.
+
+    Flat thread index, from `first` on: (view, rank, thread); the `threads` threads of a body stride over its triangles. A tote whose pose
+    is that of the static background is skipped.
+    """
     index = wp.tid() + first
     slots = bodies.mesh.shape[1]
-    number = (index // threads) % slots
+    rank = (index // threads) % slots
     view = index // (threads * slots)
-    if number >= bodies.present[view]:
+    if rank >= bodies.present[view]:
         return
-    body = bodies.order[view, number]
+    body = bodies.order[view, rank]
     if body == views.instances and bodies.uses_background[view] != 0:
         return
     box = bodies.box[view, body]
@@ -182,15 +198,16 @@ def rasterize_triangles_kernel(
     for k in range(index % threads, meshes.first_triangle[mesh + 1] - meshes.first_triangle[mesh], threads):
         triangle = camera_triangle(meshes, bodies, view, body, k)
         footprint = find_footprint(grid, intrinsics, triangle)
-        found = footprint.pixels
-        columns = found[2] - found[0] + 1
-        rows = found[3] - found[1] + 1
+        pixels = footprint.pixels
+        columns = pixels[2] - pixels[0] + 1
+        rows = pixels[3] - pixels[1] + 1
         if columns > 0 and rows > 0:
             listed = False
-            if columns * rows > SMALL:
-                listed = list_blocks(visibility_inout, view, number, k, found)
+            if columns * rows > SMALL_PIXELS:
+                listed = list_blocks(visibility_inout, view, rank, k, pixels)
             if not listed:
-                rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, found, triangle, footprint, sample_id(body, k), bit)
+                name = sample_name(body, k)
+                rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, pixels, triangle, footprint, name, bit)
 
 
 @wp.kernel
@@ -206,10 +223,10 @@ def rasterize_blocks_kernel(
     first: int,
     # Out:
     visibility_inout: VisibilityBuffer,
-    amodal_inout: wp.array3d[wp.uint32],
+    amodal_inout: wp.array3d[wp.uint32],  # (view, row, column)
 ):
-    """Large triangles leave their marks in their blocks. The host knows no number of blocks, so `threads` threads a view take rows of them
-    in turn."""
+    """Rasterize the listed blocks of large triangles. Flat thread index, from `first` on: (view, thread); the `threads` threads of a view
+    stride over the rows of its blocks, whose number the host does not know."""
     index = wp.tid() + first
     view = index // threads
     intrinsics = cameras.intrinsics[views.camera[view]]
@@ -222,20 +239,20 @@ def rasterize_blocks_kernel(
         footprint = find_footprint(grid, intrinsics, triangle)
         if row <= footprint.pixels[3]:
             pixels = wp.vec4i(block[3], row, wp.min(block[3] + BLOCK_COLUMNS - 1, footprint.pixels[2]), row)
-            name = sample_id(body, block[1])
+            name = sample_name(body, block[1])
             bit = amodal_bit(body, views.instances)
             rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, pixels, triangle, footprint, name, bit)
 
 
 @wp.func
-def resolve_hit(meshes: Meshes, bodies: ViewBodies, view: int, instances: int, mark: wp.uint64, ray: wp.vec3) -> Hit:
-    """The hit that left a mark, whose lower half is a name."""
-    name = wp.uint32(mark)
+def resolve_hit(meshes: Meshes, bodies: ViewBodies, view: int, instances: int, key: wp.uint64, ray: wp.vec3) -> Hit:
+    """Hit of a visibility key: unpack segment, triangle and depth, and intersect the triangle again for barycentric weights."""
+    name = wp.uint32(key)
     body = int(name >> TRIANGLE_BITS)
     hit = Hit()
     hit.segment = segment_of(body, instances)
     hit.triangle = int(name & ((wp.uint32(1) << TRIANGLE_BITS) - wp.uint32(1)))
-    hit.depth = wp.cast(wp.uint32(mark >> DEPTH_BITS), float)
+    hit.depth = wp.cast(wp.uint32(key >> DEPTH_BITS), float)
     weights = ray_weights(camera_triangle(meshes, bodies, view, body, hit.triangle), ray)
     hit.barycentric = wp.vec2(weights[0], weights[1])
     return hit
@@ -257,12 +274,13 @@ def resolve_visibility_kernel(
     first: int,
     # Out:
     gbuffer_out: GBuffer,
-    instance_out: wp.array3d[wp.uint8],
-    depth_out: wp.array3d[wp.uint16],
+    instance_out: wp.array3d[wp.uint8],  # (view, row, column)
+    depth_out: wp.array3d[wp.uint16],  # (view, row, column) [counts]
 ):
-    """The nearest hit of each pixel: that of its mark, or what the backdrop, a row a camera, shows if that is nearer.
+    """Resolve the visibility buffer: G-buffer, segmentation ids, and planar depth rounded to counts (0: no surface, or above 65,535).
 
-    Depth is planar, in counts rounded to nearest, 0 where nothing is hit or the count does not fit.
+    The nearest triangle competes with the cached static background, one G-buffer a camera (view: camera), or with the table where the
+    tote has another pose. One thread a pixel from flat index `first` on, in tile order.
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
@@ -272,13 +290,13 @@ def resolve_visibility_kernel(
     hit = Hit()
     hit.segment = Segment.NOTHING
     hit.depth = FAR
-    mark = visibility.nearest[view, row, column]
-    if mark != EMPTY:
-        hit = resolve_hit(meshes, bodies, view, views.instances, mark, ray)
+    key = visibility.nearest[view, row, column]
+    if key != EMPTY:
+        hit = resolve_hit(meshes, bodies, view, views.instances, key, ray)
     if bodies.uses_background[view] != 0:
-        behind = read_hit(background, camera, row, column)
-        if behind.segment != Segment.NOTHING and behind.depth < hit.depth:
-            hit = behind
+        static_hit = read_hit(background, camera, row, column)
+        if static_hit.segment != Segment.NOTHING and static_hit.depth < hit.depth:
+            hit = static_hit
     else:
         hit = hit_table(table, cameras, camera, ray, hit)
     store_hit(gbuffer_out, view, row, column, hit)

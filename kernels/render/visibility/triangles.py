@@ -1,5 +1,8 @@
-"""Triangles before a camera: which pixels' rays may meet one, and where on it they do. Of a dense mesh, a triangle meets a few rays in
-known pixels, while a ray would have to look for its triangle in a tree. The rays are those of `camera_rays`."""
+"""Triangle setup and ray/triangle test of the rasterizer: conservative screen footprint (edge functions), watertight intersection.
+
+For dense meshes rasterizing beats ray tracing: a triangle covers a few known pixels, whereas a ray has to find its triangle in a BVH. The
+rays are those of `camera.camera_ray`, so that both agree.
+"""
 
 import warp as wp
 
@@ -9,40 +12,42 @@ from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
 wp.set_module_options({"enable_backward": False})
 
 MARGIN = wp.constant(0.02)
-"""A triangle's footprint is larger by this [px], against rounding of its projected corners: 2e-4 px at 2,000 columns."""
-FARTHEST = wp.constant(16384.0)
-"""A corner projected farther out than this [px] is not known to within MARGIN: then every pixel is tried."""
-UNSURE = wp.constant(1.0e-3)
-"""A difference of products smaller than this share of them is computed in float64, where it is exact."""
+"""A footprint is enlarged by this [px], against rounding of the projected corners: 2e-4 px at 2,000 columns."""
+MAX_PROJECTION = wp.constant(16384.0)
+"""A corner projected farther out than this [px] is not accurate to MARGIN: the footprint is then the whole image."""
+CANCELLATION = wp.constant(1.0e-3)
+"""A difference of products below this fraction of their sum is recomputed in float64, where it is exact."""
 
 
 @wp.struct
 class Triangle:
-    """A triangle before a camera, in the camera's axes, z from `near` on [m]."""
+    """Triangle in the camera's axes [m]; depth is near + z, so that float32 keeps its precision far from the camera."""
 
     a: wp.vec3
     b: wp.vec3
     c: wp.vec3
+    """Corners."""
     near: float
+    """Depth at which z is 0."""
 
 
 @wp.struct
 class Footprint:
-    """Pixels whose rays a triangle may meet."""
+    """Conservative screen footprint of a triangle: a box and three edge functions."""
 
     pixels: wp.vec4i
-    """x_min, y_min, x_max, y_max, inclusive; none if a largest is below its least."""
+    """Box (x_min, y_min, x_max, y_max), inclusive; empty if a maximum is below its minimum."""
     origin: wp.vec2
-    """Column and row from which the lines count [px]."""
+    """Column and row that are the origin of the edge functions [px]."""
     ab: wp.vec3
     bc: wp.vec3
     ca: wp.vec3
-    """The edges, see `edge_line`; 0: no bound."""
+    """Edge functions, see `edge_line`; 0: no bound."""
 
 
 @wp.func
 def camera_triangle(meshes: Meshes, bodies: ViewBodies, view: int, body: int, triangle: int) -> Triangle:
-    """A body's triangle before a view's camera. Neighbours have the same corners to the last bit."""
+    """Transform a body's triangle into a view's camera axes. Neighbours share corners to the last bit, which watertightness needs."""
     first = 3 * (meshes.first_triangle[bodies.mesh[view, body]] + triangle)
     rotation = wp.transpose(bodies.rotation[view, body])
     start = bodies.start[view, body]
@@ -56,18 +61,18 @@ def camera_triangle(meshes: Meshes, bodies: ViewBodies, view: int, body: int, tr
 
 @wp.func
 def beside_ray(point: wp.vec3, near: float, ray: wp.vec3) -> wp.vec2:
-    """How far a point lies beside a ray, along the image's axes [m]."""
+    """Offset of a point from a camera ray at the point's depth, along the image axes [m]: the shear of the watertight test."""
     depth = near + point[2]
     return wp.vec2(point[0] - depth * ray[0], point[1] - depth * ray[1])
 
 
 @wp.func
 def cross(a: wp.vec2, b: wp.vec2) -> float:
-    """a_x b_y - a_y b_x; its sign is exact, so that no ray passes between two triangles that share an edge, nor is lost on it."""
+    """2D cross product a_x b_y - a_y b_x with an exact sign, so that no ray slips between two triangles that share an edge."""
     forward = a[0] * b[1]
     backward = a[1] * b[0]
     difference = forward - backward
-    if wp.abs(difference) <= UNSURE * (wp.abs(forward) + wp.abs(backward)):
+    if wp.abs(difference) <= CANCELLATION * (wp.abs(forward) + wp.abs(backward)):
         exact = wp.float64(a[0]) * wp.float64(b[1]) - wp.float64(a[1]) * wp.float64(b[0])
         difference = float(exact)
     return difference
@@ -75,8 +80,10 @@ def cross(a: wp.vec2, b: wp.vec2) -> float:
 
 @wp.func
 def ray_weights(triangle: Triangle, ray: wp.vec3) -> wp.vec3:
-    """Weights of the corners where a ray meets a triangle's plane, edges included; negative: it passes by. Woop, Benthin and Wald,
-    "Watertight ray/triangle intersection" (2013), where all rays have one origin and the camera's axis as their longest."""
+    """Watertight ray/triangle intersection (Woop, Benthin and Wald, 2013): barycentric weights of a, b, c, edges included; -1: a miss.
+
+    All rays start at the camera and have the optical axis as their dominant axis.
+    """
     a = beside_ray(triangle.a, triangle.near, ray)
     b = beside_ray(triangle.b, triangle.near, ray)
     c = beside_ray(triangle.c, triangle.near, ray)
@@ -91,7 +98,8 @@ def ray_weights(triangle: Triangle, ray: wp.vec3) -> wp.vec3:
 
 @wp.func
 def edge_line(start: wp.vec2, end: wp.vec2, sense: float, margin: float) -> wp.vec3:
-    """(p, q, r): pixels on the inner side of an edge, or near it, have p column + q row + r >= 0. `sense` is 1 or -1."""
+    """Edge function (p, q, r): p column + q row + r >= 0 on the inner side and within `margin` of the edge. `sense` (1 or -1) is the
+    triangle's orientation."""
     p = sense * (start[1] - end[1])
     q = sense * (end[0] - start[0])
     return wp.vec3(p, q, margin - p * start[0] - q * start[1])
@@ -99,7 +107,7 @@ def edge_line(start: wp.vec2, end: wp.vec2, sense: float, margin: float) -> wp.v
 
 @wp.func
 def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> Footprint:
-    """Pixels of the image whose rays a triangle may meet."""
+    """Project a triangle and compute its conservative footprint, clipped to the image."""
     found = Footprint()
     found.pixels = wp.vec4i(0, 0, grid.width - 1, grid.height - 1)
     depth = wp.vec3(triangle.near + triangle.a[2], triangle.near + triangle.b[2], triangle.near + triangle.c[2])
@@ -113,7 +121,7 @@ def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> 
     c = wp.cw_mul(focal, wp.vec2(triangle.c[0], triangle.c[1]) / depth[2]) + middle
     least = wp.min(wp.min(a, b), c)
     most = wp.max(wp.max(a, b), c)
-    if wp.max(wp.max(-least), wp.max(most)) > FARTHEST:
+    if wp.max(wp.max(-least), wp.max(most)) > MAX_PROJECTION:
         return found
     width = float(grid.width)
     height = float(grid.height)
@@ -125,7 +133,8 @@ def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> 
     )
     if found.pixels[2] < found.pixels[0] or found.pixels[3] < found.pixels[1]:
         return found
-    # From the box's corner on, numbers are small. The margin is that of the longest edge that the box can hold, and of no less than 1 px.
+    # Relative to the box's corner, so that numbers are small. Edge functions are not normalized: the margin is scaled by at least their
+    # gradient, that of the longest edge which fits into the box (1 px or more).
     a -= least
     b -= least
     c -= least
@@ -141,24 +150,24 @@ def find_footprint(grid: ImageGrid, intrinsics: wp.vec4, triangle: Triangle) -> 
 
 @wp.func
 def cut_span(span: wp.vec2, line: wp.vec3, row: float) -> wp.vec2:
-    """A row's columns, least and most, on an edge's inner side."""
-    least = span[0]
-    most = span[1]
+    """Clip a row's interval of columns (minimum, maximum) by an edge function."""
+    left = span[0]
+    right = span[1]
     if line[0] > 0.0:
-        least = wp.max(least, -(line[1] * row + line[2]) / line[0])
+        left = wp.max(left, -(line[1] * row + line[2]) / line[0])
     elif line[0] < 0.0:
-        most = wp.min(most, -(line[1] * row + line[2]) / line[0])
-    return wp.vec2(least, most)
+        right = wp.min(right, -(line[1] * row + line[2]) / line[0])
+    return wp.vec2(left, right)
 
 
 @wp.func
 def row_span(footprint: Footprint, row: int, left: int, right: int) -> wp.vec2i:
-    """First and last pixel of a footprint in a row, from column `left` to column `right`; none if the last is below the first."""
+    """Scanline span: first and last column of a footprint in a row, within columns `left` to `right`; empty if last < first."""
     begin = float(left) - footprint.origin[0]
     end = float(right) - footprint.origin[0]
     down = float(row) - footprint.origin[1]
     span = cut_span(cut_span(cut_span(wp.vec2(begin, end), footprint.ab, down), footprint.bc, down), footprint.ca, down)
-    # Lines that are all but level may meet the row anywhere.
+    # The intersection with an almost horizontal edge may be any number, so clamp before rounding.
     before = wp.ceil(wp.min(span[0], end + 1.0) - begin)
     behind = wp.ceil(end - wp.max(span[1], begin - 1.0))
     return wp.vec2i(left + int(before), right - int(behind))

@@ -1,7 +1,8 @@
-"""Bodies before cameras: where they stand, in which order, and which of them a tile's rays may meet."""
+"""Per-view setup: camera-space transforms, screen boxes and bounding spheres, front-to-back order, tile binning of bodies."""
 
 import warp as wp
 
+from synpick_warp.kernels.render.visibility.bvh_rays import body_ray_start
 from synpick_warp.kernels.render.visibility.camera import (
     PIXEL_CENTER,
     TILE_HEIGHT,
@@ -12,12 +13,12 @@ from synpick_warp.kernels.render.visibility.camera import (
     camera_ray,
     projected_box,
 )
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Meshes, ViewBodies, body_ray_start
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Meshes, ViewBodies
 
 wp.set_module_options({"enable_backward": False})
 
-TILE_REACH = wp.constant(5.5)
-"""Rays of a tile pass within this many pixels of the ray of its middle: half its diagonal, 4.5, and colour samples' offsets."""
+TILE_RADIUS = wp.constant(5.5)
+"""Largest distance of a tile's rays from its central ray [px]: half the diagonal, 4.5, plus the offsets of colour samples."""
 
 
 @wp.kernel
@@ -25,7 +26,7 @@ def aim_views_kernel(
     # Out:
     views_inout: Views,
 ):
-    """Views of a world look through camera 0, views of none (-1) through none (-1)."""
+    """Set the camera of each view: 0, or -1 where the view is unused (world -1)."""
     view = wp.tid()
     views_inout.camera[view] = 0
     if views_inout.world[view] < 0:
@@ -39,16 +40,19 @@ def set_up_views_kernel(
     cameras: Cameras,
     grid: ImageGrid,
     # State:
-    catalog_index: wp.array2d[int],
-    pose: wp.array2d[wp.transformf],
-    fixture_pose: wp.array2d[wp.transformf],
-    fixture_visible: wp.array2d[int],
+    catalog_index: wp.array2d[int],  # (world, instance)
+    pose: wp.array2d[wp.transformf],  # (world, instance) [m]
+    fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
+    fixture_visible: wp.array2d[int],  # (world, fixture)
     # In:
     views: Views,
     # Out:
     bodies_out: ViewBodies,
 ):
-    """Place bodies of a view's world (-1: none) before the view's camera: x_camera = R (x_world - c), in float64, stored in float32."""
+    """Transform each body of a view's world into the view's camera, x_camera = R (x_world - c), in float64, stored in float32.
+
+    Writes all of `ViewBodies` but `order`, `present` and `body_mask`; absent bodies (all, if the view is unused) get mesh -1.
+    """
     view, body = wp.tid()
     world = views.world[view]
     camera = views.camera[view]
@@ -95,7 +99,7 @@ def set_up_views_kernel(
 
 @wp.func
 def rank_depth(bodies: ViewBodies, view: int, body: int) -> float:
-    """What bodies are ranked by [m]. A ray that has met an object in the tote seldom has to look at the tote, see `stays_in_interior`."""
+    """Sort key of a body: its near depth [m]; infinite for the tote, which a ray that hit an object in it can mostly skip."""
     if body == bodies.mesh.shape[1] - FIXTURES:
         return FAR
     return bodies.near[view, body]
@@ -106,7 +110,10 @@ def sort_bodies_kernel(
     # Out:
     bodies_inout: ViewBodies,
 ):
-    """List a view's bodies that are there, the nearest first and the tote last: a body's rank is the number of those before it."""
+    """Sort the present bodies of each view front to back, the tote last, by counting: a body's rank is the number of bodies before it.
+
+    Writes `order` and `present`.
+    """
     view, body = wp.tid()
     bodies = bodies_inout.mesh.shape[1]
     near = rank_depth(bodies_inout, view, body)
@@ -126,8 +133,8 @@ def sort_bodies_kernel(
 
 
 @wp.func
-def meets_box(lower: wp.vec3, upper: wp.vec3, start: wp.vec3, direction: wp.vec3) -> bool:
-    """Whether the line through `start` along `direction` meets a box."""
+def hits_box(lower: wp.vec3, upper: wp.vec3, start: wp.vec3, direction: wp.vec3) -> bool:
+    """Slab test: True if the line through `start` along `direction` intersects a box."""
     enter = float(-FAR)
     leave = float(FAR)
     for axis in range(3):
@@ -153,13 +160,14 @@ def bin_bodies_kernel(
     # Out:
     bodies_inout: ViewBodies,
 ):
-    """Which bodies the rays of a tile's pixels may meet: those whose box, in its own axes, the ray of the tile's middle meets.
+    """Tile binning: `body_mask` of each tile, the bodies whose oriented bounding box the tile's central ray intersects.
 
-    Boxes are made larger by how far the tile's rays lie apart at the body's far side.
+    Boxes are enlarged by the tile's radius at the body's far side, so that the mask is conservative for all rays of the tile. A screen box
+    is tested first.
     """
     view, tile = wp.tid()
     camera = views.camera[view]
-    found = wp.uint64(0)
+    mask = wp.uint64(0)
     if camera >= 0:
         intrinsics = cameras.intrinsics[camera]
         tile_row = tile // grid.tile_columns
@@ -167,16 +175,16 @@ def bin_bodies_kernel(
         column = (tile - tile_row * grid.tile_columns) * TILE_WIDTH
         middle = wp.vec2(0.5 * float(TILE_WIDTH) - PIXEL_CENTER, 0.5 * float(TILE_HEIGHT) - PIXEL_CENTER)
         ray = camera_ray(intrinsics, row, column, middle)
-        apart = TILE_REACH / wp.min(intrinsics[0], intrinsics[1])
-        for number in range(bodies_inout.present[view]):
-            body = bodies_inout.order[view, number]
+        spread = TILE_RADIUS / wp.min(intrinsics[0], intrinsics[1])
+        for rank in range(bodies_inout.present[view]):
+            body = bodies_inout.order[view, rank]
             box = bodies_inout.box[view, body]
             if column <= box[2] and column + TILE_WIDTH > box[0] and row <= box[3] and row + TILE_HEIGHT > box[1]:
                 mesh = bodies_inout.mesh[view, body]
                 far = bodies_inout.near[view, body] + 2.0 * meshes.radius[mesh]
-                margin = wp.vec3(apart * far, apart * far, apart * far)
+                margin = wp.vec3(spread * far, spread * far, spread * far)
                 start = body_ray_start(bodies_inout, view, body, ray)
                 direction = bodies_inout.rotation[view, body] * ray
-                if meets_box(meshes.lower[mesh] - margin, meshes.upper[mesh] + margin, start, direction):
-                    found = found | (wp.uint64(1) << wp.uint64(number))
-    bodies_inout.body_mask[view, tile] = found
+                if hits_box(meshes.lower[mesh] - margin, meshes.upper[mesh] + margin, start, direction):
+                    mask = mask | (wp.uint64(1) << wp.uint64(rank))
+    bodies_inout.body_mask[view, tile] = mask

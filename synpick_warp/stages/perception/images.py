@@ -10,8 +10,8 @@ import warp as wp
 from synpick_warp.arrays import allocate_struct, memory_table
 from synpick_warp.configs import schema
 from synpick_warp.errors import ConfigError
+from synpick_warp.kernels.render.visibility.bvh_rays import trace_gbuffer_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-from synpick_warp.kernels.render.visibility.gbuffer import trace_sample_kernel
 from synpick_warp.kernels.render.visibility.view_setup import aim_views_kernel
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.stages.buffers import Snapshot
@@ -100,4 +100,4 @@ class PerceptionImages:
         wp.launch(aim_views_kernel, dim=views.count, outputs=[views], device=scene.device)
         set_up_views(scene, scene.cameras, scene.grid, snapshot, self.fixture_visible, views, self.bodies)
         inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.bodies, views, CENTER]
-        launch_pixels(trace_sample_kernel, self.pixels, inputs, [self.gbuffer], scene.device)
+        launch_pixels(trace_gbuffer_kernel, self.pixels, inputs, [self.gbuffer], scene.device)

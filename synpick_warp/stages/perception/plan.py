@@ -19,13 +19,11 @@ from synpick_warp.kernels.perception.occlusion_votes import (
     weigh_votes_kernel,
 )
 from synpick_warp.kernels.perception.target import choose_target_kernel
+from synpick_warp.kernels.tuning import VIEW_BLOCK
 from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
-
-VIEW_BLOCK = 32
-"""Threads of a block where one thread processes a whole view: small blocks spread few views over many multiprocessors."""
 
 
 @dataclass(frozen=True, eq=False)

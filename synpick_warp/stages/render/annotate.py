@@ -12,11 +12,9 @@ from synpick_warp.kernels.render.images.boxes_counts import (
     count_image_pixels_kernel,
     reset_empty_boxes_kernel,
 )
+from synpick_warp.kernels.tuning import COUNT_THREADS
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.render.scene import RenderScene
-
-GPU_THREADS = 1024
-"""Threads per instance on a GPU: enough to hide the latency of their reads, few enough that atomic operations do not contend."""
 
 
 def annotate(scene: RenderScene, bodies: Any, views: Any, out: ViewBuffers) -> None:
@@ -29,7 +27,7 @@ def annotate(scene: RenderScene, bodies: Any, views: Any, out: ViewBuffers) -> N
         out: Its images are read, its counts and boxes written.
     """
     instances = out.pixels.shape[1]
-    threads = GPU_THREADS if scene.device.is_cuda else 1
+    threads = COUNT_THREADS if scene.device.is_cuda else 1
     wp.launch(clear_boxes_counts_kernel, dim=(views.count, instances), outputs=[out.pixels, out.boxes], device=scene.device)
     wp.launch(
         count_image_pixels_kernel,

@@ -16,8 +16,9 @@ from synpick_warp.kernels.render.lighting.denoise import RatioImages, choose_wid
 from synpick_warp.kernels.render.lighting.shading import shade_kernel
 from synpick_warp.kernels.render.lighting.shadows import filter_shadows_kernel, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.tuning import FOOTPRINT_THREADS, PIXEL_BLOCK
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.launch import BLOCK, launch_pixels
+from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.reference import make_path_rules
 from synpick_warp.stages.render.scene import RenderScene, build_grid
 from synpick_warp.stages.timing import scope
@@ -40,8 +41,6 @@ FIREFLY_CLAMP = 8.0
 surfaces is added to the limit. Twice as much is 0.5 % brighter and 0.1 dB farther from the reference."""
 ROULETTE = 1
 """First bounce with Russian roulette: few paths are long, since many neighbours share them."""
-FOOTPRINT_THREADS = 128
-"""Threads that share the list of a chunk on a GPU: it has some hundred samples."""
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column", units={"depth": "m"})
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
@@ -208,12 +207,14 @@ class DenoisedRenderer:
         inputs = [scene.cameras, scene.grid, self.footprints, gbuffer, image.radiance, views]
         outputs = [image.resolve, lists.footprint, lists.count]
         footprints = views.count * self.footprints.tiles * int(TILE_PIXELS)
-        wp.launch(find_footprints_kernel, dim=footprints, inputs=inputs, outputs=outputs, device=scene.device, block_dim=BLOCK)
+        wp.launch(find_footprints_kernel, dim=footprints, inputs=inputs, outputs=outputs, device=scene.device, block_dim=PIXEL_BLOCK)
         threads = FOOTPRINT_THREADS if scene.device.is_cuda else int(SAMPLES)
         inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.footprints, bodies, gbuffer, lists.footprint, lists.count]
         inputs += [views, threads]
         samples = views.count * lists.count.shape[1] * threads
-        wp.launch(resolve_footprints_kernel, dim=samples, inputs=inputs, outputs=[image.resolve], device=scene.device, block_dim=BLOCK)
+        wp.launch(
+            resolve_footprints_kernel, dim=samples, inputs=inputs, outputs=[image.resolve], device=scene.device, block_dim=PIXEL_BLOCK
+        )
 
     def _launch(self, kernel: wp.Kernel, grid: Any, views: Any, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel over all pixels of a grid in all views."""

@@ -1,4 +1,4 @@
-"""Launching the search for what the rays through pixels' centres meet, before a backdrop that is rendered once."""
+"""Launcher of the triangle rasterizer, and the cached static background: tote and table, rendered once a camera."""
 
 from __future__ import annotations
 
@@ -17,40 +17,38 @@ from synpick_warp.kernels.render.visibility.raster import (
     rasterize_triangles_kernel,
     resolve_visibility_kernel,
 )
+from synpick_warp.kernels.tuning import BLOCK_THREADS, TRIANGLE_THREADS
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
 from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_views, set_up_views
 
 BLOCKS = 32768
-"""Blocks of large triangles that a view has room for: thirteen objects of some hundred to some thousand triangles, as the embedded ones,
-have 14,000 at full HD in front of a camera, dense meshes a tenth of that. Without room a single thread does them, which is slow."""
-TRIANGLE_THREADS = 4096
-"""Threads that share the triangles of a body on a GPU: a dense mesh keeps them busy, and those of a box cost little."""
-BLOCK_THREADS = 16384
-"""Threads that share the blocks of a view on a GPU."""
-
+"""Capacity for blocks of large triangles per view. Thirteen objects of some hundred to some thousand triangles each, as the embedded ones,
+have 14,000 at full HD in front of a camera; dense meshes have a tenth. Triangles beyond the capacity are rasterized by single threads,
+which is slow."""
 
 VISIBILITY_BUFFER = struct_arrays(VisibilityBuffer, "view", "row", "column", block=("view", "block"), blocks=("view",))
 
 
 class Rasterizer:
-    """Finds primary hits. Owns its scratch and the backdrop; `find` only launches.
+    """Renders G-buffers by rasterization. Owns its scratch; `rasterize` only launches kernels, so a CUDA graph can capture it.
 
     Attributes:
-        background: The struct `GBuffer`, a row a camera: what the tote, standing where it always does, and the table show.
+        background: Cached static background: the struct `GBuffer`, one view a camera, of the tote at its usual pose and the table.
     """
 
     def __init__(self, scene: RenderScene, counts_per_meter: float, views: int, background: Any = None) -> None:
-        """
+        """Allocate scratch.
+
         Args:
             scene: Constant data.
-            counts_per_meter: Counts of the depth image.
-            views: Most views of a batch.
+            counts_per_meter: Counts of the depth image per metre.
+            views: Maximum number of views of a batch.
             background: As the attribute; None: it is rendered.
 
         Raises:
-            CatalogError: A mesh has more triangles than a mark can name.
+            CatalogError: A mesh has more triangles than a visibility key can hold.
         """
         most = max(len(mesh.indices) // 3 for mesh in scene.keep)
         if most > MAX_TRIANGLES:
@@ -61,28 +59,28 @@ class Rasterizer:
         self.background = render_background(scene) if background is None else background
 
     def rasterize(self, bodies: Any, views: Any, gbuffer: Any, out: ViewBuffers) -> None:
-        """What each pixel of the views shows.
+        """Render the G-buffer of a batch of views.
 
         Args:
-            bodies: The struct `ViewBodies`, prepared for these views.
+            bodies: The struct `ViewBodies` of these views.
             views: The struct `Views`.
             gbuffer: The struct `GBuffer`; written.
-            out: Its `instance`, `depth` and `amodal` are written.
+            out: `instance`, `depth` and `amodal` are written.
         """
         scene, visibility, device = self.scene, self.visibility, self.scene.device
         pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
         launch_pixels(clear_visibility_kernel, pixels, [scene.grid], [visibility, out.amodal], device)
         inputs = [scene.meshes, scene.cameras, scene.grid, bodies, views]
-        threads = (TRIANGLE_THREADS, BLOCK_THREADS) if device.is_cuda else (1, 1)
-        each = bodies.mesh.shape[1] * threads[0]
-        launch_views(rasterize_triangles_kernel, views.count, each, [*inputs, threads[0]], [visibility, out.amodal], device)
-        launch_views(rasterize_blocks_kernel, views.count, threads[1], [*inputs, threads[1]], [visibility, out.amodal], device)
+        per_body, per_view = (TRIANGLE_THREADS, BLOCK_THREADS) if device.is_cuda else (1, 1)
+        threads = bodies.mesh.shape[1] * per_body
+        launch_views(rasterize_triangles_kernel, views.count, threads, [*inputs, per_body], [visibility, out.amodal], device)
+        launch_views(rasterize_blocks_kernel, views.count, per_view, [*inputs, per_view], [visibility, out.amodal], device)
         inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.background, bodies, visibility, views, self.counts_per_meter]
         launch_pixels(resolve_visibility_kernel, pixels, inputs, [gbuffer, out.instance, out.depth], device)
 
 
 def render_background(scene: RenderScene) -> Any:
-    """What every camera sees of a world that has the tote alone: the struct `GBuffer`, a row a camera."""
+    """Render the static background: the struct `GBuffer`, one view a camera, of a world that contains the tote alone."""
     device, cameras = scene.device, scene.camera_count
     sizes = {"view": cameras, "row": scene.height, "column": scene.width} | body_sizes(0, scene.width, scene.height)
     world = allocate(Snapshot, {"world": 1, "instance": 0, "fixture": len(FIXTURES)}, device)
@@ -92,7 +90,7 @@ def render_background(scene: RenderScene) -> Any:
     views = make_views(first_world, wp.array(range(cameras), dtype=wp.int32, device=device), cameras, 0)
     bodies, gbuffer = allocate_struct(VIEW_BODIES, sizes, device), allocate_struct(GBUFFER, sizes, device)
     set_up_views(scene, scene.cameras, scene.grid, world, tote, views, bodies)
-    # Nothing stands before it yet; its depth image is of no use, in whatever unit.
+    # The background itself must be rasterized. Its depth image is not used, so any unit will do.
     bodies.uses_background.zero_()
     out = allocate(ViewBuffers, sizes, device, ("instance", "depth", "amodal"))
     Rasterizer(scene, 1.0, cameras, background=gbuffer).rasterize(bodies, views, gbuffer, out)
@@ -100,5 +98,5 @@ def render_background(scene: RenderScene) -> Any:
 
 
 def visibility_sizes(views: int, width: int, height: int) -> dict[str, int]:
-    """Extents of the dimensions that `VISIBILITY_BUFFER` names."""
+    """Extents of the dimensions of `VISIBILITY_BUFFER`."""
     return {"view": views, "row": height, "column": width, "block": BLOCKS}

@@ -168,7 +168,7 @@ def test_rendering_does_not_depend_on_the_number_of_threads(device, monkeypatch)
     monkeypatch.setattr(launch, "_cores", lambda: 1)
     one = render(toy, device)
     monkeypatch.setattr(launch, "_cores", lambda: 2)
-    monkeypatch.setattr(launch, "CHUNK_PIXELS", 256)
+    monkeypatch.setattr(launch, "CPU_PIECE_PIXELS", 256)
     two = render(toy, device)
     for name in ("color", "depth", "instance", "amodal"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))

@@ -10,7 +10,8 @@ import trimesh
 import warp as wp
 
 from synpick_warp.configs.schema import Tote
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, stays_in_interior
+from synpick_warp.kernels.render.visibility.bvh_rays import stays_in_interior
+from synpick_warp.kernels.render.visibility.gbuffer import FAR
 from synpick_warp.kernels.render.visibility.gbuffer import Interior as DeviceInterior
 from synpick_warp.scenes.tote import tote_fixture
 from synpick_warp.scenes.types import Interior

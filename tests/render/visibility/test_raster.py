@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from synpick_warp.codes import Segment
 from synpick_warp.device import pick_device
 from synpick_warp.errors import CatalogError
+from synpick_warp.kernels.render.visibility.bvh_rays import trace_gbuffer_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-from synpick_warp.kernels.render.visibility.gbuffer import trace_sample_kernel
 from synpick_warp.scenes.types import Fixture, TriangleMesh
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render import raster
@@ -38,7 +38,7 @@ def hits_of(toy: ToyScene, device: wp.Device, by_trees: bool = False) -> dict[st
         scene, zero = renderer.scene, wp.zeros(1, dtype=wp.int32, device=device)
         inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, renderer.bodies]
         inputs += [make_views(zero, zero, 1, toy.room), wp.vec2(0.0, 0.0)]
-        launch_pixels(trace_sample_kernel, scene.grid.tiles * int(TILE_PIXELS), inputs, [renderer.gbuffer], device)
+        launch_pixels(trace_gbuffer_kernel, scene.grid.tiles * int(TILE_PIXELS), inputs, [renderer.gbuffer], device)
     found = {name: getattr(renderer.gbuffer, name).numpy()[0].copy() for name in ("segment", "triangle", "barycentric", "depth")}
     return found | {"amodal": out.amodal.numpy()[0].copy()}
 

@@ -1,0 +1,209 @@
+"""Ray queries against the BVHs of meshes: closest hit and any hit, of camera rays (by tile masks) and of world-space rays.
+
+Camera rays are (x, y, 1) in the camera's axes, so that the ray parameter is planar depth.
+"""
+
+import warp as wp
+
+from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Hit, Interior, Meshes, Table, ViewBodies, segment_of, store_hit
+from synpick_warp.kernels.tuning import RAY_REGISTERS
+
+wp.set_module_options({"enable_backward": False})
+
+RAY_OFFSET = wp.constant(2.0e-4)
+"""Secondary rays start this far off the surface [m], against self-intersection."""
+
+
+@wp.func
+def is_in_interior(interior: Interior, point: wp.vec3) -> bool:
+    """True if a point, which must not be above the top, lies in the tote's empty interior."""
+    x = wp.abs(point[0])
+    y = wp.abs(point[1])
+    z = point[2]
+    return (
+        z >= interior.floor
+        and x <= interior.half[0] + z * interior.growth[0]
+        and y <= interior.half[1] + z * interior.growth[1]
+        and x + y <= interior.half[2] + z * interior.growth[2]
+    )
+
+
+@wp.func
+def stays_in_interior(interior: Interior, start: wp.vec3, direction: wp.vec3, reach: float) -> bool:
+    """Conservative early-out: True if the ray's segment up to `reach`, clipped to the tote's height, lies in its empty convex interior.
+
+    Both ends of the clipped segment are tested; convexity does the rest. It spares camera rays that hit an object in the tote the tote's
+    BVH; for rays of paths it does not pay.
+    """
+    begin = float(0.0)
+    end = float(reach)
+    if direction[2] > 0.0:
+        end = wp.min(reach, (interior.top - start[2]) / direction[2])
+    elif start[2] > interior.top:
+        begin = FAR
+        if direction[2] < 0.0:
+            begin = (interior.top - start[2]) / direction[2]
+    if begin >= end:
+        return interior.half[0] > 0.0
+    return is_in_interior(interior, start + begin * direction) and is_in_interior(interior, start + end * direction)
+
+
+@wp.func
+def body_ray_start(bodies: ViewBodies, view: int, body: int, ray: wp.vec3) -> wp.vec3:
+    """Point of a camera ray at the body's near depth, in the body's frame [m]."""
+    return bodies.start[view, body] + bodies.near[view, body] * (bodies.rotation[view, body] * wp.vec3(ray[0], ray[1], 0.0))
+
+
+@wp.func
+def hits_body(meshes: Meshes, bodies: ViewBodies, view: int, body: int, ray: wp.vec3) -> bool:
+    """Any-hit query of a camera ray against one body."""
+    return wp.mesh_query_ray_anyhit(
+        meshes.id[bodies.mesh[view, body]], body_ray_start(bodies, view, body, ray), bodies.rotation[view, body] * ray, FAR
+    )
+
+
+@wp.func
+def trace_bodies(
+    meshes: Meshes,
+    bodies: ViewBodies,
+    view: int,
+    body_mask: wp.uint64,
+    ray: wp.vec3,
+    instances: int,
+) -> Hit:
+    """Closest hit of a camera ray among the bodies in a mask, as in `ViewBodies.body_mask`; front to back, so that most are skipped."""
+    best = Hit()
+    best.segment = Segment.NOTHING
+    best.depth = FAR
+    left = body_mask
+    rank = int(0)
+    while left != wp.uint64(0):
+        if (left & wp.uint64(1)) != wp.uint64(0):
+            body = bodies.order[view, rank]
+            near = bodies.near[view, body]
+            if near < best.depth:
+                reach = best.depth - near
+                start = body_ray_start(bodies, view, body, ray)
+                direction = bodies.rotation[view, body] * ray
+                if body != instances or not stays_in_interior(meshes.interior, start, direction, reach):
+                    query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, direction, reach)
+                    if query.result:
+                        best.depth = near + query.t
+                        best.triangle = query.face
+                        best.barycentric = wp.vec2(query.u, query.v)
+                        best.segment = segment_of(body, instances)
+        left = left >> wp.uint64(1)
+        rank += 1
+    return best
+
+
+@wp.func
+def trace_camera_ray(meshes: Meshes, bodies: ViewBodies, view: int, tile: int, ray: wp.vec3, instances: int) -> Hit:
+    """Closest hit of a camera ray among the bodies that its tile can show."""
+    return trace_bodies(meshes, bodies, view, bodies.body_mask[view, tile], ray, instances)
+
+
+@wp.func
+def hit_table(table: Table, cameras: Cameras, camera: int, ray: wp.vec3, best: Hit) -> Hit:
+    """Closer one of a camera ray's hit `best` and its hit on the table's plane."""
+    result = best
+    if table.visible != 0:
+        fall = (cameras.to_world[camera] * ray)[2]
+        height = float(cameras.center[camera][2]) - table.height
+        if fall * height < 0.0:
+            depth = -height / fall
+            if depth < best.depth:
+                result.segment = Segment.TABLE
+                result.depth = depth
+    return result
+
+
+@wp.func
+def trace_ray(meshes: Meshes, table: Table, bodies: ViewBodies, view: int, instances: int, origin: wp.vec3, direction: wp.vec3) -> Hit:
+    """Closest hit of a world-space ray along a unit vector, table included; `depth` is the distance [m]. Bounding spheres are tested before
+    BVHs. `is_blocked` is its any-hit counterpart."""
+    best = Hit()
+    best.segment = Segment.NOTHING
+    best.depth = FAR
+    height = origin[2] - table.height
+    if table.visible != 0 and direction[2] * height < 0.0:
+        best.segment = Segment.TABLE
+        best.depth = -height / direction[2]
+    for rank in range(bodies.present[view]):
+        body = bodies.order[view, rank]
+        sphere = bodies.sphere[view, body]
+        offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
+        closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, best.depth) * direction
+        if wp.dot(closest, closest) < sphere[3]:
+            rotation = bodies.world_rotation[view, body]
+            start = rotation * (origin - bodies.position[view, body])
+            local = rotation * direction
+            query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, local, best.depth)
+            if query.result:
+                best.depth = query.t
+                best.triangle = query.face
+                best.barycentric = wp.vec2(query.u, query.v)
+                best.segment = segment_of(body, instances)
+    return best
+
+
+@wp.func
+def is_blocked(
+    meshes: Meshes,
+    table: Table,
+    bodies: ViewBodies,
+    view: int,
+    origin: wp.vec3,
+    direction: wp.vec3,
+    reach: float,
+) -> bool:
+    """Any-hit query (shadow ray): True if something lies within `reach` [m] of `origin` along the unit vector `direction`, in the world."""
+    if table.visible != 0 and direction[2] < 0.0:
+        if origin[2] + reach * direction[2] < table.height:
+            return True
+    present = bodies.present[view]
+    for index in range(present):
+        # Back to front, so that the tote comes first: low rays hit its walls.
+        body = bodies.order[view, present - 1 - index]
+        sphere = bodies.sphere[view, body]
+        offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
+        closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, reach) * direction
+        if wp.dot(closest, closest) < sphere[3]:
+            rotation = bodies.world_rotation[view, body]
+            start = rotation * (origin - bodies.position[view, body])
+            local = rotation * direction
+            if wp.mesh_query_ray_anyhit(meshes.id[bodies.mesh[view, body]], start, local, reach):
+                return True
+    return False
+
+
+@wp.kernel(cuda_max_registers=RAY_REGISTERS)
+def trace_gbuffer_kernel(
+    # Scene:
+    meshes: Meshes,
+    table: Table,
+    cameras: Cameras,
+    grid: ImageGrid,
+    # In:
+    bodies: ViewBodies,
+    views: Views,
+    offset: wp.vec2,
+    first: int,
+    # Out:
+    gbuffer_out: GBuffer,
+):
+    """Render the G-buffer by ray tracing: one ray a pixel, `offset` [px] off its centre. Pixels of unused views (camera -1) stay.
+
+    One thread a pixel from flat index `first` on, in tile order.
+    """
+    view, row, column = tile_pixel(grid, wp.tid() + first)
+    if not in_image(grid, row, column):
+        return
+    camera = views.camera[view]
+    if camera < 0:
+        return
+    ray = camera_ray(cameras.intrinsics[camera], row, column, offset)
+    hit = trace_camera_ray(meshes, bodies, view, tile_of(grid, row, column), ray, views.instances)
+    store_hit(gbuffer_out, view, row, column, hit_table(table, cameras, camera, ray, hit))

@@ -1,0 +1,31 @@
+"""Launch tuning: register limits, block sizes and thread counts of kernels. They change speed, never results.
+
+Measured on one H200 (driver 580, Warp 1.19, 21 YCB-Video objects, three cameras at 1920x1080) by `python -m tools.bench --parts render`,
+unless said otherwise. On the CPU a launch runs its threads one after the other, so that counts of sharing threads are 1 there.
+"""
+
+RAY_REGISTERS = 64
+"""Register limit of kernels that trace rays. With more, too few threads are resident to hide the latency of BVH nodes; from 56 to 64 is
+best, fewer and more are slower."""
+COARSE_PATH_REGISTERS = 56
+"""The same of kernels that trace whole paths, for which slightly fewer are better still."""
+SHADE_REGISTERS = 80
+"""Register limit of the shading kernel: it waits less than one that traces rays, and keeps more values."""
+PIXEL_BLOCK = 128
+"""Block size of kernels with a thread a pixel: four tiles of 8 x 4 pixels."""
+VIEW_BLOCK = 32
+"""Block size of kernels with a thread a view: small blocks spread few views over many multiprocessors."""
+TRIANGLE_THREADS = 4096
+"""Threads that share the triangles of a body in the rasterizer: enough to spread a dense mesh, while those without a triangle cost little.
+Rasterizing triangles takes 0.10 of the 0.18 ms of a view's G-buffer."""
+BLOCK_THREADS = 16384
+"""Threads that share a view's blocks of large triangles in the rasterizer (0.015 ms of a view)."""
+COUNT_THREADS = 1024
+"""Threads that share the pixels of one instance in counts and boxes: enough to hide the latency of reads, few enough that their atomics do
+not contend."""
+FOOTPRINT_THREADS = 128
+"""Threads that share the list of anti-aliasing footprints of a chunk: it has some hundred samples."""
+CPU_PIECES = 8
+"""Pieces per CPU core of a launch over pixels, so that cores finish together although some tiles cost more."""
+CPU_PIECE_PIXELS = 8192
+"""Smallest piece: launching one costs as much as shading about a hundred pixels."""
