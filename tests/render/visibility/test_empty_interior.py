@@ -138,6 +138,6 @@ def test_pictures_are_the_same_without_the_room(device, turn):
         fixtures = (fixture, *(replace(FIXTURE, mesh=mesh, interior=None) for mesh in grip))
         toy = ToyScene(boxes, [placed], views, fixtures=fixtures, fixture_poses=(pose,) * 3, fixtures_visible=(1, 0, 0), table=True)
         scenes.append(render(toy, device))
-    for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance", "mix"):
+    for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance", "resolve"):
         np.testing.assert_array_equal(getattr(scenes[0], name), getattr(scenes[1], name))
     assert {1, 2, 3, 253} <= set(np.unique(scenes[0].instance))
