@@ -48,7 +48,7 @@ from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratc
 from synpick_warp.stages.render.postprocess import LensArrays, has_lens_filter
 from synpick_warp.stages.render.raster import VISIBILITY_BUFFER, visibility_sizes
 from synpick_warp.stages.render.renderer import SHADED_IMAGE, Renderer
-from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import RECORDS, Simulation
@@ -90,15 +90,29 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
     catalog = load_catalog(config, report=progress.note)
     lights = load_lights(config.bake.lights)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
-    scene = build_render_scene(config, catalog, fixtures, cameras, lights, device)
+    scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     sizes = view_sizes(config, device)
-    renderer = Renderer(config, scene, config.arrangement.max_objects, sizes["view"])
+    renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"])
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
     tick_time = config.physics.step * config.physics.steps_per_tick
     stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device)
     return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.sight.resolution, object_ids))
+
+
+def make_renderer(config: Config, scene: RenderScene, instances: int, views: int) -> Renderer:
+    """The renderer of a bake: its sections of the settings, for `instances` instances of a world and at most `views` views of a batch."""
+    return Renderer(
+        scene,
+        config.render,
+        config.effects,
+        config.depth_sensor,
+        seed=config.bake.seed,
+        depth_scale=config.bop.depth_scale,
+        instances=instances,
+        views=views,
+    )
 
 
 def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, int] = (0, 1)) -> BakeSummary:

@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.arrays import device_array
+from synpick_warp.arrays import allocate, device_array
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.layers import LAYER_TABLE, Layer
 
@@ -78,6 +78,16 @@ class ViewBuffers:
     """bbox_obj and bbox_visib: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty."""
     effects: wp.array = device_array("view", dtype=EffectParameters)
     """Camera-effect parameters of each view, by `Effect`; zero: off."""
+
+
+def view_buffer_sizes(views: int, width: int, height: int, instances: int) -> dict[str, int]:
+    """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`."""
+    return {"view": views, "row": height, "column": width, "instance": instances, "count": 3, "box": 2, "side": 4}
+
+
+def allocate_view_buffers(views: int, width: int, height: int, instances: int, device: wp.Device) -> ViewBuffers:
+    """`ViewBuffers` of a batch of at most `views` views of `width` x `height` px, with space for `instances` instances of a world."""
+    return allocate(ViewBuffers, view_buffer_sizes(views, width, height, instances), device)
 
 
 def _declare_layer(layer: Layer) -> Any:

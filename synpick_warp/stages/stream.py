@@ -14,7 +14,7 @@ from synpick_warp.arrays import allocate, memory_table
 from synpick_warp.codes import Measure, Status, column_names
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch, TickBatch
-from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
@@ -47,16 +47,7 @@ def views_per_batch(config: Config, device: wp.Device) -> int:
 
 def view_sizes(config: Config, device: wp.Device) -> dict[str, int]:
     """Extents of the dimensions of `ViewBuffers` and `LayerBuffers`."""
-    width, height = config.cameras.resolution
-    return {
-        "view": views_per_batch(config, device),
-        "row": height,
-        "column": width,
-        "instance": config.arrangement.max_objects,
-        "count": 3,
-        "box": 2,
-        "side": 4,
-    }
+    return view_buffer_sizes(views_per_batch(config, device), *config.cameras.resolution, config.arrangement.max_objects)
 
 
 @dataclass(frozen=True, eq=False)

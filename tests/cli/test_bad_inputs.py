@@ -18,14 +18,14 @@ from synpick_warp.arrays import allocate
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
+from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.appearance import read_texture
 from synpick_warp.scenes.catalog import load_catalog
-from synpick_warp.scenes.types import Catalog, Material
-from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers
-from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.scenes.types import Material
+from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, camera, entry, even_light, sheet, snapshot
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, build_scene, camera, entry, even_light, sheet, snapshot
 
 TEXEL, PIXELS = 0.01, 5
 """Width of a texel on a sheet [m], and in the picture: an odd number, so that some pixel's centre is a texel's."""
@@ -56,7 +56,7 @@ def test_a_gltf_material_reaches_the_renderer(tmp_path, device):
     config = load_config(None, {"bake.models": str(tmp_path / "models")})
     catalog = load_catalog(config, tmp_path / "cache")
     toy = ToyScene([], [], (camera(8, 8, 8.0, (0.0, 0.0, 1.0)),))
-    scene = build_render_scene(config, catalog, toy.fixtures, toy.cameras, (even_light(),), device)
+    scene = build_render_scene(config.render, config.tote, catalog, toy.fixtures, toy.cameras, (even_light(),), device)
     surfaces = scene.surfaces
     assert surfaces.metallic.numpy()[0] == pytest.approx(0.5 * 220 / 255, abs=1e-3)
     assert surfaces.roughness.numpy()[0] == pytest.approx(0.8 * 150 / 255, abs=1e-3)
@@ -71,11 +71,11 @@ def albedo(material: Material, rows: int, columns: int, device) -> np.ndarray:
     view = camera(PIXELS * columns, PIXELS * rows, PIXELS / TEXEL, (0.0, 0.0, 1.0))
     toy = ToyScene([entry(sheet(TEXEL * columns, TEXEL * rows), material)], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (view,))
     config = replace(Config(), render=replace(Config().render, table=False, layers=("albedo",)))
-    scene = build_render_scene(config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
-    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
+    scene = build_scene(toy, device)
+    sizes = view_buffer_sizes(1, scene.width, scene.height, toy.room)
     layers = allocate(LayerBuffers, sizes, device, ("albedo",))
     zero = wp.zeros(1, dtype=wp.int32, device=device)
-    Renderer(config, scene, toy.room, 1).render(
+    make_renderer(config, scene, toy.room, 1).render(
         snapshot(toy, device), make_views(zero, zero, 1, toy.room), allocate(ViewBuffers, sizes, device), layers
     )
     return layers.albedo.numpy()[0]

@@ -13,18 +13,16 @@ from hypothesis import strategies as st
 
 from synpick_warp.arrays import allocate
 from synpick_warp.codes import Mode
-from synpick_warp.scenes.types import Catalog
-from synpick_warp.stages.buffers import ViewBuffers
+from synpick_warp.pipeline import make_renderer
+from synpick_warp.stages.buffers import ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import GraspPlanner
-from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.worlds import AttemptState
 from tests.harness.grasp_probe import solve_kinematics_kernel
 from tests.twins import planning
 from tests.worlds.kernel_worlds import KernelWorlds, filled
-from tests.worlds.toy_scene import ToyScene, ball, box, camera, entry, flat_shaded, sheet, snapshot
+from tests.worlds.toy_scene import ToyScene, ball, box, build_scene, camera, entry, flat_shaded, sheet, snapshot
 
 QUARTER = np.pi / 2
 VIEW = camera(160, 120, 400.0, (0.02, -0.03, 2.0))
@@ -104,19 +102,9 @@ class GraspHarness:
 
     def __init__(self, device, toy: ToyScene, window: int = 10, tilt_limit: float = QUARTER) -> None:
         views, instances = len(toy.placed), toy.room
-        scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
-        renderer = Renderer(toy.settings(), scene, instances, views)
-        sizes = {
-            "view": views,
-            "world": views,
-            "row": scene.height,
-            "column": scene.width,
-            "instance": instances,
-            "count": 3,
-            "box": 2,
-            "side": 4,
-            "point": planning.CAPACITY,
-        }
+        scene = build_scene(toy, device)
+        renderer = make_renderer(toy.settings(), scene, instances, views)
+        sizes = view_buffer_sizes(views, scene.width, scene.height, instances) | {"world": views, "point": planning.CAPACITY}
         self.arrays, self.observation = allocate(PerceptionArrays, sizes, device), allocate(Observation, sizes, device)
         self.grasp = allocate(Plan, sizes, device)
         world, camera_index = (wp.array(values, dtype=wp.int32, device=device) for values in (range(views), [0] * views))

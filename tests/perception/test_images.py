@@ -17,7 +17,7 @@ from synpick_warp.scenes.types import Catalog, Fixture
 from synpick_warp.stages.perception import images
 from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.render.scene import build_render_scene
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, entry, render, snapshot
+from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, build_scene, entry, render, snapshot
 
 RESOLUTION = (96, 54)
 
@@ -51,7 +51,9 @@ def make_images(toy: ToyScene, device: wp.Device, worlds: int = 4, views: int = 
     config = toy.settings()
     cameras = replace(config.cameras, resolution=(192, 108))
     settings = replace(config.sight, resolution=RESOLUTION, views=views)
-    scene = build_render_scene(config, Catalog(tuple(toy.entries)), toy.fixtures, make_cameras(cameras), toy.lights, device)
+    scene = build_render_scene(
+        config.render, config.tote, Catalog(tuple(toy.entries)), toy.fixtures, make_cameras(cameras), toy.lights, device
+    )
     return PerceptionImages(settings, cameras, scene, worlds, toy.room)
 
 
@@ -90,6 +92,6 @@ def test_number_of_views():
 
 def test_more_pixels_than_31_bits_count_are_an_error(device, toy):
     settings = replace(Config().sight, resolution=(8192, 8192), views=32)
-    scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+    scene = build_scene(toy, device)
     with pytest.raises(ConfigError, match=r"sight\.views is 32"):
         PerceptionImages(settings, Config().cameras, scene, 32, toy.room)

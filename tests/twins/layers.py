@@ -9,13 +9,12 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.scenes.types import Camera, Catalog
-from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers
-from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.pipeline import make_renderer
+from synpick_warp.scenes.types import Camera
+from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.view_setup import make_views
 from tests.twins.raycast import rotation_of
-from tests.worlds.toy_scene import ToyScene, snapshot
+from tests.worlds.toy_scene import ToyScene, build_scene, snapshot
 
 
 @dataclass
@@ -47,7 +46,7 @@ def render_layers(
 ) -> RenderedLayers:
     """Render layers of every world by every camera: view = world x cameras + camera."""
     config = replace(toy.settings(), render=replace(toy.settings().render, layers=names))
-    scene = build_render_scene(config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+    scene = build_scene(toy, device)
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
     now = snapshot(toy, device)
@@ -57,8 +56,8 @@ def render_layers(
         for name in ("catalog_index", "pose", "fixture_pose", "fixture_visible"):
             wp.copy(getattr(now, f"last_{name}"), getattr(last, name))
         now.follows.assign(np.array(previous.follows))
-    renderer = Renderer(config, scene, toy.room, views)
-    sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
+    renderer = make_renderer(config, scene, toy.room, views)
+    sizes = view_buffer_sizes(views, scene.width, scene.height, toy.room)
     out = allocate(LayerBuffers, sizes, device, names)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)

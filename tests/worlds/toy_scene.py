@@ -10,10 +10,11 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config
+from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Fixture, Material, TriangleMesh
-from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
 
 GREY = Material(color=(0.7, 0.7, 0.7), texture=None, metallic=0.0, roughness=0.8)
@@ -163,15 +164,20 @@ def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
     return made
 
 
+def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
+    """The renderer's constant data of a toy scene."""
+    settings = toy.settings()
+    return build_render_scene(settings.render, settings.tote, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+
+
 def render(toy: ToyScene, device: wp.Device) -> Picture:
     """Render every world by every camera: view = world x cameras + camera."""
     config = toy.settings()
-    scene = build_render_scene(config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+    scene = build_scene(toy, device)
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
-    renderer = Renderer(config, scene, toy.room, views)
-    sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
-    out = allocate(ViewBuffers, sizes, device)
+    renderer = make_renderer(config, scene, toy.room, views)
+    out = allocate_view_buffers(views, scene.width, scene.height, toy.room, device)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
     renderer.render(snapshot(toy, device), make_views(view_world, view_camera, views, toy.room), out)
@@ -182,10 +188,9 @@ def render(toy: ToyScene, device: wp.Device) -> Picture:
 
 def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
     """Primary hits alone: what world 0 shows to camera 0."""
-    scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
-    renderer = Renderer(toy.settings(), scene, toy.room, 1)
-    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
-    out = allocate(ViewBuffers, sizes, device)
+    scene = build_scene(toy, device)
+    renderer = make_renderer(toy.settings(), scene, toy.room, 1)
+    out = allocate_view_buffers(1, scene.width, scene.height, toy.room, device)
     zero = wp.zeros(1, dtype=wp.int32, device=device)
     views = make_views(zero, zero, 1, toy.room)
     renderer.render_gbuffer(snapshot(toy, device), views, out)

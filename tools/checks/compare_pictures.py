@@ -23,12 +23,12 @@ from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
+from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
 from tools.options import configure, fail, make_parser, write_json
@@ -199,9 +199,8 @@ def copy_snapshot(snapshot: Snapshot, device: Any) -> Snapshot:
 def render_views(config: Config, scene: Any, snapshot: Snapshot) -> dict[str, np.ndarray]:
     """Render all worlds by all cameras; returns all images and layers by name."""
     worlds, cameras, device = config.bake.worlds, scene.camera_count, scene.device
-    sizes = {"view": worlds * cameras, "row": scene.height, "column": scene.width, "instance": config.arrangement.max_objects}
-    sizes |= {"count": 3, "box": 2, "side": 4}
-    renderer = Renderer(config, scene, config.arrangement.max_objects, worlds * cameras)
+    sizes = view_buffer_sizes(worlds * cameras, scene.width, scene.height, config.arrangement.max_objects)
+    renderer = make_renderer(config, scene, config.arrangement.max_objects, worlds * cameras)
     out, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, LAYERS)
     view = np.arange(worlds * cameras, dtype=np.int32)
     world, camera = (wp.array(values, dtype=wp.int32, device=device) for values in (view // cameras, view % cameras))

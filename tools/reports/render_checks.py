@@ -12,12 +12,12 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Material, TriangleMesh
-from synpick_warp.stages.buffers import FIXTURES, Snapshot, ViewBuffers
-from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.buffers import FIXTURES, Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
 from tools.options import Row
@@ -56,11 +56,10 @@ class Studio:
         self, config: Config, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...], device: Any
     ) -> None:
         fixtures = make_fixtures(config.tote, config.gripper)
-        scene = build_render_scene(config, catalog, fixtures, cameras, lights, device)
+        scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
         self.device = device
-        self.renderer = Renderer(config, scene, config.arrangement.max_objects, 1)
-        sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": config.arrangement.max_objects}
-        self.out = allocate(ViewBuffers, sizes | {"count": 3, "box": 2, "side": 4}, device)
+        self.renderer = make_renderer(config, scene, config.arrangement.max_objects, 1)
+        self.out = allocate_view_buffers(1, scene.width, scene.height, config.arrangement.max_objects, device)
 
     def render(self, snapshot: Snapshot, world: int, camera: int) -> Shot:
         """Render one world by one camera."""

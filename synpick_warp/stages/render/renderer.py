@@ -1,11 +1,12 @@
-"""Pictures and ground truth of a batch of views, from a snapshot of all worlds."""
+"""Renderer: images, annotation layers and ground truth of a batch of views, from a snapshot of all worlds."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from synpick_warp.arrays import allocate_struct, struct_arrays
-from synpick_warp.configs.schema import REFERENCE, Config
+from synpick_warp.configs import schema
+from synpick_warp.configs.sensors import DepthSensor, Effects
 from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.render.annotate import annotate
@@ -22,16 +23,42 @@ SHADED_IMAGE = struct_arrays(ShadedImage, "view", "row", "column")
 
 
 class Renderer:
-    """Renders and annotates batches of views. Owns its scratch; `render` only launches, so a CUDA graph can capture it."""
+    """Renders and annotates batches of views. Owns its scratch; `render` only launches kernels, so a CUDA graph can capture it.
 
-    def __init__(self, config: Config, scene: RenderScene, instances: int, views: int) -> None:
+    Passes: view setup, rasterization to a G-buffer, annotation layers, shading (denoised or path-traced reference), post-processing,
+    boxes and pixel counts.
+
+    Attributes:
+        instances: Instance capacity of a world.
+        views: Maximum number of views of a batch.
+        bodies: The struct `ViewBodies` of the last batch.
+        gbuffer: The struct `GBuffer` of the last batch.
+        image: The struct `ShadedImage` of the last batch: linear radiance.
+    """
+
+    def __init__(
+        self,
+        scene: RenderScene,
+        settings: schema.Render,
+        effects: Effects,
+        depth_sensor: DepthSensor,
+        *,
+        seed: int,
+        depth_scale: float,
+        instances: int,
+        views: int,
+    ) -> None:
         """Allocate scratch.
 
         Args:
-            config: All settings.
             scene: Constant data.
-            instances: Room for instances of a world, at most 32: one bit each.
-            views: Most views of a batch.
+            settings: Settings of the renderer.
+            effects: Settings of the camera effects.
+            depth_sensor: Settings of the simulated depth camera.
+            seed: Seed of all random numbers.
+            depth_scale: Millimetres per count of the depth image.
+            instances: Instance capacity of a world, at most 32: one bit each in the amodal image.
+            views: Maximum number of views of a batch.
         """
         sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(instances, scene.width, scene.height)
         self.scene = scene
@@ -40,26 +67,26 @@ class Renderer:
         self.bodies = allocate_struct(VIEW_BODIES, sizes, scene.device)
         self.gbuffer = allocate_struct(GBUFFER, sizes, scene.device)
         self.image = allocate_struct(SHADED_IMAGE, sizes, scene.device)
-        if config.render.mode == REFERENCE:
-            self.shading: DenoisedRenderer | ReferenceRenderer = ReferenceRenderer(config.render, config.bake.seed, scene)
+        if settings.mode == schema.REFERENCE:
+            self.shading: DenoisedRenderer | ReferenceRenderer = ReferenceRenderer(settings, seed, scene)
         else:
-            self.shading = DenoisedRenderer(config.render, config.bake.seed, scene, views)
-        self.rasterizer = Rasterizer(scene, 1000.0 / config.bop.depth_scale, views)
-        sensor = sensor_parameters(config.depth_sensor, config.bake.seed, config.bop.depth_scale)
-        self.layer_renderer = LayerRenderer(config.render.layers, sensor, scene, instances, views)
-        self.postprocessor = PostProcessor(config.effects, config.render.tone, config.bake.seed, scene, views)
+            self.shading = DenoisedRenderer(settings, seed, scene, views)
+        self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views)
+        sensor = sensor_parameters(depth_sensor, seed, depth_scale)
+        self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, instances, views)
+        self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views)
 
     def render(self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None) -> None:
         """Render and annotate a batch of views: the one place that knows the order of the passes.
 
         Args:
-            snapshot: The worlds.
+            snapshot: State of the worlds.
             views: The struct `Views`.
             out: Written.
-            layers: Written, if given.
+            layers: Written; None: no layers.
 
         Raises:
-            ValueError: More views than there is scratch for.
+            ValueError: The batch has more views than there is scratch for.
         """
         if views.count > self.views:
             raise ValueError(f"{views.count} views in a batch; this renderer has scratch for {self.views}")

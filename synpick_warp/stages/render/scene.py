@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs import schema
 from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.kernels.render.lighting.materials import Surfaces
 from synpick_warp.kernels.render.lighting.path_tracing import PathScene
@@ -193,7 +193,8 @@ def build_lights(maps: tuple[EnvironmentMap, ...], ground: np.ndarray | None, ex
 
 
 def build_render_scene(
-    config: Config,
+    settings: schema.Render,
+    tote: schema.Tote,
     catalog: Catalog,
     fixtures: tuple[Fixture, Fixture, Fixture],
     cameras: tuple[Camera, ...],
@@ -203,26 +204,27 @@ def build_render_scene(
     """Put all constant data of the renderer on the device.
 
     Args:
-        config: All settings.
-        catalog: The objects; an instance's `entry` is the index into it.
-        fixtures: Tote, finger, cup, each in its own frame.
-        cameras: All of the same image size; a view's camera is the index into it.
-        lights: A world's light is the index into it.
-        device: Where to put it.
+        settings: Settings of the renderer.
+        tote: Settings of the tote, which stands on the table.
+        catalog: The objects; `Snapshot.catalog_index` is the index into it.
+        fixtures: Tote, gripper shaft and cup, each in its own frame.
+        cameras: Cameras of one image size; `Views.camera` is the index into it.
+        lights: Environment maps; `Snapshot.light` is the index into it.
+        device: Device of the arrays.
     """
     shapes = [entry.mesh for entry in catalog.entries] + [fixture.mesh for fixture in fixtures]
-    table_material = Material(color=config.render.table_color, texture=None, metallic=0.0, roughness=TABLE_ROUGHNESS)
+    table_material = Material(color=settings.table_color, texture=None, metallic=0.0, roughness=TABLE_ROUGHNESS)
     materials = [entry.material for entry in catalog.entries] + [fixture.material for fixture in fixtures] + [table_material]
     meshes, keep = build_meshes(shapes, len(catalog), device, fixtures[0].interior)
     table = Table()
-    table.visible, table.height = int(config.render.table), -config.tote.wall
-    ground = srgb_to_linear(np.array(config.render.table_color)) if config.render.table else None
+    table.visible, table.height = int(settings.table), -tote.wall
+    ground = srgb_to_linear(np.array(settings.table_color)) if settings.table else None
     paths = PathScene()
     paths.meshes = meshes
     paths.table = table
     paths.surfaces = build_surfaces(shapes, materials, device)
-    paths.lights = build_lights(lights, ground, config.render.exposure, device)
-    paths.cdf = build_environment_cdf(paths.lights.radiance.numpy(), device, config.render.table)
+    paths.lights = build_lights(lights, ground, settings.exposure, device)
+    paths.cdf = build_environment_cdf(paths.lights.radiance.numpy(), device, settings.table)
     return RenderScene(
         meshes=meshes,
         surfaces=paths.surfaces,

@@ -12,12 +12,10 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import DepthSensor
-from synpick_warp.scenes.types import Catalog
-from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers
-from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.pipeline import make_renderer
+from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.view_setup import make_views
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, sheet, snapshot
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, build_scene, camera, entry, sheet, snapshot
 
 WIDTH, HEIGHT, FOCAL = 160, 96, 400.0
 TOP = 2.0
@@ -58,11 +56,11 @@ def measure(toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, fi
     """Simulate the sensor for every world and camera, in `frames` batches for frames 0, 1, ..., stacked."""
     config = replace(toy.settings(), depth_sensor=DepthSensor(**sensor))
     config = replace(config, render=replace(config.render, layers=("depth_sensor",)), bake=replace(config.bake, seed=seed))
-    scene = build_render_scene(config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
+    scene = build_scene(toy, device)
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
-    renderer = Renderer(config, scene, toy.room, views)
-    sizes = {"view": views, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
+    renderer = make_renderer(config, scene, toy.room, views)
+    sizes = view_buffer_sizes(views, scene.width, scene.height, toy.room)
     images, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, ("depth_sensor",))
     world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     camera_index = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)

@@ -13,7 +13,7 @@ from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.exporters.bop.view import ViewSettings, extract_masks, make_view_task
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
-from synpick_warp.stages.buffers import ViewBuffers
+from synpick_warp.stages.buffers import ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render import mask_runs
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from tests.harness.exporter_contract import digests, exporting, finish
@@ -26,7 +26,7 @@ SETTINGS = ViewSettings(".jpg", 95, (), masks=True, coco=True, camera={})
 def list_on_device(instance: np.ndarray, amodal: np.ndarray, device: wp.Device) -> tuple[np.ndarray, np.ndarray]:
     """Counts and lists of run boundaries of images (B, H, W), of which the last view is not in use."""
     views, rows, columns = instance.shape
-    sizes = {"view": views, "row": rows, "column": columns, "instance": 1, "count": 3, "box": 2, "side": 4}
+    sizes = view_buffer_sizes(views, columns, rows, 1)
     images = allocate(ViewBuffers, sizes, device)
     images.instance.assign(instance)
     images.amodal.assign(amodal)

@@ -9,19 +9,18 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.appearance import linear_to_srgb
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS
 from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
-from synpick_warp.stages.buffers import ViewBuffers
+from synpick_warp.stages.buffers import allocate_view_buffers
 from synpick_warp.stages.render.light_tables import measure_albedo, precompute_environment
-from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
 from tests.harness.brdf_probe import evaluate, toward
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, camera, entry, even_light, render, sheet, snapshot, sun
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, render, sheet, snapshot, sun
 
 VIEW = camera(64, 48, 200.0, (0.0, 0.0, 2.0))
 FLAT = (0.0, 0.0, 0.0, *UPRIGHT)
@@ -141,10 +140,9 @@ def test_two_frames_of_a_still_scene_are_identical(device):
     toy.placed[0] = [(index, pose[0] if pose else FLAT) for index, (_, _, *pose) in enumerate(clutter())][1:]
     toy.placed[1] = [(0, (0.0, 0.0, 0.2, *UPRIGHT))]
     toy.config = settings(cell=4)
-    scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
-    renderer = Renderer(toy.settings(), scene, toy.room, 1)
-    sizes = {"view": 1, "row": scene.height, "column": scene.width, "instance": toy.room, "count": 3, "box": 2, "side": 4}
-    out = allocate(ViewBuffers, sizes, device)
+    scene = build_scene(toy, device)
+    renderer = make_renderer(toy.settings(), scene, toy.room, 1)
+    out = allocate_view_buffers(1, scene.width, scene.height, toy.room, device)
     state, zero, images = snapshot(toy, device), wp.zeros(1, dtype=wp.int32, device=device), []
     for world in (0, 1, 0, 0):
         views = make_views(wp.array([world], dtype=wp.int32, device=device), zero, 1, toy.room)
@@ -225,8 +223,10 @@ def test_sun_shadow_has_its_geometric_outline(device, yaw):
 
 def test_scratch_has_the_size_of_the_scenes_images(device):
     config = replace(settings(cell=4), cameras=replace(Config().cameras, resolution=(8, 8)))
-    scene = build_render_scene(config, Catalog((entry(sheet(0.1, 0.1)),)), ToyScene([], [], ()).fixtures, (VIEW,), (EVEN,), device)
-    shading = Renderer(config, scene, 1, 2).shading
+    scene = build_render_scene(
+        config.render, config.tote, Catalog((entry(sheet(0.1, 0.1)),)), ToyScene([], [], ()).fixtures, (VIEW,), (EVEN,), device
+    )
+    shading = make_renderer(config, scene, 1, 2).shading
     assert shading.guide.segment.shape == shading.ratios.specular.shape == (2, 12, 16)
     assert shading.shadows.filtered.shape == (2, 24, 32)
 

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.sun import extract_sun
-from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
+from synpick_warp.scenes.types import EnvironmentMap, Material
 from synpick_warp.stages import launch
 from synpick_warp.stages.render.light_tables import precompute_environment, prefilter_specular, sh_basis
-from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.scene import build_render_scene, mip_levels, uv_density
+from synpick_warp.stages.render.scene import mip_levels, uv_density
 from synpick_warp.stages.render.view_setup import make_views
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, even_light, render, sheet, sun
+from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, render, sheet, sun
 
 VIEW = camera(64, 48, 200.0, (0.0, 0.0, 2.0))
 EVEN = even_light()
@@ -218,8 +218,8 @@ def test_prefiltered_maps_of_a_uniform_map_and_a_spot():
 
 def test_a_batch_larger_than_the_scratch_is_refused(device):
     toy = ToyScene([entry(sheet(0.1, 0.1))], [[(0, FLAT)]], (VIEW,))
-    scene = build_render_scene(toy.settings(), Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
-    renderer = Renderer(toy.settings(), scene, toy.room, 1)
+    scene = build_scene(toy, device)
+    renderer = make_renderer(toy.settings(), scene, toy.room, 1)
     views = make_views(None, None, 2, toy.room)
     with pytest.raises(ValueError, match="2 views in a batch; this renderer has scratch for 1"):
         renderer.render(None, views, None)
