@@ -32,8 +32,8 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 SEQUENCE_PERIOD = wp.constant(16)
 """Coarse pixels share one Sobol' sequence by their Morton index in squares of this width; aligned smaller squares hold aligned runs."""
 INDIRECT_CLAMP = wp.constant(4.0)
-"""Firefly clamp of indirect light: at most this many times what a white surface that faces the sun reflects. Few paths find sunlit
-surfaces, and those that do count for the others."""
+"""Firefly clamp of indirect light: at most this many times the radiance of a white surface that faces the sun, on top of the clamp for
+unoccluded light. Few paths find sunlit surfaces, so each of them has a large weight."""
 SHIFT_RANGE = wp.constant(1.0)
 """Cranley-Patterson rotation of the first dimension over an image's height and width: slow enough that the points of a filter kernel
 stay stratified, and large enough that the image's mean is unbiased."""
@@ -79,7 +79,7 @@ def make_context(
     light: int,
     yaw: float,
 ) -> PathContext:
-    """Context of a coarse pixel's paths. All images of an episode use one stream of random numbers, so that noise on what rests is still.
+    """Context of a coarse pixel's paths. All images of an episode use one stream of random numbers: noise on resting objects stays still.
 
     The sun is left out of the light on the first surface: row `light` + maps of `Lights.radiance`.
     """

@@ -30,7 +30,7 @@ BLOCKS = wp.constant(4)
 MEDIUM_BLOCKS = wp.constant(4.0)
 """Blocks of the medium kernel: 2 x 2."""
 RING = wp.constant(1)
-"""Upsampling fallback: width of the ring around the four nearest coarse pixels that is searched if none of them is on the surface."""
+"""Upsampling fallback: the four nearest coarse pixels are widened by this many on each side if none of them is on the surface."""
 SAME_BODY_WEIGHT = wp.constant(0.02)
 """Bilateral weight of a coarse pixel on the same body but on another surface: it reduces noise where few pixels are similar."""
 
@@ -227,7 +227,7 @@ def choose_widths_kernel(
     narrow_diffuse = visibility_ratio(blocks.diffuse[view, row, column], blocks.unoccluded_diffuse[view, row, column])
     narrow_specular = visibility_ratio(blocks.specular[view, row, column], blocks.unoccluded_specular[view, row, column])
     if wide.weight <= 0.0:
-        # No block may have its middle on the body.
+        # The middles of all blocks may lie off the body.
         ratios_out.diffuse[view, row, column] = narrow_diffuse
         ratios_out.specular[view, row, column] = narrow_specular
         ratios_out.indirect[view, row, column] = blocks.indirect[view, row, column]
@@ -308,7 +308,7 @@ def add_ratios(total: Ratios, ratios: RatioImages, view: int, row: int, column: 
 
 @wp.func
 def upsample_ratios(guide: Guide, ratios: RatioImages, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane) -> Ratios:
-    """Joint bilateral upsampling: visibility ratios at a pixel from the four nearest coarse pixels, those on its surface first.
+    """Joint bilateral upsampling: visibility ratios at a pixel from those of the four nearest coarse pixels on its surface.
 
     If all four are on other surfaces, the ring around them is searched too, because light changes less along a surface than between
     surfaces. `plane` is the pixel's tangent plane.

@@ -12,7 +12,7 @@ SH_CONSTANT = wp.constant(0.282095)
 
 @wp.struct
 class Lights:
-    """Environment maps and what is precomputed from them. Constant. A world rotates its map about +z by its yaw.
+    """Environment maps and their precomputed tables. Constant. A world rotates its map about +z by its yaw.
 
     A map's sun is its dominant light, split off where it is small enough: see `scenes.sun`. Directions are in the map's frame.
     """

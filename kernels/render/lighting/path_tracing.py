@@ -74,7 +74,7 @@ class PathRules:
 
 @wp.struct
 class PathContext:
-    """What all paths of one pixel share: its view, its light, its stream of random numbers."""
+    """Constants of all paths of one pixel: its view, its light, its stream of random numbers."""
 
     view: int
     instances: int
@@ -313,7 +313,7 @@ def trace_paths_kernel(
     # Out:
     radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
-    """Path-traced reference: mean radiance of N paths per pixel, which start at points spread over the pixel's square.
+    """Path-traced reference: mean radiance of N paths per pixel, with stratified start points in the pixel (box filter).
 
     Random numbers are addressed by (seed, episode; camera and pixel; path, dimension): a still scene gives the same image again.
     """

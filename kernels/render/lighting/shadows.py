@@ -125,7 +125,13 @@ def filter_shadows_kernel(
 
 @wp.func
 def upsample_shadow(
-    gbuffer: GBuffer, visibility: wp.array3d[float], coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane
+    gbuffer: GBuffer,
+    visibility: wp.array3d[float],  # (view, shadow_row, shadow_column)
+    coarse: CoarseGrid,
+    view: int,
+    row: int,
+    column: int,
+    plane: Plane,
 ) -> float:
     """Sun visibility at a pixel by joint bilateral upsampling from the four nearest coarse pixels; `plane` is the pixel's tangent plane."""
     y = coarse_coordinate(coarse, row)

@@ -37,7 +37,7 @@ def shown(material, device, *, mesh=None, lights=(EVEN,), view=VIEW, pose=FLAT, 
 
 
 def test_texture_is_upright_and_not_mirrored(device):
-    # Row 0 of the image is v = 1, the sheet's +y edge, the picture's upper edge: red green / blue white.
+    # Row 0 of the image is v = 1, the sheet's +y edge, the image's upper edge: red green / blue white.
     texture = np.zeros((8, 8, 3), np.uint8)
     texture[:4, :4], texture[:4, 4:], texture[4:, :4], texture[4:, 4:] = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)
     color = shown(matte(texture=texture), device).color[0]
