@@ -4,6 +4,8 @@ Measured on one H200 (driver 580, Warp 1.19, 21 YCB-Video objects, three cameras
 unless said otherwise. On the CPU a launch runs its threads one after the other, so that counts of sharing threads are 1 there.
 """
 
+import warp as wp
+
 RAY_REGISTERS = 64
 """Register limit of kernels that trace rays. With more, too few threads are resident to hide the latency of BVH nodes; from 56 to 64 is
 best, fewer and more are slower."""
@@ -13,6 +15,10 @@ SHADE_REGISTERS = 80
 """Register limit of the shading kernel: it waits less than one that traces rays, and keeps more values."""
 PIXEL_BLOCK = 128
 """Block size of kernels with a thread a pixel: four tiles of 8 x 4 pixels."""
+LANE_STRIDE = wp.constant(4)
+"""Interleaved order of the coarse path pass: the threads of a warp take coarse pixels this far apart, by row and by column."""
+LANE_COLUMNS = wp.constant(8)
+"""Interleaved order: threads of a warp in one row of coarse pixels."""
 VIEW_BLOCK = 32
 """Block size of kernels with a thread a view: small blocks spread few views over many multiprocessors."""
 TRIANGLE_THREADS = 4096

@@ -3,13 +3,10 @@
 import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS, ImageGrid
+from synpick_warp.kernels.tuning import LANE_COLUMNS, LANE_STRIDE
 
 wp.set_module_options({"enable_backward": False})
 
-LANE_STRIDE = wp.constant(4)
-"""Interleaved order: neighbouring threads of a warp take coarse pixels this far apart, by row and by column."""
-LANE_COLUMNS = wp.constant(8)
-"""Interleaved order: number of a warp's threads in one row."""
 PLANE_TOLERANCE = wp.constant(1.0)
 """Coarse pixels lie on one surface up to this distance from its tangent plane, in widths of a coarse pixel at their depth times the
 filter's stride."""

@@ -10,13 +10,13 @@ import warp as wp
 from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.configs.schema import Render
 from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, find_footprints_kernel, resolve_footprints_kernel
-from synpick_warp.kernels.render.lighting.coarse_grid import LANE_COLUMNS, LANE_STRIDE, CoarseGrid, Guide
+from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, trace_coarse_paths_kernel
 from synpick_warp.kernels.render.lighting.denoise import RatioImages, choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
 from synpick_warp.kernels.render.lighting.shading import shade_kernel
 from synpick_warp.kernels.render.lighting.shadows import filter_shadows_kernel, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-from synpick_warp.kernels.tuning import FOOTPRINT_THREADS, PIXEL_BLOCK
+from synpick_warp.kernels.tuning import FOOTPRINT_THREADS, LANE_COLUMNS, LANE_STRIDE, PIXEL_BLOCK
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.reference import make_path_rules
