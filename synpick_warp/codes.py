@@ -11,7 +11,7 @@ from typing import Self
 
 
 class _Described(enum.IntEnum):
-    """An enum declared by its sentences; the value of a member is its position in that order."""
+    """Enum declared by sentences; the value of a member is its position in that order."""
 
     sentence: str
 
@@ -26,28 +26,28 @@ class Phase(enum.IntEnum):
     """Phase of a world."""
 
     EMPTY = 0
-    """Waits for an episode number."""
+    """No episode assigned yet."""
     START = 1
-    """Has an episode number; its objects are to be sampled and dropped."""
+    """An episode is assigned; its objects are sampled and dropped in this tick."""
     SETTLE = 2
-    """Objects fall and come to rest."""
+    """Dropped objects fall until they are at rest."""
     ACT = 3
-    """The gripper acts; every tick is a frame."""
+    """The gripper moves or picks; every tick is a frame."""
     OVER = 4
-    """The episode ended in this tick; an `Ending` says how."""
+    """The episode ended in this tick, with an `Ending`."""
     IDLE = 5
-    """No episode is left."""
+    """No episode is left to assign."""
 
 
 class Mode(enum.IntEnum):
-    """Mode of an episode: what the gripper does in phase ACT."""
+    """Mode of an episode: behaviour of the gripper in phase ACT."""
 
     MOVE = 0
-    """Stirs the pile."""
+    """Stirring: the gripper visits the corners of the tote."""
     PICK = 1
-    """Untargeted picking: takes the object with the fewest others above it in the clutter graph."""
+    """Untargeted picking: the target has the fewest ancestors in the clutter graph."""
     TARGET = 2
-    """Targeted picking: takes the object with the most others above it."""
+    """Targeted picking: the target has the most ancestors."""
 
 
 class Task(enum.IntEnum):
@@ -55,7 +55,7 @@ class Task(enum.IntEnum):
 
     NONE = 0
     LOOK = 1
-    """Waits beside the tote; a target and a grasp are planned at the end of the tick."""
+    """The gripper waits beside the tote; perception plans a target and a grasp at the end of the tick."""
     APPROACH = 2
     """The setpoint moves from far above to a short distance before the grasp point."""
     DESCEND = 3
@@ -89,7 +89,7 @@ class Ending(_Described):
 
     @property
     def delivers(self) -> bool:
-        """Whether an episode with this ending becomes part of the data set."""
+        """True if an episode with this ending becomes part of the data set."""
         return Ending.FINISHED <= self <= Ending.GAVE_UP
 
 
@@ -105,7 +105,7 @@ class Outcome(_Described):
 
     @property
     def succeeded(self) -> bool:
-        """Whether something was picked."""
+        """True if an object was picked."""
         return self in (Outcome.TARGET_PICKED, Outcome.OTHER_PICKED)
 
 
@@ -143,7 +143,7 @@ class Measure(enum.IntEnum):
 
 
 class Stream(enum.IntEnum):
-    """Purpose of a random number stream: part of its key, so that draws for different purposes are independent."""
+    """Random number stream: part of the key of `kernels.rng.stream_key`, so that samples for different purposes are independent."""
 
     OBJECTS = 1
     DROP = 2

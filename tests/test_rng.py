@@ -11,26 +11,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Stream
-from tests.harness.probes import draw_kernel
+from tests.harness.probes import sample_kernel
 from tests.twins import rng
 
 # A test below fails by chance once in 10⁵ fixed seeds, so never.
 SIGMA = 4.5
 
 
-def draw(device, seeds, addresses, count: int = 21):
+def draw(device, seeds, stream_indices, count: int = 21):
     """Keys, uniforms, indices and rotations from the device."""
-    addresses = np.atleast_2d(np.asarray(addresses, np.int32))
-    seeds = np.broadcast_to(np.asarray(seeds, np.uint64), len(addresses))
-    outputs = [wp.zeros(len(addresses), dtype=dtype, device=device) for dtype in (wp.uint64, float, int, wp.quat)]
-    inputs = [wp.array(np.ascontiguousarray(seeds), dtype=wp.uint64, device=device), wp.array(addresses, dtype=int, device=device), count]
-    wp.launch(draw_kernel, dim=len(addresses), inputs=inputs, outputs=outputs, device=device)
+    stream_indices = np.atleast_2d(np.asarray(stream_indices, np.int32))
+    seeds = np.broadcast_to(np.asarray(seeds, np.uint64), len(stream_indices))
+    outputs = [wp.zeros(len(stream_indices), dtype=dtype, device=device) for dtype in (wp.uint64, float, int, wp.quat)]
+    inputs = [
+        wp.array(np.ascontiguousarray(seeds), dtype=wp.uint64, device=device),
+        wp.array(stream_indices, dtype=int, device=device),
+        count,
+    ]
+    wp.launch(sample_kernel, dim=len(stream_indices), inputs=inputs, outputs=outputs, device=device)
     return [output.numpy() for output in outputs]
 
 
-def stream(device, length: int, seed: int = 0, episode: int = 0, redraw: int = 0, purpose: int = Stream.DROP, step: int = 1):
+def stream(device, length: int, seed: int = 0, episode: int = 0, arrangement: int = 0, stream: int = Stream.DROP, step: int = 1):
     index = step * np.arange(length)
-    return draw(device, seed, np.stack([np.full(length, episode), np.full(length, redraw), np.full(length, purpose), index], axis=1))
+    return draw(device, seed, np.stack([np.full(length, episode), np.full(length, arrangement), np.full(length, stream), index], axis=1))
 
 
 def chi_square(counts: np.ndarray) -> float:
@@ -48,23 +52,25 @@ def test_the_twin_is_splitmix64():
 def test_every_address_gives_the_twins_numbers_to_the_bit(device):
     numbers = np.random.default_rng(0)
     seeds = np.append(numbers.integers(0, 2**63, 2000, dtype=np.uint64), [0, 1, 2**63 - 1])
-    addresses = numbers.integers(0, 2**20, (len(seeds), 4), dtype=np.int32)
-    addresses[:10] = np.array([-1, 2**31 - 1, 0, 1, 2, 3, 4, 5, 6, 7])[:, None]
-    key, uniform, index, rotation = draw(device, seeds, addresses, 21)
-    expected = np.array([rng.stream_key(seed, *address[:3]) for seed, address in zip(seeds, addresses, strict=True)], np.uint64)
+    stream_indices = numbers.integers(0, 2**20, (len(seeds), 4), dtype=np.int32)
+    stream_indices[:10] = np.array([-1, 2**31 - 1, 0, 1, 2, 3, 4, 5, 6, 7])[:, None]
+    key, uniform, index, rotation = draw(device, seeds, stream_indices, 21)
+    expected = np.array(
+        [rng.stream_key(seed, *stream_index[:3]) for seed, stream_index in zip(seeds, stream_indices, strict=True)], np.uint64
+    )
     np.testing.assert_array_equal(key, expected)
-    np.testing.assert_array_equal(uniform, rng.uniform(expected, addresses[:, 3]))
-    np.testing.assert_array_equal(index, rng.uniform_index(expected, addresses[:, 3], 21))
-    np.testing.assert_allclose(rotation[10:], rng.uniform_rotation(expected, addresses[:, 3])[10:], atol=2e-6)
+    np.testing.assert_array_equal(uniform, rng.uniform(expected, stream_indices[:, 3]))
+    np.testing.assert_array_equal(index, rng.uniform_index(expected, stream_indices[:, 3], 21))
+    np.testing.assert_allclose(rotation[10:], rng.uniform_rotation(expected, stream_indices[:, 3])[10:], atol=2e-6)
 
 
 @given(
     seed=st.integers(0, 2**63 - 1),
-    address=st.tuples(st.integers(-1, 2**31 - 1), st.integers(0, 1000), st.integers(1, 5), st.integers(0, 2**31 - 4)),
+    stream_index=st.tuples(st.integers(-1, 2**31 - 1), st.integers(0, 1000), st.integers(1, 5), st.integers(0, 2**31 - 4)),
     count=st.integers(1, 2**20),
 )
-def test_numbers_stay_in_range(seed, address, count, device):
-    _, uniform, index, rotation = draw(device, seed, address, count)
+def test_numbers_stay_in_range(seed, stream_index, count, device):
+    _, uniform, index, rotation = draw(device, seed, stream_index, count)
     assert 0.0 <= uniform[0] < 1.0
     assert 0 <= index[0] < count
     assert np.linalg.norm(rotation[0]) == pytest.approx(1.0, abs=1e-5)
@@ -84,7 +90,16 @@ def test_low_bits_of_numbers_are_even(device):
     assert abs(chi_square(np.bincount(low, minlength=64))) < SIGMA
 
 
-NEIGHBOURS = [{}, {"seed": 1}, {"seed": 2}, {"episode": 1}, {"episode": 2}, {"redraw": 1}, {"redraw": 2}, {"purpose": Stream.OBJECTS}]
+NEIGHBOURS = [
+    {},
+    {"seed": 1},
+    {"seed": 2},
+    {"episode": 1},
+    {"episode": 2},
+    {"arrangement": 1},
+    {"arrangement": 2},
+    {"stream": Stream.OBJECTS},
+]
 
 
 @pytest.mark.parametrize(("one", "other"), list(itertools.combinations(NEIGHBOURS, 2)))
@@ -99,9 +114,9 @@ def test_streams_of_neighbouring_addresses_are_independent(device, one, other):
 
 def test_the_first_number_is_even_over_episodes_and_attempts(device):
     """What each episode draws first must not depend on how episodes are counted."""
-    episode, redraw = np.divmod(np.arange(20_000), 4)
-    addresses = np.stack([episode, redraw, np.full(20_000, Stream.OBJECTS), np.zeros(20_000)], axis=1)
-    _, _, index, _ = draw(device, 7, addresses)
+    episode, arrangement = np.divmod(np.arange(20_000), 4)
+    stream_indices = np.stack([episode, arrangement, np.full(20_000, Stream.OBJECTS), np.zeros(20_000)], axis=1)
+    _, _, index, _ = draw(device, 7, stream_indices)
     assert abs(chi_square(np.bincount(index, minlength=21))) < SIGMA
     following = np.bincount(21 * index[:-1] + index[1:], minlength=441)
     assert abs(chi_square(following)) < SIGMA

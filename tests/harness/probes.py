@@ -9,22 +9,22 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def draw_kernel(
+def sample_kernel(
     seed: wp.array[wp.uint64],
-    address: wp.array2d[int],
+    stream_index: wp.array2d[int],
     count: int,
     key_out: wp.array[wp.uint64],
     uniform_out: wp.array[float],
     index_out: wp.array[int],
     rotation_out: wp.array[wp.quat],
 ):
-    """One number of each kind at each address: episode, redraw, purpose, index."""
+    """One sample of each type for each row (episode, arrangement, stream, index)."""
     i = wp.tid()
-    key = rng.stream_key(seed[i], address[i, 0], address[i, 1], address[i, 2])
+    key = rng.stream_key(seed[i], stream_index[i, 0], stream_index[i, 1], stream_index[i, 2])
     key_out[i] = key
-    uniform_out[i] = rng.uniform(key, address[i, 3])
-    index_out[i] = rng.uniform_index(key, address[i, 3], count)
-    rotation_out[i] = rng.uniform_rotation(key, address[i, 3])
+    uniform_out[i] = rng.uniform(key, stream_index[i, 3])
+    index_out[i] = rng.uniform_index(key, stream_index[i, 3], count)
+    rotation_out[i] = rng.uniform_rotation(key, stream_index[i, 3])
 
 
 @wp.kernel
@@ -34,6 +34,6 @@ def force_kernel(
     law: wp.array2d[float],
     force_out: wp.array[wp.vec3],
 ):
-    """The gripper's force; law: stiffness, damping, limit, mass, time step."""
+    """Impedance force; law: stiffness, damping, largest force, mass, time step."""
     i = wp.tid()
     force_out[i] = gripper.impedance_force(offset[i], velocity[i], law[i, 0], law[i, 1], law[i, 2], law[i, 3], law[i, 4])

@@ -1,4 +1,4 @@
-"""Which objects are drawn, where they fall from, and who gets which episode."""
+"""Which objects are expected_arrangements, where they fall from, and who gets which episode."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ def may_repeat(worlds: KernelWorlds, world: int) -> bool:
     return bool(drop.move_repeats if worlds.state.mode.numpy()[world] == Mode.MOVE else drop.pick_repeats)
 
 
-def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangement]:
-    """What the twin draws for each world, in the mode that it has."""
+def expected_arrangements(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangement]:
+    """Arrangement that the twin samples for each world, in the mode of that world."""
     return [
         arrangement.sample_objects(
             seed,
-            *map(int, address),
+            *map(int, arrangement_id),
             volume=worlds.volume,
             compound=worlds.compound,
             budget=worlds.scene.drop.volume,
@@ -60,7 +60,7 @@ def drawn(worlds: KernelWorlds, seed: int = SEED) -> list[arrangement.Arrangemen
             single_slots=worlds.single_slots,
             compound_slots=worlds.compound_slots,
         )
-        for world, address in enumerate(worlds.state.arrangement_id.numpy())
+        for world, arrangement_id in enumerate(worlds.state.arrangement_id.numpy())
     ]
 
 
@@ -70,24 +70,24 @@ def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, redraw, device
     worlds.begin(Phase.START, first + np.arange(WORLDS), redraw)
     worlds.set(worlds.state.catalog_index, 99)
     arrange.sample_objects(worlds.scene, worlds.state, seed)
-    entry, slot = worlds.state.catalog_index.numpy(), worlds.state.body_slot.numpy()
-    for world, expected in enumerate(drawn(worlds, seed)):
+    catalog_index, slot = worlds.state.catalog_index.numpy(), worlds.state.body_slot.numpy()
+    for world, expected in enumerate(expected_arrangements(worlds, seed)):
         count = len(expected.entries)
-        assert tuple(entry[world, :count]) == expected.entries
-        assert (entry[world, count:] == -1).all()
+        assert tuple(catalog_index[world, :count]) == expected.entries
+        assert (catalog_index[world, count:] == -1).all()
         assert tuple(slot[world, :count]) == expected.slots
         state = (worlds.state.phase.numpy()[world], worlds.state.ending.numpy()[world])
         assert state == ((Phase.OVER, Ending.ARRANGEMENT_OVERFLOW) if expected.overflow else (Phase.START, Ending.RUNNING))
-        check_law(worlds, world, entry[world, :count], slot[world, :count])
+        check_law(worlds, world, catalog_index[world, :count], slot[world, :count])
 
 
-def check_law(worlds: KernelWorlds, world: int, entry: np.ndarray, slot: np.ndarray) -> None:
-    assert worlds.volume[entry].sum() <= worlds.scene.drop.volume * (1 + 1e-6)
+def check_law(worlds: KernelWorlds, world: int, catalog_index: np.ndarray, slot: np.ndarray) -> None:
+    assert worlds.volume[catalog_index].sum() <= worlds.scene.drop.volume * (1 + 1e-6)
     assert len(set(slot)) == len(slot)
-    np.testing.assert_array_equal(slot >= worlds.single_slots, worlds.compound[entry] == 1)
+    np.testing.assert_array_equal(slot >= worlds.single_slots, worlds.compound[catalog_index] == 1)
     assert (slot < worlds.slots).all()
     if not may_repeat(worlds, world):
-        assert len(set(entry)) == len(entry)
+        assert len(set(catalog_index)) == len(catalog_index)
 
 
 # ---- modes ----
@@ -131,7 +131,7 @@ def test_shares_of_modes_are_the_weights(built, device, mix):
 
 
 def test_an_episode_keeps_its_mode_in_any_world_and_arrangement(built, device):
-    """Whatever world has the episode, of however many, and however often its arrangement was drawn again."""
+    """Whatever world has the episode, of however many, and however often its arrangement was expected_arrangements again."""
     mix, episodes = (1.0, 1.0, 1.0), np.arange(60)
     expected = modes(built, device, "mixed", mix, episodes)
     numbers = np.random.default_rng(5)
@@ -174,9 +174,9 @@ def test_an_object_that_never_fits_is_never_drawn(device):
     worlds = arrangement_worlds(device, WORLDS, drop={"volume": 0.25})
     worlds.begin(Phase.START)
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
-    entry = worlds.state.catalog_index.numpy()
-    assert (entry[:, 0] >= 0).all()
-    assert not (entry == 2).any()
+    catalog_index = worlds.state.catalog_index.numpy()
+    assert (catalog_index[:, 0] >= 0).all()
+    assert not (catalog_index == 2).any()
 
 
 def test_each_mode_has_its_own_rule_of_repeating(device):
@@ -208,8 +208,8 @@ def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
         device,
         episodes,
         mix,
-        volume=np.array([entry.volume for entry in objects.entries]),
-        compound=np.array([len(entry.pieces) > 1 for entry in objects.entries]),
+        volume=np.array([catalog_index.volume for catalog_index in objects.entries]),
+        compound=np.array([len(catalog_index.pieces) > 1 for catalog_index in objects.entries]),
         instances=12,
         single_slots=single,
         compound_slots=compound,
@@ -254,16 +254,16 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
     drop = worlds.scene.drop
     rim = (drop.rim_length, drop.rim_width, drop.rim_height)
     for world in range(WORLDS):
-        entry = worlds.state.catalog_index.numpy()[world]
-        entry = entry[entry >= 0]
-        poses = worlds.coordinates()[world, worlds.state.body_slot.numpy()[world, : len(entry)]]
-        radius = worlds.radius[entry]
+        catalog_index = worlds.state.catalog_index.numpy()[world]
+        catalog_index = catalog_index[catalog_index >= 0]
+        poses = worlds.coordinates()[world, worlds.state.body_slot.numpy()[world, : len(catalog_index)]]
+        radius = worlds.radius[catalog_index]
         expected = arrangement.drop_poses(SEED, episode + world, 0, radius, rim=rim, clearance=clearance, spread=spread)
         np.testing.assert_allclose(poses, expected, atol=1e-5)
         place, bottom = poses[:, :3].astype(np.float64), poses[:, 2] - radius
         assert (bottom >= drop.rim_height - 1e-5).all()
         gaps = np.linalg.norm(place[:, None] - place[None], axis=2) - radius[:, None] - radius[None]
-        assert (gaps[~np.eye(len(entry), dtype=bool)] >= -1e-5).all()
+        assert (gaps[~np.eye(len(catalog_index), dtype=bool)] >= -1e-5).all()
         for axis in range(2):
             assert (np.abs(place[:, axis]) <= np.maximum(0.0, rim[axis] / 2 - radius) + 1e-6).all()
 
@@ -290,9 +290,9 @@ def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device)
     variant = state.variant.numpy().reshape(WORLDS, -1)
     full = np.zeros((WORLDS, worlds.slots), dtype=bool)
     for world, instance in zip(*np.nonzero(state.catalog_index.numpy() >= 0), strict=True):
-        slot, entry = state.body_slot.numpy()[world, instance], state.catalog_index.numpy()[world, instance]
+        slot, catalog_index = state.body_slot.numpy()[world, instance], state.catalog_index.numpy()[world, instance]
         full[world, slot] = True
-        assert variant[world, 2 + slot] == catalog.variant.numpy()[entry]
+        assert variant[world, 2 + slot] == catalog.variant.numpy()[catalog_index]
     empty = np.where(np.arange(worlds.slots) < worlds.single_slots, catalog.empty_single, catalog.empty_compound)
     np.testing.assert_array_equal(variant[:, 2:][~full], np.broadcast_to(empty, full.shape)[~full])
     weight = np.array([0.0, 0.0, catalog.empty_mass * worlds.scene.drop.gravity, 0.0, 0.0, 0.0])

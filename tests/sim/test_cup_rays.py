@@ -1,4 +1,4 @@
-"""What the cup's rays catch: plates, edges, reach, concave objects, neighbours; bodies that stay where they are put."""
+"""Suction rays: plates, edges, reach, concave objects, neighbours; bodies stay at their poses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RAYS, RADIUS, REACH, TIP = 10, 0.01, 0.03, 0.055
 PRESS_STEPS = 5
 GOOD, POOR = 40.0, 2.0
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
-# Where the cup's tip is.
+# Position of the TCP.
 PLACE = np.array([0.05, -0.03, 0.1])
 
 
@@ -70,10 +70,10 @@ class Cups(KernelWorlds):
         for world in range(worlds):
             self.put_cup(world, PLACE, UPRIGHT)
 
-    def put_cup(self, world: int, tip, quaternion) -> None:
-        """Put a cup's tip at a place."""
+    def put_cup(self, world: int, tcp, quaternion) -> None:
+        """Place a cup by its TCP [m]."""
         body_q = self.physics.state.body_q.numpy()
-        origin = np.asarray(tip) + TIP * rotation_of(np.asarray(quaternion))[:, 2]
+        origin = np.asarray(tcp) + TIP * rotation_of(np.asarray(quaternion))[:, 2]
         body_q[world * self.bodies + 1] = [*origin, *quaternion]
         self.physics.state.body_q.assign(body_q)
 
@@ -85,16 +85,16 @@ class Cups(KernelWorlds):
         self.place(world, instance, [*place, *quaternion])
 
     def cast(self) -> tuple[list[int], list[int]]:
-        """Rays that hit, and objects caught as bits, of every world."""
+        """Count of rays that hit and bit mask of engaged objects, of every world."""
         self.suction.count_seal_rays(self.scene, self.state, self.attempts, self.seals, self.physics)
         return self.attempts.hits.numpy().tolist(), self.attempts.engaged_bits.numpy().tolist()
 
-    def held(self) -> list[list[int]]:
+    def attached(self) -> list[list[int]]:
         return self.seals.attached.numpy().tolist()
 
 
 def below(distance: float) -> np.ndarray:
-    """Centre of a plate whose upper side is so far below the tip."""
+    """Centre of a plate whose upper side is so far below the tcp."""
     return PLACE - [0.0, 0.0, distance + THICKNESS / 2]
 
 
@@ -107,7 +107,7 @@ def test_a_plate_is_hit_by_all_rays_and_held_as_it_lies(device):
     cups.put(1, 2, 0, below(0.004), turned)
     cups.set(cups.seals.seal_force, 3.0)
     assert cups.cast() == ([0, RAYS], [0, 0b100])
-    assert cups.held() == [[0, 0, 0, 0], [0, 0, 1, 0]]
+    assert cups.attached() == [[0, 0, 0, 0], [0, 0, 1, 0]]
     np.testing.assert_allclose(cups.seals.object_in_tcp.numpy()[1, 2], [0, 0, -0.004 - THICKNESS / 2, *turned], atol=1e-6)
     assert cups.seals.break_force.numpy().tolist() == [POOR, GOOD]
     assert cups.seals.seal_force.numpy()[1].tolist() == [3.0, 3.0, 0.0, 3.0]
@@ -122,12 +122,12 @@ def test_over_an_edge_those_rays_hit_that_start_above_the_plate(device, edge, co
     assert cups.seals.break_force.numpy()[0] == (GOOD if count == RAYS else POOR)
 
 
-@pytest.mark.parametrize(("tolerated", "limit"), [(2, POOR), (3, GOOD)])
-def test_so_many_misses_are_tolerated(device, tolerated, limit):
+@pytest.mark.parametrize(("tolerated", "break_force"), [(2, POOR), (3, GOOD)])
+def test_so_many_misses_are_tolerated(device, tolerated, break_force):
     cups = Cups(device, tolerated_misses=tolerated)
     cups.put(0, 0, 0, below(0.01) - [0.15 - 0.5 * RADIUS, 0.0, 0.0])
     assert cups.cast()[0] == [7]
-    assert cups.seals.break_force.numpy()[0] == limit
+    assert cups.seals.break_force.numpy()[0] == break_force
 
 
 @pytest.mark.parametrize(("distance", "count"), [(0.0299, RAYS), (0.0301, 0), (-0.002, RAYS), (-0.0099, RAYS), (-0.0101, 0)])
@@ -142,13 +142,13 @@ def test_rays_reach_three_centimetres_from_the_tip_and_count_inside(device, dist
 
 
 def test_nothing_but_objects_is_hit(device):
-    """The tip 1 cm above the tote's floor: that is not caught, nor does it hide what lies below it."""
+    """The tcp 1 cm above the tote's floor: that is not engaged, nor does it hide what lies below it."""
     cups = Cups(device, worlds=2)
     for world in range(2):
         cups.put_cup(world, (0.0, 0.0, 0.01), UPRIGHT)
     cups.put(1, 0, 0, (0.0, 0.0, -0.005 - THICKNESS / 2))
     assert cups.cast() == ([0, RAYS], [0, 1])
-    assert cups.held()[0] == [0, 0, 0, 0]
+    assert cups.attached()[0] == [0, 0, 0, 0]
 
 
 def test_each_ray_catches_what_is_nearest(device):
@@ -161,7 +161,7 @@ def test_each_ray_catches_what_is_nearest(device):
     cups.put(2, 0, 0, below(0.022))
     cups.put(2, 1, 1, PLACE - [0.0, -0.01, 0.012])
     assert cups.cast() == ([RAYS, RAYS, RAYS], [0b1000, 0b1001, 0b11])
-    assert cups.held() == [[0, 0, 0, 1], [1, 0, 0, 1], [1, 1, 0, 0]]
+    assert cups.attached() == [[0, 0, 0, 1], [1, 0, 0, 1], [1, 1, 0, 0]]
     assert (cups.seals.break_force.numpy() == GOOD).all()
 
 
@@ -193,7 +193,7 @@ def test_rays_are_cast_when_the_time_to_press_is_up(device, phase, task, steps):
     for array in (cups.attempts.hits, cups.attempts.engaged_bits, cups.seals.break_force):
         cups.set(array, 7)
     assert cups.cast() == ([7, RAYS], [7, 1])
-    assert cups.held() == [[0, 0, 0, 0], [1, 0, 0, 0]]
+    assert cups.attached() == [[0, 0, 0, 0], [1, 0, 0, 0]]
     assert cups.seals.break_force.numpy().tolist() == [7.0, GOOD]
 
 
@@ -214,7 +214,7 @@ def test_meshes_are_hit_from_both_sides(device):
 
 @given(seed=st.integers(0, 10_000), rays=st.integers(3, 12))
 @settings(max_examples=40)
-def test_any_scene_is_caught_as_the_twin_says(seed, rays, device):
+def test_random_scenes_agree_with_the_twin(seed, rays, device):
     numbers = np.random.default_rng(seed)
     cups = Cups(device, rays=rays, radius=0.02)
     cup = numbers.normal(size=4)
@@ -228,9 +228,9 @@ def test_any_scene_is_caught_as_the_twin_says(seed, rays, device):
         cups.put(0, instance, index, poses[instance, :3], poses[instance, 3:])
     pose = cups.physics.state.body_q.numpy()[1].astype(np.float64)
     starts, way = twin.ray_starts(pose, rays, 0.02, TIP)
-    hits, caught = twin.catch(entries, poses, starts, way, REACH)
-    assert cups.cast() == ([hits], [caught])
-    assert cups.held() == [[caught >> instance & 1 for instance in range(4)]]
+    hits, engaged = twin.engage(entries, poses, starts, way, REACH)
+    assert cups.cast() == ([hits], [engaged])
+    assert cups.attached() == [[engaged >> instance & 1 for instance in range(4)]]
 
 
 def test_planes_hold_the_vertices_of_their_piece():

@@ -1,4 +1,4 @@
-"""The gripper: corners, goal, force law, and how the simulated gripper follows."""
+"""The gripper: corners, setpoint, force law, and how the simulated gripper follows."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_the_force_is_the_twins_and_never_above_the_limit(offset, velocity, stif
     assert np.linalg.norm(found) <= limit * (1 + 1e-5)
 
 
-def test_the_force_is_a_spring_at_rest_and_a_damper_at_the_goal(device):
+def test_the_force_is_a_spring_at_rest_and_a_damper_at_the_setpoint(device):
     """With a step that vanishes: 1000 N/m · 1 cm = 10 N; 60 N·s/m · 0.1 m/s = 6 N; 1 m is too far: 30 N."""
     law = [[1000.0, 60.0, 30.0, 2.0, 1e-7]] * 3
     found = forces(device, [[0.01, 0, 0], [0, 0, 0], [0, 0, 1]], [[0, 0, 0], [0, 0.1, 0], [0, 0, 0]], law)
@@ -88,17 +88,17 @@ def test_the_force_is_a_spring_at_rest_and_a_damper_at_the_goal(device):
 def test_the_law_is_stable_for_every_mass(device, mass, step):
     """Where an explicit spring would explode: energy of a free mass on it never grows."""
     x, v = np.zeros(3), np.zeros(3)
-    goal = np.array([0.02, -0.01, 0.005])
+    setpoint = np.array([0.02, -0.01, 0.005])
     energies = []
     for _ in range(60):
-        force = forces(device, [goal - x], [v], [[1e4, 0.0, 1e6, mass, step]])[0].astype(float)
+        force = forces(device, [setpoint - x], [v], [[1e4, 0.0, 1e6, mass, step]])[0].astype(float)
         v = v + step * force / mass
         x = x + step * v
-        energies.append(0.5e4 * np.sum((goal - x) ** 2) + 0.5 * mass * np.sum(v**2))
+        energies.append(0.5e4 * np.sum((setpoint - x) ** 2) + 0.5 * mass * np.sum(v**2))
     assert (np.diff(energies) <= 1e-5 * energies[0]).all()
 
 
-# ---- corners and goal ----
+# ---- corners and setpoint ----
 
 
 @pytest.mark.parametrize("rounds", [1, 3])
@@ -152,26 +152,26 @@ def test_an_order_once_drawn_is_kept(device):
     assert (worlds.state.setpoint.numpy() == 7.0).all()
 
 
-def test_the_goal_walks_from_corner_to_corner_at_constant_speed(device):
+def test_the_setpoint_walks_from_corner_to_corner_at_constant_speed(device):
     worlds = made(device, waypoints=4, speed=0.5, step=0.01, start_height=0.1)
     worlds.begin(Phase.ACT)
     act.begin_moving(worlds.scene, worlds.state, worlds.physics, SEED)
-    goals, waypoints = [worlds.state.setpoint.numpy()[0].copy()], [0]
-    while waypoints[-1] < 4 and len(goals) < 1000:
+    setpoints, waypoints = [worlds.state.setpoint.numpy()[0].copy()], [0]
+    while waypoints[-1] < 4 and len(setpoints) < 1000:
         act.drive_gripper(worlds.scene, worlds.state, worlds.attempts, worlds.plan, worlds.physics, worlds.physics.state)
-        goals.append(worlds.state.setpoint.numpy()[0].copy())
+        setpoints.append(worlds.state.setpoint.numpy()[0].copy())
         waypoints.append(int(worlds.state.waypoint.numpy()[0]))
-    strides = np.linalg.norm(np.diff(goals, axis=0), axis=1)
+    strides = np.linalg.norm(np.diff(setpoints, axis=0), axis=1)
     arrivals = np.flatnonzero(np.diff(waypoints)) + 1
     assert np.delete(strides, arrivals - 1) == pytest.approx(0.005, abs=1e-6)
     assert (strides[arrivals - 1] <= 0.005 + 1e-6).all()
     places = [twin.corner_place(code, np.add(CORNER, (0, 0, TIP))) for code in worlds.state.corner_order.numpy()[0]]
-    np.testing.assert_allclose(np.array(goals)[arrivals], places, atol=1e-6)
-    legs = [np.linalg.norm(b - a) for a, b in itertools.pairwise([goals[0], *places])]
+    np.testing.assert_allclose(np.array(setpoints)[arrivals], places, atol=1e-6)
+    legs = [np.linalg.norm(b - a) for a, b in itertools.pairwise([setpoints[0], *places])]
     # A step more where rounding leaves a sliver of the way.
-    assert len(goals) - 1 == pytest.approx(sum(np.ceil(leg / 0.005 - 1e-3) for leg in legs), abs=len(legs))
+    assert len(setpoints) - 1 == pytest.approx(sum(np.ceil(leg / 0.005 - 1e-3) for leg in legs), abs=len(legs))
     act.drive_gripper(worlds.scene, worlds.state, worlds.attempts, worlds.plan, worlds.physics, worlds.physics.state)
-    np.testing.assert_array_equal(worlds.state.setpoint.numpy()[0], goals[-1])
+    np.testing.assert_array_equal(worlds.state.setpoint.numpy()[0], setpoints[-1])
 
 
 def test_only_an_acting_gripper_is_pulled_but_every_gripper_is_carried(device):
@@ -200,7 +200,7 @@ OFFSETS = {SMALL: (0.012, -0.006, 0.0), LIFT: (0.0, 0.0, 0.015), FAR: (0.6, 0.3,
 
 @pytest.fixture(scope="module")
 def run(device):
-    """Positions, commanded forces and goals (step, world, 3) of six grippers without objects, each with its own goal."""
+    """Positions, commanded forces and setpoints (step, world, 3) of six grippers without objects, each with its own setpoint."""
     config = settings(bake__worlds=6, physics__steps_per_tick=1, move__speed=0.4, arrangement__max_objects=1)
     simulation = Simulation(config, catalog(CUBE), 1, device)
     state, physics, worlds = simulation.state, simulation.physics, 6
@@ -228,8 +228,8 @@ def run(device):
         physics.tick(drive)
         force = physics.control.joint_f.numpy().reshape(worlds, -1)[:, :3] - [0, 0, simulation.scene.move.mass * config.physics.gravity]
         rows.append((physics.state.joint_q.numpy().reshape(worlds, -1)[:, :4].copy(), force, state.setpoint.numpy().copy()))
-    position, force, goals = (np.stack(column).astype(float) for column in zip(*rows, strict=True))
-    return config, start, position, force, goals
+    position, force, setpoints = (np.stack(column).astype(float) for column in zip(*rows, strict=True))
+    return config, start, position, force, setpoints
 
 
 def mass_of(config) -> float:
@@ -247,12 +247,12 @@ def test_a_free_gripper_follows_the_analytic_step_response(run, world):
     assert error.max() < 0.02 * np.linalg.norm(offset)
 
 
-def test_a_gripper_at_its_goal_is_carried(run):
+def test_a_gripper_at_its_setpoint_is_carried(run):
     _, start, position, _, _ = run
     assert np.abs(position[:, HOLD, :3] - start[HOLD]).max() < 1e-5
 
 
-def test_a_far_goal_pulls_with_the_largest_force_and_no_more(run):
+def test_a_far_setpoint_pulls_with_the_largest_force_and_no_more(run):
     """Until the spring would pull less: constant acceleration F / m."""
     config, start, position, force, _ = run
     size = np.linalg.norm(force[:, FAR], axis=1)
@@ -291,10 +291,10 @@ def test_the_cup_keeps_its_tilt(run):
 
 
 def test_a_following_gripper_lags_by_speed_times_damping_over_stiffness(run):
-    config, _, position, _, goals = run
+    config, _, position, _, setpoints = run
     move = config.move
     steady = slice(int(0.6 * STEPS), STEPS)
-    assert np.linalg.norm(np.diff(goals[steady, FOLLOW], axis=0), axis=1) == pytest.approx(move.speed * config.physics.step, rel=1e-3)
-    lag = goals[steady, FOLLOW] - position[steady, FOLLOW, :3]
+    assert np.linalg.norm(np.diff(setpoints[steady, FOLLOW], axis=0), axis=1) == pytest.approx(move.speed * config.physics.step, rel=1e-3)
+    lag = setpoints[steady, FOLLOW] - position[steady, FOLLOW, :3]
     np.testing.assert_allclose(lag[:, 0], -move.speed * move.damping / move.stiffness, rtol=0.02)
     assert np.abs(lag[:, 1:]).max() < 1e-4

@@ -18,9 +18,9 @@ PULL_STEPS = 480
 SHIFT = {"pick": (0.012, -0.016, 0.0), "move": (0.012, 0.0, 0.009)}
 """Goal of a free gripper [m]: 20 and 15 mm away, so that the force stays below its limit."""
 DEEP = 1.0
-"""How far below the floor the goal of a standing gripper lies [m]."""
+"""How far below the floor the setpoint of a standing gripper lies [m]."""
 ABOVE = 0.005
-"""How far above the floor the tip of a gripper starts whose goal moves down [m]."""
+"""How far above the floor the tip of a gripper starts whose setpoint moves down [m]."""
 
 SMOOTH, FOUND = 5, 50
 """Steps over which single ones even out, 10 ms; steps after which all contacts of a standing gripper are found, 100 ms."""
@@ -33,7 +33,7 @@ class Pulls:
     section: Move | Pick
     config: Config
     speed: float
-    """Of the goal that moves down [m/s]."""
+    """Of the setpoint that moves down [m/s]."""
     position: np.ndarray
     velocity: np.ndarray
     force: np.ndarray
@@ -51,11 +51,11 @@ def pulled(device) -> dict[str, Pulls]:
     sections, speeds = (config.pick, config.move), (config.pick.near_speed, Config().move.speed)
     law = np.repeat([(section.stiffness, section.damping, section.force) for section in sections], 3, axis=0)
     start = np.array([(0.0, 0.0, 0.5), (0.0, 0.0, tip), (0.0, 0.0, tip + ABOVE)] * 2)
-    goal, velocity = start.copy(), np.zeros_like(start)
-    goal[FREE::3] += list(SHIFT.values())
-    goal[STAND::3, 2] -= DEEP
+    setpoint, velocity = start.copy(), np.zeros_like(start)
+    setpoint[FREE::3] += list(SHIFT.values())
+    setpoint[STAND::3, 2] -= DEEP
     velocity[MEET::3, 2] = np.negative(speeds)
-    found = grippers.pull(config, catalog(CUBE), device, law, start, goal, velocity, PULL_STEPS)
+    found = grippers.pull(config, catalog(CUBE), device, law, start, setpoint, velocity, PULL_STEPS)
     return {
         mode: Pulls(
             section,
@@ -98,7 +98,7 @@ def test_the_step_responses_error_is_proportional_to_the_time_step(pulled, mode)
 
 @pytest.mark.parametrize("mode", SHIFT)
 def test_a_gripper_that_stands_on_the_floor_presses_with_no_more_than_the_limit(device, pulled, mode):
-    """The goal is far below. What is bounded is the whole reaction of the floor, as the solver has it.
+    """The setpoint is far below. What is bounded is the whole reaction of the floor, as the solver has it.
 
     While it still finds the contacts, in the first tenth of a second, some of its steps of 1 ms are off by up to 6 N, for lack of
     iterations; they even out within 10 ms.
@@ -116,7 +116,7 @@ def test_a_gripper_that_stands_on_the_floor_presses_with_no_more_than_the_limit(
 
 
 def test_a_picking_gripper_that_meets_the_floor_never_presses_with_more_than_the_limit(pulled):
-    """The goal goes through the floor at the speed of the last 5 cm; the impact, m v in one step, is within the bound."""
+    """The setpoint goes through the floor at the speed of the last 5 cm; the impact, m v in one step, is within the bound."""
     found = pulled["pick"]
     contact = np.linalg.norm(found.contact[:, :, MEET], axis=2)
     assert contact[-1].max() > 0.8 * found.section.force  # Far in: the bound is put to the test.

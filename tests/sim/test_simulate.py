@@ -25,7 +25,7 @@ LONGEST = 150
 
 
 def track(device, worlds: int, disturb=None, episodes: int = EPISODES) -> dict[tuple[int, int], list[bytes]]:
-    """Everything that each tick of each (episode, redraw) leaves, run in so many worlds; `disturb(simulation, tick)` before each tick."""
+    """Results of every tick by (episode, arrangement) in a number of worlds; `disturb(simulation, tick)` runs before each tick."""
     config = settings(bake__worlds=worlds, bake__episodes=episodes, **COARSE)
     simulation = Simulation(config, catalog(), LIGHTS, device)
     ticks = defaultdict(list)

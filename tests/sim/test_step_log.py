@@ -223,7 +223,7 @@ def test_a_batch_has_the_live_worlds_arrays(moved):
 
 
 def episodes(device, worlds: int, recorded: bool) -> dict[tuple[int, int], bytes]:
-    """What each live tick of each episode left, in so many worlds."""
+    """Results of each live tick of each episode in a number of worlds."""
     config = settings(bake__worlds=worlds, bake__episodes=3, **COARSE)
     simulation = Simulation(config, catalog(), 1, device, records_physics=recorded)
     reader, made = TickReader(simulation.records[0]), {}

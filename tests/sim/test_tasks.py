@@ -125,7 +125,7 @@ def test_an_attempt_begins_above_the_grasp(device):
     np.testing.assert_allclose(worlds.state.setpoint.numpy()[0], axis, rtol=1e-6)
 
 
-def test_the_goal_goes_down_slowly_at_the_end_and_up_again(device):
+def test_the_setpoint_goes_down_slowly_at_the_end_and_up_again(device):
     worlds = made(device)
     begin(worlds)
     worlds.set(worlds.plan.target, 1)
@@ -139,11 +139,11 @@ def test_the_goal_goes_down_slowly_at_the_end_and_up_again(device):
     order = [task for task, _ in seen]
     counts = {task: order.count(task) for task in set(order)}
     way = np.linalg.norm(axis + np.array([0.0, 0.0, PICK["appear_height"]]) - before)
-    # The step in which the goal arrives already belongs to the next task.
+    # The step in which the setpoint arrives already belongs to the next task.
     assert counts[Task.APPROACH] == int(np.ceil(way / (PICK["speed"] * STEP))) - 1
     assert abs(counts[Task.DESCEND] - PICK["near"] / (PICK["near_speed"] * STEP)) < 1.5
     assert set(order) == {Task.APPROACH, Task.DESCEND, Task.PRESS}
-    places = np.array([goal for task, goal in seen if task == Task.DESCEND])
+    places = np.array([setpoint for task, setpoint in seen if task == Task.DESCEND])
     np.testing.assert_allclose(places[0], before, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(np.diff(places, axis=0), axis=1), PICK["near_speed"] * STEP, atol=1e-6)
     np.testing.assert_allclose(seen[-1][1], axis, atol=1e-6)
@@ -179,28 +179,28 @@ JUDGED = [
 ]
 
 
-def lifted(device, target: int, caught: int, held: tuple[int, ...], mode: int = Mode.PICK, **pick) -> KernelWorlds:
+def lifted(device, target: int, engaged: int, attached: tuple[int, ...], mode: int = Mode.PICK, **pick) -> KernelWorlds:
     worlds = made(device, **pick)
     worlds.set(worlds.state.mode, mode)
     worlds.set(worlds.attempts.task, Task.LIFT)
     worlds.set(worlds.plan.target, target)
-    worlds.set(worlds.attempts.engaged_bits, caught)
-    worlds.set(worlds.seals.attached, held)
+    worlds.set(worlds.attempts.engaged_bits, engaged)
+    worlds.set(worlds.seals.attached, attached)
     worlds.set(worlds.state.setpoint, LIFTED)
     step(worlds)
     return worlds
 
 
-@pytest.mark.parametrize(("target", "caught", "held", "outcome", "failures"), JUDGED)
-def test_what_hangs_after_the_lift_leaves_the_scene(device, target, caught, held, outcome, failures):
-    worlds = lifted(device, target, caught, held)
+@pytest.mark.parametrize(("target", "engaged", "attached", "outcome", "failures"), JUDGED)
+def test_what_hangs_after_the_lift_leaves_the_scene(device, target, engaged, attached, outcome, failures):
+    worlds = lifted(device, target, engaged, attached)
     end(worlds)
     assert worlds.attempts.outcome.numpy()[0] == outcome
     assert worlds.attempts.failures.numpy()[0] == failures
     assert worlds.attempts.task.numpy()[0] == Task.LOOK
-    assert worlds.attempts.attached_bits.numpy()[0] == sum(bit << i for i, bit in enumerate(held))
-    assert worlds.attempts.removed.numpy()[0].tolist() == [Removal.PICKED * bit for bit in held]
-    assert worlds.state.catalog_index.numpy()[0].tolist() == [-1 if bit else i for i, bit in enumerate(held)]
+    assert worlds.attempts.attached_bits.numpy()[0] == sum(bit << i for i, bit in enumerate(attached))
+    assert worlds.attempts.removed.numpy()[0].tolist() == [Removal.PICKED * bit for bit in attached]
+    assert worlds.state.catalog_index.numpy()[0].tolist() == [-1 if bit else i for i, bit in enumerate(attached)]
     assert not worlds.seals.attached.numpy().any()
     np.testing.assert_allclose(worlds.physics.state.joint_q.numpy()[:4], [3.0, 0.0, 1.0, 0.0])
 
@@ -236,11 +236,11 @@ PLACES = [
 ]
 
 
-@pytest.mark.parametrize(("place", "shift", "lost"), PLACES)
-def test_what_left_the_tote_is_lost_when_it_lies_or_is_deep(device, place, shift, lost):
+@pytest.mark.parametrize(("place", "displacement", "lost"), PLACES)
+def test_what_left_the_tote_is_lost_when_it_lies_or_is_deep(device, place, displacement, lost):
     worlds = made(device)
     worlds.set(worlds.seals.attached, 1)
-    worlds.set(worlds.state.displacement, [1.0, shift, 1.0])
+    worlds.set(worlds.state.displacement, [1.0, displacement, 1.0])
     for instance in range(3):
         worlds.place(0, instance, [0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0])
     worlds.place(0, 1, [*place, 0.0, 0.0, 0.0, 1.0])
@@ -265,7 +265,7 @@ def test_what_has_left_is_parked_apart_and_weightless_no_more(device):
 
 
 @pytest.mark.parametrize(
-    ("task", "entry", "failures", "ending"),
+    ("task", "catalog_index", "failures", "ending"),
     [
         (Task.LOOK, [0, 1, 2], 2, Ending.RUNNING),
         (Task.LOOK, [0, 1, 2], 3, Ending.GAVE_UP),
@@ -274,13 +274,13 @@ def test_what_has_left_is_parked_apart_and_weightless_no_more(device):
         (Task.LIFT, [-1, -1, -1], 3, Ending.RUNNING),
     ],
 )
-def test_when_picking_ends(device, task, entry, failures, ending):
+def test_when_picking_ends(device, task, catalog_index, failures, ending):
     worlds = made(device)
     for instance in range(3):
         worlds.place(0, instance, [0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0])
     worlds.set(worlds.attempts.task, task)
     worlds.set(worlds.attempts.failures, failures)
-    worlds.set(worlds.state.catalog_index, entry)
+    worlds.set(worlds.state.catalog_index, catalog_index)
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
     assert worlds.state.ending.numpy()[0] == ending
     assert worlds.state.phase.numpy()[0] == (Phase.ACT if ending == Ending.RUNNING else Phase.OVER)

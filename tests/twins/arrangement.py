@@ -1,4 +1,4 @@
-"""Which objects an episode gets and where they are dropped from, in NumPy, from the laws in kernels.sim.arrangement's docstrings."""
+"""Sampling of modes, objects and drop poses in NumPy, from the laws in kernels.sim.arrangement's docstrings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MODE_ORDER = (1, 2, 0)
 
 @dataclass(frozen=True)
 class Arrangement:
-    """What was drawn: catalog indices, body slots, and whether slots ran out."""
+    """Sampled catalog indices, body slots, and whether slots ran out."""
 
     entries: tuple[int, ...]
     slots: tuple[int, ...]
@@ -24,16 +24,16 @@ class Arrangement:
 
 
 def sample_modes(seed: int, episodes: np.ndarray, weights: tuple[float, float, float]) -> np.ndarray:
-    """Mode of each episode: the first whose cumulative share of the weights exceeds the episode's number."""
-    number = rng.uniform(rng.stream_key(seed, episodes, 0, Stream.MODE), 0)
+    """Mode of each episode: the first whose cumulative fraction of the weights exceeds the episode's sample."""
+    sample = rng.uniform(rng.stream_key(seed, episodes, 0, Stream.MODE), 0)
     share = (np.cumsum(weights) / np.sum(weights)).astype(np.float32)
-    return np.array(MODE_ORDER)[np.searchsorted(share, number, side="right")]
+    return np.array(MODE_ORDER)[np.searchsorted(share, sample, side="right")]
 
 
 def sample_objects(
     seed: int,
     episode: int,
-    redraw: int,
+    arrangement: int,
     *,
     volume: np.ndarray,
     compound: np.ndarray,
@@ -43,8 +43,8 @@ def sample_objects(
     single_slots: int,
     compound_slots: int,
 ) -> Arrangement:
-    """Draw until the next object would exceed the budget; sums in float32, as on the device."""
-    key = rng.stream_key(seed, episode, redraw, Stream.OBJECTS)
+    """Sample until the next object would exceed the budget; sums in float32, as on the device."""
+    key = rng.stream_key(seed, episode, arrangement, Stream.OBJECTS)
     sequence = rng.uniform_index(key, np.arange(MAX_SAMPLES), len(volume))
     entries: list[int] = []
     slots: list[int] = []
@@ -69,11 +69,11 @@ def sample_objects(
 
 
 def drop_poses(
-    seed: int, episode: int, redraw: int, radius: np.ndarray, *, rim: tuple[float, float, float], clearance: float, spread: float
+    seed: int, episode: int, arrangement: int, radius: np.ndarray, *, rim: tuple[float, float, float], clearance: float, spread: float
 ) -> np.ndarray:
     """Poses (instance, 7) of the drop column of bounding spheres: z_i = rim + r_i + sum over j < i of (2 r_j + clearance)."""
     count = len(radius)
-    key = rng.stream_key(seed, episode, redraw, Stream.DROP)
+    key = rng.stream_key(seed, episode, arrangement, Stream.DROP)
     poses = np.zeros((count, 7))
     for axis in range(2):
         side = 2.0 * rng.uniform(key, 5 * np.arange(count) + axis).astype(np.float64) - 1.0

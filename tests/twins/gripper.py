@@ -1,4 +1,4 @@
-"""The gripper's corners, goal and force, in NumPy, from the laws in kernels.sim.gripper's docstrings."""
+"""The gripper's corners, setpoint and force, in NumPy, from the laws in kernels.sim.gripper's docstrings."""
 
 from __future__ import annotations
 

@@ -13,10 +13,10 @@ from tests.twins.raycast import rotation_of
 from tests.twins.rays import first_hit
 
 
-def ray_starts(cup: np.ndarray, rays: int, radius: float, tip: float) -> tuple[np.ndarray, np.ndarray]:
+def ray_starts(cup: np.ndarray, rays: int, radius: float, tcp_offset: float) -> tuple[np.ndarray, np.ndarray]:
     """Starts (ray, 3) and common direction (3) in the world, for the cup's pose (7)."""
     angle = 2 * np.pi * np.arange(rays) / rays
-    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(rays, -tip)], axis=1)
+    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(rays, -tcp_offset)], axis=1)
     turn = rotation_of(cup[3:])
     return local @ turn.T + cup[:3], -turn[:, 2]
 
@@ -28,30 +28,32 @@ def is_inside(piece: ConvexPiece, point: np.ndarray) -> bool:
     return bool((((point - corners[:, 0]) * normal).sum(axis=1) <= 0.0).all())
 
 
-def distance(entry: CatalogEntry, pose: np.ndarray, start: np.ndarray, way: np.ndarray) -> float:
+def distance(entry: CatalogEntry, pose: np.ndarray, start: np.ndarray, direction: np.ndarray) -> float:
     """From a ray's start to the object's collision shape at a pose (7) [m]: 0 inside, infinite if the ray passes it."""
     turn = rotation_of(pose[3:])
-    local, direction = (start - pose[:3]) @ turn, way @ turn
+    local, local_direction = (start - pose[:3]) @ turn, direction @ turn
     if any(is_inside(piece, local) for piece in entry.pieces):
         return 0.0
-    return min(first_hit(piece.vertices, piece.faces, tuple(local), tuple(direction)) for piece in entry.pieces)
+    return min(first_hit(piece.vertices, piece.faces, tuple(local), tuple(local_direction)) for piece in entry.pieces)
 
 
-def catch(entries: Sequence[CatalogEntry | None], poses: np.ndarray, starts: np.ndarray, way: np.ndarray, reach: float) -> tuple[int, int]:
+def engage(
+    entries: Sequence[CatalogEntry | None], poses: np.ndarray, starts: np.ndarray, direction: np.ndarray, reach: float
+) -> tuple[int, int]:
     """Rays that hit, and objects hit as bits; entry i at pose i, None: not there."""
-    hits, caught = 0, 0
+    hits, engaged = 0, 0
     for start in starts:
-        along = [np.inf if entry is None else distance(entry, pose, start, way) for entry, pose in zip(entries, poses, strict=True)]
+        along = [np.inf if entry is None else distance(entry, pose, start, direction) for entry, pose in zip(entries, poses, strict=True)]
         nearest = int(np.argmin(along))
         if along[nearest] <= reach:
             hits += 1
-            caught |= 1 << nearest
-    return hits, caught
+            engaged |= 1 << nearest
+    return hits, engaged
 
 
 @dataclass(frozen=True)
 class Body:
-    """Pose (7), velocity of the centre of mass and spin (6), mass properties in the body's frame."""
+    """Pose (7), linear velocity of the centre of mass and angular velocity (6), mass properties in the body's frame."""
 
     pose: np.ndarray
     velocity: np.ndarray
@@ -59,46 +61,46 @@ class Body:
     inertia: np.ndarray
     center: np.ndarray
 
-    def lever(self, point: np.ndarray) -> np.ndarray:
+    def moment_arm(self, point: np.ndarray) -> np.ndarray:
         """From the centre of mass to a point of the world."""
         return point - self.pose[:3] - rotation_of(self.pose[3:]) @ self.center
 
     def motion(self, point: np.ndarray) -> np.ndarray:
-        """(6, 6): from velocity and spin to those of the frame at a point."""
-        return np.block([[np.eye(3), -_cross(self.lever(point))], [np.zeros((3, 3)), np.eye(3)]])
+        """(6, 6): from linear and angular velocity to those of the frame at a point."""
+        return np.block([[np.eye(3), -_cross(self.moment_arm(point))], [np.zeros((3, 3)), np.eye(3)]])
 
 
-def seal_wrench(cup: Body, body: Body, anchor: np.ndarray, law: SimpleNamespace, seals: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """Generalized forces of one of `seals` seals on its object (6) and on x, y, z and tilt of the gripper (4), and its load [N].
+def seal_wrench(cup: Body, body: Body, object_in_tcp: np.ndarray, law: SimpleNamespace, seals: int) -> tuple[np.ndarray, np.ndarray, float]:
+    """Generalized forces of one of `seals` seals on its object (6) and on x, y, z and tilt of the gripper (4), and its seal force [N].
 
     By the whole 6 x 6 system: w = K (e + h u') + D u' with u' = u - h W w, and W = J M⁻¹ Jᵀ of both sides.
     """
-    turn, held = rotation_of(cup.pose[3:]), rotation_of(body.pose[3:])
-    axis, hinge = turn[:, 2], turn[:, 1]
-    tip = cup.pose[:3] - law.tcp_offset * axis
-    caught = held @ rotation_of(anchor[3:]).T
-    origin = body.pose[:3] - caught @ anchor[:3]
-    stiffness, swing = law.twist_stiffness * np.outer(axis, axis), turn.T @ caught
+    turn, rotation = rotation_of(cup.pose[3:]), rotation_of(body.pose[3:])
+    axis, wrist_axis = turn[:, 2], turn[:, 1]
+    tcp = cup.pose[:3] - law.tcp_offset * axis
+    grip = rotation @ rotation_of(object_in_tcp[3:]).T
+    origin = body.pose[:3] - grip @ object_in_tcp[:3]
+    stiffness, swing = law.twist_stiffness * np.outer(axis, axis), turn.T @ grip
     torque = -law.twist_stiffness * 2 * np.arctan2(swing[1, 0] - swing[0, 1], 1 + np.trace(swing)) * axis
     beyond = np.arccos(np.clip(swing[2, 2], -1, 1)) - law.swing_limit
     if beyond > 0:
-        normal = np.cross(axis, caught[:, 2])
+        normal = np.cross(axis, grip[:, 2])
         normal /= np.linalg.norm(normal)
         torque -= law.swing_stiffness * beyond * normal
         stiffness = stiffness + law.swing_stiffness * np.outer(normal, normal)
     zero, one, h = np.zeros((3, 3)), np.eye(3), law.step
     gain = h * np.block([[law.stiffness * one, zero], [zero, stiffness]])
     gain += np.block([[law.damping * one, zero], [zero, law.twist_damping * one]])
-    object_inverse = np.block([[one / body.mass, zero], [zero, held @ np.linalg.inv(body.inertia) @ held.T]])
+    object_inverse = np.block([[one / body.mass, zero], [zero, rotation @ np.linalg.inv(body.inertia) @ rotation.T]])
     slide = np.zeros((6, 4))
-    slide[:3, :3], slide[:3, 3], slide[3:, 3] = one, np.cross(hinge, tip - cup.pose[:3]), hinge
+    slide[:3, :3], slide[:3, 3], slide[3:, 3] = one, np.cross(wrist_axis, tcp - cup.pose[:3]), wrist_axis
     gripper_inverse = np.diag(1 / np.array([law.finger_mass + law.cup_mass] * 3 + [law.tilt_inertia]))
-    response = body.motion(tip) @ object_inverse @ body.motion(tip).T + seals * slide @ gripper_inverse @ slide.T
-    relative = cup.motion(tip) @ cup.velocity - body.motion(tip) @ body.velocity
-    spring = np.concatenate([law.stiffness * (tip - origin), torque])
-    wrench = np.linalg.solve(np.eye(6) + h * gain @ response, spring + gain @ relative)
+    inverse_mass = body.motion(tcp) @ object_inverse @ body.motion(tcp).T + seals * slide @ gripper_inverse @ slide.T
+    relative = cup.motion(tcp) @ cup.velocity - body.motion(tcp) @ body.velocity
+    spring = np.concatenate([law.stiffness * (tcp - origin), torque])
+    wrench = np.linalg.solve(np.eye(6) + h * gain @ inverse_mass, spring + gain @ relative)
     borne = wrench[:3] - min(wrench[:3] @ axis, 0.0) * axis
-    return body.motion(tip).T @ wrench, -slide.T @ wrench, float(np.linalg.norm(borne))
+    return body.motion(tcp).T @ wrench, -slide.T @ wrench, float(np.linalg.norm(borne))
 
 
 def _cross(v: np.ndarray) -> np.ndarray:

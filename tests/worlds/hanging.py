@@ -1,4 +1,4 @@
-"""Objects that hang on cups, in the real physics: boxes of any mass, caught where the test puts them, lifted by a scripted gripper."""
+"""Boxes of given masses attached to cups in the real physics, lifted by a scripted gripper."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.worlds.small_worlds import catalog, settings
 
 Size = tuple[float, float, float]
 HEIGHT = 1.0
-"""Of the tilt axis at the start [m]: far above the tote."""
+"""Height of the wrist at the start [m]: far above the tote."""
 COARSE = {"physics__steps_per_tick": 1, "physics__iterations": 4, "physics__rows_per_world": 96, "physics__contacts_per_world": 48}
 """A step at a time, and no more room than bodies in the air need."""
 ROOM = 0.02
@@ -29,7 +29,7 @@ ROOM = 0.02
 
 
 class Hanging:
-    """Worlds in which every object is held by a seal from the start; object `instance` of world `world` has its own mass."""
+    """Worlds in which every object is attached by a seal from the start; object `instance` of world `world` has its own mass."""
 
     def __init__(self, device, masses: Sequence[Sequence[float]], sizes: Sequence[Sequence[Size]], **overrides: object) -> None:
         """Masses [kg] and sizes [m], by world and instance."""
@@ -60,39 +60,39 @@ class Hanging:
         self.state.restarted.fill_(True)
         self.gripper_mass = self.config.gripper.finger_mass + self.config.gripper.cup_mass
         self.carried, self.ignoring = True, True
-        self.goal, self.speed = np.zeros((self.worlds, 3)), np.zeros(3)
+        self.setpoint, self.speed = np.zeros((self.worlds, 3)), np.zeros(3)
 
-    def start(self, place: np.ndarray, limit: float = 40.0, quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> None:
-        """Everything at rest, the cups upright; catch the objects with centres at `place` (world, instance, 3), from the tip [m]."""
-        tip = np.array([0.0, 0.0, HEIGHT - self.config.gripper.cup_length])
+    def start(self, place: np.ndarray, break_force: float = 40.0, quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> None:
+        """Reset to rest with upright cups; attach the objects with centres at `place` (world, instance, 3) relative to the TCP [m]."""
+        tcp = np.array([0.0, 0.0, HEIGHT - self.config.gripper.cup_length])
         turn = np.broadcast_to(quaternion, (self.worlds, self.instances, 4))
         first = build.GRIPPER_DOFS
         coordinates = self.physics.state.joint_q.numpy().reshape(self.worlds, -1)
         coordinates[:, :first] = (0.0, 0.0, HEIGHT, 0.0)
-        coordinates[:, first : first + 7 * self.instances] = np.concatenate([tip + place, turn], axis=2).reshape(self.worlds, -1)
+        coordinates[:, first : first + 7 * self.instances] = np.concatenate([tcp + place, turn], axis=2).reshape(self.worlds, -1)
         self.physics.state.joint_q.assign(coordinates.reshape(-1))
         self.physics.state.joint_qd.zero_()
         self.physics.control.joint_f.zero_()
         self.physics.load(self.state.variant, self.state.restarted)
         self.seals.object_in_tcp.assign(np.concatenate([place, turn], axis=2))
         self.seals.attached.fill_(1)
-        self.seals.break_force.fill_(limit)
+        self.seals.break_force.fill_(break_force)
         self.seals.peak_force.zero_()
-        self.goal[:], self.speed[:] = (0.0, 0.0, HEIGHT), 0.0
+        self.setpoint[:], self.speed[:] = (0.0, 0.0, HEIGHT), 0.0
 
     def run(self, steps: int) -> np.ndarray:
-        """So many steps; loads (step, world, instance) [N]."""
-        loads = []
+        """Run steps; return the seal forces (step, world, instance) [N]."""
+        forces = []
         for _ in range(steps):
             self.physics.tick(self.drive, self.ignore)
-            loads.append(self.seals.seal_force.numpy().copy())
-        return np.array(loads)
+            forces.append(self.seals.seal_force.numpy().copy())
+        return np.array(forces)
 
     def drive(self, current) -> None:
-        """The impedance law of picking, or nothing, and the seals."""
+        """Apply the impedance control of picking, or nothing, and the seal forces."""
         pick, step = self.config.pick, self.config.physics.step
-        self.goal += step * self.speed
-        offset = self.goal - current.joint_q.numpy().reshape(self.worlds, -1)[:, :3]
+        self.setpoint += step * self.speed
+        offset = self.setpoint - current.joint_q.numpy().reshape(self.worlds, -1)[:, :3]
         velocity = current.joint_qd.numpy().reshape(self.worlds, -1)[:, :3]
         gain = 1.0 + (pick.damping * step + pick.stiffness * step**2) / self.gripper_mass
         force = self.physics.control.joint_f.numpy().reshape(self.worlds, -1)
@@ -104,12 +104,12 @@ class Hanging:
         self.suction.apply_seal_forces(self.scene, self.state, self.seals, self.physics, current)
 
     def ignore(self) -> None:
-        """Contacts of cups with what they hold."""
+        """Disable contacts of cups with their attached objects."""
         if self.ignoring:
             self.suction.ignore_attached_contacts(self.scene, self.state, self.seals, self.physics)
 
     def bodies(self) -> tuple[np.ndarray, np.ndarray]:
-        """Poses (world, body, 7) and velocities (world, body, 6): finger, cup, objects."""
+        """Poses (world, body, 7) and velocities (world, body, 6): gripper shaft, cup, objects."""
         count = build.GRIPPER_BODIES + self.instances
         state = self.physics.state
         return tuple(
@@ -118,19 +118,19 @@ class Hanging:
         )  # type: ignore[return-value]
 
     def swing(self) -> np.ndarray:
-        """Angle between each cup's axis and that of its first object, which was upright when it was caught (world) [°]."""
+        """Angle between each cup's axis and that of its first object, which was upright when it was attached (world) [°]."""
         poses, _ = self.bodies()
         axes = [np.stack([rotation_of(pose[3:])[:, 2] for pose in poses[:, body]]) for body in (1, 2)]
         return np.degrees(np.arccos(np.clip((axes[0] * axes[1]).sum(axis=1), -1.0, 1.0)))
 
     def momentum(self) -> np.ndarray:
-        """Of gripper and objects together (world, 3) [N·s]."""
+        """Linear momentum of gripper and objects together (world, 3) [N·s]."""
         _, velocity = self.bodies()
         gripper = self.config.gripper.finger_mass * velocity[:, 0, :3] + self.config.gripper.cup_mass * velocity[:, 1, :3]
         return gripper + np.einsum("wi,wic->wc", self.mass, velocity[:, 2:, :3])
 
     def energy(self) -> np.ndarray:
-        """Kinetic, of gripper and objects together (world) [J]; the cup's spin is left out."""
+        """Kinetic energy of gripper and objects together (world) [J], without the cup's rotation."""
         poses, velocity = self.bodies()
         gripper = np.tile([self.config.gripper.finger_mass, self.config.gripper.cup_mass], (self.worlds, 1))
         masses = np.concatenate([gripper, self.mass], axis=1)

@@ -1,4 +1,4 @@
-"""Worlds whose ticks are written by hand: what the host would be told of them."""
+"""Scripted worlds: tick reports written by hand."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RAYS = CONFIG.suction.rays
 
 
 class World:
-    """One world's part of the reports. What was seen and planned stays until the next look, as on the device."""
+    """One world's rows of the reports. Observation and plan stay until the next perception, as on the device."""
 
     def __init__(self, config: Config, device: Any) -> None:
         sizes = worlds.world_sizes(config, 1) | {"world": 1}
@@ -75,7 +75,7 @@ class World:
         self.frame(phase=Phase.ACT, live=1, task=Task.NONE if move else Task.LOOK, attempt=-1)
 
     def look(self, target: int) -> None:
-        """A look chooses; what is not set by the test is some number."""
+        """Perception chooses a target; arrays that the test does not set change to arbitrary values."""
         self.plan.target[0] = target
         for arrays in (self.plan, self.observation):
             for name, array in vars(arrays).items():

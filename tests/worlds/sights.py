@@ -1,4 +1,4 @@
-"""What small worlds that pick look at."""
+"""Small simulations with perception."""
 
 from __future__ import annotations
 

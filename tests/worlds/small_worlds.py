@@ -89,14 +89,14 @@ def _entry(obj_id: int, sizes: Sequence[tuple[float, float, float]]) -> CatalogE
 
 
 def report(record: TickRecord) -> TickReport:
-    """What a tick left, on the host."""
+    """Report of a tick."""
     reader = TickReader(record)
     reader.start()
     return reader.wait()
 
 
 def run_ticks(simulation: Simulation, ticks: int) -> list[TickReport]:
-    """So many ticks."""
+    """Run ticks; return their reports."""
     reports = []
     for _ in range(ticks):
         simulation.tick(simulation.records[0])
