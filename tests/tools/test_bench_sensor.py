@@ -37,7 +37,7 @@ def views(device):
     scene = bench_sensor.build_sensor_scene(
         config, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, -config.tote.wall, snapshot(toy, device), 4, device
     )
-    images = scene.outputs(shape_index_image="shape_index", forward_depth_image="depth_forward")
+    images = scene.allocate_outputs(shape_index_image="shape_index", forward_depth_image="depth_forward")
     scene.render(bench_sensor.SensorCamera.RenderConfig(), images)
     return scene, *(image.numpy() for image in images.values()), render(toy, device)
 
@@ -45,7 +45,7 @@ def views(device):
 def test_an_independent_renderer_agrees(views):
     scene, index, depth, ours = views
     assert set(np.unique(ours.instance)) == {1, 2, 3, Segment.TABLE, Segment.TOTE, Segment.FINGER}
-    same, close, largest = (row.value for row in bench_sensor.agreement(scene, index, depth, ours.instance, ours.depth, 0.1))
+    same, close, largest = (row.value for row in bench_sensor.compare_hits(scene, index, depth, ours.instance, ours.depth, 0.1))
     # Rounding decides on which side of a silhouette a grazing ray passes.
     assert same >= 99.9
     assert close >= 99.9
@@ -54,10 +54,10 @@ def test_an_independent_renderer_agrees(views):
 
 def test_differences_are_counted(views):
     scene, index, depth, ours = views
-    code, counts = ours.instance.copy(), ours.depth.copy()
-    code[0, :30] = Segment.CUP
+    segment, counts = ours.instance.copy(), ours.depth.copy()
+    segment[0, :30] = Segment.CUP
     counts[0, 30:] += 100
-    same, close, largest = (row.value for row in bench_sensor.agreement(scene, index, depth, code, counts, 0.1))
+    same, close, largest = (row.value for row in bench_sensor.compare_hits(scene, index, depth, segment, counts, 0.1))
     assert same == pytest.approx(87.5, abs=0.2)
     assert close == pytest.approx(75.0, abs=0.2)
     assert largest >= 9.9
@@ -71,7 +71,7 @@ def test_surfaces_are_compared_in_the_camera_frame():
         "normals": np.array([[[(0.0, 0.0, -1.0), (0.0, 0.0, -1.0)]]], np.float32),
         "albedo": np.array([[[(1, 2, 3), (3, 4, 5)]]], np.uint8),
     }
-    same_normal, color_difference = (row.value for row in bench_sensor.surface_agreement(cameras, normal, albedo, layers))
+    same_normal, color_difference = (row.value for row in bench_sensor.compare_surfaces(cameras, normal, albedo, layers))
     assert (same_normal, color_difference) == (50.0, 1.0)
 
 

@@ -346,7 +346,7 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
     assert {row["part"] for row in rows} == {"setup", *bench.PARTS}
     assert all(row["value"] >= 0.0 for row in rows)
     printed = capsys.readouterr().out
-    rows_of_stages = ("views, all stages", "picking, steps alone", "looks and plans: share of the time with rendering")
+    rows_of_stages = ("views, all stages", "picking, steps alone", "perception and planning: fraction of simulation and rendering")
     writers = ("bop, 1 process: views", "bop, 1 process: CPU time per view, writers, kernel", "shards, 1 process: cores in use")
     for name in (*rows_of_stages, *writers, "SensorCamera's time over ours"):
         assert name in printed
