@@ -65,7 +65,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Sight:
+class Perception:
     """Perception of the gripper: suction points and clutter graph from the segmentation that camera 0 sees without the gripper."""
 
     resolution: tuple[int, int] = setting(
@@ -77,14 +77,14 @@ class Sight:
     )
     views: int = setting(0, "", "Images processed in one batch; 0: chosen by device and resolution.", low=0)
     contour_points: int = setting(8192, "", "Capacity for the points of one contour; a longer contour ends the episode.", low=16)
-    center_share: float = setting(
+    center_fraction: float = setting(
         0.8,
         "",
         "Centroid, or midpoint to the pole of inaccessibility, is used if its distance to the contour exceeds this fraction of the pole's.",
         low=0.0,
     )
     heavy_mass: float = setting(0.8, "kg", "Mass above which objects are grasped nearer to their centroid.", low=0.0)
-    heavy_center_share: float = setting(0.4, "", "Same as center_share, for heavy objects.", low=0.0)
+    heavy_center_fraction: float = setting(0.4, "", "Same as center_fraction, for heavy objects.", low=0.0)
     contour_offset: float = setting(
         3.0, "px", "Distance from the contour, inside and outside, at which the depths of neighbours are compared.", above=0.0
     )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from synpick_warp.codes import Tone, names
 from synpick_warp.configs.fields import setting
-from synpick_warp.configs.manipulation import Move, Pick, Sight, Suction, Target
+from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
 from synpick_warp.configs.sensors import DepthSensor, Effects
 from synpick_warp.layers import LAYER_TABLE
 
@@ -172,11 +172,11 @@ class Settle:
 
     min_time: float = setting(1.0, "s", "Minimum simulated time from the drop to the first frame.", low=0.0)
     max_time: float = setting(10.0, "s", "A world whose pile is not at rest after this time resamples its arrangement.", above=0.0)
-    rest_shift: float = setting(1e-4, "m", "An object is at rest if none of its points is displaced by more in a tick.", above=0.0)
-    late_time: float = setting(
-        4.0, "s", "Time after which last_shift replaces rest_shift, since some piles keep jittering slightly.", low=0.0
+    rest_displacement: float = setting(1e-4, "m", "An object is at rest if none of its points is displaced by more in a tick.", above=0.0)
+    relax_time: float = setting(
+        4.0, "s", "Time after which relaxed_displacement replaces rest_displacement, since some piles keep jittering slightly.", low=0.0
     )
-    last_shift: float = setting(2e-3, "m", "Relaxed rest threshold after late_time: displacement in a tick.", above=0.0)
+    relaxed_displacement: float = setting(2e-3, "m", "Relaxed rest threshold after relax_time: displacement in a tick.", above=0.0)
     rest_ticks: int = setting(8, "", "Consecutive ticks for which all objects must be at rest.", low=1)
     stuck_depth: float = setting(0.01, "m", "An object that penetrates another by more is stuck (released).", above=0.0)
     stuck_time: float = setting(0.4, "s", "An object stuck for this long is dropped again (released).", above=0.0)
@@ -231,7 +231,7 @@ class Render:
     )
     samples: int = setting(64, "", "Mode reference: paths per pixel; powers of two are stratified best.", low=1, high=65536)
     bounces: int = setting(4, "", "Maximum surfaces along a path; 1: direct light only.", low=1, high=64)
-    turn_lights: bool = setting(True, "", "Rotate each episode's environment map by a random yaw about the vertical.")
+    random_yaw: bool = setting(True, "", "Rotate each episode's environment map by a random yaw about the vertical.")
     exposure: float = setting(1.0, "", "Factor on the automatic exposure.", above=0.0)
     exposure_spread: float = setting(
         0.3,
@@ -240,14 +240,14 @@ class Render:
         low=0.0,
         high=5.0,
     )
-    cell: int = setting(
+    coarse_pixel: int = setting(
         0,
         "px",
         "Mode fast: width of a coarse pixel, at whose centre paths start; 0: as wide as leaves at least 384 coarse pixels per row.",
         low=0,
         high=64,
     )
-    cell_paths: int = setting(
+    coarse_paths: int = setting(
         0,
         "",
         "Mode fast: paths per coarse pixel; powers of two are stratified best; 0: 2, or 1 if a row has more than 480 coarse pixels.",
@@ -309,7 +309,7 @@ class Config:
     move: Move = field(default_factory=Move)
     pick: Pick = field(default_factory=Pick)
     target: Target = field(default_factory=Target)
-    sight: Sight = field(default_factory=Sight)
+    perception: Perception = field(default_factory=Perception)
     suction: Suction = field(default_factory=Suction)
     render: Render = field(default_factory=Render)
     effects: Effects = field(default_factory=Effects)

@@ -91,7 +91,7 @@ class DropData:
     """Wrist position while the gripper waits [m]."""
     lights: int
     """Environment maps."""
-    turn_lights: int
+    random_yaw: int
     """1: sample the yaw of environment maps."""
     exposure_spread: float
     """Half-width of the sampled exposure range [EV]."""
@@ -197,11 +197,11 @@ class PickData:
 
 @wp.struct
 class PerceptionData:
-    """Parameters of perception and grasp planning, named as in configs.schema.Sight. Lengths in the image [px], heights [m]."""
+    """Parameters of perception and grasp planning, named as in configs.schema.Perception. Lengths in the image [px], heights [m]."""
 
-    center_share: float
+    center_fraction: float
     heavy_mass: float
-    heavy_center_share: float
+    heavy_center_fraction: float
     contour_offset: float
     deep_distance: float
     deep_weight: float

@@ -1,6 +1,6 @@
 """Attempt log: builds the records of attempts.jsonl and the counts of each episode from the reports of all ticks, on the host.
 
-Fields of the record dataclasses are the JSON keys, which are public: `caught` lists the engaged instances, `load` the peak seal forces.
+Fields of the record dataclasses are the JSON keys.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ class InstanceObservation:
     instance: int
     object_id: int
     visible: int
-    share: float
+    visible_fraction: float
     pole: Vector
     centroid: Vector
-    middle: Vector
+    midpoint: Vector
     distances: Vector
-    suction: tuple[int, ...]
+    grasp_pixel: tuple[int, ...]
     depth: float
     above: tuple[int, ...]
     """Instances from which an edge of the clutter graph runs to this one."""
-    all_above: tuple[int, ...]
+    ancestors: tuple[int, ...]
     """Instances from which a path runs to this one."""
 
 
@@ -85,13 +85,13 @@ class AttemptRecord:
     """Rays that hit an object when suction was switched on."""
     good_seal: bool
     """True if at most `suction.tolerated_misses` rays missed, so that seals had the break force of a good seal."""
-    caught: tuple[int, ...]
+    engaged: tuple[int, ...]
     """Engaged instances: those that rays hit."""
     picked: tuple[int, ...]
     """Instances that left the scene on the cup."""
-    load: Vector
+    peak_force: Vector
     """Peak seal force [N] in each tick of the lift, that of a seal that broke included; 0 in the first, which ends as suction begins."""
-    sight: ObservationRecord
+    observation: ObservationRecord
 
     def line(self) -> str:
         """Serialize the record as one line of JSON with line break.
@@ -186,7 +186,7 @@ class AttemptLog:
         outcome = Outcome(_status(report, "outcome", world))
         lifted = outcome not in (Outcome.NONE, Outcome.NOTHING_SEEN)
         if lifted or _status(report, "task", world) == Task.LIFT:
-            running.forces.append(round(float(report.measure("load")[world]), FORCE_PLACES))
+            running.forces.append(round(float(report.measure("peak_force")[world]), FORCE_PLACES))
         if outcome is not Outcome.NONE:
             self._end_attempt(running, report, world, outcome)
 
@@ -205,7 +205,7 @@ class AttemptLog:
             "attempt": _status(report, "attempt", world) + 1,
             "mode": Mode(_status(report, "mode", world)).name.lower(),
             "frame": _status(report, "frame", world),
-            "sight": self._observation(report, world),
+            "observation": self._observation(report, world),
         }
         grasp = dict.fromkeys(("target", "object_id", "point", "normal", "yaw", "tilt"))
         if target >= 0:
@@ -228,9 +228,9 @@ class AttemptLog:
                 rays=self.rays,
                 hits=hits,
                 good_seal=self.rays - hits <= self.tolerated_misses,
-                caught=_instances(_status(report, "caught", world)) if seen else (),
-                picked=_instances(_status(report, "held", world)),
-                load=tuple(running.forces),
+                engaged=_instances(_status(report, "engaged", world)) if seen else (),
+                picked=_instances(_status(report, "attached", world)),
+                peak_force=tuple(running.forces),
             )
         )
         running.planned = None
@@ -249,15 +249,15 @@ class AttemptLog:
             instance=instance,
             object_id=self._object_id(report, world, instance),
             visible=int(row["visible"]),
-            share=_round(row["visible_fraction"]),
+            visible_fraction=_round(row["visible_fraction"]),
             pole=_round_vector(row["pole"]),
             centroid=_round_vector(row["centroid"]),
-            middle=_round_vector(row["midpoint"]),
+            midpoint=_round_vector(row["midpoint"]),
             distances=_round_vector(row["distances"]),
-            suction=tuple(row["grasp_pixel"].tolist()),
+            grasp_pixel=tuple(row["grasp_pixel"].tolist()),
             depth=_round(row["depth"]),
             above=_instances(int(row["above"])),
-            all_above=_instances(int(row["ancestors"])),
+            ancestors=_instances(int(row["ancestors"])),
         )
 
     def _object_id(self, report: TickReport, world: int, instance: int) -> int:

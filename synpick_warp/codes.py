@@ -193,13 +193,9 @@ class Effect(enum.IntEnum):
     JPEG_QUALITY = 8
 
 
-PUBLIC_COLUMNS = {"arrangement": "redraw", "engaged": "caught", "attached": "held", "peak_force": "load"}
-"""Columns of `Status` and `Measure` whose name in reports and data sets differs from the member's."""
-
-
 def column_names(kind: type[enum.IntEnum]) -> dict[str, enum.IntEnum]:
     """Members of `Status` or `Measure` by their name in reports and data sets, in order of their values."""
-    return {PUBLIC_COLUMNS.get(member.name.lower(), member.name.lower()): member for member in sorted(kind)}
+    return {member.name.lower(): member for member in sorted(kind)}
 
 
 def names(kind: type[enum.IntEnum]) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ class EpisodeRow(NamedTuple):
     """One line of episodes.jsonl and of the summary; the fields are the JSON keys. Counts are 0 if the episode ended without delivery."""
 
     episode: int
-    redraw: int
+    arrangement: int
     """Index of the arrangement: how often it was resampled before."""
     ending: Ending
     frames: int
@@ -95,11 +95,11 @@ class BakeSummary:
 
 def episode_row(config: Config, report: TickReport, world: int, record: EpisodeRecord) -> EpisodeRow:
     """Build the row of the episode that ended in a world."""
-    episode, redraw, frame, ending = (int(report.column(name)[world]) for name in ("episode", "redraw", "frame", "ending"))
+    episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     tick = config.physics.step * config.physics.steps_per_tick
     return EpisodeRow(
         episode,
-        redraw,
+        arrangement,
         Ending(ending),
         frame + 1,
         round(max(0, frame) * tick, PLACES),
@@ -114,17 +114,17 @@ def episode_row(config: Config, report: TickReport, world: int, record: EpisodeR
 
 def is_resampled(config: Config, row: EpisodeRow) -> bool:
     """True if the episode will run again with a resampled arrangement."""
-    return not row.ending.delivers and row.redraw + 1 < config.settle.tries
+    return not row.ending.delivers and row.arrangement + 1 < config.settle.tries
 
 
 def remedy(config: Config, ending: Ending) -> str:
     """Advice against an ending that is caused by a setting, with the current values; empty: no setting cures it."""
-    physics, sight, settle = config.physics, config.sight, config.settle
+    physics, perception, settle = config.physics, config.perception, config.settle
     if ending is Ending.SOLVER_OVERFLOW:
         capacities = ("contacts_per_world", "pairs_per_world", "rows_per_world", "gripper_rows_per_world")
         return "raise " + " or ".join(f"physics.{name} ({getattr(physics, name)})" for name in capacities)
     if ending is Ending.SIGHT_OVERFLOW:
-        return f"raise sight.contour_points ({sight.contour_points})"
+        return f"raise perception.contour_points ({perception.contour_points})"
     if ending is Ending.ARRANGEMENT_OVERFLOW:
         return f"lower arrangement.slot_shortfall ({config.arrangement.slot_shortfall:g})"
     if ending is Ending.UNSETTLED:
@@ -135,5 +135,7 @@ def remedy(config: Config, ending: Ending) -> str:
 def episode_end(config: Config, row: EpisodeRow, record: EpisodeRecord) -> EpisodeEnd:
     """Build the end-of-episode message for exporters; a resampled episode has neither row nor attempts."""
     if is_resampled(config, row):
-        return EpisodeEnd(row.episode, row.redraw, row.frames, int(row.ending))
-    return EpisodeEnd(row.episode, row.redraw, row.frames, int(row.ending), row.as_json(), tuple(one.line() for one in record.attempts))
+        return EpisodeEnd(row.episode, row.arrangement, row.frames, int(row.ending))
+    return EpisodeEnd(
+        row.episode, row.arrangement, row.frames, int(row.ending), row.as_json(), tuple(one.line() for one in record.attempts)
+    )

@@ -108,7 +108,7 @@ class EpisodeEnd:
 
     episode: int
     """Episode index."""
-    redraw: int
+    arrangement: int
     """Number of arrangements of this episode that were discarded and resampled before this one."""
     frames: int
     """Number of frames."""

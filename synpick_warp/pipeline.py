@@ -98,7 +98,7 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
     table = name_lights([light.name for light in lights], scene.lights)
     tick_time = config.physics.step * config.physics.steps_per_tick
     stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device)
-    return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.sight.resolution, object_ids))
+    return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.perception.resolution, object_ids))
 
 
 def make_renderer(config: Config, scene: RenderScene, instances: int, views: int) -> Renderer:
@@ -247,7 +247,7 @@ class _Run:
             self.summary.remedies[row.ending] = advice
         if is_resampled(self.config, row):
             self.summary.take_resample(row.ending)
-            note = f"episode {row.episode}, arrangement {row.redraw + 1}: {row.ending.sentence}"
+            note = f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}"
             self.progress.note(note + (f"; {advice}" if advice else ""))
             self.exporters.end_episode(end, lambda: None)
         else:
@@ -313,9 +313,9 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     if has_lens_filter(config.effects):
         groups += [(LensArrays, views, 1)]
     if may_pick(config):
-        count = count_views(config.sight, worlds["world"], room, device)
-        groups += [(kind, perception_sizes(config.sight, room, count), 1) for kind in SCRATCH]
-        groups += [(kind, plan_sizes(config.sight, room, count), 1) for kind in (VoteArrays, CYCLES)]
+        count = count_views(config.perception, worlds["world"], room, device)
+        groups += [(kind, perception_sizes(config.perception, room, count), 1) for kind in SCRATCH]
+        groups += [(kind, plan_sizes(config.perception, room, count), 1) for kind in (VoteArrays, CYCLES)]
     rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
     if config.render.mode == FAST:
         sizes = views | scratch_sizes(config.render, *config.cameras.resolution)

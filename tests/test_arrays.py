@@ -146,7 +146,7 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
     [(0, 8, (6, 8, 6, 8)), (0, 960, (3, 480, 6, 960)), (0, 1920, (2, 384, 3, 960)), (3, 8, (2, 3, 6, 8)), (64, 8, (1,) * 4)],
 )
 def test_cells_cover_the_image(cell, width, shape):
-    sizes = scratch_sizes(settings(render__cell=cell).render, width, 6)
+    sizes = scratch_sizes(settings(render__coarse_pixel=cell).render, width, 6)
     assert tuple(sizes[name] for name in ("cell_row", "cell_column", "shadow_row", "shadow_column")) == shape
 
 
@@ -154,8 +154,8 @@ def test_cells_cover_the_image(cell, width, shape):
     ("cell", "width", "paths"), [(0, 320, 2), (0, 480, 2), (0, 481, 1), (0, 640, 1), (0, 960, 2), (0, 1920, 2), (1, 1920, 1)]
 )
 def test_small_cells_have_one_path_and_wider_ones_two(cell, width, paths):
-    assert paths_per_coarse_pixel(settings(render__cell=cell).render, width) == paths
-    assert paths_per_coarse_pixel(settings(render__cell=cell, render__cell_paths=5).render, width) == 5
+    assert paths_per_coarse_pixel(settings(render__coarse_pixel=cell).render, width) == paths
+    assert paths_per_coarse_pixel(settings(render__coarse_pixel=cell, render__coarse_paths=5).render, width) == 5
 
 
 def test_the_reference_has_no_cells():
@@ -166,9 +166,9 @@ def test_the_reference_has_no_cells():
 
 @pytest.mark.parametrize("mode", [{"bake__mode": "target"}, {"bake__mode": "mixed", "bake__mix": [1, 0, 3]}])
 def test_a_bake_that_may_pick_has_the_arrays_of_looking_as_well(mode):
-    config = settings(bake__worlds=7, sight__resolution=[64, 48], **mode)
+    config = settings(bake__worlds=7, perception__resolution=[64, 48], **mode)
     room = config.arrangement.max_objects
-    looks = count_views(config.sight, config.bake.worlds, room, pick_device("cpu"))
+    looks = count_views(config.perception, config.bake.worlds, room, pick_device("cpu"))
     rows = describe_arrays(config)
     assert {name.split(".")[0] for name, *_ in rows} == {kind.__name__ for kind in MOVING + LOOKING}
     shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in LOOKING}}

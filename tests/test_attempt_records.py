@@ -61,8 +61,8 @@ def pick_one(world: World) -> Ticks:
         [0.0, 5.00004, 4.99996, 3.5],
         outcome=Outcome.TARGET_PICKED,
         hits=RAYS - 1,
-        caught=bits(1, 3),
-        held=bits(1, 3),
+        engaged=bits(1, 3),
+        attached=bits(1, 3),
         catalog_index=[-1] * ROOM,
     )
     world.over(Ending.EMPTIED)
@@ -96,10 +96,10 @@ def test_a_record_says_all_that_was_seen_and_done(picked):
         rays=RAYS,
         hits=RAYS - 1,
         good_seal=True,
-        caught=(1, 3),
+        engaged=(1, 3),
         picked=(1, 3),
-        load=(0.0, 5.0, 5.0, 3.5),
-        sight=PAIR,
+        peak_force=(0.0, 5.0, 5.0, 3.5),
+        observation=PAIR,
     )
     assert (picked.mode, picked.objects, picked.picked, picked.lost, picked.left) == ("target", 2, 2, 0, 0)
 
@@ -126,30 +126,30 @@ def test_a_line_is_json_with_the_keys_of_the_format(picked):
         "rays",
         "hits",
         "good_seal",
-        "caught",
+        "engaged",
         "picked",
-        "load",
-        "sight",
+        "peak_force",
+        "observation",
     ]
     assert (record["outcome"], record["sentence"]) == ("target_picked", Outcome.TARGET_PICKED.sentence)
-    assert (record["point"], record["caught"], record["load"]) == ([0.1, -0.2, 0.034568], [1, 3], [0.0, 5.0, 5.0, 3.5])
+    assert (record["point"], record["engaged"], record["peak_force"]) == ([0.1, -0.2, 0.034568], [1, 3], [0.0, 5.0, 5.0, 3.5])
     assert record["good_seal"] is True
     assert "-0.0," not in line
-    sight = record["sight"]
+    sight = record["observation"]
     assert (sight["resolution"], sight["votes"]) == ([64, 48], [[1, 3, 12.3], [3, 1, 0.1]])
     assert sight["instances"][0] == {
         "instance": 1,
         "object_id": 21,
         "visible": 120,
-        "share": 0.333333,
+        "visible_fraction": 0.333333,
         "pole": [10.0, 20.0],
         "centroid": [12.3457, 21.0],
-        "middle": [11.1728, 20.5],
+        "midpoint": [11.1728, 20.5],
         "distances": [5.0, 4.47214, 0.0],
-        "suction": [11, 21],
+        "grasp_pixel": [11, 21],
         "depth": 1.98765,
         "above": [3],
-        "all_above": [0, 3],
+        "ancestors": [0, 3],
     }
 
 
@@ -157,11 +157,11 @@ def test_explain_reads_what_is_written(picked, tmp_path):
     (attempt,) = picked.attempts
     (tmp_path / "attempts.jsonl").write_text(attempt.line())
     (read,) = read_attempts(tmp_path, 7, None)
-    for name in ("mode", "frame", "end_frame", "target", "tilt", "rays", "hits", "good_seal", "caught", "picked", "load"):
+    for name in ("mode", "frame", "end_frame", "target", "tilt", "rays", "hits", "good_seal", "engaged", "picked", "peak_force"):
         assert getattr(read, name) == getattr(attempt, name), name
     assert (read.number, read.sentence, read.resolution) == (0, attempt.outcome.sentence, (64, 48))
     assert [one.instance for one in read.seen] == [1], "3 was not visible"
-    assert read.seen[0].distances == attempt.sight.instances[0].distances
+    assert read.seen[0].distances == attempt.observation.instances[0].distances
     assert read.votes == {(1, 3): 12.3, (3, 1): 0.1}
 
 

@@ -23,25 +23,25 @@ def every_outcome(world: World) -> Ticks:
     world.look(1)
     yield
     yield from world.attempt(
-        0, [0.0, 9.0, 8.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, caught=bits(0, 1), held=bits(1), catalog_index=[2, -1, 1, 1]
+        0, [0.0, 9.0, 8.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, engaged=bits(0, 1), attached=bits(1), catalog_index=[2, -1, 1, 1]
     )
     world.look(0)
     yield
-    yield from world.attempt(1, [0.0, 3.0], outcome=Outcome.DROPPED, hits=RAYS - 2, caught=bits(0), held=0)
+    yield from world.attempt(1, [0.0, 3.0], outcome=Outcome.DROPPED, hits=RAYS - 2, engaged=bits(0), attached=0)
     world.look(0)
     yield
     yield from world.attempt(
-        2, [0.0, 2.0, 1.0, 1.0], outcome=Outcome.OTHER_PICKED, hits=1, caught=bits(0, 2), held=bits(2), catalog_index=[2, -1, -1, 1]
+        2, [0.0, 2.0, 1.0, 1.0], outcome=Outcome.OTHER_PICKED, hits=1, engaged=bits(0, 2), attached=bits(2), catalog_index=[2, -1, -1, 1]
     )
     world.look(3)
     yield
     # Instance 3 falls beside the tote in the meantime.
     world.catalog_index[0, 3] = -1
-    yield from world.attempt(3, [0.0, 0.0], outcome=Outcome.NOTHING_CAUGHT, hits=0, caught=0, held=0)
+    yield from world.attempt(3, [0.0, 0.0], outcome=Outcome.NOTHING_CAUGHT, hits=0, engaged=0, attached=0)
     world.look(-1)
     yield
     # The columns still tell of the attempt before.
-    world.now(hits=RAYS, caught=bits(0))
+    world.now(hits=RAYS, engaged=bits(0))
     world.nothing_seen(4)
     world.over(Ending.GAVE_UP)
     yield
@@ -54,7 +54,7 @@ def redrawn(world: World) -> Ticks:
     world.first_frame()
     world.look(0)
     yield
-    yield from world.attempt(0, [0.0, 6.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, caught=1, held=1, catalog_index=[-1, 1, -1, -1])
+    yield from world.attempt(0, [0.0, 6.0], outcome=Outcome.TARGET_PICKED, hits=RAYS, engaged=1, attached=1, catalog_index=[-1, 1, -1, -1])
     world.look(1)
     yield
     world.frame(task=Task.APPROACH, attempt=1)
@@ -65,7 +65,7 @@ def redrawn(world: World) -> Ticks:
     world.first_frame()
     world.look(2)
     yield
-    yield from world.attempt(0, [0.0, 4.0], outcome=Outcome.DROPPED, hits=RAYS, caught=bits(2), held=0)
+    yield from world.attempt(0, [0.0, 4.0], outcome=Outcome.DROPPED, hits=RAYS, engaged=bits(2), attached=0)
     world.over(Ending.GAVE_UP)
     yield
     world.settle(9, 19, Mode.TARGET, [0, -1, -1, -1])
@@ -114,13 +114,13 @@ def test_every_attempt_has_its_outcome_once(mixed):
     # An attempt begins in the frame in which the one before ended.
     assert [one.frame for one in attempts] == [0, 6, 11, 18, 23]
     assert [one.end_frame for one in attempts] == [6, 11, 18, 23, 24]
-    assert [one.load for one in attempts] == [(0.0, 9.0, 8.0), (0.0, 3.0), (0.0, 2.0, 1.0, 1.0), (0.0, 0.0), ()]
+    assert [one.peak_force for one in attempts] == [(0.0, 9.0, 8.0), (0.0, 3.0), (0.0, 2.0, 1.0, 1.0), (0.0, 0.0), ()]
     assert {(one.episode, one.mode, one.rays) for one in attempts} == {(5, "pick", RAYS)}
 
 
 def test_caught_and_picked_are_the_attempts_own(mixed):
     attempts = by_number(mixed)[5].attempts
-    assert [one.caught for one in attempts] == [(0, 1), (0,), (0, 2), (), ()]
+    assert [one.engaged for one in attempts] == [(0, 1), (0,), (0, 2), (), ()]
     assert [one.picked for one in attempts] == [(1,), (), (2,), (), ()]
     assert [one.hits for one in attempts] == [RAYS, RAYS - 2, 1, 0, 0]
     assert [one.good_seal for one in attempts] == [True, False, False, False, False]
@@ -132,16 +132,16 @@ def test_an_attempt_keeps_what_its_own_look_saw(mixed):
     attempts = by_number(mixed)[5].attempts
     assert [one.point for one in attempts] == [(number,) * 3 for number in (1.0, 2.0, 3.0, 4.0)] + [None]
     assert [one.tilt for one in attempts] == [1.0, 2.0, 3.0, 4.0, None]
-    assert [one.sight.instances[0].share for one in attempts] == [1.0, 2.0, 3.0, 4.0, 5.0]
-    present = [[seen.instance for seen in one.sight.instances] for one in attempts]
+    assert [one.observation.instances[0].visible_fraction for one in attempts] == [1.0, 2.0, 3.0, 4.0, 5.0]
+    present = [[seen.instance for seen in one.observation.instances] for one in attempts]
     assert present == [[0, 1, 2, 3], [0, 2, 3], [0, 2, 3], [0, 3], [0]]
-    assert attempts[0].sight.instances[0].object_id == 21
+    assert attempts[0].observation.instances[0].object_id == 21
 
 
 def test_a_look_that_found_nothing_has_no_grasp(mixed):
     record = json.loads(by_number(mixed)[5].attempts[-1].line())
     assert all(record[key] is None for key in ("target", "object_id", "point", "normal", "yaw", "tilt"))
-    assert (record["hits"], record["good_seal"], record["caught"], record["picked"], record["load"]) == (0, False, [], [], [])
+    assert (record["hits"], record["good_seal"], record["engaged"], record["picked"], record["peak_force"]) == (0, False, [], [], [])
 
 
 def test_objects_are_accounted_for(mixed):
@@ -170,12 +170,12 @@ def test_the_last_of_32_instances_is_a_bit_like_the_others(device):
         world.first_frame()
         world.look(0)
         yield
-        yield from world.attempt(0, [0.0], outcome=Outcome.OTHER_PICKED, hits=1, caught=bits(0, 31), held=bits(31))
+        yield from world.attempt(0, [0.0], outcome=Outcome.OTHER_PICKED, hits=1, engaged=bits(0, 31), attached=bits(31))
         world.over(Ending.GAVE_UP)
         yield
 
     (record,) = run((world, script())).values()
-    assert (record.attempts[0].caught, record.attempts[0].picked) == ((0, 31), (31,))
+    assert (record.attempts[0].engaged, record.attempts[0].picked) == ((0, 31), (31,))
 
 
 @pytest.mark.parametrize(("hits", "tolerated", "good"), [(RAYS, 0, True), (RAYS - 1, 0, False), (RAYS - 2, 2, True), (0, RAYS - 1, False)])
@@ -187,17 +187,17 @@ def test_a_good_seal(device, hits, tolerated, good):
         world.first_frame()
         world.look(0)
         yield
-        yield from world.attempt(0, [0.0], outcome=Outcome.DROPPED, hits=hits, held=0)
+        yield from world.attempt(0, [0.0], outcome=Outcome.DROPPED, hits=hits, attached=0)
         world.over(Ending.GAVE_UP)
         yield
 
-    log = AttemptLog(settings(suction__tolerated_misses=tolerated).suction, CONFIG.sight.resolution, OBJECT_IDS)
+    log = AttemptLog(settings(suction__tolerated_misses=tolerated).suction, CONFIG.perception.resolution, OBJECT_IDS)
     (record,) = play({world: script()}, log).values()
     assert record.attempts[0].good_seal is good
 
 
 def test_missing_reports_are_noticed(device):
-    world, log = new_world(device), AttemptLog(CONFIG.suction, CONFIG.sight.resolution, OBJECT_IDS)
+    world, log = new_world(device), AttemptLog(CONFIG.suction, CONFIG.perception.resolution, OBJECT_IDS)
     world.settle(3, 0, Mode.PICK, [0, 1, 2, 0])
     world.first_frame()
     world.look(0)
@@ -227,7 +227,7 @@ def test_worlds_do_not_disturb_each_other(device, plans):
             world.look(0 if seen else -1)
             yield
             if seen:
-                yield from world.attempt(number, loads, outcome=outcome, held=0)
+                yield from world.attempt(number, loads, outcome=outcome, attached=0)
             else:
                 world.nothing_seen(number)
             last = frame + (3 + len(loads) if seen else 1)
@@ -239,7 +239,9 @@ def test_worlds_do_not_disturb_each_other(device, plans):
 
     made = [new_world(device) for _ in plans]
     found = run(*((world, script(world, episode, *plan)) for episode, (world, plan) in enumerate(zip(made, plans, strict=True))))
-    records = {episode: [(a.attempt, a.outcome, a.frame, a.end_frame, a.load) for a in one.attempts] for (_, episode), one in found.items()}
+    records = {
+        episode: [(a.attempt, a.outcome, a.frame, a.end_frame, a.peak_force) for a in one.attempts] for (_, episode), one in found.items()
+    }
     assert records == expected
 
 

@@ -37,7 +37,7 @@ TINY = {
     "physics.iterations": 6,
     "move.speed": 4.0,
 }
-PICKING = SHORT | {"arrangement__max_objects": 2, "bake__episodes": 2, "pick__failures": 1, "sight__resolution": [160, 90]}
+PICKING = SHORT | {"arrangement__max_objects": 2, "bake__episodes": 2, "pick__failures": 1, "perception__resolution": [160, 90]}
 
 
 def tiny(**overrides: object):
@@ -144,7 +144,7 @@ def test_the_list_of_episodes_is_right(baked):
     assert {row["sentence"] for row in rows} == {Ending.FINISHED.sentence}
     tick = baked.config.physics.step * baked.config.physics.steps_per_tick
     for row, known in zip(rows, baked.summary.episodes, strict=True):
-        assert (row["redraw"], row["frames"]) == (known.redraw, known.frames)
+        assert (row["arrangement"], row["frames"]) == (known.arrangement, known.frames)
         assert row["seconds"] == pytest.approx((row["frames"] - 1) * tick, abs=1e-6)
         assert (row["mode"], row["attempts"], row["picked"]) == ("move", 0, 0)
         assert row["objects"] == row["left"] + row["lost"] > 0
@@ -246,14 +246,14 @@ def test_what_was_picked_is_in_the_truth_until_then(picked):
     for attempt in records(picked, "attempts"):
         scene = truth(picked.scenes()[CAMERAS * attempt["episode"]], "scene_gt")
         there = [{row["instance_id"]: row["obj_id"] for row in scene[attempt[name]]} for name in ("frame", "end_frame")]
-        assert there[0] == {seen["instance"]: seen["object_id"] for seen in attempt["sight"]["instances"]}
+        assert there[0] == {seen["instance"]: seen["object_id"] for seen in attempt["observation"]["instances"]}
         assert set(there[0]) - set(there[1]) >= set(attempt["picked"])
         if attempt["target"] is not None:
             assert there[0][attempt["target"]] == attempt["object_id"]
 
 
 def test_attempts_are_the_same_in_any_number_of_worlds(picked, tmp_path):
-    other = Baked(tmp_path / "other", **PICKING | {"bake__worlds": 1, "sight__views": 1})
+    other = Baked(tmp_path / "other", **PICKING | {"bake__worlds": 1, "perception__views": 1})
     assert {name for name, _ in other.files().items() ^ picked.files().items()} == {"config.toml"}
 
 
@@ -322,7 +322,7 @@ def test_drawn_again_and_counted(tmp_path):
     config = tiny(settle__max_time=0.1, settle__tries=2, bake__episodes=1, bake__worlds=1)
     summary = run_bake(config, tmp_path / "set", Notes())
     assert (summary.redraws, summary.redrawn) == (1, {Ending.UNSETTLED: 1})
-    assert [(row.episode, row.redraw, row.ending) for row in summary.episodes] == [(0, 1, Ending.UNSETTLED)]
+    assert [(row.episode, row.arrangement, row.ending) for row in summary.episodes] == [(0, 1, Ending.UNSETTLED)]
     advice = "raise settle.max_time (0.1) or settle.max_redrops (8)"
     assert noted == [f"episode 0, arrangement 1: {Ending.UNSETTLED.sentence}; {advice}"]
     assert summary.remedies == {Ending.UNSETTLED: advice}

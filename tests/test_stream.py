@@ -296,7 +296,7 @@ def test_a_report_has_every_array_under_its_name(device):
     assert report.observation.grasp_pixel.dtype == np.int32
     assert report.observation.above.dtype == np.uint32
     assert report.plan.point.shape == (WORLDS, 3)
-    assert report.measure("load").tolist() == list(range(WORLDS))
+    assert report.measure("peak_force").tolist() == list(range(WORLDS))
 
 
 def test_a_host_copy_is_the_array_itself_on_the_cpu_and_a_copy_on_a_gpu(device):

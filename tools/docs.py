@@ -78,7 +78,7 @@ resolved configuration is stored in each data set as `config.toml`.
 | `suction.poor_force` | 2 N | 0.2 N |
 | `bop.coco` | true | false |
 
-`smoke` sets `bake.mode` to move with 2 worlds and 2 episodes, 320x180 images (perception: 640x360, with `sight` scaled along), a volume
+`smoke` sets `bake.mode` to move with 2 worlds and 2 episodes, 320x180 images (perception: 640x360, its settings scaled along), a volume
 budget of 3 l, one round of stirring at 0.4 m/s, and PNG images in a split named `train`.
 
 ## Object table

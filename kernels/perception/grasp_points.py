@@ -164,9 +164,9 @@ def choose_grasp_points_kernel(
     grasp_pixel_out: wp.array2d[wp.vec2i],  # (world, instance) [px]
     depth_out: wp.array2d[float],  # (world, instance) [m]
 ):
-    """Grasp point: of centroid and midpoint the one with the larger r = distance / pole's distance if r > center_share; else the pole.
+    """Grasp point: of centroid and midpoint the one with the larger r = distance / pole's distance if r > center_fraction; else the pole.
 
-    The centroid wins ties. For objects above heavy_mass [kg] the threshold is heavy_center_share (Periyasamy et al., 2021). Writes the
+    The centroid wins ties. For objects above heavy_mass [kg] the threshold is heavy_center_fraction (Periyasamy et al., 2021). Writes the
     midpoint, the pixel of the grasp point and its planar depth; (-1, -1) and depth 0 for instances that are not visible.
     """
     view, instance = wp.tid()
@@ -178,9 +178,9 @@ def choose_grasp_points_kernel(
         grasp_pixel_out[world, instance] = wp.vec2i(-1, -1)
         depth_out[world, instance] = 0.0
         return
-    threshold = perception.center_share
+    threshold = perception.center_fraction
     if catalog.mass[catalog_index[world, instance]] > perception.heavy_mass:
-        threshold = perception.heavy_center_share
+        threshold = perception.heavy_center_fraction
     d = distances[world, instance]
     point = centroid[world, instance]
     ratio = d[1] / d[0]

@@ -188,7 +188,7 @@ def sample_lights_kernel(
         return
     key = stream_key(seed, arrangement_id[world][0], arrangement_id[world][1], Stream.LIGHT)
     light_out[world] = uniform_index(key, 0, drop.lights)
-    light_yaw_out[world] = TAU * uniform(key, 1) * float(drop.turn_lights)
+    light_yaw_out[world] = TAU * uniform(key, 1) * float(drop.random_yaw)
     light_exposure_out[world] = drop.exposure_spread * (2.0 * uniform(key, 2) - 1.0)
 
 

@@ -158,7 +158,9 @@ def print_profile(console: Console, recorder: Recorder) -> None:
 def _listing(rows: Sequence[EpisodeRow]) -> Table:
     """Table with one line per episode."""
     columns = ["episode", "mode", "ending", "redraws", "frames", "time"]
-    cells = [[str(row.episode), row.mode, row.ending.sentence, str(row.redraw), str(row.frames), _duration(row.seconds)] for row in rows]
+    cells = [
+        [str(row.episode), row.mode, row.ending.sentence, str(row.arrangement), str(row.frames), _duration(row.seconds)] for row in rows
+    ]
     if any(row.attempts for row in rows):
         columns += ["attempts", "picked", "lost"]
         for row, line in zip(rows, cells, strict=True):

@@ -45,7 +45,7 @@ FREE_SETTINGS = (
     "bake.lights",
     "bake.writers",
     "render.views_per_batch",
-    "sight.views",
+    "perception.views",
 )
 """Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
 of their folder. A device of another type computes the same episodes up to rounding."""

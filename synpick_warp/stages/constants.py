@@ -81,7 +81,7 @@ def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, l
             press_steps=math.ceil(config.pick.press_time / physics.step),
             tilt_limit=math.radians(gripper.tilt_limit),
         ),
-        fill(structs.PerceptionData, config.sight),
+        fill(structs.PerceptionData, config.perception),
         _suction_data(config.suction, gripper, physics.step),
         wp.array(np.array(built.layout.guide_shapes, dtype=np.int32), device=device),
     )
@@ -158,9 +158,9 @@ def _settle_data(settle: Settle, tick: float) -> structs.SettleData:
         min_ticks=math.ceil(settle.min_time / tick),
         max_ticks=math.ceil(settle.max_time / tick),
         stuck_ticks=math.ceil(settle.stuck_time / tick),
-        late_ticks=math.ceil(settle.late_time / tick),
-        rest_threshold=settle.rest_shift,
-        relaxed_rest_threshold=settle.last_shift,
+        late_ticks=math.ceil(settle.relax_time / tick),
+        rest_threshold=settle.rest_displacement,
+        relaxed_rest_threshold=settle.relaxed_displacement,
     )
 
 

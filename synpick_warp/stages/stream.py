@@ -74,11 +74,11 @@ class TickReport:
     """Arrays (world, step, ...) for `TickBatch.steps`, likewise."""
 
     def column(self, name: str) -> np.ndarray:
-        """Column of the status rows by its name in data sets, such as "phase" or "held" (world) int32."""
+        """Column of the status rows by its name, such as "phase" or "attached" (world) int32."""
         return self.status[:, column_names(Status)[name]]
 
     def measure(self, name: str) -> np.ndarray:
-        """Column of the measures by its name in data sets, such as "load" (world) float32."""
+        """Column of the measures by its name, such as "peak_force" (world) float32."""
         return self.measures[:, column_names(Measure)[name]]
 
 

@@ -169,9 +169,9 @@ def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Conf
     _draw_key(sheet, columns[0], top + image.shape[0] + 24)
     plot = draw_load(attempt, config, IMAGE_WIDTH, height - image.shape[0] - 2 * LINE - MARGIN)
     _paste(sheet, plot, columns[0], top + height - plot.shape[0])
-    states = {edge.state for edge in clutter_edges(attempt, config.sight.min_votes)}
+    states = {edge.state for edge in clutter_edges(attempt, config.perception.min_votes)}
     foot = _graph_foot(states) if attempt.seen else []
-    _paste(sheet, draw_graph(attempt, config.sight.min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
+    _paste(sheet, draw_graph(attempt, config.perception.min_votes, (_GRAPH_WIDTH, height - LINE * len(foot))), columns[1], top)
     for number, (text, color) in enumerate(foot):
         put_text(sheet, text, (columns[1], top + height - LINE * (len(foot) - 1 - number) - 6), SMALL, color)
     _paste(sheet, words, columns[2], top)
@@ -203,7 +203,7 @@ def _draw_image(attempt: Attempt, scene: _Scene) -> Image:
         _draw_contours(drawn, color, mask, instance, instance == attempt.target)
     short = labels(attempt)
     for one in attempt.seen:
-        places = [to_color_image(point, attempt.resolution, (width, height)) for point in (*one.candidates, one.suction)]
+        places = [to_color_image(point, attempt.resolution, (width, height)) for point in (*one.candidates, one.grasp_pixel)]
         points = [(scale * (x + 0.5) - 0.5, scale * (y + 0.5) - 0.5) for x, y in places]
         target = one.instance == attempt.target
         for kind, point in enumerate(points[:-1]):

@@ -97,7 +97,7 @@ def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> L
     """
     width, height = size
     kept = [(edge.upper, edge.lower) for edge in edges if edge.state == KEPT]
-    place: dict[Key, float] = {one.instance: one.suction[0] / attempt.resolution[0] for one in attempt.seen}
+    place: dict[Key, float] = {one.instance: one.grasp_pixel[0] / attempt.resolution[0] for one in attempt.seen}
     depth = _assign_layers(attempt, kept, place, max(1, int((width - 2 * _MARGIN) // (2 * RADIUS + _MIN_GAP)) + 1))
     layers: list[list[Key]] = [[] for _ in range(1 + max(depth.values(), default=-1))]
     for instance, layer in depth.items():
@@ -241,7 +241,7 @@ def _draw_node(canvas: Image, place: tuple[float, float], label: str, one: SeenO
     badge = x + 0.8 * RADIUS, y - 0.8 * RADIUS
     disc(canvas, badge, 8.5, INK)
     disc(canvas, badge, 7.5, WHITE)
-    put_centered(canvas, str(len(one.all_above)), badge, 0.36, INK, 1)
+    put_centered(canvas, str(len(one.ancestors)), badge, 0.36, INK, 1)
 
 
 def _draw_arrow(canvas: Image, route: np.ndarray, color: tuple[int, int, int], thickness: int, dashed: bool = False) -> None:

@@ -58,7 +58,7 @@ def _draw_table(canvas: Image, attempt: Attempt, names: Mapping[int, str], top: 
         disc(canvas, (8, y - 5), 6, instance_color(one.instance))
         name = fitted(f"{short[one.instance]} {names.get(one.object_id, '')}", TEXT, _COLUMNS[1][0] - 30)
         kind = ("pole", "centr.", "half")[suction_kind(one)]
-        cells = ((22, name), (244, f"{len(one.all_above)}"), (296, f"{one.share:.2f}"), (356, f"{one.visible}"), (416, kind))
+        cells = ((22, name), (244, f"{len(one.ancestors)}"), (296, f"{one.visible_fraction:.2f}"), (356, f"{one.visible}"), (416, kind))
         for x, text in cells:
             put_text(canvas, text, (x, y), TEXT, INK, 2 if target and x == 22 else 1)
 
@@ -94,12 +94,12 @@ def draw_load(attempt: Attempt, config: Config, width: int, height: int) -> Imag
     put_text(canvas, "seal force [N] (the largest, if several)", (0, 14), TEXT, SOFT)
     cv2.line(canvas, (left, bottom), (right, bottom), INK, 1)
     cv2.line(canvas, (left, top), (left, bottom), INK, 1)
-    if not attempt.load or not attempt.hits:
+    if not attempt.peak_force or not attempt.hits:
         put_text(canvas, "no force: nothing was engaged", (left + 20, (top + bottom) // 2), TEXT, SOFT)
         return canvas
     tick = config.physics.step * config.physics.steps_per_tick
     limit = break_force(attempt, config)
-    span, peak = tick * max(1, len(attempt.load) - 1), 1.12 * max(limit, *attempt.load)
+    span, peak = tick * max(1, len(attempt.peak_force) - 1), 1.12 * max(limit, *attempt.peak_force)
 
     def place(time: float, load: float) -> tuple[float, float]:
         return left + (right - left) * time / span, bottom - (bottom - top) * load / peak
@@ -117,7 +117,7 @@ def draw_load(attempt: Attempt, config: Config, width: int, height: int) -> Imag
     y = round(place(0.0, limit)[1])
     cv2.line(canvas, (left, y), (right, y), RED, 2)
     put_text(canvas, f"breaks at {limit:g} N", (left + 8, y - 6), SMALL, RED)
-    points = [place(tick * number, load) for number, load in enumerate(attempt.load)]
+    points = [place(tick * number, load) for number, load in enumerate(attempt.peak_force)]
     cv2.polylines(canvas, [fixed(np.array(points))], False, _BLUE, 2, cv2.LINE_AA, 4)
     for point in points:
         disc(canvas, point, 3, _BLUE)

@@ -14,7 +14,7 @@ from synpick_warp.dataset.manifest import ATTEMPTS_FILE
 from synpick_warp.errors import DatasetError
 
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
-CANDIDATES = ("pole", "centroid", "middle")
+CANDIDATES = ("pole", "centroid", "midpoint")
 """Candidates of the suction point, in the order of `SeenObject.distances`."""
 
 Pixel = tuple[float, float]
@@ -29,16 +29,16 @@ class SeenObject:
     object_id: int
     visible: int
     """Pixel count of its largest connected component."""
-    share: float
+    visible_fraction: float
     """Visible fraction of the expected area."""
     candidates: tuple[Pixel, Pixel, Pixel]
     """Positions of `CANDIDATES`."""
     distances: tuple[float, float, float]
     """Distance of each candidate to the contour [px]."""
-    suction: Pixel
+    grasp_pixel: Pixel
     above: frozenset[int]
     """Parents: instances with an edge of the clutter graph to this one."""
-    all_above: frozenset[int]
+    ancestors: frozenset[int]
     """Ancestors: instances with a path to this one (transitive closure)."""
 
 
@@ -60,9 +60,9 @@ class Attempt:
     rays: int
     hits: int
     good_seal: bool
-    caught: tuple[int, ...]
+    engaged: tuple[int, ...]
     picked: tuple[int, ...]
-    load: tuple[float, ...]
+    peak_force: tuple[float, ...]
     """Largest seal force in each tick of the lift [N]; the suction is switched on at the end of the first."""
     resolution: tuple[int, int]
     """Width and height of the perception image [px]."""
@@ -78,7 +78,7 @@ class Attempt:
     def ranked(self) -> list[SeenObject]:
         """Rank by the choice rule: fewest ancestors, then largest visible fraction; in targeted picking the reverse."""
         sign = -1 if self.mode == "target" else 1
-        return sorted(self.seen, key=lambda one: (sign * len(one.all_above), -sign * one.share, one.instance))
+        return sorted(self.seen, key=lambda one: (sign * len(one.ancestors), -sign * one.visible_fraction, one.instance))
 
 
 def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attempt]:
@@ -145,11 +145,11 @@ def _which(what: str, numbers: list[int]) -> str:
 
 def _attempt(record: dict[str, Any]) -> Attempt:
     """Parse and validate the record of an attempt."""
-    sight = record["sight"]
-    width, height = map(int, sight["resolution"])
+    observation = record["observation"]
+    width, height = map(int, observation["resolution"])
     if min(width, height) < 1:
         raise ValueError(f"resolution is {width} x {height}")
-    seen = tuple(_seen(one) for one in sight["instances"] if one["visible"] > 0)
+    seen = tuple(_seen(one) for one in observation["instances"] if one["visible"] > 0)
     target = None if record["target"] is None else int(record["target"])
     if target is not None and target not in {one.instance for one in seen}:
         raise ValueError(f"target is {target}, which was not visible")
@@ -167,12 +167,12 @@ def _attempt(record: dict[str, Any]) -> Attempt:
         rays=int(record["rays"] or 0),
         hits=int(record["hits"] or 0),
         good_seal=bool(record["good_seal"]),
-        caught=tuple(map(int, record["caught"])),
+        engaged=tuple(map(int, record["engaged"])),
         picked=tuple(map(int, record["picked"])),
-        load=tuple(map(_finite, record["load"])),
+        peak_force=tuple(map(_finite, record["peak_force"])),
         resolution=(width, height),
         seen=seen,
-        votes={(int(lower), int(upper)): _finite(votes) for lower, upper, votes in sight["votes"]},
+        votes={(int(lower), int(upper)): _finite(votes) for lower, upper, votes in observation["votes"]},
     )
 
 
@@ -182,12 +182,12 @@ def _seen(record: dict[str, Any]) -> SeenObject:
         instance=int(record["instance"]),
         object_id=int(record["object_id"]),
         visible=int(record["visible"]),
-        share=float(record["share"]),
-        candidates=(_pixel(record["pole"]), _pixel(record["centroid"]), _pixel(record["middle"])),
+        visible_fraction=float(record["visible_fraction"]),
+        candidates=(_pixel(record["pole"]), _pixel(record["centroid"]), _pixel(record["midpoint"])),
         distances=(first, second, third),
-        suction=_pixel(record["suction"]),
+        grasp_pixel=_pixel(record["grasp_pixel"]),
         above=frozenset(map(int, record["above"])),
-        all_above=frozenset(map(int, record["all_above"])),
+        ancestors=frozenset(map(int, record["ancestors"])),
     )
 
 
@@ -223,7 +223,7 @@ def full_names(attempt: Attempt, names: Mapping[int, str]) -> dict[int, str]:
 
 def suction_kind(one: SeenObject) -> int:
     """Index of the candidate that became the suction point: the nearest, as the point is rounded to a pixel."""
-    return min(range(len(CANDIDATES)), key=lambda kind: math.dist(one.candidates[kind], one.suction))
+    return min(range(len(CANDIDATES)), key=lambda kind: math.dist(one.candidates[kind], one.grasp_pixel))
 
 
 def choice_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> list[str]:
@@ -241,19 +241,19 @@ def choice_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> 
 
 def _reason(attempt: Attempt, one: SeenObject, full: Mapping[int, str], config: Config) -> str:
     targeted = attempt.mode == "target"
-    count = len(one.all_above)
+    count = len(one.ancestors)
     above = f"{count} object{'' if count == 1 else 's'} above"
     first = attempt.ranked()[0]
-    if first.share != one.share or len(first.all_above) != count:
+    if first.visible_fraction != one.visible_fraction or len(first.ancestors) != count:
         if targeted and config.target.random_after_failure:
             return f"{above}; chosen at random after a failed attempt"
         return f"{above}; the rule would name {full[first.instance]}"
-    equals = sum(len(other.all_above) == count for other in attempt.seen)
+    equals = sum(len(other.ancestors) == count for other in attempt.seen)
     if len(attempt.seen) == 1:
         return f"{above}; the only visible object"
     if equals == 1:
         return f"{above}, the {'most' if targeted else 'fewest'} of all"
-    return f"{above}; visible fraction {one.share:.2f}, the {'smallest' if targeted else 'largest'} of {equals} such"
+    return f"{above}; visible fraction {one.visible_fraction:.2f}, the {'smallest' if targeted else 'largest'} of {equals} such"
 
 
 def seal_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> list[str]:
@@ -264,8 +264,8 @@ def seal_words(attempt: Attempt, names: Mapping[int, str], config: Config) -> li
     lines = [f"rays: {attempt.hits} of {attempt.rays} hit"]
     if attempt.hits:
         lines[0] += f"; {'good' if attempt.good_seal else 'poor'} seal, breaks at {break_force(attempt, config):g} N"
-        peak = f"; largest force {max(attempt.load):.1f} N" if attempt.load else ""
-        lines.append(f"engaged: {_listed(attempt.caught, full)}{peak}")
+        peak = f"; largest force {max(attempt.peak_force):.1f} N" if attempt.peak_force else ""
+        lines.append(f"engaged: {_listed(attempt.engaged, full)}{peak}")
         lines.append(f"picked: {_listed(attempt.picked, full)}")
     return lines
 

@@ -77,7 +77,7 @@ def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
 
 def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, capsys):
     bakes.result = finished(2)
-    bakes.result.episodes[1] = bakes.result.episodes[1]._replace(redraw=19, ending=Ending.UNSETTLED, frames=0)
+    bakes.result.episodes[1] = bakes.result.episodes[1]._replace(arrangement=19, ending=Ending.UNSETTLED, frames=0)
     assert main(["bake", "--out", str(tmp_path / "a"), "--device", "cpu", "--episodes", "2"]) == 1
     assert "did not come to rest" in capsys.readouterr().out
 

@@ -15,8 +15,8 @@ from synpick_warp.episodes import BakeSummary, EpisodeRow
 from synpick_warp.progress import Progress, SilentProgress
 
 
-def row(episode: int, redraw: int, ending: Ending, frames: int, seconds: float, mode: str = "move", *counts: int) -> EpisodeRow:
-    return EpisodeRow(episode, redraw, ending, frames, seconds, mode, *(counts or (9, 0, 0, 0, 9)))
+def row(episode: int, arrangement: int, ending: Ending, frames: int, seconds: float, mode: str = "move", *counts: int) -> EpisodeRow:
+    return EpisodeRow(episode, arrangement, ending, frames, seconds, mode, *(counts or (9, 0, 0, 0, 9)))
 
 
 def printed(summary: BakeSummary) -> str:
@@ -52,9 +52,9 @@ def test_a_bake_that_picked_tells_of_attempts():
 
 def test_a_summary_names_the_settings_that_cure_its_endings():
     text = printed(
-        BakeSummary(1, [row(0, 1, Ending.FINISHED, 9, 1.0)], remedies={Ending.SIGHT_OVERFLOW: "raise sight.contour_points (16)"})
+        BakeSummary(1, [row(0, 1, Ending.FINISHED, 9, 1.0)], remedies={Ending.SIGHT_OVERFLOW: "raise perception.contour_points (16)"})
     )
-    assert "sight overflow: raise sight.contour_points (16)" in text.splitlines()
+    assert "sight overflow: raise perception.contour_points (16)" in text.splitlines()
 
 
 def test_a_long_bake_lists_counts_and_failures():

@@ -100,9 +100,9 @@ def test_the_smoke_preset_stirs_few_objects_in_small_images():
     changed = {key for key, value in smoke.items() if value != paper[key]}
     assert (paper["bake.mode"], smoke["bake.mode"]) == ("pick", "move")
     # Physics and the rules of picking are the paper's; settings in pixels shrink with the image.
-    assert {key.split(".")[0] for key in changed} == {"bake", "cameras", "arrangement", "move", "sight", "bop"}
-    assert {key for key in changed if key.startswith("sight.")} == {
-        f"sight.{name}" for name in ("resolution", "contour_points", "contour_offset", "min_votes", "normal_window")
+    assert {key.split(".")[0] for key in changed} == {"bake", "cameras", "arrangement", "move", "perception", "bop"}
+    assert {key for key in changed if key.startswith("perception.")} == {
+        f"perception.{name}" for name in ("resolution", "contour_points", "contour_offset", "min_votes", "normal_window")
     }
 
 
@@ -151,7 +151,7 @@ def test_whole_numbers_are_allowed_for_floats():
         ("bake.mode", "mvoe", 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed; did you mean move?'),
         ("bake.mix", [1, -1, 1], "bake.mix is [1, -1, 1] on the command line; allowed: each at least 0, at most 1000"),
         ("bake.mix", [1, 1], "bake.mix is [1, 1] on the command line; allowed: 3 numbers in a list"),
-        ("sight.exact_cycle", 13, "sight.exact_cycle is 13 on the command line; allowed: at least 2, at most 12"),
+        ("perception.exact_cycle", 13, "perception.exact_cycle is 13 on the command line; allowed: at least 2, at most 12"),
         ("suction.rays", 2, "suction.rays is 2 on the command line; allowed: at least 3, at most 64"),
         ("cameras.resolution", [0, 0], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
         ("cameras.resolution", [640], "cameras.resolution is [640] on the command line; allowed: 2 whole numbers in a list [px]"),
@@ -269,7 +269,7 @@ def test_values_that_contradict_each_other(overrides, expected):
         {"bake.mode": "mixed", "bake.mix": [0, 0.5, 0]},
         {"pick.near": 1.0, "pick.near_speed": 1.0, "pick.lift_height": 0.2},
         {"suction.radius": 0.021, "suction.tolerated_misses": 9, "suction.poor_force": 40},
-        {"sight.resolution": [640, 160]},
+        {"perception.resolution": [640, 160]},
     ],
 )
 def test_values_at_the_limits_of_their_constraints(overrides):

@@ -142,7 +142,7 @@ def test_motion_is_that_of_the_poses(split):
 
 
 def test_a_gripper_that_was_out_of_the_picture_has_no_motion(tmp_path):
-    picking = SHORT | {"arrangement__max_objects": 2, "bake__episodes": 1, "pick__failures": 1, "sight__resolution": [160, 90]}
+    picking = SHORT | {"arrangement__max_objects": 2, "bake__episodes": 1, "pick__failures": 1, "perception__resolution": [160, 90]}
     split = baked(tmp_path / "set", **picking)
     chosen = {json.loads(line)["frame"] for line in (split.parent / "attempts.jsonl").read_text().splitlines()}
     appeared = 0

@@ -22,7 +22,7 @@ TINY = {
     "bake.formats": ["bop", "shards", "usd", "zarr"],
     "cameras.resolution": [48, 27],
     "render.bounces": 1,
-    "render.cell_paths": 1,
+    "render.coarse_paths": 1,
     "render.layers": ["flow", "depth_sensor"],
     "effects.blur": [0.0, 1.0],
     "effects.shot_noise": [0.0, 0.1],

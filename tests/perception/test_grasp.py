@@ -123,7 +123,7 @@ class GraspHarness:
         self.worlds.scene.pick.tilt_limit = tilt_limit
         self.scene = self.worlds.scene
         self.images: Any = SimpleNamespace(scene=scene, views=batch, bodies=renderer.bodies, gbuffer=renderer.gbuffer)
-        self.planner = GraspPlanner(toy.settings().sight, self.images, self.arrays)
+        self.planner = GraspPlanner(toy.settings().perception, self.images, self.arrays)
 
     def plan_grasps(self) -> Plan:
         self.observation.grasp_pixel.assign(self.grasp_pixel)

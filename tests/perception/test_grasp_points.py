@@ -141,7 +141,7 @@ def test_same_as_reference(seed, mass, shared):
     harness.observe(segments)
     labels = perception.label_components(segments, 2)
     mask = labels == perception.largest_label(labels, segments, 0)
-    expected = perception.choose_grasp_point(mask, mass, harness.config.sight)
+    expected = perception.choose_grasp_point(mask, mass, harness.config.perception)
     found = candidates(harness)
     assert found["pole"].tolist() == expected["pole"].tolist()
     np.testing.assert_allclose(found["centroid"], expected["centroid"], atol=1e-5)

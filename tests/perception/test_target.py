@@ -86,9 +86,9 @@ def test_random_choice_only_after_failures_in_target_mode_if_enabled(device, out
 def test_random_choices_use_their_stream_and_are_uniform(device):
     worlds = 400
     harness = failed(device, worlds, Outcome.DROPPED, 1)
-    redraw = np.arange(worlds) % 2
-    harness.worlds.begin(Phase.ACT, arrangement=redraw)
-    key = rng.stream_key(SEED, np.arange(worlds), redraw, Stream.TARGETS)
+    arrangement = np.arange(worlds) % 2
+    harness.worlds.begin(Phase.ACT, arrangement=arrangement)
+    key = rng.stream_key(SEED, np.arange(worlds), arrangement, Stream.TARGETS)
     index = rng.uniform_index(key, np.arange(worlds) % 3 + 1, 4)
     found = np.array(choose(harness, Mode.TARGET))
     np.testing.assert_array_equal(found, np.array([0, 1, 3, 4])[index])

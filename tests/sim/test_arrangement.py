@@ -64,10 +64,10 @@ def expected_arrangements(worlds: KernelWorlds, seed: int = SEED) -> list[arrang
     ]
 
 
-@given(sizes=catalogs(), seed=st.integers(0, 2**63 - 1), first=st.integers(0, 2**30), redraw=st.integers(0, 20))
-def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, redraw, device):
+@given(sizes=catalogs(), seed=st.integers(0, 2**63 - 1), first=st.integers(0, 2**30), arrangement=st.integers(0, 20))
+def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, arrangement, device):
     worlds = arrangement_worlds(device, WORLDS, **sizes)
-    worlds.begin(Phase.START, first + np.arange(WORLDS), redraw)
+    worlds.begin(Phase.START, first + np.arange(WORLDS), arrangement)
     worlds.set(worlds.state.catalog_index, 99)
     arrange.sample_objects(worlds.scene, worlds.state, seed)
     catalog_index, slot = worlds.state.catalog_index.numpy(), worlds.state.body_slot.numpy()
@@ -98,13 +98,13 @@ def built(device) -> build.BuiltModel:
     return build.build_model(small_worlds.settings(), small_worlds.catalog(), device)
 
 
-def modes(built, device, mode: str, mix: tuple[float, float, float], episodes: np.ndarray, redraw: object = 0) -> np.ndarray:
+def modes(built, device, mode: str, mix: tuple[float, float, float], episodes: np.ndarray, arrangement: object = 0) -> np.ndarray:
     """Mode of each episode, one world an episode, from settings to the device and back."""
     config = small_worlds.settings(bake__mode=mode, bake__mix=list(mix))
     worlds = arrangement_worlds(device, worlds=len(episodes))
     scene = make_scene_data(config, small_worlds.catalog(), built, 1, device)
     worlds.scene = dataclasses.replace(worlds.scene, mode=scene.mode)
-    worlds.begin(Phase.START, episodes, redraw)
+    worlds.begin(Phase.START, episodes, arrangement)
     worlds.set(worlds.state.mode, 99)
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
     return worlds.state.mode.numpy()
@@ -137,8 +137,8 @@ def test_an_episode_keeps_its_mode_in_any_world_and_arrangement(built, device):
     numbers = np.random.default_rng(5)
     for count in (7, 60):
         some = numbers.permutation(episodes)[:count]
-        redraw = numbers.integers(0, 20, count)
-        np.testing.assert_array_equal(modes(built, device, "mixed", mix, some, redraw), expected[some])
+        arrangement = numbers.integers(0, 20, count)
+        np.testing.assert_array_equal(modes(built, device, "mixed", mix, some, arrangement), expected[some])
 
 
 def test_modes_are_drawn_apart_from_objects(device):

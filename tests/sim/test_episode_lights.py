@@ -52,11 +52,11 @@ def test_exposures_are_even_within_their_spread_and_the_episodes_own(device):
     np.testing.assert_array_equal(wide.state.light_yaw.numpy(), worlds.state.light_yaw.numpy())
 
 
-@pytest.mark.parametrize("setting", ["turn_lights", "exposure_spread"])
+@pytest.mark.parametrize("setting", ["random_yaw", "exposure_spread"])
 def test_what_is_not_to_be_drawn_is_zero(device, setting):
     worlds = made(device, **{setting: 0})
     worlds.begin(Phase.START)
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
-    drawn = {"turn_lights": worlds.state.light_yaw, "exposure_spread": worlds.state.light_exposure}
+    drawn = {"random_yaw": worlds.state.light_yaw, "exposure_spread": worlds.state.light_exposure}
     for name, array in drawn.items():
         assert (array.numpy() == 0.0).all() == (name == setting)

@@ -89,11 +89,11 @@ def test_what_is_not_there_is_not_a_number(run, request, device):
         there = (before.catalog_index[0] >= 0) if before.column("phase")[0] in (Phase.SETTLE, Phase.ACT) else (row.catalog_index[0] >= 0)
         for name in names:
             values = steps[name][0]
-            if name.startswith("gripper") or values.shape[1:2] != there.shape or name in ("goal", "impedance_force"):
+            if name.startswith("gripper") or values.shape[1:2] != there.shape or name in ("setpoint", "impedance_force"):
                 continue
             assert np.isfinite(values[:, there]).all(), name
             assert np.isnan(values[:, ~there]).all(), name
-        assert not steps["held"][0][:, ~there].any()
+        assert not steps["attached"][0][:, ~there].any()
         for name in ("gripper_pose", "gripper_velocity", "gripper_contact_force", "gripper_contact_load", "impedance_force"):
             assert np.isfinite(steps[name]).all(), name
 
@@ -105,7 +105,7 @@ def test_momentum_changes_by_contacts_and_weight(run, request, device):
     step = simulation.config.physics.step
     objects = catalog(CUBE, BOX) if run == "moved" else catalog(BOX, CUBE)
     weights = np.repeat(masses(log, objects), simulation.config.physics.steps_per_tick, axis=0)
-    velocity, force, held = log.all("velocity").astype(float), log.all("contact_force").astype(float), log.all("held").astype(bool)
+    velocity, force, held = log.all("velocity").astype(float), log.all("contact_force").astype(float), log.all("attached").astype(bool)
     phase = np.repeat(log.column("phase"), simulation.config.physics.steps_per_tick)
     change = weights[1:, :, None] * (np.diff(velocity, axis=0) / step + [0.0, 0.0, GRAVITY]) - force[1:]
     free = ~held[1:] & ~held[:-1] & (phase[1:] == Phase.ACT)[:, None] & np.isfinite(change).all(axis=2)
@@ -177,7 +177,7 @@ def test_the_force_is_the_impedance_law_of_goal_pose_and_velocity(run, request, 
     law = (section.stiffness, section.damping, section.force, config.gripper.finger_mass + config.gripper.cup_mass, config.physics.step)
     checked = 0
     for row, steps in zip(log.reports, log.steps, strict=True):
-        goal, force = steps["goal"][0], steps["impedance_force"][0]
+        goal, force = steps["setpoint"][0], steps["impedance_force"][0]
         drawn = np.isfinite(goal[:, 0])
         assert not force[~drawn].any()
         place, velocity = steps["gripper_pose"][0, :, 0, :3], steps["gripper_velocity"][0, :, 0]
@@ -192,12 +192,12 @@ def test_the_force_is_the_impedance_law_of_goal_pose_and_velocity(run, request, 
 def test_seal_loads_are_those_of_the_attempts(picked):
     """The largest of a tick's steps is the load that attempts tell of, to the bit; what hangs bears its weight at last."""
     log, _ = picked
-    loads = log.all("seal_load").reshape(len(log.reports), -1)
+    loads = log.all("seal_force").reshape(len(log.reports), -1)
     peak = np.nanmax(np.where(np.isnan(loads), 0.0, loads), axis=1)
-    assert peak.tolist() == [float(row.measure("load")[0]) for row in log.reports]
+    assert peak.tolist() == [float(row.measure("peak_force")[0]) for row in log.reports]
     assert peak.max() > 0.5
-    held = log.all("held").astype(bool)
-    assert not log.all("seal_load")[~held & ~np.isnan(log.all("seal_load"))].any()
+    held = log.all("attached").astype(bool)
+    assert not log.all("seal_force")[~held & ~np.isnan(log.all("seal_force"))].any()
     assert {Task.LIFT, Task.PRESS, Task.DESCEND, Task.APPROACH} <= set(log.all("task").tolist())
     assert set(log.all("task")[held.any(axis=1)].tolist()) == {Task.LIFT}
 
@@ -207,8 +207,8 @@ def test_ticks_say_what_the_status_says(picked):
     for row, ticks in zip(log.reports, log.ticks, strict=True):
         for name in ("phase", "task", "attempt", "outcome", "target", "hits"):
             assert ticks[name][0] == row.column(name)[0]
-        assert ticks["load"][0] == row.measure("load")[0]
-        for name in ("held", "caught"):
+        assert ticks["peak_force"][0] == row.measure("peak_force")[0]
+        for name in ("attached", "engaged"):
             assert (1 << np.flatnonzero(ticks[name][0])).sum() == row.column(name)[0]
             assert ticks[name].shape == row.catalog_index.shape
 

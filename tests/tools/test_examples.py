@@ -28,7 +28,7 @@ TINY = SHORT | {
     "physics__iterations": 6,
     "arrangement__max_objects": 2,
     "pick__failures": 1,
-    "sight__resolution": [160, 90],
+    "perception__resolution": [160, 90],
 }
 
 

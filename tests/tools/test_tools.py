@@ -44,15 +44,15 @@ FEW_STEPS = (
 """Settings: one object per world, and as few steps as bring it to rest."""
 SMALL_IMAGES = (
     "--set",
-    "sight.resolution=[160,90]",
+    "perception.resolution=[160,90]",
     "--set",
-    "sight.contour_points=512",
+    "perception.contour_points=512",
     "--set",
-    "sight.contour_offset=1.5",
+    "perception.contour_offset=1.5",
     "--set",
-    "sight.min_votes=2.0",
+    "perception.min_votes=2.0",
     "--set",
-    "sight.normal_window=2",
+    "perception.normal_window=2",
 )
 """Settings: small images for perception."""
 SHORT_EPISODES = (
@@ -69,7 +69,7 @@ SHORT_EPISODES = (
     "--set",
     "pick.failures=1",
     "--set",
-    "settle.rest_shift=1e-3",
+    "settle.rest_displacement=1e-3",
 )
 """Settings: short picking episodes."""
 
@@ -233,11 +233,11 @@ def test_each_mode_has_its_own_sequences():
 
 def test_failed_arrangements_are_dropped_and_finally_given_up():
     failed = {"phase": Phase.OVER, "live": 0, "ending": Ending.SOLVER_OVERFLOW}
-    resampled = [tick_report({}), tick_report(failed), tick_report({"redraw": 1}), tick_report({"redraw": 1} | OVER)]
+    resampled = [tick_report({}), tick_report(failed), tick_report({"arrangement": 1}), tick_report({"arrangement": 1} | OVER)]
     tally = tally_of(*resampled)
     assert tally.resampled == {"solver_overflow": 1}
     assert tally.sequences("pick")[0].frames == 2
-    tally = tally_of(tick_report({}), tick_report(failed | {"redraw": Config().settle.tries - 1}))
+    tally = tally_of(tick_report({}), tick_report(failed | {"arrangement": Config().settle.tries - 1}))
     assert tally.complete()
     assert tally.sequences("pick") == []
     assert {row.name: row.values["pick"] for row in pick_tally.report(tally)}["given up"] == 1
@@ -252,7 +252,7 @@ def test_speeds_are_reported_by_place():
     (sequence,) = tally_of(tick_report(still), tick_report(moved), tick_report(moved | OVER)).sequences("pick")
     assert sequence.speed == pytest.approx([0.5, 1.0, 2.0], rel=1e-4)
     # Removed objects, and objects of another arrangement, have no speed.
-    (sequence,) = tally_of(tick_report(still | {"redraw": 1}), tick_report(moved | OVER | {"removed": [2]})).sequences("pick")
+    (sequence,) = tally_of(tick_report(still | {"arrangement": 1}), tick_report(moved | OVER | {"removed": [2]})).sequences("pick")
     assert sequence.speed == [0.0, 0.0, 0.0]
 
 

@@ -8,9 +8,9 @@ from synpick_warp.codes import Stream
 from tests.twins import rng
 
 
-def corner_order(seed: int, episode: int, redraw: int, rounds: int) -> list[int]:
+def corner_order(seed: int, episode: int, arrangement: int, rounds: int) -> list[int]:
     """A Fisher-Yates shuffle of the four corners for each round."""
-    key = rng.stream_key(seed, episode, redraw, Stream.CORNERS)
+    key = rng.stream_key(seed, episode, arrangement, Stream.CORNERS)
     order: list[int] = []
     for visit in range(4 * rounds):
         if visit % 4 == 0:

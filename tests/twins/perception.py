@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct
-from synpick_warp.configs.schema import Config, Sight
+from synpick_warp.configs.schema import Config, Perception
 from synpick_warp.kernels import structs
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.stages.perception.arrays import Observation
@@ -29,13 +29,13 @@ class SegmenterHarness:
         config = Config()
         self.config = replace(
             config,
-            sight=replace(config.sight, resolution=(width, height), **settings),
+            perception=replace(config.perception, resolution=(width, height), **settings),
             bake=replace(config.bake, worlds=worlds),
             arrangement=replace(config.arrangement, max_objects=instances),
         )
         camera = make_cameras(replace(config.cameras, resolution=(width, height)))[0]
         self.focal = camera.matrix[[0, 1], [0, 1]]
-        sizes = perception_sizes(self.config.sight, instances, worlds)
+        sizes = perception_sizes(self.config.perception, instances, worlds)
         self.images: Any = SimpleNamespace(
             scene=SimpleNamespace(device=device, cameras=build_cameras((camera,), device), grid=build_grid(width, height)),
             views=allocate_struct(VIEWS, sizes, device),
@@ -48,8 +48,8 @@ class SegmenterHarness:
         catalog, rules = structs.CatalogData(), structs.PerceptionData()
         catalog.mass = wp.zeros(instances, dtype=float, device=device)
         catalog.area = wp.zeros(instances, dtype=float, device=device)
-        for name in ("center_share", "heavy_mass", "heavy_center_share"):
-            setattr(rules, name, getattr(self.config.sight, name))
+        for name in ("center_fraction", "heavy_mass", "heavy_center_fraction"):
+            setattr(rules, name, getattr(self.config.perception, name))
         self.scene: Any = SimpleNamespace(catalog=catalog, perception=rules)
         self.catalog_index = wp.array(np.tile(np.arange(instances), (worlds, 1)), dtype=wp.int32, device=device)
         self.observation = allocate(Observation, world_sizes(self.config, 0), device)
@@ -122,7 +122,7 @@ def centroid(points: np.ndarray) -> np.ndarray:
     return np.array([moments["m10"], moments["m01"]]) / moments["m00"]
 
 
-def choose_grasp_point(mask: np.ndarray, mass: float, rules: Sight) -> dict[str, np.ndarray]:
+def choose_grasp_point(mask: np.ndarray, mass: float, rules: Perception) -> dict[str, np.ndarray]:
     """Pole, centroid, midpoint, their distances to the contour, and the chosen pixel, of a mask with one component."""
     squared = squared_distance(mask)
     row, column = np.unravel_index(np.argmax(squared), mask.shape)
@@ -131,7 +131,7 @@ def choose_grasp_point(mask: np.ndarray, mass: float, rules: Sight) -> dict[str,
     points = [pole, center, np.float32(0.5) * (pole + center)]
     pixels = np.rint(points).astype(int)
     distances = np.sqrt(squared[pixels[:, 1], pixels[:, 0]]).astype(np.float32)
-    threshold = np.float32(rules.heavy_center_share if mass > rules.heavy_mass else rules.center_share)
+    threshold = np.float32(rules.heavy_center_fraction if mass > rules.heavy_mass else rules.center_fraction)
     best = 1 if distances[1] >= distances[2] else 2
     chosen = pixels[best if distances[best] / distances[0] > threshold else 0]
     return {"pole": pole, "centroid": center, "midpoint": points[2], "distances": distances, "grasp_pixel": chosen}

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct
-from synpick_warp.configs.schema import Sight
+from synpick_warp.configs.schema import Perception
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan
 from synpick_warp.stages.perception.plan import GraspPlanner
@@ -97,7 +97,7 @@ class PlannerHarness:
         for name in ("visible", "grasp_pixel", "depth", "visible_fraction"):
             getattr(self.observation, name).assign(self.expected[name])
         self.scene = self.worlds.scene
-        self.planner = GraspPlanner(Sight(exact_cycle=self.scene.perception.exact_cycle), self.images, self.arrays)
+        self.planner = GraspPlanner(Perception(exact_cycle=self.scene.perception.exact_cycle), self.images, self.arrays)
 
     def votes(self) -> np.ndarray:
         """Occlusion votes (V, I, I)."""

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.cli.commands import main
-from synpick_warp.configs.schema import Config, Sight, Target
+from synpick_warp.configs.schema import Config, Perception, Target
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
@@ -49,13 +49,13 @@ def dataset(made, tmp_path) -> Path:
     folder = Path(shutil.copytree(made, tmp_path / "set"))
     boxes = [
         seen_object(2, 7, (50, 38)),
-        seen_object(0, 3, (30, 20), above=[2], all_above=[2]),
-        seen_object(3, 3, (66, 36), above=[2], all_above=[2]),
+        seen_object(0, 3, (30, 20), above=[2], ancestors=[2]),
+        seen_object(3, 3, (66, 36), above=[2], ancestors=[2]),
     ]
-    sight = {"resolution": [96, 72], "instances": boxes, "votes": [[0, 2, 9.0], [3, 2, 12.0], [2, 3, 5.0]]}
+    observation = {"resolution": [96, 72], "instances": boxes, "votes": [[0, 2, 9.0], [3, 2, 12.0], [2, 3, 5.0]]}
     second = record(boxes[::-1], episode=1, attempt=1, frame=1, mode="target", picked=[], sentence="every seal broke during the lift")
     third = nothing_seen(episode=1, attempt=2, frame=1)
-    return write(folder, third, record(boxes, episode=1, sight=sight), second, record(boxes, episode=4))
+    return write(folder, third, record(boxes, episode=1, observation=observation), second, record(boxes, episode=4))
 
 
 def write(folder: Path, *records: dict) -> Path:
@@ -116,7 +116,7 @@ def test_suction_points_are_drawn_where_they_are_at_any_sight_resolution(dataset
     place = (21.0, 52.0)  # Nothing else is drawn there.
     pixel = tuple((value + 0.5) * factor - 0.5 for value in place)
     boxes = [seen_object(2, 7, pixel)]
-    write(dataset, record(boxes, episode=1, sight={"resolution": resolution, "instances": boxes, "votes": []}))
+    write(dataset, record(boxes, episode=1, observation={"resolution": resolution, "instances": boxes, "votes": []}))
     rows, columns = np.nonzero((image_of(drawn(dataset)) == instance_color(2)).all(axis=2))
     x, y = (SCALE * (value + 0.5) - 0.5 for value in place)
     disc = np.hypot(columns - x, rows - y) < 8
@@ -167,7 +167,7 @@ def test_objects_that_come_twice_get_letters():
     assert labels(attempt((seen(0, object_id=4), seen(3, object_id=2), seen(5, object_id=4)), {})) == {0: "4a", 5: "4b", 3: "2"}
 
 
-FIRST, SECOND, THIRD = seen(0, share=0.4), seen(1, share=0.6), seen(2, frozenset({0}), share=0.3)
+FIRST, SECOND, THIRD = seen(0, visible_fraction=0.4), seen(1, visible_fraction=0.6), seen(2, frozenset({0}), visible_fraction=0.3)
 
 
 @pytest.mark.parametrize(
@@ -201,26 +201,26 @@ def test_a_draw_after_a_failure_is_named_where_the_settings_have_it():
     ],
 )
 def test_where_the_suction_point_is(suction, said):
-    one = attempt((seen(0, suction=suction),), {}, 0, tilt=-np.pi / 2)
+    one = attempt((seen(0, grasp_pixel=suction),), {}, 0, tilt=-np.pi / 2)
     assert choice_words(one, NAMES, Config())[1] == said
 
 
 def test_what_the_seal_bore():
-    good = attempt((FIRST, SECOND), {}, 0, caught=(0, 1), picked=(1,), load=(1.0, 6.25, 3.0))
+    good = attempt((FIRST, SECOND), {}, 0, engaged=(0, 1), picked=(1,), peak_force=(1.0, 6.25, 3.0))
     assert seal_words(good, NAMES, Config()) == [
         "rays: 10 of 10 hit; good seal, breaks at 40 N",
         "engaged: 1 tin, 2 box; largest force 6.2 N",
         "picked: 2 box",
     ]
-    poor = attempt((FIRST,), {}, 0, hits=3, good_seal=False, caught=(7,))
+    poor = attempt((FIRST,), {}, 0, hits=3, good_seal=False, engaged=(7,))
     said = ["rays: 3 of 10 hit; poor seal, breaks at 2 N", "engaged: instance 7, unseen", "picked: nothing"]
     assert seal_words(poor, NAMES, Config()) == said
-    assert seal_words(attempt((FIRST,), {}, 0, hits=0, load=(0.0, 0.0)), NAMES, Config()) == ["rays: 0 of 10 hit"]
+    assert seal_words(attempt((FIRST,), {}, 0, hits=0, peak_force=(0.0, 0.0)), NAMES, Config()) == ["rays: 0 of 10 hit"]
     assert seal_words(attempt((), {}), NAMES, Config()) == []
 
 
 def test_a_load_of_half_the_limit_lies_half_way_below_it():
-    plot = draw_load(attempt((FIRST,), {}, 0, load=(20.0,) * 9), Config(), 400, 200)
+    plot = draw_load(attempt((FIRST,), {}, 0, peak_force=(20.0,) * 9), Config(), 400, 200)
     limit = np.flatnonzero((plot[:, 200] == RED).all(axis=1))
     curve = np.flatnonzero((plot[:, 300, 0] > 120) & (plot[:, 300, 2] < 60))
     axis = np.flatnonzero((plot[:, 53] < 80).all(axis=1))
@@ -262,13 +262,13 @@ CIRCLE = {
         ("", r"attempts\.jsonl, line 2 is not JSON: "),
         ("[1]", r"line 2 is not a record of an attempt: it needs integers episode and attempt"),
         ('{"episode": 1, "attempt": "0"}', r"line 2 is not a record of an attempt"),
-        ('{"episode": 1, "attempt": 0}', r"line 2: the record has no sight"),
+        ('{"episode": 1, "attempt": 0}', r"line 2: the record has no observation"),
         (damaged(frame="first"), r"line 2: the record of an attempt has a value of the wrong type: .*'first'"),
         (damaged(mode="move"), r'line 2: .* mode is "move"'),
         (damaged(target=9), r"line 2: .* target is 9, which was not visible"),
-        (damaged(load=[float("inf")]), r"line 2: .* inf is not finite"),
-        (damaged(sight=NO_POLE), r"line 2: .*'NoneType'"),
-        (damaged(sight=CIRCLE), r"the clutter graph of attempt 0 of episode 1 has a cycle"),
+        (damaged(peak_force=[float("inf")]), r"line 2: .* inf is not finite"),
+        (damaged(observation=NO_POLE), r"line 2: .*'NoneType'"),
+        (damaged(observation=CIRCLE), r"the clutter graph of attempt 0 of episode 1 has a cycle"),
         (damaged(frame=77), r"scene_gt\.json has no image 77, which "),
     ],
 )
@@ -318,7 +318,9 @@ def test_what_does_not_exist_is_answered_with_what_does(dataset):
 
 def test_settings_decide_which_votes_make_edges(dataset):
     before = drawn(dataset)
-    (dataset / "config.toml").write_text(config_to_toml(replace(config(split="train", color_format="png"), sight=Sight(min_votes=5.5))))
+    (dataset / "config.toml").write_text(
+        config_to_toml(replace(config(split="train", color_format="png"), perception=Perception(min_votes=5.5)))
+    )
     assert (drawn(dataset) != before).any()
 
 

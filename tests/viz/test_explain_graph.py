@@ -23,7 +23,7 @@ def from_votes(count: int, kept: list[tuple[int, int]], votes: dict[tuple[int, i
     graph = nx.DiGraph(kept)
     graph.add_nodes_from(range(count))
     objects = tuple(
-        seen(i, frozenset(graph.predecessors(i)), frozenset(nx.ancestors(graph, i)), suction=(columns[i], 10.0)) for i in range(count)
+        seen(i, frozenset(graph.predecessors(i)), frozenset(nx.ancestors(graph, i)), grasp_pixel=(columns[i], 10.0)) for i in range(count)
     )
     return attempt(objects, votes, target=0)
 

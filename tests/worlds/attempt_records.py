@@ -8,21 +8,21 @@ from synpick_warp.viz.explain_record import Attempt, SeenObject
 
 
 def seen_object(instance: int, object_id: int, suction: tuple[float, float], **other: Any) -> dict[str, Any]:
-    """An entry of sight.instances; its three candidates lie beside each other, the suction point is the pole."""
+    """An entry of perception.instances; its three candidates lie beside each other, the suction point is the pole."""
     column, row = suction
     entry = {
         "instance": instance,
         "object_id": object_id,
         "visible": 100,
-        "share": 0.5,
+        "visible_fraction": 0.5,
         "pole": [column, row],
         "centroid": [column + 8.0, row],
-        "middle": [column + 4.0, row],
+        "midpoint": [column + 4.0, row],
         "distances": [6.0, 3.0, 5.1],
-        "suction": [column, row],
+        "grasp_pixel": [column, row],
         "depth": 1.4,
         "above": [],
-        "all_above": [],
+        "ancestors": [],
     }
     return entry | other
 
@@ -47,10 +47,10 @@ def record(seen: list[dict[str, Any]], **other: Any) -> dict[str, Any]:
         "rays": 10,
         "hits": 10 if seen else 0,
         "good_seal": bool(seen),
-        "caught": [target] if seen else [],
+        "engaged": [target] if seen else [],
         "picked": [target] if seen else [],
-        "load": [0.0, 20.0, 20.0, 20.0] if seen else [],
-        "sight": {"resolution": [96, 72], "instances": seen, "votes": []},
+        "peak_force": [0.0, 20.0, 20.0, 20.0] if seen else [],
+        "observation": {"resolution": [96, 72], "instances": seen, "votes": []},
     }
     return line | other
 
@@ -82,22 +82,22 @@ def attempt(seen: tuple[SeenObject, ...], votes: dict[tuple[int, int], float], t
         "rays": 10,
         "hits": 10,
         "good_seal": True,
-        "caught": (),
+        "engaged": (),
         "picked": (),
-        "load": (),
+        "peak_force": (),
         "resolution": (96, 72),
     }
     return Attempt(**(values | other), seen=seen, votes=votes)
 
 
-def seen(instance: int, above: frozenset[int] = frozenset(), all_above: frozenset[int] | None = None, **other: Any) -> SeenObject:
+def seen(instance: int, above: frozenset[int] = frozenset(), ancestors: frozenset[int] | None = None, **other: Any) -> SeenObject:
     """A seen object as `read_attempts` returns it; its obj_id is its instance plus 1."""
     values: dict[str, Any] = {
         "object_id": instance + 1,
         "visible": 100,
-        "share": 0.5,
+        "visible_fraction": 0.5,
         "candidates": ((10.0, 10.0), (18.0, 10.0), (14.0, 10.0)),
         "distances": (6.0, 3.0, 5.1),
-        "suction": (10.0, 10.0),
+        "grasp_pixel": (10.0, 10.0),
     }
-    return SeenObject(instance=instance, above=above, all_above=above if all_above is None else all_above, **(values | other))
+    return SeenObject(instance=instance, above=above, ancestors=above if ancestors is None else ancestors, **(values | other))

@@ -126,8 +126,8 @@ def _tick(episode: int, frame: int) -> dict[str, np.ndarray]:
     }
 
 
-def ends(episodes: tuple[int, ...], frames: int, ending: Ending = Ending.FINISHED, redraw: int = 0) -> list[EpisodeEnd]:
-    return [EpisodeEnd(episode, redraw, frames, int(ending)) for episode in episodes]
+def ends(episodes: tuple[int, ...], frames: int, ending: Ending = Ending.FINISHED, arrangement: int = 0) -> list[EpisodeEnd]:
+    return [EpisodeEnd(episode, arrangement, frames, int(ending)) for episode in episodes]
 
 
 def _view(episode: int, frame: int, index: int, camera: Camera, depth_scale: float) -> dict[str, np.ndarray]:

@@ -31,7 +31,7 @@ DROP: dict[str, Any] = {
     "gravity": 9.81,
     "gripper_home": wp.vec3(3.0, 0.0, 1.0),
     "lights": 5,
-    "turn_lights": 1,
+    "random_yaw": 1,
     "exposure_spread": 0.5,
 }
 SETTLE: dict[str, Any] = {

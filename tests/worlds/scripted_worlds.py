@@ -23,7 +23,7 @@ Ticks = Iterator[None]
 
 ROOM = 4
 OBJECT_IDS = np.array([3, 8, 21], np.int32)
-CONFIG = settings(bake__mode="mixed", arrangement__max_objects=ROOM, sight__resolution=[64, 48], suction__tolerated_misses=1)
+CONFIG = settings(bake__mode="mixed", arrangement__max_objects=ROOM, perception__resolution=[64, 48], suction__tolerated_misses=1)
 RAYS = CONFIG.suction.rays
 
 
@@ -53,12 +53,12 @@ class World:
         following = int(self.status[0, Status.FRAME]) + 1
         self.now(**{"frame": following, "outcome": 0, **columns})
 
-    def settle(self, episode: int, redraw: int, mode: int, catalog_index: list[int]) -> None:
+    def settle(self, episode: int, arrangement: int, mode: int, catalog_index: list[int]) -> None:
         """An arrangement falls."""
         self.now(
             phase=Phase.SETTLE,
             episode=episode,
-            redraw=redraw,
+            arrangement=arrangement,
             mode=mode,
             frame=-1,
             live=0,
@@ -94,7 +94,7 @@ class World:
 
     def nothing_seen(self, number: int) -> None:
         """The tick after a look that found nothing."""
-        self.frame(task=Task.LOOK, attempt=number, outcome=Outcome.NOTHING_SEEN, held=0)
+        self.frame(task=Task.LOOK, attempt=number, outcome=Outcome.NOTHING_SEEN, attached=0)
 
     def over(self, ending: Ending) -> None:
         """The current tick is the episode's last."""
@@ -145,4 +145,4 @@ def new_world(device: Any) -> World:
 
 def run(*scripts: tuple[World, Ticks]) -> dict[tuple[int, int], EpisodeRecord]:
     """Play scripts side by side into a new log; see `play`."""
-    return play(dict(scripts), AttemptLog(CONFIG.suction, CONFIG.sight.resolution, OBJECT_IDS))
+    return play(dict(scripts), AttemptLog(CONFIG.suction, CONFIG.perception.resolution, OBJECT_IDS))

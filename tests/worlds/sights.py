@@ -16,7 +16,7 @@ LIGHTS = 1
 
 SHORT = {
     "bake__mode": "pick",
-    "sight__resolution": [320, 180],
+    "perception__resolution": [320, 180],
     "pick__appear_height": 0.3,
     "pick__lift_height": 0.3,
     "pick__lift_speed": 0.6,

@@ -30,7 +30,7 @@ QUICK = {
     "arrangement.volume": 6e-4,
     "settle.min_time": 0.1,
     "settle.rest_ticks": 1,
-    "settle.late_time": 0.6,
+    "settle.relax_time": 0.6,
     "settle.tries": 3,
     "move.rounds": 1,
     "move.speed": 2.0,

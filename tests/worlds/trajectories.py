@@ -37,10 +37,10 @@ ATTEMPT = {
     "rays": 10,
     "hits": 9,
     "good_seal": False,
-    "caught": [2],
+    "engaged": [2],
     "picked": [2, 3],
-    "load": [0.0, 3.25],
-    "sight": {"resolution": [4, 3], "instances": [], "votes": []},
+    "peak_force": [0.0, 3.25],
+    "observation": {"resolution": [4, 3], "instances": [], "votes": []},
 }
 UNSEEN = ATTEMPT | {
     "attempt": 1,
@@ -48,9 +48,9 @@ UNSEEN = ATTEMPT | {
     "end_frame": 7,
     "outcome": "nothing_seen",
     "hits": 0,
-    "caught": [],
+    "engaged": [],
     "picked": [],
-    "load": [],
+    "peak_force": [],
     **dict.fromkeys(("target", "object_id", "point", "normal", "yaw", "tilt")),
 }
 

@@ -144,7 +144,7 @@ def _append_tick(reader: TickReader, ticks: Ticks) -> bool:
     """Append the state after a tick to `ticks`; returns whether all worlds are idle."""
     reader.start()
     report = reader.wait()
-    episode, arrangement, phase = (report.column(name) for name in ("episode", "redraw", "phase"))
+    episode, arrangement, phase = (report.column(name) for name in ("episode", "arrangement", "phase"))
     for world in np.flatnonzero(phase != Phase.IDLE):
         present = report.catalog_index[world] >= 0
         poses = np.concatenate((report.pose[world][present], report.snapshot.fixture_pose[world]))

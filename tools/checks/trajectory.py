@@ -69,7 +69,7 @@ def check_objects(
     scale = np.maximum(1.0, np.maximum(np.linalg.norm(inertial_force, axis=2), np.linalg.norm(force[1:], axis=2)))
     speed = np.linalg.norm(velocity, axis=2)
     max_speed = np.maximum(speed[1:], speed[:-1])
-    free = ~(steps["held"][1:] | steps["held"][:-1]) & (max_speed < MAX_SPEED_FRACTION * settings["physics"]["max_speed"])
+    free = ~(steps["attached"][1:] | steps["attached"][:-1]) & (max_speed < MAX_SPEED_FRACTION * settings["physics"]["max_speed"])
     measures["momentum"].update_max((residual / scale)[free & np.isfinite(residual)], where)
     weight = mass[present[0]].sum() * gravity
     support = force[:count, present[0], 2].sum(axis=1).mean()
@@ -91,7 +91,7 @@ def check_gripper(steps: dict[str, np.ndarray], root: Any, settings: Any, mode: 
     mass = settings["gripper"]["finger_mass"] + settings["gripper"]["cup_mass"]
     position, velocity = steps["gripper_pose"][:-1, 0, :3].astype(float), steps["gripper_velocity"][:-1, 0].astype(float)
     stiffness, damping = section["stiffness"], section["damping"]
-    force = stiffness * (steps["goal"][1:] - position - step * velocity) - damping * velocity
+    force = stiffness * (steps["setpoint"][1:] - position - step * velocity) - damping * velocity
     force /= 1.0 + (damping * step + stiffness * step * step) / mass
     magnitude = np.linalg.norm(force, axis=1, keepdims=True)
     force *= np.minimum(1.0, section["force"] / np.maximum(magnitude, 1e-12))
@@ -102,12 +102,12 @@ def check_gripper(steps: dict[str, np.ndarray], root: Any, settings: Any, mode: 
 
 def check_seals(steps: dict[str, np.ndarray], ticks: dict[str, np.ndarray], attempts: list[dict], measures: dict[str, Measure], where: str):
     """Check peak seal forces of ticks and attempts against those of steps."""
-    forces = np.nan_to_num(steps["seal_load"]).reshape(len(ticks["load"]), -1)
+    forces = np.nan_to_num(steps["seal_force"]).reshape(len(ticks["peak_force"]), -1)
     peak = forces.max(axis=1, initial=0.0)
-    measures["peak_force"].update_max(peak - ticks["load"], where)
+    measures["peak_force"].update_max(peak - ticks["peak_force"], where)
     for attempt in attempts:
-        last, count = attempt["end_frame"] + 1, len(attempt["load"])
-        measures["attempts"].update_max(peak[last - count : last] - np.array(attempt["load"]), where)
+        last, count = attempt["end_frame"] + 1, len(attempt["peak_force"])
+        measures["attempts"].update_max(peak[last - count : last] - np.array(attempt["peak_force"]), where)
 
 
 def check(dataset: Path, count: int) -> dict[str, Measure]:

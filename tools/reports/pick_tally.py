@@ -122,7 +122,7 @@ class Tally:
             visibility: World -> (sum of visible fractions, instances, views), for live worlds that were rendered.
         """
         speeds = self._max_speeds(report)
-        status = {name: report.column(name).tolist() for name in ("phase", "mode", "episode", "redraw", "live", "task", "ending")}
+        status = {name: report.column(name).tolist() for name in ("phase", "mode", "episode", "arrangement", "live", "task", "ending")}
         names = {code: name for name, code in MODES.items()}
         for world, phase in enumerate(status["phase"]):
             mode, episode = names.get(status["mode"][world]), status["episode"][world]
@@ -139,13 +139,13 @@ class Tally:
                 sequence.instances += instances
                 sequence.views += views
             if phase == Phase.OVER:
-                self._end_sequence(world, episode, Ending(status["ending"][world]), status["redraw"][world])
+                self._end_sequence(world, episode, Ending(status["ending"][world]), status["arrangement"][world])
         self._before = report
 
     def _count_frame(self, sequence: Sequence, report: TickReport, world: int) -> None:
         """Add a frame of a world: objects present and removed, seal forces, and the outcome of an attempt that ended."""
         present = report.catalog_index[world] >= 0
-        attached = _bits(int(report.column("held")[world]), len(present))
+        attached = _bits(int(report.column("attached")[world]), len(present))
         outcome = Outcome(int(report.column("outcome")[world]))
         if sequence.frames == 0:
             sequence.objects = int(present.sum())
@@ -157,10 +157,10 @@ class Tally:
         sequence.frames += 1
         sequence.left = int(present.sum())
         sequence.not_finite += int((~np.isfinite(report.pose[world][present]).all(axis=1)).sum())
-        sequence.peak_force = max(sequence.peak_force, float(report.measure("load")[world]))
+        sequence.peak_force = max(sequence.peak_force, float(report.measure("peak_force")[world]))
         if outcome is not Outcome.NONE:
             sequence.outcomes[outcome.name] += 1
-            if report.column("caught")[world] != 0:
+            if report.column("engaged")[world] != 0:
                 sequence.hits.append(int(report.column("hits")[world]))
                 sequence.peak_forces.append(sequence.peak_force)
             sequence.peak_force = 0.0
@@ -181,13 +181,13 @@ class Tally:
         max_speed = np.zeros((len(report.status), len(PLACES)))
         if (before := self._before) is None:
             return max_speed
-        unchanged = [report.column(name) == before.column(name) for name in ("episode", "redraw")]
+        unchanged = [report.column(name) == before.column(name) for name in ("episode", "arrangement")]
         both = (report.column("live") != 0) & (before.column("live") != 0) & unchanged[0] & unchanged[1]
         world, instance = np.nonzero(both[:, None] & (report.catalog_index >= 0) & (before.catalog_index >= 0))
         center = self.center[report.catalog_index[world, instance]]
         position, _ = transform_points(report.pose[world, instance], center)
         last, _ = transform_points(before.pose[world, instance], center)
-        attached = (report.column("held")[world] | before.column("held")[world]) >> instance & 1
+        attached = (report.column("attached")[world] | before.column("attached")[world]) >> instance & 1
         place = np.where(attached, 2, np.where(is_inside(self.config, last), 0, 1))
         # fmax ignores NaN; poses that are not finite are counted by `_count_frame`.
         np.fmax.at(max_speed, (world, place), np.linalg.norm(position - last, axis=1) / self.tick)

@@ -149,7 +149,7 @@ def settle(simulation: Simulation, catalog: Catalog, results: Results, report_pr
         phase = report.column("phase")
         for world in np.flatnonzero(phase == Phase.OVER):
             results.resampled[Ending(int(report.column("ending")[world])).name.lower()] += 1
-            results.given_up += int(report.column("redraw")[world]) + 1 == config.settle.tries
+            results.given_up += int(report.column("arrangement")[world]) + 1 == config.settle.tries
         resting = np.flatnonzero(phase == Phase.ACT)
         if len(resting):
             assert before is not None  # A pile rests for several ticks before it counts as settled.

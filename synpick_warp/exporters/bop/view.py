@@ -145,7 +145,7 @@ def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dic
     direction = batch.light_direction[view]
     light = {
         "map": str(batch.light_name[view]),
-        "turn": round(float(batch.light_yaw[view]), _DIGITS),
+        "yaw": round(float(batch.light_yaw[view]), _DIGITS),
         "exposure": round(float(batch.light_exposure[view]), _DIGITS),
         "direction": [round(part, _DIGITS) for part in direction.tolist()] if direction.any() else None,
     }

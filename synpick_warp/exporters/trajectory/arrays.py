@@ -74,9 +74,9 @@ TICKS = GroupSpec(
         "outcome": ArraySpec(("tick",), "<i4", "1", "What came of the attempt that ended in this tick.", names(Outcome)),
         "target": ArraySpec(("tick",), "<i4", "1", "Instance that the attempt was to pick; -1: none."),
         "hits": ArraySpec(("tick",), "<i4", "1", "Rays of the cup that hit an object when the suction of the attempt was switched on."),
-        "caught": ArraySpec(("tick", "instance"), "|b1", "1", "Whether one of them hit the instance."),
-        "held": ArraySpec(("tick", "instance"), "|b1", "1", "Whether the instance hangs on the cup, or was picked in this tick."),
-        "load": ArraySpec(("tick",), "<f4", "N", "Largest load of any seal in any step of the tick."),
+        "engaged": ArraySpec(("tick", "instance"), "|b1", "1", "Whether one of them hit the instance."),
+        "attached": ArraySpec(("tick", "instance"), "|b1", "1", "Whether the instance hangs on the cup, or was picked in this tick."),
+        "peak_force": ArraySpec(("tick",), "<f4", "N", "Largest load of any seal in any step of the tick."),
     },
 )
 STEPS = GroupSpec(
@@ -89,16 +89,16 @@ STEPS = GroupSpec(
         "angular_velocity": ArraySpec(("step", "instance", "axis"), "<f4", "rad/s", f"{_SPIN}{_GONE}"),
         "contact_force": ArraySpec(("step", "instance", "axis"), "<f4", "N", f"{_CONTACT}{_GONE}"),
         "contact_load": ArraySpec(("step", "instance"), "<f4", "N", f"{_SIZES}{_GONE}"),
-        "seal_load": ArraySpec(
+        "seal_force": ArraySpec(
             ("step", "instance"), "<f4", "N", f"Tension and shear that the instance's seal bore; 0: none holds it.{_GONE}"
         ),
-        "held": ArraySpec(("step", "instance"), "|b1", "1", "Whether a seal holds the instance at the step's end."),
+        "attached": ArraySpec(("step", "instance"), "|b1", "1", "Whether a seal holds the instance at the step's end."),
         "gripper_pose": ArraySpec(("step", "link", "pose"), "<f4", "m", f"Finger and cup to world at the step's end: {_POSE}"),
         "gripper_velocity": ArraySpec(("step", "link", "axis"), "<f4", "m/s", _COM),
         "gripper_angular_velocity": ArraySpec(("step", "link", "axis"), "<f4", "rad/s", _SPIN),
         "gripper_contact_force": ArraySpec(("step", "link", "axis"), "<f4", "N", _CONTACT),
         "gripper_contact_load": ArraySpec(("step", "link"), "<f4", "N", _SIZES),
-        "goal": ArraySpec(
+        "setpoint": ArraySpec(
             ("step", "axis"), "<f4", "m", "Where the cup's tilt axis, the origin of finger and cup, was drawn to in the step. NaN: nowhere."
         ),
         "impedance_force": ArraySpec(
@@ -131,9 +131,9 @@ ATTEMPTS = GroupSpec(
         "rays": ArraySpec(("attempt",), "<i4", "1", "Rays of the cup."),
         "hits": ArraySpec(("attempt",), "<i4", "1", "Rays that hit an object when the suction was switched on."),
         "good_seal": ArraySpec(("attempt",), "|b1", "1", "Whether the seals were of full strength."),
-        "caught": ArraySpec(("attempt", "instance"), "|b1", "1", "Whether a ray hit the instance."),
+        "engaged": ArraySpec(("attempt", "instance"), "|b1", "1", "Whether a ray hit the instance."),
         "picked": ArraySpec(("attempt", "instance"), "|b1", "1", "Whether the instance left the scene on the cup."),
-        "load": ArraySpec(
+        "peak_force": ArraySpec(
             ("attempt", "lift_tick"), "<f8", "N", "Largest load of any seal in each tick since the suction came on. NaN: it is over."
         ),
         "record": ArraySpec(("byte",), "|u1", "1", "The lines of attempts.jsonl, with what was seen of every object; JSON in UTF-8."),

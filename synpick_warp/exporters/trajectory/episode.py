@@ -138,7 +138,7 @@ def _write_arrangement(group: zarr.Group, content: EpisodeContent, settings: Epi
 
 def make_attempt_arrays(attempts: Sequence[Mapping[str, Any]], instances: int) -> dict[str, np.ndarray]:
     """Convert attempts (lines of attempts.jsonl) to columns, the arrays of ATTEMPTS; `record` stays empty."""
-    ticks = max((len(attempt["load"]) for attempt in attempts), default=0)
+    ticks = max((len(attempt["peak_force"]) for attempt in attempts), default=0)
     sizes = {"attempt": len(attempts), "instance": instances, "lift_tick": ticks, "byte": 0}
     columns = {}
     for name, spec in ATTEMPTS.arrays.items():
@@ -151,9 +151,9 @@ def make_attempt_arrays(attempts: Sequence[Mapping[str, Any]], instances: int) -
             value = attempt[name]
             if name == "outcome":
                 column[row] = Outcome[value.upper()]
-            elif name == "load":
+            elif name == "peak_force":
                 column[row, : len(value)] = value
-            elif name in ("caught", "picked"):
+            elif name in ("engaged", "picked"):
                 column[row, list(value)] = True
             elif value is not None:
                 column[row] = value

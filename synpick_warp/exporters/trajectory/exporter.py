@@ -147,9 +147,9 @@ class TrajectoryExporter:
             "light": {
                 "map": light,
                 "name": self._context.lights[light].name,
-                "turn": float(batch.light_yaw[world]),
+                "yaw": float(batch.light_yaw[world]),
                 "exposure": float(batch.light_exposure[world]),
-                "units": {"turn": "rad", "exposure": "stops"},
+                "units": {"yaw": "rad", "exposure": "stops"},
             }
         }
         if "mode" in batch.tick:
@@ -191,7 +191,7 @@ class TrajectoryExporter:
         ending = Ending(end.ending)
         attributes = {
             "episode": end.episode,
-            "redraw": end.redraw,
+            "arrangement": end.arrangement,
             "frames": end.frames,
             "ending": ending.name.lower(),
             "sentence": ending.sentence,

@@ -47,7 +47,7 @@ class EpisodeMetadata:
     """Custom data of an episode's root prim."""
 
     episode: int
-    redraw: int
+    arrangement: int
     """Number of arrangements that were discarded before this one."""
     frames: int
     ending: str
@@ -55,4 +55,4 @@ class EpisodeMetadata:
     @staticmethod
     def from_end(end: EpisodeEnd) -> EpisodeMetadata:
         """Take the metadata from the episode's end."""
-        return EpisodeMetadata(end.episode, end.redraw, end.frames, Ending(end.ending).name.lower())
+        return EpisodeMetadata(end.episode, end.arrangement, end.frames, Ending(end.ending).name.lower())

@@ -22,7 +22,7 @@ from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, b
 
 CPU_BYTES = 512 * 2**20
 GPU_BYTES = 2 * 2**30
-"""Scratch that the views of a batch may take if `sight.views` is 0."""
+"""Scratch that the views of a batch may take if `perception.views` is 0."""
 CPU_VIEWS = 4
 """Maximum number of views on the CPU in that case: larger batches gain nothing there, and unused views still cost a little."""
 CENTER = wp.vec2(0.0, 0.0)
@@ -31,20 +31,20 @@ SCRATCH = (VIEWS, VIEW_BODIES, GBUFFER, PerceptionArrays, SegmentationScratch)
 """Declarations of the arrays of a batch."""
 
 
-def perception_sizes(settings: schema.Sight, instances: int, views: int) -> dict[str, int]:
+def perception_sizes(settings: schema.Perception, instances: int, views: int) -> dict[str, int]:
     """Extents of the dimensions of the declarations in `SCRATCH`."""
     width, height = settings.resolution
     sizes = {"view": views, "instance": instances, "row": height, "column": width, "point": settings.contour_points}
     return sizes | body_sizes(instances, width, height)
 
 
-def view_bytes(settings: schema.Sight, instances: int) -> int:
+def view_bytes(settings: schema.Perception, instances: int) -> int:
     """Scratch of one view [bytes]."""
     sizes = perception_sizes(settings, instances, 1)
     return sum(row[3] for kind in SCRATCH for row in memory_table(kind, sizes))
 
 
-def count_views(settings: schema.Sight, worlds: int, instances: int, device: wp.Device) -> int:
+def count_views(settings: schema.Perception, worlds: int, instances: int, device: wp.Device) -> int:
     """Views of a batch: the setting, or as many as fit into the memory budget; never more than there are worlds."""
     views = settings.views
     if views == 0:
@@ -64,7 +64,9 @@ class PerceptionImages:
         sizes: Extents of the dimensions of the declarations in `SCRATCH`.
     """
 
-    def __init__(self, settings: schema.Sight, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int) -> None:
+    def __init__(
+        self, settings: schema.Perception, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int
+    ) -> None:
         """Allocate scratch.
 
         Args:
@@ -83,7 +85,7 @@ class PerceptionImages:
         grid = build_grid(width, height)
         self.pixels = count * grid.tiles * int(TILE_PIXELS)
         if self.pixels >= 2**31:
-            raise ConfigError(f"sight.views is {count}; of {width} x {height} px that is more than 2³¹ pixels; take fewer")
+            raise ConfigError(f"perception.views is {count}; of {width} x {height} px that is more than 2³¹ pixels; take fewer")
         camera = make_cameras(replace(cameras, resolution=settings.resolution))[:1]
         self.scene = replace(render_scene, cameras=build_cameras(camera, device), grid=grid, camera_count=1)
         self.sizes = perception_sizes(settings, instances, count)

@@ -21,7 +21,7 @@ class Perception:
 
     def __init__(
         self,
-        settings: schema.Sight,
+        settings: schema.Perception,
         cameras: schema.Cameras,
         seed: int,
         render_scene: RenderScene,

@@ -41,7 +41,7 @@ class VoteArrays:
 CYCLES = struct_arrays(Cycles, "view", "instance", weight=("view", "instance", "instance"), best=("view", "subset"))
 
 
-def plan_sizes(settings: schema.Sight, instances: int, views: int) -> dict[str, int]:
+def plan_sizes(settings: schema.Perception, instances: int, views: int) -> dict[str, int]:
     """Extents of the dimensions of `VoteArrays` and `CYCLES`."""
     return {"view": views, "instance": instances, "kind": 2, "subset": 1 << min(settings.exact_cycle, instances)}
 
@@ -49,7 +49,7 @@ def plan_sizes(settings: schema.Sight, instances: int, views: int) -> dict[str, 
 class GraspPlanner:
     """Chooses a target and its suction grasp for the worlds of a batch. Owns its scratch; `plan` only launches kernels."""
 
-    def __init__(self, settings: schema.Sight, images: PerceptionImages, arrays: PerceptionArrays) -> None:
+    def __init__(self, settings: schema.Perception, images: PerceptionImages, arrays: PerceptionArrays) -> None:
         """Allocate scratch for the views and instances of a batch.
 
         Args:

@@ -73,12 +73,12 @@ DENOISED_SCRATCH = ((GUIDE, 1), (COARSE_LIGHT, 2), (RATIO_IMAGES, 2), (ShadowArr
 
 def coarse_size(render: Render, width: int) -> int:
     """Width of a coarse pixel [px] in images of `width` px."""
-    return render.cell or max(1, width // MIN_COARSE_COLUMNS)
+    return render.coarse_pixel or max(1, width // MIN_COARSE_COLUMNS)
 
 
 def paths_per_coarse_pixel(render: Render, width: int) -> int:
     """Paths per coarse pixel in images of `width` px."""
-    return render.cell_paths or (2 if width <= MAX_COLUMNS_TWO_PATHS * coarse_size(render, width) else 1)
+    return render.coarse_paths or (2 if width <= MAX_COLUMNS_TWO_PATHS * coarse_size(render, width) else 1)
 
 
 def scratch_sizes(render: Render, width: int, height: int) -> dict[str, int]:
@@ -124,7 +124,7 @@ class DenoisedRenderer:
         """Allocate scratch.
 
         Args:
-            render: Render settings: `cell`, `cell_paths`, `bounces` and `antialias`.
+            render: Render settings: `coarse_pixel`, `coarse_paths`, `bounces` and `antialias`.
             seed: Seed of the data set.
             scene: Constant data.
             views: Capacity of a batch.

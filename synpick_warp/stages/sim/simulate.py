@@ -99,7 +99,7 @@ class Simulation:
                 raise ValueError("episodes that pick need a render_scene for perception")
             self.suction = Suction(config.suction, catalog, render_scene, device)
             state = (self.scene, self.state, self.attempts, self.observation, self.plan)
-            self.perception = Perception(config.sight, config.cameras, config.bake.seed, render_scene, *state)
+            self.perception = Perception(config.perception, config.cameras, config.bake.seed, render_scene, *state)
 
     def _make_record(self, sizes: dict[str, int]) -> TickRecord:
         physics = self.recorder.new_record() if self.recorder is not None else None

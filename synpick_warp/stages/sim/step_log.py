@@ -17,9 +17,6 @@ from synpick_warp.stages.constants import SceneData
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
-PUBLIC_NAMES = {"seal_force": "seal_load", "attached": "held", "setpoint": "goal"}
-"""Names that arrays of `StepArrays` have in data sets, where they differ."""
-
 
 @dataclass(frozen=True, eq=False)
 class StepArrays:
@@ -236,7 +233,7 @@ def _split_places(arrays: Mapping[str, np.ndarray], names: list[str], instances:
             steps[item.name] = values[:, :, :instances]
             steps[f"gripper_{item.name}"] = values[:, :, instances:]
         else:
-            steps[PUBLIC_NAMES.get(item.name, item.name)] = values
+            steps[item.name] = values
     return steps
 
 
@@ -247,6 +244,6 @@ def tick_measures(columns: Mapping[str, np.ndarray], instances: int) -> dict[str
         columns: Columns (world) of status and measures, by `codes.column_names`.
         instances: Capacity for instances of a world.
     """
-    result = {name: columns[name] for name in ("phase", "mode", "task", "attempt", "outcome", "target", "hits", "load")}
+    result = {name: columns[name] for name in ("phase", "mode", "task", "attempt", "outcome", "target", "hits", "peak_force")}
     bits = np.arange(instances, dtype=np.int32)
-    return result | {name: (columns[name][:, None] >> bits & 1).astype(np.uint8) for name in ("caught", "held")}
+    return result | {name: (columns[name][:, None] >> bits & 1).astype(np.uint8) for name in ("engaged", "attached")}

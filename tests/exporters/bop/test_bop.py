@@ -46,7 +46,7 @@ def load(path: Path) -> object:
 
 def light_of(episode: int) -> dict[str, object]:
     direction = [0.0, 0.6, 0.8] if episode else None
-    return {"map": f"map {episode}", "turn": 0.5 * episode, "exposure": -0.25, "direction": direction}
+    return {"map": f"map {episode}", "yaw": 0.5 * episode, "exposure": -0.25, "direction": direction}
 
 
 def rows():

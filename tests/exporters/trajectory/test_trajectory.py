@@ -86,11 +86,11 @@ def test_episode_attributes_and_arrangement(store):
     episode = store[f"{tables.EPISODES}/000004"]
     attributes = dict(episode.attrs)
     light = attributes.pop("light")
-    assert {name: light[name] for name in ("map", "turn", "exposure")} == {"map": 0, "turn": 2.0, "exposure": 0.25}
-    assert light["units"] == {"turn": "rad", "exposure": "stops"}
+    assert {name: light[name] for name in ("map", "yaw", "exposure")} == {"map": 0, "yaw": 2.0, "exposure": 0.25}
+    assert light["units"] == {"yaw": "rad", "exposure": "stops"}
     assert attributes == {
         "episode": 4,
-        "redraw": 1,
+        "arrangement": 1,
         "frames": FRAMES,
         "ending": "emptied",
         "sentence": "no object is left in the tote",
@@ -116,9 +116,9 @@ def test_attempts_as_columns(store):
     assert (columns["point"][0], columns["normal"][0], columns["yaw"][0], columns["tilt"][0]) == ([0.1, 0.2, 0.3], [0, 0, 1], 0.25, -0.5)
     assert np.isnan(columns["point"][1]).all()
     assert np.isnan(columns["yaw"][1])
-    assert columns["caught"] == [[False, False, True, False], [False] * 4]
+    assert columns["engaged"] == [[False, False, True, False], [False] * 4]
     assert columns["picked"] == [[False, False, True, True], [False] * 4]
-    np.testing.assert_array_equal(columns["load"], [[0.0, 3.25], [np.nan, np.nan]])
+    np.testing.assert_array_equal(columns["peak_force"], [[0.0, 3.25], [np.nan, np.nan]])
 
 
 def test_an_episode_without_attempts_has_empty_columns(tmp_path):
@@ -209,7 +209,7 @@ def test_missing_frames_are_an_error(tmp_path):
 
 def test_an_array_missing_from_the_schema_is_an_error(tmp_path):
     (batch,) = ticks((0,), 1)
-    batch.steps["magic"] = batch.steps["goal"]
+    batch.steps["magic"] = batch.steps["setpoint"]
     with exporting(TrajectoryExporter, tmp_path, config()) as exporter, pytest.raises(ValueError, match="magic"):
         exporter.write_ticks(batch)
 
@@ -233,4 +233,4 @@ def test_an_episode_without_instances_has_empty_dimensions(tmp_path):
         exporter.end_episode(box_views.ends((0,), 1)[0], lambda: None)
     episode = zarr.open_group(tmp_path / tables.STORE / tables.EPISODES / "000000", mode="r")
     assert episode["steps/pose"].shape == (STEP_COUNT, 0, 7)
-    assert episode["steps/goal"].shape == (STEP_COUNT, 3)
+    assert episode["steps/setpoint"].shape == (STEP_COUNT, 3)

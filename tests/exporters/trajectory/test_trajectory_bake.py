@@ -37,7 +37,7 @@ def mixed() -> Config:
             "bake__episodes": 3,
             "arrangement__max_objects": 2,
             "pick__failures": 1,
-            "sight__resolution": [160, 90],
+            "perception__resolution": [160, 90],
             "cameras__resolution": [32, 18],
             "physics__step": 4e-3,
             "physics__steps_per_tick": 16,
@@ -82,8 +82,8 @@ def test_the_laws_of_motion_hold(out, monkeypatch, capsys):
         ("steps/velocity", "change of momentum"),
         ("steps/contact_force", "contacts of all objects against their weight"),
         ("steps/pose", "last step against frame"),
-        ("steps/goal", "gripper: force against its law"),
-        ("steps/seal_load", "peak force of a tick"),
+        ("steps/setpoint", "gripper: force against its law"),
+        ("steps/seal_force", "peak force of a tick"),
     ],
 )
 def test_corrupted_arrays_violate_the_laws_of_motion(out, tmp_path, monkeypatch, capsys, array, what):

@@ -148,7 +148,7 @@ def test_stages_state_units_and_time_codes(folder, config):
     assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == pytest.approx(rate)
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, usd_sets.FRAMES - 1)
     metadata = stage.GetDefaultPrim().GetCustomData()
-    assert metadata.items() >= {"episode": 4, "redraw": 0, "frames": usd_sets.FRAMES, "ending": "emptied"}.items()
+    assert metadata.items() >= {"episode": 4, "arrangement": 0, "frames": usd_sets.FRAMES, "ending": "emptied"}.items()
 
 
 @pytest.mark.parametrize("entry", CATALOG.entries, ids=lambda entry: entry.name)

@@ -36,7 +36,7 @@ def picking() -> Config:
             "bake__episodes": 1,
             "arrangement__max_objects": 2,
             "pick__failures": 1,
-            "sight__resolution": [160, 90],
+            "perception__resolution": [160, 90],
             "cameras__resolution": [192, 108],
             "physics__step": 4e-3,
             "physics__steps_per_tick": 16,
