@@ -85,7 +85,7 @@ class Ending(_Described):
     ARRANGEMENT_OVERFLOW = "more objects of a kind were drawn than a world has body slots for, so the arrangement was resampled"
     SOLVER_OVERFLOW = "more contacts arose than the solver has capacity for, so the episode was resampled"
     NOT_FINITE = "a pose became infinite or not a number, so the episode was resampled"
-    SIGHT_OVERFLOW = "a contour has more points than its capacity, so the episode was resampled"
+    PERCEPTION_OVERFLOW = "a contour has more points than its capacity, so the episode was resampled"
 
     @property
     def delivers(self) -> bool:

@@ -123,7 +123,7 @@ def remedy(config: Config, ending: Ending) -> str:
     if ending is Ending.SOLVER_OVERFLOW:
         capacities = ("contacts_per_world", "pairs_per_world", "rows_per_world", "gripper_rows_per_world")
         return "raise " + " or ".join(f"physics.{name} ({getattr(physics, name)})" for name in capacities)
-    if ending is Ending.SIGHT_OVERFLOW:
+    if ending is Ending.PERCEPTION_OVERFLOW:
         return f"raise perception.contour_points ({perception.contour_points})"
     if ending is Ending.ARRANGEMENT_OVERFLOW:
         return f"lower arrangement.slot_shortfall ({config.arrangement.slot_shortfall:g})"

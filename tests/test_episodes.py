@@ -10,7 +10,7 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.episodes import remedy
 
-CURED = {Ending.UNSETTLED, Ending.ARRANGEMENT_OVERFLOW, Ending.SOLVER_OVERFLOW, Ending.SIGHT_OVERFLOW}
+CURED = {Ending.UNSETTLED, Ending.ARRANGEMENT_OVERFLOW, Ending.SOLVER_OVERFLOW, Ending.PERCEPTION_OVERFLOW}
 
 
 def setting_values(config: Config) -> dict[str, object]:

@@ -85,7 +85,7 @@ def judge_episodes_kernel(
     if phase == Phase.SETTLE and (progress[world][0] >= settle.max_ticks or progress[world][2] > settle.max_redrops):
         ending = Ending.UNSETTLED
     if perception_overflow[world] != 0:
-        ending = Ending.SIGHT_OVERFLOW
+        ending = Ending.PERCEPTION_OVERFLOW
     if solver_overflow[world]:
         ending = Ending.SOLVER_OVERFLOW
     body = world * layout.bodies

@@ -52,9 +52,9 @@ def test_a_bake_that_picked_tells_of_attempts():
 
 def test_a_summary_names_the_settings_that_cure_its_endings():
     text = printed(
-        BakeSummary(1, [row(0, 1, Ending.FINISHED, 9, 1.0)], remedies={Ending.SIGHT_OVERFLOW: "raise perception.contour_points (16)"})
+        BakeSummary(1, [row(0, 1, Ending.FINISHED, 9, 1.0)], remedies={Ending.PERCEPTION_OVERFLOW: "raise perception.contour_points (16)"})
     )
-    assert "sight overflow: raise perception.contour_points (16)" in text.splitlines()
+    assert "perception overflow: raise perception.contour_points (16)" in text.splitlines()
 
 
 def test_a_long_bake_lists_counts_and_failures():

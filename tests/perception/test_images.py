@@ -50,7 +50,7 @@ def make_images(toy: ToyScene, device: wp.Device, worlds: int = 4, views: int = 
     """Perception of the toy scene, whose other cameras have another resolution."""
     config = toy.settings()
     cameras = replace(config.cameras, resolution=(192, 108))
-    settings = replace(config.sight, resolution=RESOLUTION, views=views)
+    settings = replace(config.perception, resolution=RESOLUTION, views=views)
     scene = build_render_scene(
         config.render, config.tote, Catalog(tuple(toy.entries)), toy.fixtures, make_cameras(cameras), toy.lights, device
     )
@@ -78,20 +78,20 @@ def test_gbuffer_equals_the_renderers_without_gripper(device, toy):
 def test_number_of_views():
     config = Config()
     cpu, cuda = SimpleNamespace(is_cuda=False), SimpleNamespace(is_cuda=True)
-    assert images.count_views(config.sight, 64, 21, cpu) == images.CPU_VIEWS
-    each = images.view_bytes(config.sight, 21)
+    assert images.count_views(config.perception, 64, 21, cpu) == images.CPU_VIEWS
+    each = images.view_bytes(config.perception, 21)
     assert 1920 * 1080 * 30 < each < 1920 * 1080 * 40
-    views = images.count_views(config.sight, 64, 21, cuda)
+    views = images.count_views(config.perception, 64, 21, cuda)
     assert views * each <= images.GPU_BYTES < (views + 1) * each
-    asked = replace(config.sight, views=7)
+    asked = replace(config.perception, views=7)
     assert images.count_views(asked, 64, 21, cpu) == 7
-    assert images.count_views(config.sight, 2, 21, cuda) == 2
-    vast = replace(config.sight, resolution=(8192, 8192))
+    assert images.count_views(config.perception, 2, 21, cuda) == 2
+    vast = replace(config.perception, resolution=(8192, 8192))
     assert images.count_views(vast, 64, 21, cpu) == 1
 
 
 def test_more_pixels_than_31_bits_count_are_an_error(device, toy):
-    settings = replace(Config().sight, resolution=(8192, 8192), views=32)
+    settings = replace(Config().perception, resolution=(8192, 8192), views=32)
     scene = build_scene(toy, device)
-    with pytest.raises(ConfigError, match=r"sight\.views is 32"):
+    with pytest.raises(ConfigError, match=r"perception\.views is 32"):
         PerceptionImages(settings, Config().cameras, scene, 32, toy.room)

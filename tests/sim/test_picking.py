@@ -65,7 +65,7 @@ def test_what_was_picked_is_gone_from_the_next_picture(emptied):
     assert np.diff(present).tolist() == [-int(end) for end in ended[1:]]
     for row, end in zip(live, ended, strict=True):
         if end:
-            assert row.column("held")[0] == 1 << row.column("target")[0]
+            assert row.column("attached")[0] == 1 << row.column("target")[0]
 
 
 def test_tasks_come_in_order(emptied):
@@ -82,7 +82,7 @@ def test_the_seal_bears_the_weight_at_the_end_of_the_lift(emptied):
         if following.column("outcome")[0]:
             target = following.column("target")[0]
             weight = objects.entries[row.catalog_index[0][target]].mass * GRAVITY
-            assert row.measure("load")[0] == pytest.approx(weight, rel=0.03)
+            assert row.measure("peak_force")[0] == pytest.approx(weight, rel=0.03)
             assert row.column("hits")[0] == 10
 
 
@@ -105,7 +105,7 @@ def track(device, worlds: int, episodes: int = 3) -> dict[tuple[int, int], list[
     ticks = defaultdict(list)
     for row in run(simulation):
         for world in range(worlds):
-            address = (int(row.column("episode")[world]), int(row.column("redraw")[world]))
+            address = (int(row.column("episode")[world]), int(row.column("arrangement")[world]))
             full = row.catalog_index[world] >= 0
             parts = (row.status[world], row.measures[world], row.catalog_index[world], row.pose[world][full])
             ticks[address].append(b"".join(np.ascontiguousarray(part).tobytes() for part in parts))

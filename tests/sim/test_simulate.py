@@ -38,7 +38,7 @@ def track(device, worlds: int, disturb=None, episodes: int = EPISODES) -> dict[t
         fixtures, light, turn = snapshot.fixture_pose.numpy(), snapshot.light.numpy(), snapshot.light_yaw.numpy()
         exposure = snapshot.light_exposure.numpy()
         for world in range(worlds):
-            address = (int(seen.column("episode")[world]), int(seen.column("redraw")[world]))
+            address = (int(seen.column("episode")[world]), int(seen.column("arrangement")[world]))
             full = seen.catalog_index[world] >= 0
             parts = (
                 seen.status[world],
@@ -93,7 +93,7 @@ def test_episodes_differ(together):
 
 
 def test_a_world_that_was_not_finite_is_as_good_as_new(device):
-    """Poisoned with NaN while another world runs: the next redraw there, and the other world, know nothing of it."""
+    """Poisoned with NaN while another world runs: the next arrangement there, and the other world, know nothing of it."""
 
     def poison(simulation: Simulation, tick: int) -> None:
         if tick == 3:
@@ -321,7 +321,7 @@ def test_too_little_room_for_contacts_ends_episodes(device, key):
 def test_a_pile_without_time_is_unsettled(device):
     config = settings(settle__max_time=0.1, settle__tries=2, bake__episodes=1, **COARSE)
     seen = run_ticks(Simulation(config, catalog(ANGLE), 1, device), 6)
-    rows = [(int(row.column("phase")[0]), int(row.column("ending")[0]), int(row.column("redraw")[0])) for row in seen]
+    rows = [(int(row.column("phase")[0]), int(row.column("ending")[0]), int(row.column("arrangement")[0])) for row in seen]
     settle = (Phase.SETTLE, Ending.RUNNING)
     over = (Phase.OVER, Ending.UNSETTLED)
     ticks = int(np.ceil(0.1 / (config.physics.step * config.physics.steps_per_tick)))

@@ -291,7 +291,7 @@ def test_a_contour_without_room_ends_the_episode(device):
     worlds.set(worlds.attempts.task, Task.LIFT)
     worlds.set(worlds.observation.overflow, 1)
     arrange.judge_episodes(worlds.scene, worlds.state, worlds.attempts, worlds.observation, worlds.physics)
-    assert worlds.state.ending.numpy()[0] == Ending.SIGHT_OVERFLOW
+    assert worlds.state.ending.numpy()[0] == Ending.PERCEPTION_OVERFLOW
 
 
 @pytest.mark.parametrize("link", [0, 1])
