@@ -28,6 +28,7 @@ test: checks
 
 checks: $(VENV)/installed-dev
 	$(BIN)/ruff check --quiet --output-format concise .
+	$(BIN)/ruff format --quiet --check .
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/basedpyright
 	$(BIN)/python -m tools.checks.kernels

@@ -136,7 +136,7 @@ def _row(view: _View) -> Image:
     depth = read_image(view.scene / "depth", stem, cv2.IMREAD_UNCHANGED) * view.depth_scale
     panels: list[tuple[str, Callable[[float], Image]]] = [
         (f"{view.scene.parent.name}/{view.scene.name} image {view.frame}", lambda scale: _fit(color, scale)),
-        (_depth_caption(depth), lambda scale: _fit(_color_depth(depth), scale, smooth=False)),
+        (_depth_caption(depth), lambda scale: _fit(color_depth(depth), scale, smooth=False)),
         (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
         ("boxes: amodal thin, visible thick; obj_id and visible fraction", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
     ]
@@ -177,7 +177,7 @@ def _depth_caption(depth: np.ndarray) -> str:
     return "depth: none" if limits is None else f"depth {limits[0] / 1000:.3f} (red) to {limits[1] / 1000:.3f} m (blue); black: none"
 
 
-def _color_depth(depth: np.ndarray) -> Image:
+def color_depth(depth: np.ndarray) -> Image:
     """Depth as a TURBO colour map, near red, far blue, no surface black."""
     low, high = _depth_limits(depth) or (0.0, 1.0)
     nearness = np.clip((high - depth) / max(high - low, 1e-9), 0.0, 1.0)

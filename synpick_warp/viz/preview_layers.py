@@ -23,6 +23,11 @@ Image = np.ndarray
 """(H, W, 3) uint8, blue first."""
 
 
+def color_layer(name: str, values: np.ndarray) -> Image:
+    """One layer as colours, from its values as `synpick_warp.layer_codec.read_layer` returns them."""
+    return _DRAW[name](values)[1]
+
+
 def layer_pictures(scene: Path, frame: int) -> list[tuple[str, Image]]:
     """Draw each layer of a scene that `_DRAW` has: caption and image.
 

@@ -1,0 +1,144 @@
+"""Draw the README's pictures anew: a strip of one view's images, and an animated pick.
+
+Two small bakes of embedded objects under embedded light maps, removed afterwards; some minutes on two CPU cores.
+
+    python -m tools.draw_pictures                     # into tools/pictures/
+    python -m tools.draw_pictures --out DIR --device cuda:0
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image as PillowImage
+
+import synpick_warp
+from synpick_warp.dataset.reading import Episode
+from synpick_warp.dataset.view import View
+from synpick_warp.errors import SynpickError
+from synpick_warp.viz.preview import FONT, color_depth, instance_color, put_text, write_picture
+from synpick_warp.viz.preview_layers import color_layer
+from tools.options import fail, make_parser
+
+PICTURES = Path(__file__).resolve().parent / "pictures"
+STRIP, PICK = "strip.jpg", "pick.gif"
+COMMON = {"bake.worlds": 1, "bake.episodes": 1, "bop.color_format": "png", "bop.coco": False}
+STRIP_SETTINGS = COMMON | {
+    "bake.mode": "move",
+    "arrangement.volume": 7e-3,
+    "move.speed": 0.8,
+    "cameras.resolution": [960, 540],
+    "cameras.positions": [[0.0, 0.0, 2.0]],
+    "cameras.ups": [[0.0, 1.0, 0.0]],
+    "render.layers": ["normals", "flow"],
+}
+PICK_SETTINGS = COMMON | {
+    "bake.mode": "pick",
+    "arrangement.volume": 3e-3,
+    "pick.failures": 1,
+    # The first camera is the one that perception uses; the second is drawn.
+    "cameras.resolution": [480, 270],
+    "cameras.positions": [[0.0, 0.0, 2.0], [0.9, -1.1, 1.3]],
+    "cameras.ups": [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+}
+PANEL = (480, 270)
+"""Width and height of an image in the strip [px]."""
+CAPTION_SCALE = 0.5
+GIF_WIDTH, GIF_COLORS, GIF_STRIDE = 400, 96, 2
+"""Width [px], palette size, and frames per drawn frame: 7.5 Hz of simulated time."""
+LEAD_OUT = 6
+"""Frames after the end of the attempt."""
+
+Image = np.ndarray
+"""(H, W, 3) uint8, blue first."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Bake, draw, write; returns the exit code."""
+    parser = make_parser(__doc__, "device")
+    parser.add_argument("--out", type=Path, default=PICTURES, help="folder of the pictures (default: tools/pictures)")
+    options = parser.parse_args(arguments)
+    device = {"bake.device": options.device}
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            for name, settings in (("strip", STRIP_SETTINGS), ("pick", PICK_SETTINGS)):
+                synpick_warp.bake("smoke", Path(folder) / name, settings | device)
+            (strip,) = synpick_warp.open(Path(folder) / "strip").values()
+            print(write_picture(options.out / STRIP, draw_strip(strip)))
+            (pick,) = synpick_warp.open(Path(folder) / "pick").values()
+            print(write_animation(options.out / PICK, draw_pick(pick)))
+    except SynpickError as error:
+        return fail("draw_pictures", error)
+    return 0
+
+
+def draw_strip(episode: Episode) -> Image:
+    """Colour, depth, visible masks, amodal masks, normals and flow of the view with the most motion."""
+    view = max(episode.views(camera=0), key=lambda view: float(np.nansum(np.abs(view.layer("flow")))))
+    panels = {
+        "RGB": view.rgb[..., ::-1],
+        "depth": color_depth(view.depth),
+        "instances": draw_masks(view, view.masks),
+        "amodal masks": draw_masks(view, view.amodal_masks, outline=True),
+        "normals": color_layer("normals", view.layer("normals")),
+        "optical flow": color_layer("flow", view.layer("flow")),
+    }
+    small = [captioned(cv2.resize(panel, PANEL, interpolation=cv2.INTER_AREA), name) for name, panel in panels.items()]
+    return np.concatenate([np.concatenate(small[:3], axis=1), np.concatenate(small[3:], axis=1)])
+
+
+def draw_masks(view: View, masks: np.ndarray, outline: bool = False) -> Image:
+    """Masks in their instances' colours over the darkened image; as outlines where masks overlap."""
+    gray = cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY)
+    picture = np.repeat((gray // 3)[..., None], 3, axis=2)
+    for instance, mask in zip(view.instance_ids.tolist(), masks, strict=True):
+        color = np.array(instance_color(instance), np.uint8)
+        if outline:
+            contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+            picture[mask] = picture[mask] // 2 + color // 4
+            cv2.drawContours(picture, contours, -1, color.tolist(), 3, cv2.LINE_AA)
+        else:
+            picture[mask] = color
+    return picture
+
+
+def captioned(image: Image, text: str) -> Image:
+    """The image with its name on a dark ground in the lower left corner."""
+    picture = np.ascontiguousarray(image)
+    (width, height), _ = cv2.getTextSize(text, FONT, CAPTION_SCALE, 1)
+    picture[-height - 14 :, : width + 16] //= 4
+    put_text(picture, text, (8, picture.shape[0] - 8), CAPTION_SCALE, (255, 255, 255))
+    return picture
+
+
+def draw_pick(episode: Episode) -> list[Image]:
+    """Frames of the episode's first successful attempt, seen from the side.
+
+    Raises:
+        SynpickError: No attempt succeeded.
+    """
+    attempt = next((attempt for attempt in episode.attempts if attempt["picked"]), None)
+    if attempt is None:
+        raise SynpickError("no attempt of the episode picked anything; choose another seed")
+    last = min(attempt["end_frame"] + LEAD_OUT, len(episode))
+    frames = [episode.view(frame, camera=1).rgb for frame in range(attempt["frame"], last, GIF_STRIDE)]
+    height = round(GIF_WIDTH * frames[0].shape[0] / frames[0].shape[1])
+    return [cv2.resize(frame, (GIF_WIDTH, height), interpolation=cv2.INTER_AREA)[..., ::-1] for frame in frames]
+
+
+def write_animation(path: Path, frames: list[Image]) -> Path:
+    """Write frames as an endless GIF with one palette."""
+    pictures = [PillowImage.fromarray(np.ascontiguousarray(frame[..., ::-1])) for frame in frames]
+    palette = pictures[len(pictures) // 2].quantize(GIF_COLORS)
+    first, *rest = (picture.quantize(palette=palette, dither=PillowImage.Dither.NONE) for picture in pictures)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    first.save(path, save_all=True, append_images=rest, duration=round(1000 * GIF_STRIDE / 15), loop=0, optimize=True)
+    return path
+
+
+if __name__ == "__main__":
+    sys.exit(main())
