@@ -15,6 +15,7 @@ import math
 import re
 import sys
 import tarfile
+import tempfile
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -25,9 +26,11 @@ import cv2
 import numpy as np
 
 from synpick_warp.dataset.manifest import CONFIG_FILE, FREE_SETTINGS, MANIFEST_FILE
+from tools.checks.renamed import DERIVED, translate
 
 IMAGES = (".png", ".jpg")
 USD = (".usd", ".usdc", ".usda")
+SAME_CONTENT = "different bytes, equal content"
 CHUNK = 1 << 20
 """Bytes of a file compared at once."""
 _INDICES = re.compile(r"\d{6,}(_\d{6,})*")
@@ -58,18 +61,35 @@ class UnusableError(Exception):
     """A folder is missing or empty."""
 
 
-def compare(first: Path, second: Path) -> tuple[dict[str, Layer], str]:
+def compare(first: Path, second: Path, renamed: bool = False) -> tuple[dict[str, Layer], str]:
     """Compare two folders; returns layers by name, and the first difference as one line (empty: none).
 
     Sources come before files derived from them: manifest and settings, then files by name, then manifest entries and lists.
+
+    Args:
+        first: Folder of a data set.
+        second: Folder of another.
+        renamed: Compare content under the new names of `tools.checks.renamed`, which the first data set does not have yet. Checksums of
+            files, which cannot be equal then, are left out.
     """
-    names = [_list_files(folder) for folder in (first, second)]
+    if renamed:
+        with tempfile.TemporaryDirectory() as folder:
+            translate(first, Path(folder))
+            return _compare_folders(Path(folder), second, content=True)
+    return _compare_folders(first, second, content=False)
+
+
+def _compare_folders(first: Path, second: Path, content: bool) -> tuple[dict[str, Layer], str]:
+    """See `compare`; `content`: files of different bytes and equal content are equal."""
+    names = [{name for name in _list_files(folder) if not (content and name.endswith(DERIVED))} for folder in (first, second)]
     layers: dict[str, Layer] = {}
     first_difference = ""
     for name in sorted(names[0] | names[1], key=_sort_key):
         layer = layers.setdefault(layer_of(name), Layer())
         layer.files += 1
         difference = _compare_file(first, second, name, names)
+        if content and difference is not None and difference.where == SAME_CONTENT:
+            difference = None
         if difference is not None:
             layer.differing += 1
             layer.largest = math.nan if math.isnan(difference.largest) else max(layer.largest, difference.largest)
@@ -113,7 +133,7 @@ def _compare_file(first: Path, second: Path, name: str, names: list[set[str]]) -
         return None
     difference = explain(first / name, second / name)
     if difference is None and name != CONFIG_FILE:
-        return Difference("different bytes, equal content", 0.0)
+        return Difference(SAME_CONTENT, 0.0)
     return difference
 
 
@@ -273,9 +293,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("first", type=Path, metavar="A")
     parser.add_argument("second", type=Path, metavar="B")
+    parser.add_argument("--renamed", action="store_true", help="A has the public names of before the change that the changelog lists")
     options = parser.parse_args(arguments)
     try:
-        layers, first_difference = compare(options.first, options.second)
+        layers, first_difference = compare(options.first, options.second, options.renamed)
     except (UnusableError, OSError, ValueError) as error:
         print(f"compare_runs: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

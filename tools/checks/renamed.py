@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import PurePosixPath
+import io
+import json
+import re
+import shutil
+import tarfile
+from pathlib import Path, PurePosixPath
 from typing import Any
+
+import numpy as np
+import zarr
 
 SETTINGS = {
     "sight": "perception",
@@ -35,15 +43,71 @@ DERIVED = (".sha256",)
 """Suffixes of files that hold checksums of files whose keys changed."""
 
 
+RECORD = "record"
+"""Array of the zarr store that holds lines of attempts.jsonl."""
+
+
+def translate(source: Path, target: Path) -> None:
+    """Copy a data set that has the old names to the folder `target`, under the new ones. Checksum files keep the old files' sums."""
+    for path in sorted(source.rglob("*")):
+        if path.is_file():
+            copy = target / renamed_path(path.relative_to(source).as_posix())
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            if path.suffix == ".tar":
+                _translate_tar(path, copy)
+            elif path.suffix == ".usdc" and path.parent.name == "usd":
+                _translate_usd(path, copy)
+            elif path.suffix in (".json", ".jsonl", ".toml"):
+                copy.write_bytes(renamed_text(path.name, path.read_bytes()))
+            else:
+                shutil.copyfile(path, copy)
+    for folder in sorted(target.glob(f"*.zarr/**/{RECORD}")):
+        array = zarr.open_array(folder, mode="r")
+        lines = renamed_text("attempts.jsonl", np.asarray(array[...]).tobytes())
+        attributes, names = dict(array.attrs), array.metadata.dimension_names  # type: ignore[union-attr]
+        data = np.frombuffer(lines, np.uint8)
+        zarr.create_array(folder, data=data, attributes=attributes, dimension_names=names, overwrite=True)
+
+
 def renamed_path(name: str) -> str:
     """Path of a data set's file under the new names."""
     path = PurePosixPath(name)
     return "/".join(ARRAYS.get(part, part) for part in path.parts) if any(part.endswith(".zarr") for part in path.parts) else name
 
 
-def renamed_keys(value: Any, name: str) -> Any:
-    """A JSON or TOML value of the file `name` under the new names; lines of JSON inside of strings are left alone."""
-    table = SETTINGS if PurePosixPath(name).name in ("config.toml", "manifest.json") else RECORDS
+def renamed_text(name: str, data: bytes) -> bytes:
+    """Content of a JSON, JSON lines or TOML file under the new names."""
+    if name.endswith(".toml"):
+        text = re.sub(r"^\[(\w+)\]$", lambda match: f"[{SETTINGS.get(match[1], match[1])}]", data.decode(), flags=re.MULTILINE)
+        return re.sub(r"^(\w+) =", lambda match: f"{SETTINGS.get(match[1], match[1])} =", text, flags=re.MULTILINE).encode()
+    table = SETTINGS if name == "manifest.json" else RECORDS | ARRAYS if name == "zarr.json" else RECORDS
+    if name.endswith(".jsonl"):
+        return b"".join(json.dumps(_renamed(json.loads(line), table)).encode() + b"\n" for line in data.splitlines())
+    return json.dumps(_renamed(json.loads(data), table)).encode()
+
+
+def _renamed(value: Any, table: dict[str, str]) -> Any:
     if isinstance(value, dict):
-        return {table.get(key, key): renamed_keys(item, name) for key, item in value.items()}
-    return [renamed_keys(item, name) for item in value] if isinstance(value, list) else value
+        return {table.get(key, key): _renamed(item, table) for key, item in value.items()}
+    return [_renamed(item, table) for item in value] if isinstance(value, list) else value
+
+
+def _translate_tar(source: Path, target: Path) -> None:
+    with tarfile.open(source) as old, tarfile.open(target, "w") as new:
+        for member in old.getmembers():
+            data = (old.extractfile(member) or io.BytesIO()).read()
+            if member.name.endswith(".json"):
+                data = renamed_text(member.name, data)
+                member.size = len(data)
+            new.addfile(member, io.BytesIO(data))
+
+
+def _translate_usd(source: Path, target: Path) -> None:
+    from pxr import Sdf
+
+    shutil.copyfile(source, target)
+    layer = Sdf.Layer.FindOrOpen(str(target))  # type: ignore[attr-defined]
+    for prim in layer.rootPrims:
+        data = {RECORDS.get(key, key): value for key, value in dict(prim.customData).items()}
+        prim.customData = data
+    layer.Save()
