@@ -19,7 +19,7 @@
 #     DEVICE             cuda:0
 #     ARRANGEMENTS       64: arrangements of the step rest
 #     WORLDS             512: worlds of the step bench
-#     BENCH_PARTS        physics,sight,render,write; also sensor
+#     BENCH_PARTS        physics,perception,render,write; also sensor
 #     BENCH_RESOLUTION   1920x1080
 #     BENCH_SETTINGS     none, such as "bake.mode=move bake.formats=[bop,shards,usd,zarr]"; writers write to TMPDIR
 #     RENDER_SCENES      10: piles whose denoised image is compared with the reference; RENDER_SAMPLES 1024, RENDER_SIZE 960x540
@@ -121,7 +121,7 @@ measure_rest() {
 measure_bench() {
     parse_settings "${BENCH_SETTINGS:-}"
     step "benchmarks" "${BENCH_LIMIT:-$1}" "$python" -m tools.bench --device "$device" "${models[@]}" "${lights[@]}" \
-        --worlds "${WORLDS:-512}" --resolution "${BENCH_RESOLUTION:-1920x1080}" --parts "${BENCH_PARTS:-physics,sight,render,write}" \
+        --worlds "${WORLDS:-512}" --resolution "${BENCH_RESOLUTION:-1920x1080}" --parts "${BENCH_PARTS:-physics,perception,render,write}" \
         "${settings[@]}" --json "$results/bench.json"
 }
 

@@ -164,19 +164,19 @@ IN_TOTE = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0])
 
 
 def tick_report(*worlds: dict) -> TickReport:
-    """Report of a tick of acting worlds with three objects each; keys: status columns, load, `removed` instances, `poses` by instance."""
+    """Report of a tick of acting worlds with three objects each; keys: status columns, peak_force, `removed` instances, `poses` by instance."""
     status = np.zeros((len(worlds), len(Status)), np.int32)
     catalog_index, pose = np.zeros((len(worlds), CAPACITY), np.int32), np.tile(IN_TOTE, (len(worlds), CAPACITY, 1))
     columns = column_names(Status)
     acting = {"phase": Phase.ACT, "live": 1, "mode": Mode.PICK, "task": Task.LIFT}
     for world, values in enumerate(worlds):
         for name, value in (acting | values).items():
-            if name in columns:
+            if name not in ("removed", "poses", "peak_force"):
                 status[world, columns[name]] = int(value)
         catalog_index[world, list(values.get("removed", ()))] = -1
         for instance, instance_pose in values.get("poses", {}).items():
             pose[world, instance] = instance_pose
-    measures = np.array([[values.get("load", 0.0)] for values in worlds], np.float32)
+    measures = np.array([[values.get("peak_force", 0.0)] for values in worlds], np.float32)
     return TickReport(status, measures, catalog_index, pose.astype(np.float32), *(SimpleNamespace() for _ in range(3)))
 
 
@@ -194,9 +194,9 @@ OVER = {"phase": Phase.OVER, "ending": Ending.GAVE_UP}
 def test_a_sequence_accumulates_frame_by_frame():
     tally = tally_of(
         tick_report({"task": Task.LOOK}),
-        tick_report({"task": Task.LIFT, "held": 0b110, "caught": 0b110, "load": 7.0}),
-        tick_report({**PICKED, "task": Task.LOOK, "caught": 0b110, "hits": 9, "held": 0b100, "removed": [2], "load": 3.0}),
-        tick_report({"task": Task.LIFT, "removed": [0, 2], "held": 0b001, "load": 5.0}),
+        tick_report({"task": Task.LIFT, "attached": 0b110, "engaged": 0b110, "peak_force": 7.0}),
+        tick_report({**PICKED, "task": Task.LOOK, "engaged": 0b110, "hits": 9, "attached": 0b100, "removed": [2], "peak_force": 3.0}),
+        tick_report({"task": Task.LIFT, "removed": [0, 2], "attached": 0b001, "peak_force": 5.0}),
         tick_report({**OVER, "task": Task.LOOK, "removed": [0, 2], "outcome": Outcome.NOTHING_CAUGHT}),
     )
     (sequence,) = tally.sequences("pick")
@@ -246,9 +246,9 @@ def test_failed_arrangements_are_dropped_and_finally_given_up():
 def test_speeds_are_reported_by_place():
     """Over a tick of 66 ms: 33 mm in the tote, 66 mm outside, 132 mm on the cup."""
     outside, high = IN_TOTE + np.eye(7)[0] * 2.0, IN_TOTE + np.eye(7)[2] * 0.5
-    still = {"held": 0b100, "poses": {1: outside, 2: high}}
+    still = {"attached": 0b100, "poses": {1: outside, 2: high}}
     displacement = 0.033 * np.eye(7)[0]
-    moved = {"held": 0b100, "poses": {0: IN_TOTE + displacement, 1: outside - 2 * displacement, 2: high + 4 * displacement}}
+    moved = {"attached": 0b100, "poses": {0: IN_TOTE + displacement, 1: outside - 2 * displacement, 2: high + 4 * displacement}}
     (sequence,) = tally_of(tick_report(still), tick_report(moved), tick_report(moved | OVER)).sequences("pick")
     assert sequence.speed == pytest.approx([0.5, 1.0, 2.0], rel=1e-4)
     # Removed objects, and objects of another arrangement, have no speed.

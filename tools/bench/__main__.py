@@ -1,4 +1,4 @@
-"""Benchmark of a bake's parts: physics, perception and planning (sight), rendering, writing, and a whole small bake.
+"""Benchmark of a bake's parts: physics, perception and planning, rendering, writing, and a whole small bake.
 
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
 mode pick; with `--set bake.mode=move`, piles are stirred instead. Writers get the same views repeatedly. Files are written to the
@@ -47,7 +47,7 @@ from tools.bench.sensor import measure_sensor
 from tools.bench.write import measure_writing
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
 
-PARTS = ("physics", "sight", "render", "sensor", "write", "bake")
+PARTS = ("physics", "perception", "render", "sensor", "write", "bake")
 STREAM_BATCHES = 12
 """Batches rendered and copied in a row."""
 WRITE_VIEWS = 12
@@ -83,7 +83,7 @@ def main(arguments: list[str] | None = None) -> int:
             console.print(f"{name:20} {value}")
         for row in measure(config, options.parts, options.seconds):
             rows.append(row)
-            console.print(f"{row.part:8} {row.name:52} {row.value:14,.3f} {row.unit}")
+            console.print(f"{row.part:10} {row.name:52} {row.value:14,.3f} {row.unit}")
     except SynpickError as error:
         return fail("bench", error)
     except KeyboardInterrupt:
@@ -152,7 +152,7 @@ def _perception_fraction(config: Config, values: dict[str, float]) -> Iterator[R
     if perceive is not None and step and rate:
         render = 1e3 * config.bake.worlds * len(config.cameras.positions) / rate
         fraction = perceive / (step * config.physics.steps_per_tick + render)
-        yield Row("sight", "perception and planning: fraction of simulation and rendering", 100.0 * fraction, "%")
+        yield Row("perception", "perception and planning: fraction of simulation and rendering", 100.0 * fraction, "%")
 
 
 def _memory_in_use(device: wp.Device) -> Row:

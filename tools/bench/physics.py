@@ -101,7 +101,7 @@ def measure_simulation(factory: Factory, min_seconds: float, parts: tuple[str, .
     Args:
         factory: Worlds, before their first tick.
         min_seconds: Time for which a measurement is repeated, at least [s].
-        parts: Parts to measure: "physics": ticks; "sight": perception.
+        parts: Parts to measure: "physics": ticks; "perception": perception.
     """
     simulation = factory.simulation
     tick = functools.partial(simulation.tick, simulation.records[0])
@@ -137,14 +137,14 @@ def measure_simulation(factory: Factory, min_seconds: float, parts: tuple[str, .
     else:
         for _ in range(LEAD_TICKS + 2 * rest_ticks):
             tick()
-        if {"physics", "sight"} & set(parts):
+        if {"physics", "perception"} & set(parts):
             yield from (row for row in _measure_picking(simulation, pile_seconds) if row.part in parts)
     if physics_measured:
         acting = float((simulation.state.phase.numpy() == Phase.ACT).mean())
         yield Row("physics", "worlds that act", 100.0 * acting, "%")
         contacts = int(simulation.physics.contacts.rigid_contact_count.numpy()[0])
         yield Row("physics", "contacts per world", contacts / simulation.layout.worlds, "")
-    if simulation.perception is not None and "sight" in parts:
+    if simulation.perception is not None and "perception" in parts:
         yield from _measure_perception(simulation, min_seconds)
 
 
@@ -234,9 +234,9 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Ro
         yield Row("physics", "picking, steps alone: rate relative to steps without gripper and seals", 100.0 * pile_seconds / steps, "%")
     for name, count in (("act", acting), ("have an object attached", attached)):
         yield Row("physics", f"picking: worlds that {name}", 100.0 * count / (PICK_TICKS * worlds), "%")
-    yield Row("sight", "worlds perceived a tick", perceptions / PICK_TICKS, "")
-    yield Row("sight", "perception and planning, a tick", 1e3 * perceive, "ms")
-    yield Row("sight", "perception and planning: fraction of the simulation's time", 100.0 * perceive / tick, "%")
+    yield Row("perception", "worlds perceived a tick", perceptions / PICK_TICKS, "")
+    yield Row("perception", "perception and planning, a tick", 1e3 * perceive, "ms")
+    yield Row("perception", "perception and planning: fraction of the simulation's time", 100.0 * perceive / tick, "%")
 
 
 def _measure_perception(simulation: Simulation, min_seconds: float) -> Iterator[Row]:
@@ -264,7 +264,7 @@ def _measure_perception(simulation: Simulation, min_seconds: float) -> Iterator[
             perceive_batch()
             calls += 1
     views = perception.images.views.count
-    yield Row("sight", "views in a batch", views, "")
+    yield Row("perception", "views in a batch", views, "")
     for _, _, name in stages:
-        yield Row("sight", f"a view: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")
-    yield Row("sight", "a view", 1e3 * sum(watch.seconds(name) for _, _, name in stages) / (calls * views), "ms")
+        yield Row("perception", f"a view: {name}", 1e3 * watch.seconds(name) / (calls * views), "ms")
+    yield Row("perception", "a view", 1e3 * sum(watch.seconds(name) for _, _, name in stages) / (calls * views), "ms")

@@ -180,12 +180,10 @@ def compare_devices(config: Config, devices: list[Any], console: Console) -> lis
     differences = []
     for mode in (FAST, REFERENCE):
         mode_config = with_mode(config, mode)
-        outputs = [
-            render_views(
-                mode_config, build_render_scene(mode_config, catalog, fixtures, cameras, lights, device), copy_snapshot(snapshot, device)
-            )
-            for device in devices
-        ]
+        outputs = []
+        for device in devices:
+            scene = build_render_scene(mode_config.render, mode_config.tote, catalog, fixtures, cameras, lights, device)
+            outputs.append(render_views(mode_config, scene, copy_snapshot(snapshot, device)))
         differences += [compare(mode, name, outputs[0][name], outputs[1][name]) for name in outputs[0]]
     return differences
 
