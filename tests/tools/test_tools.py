@@ -164,7 +164,7 @@ IN_TOTE = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0, 1.0])
 
 
 def tick_report(*worlds: dict) -> TickReport:
-    """Report of a tick of acting worlds with three objects each; keys: status columns, peak_force, `removed` instances, `poses` by instance."""
+    """Report of a tick of acting worlds with 3 objects each; keys: status columns, peak_force, `removed` instances, `poses` by instance."""
     status = np.zeros((len(worlds), len(Status)), np.int32)
     catalog_index, pose = np.zeros((len(worlds), CAPACITY), np.int32), np.tile(IN_TOTE, (len(worlds), CAPACITY, 1))
     columns = column_names(Status)
