@@ -174,7 +174,7 @@ def test_a_bake_that_may_pick_has_the_arrays_of_looking_as_well(mode):
     shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in LOOKING}}
     assert shapes["PerceptionArrays.component"] == shapes["SegmentationScratch.gap"] == (looks, 48, 64)
     assert shapes["VoteArrays.count"] == (looks, room, room, 2)
-    assert [name for name, *_ in rows].count("GBuffer.depth") == 3
+    assert [name for name, *_ in rows].count("GBuffer.depth") == 4
 
 
 def test_a_mixture_without_picking_has_none():

@@ -12,12 +12,15 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.types import Catalog, Fixture
+from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception import images
 from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.render.scene import build_render_scene
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, build_scene, entry, render, snapshot
+from tests.harness.trace_probe import trace_gbuffer_kernel
+from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, entry, render, snapshot
 
 RESOLUTION = (96, 54)
 
@@ -69,19 +72,52 @@ def test_gbuffer_equals_the_renderers_without_gripper(device, toy):
     segment, depth = made.gbuffer.segment.numpy(), made.gbuffer.depth.numpy()
     for view, world in ((0, 1), (2, 0)):
         assert (segment[view] == expected.instance[world]).all()
-        # The renderer rasterizes triangles; perception casts rays through BVHs.
+        # Perception computes depths with the arithmetic of mesh queries, the renderer with that of the rasterizer.
         np.testing.assert_allclose(depth[view], expected.exact_depth[world], rtol=1e-6)
     assert (segment[1] == 77).all()
     assert made.views.camera.numpy().tolist() == [0, -1, 0]
 
 
+@pytest.mark.parametrize("displacement", [0.0, 0.03])
+def test_rasterized_hits_equal_traced_hits_pixel_by_pixel(device, toy, displacement):
+    """The rasterizer and rays through BVHs agree, with the static background and, if the tote is displaced, without."""
+    made = make_images(toy, device)
+    state = snapshot(toy, device)
+    tote = state.fixture_pose.numpy()
+    tote[:, 0, 0] += displacement
+    state.fixture_pose.assign(tote)
+    made.views.world.assign([1, -1, 0])
+    made.render(state)
+    names = ("segment", "triangle", "barycentric", "depth")
+    rasterized = {name: getattr(made.gbuffer, name).numpy().copy() for name in names}
+    scene, pixels = made.scene, 3 * made.scene.grid.tiles * int(TILE_PIXELS)
+    inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, made.bodies, made.views, wp.vec2(0.0, 0.0)]
+    launch_pixels(trace_gbuffer_kernel, pixels, inputs, [made.gbuffer], device)
+    traced = {name: getattr(made.gbuffer, name).numpy() for name in names}
+    assert made.bodies.uses_background.numpy()[[0, 2]].tolist() == [int(displacement == 0.0)] * 2
+    ours, expected = ({name: values[[0, 2]] for name, values in hits.items()} for hits in (rasterized, traced))
+    assert (ours["segment"] == expected["segment"]).all()
+    np.testing.assert_allclose(ours["depth"], expected["depth"], rtol=1e-6)
+    has_triangle = ~np.isin(expected["segment"], (Segment.NOTHING, Segment.TABLE))
+    assert has_triangle.any(axis=(1, 2)).all()
+    # A ray through an edge may hit either of its triangles.
+    same = has_triangle & (ours["triangle"] == expected["triangle"])
+    assert same.sum() > 0.97 * has_triangle.sum()
+    for name in ("depth", "barycentric"):
+        if device.is_cpu:
+            assert (ours[name][same] == expected[name][same]).all()
+        else:
+            # Compilers may contract products and sums differently in the two kernels.
+            np.testing.assert_allclose(ours[name][same], expected[name][same], atol=1e-4)
+
+
 def test_number_of_views():
     config = Config()
     cpu, cuda = SimpleNamespace(is_cuda=False), SimpleNamespace(is_cuda=True)
-    assert images.count_views(config.perception, 64, 21, cpu) == images.CPU_VIEWS
-    each = images.view_bytes(config.perception, 21)
-    assert 1920 * 1080 * 30 < each < 1920 * 1080 * 40
-    views = images.count_views(config.perception, 64, 21, cuda)
+    assert images.count_views(config.sight, 64, 21, cpu) == images.CPU_VIEWS
+    each = images.view_bytes(config.sight, 21)
+    assert 1920 * 1080 * 38 < each < 1920 * 1080 * 48
+    views = images.count_views(config.sight, 64, 21, cuda)
     assert views * each <= images.GPU_BYTES < (views + 1) * each
     asked = replace(config.perception, views=7)
     assert images.count_views(asked, 64, 21, cpu) == 7

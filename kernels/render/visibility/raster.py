@@ -77,7 +77,7 @@ def write_sample(
             key = (wp.uint64(wp.cast(depth, wp.uint32)) << DEPTH_BITS) | name
             # Reading first, to skip atomics that change nothing, costs more: a thread waits for reads, but not for atomics without result.
             wp.atomic_min(visibility.nearest, view, row, column, key)
-            if bit != wp.uint32(0):
+            if amodal and bit != wp.uint32(0):
                 wp.atomic_or(amodal, view, row, column, bit)
 
 
@@ -145,17 +145,22 @@ def clear_visibility_kernel(
     # Scene:
     grid: ImageGrid,
     # In:
+    views: Views,
     first: int,
     # Out:
     visibility_out: VisibilityBuffer,
     amodal_out: wp.array3d[wp.uint32],  # (view, row, column)
 ):
-    """Clear visibility buffer, amodal bits and the work list. One thread a pixel from flat index `first` on, in tile order."""
+    """Clear visibility buffer, amodal bits (unless null) and the work list; unused views (camera -1) keep theirs.
+
+    One thread a pixel from flat index `first` on, in tile order.
+    """
     view, row, column = tile_pixel(grid, wp.tid() + first)
-    if not in_image(grid, row, column):
+    if not in_image(grid, row, column) or views.camera[view] < 0:
         return
     visibility_out.nearest[view, row, column] = EMPTY
-    amodal_out[view, row, column] = wp.uint32(0)
+    if amodal_out:
+        amodal_out[view, row, column] = wp.uint32(0)
     if row == 0 and column == 0:
         visibility_out.blocks[view] = 0
 
@@ -229,7 +234,10 @@ def rasterize_blocks_kernel(
     stride over the rows of its blocks, whose number the host does not know."""
     index = wp.tid() + first
     view = index // threads
-    intrinsics = cameras.intrinsics[views.camera[view]]
+    camera = views.camera[view]
+    if camera < 0:
+        return
+    intrinsics = cameras.intrinsics[camera]
     blocks = wp.min(visibility_inout.blocks[view], visibility_inout.block.shape[1])
     for i in range(index % threads, BLOCK_ROWS * blocks, threads):
         block = visibility_inout.block[view, i // BLOCK_ROWS]
@@ -280,12 +288,15 @@ def resolve_visibility_kernel(
     """Resolve the visibility buffer: G-buffer, segmentation ids, and planar depth rounded to counts (0: no surface, or above 65,535).
 
     The nearest triangle competes with the cached static background, one G-buffer a camera (view: camera), or with the table where the
-    tote has another pose. One thread a pixel from flat index `first` on, in tile order.
+    tote has another pose. Null images are not written; unused views (camera -1) keep their content. One thread a pixel from flat index
+    `first` on, in tile order.
     """
     view, row, column = tile_pixel(grid, wp.tid() + first)
     if not in_image(grid, row, column):
         return
     camera = views.camera[view]
+    if camera < 0:
+        return
     ray = camera_ray(cameras.intrinsics[camera], row, column, wp.vec2(0.0, 0.0))
     hit = Hit()
     hit.segment = Segment.NOTHING
@@ -300,8 +311,10 @@ def resolve_visibility_kernel(
     else:
         hit = hit_table(table, cameras, camera, ray, hit)
     store_hit(gbuffer_out, view, row, column, hit)
-    instance_out[view, row, column] = wp.uint8(hit.segment)
-    counts = wp.rint(hit.depth * counts_per_meter)
-    if counts > MAX_COUNTS:
-        counts = 0.0
-    depth_out[view, row, column] = wp.uint16(counts)
+    if instance_out:
+        instance_out[view, row, column] = wp.uint8(hit.segment)
+    if depth_out:
+        counts = wp.rint(hit.depth * counts_per_meter)
+        if counts > MAX_COUNTS:
+            counts = 0.0
+        depth_out[view, row, column] = wp.uint16(counts)

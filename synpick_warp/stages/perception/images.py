@@ -10,13 +10,14 @@ import warp as wp
 from synpick_warp.arrays import allocate_struct, memory_table
 from synpick_warp.configs import schema
 from synpick_warp.errors import ConfigError
-from synpick_warp.kernels.render.visibility.bvh_rays import trace_gbuffer_kernel
+from synpick_warp.kernels.perception.exact_hits import intersect_hits_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.render.visibility.view_setup import aim_views_kernel
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.perception.arrays import PerceptionArrays, SegmentationScratch
+from synpick_warp.stages.render.raster import VISIBILITY_BUFFER, Rasterizer, visibility_sizes
 from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS, body_sizes, set_up_views
 
@@ -25,17 +26,15 @@ GPU_BYTES = 2 * 2**30
 """Scratch that the views of a batch may take if `perception.views` is 0."""
 CPU_VIEWS = 4
 """Maximum number of views on the CPU in that case: larger batches gain nothing there, and unused views still cost a little."""
-CENTER = wp.vec2(0.0, 0.0)
-"""Offset of rays through the pixel centres [px]."""
-SCRATCH = (VIEWS, VIEW_BODIES, GBUFFER, PerceptionArrays, SegmentationScratch)
+SCRATCH = (VIEWS, VIEW_BODIES, GBUFFER, VISIBILITY_BUFFER, PerceptionArrays, SegmentationScratch)
 """Declarations of the arrays of a batch."""
 
 
 def perception_sizes(settings: schema.Perception, instances: int, views: int) -> dict[str, int]:
     """Extents of the dimensions of the declarations in `SCRATCH`."""
     width, height = settings.resolution
-    sizes = {"view": views, "instance": instances, "row": height, "column": width, "point": settings.contour_points}
-    return sizes | body_sizes(instances, width, height)
+    sizes = {"instance": instances, "point": settings.contour_points}
+    return sizes | body_sizes(instances, width, height) | visibility_sizes(views, width, height)
 
 
 def view_bytes(settings: schema.Perception, instances: int) -> int:
@@ -64,10 +63,8 @@ class PerceptionImages:
         sizes: Extents of the dimensions of the declarations in `SCRATCH`.
     """
 
-    def __init__(
-        self, settings: schema.Perception, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int
-    ) -> None:
-        """Allocate scratch.
+    def __init__(self, settings: schema.Sight, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int) -> None:
+        """Allocate scratch and render the static background.
 
         Args:
             settings: Settings of perception.
@@ -95,11 +92,13 @@ class PerceptionImages:
         self.bodies: Any = allocate_struct(VIEW_BODIES, self.sizes, device)
         self.gbuffer: Any = allocate_struct(GBUFFER, self.sizes, device)
         self.fixture_visible = wp.array([[1, 0, 0]] * worlds, dtype=wp.int32, device=device)
+        self.rasterizer = Rasterizer(self.scene, 1.0, count)
 
     def render(self, snapshot: Snapshot) -> None:
-        """Cast one ray through each pixel of each view's world, without gripper shaft and cup. Unused views keep their content."""
+        """Rasterize each view's world without gripper shaft and cup. Unused views keep their content."""
         scene, views = self.scene, self.views
         wp.launch(aim_views_kernel, dim=views.count, outputs=[views], device=scene.device)
         set_up_views(scene, scene.cameras, scene.grid, snapshot, self.fixture_visible, views, self.bodies)
-        inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.bodies, views, CENTER]
-        launch_pixels(trace_gbuffer_kernel, self.pixels, inputs, [self.gbuffer], scene.device)
+        self.rasterizer.rasterize(self.bodies, views, self.gbuffer)
+        inputs = [scene.meshes, scene.cameras, scene.grid, self.bodies, views]
+        launch_pixels(intersect_hits_kernel, self.pixels, inputs, [self.gbuffer], scene.device)

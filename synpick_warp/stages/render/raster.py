@@ -58,25 +58,26 @@ class Rasterizer:
         self.visibility = allocate_struct(VISIBILITY_BUFFER, visibility_sizes(views, scene.width, scene.height), scene.device)
         self.background = render_background(scene) if background is None else background
 
-    def rasterize(self, bodies: Any, views: Any, gbuffer: Any, out: ViewBuffers) -> None:
+    def rasterize(self, bodies: Any, views: Any, gbuffer: Any, out: ViewBuffers | None = None) -> None:
         """Render the G-buffer of a batch of views.
 
         Args:
             bodies: The struct `ViewBodies` of these views.
             views: The struct `Views`.
             gbuffer: The struct `GBuffer`; written.
-            out: `instance`, `depth` and `amodal` are written.
+            out: `instance`, `depth` and `amodal` are written; None: only the G-buffer is needed.
         """
         scene, visibility, device = self.scene, self.visibility, self.scene.device
         pixels = views.count * scene.grid.tiles * int(TILE_PIXELS)
-        launch_pixels(clear_visibility_kernel, pixels, [scene.grid], [visibility, out.amodal], device)
+        instance, depth, amodal = (None, None, None) if out is None else (out.instance, out.depth, out.amodal)
+        launch_pixels(clear_visibility_kernel, pixels, [scene.grid, views], [visibility, amodal], device)
         inputs = [scene.meshes, scene.cameras, scene.grid, bodies, views]
         per_body, per_view = (TRIANGLE_THREADS, BLOCK_THREADS) if device.is_cuda else (1, 1)
         threads = bodies.mesh.shape[1] * per_body
-        launch_views(rasterize_triangles_kernel, views.count, threads, [*inputs, per_body], [visibility, out.amodal], device)
-        launch_views(rasterize_blocks_kernel, views.count, per_view, [*inputs, per_view], [visibility, out.amodal], device)
+        launch_views(rasterize_triangles_kernel, views.count, threads, [*inputs, per_body], [visibility, amodal], device)
+        launch_views(rasterize_blocks_kernel, views.count, per_view, [*inputs, per_view], [visibility, amodal], device)
         inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.background, bodies, visibility, views, self.counts_per_meter]
-        launch_pixels(resolve_visibility_kernel, pixels, inputs, [gbuffer, out.instance, out.depth], device)
+        launch_pixels(resolve_visibility_kernel, pixels, inputs, [gbuffer, instance, depth], device)
 
 
 def render_background(scene: RenderScene) -> Any:
@@ -90,10 +91,9 @@ def render_background(scene: RenderScene) -> Any:
     views = make_views(first_world, wp.array(range(cameras), dtype=wp.int32, device=device), cameras, 0)
     bodies, gbuffer = allocate_struct(VIEW_BODIES, sizes, device), allocate_struct(GBUFFER, sizes, device)
     set_up_views(scene, scene.cameras, scene.grid, world, tote, views, bodies)
-    # The background itself must be rasterized. Its depth image is not used, so any unit will do.
+    # The background itself must be rasterized.
     bodies.uses_background.zero_()
-    out = allocate(ViewBuffers, sizes, device, ("instance", "depth", "amodal"))
-    Rasterizer(scene, 1.0, cameras, background=gbuffer).rasterize(bodies, views, gbuffer, out)
+    Rasterizer(scene, 1.0, cameras, background=gbuffer).rasterize(bodies, views, gbuffer)
     return gbuffer
 
 

@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from synpick_warp.codes import Segment
 from synpick_warp.device import pick_device
 from synpick_warp.errors import CatalogError
-from synpick_warp.kernels.render.visibility.bvh_rays import trace_gbuffer_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.scenes.types import Fixture, TriangleMesh
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render import raster
 from synpick_warp.stages.render.view_setup import make_views
+from tests.harness.trace_probe import trace_gbuffer_kernel
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, sheet, traced
 
 VIEW = camera(96, 64, 150.0, (0.0, 0.0, 1.0))
