@@ -313,10 +313,10 @@ def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int
     if has_lens_filter(config.effects):
         groups += [(LensArrays, views, 1)]
     if may_pick(config):
-        count = count_views(config.sight, worlds["world"], room, device)
-        sizes = perception_sizes(config.sight, room, count)
+        count = count_views(config.perception, worlds["world"], room, device)
+        sizes = perception_sizes(config.perception, room, count)
         groups += [(kind, sizes, 1) for kind in SCRATCH] + [(GBUFFER, sizes | {"view": 1}, 1)]
-        groups += [(kind, plan_sizes(config.sight, room, count), 1) for kind in (VoteArrays, CYCLES)]
+        groups += [(kind, plan_sizes(config.perception, room, count), 1) for kind in (VoteArrays, CYCLES)]
     rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
     if config.render.mode == FAST:
         sizes = views | scratch_sizes(config.render, *config.cameras.resolution)

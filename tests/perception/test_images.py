@@ -114,10 +114,10 @@ def test_rasterized_hits_equal_traced_hits_pixel_by_pixel(device, toy, displacem
 def test_number_of_views():
     config = Config()
     cpu, cuda = SimpleNamespace(is_cuda=False), SimpleNamespace(is_cuda=True)
-    assert images.count_views(config.sight, 64, 21, cpu) == images.CPU_VIEWS
-    each = images.view_bytes(config.sight, 21)
+    assert images.count_views(config.perception, 64, 21, cpu) == images.CPU_VIEWS
+    each = images.view_bytes(config.perception, 21)
     assert 1920 * 1080 * 38 < each < 1920 * 1080 * 48
-    views = images.count_views(config.sight, 64, 21, cuda)
+    views = images.count_views(config.perception, 64, 21, cuda)
     assert views * each <= images.GPU_BYTES < (views + 1) * each
     asked = replace(config.perception, views=7)
     assert images.count_views(asked, 64, 21, cpu) == 7

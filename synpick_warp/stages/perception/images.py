@@ -63,7 +63,9 @@ class PerceptionImages:
         sizes: Extents of the dimensions of the declarations in `SCRATCH`.
     """
 
-    def __init__(self, settings: schema.Sight, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int) -> None:
+    def __init__(
+        self, settings: schema.Perception, cameras: schema.Cameras, render_scene: RenderScene, worlds: int, instances: int
+    ) -> None:
         """Allocate scratch and render the static background.
 
         Args:
