@@ -20,7 +20,7 @@ from synpick_warp.stages.perception import images
 from synpick_warp.stages.perception.images import PerceptionImages
 from synpick_warp.stages.render.scene import build_render_scene
 from tests.harness.trace_probe import trace_gbuffer_kernel
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, entry, render, snapshot
+from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, build_scene, entry, render, snapshot
 
 RESOLUTION = (96, 54)
 
