@@ -109,8 +109,10 @@ class Catalog:
 
 @dataclass(frozen=True)
 class Interior:
-    """A convex room in a mesh's own frame that no triangle reaches into, open at the top: |x| <= half[0], |y| <= half[1] and |x| + |y| <=
-    half[2] at z = 0, each wider by its growth a metre up."""
+    """Empty convex interior of a mesh, in its own frame: no triangle reaches into it, and it is open at the top.
+
+    floor <= z <= top, |x| <= half[0] + z growth[0], |y| <= half[1] + z growth[1], |x| + |y| <= half[2] + z growth[2].
+    """
 
     half: tuple[float, float, float]
     """[m]"""

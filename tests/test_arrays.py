@@ -1,4 +1,4 @@
-"""Declared arrays: what is declared is what is allocated, and what the table says."""
+"""Array declarations: allocation and memory table agree with them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ NAMES = (
     "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_footprint block"
 )
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
-MOVING = [
+BASE = [
     WorldState,
     AttemptState,
     SealState,
@@ -58,9 +58,9 @@ MOVING = [
     FootprintLists,
     VISIBILITY_BUFFER,
 ]
-LOOKING = [VIEWS, PerceptionArrays, SegmentationScratch, VoteArrays, CYCLES]
+PERCEPTION = [VIEWS, PerceptionArrays, SegmentationScratch, VoteArrays, CYCLES]
 LAYERS = [LayerBuffers, BODY_MOTIONS]
-DECLARED = MOVING + LOOKING + LAYERS
+DECLARED = BASE + PERCEPTION + LAYERS
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Sample:
     flag: wp.array = device_array("cup", "cup", "world", dtype=wp.uint8)
 
 
-def test_arrays_have_the_declared_shapes_and_types_and_begin_as_zeros(device):
+def test_allocated_arrays_have_declared_shapes_and_types_and_are_zero(device):
     made = allocate(Sample, {"world": 3, "cup": 2}, device)
     assert [made.gap.shape, made.pose.shape, made.flag.shape] == [(3, 2), (3,), (2, 2, 3)]
     assert [made.gap.dtype, made.pose.dtype, made.flag.dtype] == [wp.float32, wp.transformf, wp.uint8]
@@ -84,13 +84,13 @@ def test_the_table_counts_bytes_and_allocates_nothing():
     assert huge[0][3] == 4 * 10**12
 
 
-def test_a_size_that_is_not_given_is_an_error(device):
+def test_a_missing_extent_is_an_error(device):
     with pytest.raises(KeyError, match="cup"):
         allocate(Sample, {"world": 3}, device)
 
 
 @pytest.mark.parametrize("kind", DECLARED, ids=lambda kind: kind.__name__)
-def test_the_table_is_true_of_every_declaration(device, kind):
+def test_the_memory_table_of_every_declaration_matches_its_allocation(device, kind):
     is_struct = isinstance(kind, StructArrays)
     arrays = allocate_struct(kind, SIZES, device) if is_struct else allocate(kind, SIZES, device)
     names = [name for name in kind.struct.vars if wp.types.is_array(getattr(arrays, name))] if is_struct else [f.name for f in fields(kind)]
@@ -108,7 +108,7 @@ class SampleStruct:
     count: int
 
 
-def test_arrays_of_a_struct_have_its_types_and_the_declared_dimensions(device):
+def test_struct_arrays_have_the_types_of_the_struct_and_declared_dimensions(device):
     declared = struct_arrays(SampleStruct, "world", "cup", pose=("world",), units={"gap": "m"})
     struct = allocate_struct(declared, {"world": 3, "cup": 2}, device)
     assert (struct.gap.shape, struct.pose.shape, struct.count) == ((3, 2), (3,), 0)
@@ -123,7 +123,7 @@ def test_arrays_of_a_struct_have_its_types_and_the_declared_dimensions(device):
         (("world", "cup"), {"pose": ("world",), "count": ("world",)}, "SampleStruct has no array count"),
     ],
 )
-def test_dimensions_that_do_not_fit_a_struct_are_an_error(shape, others, message):
+def test_dimensions_that_contradict_the_struct_are_an_error(shape, others, message):
     with pytest.raises(TypeError, match=message):
         struct_arrays(SampleStruct, *shape, **others)
 
@@ -132,7 +132,7 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
     config = settings(bake__worlds=7, cameras__resolution=[8, 6])
     rows = describe_arrays(config)
     names = [name for name, *_ in rows]
-    assert {name.split(".")[0] for name in names} == {kind.__name__ for kind in MOVING}
+    assert {name.split(".")[0] for name in names} == {kind.__name__ for kind in BASE}
     assert names.count("Observation.votes") == names.count("Plan.target") == 3
     assert names.count("Snapshot.pose") == names.count("WorldStatus.table") == 2
     assert names.count("WorldState.phase") == names.count("ViewBuffers.color") == 1
@@ -145,7 +145,7 @@ def test_a_bakes_table_lists_every_array_with_its_copies():
     ("cell", "width", "shape"),
     [(0, 8, (6, 8, 6, 8)), (0, 960, (3, 480, 6, 960)), (0, 1920, (2, 384, 3, 960)), (3, 8, (2, 3, 6, 8)), (64, 8, (1,) * 4)],
 )
-def test_cells_cover_the_image(cell, width, shape):
+def test_coarse_pixels_cover_the_image(cell, width, shape):
     sizes = scratch_sizes(settings(render__coarse_pixel=cell).render, width, 6)
     assert tuple(sizes[name] for name in ("cell_row", "cell_column", "shadow_row", "shadow_column")) == shape
 
@@ -153,43 +153,43 @@ def test_cells_cover_the_image(cell, width, shape):
 @pytest.mark.parametrize(
     ("cell", "width", "paths"), [(0, 320, 2), (0, 480, 2), (0, 481, 1), (0, 640, 1), (0, 960, 2), (0, 1920, 2), (1, 1920, 1)]
 )
-def test_small_cells_have_one_path_and_wider_ones_two(cell, width, paths):
+def test_paths_per_coarse_pixel_depend_on_the_resolution(cell, width, paths):
     assert paths_per_coarse_pixel(settings(render__coarse_pixel=cell).render, width) == paths
     assert paths_per_coarse_pixel(settings(render__coarse_pixel=cell, render__coarse_paths=5).render, width) == 5
 
 
-def test_the_reference_has_no_cells():
+def test_the_path_traced_reference_has_no_coarse_grid():
     names = {name.split(".")[0] for name, *_ in describe_arrays(settings(render__mode="reference"))}
     assert "ShadedImage" in names
     assert not names & {"Guide", "Gathered", "Shares", "ShadowArrays"}
 
 
 @pytest.mark.parametrize("mode", [{"bake__mode": "target"}, {"bake__mode": "mixed", "bake__mix": [1, 0, 3]}])
-def test_a_bake_that_may_pick_has_the_arrays_of_looking_as_well(mode):
+def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
     config = settings(bake__worlds=7, perception__resolution=[64, 48], **mode)
     room = config.arrangement.max_objects
     looks = count_views(config.perception, config.bake.worlds, room, pick_device("cpu"))
     rows = describe_arrays(config)
-    assert {name.split(".")[0] for name, *_ in rows} == {kind.__name__ for kind in MOVING + LOOKING}
-    shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in LOOKING}}
+    assert {name.split(".")[0] for name, *_ in rows} == {kind.__name__ for kind in BASE + PERCEPTION}
+    shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in PERCEPTION}}
     assert shapes["PerceptionArrays.component"] == shapes["SegmentationScratch.gap"] == (looks, 48, 64)
     assert shapes["VoteArrays.count"] == (looks, room, room, 2)
     assert [name for name, *_ in rows].count("GBuffer.depth") == 4
 
 
-def test_a_mixture_without_picking_has_none():
+def test_a_mixture_without_picking_has_no_arrays_of_perception():
     config = settings(bake__mode="mixed", bake__mix=[0, 0, 1])
-    assert {name.split(".")[0] for name, *_ in describe_arrays(config)} == {kind.__name__ for kind in MOVING}
+    assert {name.split(".")[0] for name, *_ in describe_arrays(config)} == {kind.__name__ for kind in BASE}
 
 
-def test_fields_that_are_not_asked_for_are_neither_allocated_nor_counted(device):
+def test_fields_left_out_are_neither_allocated_nor_counted(device):
     made = allocate(Sample, {"world": 3, "cup": 2}, device, only=("pose",))
     assert (made.gap, made.flag) == (None, None)
     assert made.pose.shape == (3,)
     assert memory_table(Sample, {"world": 3}, only=("pose",)) == [("Sample.pose", (3,), "", 84)]
 
 
-def test_layers_are_in_the_table_if_they_are_asked_for():
+def test_the_memory_table_lists_the_layers_of_the_settings():
     rows = {name: (shape, unit, size) for name, shape, unit, size in describe_arrays(settings(render__layers=["flow", "nocs"]))}
     assert {name for name in rows if name.startswith("LayerBuffers")} == {"LayerBuffers.flow", "LayerBuffers.nocs"}
     assert rows["LayerBuffers.flow"][1] == "px"

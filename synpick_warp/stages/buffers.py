@@ -1,4 +1,4 @@
-"""Device arrays that pass from one stage to the next."""
+"""Device arrays that stages hand over to each other: snapshots of the worlds, and images of a batch of views."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.layers import LAYER_TABLE, Layer
 
 FIXTURES = ("tote", "finger", "cup")
-"""What `Snapshot.fixture_pose` holds, in order."""
+"""Order of the dimension "fixture"; finger: the gripper shaft."""
 
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """What every world looks like at the end of a tick; what the renderer and the exporters see."""
+    """Visible state of every world at the end of a tick: the input of the renderer and of exporters."""
 
     live: wp.array = device_array("world", dtype=wp.int32)
     """1: this tick is a frame of the world's episode."""
     episode: wp.array = device_array("world", dtype=wp.int32)
-    """Episode number."""
+    """Episode index."""
     frame: wp.array = device_array("world", dtype=wp.int32)
-    """Number of the frame in its episode."""
+    """Frame index within the episode."""
     catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
     """Catalog index of each instance; -1: none."""
     pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     """Object to world."""
     fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
-    """Tote, finger and cup to world."""
+    """Tote, gripper shaft and cup to world."""
     fixture_visible: wp.array = device_array("world", "fixture", dtype=wp.int32)
-    """0: not in the picture."""
+    """0: the fixture is not rendered."""
     light: wp.array = device_array("world", dtype=wp.int32)
-    """Index of the episode's light map."""
+    """Index of the episode's environment map."""
     light_yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
-    """The light map is turned counter-clockwise about +z by this angle."""
+    """Environment yaw: rotation of the map counter-clockwise about +z."""
     light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="stops")
-    """How much longer than the automatic exposure the episode's pictures are exposed."""
+    """Exposure value relative to the automatic exposure [EV]."""
     follows: wp.array = device_array("world", dtype=wp.int32)
-    """1: the arrays below hold the frame before this one, of the same episode; 0: there is none."""
+    """1: the `last_` arrays hold the previous frame of the same episode; 0: there is none."""
     last_catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
     last_pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     last_fixture_pose: wp.array = device_array("world", "fixture", dtype=wp.transformf, unit="m")
@@ -49,7 +49,7 @@ class Snapshot:
 
 @dataclass(frozen=True, eq=False)
 class LastFrame:
-    """The part of every world's last snapshot that the next one repeats; fields as those of `Snapshot` and of the struct `FramePoses`."""
+    """Copy of each world's last snapshot, from which the next one gets its `last_` arrays; members as in `Snapshot` and `FramePoses`."""
 
     live: wp.array = device_array("world", dtype=wp.int32)
     episode: wp.array = device_array("world", dtype=wp.int32)
@@ -62,20 +62,20 @@ class LastFrame:
 
 @dataclass(frozen=True, eq=False)
 class ViewBuffers:
-    """Images and counts of one batch of views."""
+    """Images, boxes and pixel counts of one batch of views."""
 
     color: wp.array = device_array("view", "row", "column", dtype=wp.vec3ub)
     """sRGB, red first."""
     depth: wp.array = device_array("view", "row", "column", dtype=wp.uint16, unit="depth_scale")
-    """Planar depth in counts of the depth scale; 0: no surface, or farther than 65,535 counts."""
+    """Planar depth in counts of the depth scale; 0: no surface, or above 65,535 counts."""
     instance: wp.array = device_array("view", "row", "column", dtype=wp.uint8)
     """Instance segmentation: 1 + instance_id, or a `Segment`."""
     amodal: wp.array = device_array("view", "row", "column", dtype=wp.uint32)
-    """Bit i: the ray hits instance i."""
+    """Amodal masks: bit i: the pixel's ray hits instance i, occluded or not."""
     pixels: wp.array = device_array("view", "instance", "count", dtype=wp.int32, unit="px")
-    """px_count_all, px_count_valid, px_count_visib."""
+    """BOP's px_count_all, px_count_valid, px_count_visib."""
     boxes: wp.array = device_array("view", "instance", "box", "side", dtype=wp.int32, unit="px")
-    """bbox_obj and bbox_visib: x_min, y_min, x_max, y_max, inclusive; x_max < x_min: empty."""
+    """BOP's bbox_obj and bbox_visib as (x_min, y_min, x_max, y_max), inclusive; x_max < x_min: empty."""
     effects: wp.array = device_array("view", dtype=EffectParameters)
     """Camera-effect parameters of each view, by `Effect`; zero: off."""
 

@@ -72,11 +72,11 @@ def albedo(material: Material, rows: int, columns: int, device) -> np.ndarray:
     toy = ToyScene([entry(sheet(TEXEL * columns, TEXEL * rows), material)], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (view,))
     config = replace(Config(), render=replace(Config().render, table=False, layers=("albedo",)))
     scene = build_scene(toy, device)
-    sizes = view_buffer_sizes(1, scene.width, scene.height, toy.room)
+    sizes = view_buffer_sizes(1, scene.width, scene.height, toy.instances)
     layers = allocate(LayerBuffers, sizes, device, ("albedo",))
     zero = wp.zeros(1, dtype=wp.int32, device=device)
-    make_renderer(config, scene, toy.room, 1).render(
-        snapshot(toy, device), make_views(zero, zero, 1, toy.room), allocate(ViewBuffers, sizes, device), layers
+    make_renderer(config, scene, toy.instances, 1).render(
+        snapshot(toy, device), make_views(zero, zero, 1, toy.instances), allocate(ViewBuffers, sizes, device), layers
     )
     return layers.albedo.numpy()[0]
 

@@ -101,7 +101,7 @@ class GraspHarness:
     """Worlds rendered by one camera; instance 0 of each is the target."""
 
     def __init__(self, device, toy: ToyScene, window: int = 10, tilt_limit: float = QUARTER) -> None:
-        views, instances = len(toy.placed), toy.room
+        views, instances = len(toy.placed), toy.instances
         scene = build_scene(toy, device)
         renderer = make_renderer(toy.settings(), scene, instances, views)
         sizes = view_buffer_sizes(views, scene.width, scene.height, instances) | {"world": views, "point": planning.CAPACITY}

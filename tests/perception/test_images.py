@@ -57,7 +57,7 @@ def make_images(toy: ToyScene, device: wp.Device, worlds: int = 4, views: int = 
     scene = build_render_scene(
         config.render, config.tote, Catalog(tuple(toy.entries)), toy.fixtures, make_cameras(cameras), toy.lights, device
     )
-    return PerceptionImages(settings, cameras, scene, worlds, toy.room)
+    return PerceptionImages(settings, cameras, scene, worlds, toy.instances)
 
 
 def test_gbuffer_equals_the_renderers_without_gripper(device, toy):
@@ -130,4 +130,4 @@ def test_more_pixels_than_31_bits_count_are_an_error(device, toy):
     settings = replace(Config().perception, resolution=(8192, 8192), views=32)
     scene = build_scene(toy, device)
     with pytest.raises(ConfigError, match=r"perception\.views is 32"):
-        PerceptionImages(settings, Config().cameras, scene, 32, toy.room)
+        PerceptionImages(settings, Config().cameras, scene, 32, toy.instances)

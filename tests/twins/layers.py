@@ -56,12 +56,12 @@ def render_layers(
         for name in ("catalog_index", "pose", "fixture_pose", "fixture_visible"):
             wp.copy(getattr(now, f"last_{name}"), getattr(last, name))
         now.follows.assign(np.array(previous.follows))
-    renderer = make_renderer(config, scene, toy.room, views)
-    sizes = view_buffer_sizes(views, scene.width, scene.height, toy.room)
+    renderer = make_renderer(config, scene, toy.instances, views)
+    sizes = view_buffer_sizes(views, scene.width, scene.height, toy.instances)
     out = allocate(LayerBuffers, sizes, device, names)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
-    renderer.render(now, make_views(view_world, view_camera, views, toy.room), allocate(ViewBuffers, sizes, device), out)
+    renderer.render(now, make_views(view_world, view_camera, views, toy.instances), allocate(ViewBuffers, sizes, device), out)
     layers = {name: getattr(out, name).numpy() for name in names}
     return RenderedLayers(layers, renderer.gbuffer.segment.numpy(), renderer.gbuffer.depth.numpy(), names)
 

@@ -1,4 +1,4 @@
-"""Rays against triangles in float64, triangle by triangle: what the renderer's hits must agree with."""
+"""Reference G-buffer in float64: every triangle against the rays of the pixels in its box."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from synpick_warp.scenes.types import Camera, TriangleMesh
 
 
 def rotation_of(quaternion: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a quaternion x, y, z, w, normalised first."""
+    """Rotation matrix (3, 3) of a quaternion x, y, z, w, which is normalized first."""
     x, y, z, w = np.asarray(quaternion, dtype=np.float64) / np.linalg.norm(np.asarray(quaternion, dtype=np.float64))
     return np.array(
         [
@@ -20,9 +20,9 @@ def rotation_of(quaternion: np.ndarray) -> np.ndarray:
 
 
 def cast_mesh(mesh: TriangleMesh, pose: np.ndarray, camera: Camera) -> np.ndarray:
-    """Planar depth of the nearest hit of each pixel's ray (H, W) float64 [m]; inf where there is none.
+    """Planar depth of the closest hit of each pixel's ray (H, W) float64 [m]; inf: a miss.
 
-    Every triangle must lie before the camera. A triangle with corners a, b, c in the camera's axes and a ray d = (x, y, 1):
+    Every triangle must lie in front of the camera. A triangle with corners a, b, c in the camera's axes and a ray d = (x, y, 1):
     z = a·n / d·n with n = (b - a) x (c - a), inside where the three determinants det(d, a, b), det(d, b, c), det(d, c, a) agree.
     """
     pose = np.asarray(pose, dtype=np.float32).astype(np.float64)
@@ -54,7 +54,7 @@ def cast_mesh(mesh: TriangleMesh, pose: np.ndarray, camera: Camera) -> np.ndarra
 
 
 def cast_scene(meshes: list[TriangleMesh], poses: list[np.ndarray], camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth (H, W) float64 [m], inf for nothing; instance codes (H, W), 0 or 1 + index; amodal bits (H, W) uint32."""
+    """Depth (H, W) float64 [m], inf: a miss; segmentation ids (H, W), 0 or 1 + index; amodal bits (H, W) uint32."""
     depths = np.stack([cast_mesh(mesh, pose, camera) for mesh, pose in zip(meshes, poses, strict=True)])
     depth = depths.min(axis=0)
     instance = np.where(np.isfinite(depth), 1 + depths.argmin(axis=0), 0).astype(np.uint8)

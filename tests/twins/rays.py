@@ -1,4 +1,4 @@
-"""Single rays against a mesh, in float64, to measure surfaces."""
+"""Ray casting of single rays against a mesh in float64, and a mesh check: closed and consistently oriented."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 
 def first_hit(vertices: np.ndarray, faces: np.ndarray, origin: tuple[float, float, float], direction: tuple[float, float, float]) -> float:
-    """Distance to the nearest triangle along a unit direction (Möller and Trumbore 1997), or infinity."""
+    """Distance to the nearest triangle along a unit direction (Möller and Trumbore, 1997); infinity: a miss."""
     corners = vertices[faces].astype(np.float64)
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     p = np.cross(direction, edge2)
@@ -23,7 +23,7 @@ def first_hit(vertices: np.ndarray, faces: np.ndarray, origin: tuple[float, floa
 
 
 def edges_match(faces: np.ndarray) -> bool:
-    """Whether each directed edge has exactly one opposite: the surface is closed and oriented."""
+    """True if each directed edge has exactly one opposite: the mesh is closed and consistently oriented."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     codes = edges[:, 0] * (faces.max() + 1) + edges[:, 1]
     opposite = edges[:, 1] * (faces.max() + 1) + edges[:, 0]

@@ -1,4 +1,4 @@
-"""Small scenes whose pictures can be worked out by hand, and a way to render them."""
+"""Small analytic scenes and their rendering: boxes, spheres and rectangles under simple lights."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from synpick_warp.stages.render.view_setup import make_views
 
 GREY = Material(color=(0.7, 0.7, 0.7), texture=None, metallic=0.0, roughness=0.8)
 DOWN = np.diag([1.0, -1.0, -1.0])
-"""World to camera for a camera that looks down, the image's up being +y."""
+"""World to camera of a camera that looks down; up in the image is +y."""
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 def flat_shaded(vertices: np.ndarray, faces: np.ndarray) -> TriangleMesh:
-    """A mesh with a vertex for every corner of every triangle, and no texture coordinates."""
+    """A mesh with three vertices a triangle, face normals and zero texture coordinates."""
     corners = np.asarray(vertices, dtype=np.float64)[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -38,18 +38,18 @@ def flat_shaded(vertices: np.ndarray, faces: np.ndarray) -> TriangleMesh:
 
 
 def box(x: float, y: float, z: float) -> TriangleMesh:
-    """A box about its origin [m]."""
-    made = trimesh.creation.box(extents=(x, y, z))
-    return flat_shaded(made.vertices, made.faces)
+    """A box centred at its origin [m]."""
+    mesh = trimesh.creation.box(extents=(x, y, z))
+    return flat_shaded(mesh.vertices, mesh.faces)
 
 
 def ball(radius: float, subdivisions: int) -> TriangleMesh:
-    """A sphere of triangles with smooth normals, vertices on the sphere [m]."""
-    made = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
-    vertices = np.asarray(made.vertices)
+    """A smooth-shaded icosphere with its vertices on the sphere [m]."""
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
+    vertices = np.asarray(mesh.vertices)
     return TriangleMesh(
         vertices=vertices.astype(np.float32),
-        faces=np.asarray(made.faces, dtype=np.int32),
+        faces=np.asarray(mesh.faces, dtype=np.int32),
         normals=(vertices / radius).astype(np.float32),
         uv=np.zeros((len(vertices), 2), np.float32),
     )
@@ -67,7 +67,7 @@ def sheet(width: float, height: float) -> TriangleMesh:
 
 
 def entry(mesh: TriangleMesh, material: Material = GREY) -> CatalogEntry:
-    """A catalog entry of which only the look matters."""
+    """A catalog entry for rendering; its physical properties are arbitrary."""
     return CatalogEntry(
         obj_id=1,
         name="toy",
@@ -93,12 +93,12 @@ def camera(width: int, height: int, focal: float, center: tuple[float, float, fl
 
 
 def even_light(radiance: float = 1.0, rows: int = 16) -> EnvironmentMap:
-    """The same white light from everywhere."""
+    """Constant white environment."""
     return EnvironmentMap("even", np.full((rows, 2 * rows, 3), radiance, np.float32))
 
 
 def sun(direction: tuple[float, float, float], sky: float = 0.3, strength: float = 2000.0, rows: int = 128) -> EnvironmentMap:
-    """An even sky with one bright texel."""
+    """Constant sky with one bright texel."""
     x, y, z = np.asarray(direction, dtype=np.float64) / np.linalg.norm(direction)
     radiance = np.full((rows, 2 * rows, 3), sky, np.float32)
     column = int((np.arctan2(y, x) / (2.0 * np.pi) + 0.5) * 2 * rows) % (2 * rows)
@@ -108,17 +108,18 @@ def sun(direction: tuple[float, float, float], sky: float = 0.3, strength: float
 
 @dataclass
 class ToyScene:
-    """What to render. Poses are x, y, z [m] and a quaternion x, y, z, w; all cameras see world 0 unless `worlds` says otherwise."""
+    """A scene: poses are x, y, z [m] and a quaternion x, y, z, w; every camera renders every world."""
 
     entries: list[CatalogEntry]
     placed: list[list[tuple[int, tuple[float, ...]]]]
-    """For every world, (entry, pose) of its instances."""
+    """(entry, pose) of the instances of each world."""
     cameras: tuple[Camera, ...]
     lights: tuple[EnvironmentMap, ...] = (even_light(),)
     fixtures: tuple[Fixture, Fixture, Fixture] = (Fixture(box(1, 1, 0.1), GREY),) + (Fixture(box(0.1, 0.1, 0.1), GREY),) * 2
     fixture_poses: tuple[tuple[float, ...], ...] = ((0.0, 0.0, 0.0, *UPRIGHT),) * 3
     fixtures_visible: tuple[int, int, int] = (0, 0, 0)
-    room: int = 4
+    instances: int = 4
+    """Instance capacity of a world."""
     light_yaw: float = 0.0
     light_exposure: float = 0.0
     table: bool = False
@@ -129,8 +130,8 @@ class ToyScene:
 
 
 @dataclass(frozen=True)
-class Picture:
-    """Arrays of a rendered batch, on the host."""
+class RenderedViews:
+    """Arrays of a rendered batch, on the host: the first of `ViewBuffers`, the others of the renderer."""
 
     color: np.ndarray
     depth: np.ndarray
@@ -139,29 +140,29 @@ class Picture:
     pixels: np.ndarray
     boxes: np.ndarray
     exact_depth: np.ndarray
-    """What the pixels' rays met, before rounding [m]."""
+    """Planar depth of the G-buffer, before rounding (B, H, W) [m]."""
     radiance: np.ndarray
     resolve: np.ndarray
     """Anti-aliasing resolve codes, see `ShadedImage` (B, H, W) uint32."""
 
 
 def snapshot(toy: ToyScene, device: wp.Device) -> Snapshot:
-    """The device arrays of a toy scene; light 0 everywhere."""
+    """Device snapshot of a scene; environment map 0 in every world."""
     worlds = len(toy.placed)
-    entries = np.full((worlds, toy.room), -1)
-    poses = np.zeros((worlds, toy.room, 7), np.float32)
+    entries = np.full((worlds, toy.instances), -1)
+    poses = np.zeros((worlds, toy.instances, 7), np.float32)
     for world, placed in enumerate(toy.placed):
         for i, (which, pose) in enumerate(placed):
             entries[world, i] = which
             poses[world, i] = pose
-    made = allocate(Snapshot, {"world": worlds, "instance": toy.room, "fixture": 3}, device)
-    made.catalog_index.assign(entries)
-    made.pose.assign(poses)
-    made.fixture_pose.assign(np.tile(np.array(toy.fixture_poses, np.float32), (worlds, 1, 1)))
-    made.fixture_visible.assign(np.tile(np.array(toy.fixtures_visible), (worlds, 1)))
-    made.light_yaw.fill_(toy.light_yaw)
-    made.light_exposure.fill_(toy.light_exposure)
-    return made
+    result = allocate(Snapshot, {"world": worlds, "instance": toy.instances, "fixture": 3}, device)
+    result.catalog_index.assign(entries)
+    result.pose.assign(poses)
+    result.fixture_pose.assign(np.tile(np.array(toy.fixture_poses, np.float32), (worlds, 1, 1)))
+    result.fixture_visible.assign(np.tile(np.array(toy.fixtures_visible), (worlds, 1)))
+    result.light_yaw.fill_(toy.light_yaw)
+    result.light_exposure.fill_(toy.light_exposure)
+    return result
 
 
 def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
@@ -170,28 +171,30 @@ def build_scene(toy: ToyScene, device: wp.Device) -> RenderScene:
     return build_render_scene(settings.render, settings.tote, Catalog(tuple(toy.entries)), toy.fixtures, toy.cameras, toy.lights, device)
 
 
-def render(toy: ToyScene, device: wp.Device) -> Picture:
+def render(toy: ToyScene, device: wp.Device) -> RenderedViews:
     """Render every world by every camera: view = world x cameras + camera."""
     config = toy.settings()
     scene = build_scene(toy, device)
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
-    renderer = make_renderer(config, scene, toy.room, views)
-    out = allocate_view_buffers(views, scene.width, scene.height, toy.room, device)
+    renderer = make_renderer(config, scene, toy.instances, views)
+    out = allocate_view_buffers(views, scene.width, scene.height, toy.instances, device)
     view_world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     view_camera = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
-    renderer.render(snapshot(toy, device), make_views(view_world, view_camera, views, toy.room), out)
+    renderer.render(snapshot(toy, device), make_views(view_world, view_camera, views, toy.instances), out)
     images = {name: getattr(out, name).numpy() for name in ("color", "depth", "instance", "amodal", "pixels", "boxes")}
     shown = renderer.image
-    return Picture(**images, exact_depth=renderer.gbuffer.depth.numpy(), radiance=shown.radiance.numpy(), resolve=shown.resolve.numpy())
+    return RenderedViews(
+        **images, exact_depth=renderer.gbuffer.depth.numpy(), radiance=shown.radiance.numpy(), resolve=shown.resolve.numpy()
+    )
 
 
-def traced(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
-    """Primary hits alone: what world 0 shows to camera 0."""
+def render_gbuffer(toy: ToyScene, device: wp.Device) -> tuple[ViewBuffers, Renderer]:
+    """Render the G-buffer of world 0 by camera 0 only."""
     scene = build_scene(toy, device)
-    renderer = make_renderer(toy.settings(), scene, toy.room, 1)
-    out = allocate_view_buffers(1, scene.width, scene.height, toy.room, device)
+    renderer = make_renderer(toy.settings(), scene, toy.instances, 1)
+    out = allocate_view_buffers(1, scene.width, scene.height, toy.instances, device)
     zero = wp.zeros(1, dtype=wp.int32, device=device)
-    views = make_views(zero, zero, 1, toy.room)
+    views = make_views(zero, zero, 1, toy.instances)
     renderer.render_gbuffer(snapshot(toy, device), views, out)
     return out, renderer

@@ -10,9 +10,7 @@ system's temporary folder (TMPDIR) and removed. The part sensor renders the same
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
-import functools
 import itertools
 import resource
 import sys
@@ -21,7 +19,6 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import warp as wp
@@ -33,15 +30,14 @@ from synpick_warp.codes import Status
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
-from synpick_warp.exporters.registry import Exporters, load_exporter_classes
-from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.pipeline import Factory, build_factory, run_bake
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import timing
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
-from synpick_warp.stages.stream import FrameStream, TickReader, TickReport
+from synpick_warp.stages.stream import TickReader, TickReport
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
 from tools.bench.sensor import measure_sensor
 from tools.bench.write import measure_writing
@@ -54,15 +50,6 @@ WRITE_VIEWS = 12
 """Views that the writers get repeatedly."""
 BAKE_WORLDS, BAKE_ROUNDS, BAKE_SPEED = 16, 1, 0.4
 """Worlds of the small bake, at most; rounds and speed [m/s] of its gripper in mode move, for short episodes."""
-BAKE_METHODS = (
-    (Simulation, "tick", "launch ticks"),
-    (TickReader, "wait", "wait for ticks"),
-    (FrameStream, "_launch", "launch views"),
-    (FrameStream, "_collect", "wait for views"),
-    (Exporters, "write_views", "hand views to writers"),
-    (WriterPool, "wait", "wait for writers, finish files"),
-)
-"""Methods in which the main process of a bake spends its time: (class, method, label). On the CPU, launches include the computation."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -236,17 +223,15 @@ class _StageTimes(SilentProgress):
 
 
 def _measure_bake(config: Config) -> Iterator[Row]:
-    """Benchmark of a small bake: time of each stage, and of the main process by method."""
+    """Benchmark of a small bake: time of each stage, and of the main process by timing scope (on the CPU with computation)."""
     worlds = min(config.bake.worlds, BAKE_WORLDS)
     small = dataclasses.replace(
         config,
         bake=dataclasses.replace(config.bake, mode="move", worlds=worlds, episodes=worlds),
         move=dataclasses.replace(config.move, rounds=BAKE_ROUNDS, speed=BAKE_SPEED),
     )
-    progress, spent = _StageTimes(), dict.fromkeys((name for _, _, name in BAKE_METHODS), 0.0)
-    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as patches:
-        for owner, method, name in BAKE_METHODS:
-            patches.enter_context(mock.patch.object(owner, method, _time_calls(getattr(owner, method), spent, name)))
+    progress = _StageTimes()
+    with tempfile.TemporaryDirectory() as folder, timing.record() as recorder:
         summary = run_bake(small, Path(folder) / "out", progress)
         progress.stage("")
     yield Row("bake", "worlds and episodes", worlds, "")
@@ -254,21 +239,8 @@ def _measure_bake(config: Config) -> Iterator[Row]:
     yield Row("bake", "views", summary.views / summary.wall_seconds, "1/s")
     for (text, started), (_, ended) in itertools.pairwise(progress.starts):
         yield Row("bake", f"stage: {text}", ended - started, "s")
-    for name, seconds in spent.items():
-        yield Row("bake", f"main process: {name}", seconds, "s")
-
-
-def _time_calls(function: Callable[..., object], spent: dict[str, float], name: str) -> Callable[..., object]:
-    """Wrap a function to add the time of its calls to `spent[name]`."""
-
-    @functools.wraps(function)
-    def wrapper(*arguments: object, **options: object) -> object:
-        started = time.perf_counter()
-        result = function(*arguments, **options)
-        spent[name] += time.perf_counter() - started
-        return result
-
-    return wrapper
+    for path, stage in recorder.times.items():
+        yield Row("bake", f"main process: {': '.join(path)}", stage.host, "s")
 
 
 if __name__ == "__main__":

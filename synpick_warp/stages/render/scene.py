@@ -23,21 +23,28 @@ from synpick_warp.stages.render.light_tables import build_environment_cdf, measu
 
 @dataclass(frozen=True, eq=False)
 class RenderScene:
-    """What all views share. The structs are arguments of kernels; `keep` holds the meshes whose ids they contain."""
+    """Constant scene data shared by all views, as kernel structs."""
 
     meshes: Any
+    """The struct `Meshes`."""
     surfaces: Any
+    """The struct `Surfaces`: materials and textures."""
     cameras: Any
+    """The struct `Cameras`."""
     lights: Any
+    """The struct `Lights`: environment maps."""
     table: Any
+    """The struct `Table`."""
     paths: Any
-    """The struct `PathScene`: all that paths meet."""
+    """The struct `PathScene`: all of the above that path tracing reads."""
     grid: Any
+    """The struct `ImageGrid` of the cameras' images."""
     obj_id: wp.array
-    """Of each catalog entry (entry) int32."""
+    """obj_id of each catalog mesh (entry) int32."""
     camera_count: int
     device: wp.Device
     keep: tuple[wp.Mesh, ...]
+    """Owners of the meshes whose handles `meshes` holds."""
 
     @property
     def width(self) -> int:
@@ -49,7 +56,7 @@ class RenderScene:
 
 
 def mip_levels(texture: np.ndarray) -> list[np.ndarray]:
-    """A texture (H, W, 3) uint8 and its halvings down to one texel, averaged in linear light."""
+    """Mip pyramid of a texture (H, W, 3) uint8: box-filtered in linear light, down to one texel."""
     levels = [np.ascontiguousarray(texture)]
     linear = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)[texture]
     while max(linear.shape[:2]) > 1:
@@ -59,19 +66,19 @@ def mip_levels(texture: np.ndarray) -> list[np.ndarray]:
     return levels
 
 
-def packed_colors(image: np.ndarray) -> np.ndarray:
-    """The colours of an image (H, W, 3) uint8, row by row, as `Surfaces.texel` holds them (H W) uint32."""
+def pack_texels(image: np.ndarray) -> np.ndarray:
+    """Pack an image (H, W, 3) uint8 into texels (H W) uint32, red in the lowest byte: the layout of `Surfaces.texel`."""
     red, green, blue = image.reshape(-1, 3).T.astype(np.uint32)
     return red | green << 8 | blue << 16
 
 
 def corner_values(values: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
-    """Values of a mesh's vertices (V, C), for the three corners of each triangle (3 F, C): what a triangle has lies together."""
+    """Expand vertex values (V, C) to triangle corners (3 F, C), so that a triangle's values are contiguous."""
     return values[mesh.faces].reshape(-1, values.shape[1])
 
 
 def uv_density(mesh: TriangleMesh) -> np.ndarray:
-    """Texture lengths per metre on each triangle (F) float32: the root of the ratio of areas, 0 for triangles without area."""
+    """Texture density of each triangle (F) float32 [texture widths per metre]: sqrt(uv area / area); 0 for degenerate triangles."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     flat = mesh.uv[mesh.faces].astype(np.float64)
@@ -83,7 +90,7 @@ def uv_density(mesh: TriangleMesh) -> np.ndarray:
 def build_meshes(
     shapes: list[TriangleMesh], entries: int, device: wp.Device, interior: Interior | None = None
 ) -> tuple[Any, tuple[wp.Mesh, ...]]:
-    """One `wp.Mesh` a shape, and the struct `Meshes` about them; `interior` is the tote's."""
+    """Build one `wp.Mesh` with its BVH per shape, and the struct `Meshes`; `interior` is the tote's empty interior."""
     keep = tuple(
         wp.Mesh(
             points=wp.array(shape.vertices, dtype=wp.vec3, device=device),
@@ -102,7 +109,7 @@ def build_meshes(
     meshes.lower = wp.array(lower, dtype=wp.vec3, device=device)
     meshes.upper = wp.array(upper, dtype=wp.vec3, device=device)
     meshes.center = wp.array(center, dtype=wp.vec3, device=device)
-    # One part in a million more, so that rounding never lets a sphere exclude its own mesh.
+    # Enlarged by 1e-6, so that rounding never lets a bounding sphere exclude its own mesh.
     meshes.radius = wp.array(np.array(radius) * (1.0 + 1e-6), dtype=wp.float32, device=device)
     meshes.first_triangle = wp.array(np.cumsum([0] + [len(shape.faces) for shape in shapes]), dtype=wp.int32, device=device)
     meshes.corner = wp.array(np.concatenate([corner_values(s.vertices, s) for s in shapes]), dtype=wp.vec3, device=device)
@@ -115,7 +122,7 @@ def build_meshes(
 
 
 def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device: wp.Device) -> Any:
-    """Pack normals, texture coordinates, materials and mip-mapped textures; `materials` has one more than `shapes`, for the table."""
+    """The struct `Surfaces`: normals, uv, materials, mip-mapped textures; `materials` ends with the table's, which has no shape."""
     chains = [mip_levels(material.texture) if material.texture is not None else [] for material in materials]
     depth = max(1, *(len(chain) for chain in chains))
     first_texel = np.zeros((len(chains), depth), dtype=np.int32)
@@ -123,7 +130,7 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     for row, chain in enumerate(chains):
         for level, image in enumerate(chain):
             first_texel[row, level] = total
-            texels.append(packed_colors(image))
+            texels.append(pack_texels(image))
             total += len(texels[-1])
     sizes = [(chain[0].shape[1], chain[0].shape[0]) if chain else (0, 0) for chain in chains]
     surfaces = Surfaces()
@@ -158,16 +165,16 @@ def build_cameras(cameras: tuple[Camera, ...], device: wp.Device) -> Any:
     rotation = np.array([camera.rotation for camera in cameras], dtype=np.float64)
     translation = np.array([camera.translation for camera in cameras], dtype=np.float64)
     matrices = [camera.matrix for camera in cameras]
-    made = Cameras()
-    made.intrinsics = wp.array([(k[0, 0], k[1, 1], k[0, 2], k[1, 2]) for k in matrices], dtype=wp.vec4, device=device)
-    made.rotation = wp.array(rotation, dtype=wp.mat33d, device=device)
-    made.center = wp.array(-np.einsum("kji,kj->ki", rotation, translation), dtype=wp.vec3d, device=device)
-    made.to_world = wp.array(rotation.transpose(0, 2, 1), dtype=wp.mat33, device=device)
-    return made
+    result = Cameras()
+    result.intrinsics = wp.array([(k[0, 0], k[1, 1], k[0, 2], k[1, 2]) for k in matrices], dtype=wp.vec4, device=device)
+    result.rotation = wp.array(rotation, dtype=wp.mat33d, device=device)
+    result.center = wp.array(-np.einsum("kji,kj->ki", rotation, translation), dtype=wp.vec3d, device=device)
+    result.to_world = wp.array(rotation.transpose(0, 2, 1), dtype=wp.mat33, device=device)
+    return result
 
 
 def build_grid(width: int, height: int) -> Any:
-    """The struct `ImageGrid`."""
+    """The struct `ImageGrid` of images of `width` x `height` px."""
     grid = ImageGrid()
     grid.width, grid.height = width, height
     grid.tile_columns = -(-width // int(TILE_WIDTH))

@@ -12,7 +12,7 @@ from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.kernels.render.images import antialias
 from synpick_warp.scenes.appearance import srgb_to_linear
 from synpick_warp.scenes.types import Material, TriangleMesh
-from tests.worlds.toy_scene import UPRIGHT, Picture, ToyScene, box, camera, entry, even_light, render, sheet, sun
+from tests.worlds.toy_scene import UPRIGHT, RenderedViews, ToyScene, box, camera, entry, even_light, render, sheet, sun
 
 VIEW = camera(48, 40, 200.0, (0.0, 0.0, 2.0))
 SAMPLES = int(antialias.SAMPLES)
@@ -32,14 +32,14 @@ def rotated_pose(x: float, y: float, z: float, angle: float, axis: int = 2) -> t
     return (x, y, z, *quaternion)
 
 
-def render_image(device, *bodies, view=VIEW, config=None, **more) -> Picture:
+def render_image(device, *bodies, view=VIEW, config=None, **more) -> RenderedViews:
     """Image of bodies, given as (mesh, pose, colour)."""
     entries = [entry(mesh, Material(color=color, texture=None, metallic=0.0, roughness=1.0)) for mesh, _, color in bodies] or [EMPTY]
     world = [(index, pose) for index, (_, pose, _) in enumerate(bodies)]
     return render(ToyScene(entries, [world], (view,), config=config or with_render(), **more), device)
 
 
-def source_pixels(picture: Picture) -> np.ndarray:
+def source_pixels(picture: RenderedViews) -> np.ndarray:
     """(row, column) of the pixel whose radiance each sample of each pixel takes (H, W, SAMPLES, 2)."""
     resolve = picture.resolve[0]
     choice = (resolve[..., None] >> (2 * np.arange(SAMPLES, dtype=np.uint32))) & 3

@@ -27,7 +27,7 @@ def check_view(toy: ToyScene, device) -> tuple[np.ndarray, np.ndarray]:
     """Compare a toy scene's counts and boxes with those of the NumPy twin, and return them."""
     picture = render(toy, device)
     canvas = render(replace(toy, cameras=(canvas_camera(toy.cameras[0]),)), device)
-    pixels, boxes = count_pixels(picture.instance[0], picture.depth[0], picture.amodal[0], canvas.amodal[0], toy.room)
+    pixels, boxes = count_pixels(picture.instance[0], picture.depth[0], picture.amodal[0], canvas.amodal[0], toy.instances)
     np.testing.assert_array_equal(picture.pixels[0], pixels)
     np.testing.assert_array_equal(picture.boxes[0], boxes)
     return picture.pixels[0], picture.boxes[0]
@@ -86,5 +86,7 @@ def test_random_piles_match_the_twin(device, seed):
         quaternion = rng.normal(size=4)
         place = rng.uniform((-0.45, -0.3, -0.1), (0.45, 0.3, 0.4))
         placed.append((int(rng.integers(2)), (*place, *(quaternion / np.linalg.norm(quaternion)))))
-    toy = ToyScene([entry(box(0.2, 0.1, 0.05)), entry(ball(0.08, 2))], [placed], (VIEW,), room=32, table=True, fixtures_visible=(1, 1, 0))
+    toy = ToyScene(
+        [entry(box(0.2, 0.1, 0.05)), entry(ball(0.08, 2))], [placed], (VIEW,), instances=32, table=True, fixtures_visible=(1, 1, 0)
+    )
     check_view(toy, device)

@@ -59,8 +59,8 @@ def measure(toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, fi
     scene = build_scene(toy, device)
     worlds, cameras = len(toy.placed), len(toy.cameras)
     views = worlds * cameras
-    renderer = make_renderer(config, scene, toy.room, views)
-    sizes = view_buffer_sizes(views, scene.width, scene.height, toy.room)
+    renderer = make_renderer(config, scene, toy.instances, views)
+    sizes = view_buffer_sizes(views, scene.width, scene.height, toy.instances)
     images, layers = allocate(ViewBuffers, sizes, device), allocate(LayerBuffers, sizes, device, ("depth_sensor",))
     world = wp.array(np.repeat(np.arange(worlds), cameras), dtype=wp.int32, device=device)
     camera_index = wp.array(np.tile(np.arange(cameras), worlds), dtype=wp.int32, device=device)
@@ -69,7 +69,7 @@ def measure(toy: ToyScene, device: wp.Device, frames: int = 1, seed: int = 0, fi
     frames_measured = []
     for frame in range(frames):
         worlds_now.frame.fill_(frame)
-        renderer.render(worlds_now, make_views(world, camera_index, views, toy.room), images, layers)
+        renderer.render(worlds_now, make_views(world, camera_index, views, toy.instances), images, layers)
         frames_measured.append(layers.depth_sensor.numpy().copy())
     return Measured(np.concatenate(frames_measured), images.depth.numpy(), renderer.gbuffer.depth.numpy())
 

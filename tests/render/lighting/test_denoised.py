@@ -1,4 +1,4 @@
-"""Denoised renderer: known amounts of light, and its error against the path-traced reference."""
+"""Denoised renderer: known amounts of light, and its error against the path-render_gbuffer reference."""
 
 from __future__ import annotations
 
@@ -141,11 +141,11 @@ def test_two_frames_of_a_still_scene_are_identical(device):
     toy.placed[1] = [(0, (0.0, 0.0, 0.2, *UPRIGHT))]
     toy.config = settings(cell=4)
     scene = build_scene(toy, device)
-    renderer = make_renderer(toy.settings(), scene, toy.room, 1)
-    out = allocate_view_buffers(1, scene.width, scene.height, toy.room, device)
+    renderer = make_renderer(toy.settings(), scene, toy.instances, 1)
+    out = allocate_view_buffers(1, scene.width, scene.height, toy.instances, device)
     state, zero, images = snapshot(toy, device), wp.zeros(1, dtype=wp.int32, device=device), []
     for world in (0, 1, 0, 0):
-        views = make_views(wp.array([world], dtype=wp.int32, device=device), zero, 1, toy.room)
+        views = make_views(wp.array([world], dtype=wp.int32, device=device), zero, 1, toy.instances)
         renderer.render(state, views, out)
         images.append(renderer.image.radiance.numpy().copy())
     assert images[0].tobytes() != images[1].tobytes()
@@ -241,7 +241,7 @@ def test_light_does_not_leak_from_the_rim_of_a_pit_to_its_floor(device):
     objects = [(sheet(0.5, 0.5), surface(HALF), (0.0, 0.0, 0.0, *UPRIGHT)), *rim]
     view = camera(64, 48, 300.0, (0.0, 0.0, 2.0))
     denoised, reference = (
-        render_objects(device, *objects, view=view, room=5, config=settings(mode, cell=5, cell_paths=16, samples=256))
+        render_objects(device, *objects, view=view, instances=5, config=settings(mode, cell=5, cell_paths=16, samples=256))
         for mode in (FAST, REFERENCE)
     )
     floor = denoised.instance[0] == 1

@@ -1,4 +1,4 @@
-"""Path-traced reference: known amounts of light, and the same mean from each sampling strategy."""
+"""Path-render_gbuffer reference: known amounts of light, and the same mean from each sampling strategy."""
 
 from __future__ import annotations
 

@@ -219,7 +219,7 @@ def test_prefiltered_maps_of_a_uniform_map_and_a_spot():
 def test_a_batch_larger_than_the_scratch_is_refused(device):
     toy = ToyScene([entry(sheet(0.1, 0.1))], [[(0, FLAT)]], (VIEW,))
     scene = build_scene(toy, device)
-    renderer = make_renderer(toy.settings(), scene, toy.room, 1)
-    views = make_views(None, None, 2, toy.room)
+    renderer = make_renderer(toy.settings(), scene, toy.instances, 1)
+    views = make_views(None, None, 2, toy.instances)
     with pytest.raises(ValueError, match="2 views in a batch; this renderer has scratch for 1"):
         renderer.render(None, views, None)

@@ -1,4 +1,4 @@
-"""Pixels and rays, tiles, projected boxes."""
+"""Pixel tiles, camera rays, projected boxes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 
-from synpick_warp.kernels.render.visibility.camera import ImageGrid, camera_ray, projected_box, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import ImageGrid, camera_ray, in_image, projected_box, tile_pixel
 from synpick_warp.stages.render.scene import build_grid
 from tests.twins.raycast import rotation_of
 
@@ -17,9 +17,9 @@ WIDTH, HEIGHT, FOCAL = 160, 90, 200.0
 
 @wp.kernel
 def visit_kernel(grid: ImageGrid, visits: wp.array3d[int]):
-    pixel = tile_pixel(grid, wp.tid())
-    if pixel[1] < grid.height and pixel[2] < grid.width:
-        wp.atomic_add(visits, pixel[0], pixel[1], pixel[2], 1)
+    view, row, column = tile_pixel(grid, wp.tid())
+    if in_image(grid, row, column):
+        wp.atomic_add(visits, view, row, column, 1)
 
 
 @wp.kernel
@@ -32,22 +32,22 @@ def ray_kernel(intrinsics: wp.vec4, offset: wp.vec2, rays: wp.array2d[wp.vec3]):
 def box_kernel(
     lower: wp.array[wp.vec3],
     upper: wp.array[wp.vec3],
-    turn: wp.array[wp.mat33d],
+    rotation: wp.array[wp.mat33d],
     position: wp.array[wp.vec3d],
     intrinsics: wp.vec4,
     grid: ImageGrid,
     boxes: wp.array[wp.vec4i],
 ):
     i = wp.tid()
-    boxes[i] = projected_box(lower[i], upper[i], turn[i], position[i], intrinsics, grid)
+    boxes[i] = projected_box(lower[i], upper[i], rotation[i], position[i], intrinsics, grid)
 
 
-def project(lower, upper, turn, position):
+def project(lower, upper, rotation, position):
     boxes = wp.zeros(1, dtype=wp.vec4i, device="cpu")
     inputs = [
         wp.array([lower], dtype=wp.vec3, device="cpu"),
         wp.array([upper], dtype=wp.vec3, device="cpu"),
-        wp.array([turn], dtype=wp.mat33d, device="cpu"),
+        wp.array([rotation], dtype=wp.mat33d, device="cpu"),
         wp.array([position], dtype=wp.vec3d, device="cpu"),
         wp.vec4(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2),
         build_grid(WIDTH, HEIGHT),
@@ -79,12 +79,12 @@ def test_a_box_straight_ahead_has_a_known_projection():
     assert project((-0.1, -0.1, 0.0), (0.1, 0.1, 1.0), np.eye(3), (0, 0, 1.0)).tolist() == [59, 24, 101, 66]
 
 
-def test_what_lies_behind_covers_nothing_and_what_passes_the_camera_may_cover_all():
+def test_a_box_behind_the_camera_is_empty_and_one_that_crosses_it_covers_the_canvas():
     assert project((-0.1,) * 3, (0.1,) * 3, np.eye(3), (0, 0, -1.0)).tolist() == [0, 0, -1, -1]
     assert project((-0.1,) * 3, (0.1,) * 3, np.eye(3), (0, 0, 0.05)).tolist() == [-160, -90, 319, 179]
 
 
-def test_what_lies_beyond_the_canvas_covers_nothing():
+def test_a_box_beyond_the_canvas_is_empty():
     assert project((-0.1,) * 3, (0.1,) * 3, np.eye(3), (5.0, 0, 1.0)).tolist() == [0, 0, -1, -1]
     assert project((-0.1,) * 3, (0.1,) * 3, np.eye(3), (0, -3.0, 1.0)).tolist() == [0, 0, -1, -1]
 
@@ -95,11 +95,11 @@ def test_what_lies_beyond_the_canvas_covers_nothing():
     position=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-0.3, 3.0)),
     seed=st.integers(0, 1000),
 )
-def test_no_point_of_a_box_projects_outside_its_pixels(size, quaternion, position, seed):
-    turn = rotation_of(np.array(quaternion))
+def test_projected_boxes_are_conservative(size, quaternion, position, seed):
+    rotation = rotation_of(np.array(quaternion))
     half = np.array(size, np.float32) / 2
-    left, top, right, bottom = project(-half, half, turn, position)
-    points = np.random.default_rng(seed).uniform(-1, 1, (200, 3)) * half.astype(np.float64) @ turn.T + position
+    left, top, right, bottom = project(-half, half, rotation, position)
+    points = np.random.default_rng(seed).uniform(-1, 1, (200, 3)) * half.astype(np.float64) @ rotation.T + position
     points = points[points[:, 2] > 1e-3]
     columns = points[:, 0] / points[:, 2] * FOCAL + WIDTH / 2
     rows = points[:, 1] / points[:, 2] * FOCAL + HEIGHT / 2

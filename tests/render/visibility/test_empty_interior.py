@@ -1,4 +1,4 @@
-"""The room in the tote: nothing of the tote reaches into it, and what rays see does not depend on it."""
+"""Empty interior of the tote: no triangle reaches into it, the early-out of rays is conservative, and images do not depend on it."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ OTHER = replace(TOTE, floor_size=(0.3, 0.2), rim_size=(0.42, 0.26), outer_size=(
 
 
 def inside(interior: Interior, points: np.ndarray) -> np.ndarray:
-    """Which points (..., 3) lie in a room."""
+    """True for points (..., 3) in an interior."""
     x, y, z = np.abs(points[..., 0]), np.abs(points[..., 1]), points[..., 2]
     wide = [half + growth * z for half, growth in zip(interior.half, interior.growth, strict=True)]
     return (z >= interior.floor) & (z <= interior.top) & (x <= wide[0]) & (y <= wide[1]) & (x + y <= wide[2])
 
 
 def corners(interior: Interior) -> np.ndarray:
-    """Of the room (16, 3)."""
+    """Corners (16, 3) of an interior."""
     points = []
     for z in (interior.floor, interior.top):
         x, y, both = (half + growth * z for half, growth in zip(interior.half, interior.growth, strict=True))
@@ -56,7 +56,7 @@ def stays_in_interior_kernel(
     result_out[ray] = int(stays_in_interior(interior, start[ray], direction[ray], reach[ray]))
 
 
-def missed(interior: Interior, start: np.ndarray, direction: np.ndarray, reach: np.ndarray, device) -> np.ndarray:
+def stays(interior: Interior, start: np.ndarray, direction: np.ndarray, reach: np.ndarray, device) -> np.ndarray:
     given = DeviceInterior()
     given.half, given.growth, given.floor, given.top = wp.vec3(*interior.half), wp.vec3(*interior.growth), interior.floor, interior.top
     inputs = [given] + [
@@ -68,7 +68,7 @@ def missed(interior: Interior, start: np.ndarray, direction: np.ndarray, reach: 
 
 
 @pytest.mark.parametrize("tote", [TOTE, OTHER, replace(TOTE, floor_size=TOTE.rim_size)])
-def test_no_part_of_the_tote_lies_in_its_room(tote):
+def test_no_part_of_the_tote_lies_in_its_interior(tote):
     fixture = tote_fixture(tote)
     interior = fixture.interior
     assert interior is not None
@@ -78,7 +78,7 @@ def test_no_part_of_the_tote_lies_in_its_room(tote):
     assert interior.top > shell.vertices[:, 2].max()
 
 
-def test_the_room_is_nearly_all_of_the_tote():
+def test_the_interior_fills_nearly_the_whole_tote():
     volume = trimesh.convex.convex_hull(corners(INTERIOR)).volume
     floor, rim = (np.prod(size) for size in (TOTE.floor_size, TOTE.rim_size))
     whole = (floor + rim + np.sqrt(floor * rim)) / 3 * INTERIOR.top
@@ -86,43 +86,43 @@ def test_the_room_is_nearly_all_of_the_tote():
 
 
 @pytest.mark.parametrize("tote", [TOTE, OTHER])
-def test_rays_that_are_said_to_miss_the_tote_do(device, tote):
+def test_the_early_out_is_conservative(device, tote):
     fixture = tote_fixture(tote)
     rng = np.random.default_rng(3)
     size = np.array((*tote.outer_size[:2], 2.0 * tote.outer_size[2]))
     start = rng.uniform(-0.6, 0.6, (4000, 3)) * size + (0.0, 0.0, 0.4 * size[2])
     direction = rng.normal(size=(4000, 3))
     reach = np.where(rng.random(4000) < 0.5, float(FAR), rng.uniform(0.0, 0.6, 4000))
-    said = missed(fixture.interior, start, direction, reach, device)
+    skipped = stays(fixture.interior, start, direction, reach, device)
     unit = direction / np.linalg.norm(direction, axis=1)[:, None]
     distance = np.array([first_hit(fixture.mesh.vertices, fixture.mesh.faces, *ray) for ray in zip(start, unit, strict=True)])
     hit = distance < reach * np.linalg.norm(direction, axis=1)
-    assert not (said & hit).any()
-    # It is plain for many: those that start in the tote and go up, or end in it.
-    assert said.sum() > 0.2 * (~hit).sum()
+    assert not (skipped & hit).any()
+    # It applies to many rays: those that start in the tote and go up, or end in it.
+    assert skipped.sum() > 0.2 * (~hit).sum()
 
 
 def within(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Points (count, 3) in the convex hull of some, not quite up to its faces."""
+    """Random points (count, 3) strictly inside the convex hull of `points`."""
     weights = rng.dirichlet(np.ones(len(points)), count)
     return 0.999 * weights @ points + 0.001 * points.mean(axis=0)
 
 
-def test_rays_within_the_room_or_out_by_its_opening_miss_the_tote(device):
+def test_segments_within_the_interior_or_through_its_opening_are_skipped(device):
     rng = np.random.default_rng(5)
-    room = corners(INTERIOR)
-    start, end, out = (within(points, 500, rng) for points in (room, room, room[room[:, 2] == INTERIOR.top]))
+    hull = corners(INTERIOR)
+    start, end, out = (within(points, 500, rng) for points in (hull, hull, hull[hull[:, 2] == INTERIOR.top]))
     below = start * (1.0, 1.0, 0.0) - (0.0, 0.0, 0.1)
     ones = np.ones(500)
-    assert missed(INTERIOR, start, end - start, ones, device).all()
-    assert missed(INTERIOR, start, out - start, float(FAR) * ones, device).all()
-    assert missed(INTERIOR, out + (out - start), start - out, 1.5 * ones, device).all()
-    assert not missed(INTERIOR, start, below - start, ones, device).any()
+    assert stays(INTERIOR, start, end - start, ones, device).all()
+    assert stays(INTERIOR, start, out - start, float(FAR) * ones, device).all()
+    assert stays(INTERIOR, out + (out - start), start - out, 1.5 * ones, device).all()
+    assert not stays(INTERIOR, start, below - start, ones, device).any()
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.4])
-def test_pictures_are_the_same_without_the_room(device, turn):
-    """A tote that is turned and moved, with boxes in it, beside it and across its wall."""
+def test_images_do_not_depend_on_the_interior(device, turn):
+    """A rotated and translated tote with boxes inside, outside and through its wall."""
     boxes = [entry(box(0.1, 0.06, 0.08)), entry(box(0.05, 0.2, 0.05))]
     placed = [
         (0, (0.05, 0.02, 0.05, *UPRIGHT)),

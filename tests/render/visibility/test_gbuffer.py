@@ -1,4 +1,4 @@
-"""Primary hits: depth, identities, amodal bits."""
+"""G-buffer: depth, segmentation ids, amodal bits."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_ball_shows_its_area_and_its_nearest_depth(device):
     assert picture.instance[0, 0, 0] == Segment.NOTHING
 
 
-def test_pixel_centres_lie_at_half(device):
+def test_pixel_centres_have_half_integer_coordinates(device):
     # A sheet whose edges project to columns 70.25 and 80.25 and rows 35.75 and 45.75: it holds the centres of columns 70 to 79 and
     # rows 36 to 45. Were centres at whole numbers, it would hold columns 71 to 80.
     view = camera(160, 90, 100.0, (0.0, 0.0, 1.0))
@@ -57,7 +57,7 @@ def test_pixel_centres_lie_at_half(device):
     assert (picture.depth[0][picture.instance[0] == 1] == 10000).all()
 
 
-def test_hidden_instances_keep_their_bits(device):
+def test_occluded_instances_keep_their_amodal_bits(device):
     toy = one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW)
     toy.placed[0] += [(0, (0.05, 0.0, 0.1, *UPRIGHT)), (0, (0.0, 0.03, -0.1, *UPRIGHT))]
     picture = render(toy, device)
@@ -71,7 +71,7 @@ def test_hidden_instances_keep_their_bits(device):
     assert ((bits >> (np.maximum(instance, 1) - 1)) & 1)[instance > 0].all()
 
 
-def test_no_instance_leaves_no_trace(device):
+def test_a_world_without_instances_shows_none(device):
     toy = one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW)
     toy.placed = [[], toy.placed[0]]
     picture = render(toy, device)
@@ -80,7 +80,7 @@ def test_no_instance_leaves_no_trace(device):
     assert picture.amodal[1].any()
 
 
-def test_fixtures_and_table_are_seen_but_have_no_bits(device):
+def test_fixtures_and_table_are_visible_without_amodal_bits(device):
     fixtures = (Fixture(box(0.3, 0.1, 0.1), GREY), Fixture(box(0.02, 0.02, 0.2), GREY), Fixture(box(0.02, 0.02, 0.02), GREY))
     toy = one(sheet(0.1, 0.1), (0.0, 0.0, 0.07, *UPRIGHT), NARROW, fixtures=fixtures, table=True)
     toy.fixture_poses = ((0.0, 0.0, 0.0, *UPRIGHT), (0.0, 0.0, 0.2, *UPRIGHT), (0.1, 0.0, 0.2, *UPRIGHT))
@@ -96,7 +96,7 @@ def test_fixtures_and_table_are_seen_but_have_no_bits(device):
     assert depth[0, 0] == round((2.0 + toy.config.tote.wall) * 1e4)
 
 
-def test_depth_beyond_sixteen_bits_is_no_depth(device):
+def test_depth_above_sixteen_bits_is_0(device):
     config = replace(Config(), bop=replace(Config().bop, depth_scale=0.03))
     picture = render(one(sheet(0.2, 0.2), (0.0, 0.0, 0.0, *UPRIGHT), NARROW, config=config), device)
     assert picture.instance[0, 45, 80] == 1
@@ -115,7 +115,7 @@ def test_worlds_and_cameras_do_not_mix(device):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_hits_agree_with_rays_in_float64(device, seed):
+def test_the_gbuffer_agrees_with_a_float64_reference(device, seed):
     rng = np.random.default_rng(seed)
     meshes = [box(0.16, 0.07, 0.2), ball(0.06, 3), box(0.2, 0.004, 0.1), ball(0.1, 1)]
     poses = [(*rng.uniform((-0.15, -0.1, 0.0), (0.15, 0.1, 0.2)), *random_quaternion(rng)) for _ in meshes]
@@ -127,7 +127,7 @@ def test_hits_agree_with_rays_in_float64(device, seed):
 
 
 @pytest.mark.parametrize("numbers", [(3, 13, 15), (11, 14, 17)])
-def test_real_objects_agree_with_rays_in_float64(device, real_models, numbers):
+def test_real_objects_agree_with_a_float64_reference(device, real_models, numbers):
     rng = np.random.default_rng(numbers[0])
     meshes = [read_mesh(real_models / f"obj_{number:06d}.ply", 1e-3)[0] for number in numbers]
     poses = [(*rng.uniform((-0.1, -0.05, 0.0), (0.1, 0.05, 0.2)), *random_quaternion(rng)) for _ in meshes]

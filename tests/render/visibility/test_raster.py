@@ -1,4 +1,4 @@
-"""Triangles find their rays: the hits that a search by trees and one in float64 find, whatever the triangles' size, order and place."""
+"""Triangle rasterizer: its G-buffer equals that of ray tracing and of a float64 reference, for triangles of any size, order and place."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render import raster
 from synpick_warp.stages.render.view_setup import make_views
 from tests.harness.trace_probe import trace_gbuffer_kernel
-from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, sheet, traced
+from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, render_gbuffer, sheet
 
 VIEW = camera(96, 64, 150.0, (0.0, 0.0, 1.0))
 NEVER = 1.0e6
-"""Depth that stands for no hit [m]."""
+"""Depth of a miss in the reference [m]."""
 
 
 def triangles(corners: np.ndarray) -> TriangleMesh:
@@ -31,20 +31,20 @@ def triangles(corners: np.ndarray) -> TriangleMesh:
     return flat_shaded(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
 
 
-def hits_of(toy: ToyScene, device: wp.Device, by_trees: bool = False) -> dict[str, np.ndarray]:
-    """What world 0 shows to camera 0: the arrays of `Hits`, by trees if asked, and amodal bits."""
-    out, renderer = traced(toy, device)
-    if by_trees:
+def gbuffer_of(toy: ToyScene, device: wp.Device, by_rays: bool = False) -> dict[str, np.ndarray]:
+    """G-buffer and amodal bits of world 0 seen by camera 0; `by_rays`: the G-buffer by ray tracing."""
+    out, renderer = render_gbuffer(toy, device)
+    if by_rays:
         scene, zero = renderer.scene, wp.zeros(1, dtype=wp.int32, device=device)
         inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, renderer.bodies]
-        inputs += [make_views(zero, zero, 1, toy.room), wp.vec2(0.0, 0.0)]
+        inputs += [make_views(zero, zero, 1, toy.instances), wp.vec2(0.0, 0.0)]
         launch_pixels(trace_gbuffer_kernel, scene.grid.tiles * int(TILE_PIXELS), inputs, [renderer.gbuffer], device)
     found = {name: getattr(renderer.gbuffer, name).numpy()[0].copy() for name in ("segment", "triangle", "barycentric", "depth")}
     return found | {"amodal": out.amodal.numpy()[0].copy()}
 
 
 def depth_in_float64(corners: np.ndarray, view=VIEW) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest planar depth (H, W) [m] by Möller and Trumbore's test, and how clearly (H, W) each ray meets or misses every triangle."""
+    """Nearest planar depth (H, W) [m] by the Möller-Trumbore test, and each ray's least margin (H, W) of hit or miss."""
     k = view.matrix
     x, y = (np.arange(view.width) + 0.5 - k[0, 2]) / k[0, 0], (np.arange(view.height) + 0.5 - k[1, 2]) / k[1, 1]
     ray = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((view.height, view.width))], axis=-1)
@@ -52,14 +52,14 @@ def depth_in_float64(corners: np.ndarray, view=VIEW) -> tuple[np.ndarray, np.nda
     for a, b, c in corners.astype(np.float32).astype(np.float64) @ view.rotation.T + view.translation:
         across = np.cross(ray, c - a)
         determinant = across @ (b - a)
-        # Edge on it may be met or not.
+        # A triangle seen edge-on may be hit or missed.
         clear = np.minimum(clear, np.abs(determinant) / (np.linalg.norm(b - a) * np.linalg.norm(c - a) + 1e-30) * 1e3)
         safe = np.where(determinant == 0.0, 1.0, determinant)
         u, v = across @ -a / safe, ray @ np.cross(-a, b - a) / safe
         depth = np.cross(-a, b - a) @ (c - a) / safe
         weights = np.stack([u, v, 1.0 - u - v, depth])
         met = (weights >= 0.0).all(axis=0) & (determinant != 0.0)
-        # How far, in px, the point is from an edge; and a ray that starts on the triangle is at depth 0.
+        # Distance of the point from an edge [px]; depth is 0 where a ray starts on the triangle.
         clear = np.minimum(clear, np.abs(weights).min(axis=0) * 1e3)
         nearest = np.where(met & (depth < nearest), depth, nearest)
     return nearest, clear
@@ -76,7 +76,7 @@ def random_triangles(seed: int, count: int, size: float, spread: float) -> np.nd
 def test_loose_triangles_of_any_size_agree_with_float64(seed, count, size):
     """Two metres are much larger than the camera's distance of one: such triangles pass through its plane, and behind it."""
     corners = random_triangles(seed, count, size, 0.2)
-    found = hits_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), pick_device("cpu"))
+    found = gbuffer_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), pick_device("cpu"))
     depth, clear = depth_in_float64(corners)
     sure = clear > 0.1
     assert sure.mean() > 0.5
@@ -87,13 +87,13 @@ def test_loose_triangles_of_any_size_agree_with_float64(seed, count, size):
 
 
 @pytest.mark.parametrize("depth", [-0.5, 0.0, 1e-3, 2e-3, 5e-3, 0.05])
-def test_triangles_that_end_at_the_camera_are_seen_to_their_edges(device, depth):
-    """A strip of triangles that comes as near as `depth` [m], with its far ends across the picture."""
+def test_triangles_that_reach_the_camera_plane_are_complete(device, depth):
+    """Triangles with one corner at `depth` [m] and the others spread over the image."""
     rng = np.random.default_rng(7)
     near, far = rng.uniform(-0.02, 0.02, (12, 2)), rng.uniform(-0.25, 0.25, (12, 2, 2))
     corners = np.stack([np.concatenate([n, [1.0 - depth]]) for n in near])[:, None]
     corners = np.concatenate([corners, np.concatenate([far, np.zeros((12, 2, 1))], axis=2)], axis=1)
-    found = hits_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), device)
+    found = gbuffer_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), device)
     expected, clear = depth_in_float64(corners)
     sure = clear > 0.02
     assert sure.mean() > 0.4
@@ -102,7 +102,7 @@ def test_triangles_that_end_at_the_camera_are_seen_to_their_edges(device, depth)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_trees_find_the_same(device, seed):
+def test_ray_tracing_gives_the_same_gbuffer(device, seed):
     rng = np.random.default_rng(seed)
     meshes = [ball(0.1, 4), box(0.2, 0.1, 0.05), ball(0.05, 2), sheet(0.4, 0.3)]
     poses = [(*rng.uniform((-0.2, -0.1, 0.0), (0.2, 0.1, 0.3)), *(q / np.linalg.norm(q))) for q in rng.normal(size=(4, 4))]
@@ -117,7 +117,7 @@ def test_trees_find_the_same(device, seed):
         fixtures_visible=(1, 1, 1),
         table=True,
     )
-    ours, theirs = hits_of(toy, device), hits_of(toy, device, by_trees=True)
+    ours, theirs = gbuffer_of(toy, device), gbuffer_of(toy, device, by_rays=True)
     # On a GPU the two ray tests round differently: rays within rounding of an edge may pass it on either side.
     differs = ours["segment"] != theirs["segment"]
     assert differs.sum() <= (2 if device.is_cuda else 0)
@@ -132,7 +132,7 @@ def test_trees_find_the_same(device, seed):
     np.testing.assert_allclose(ours["barycentric"][same], theirs["barycentric"][same], atol=2e-4)
 
 
-def test_no_ray_is_lost_between_triangles_that_share_edges(device):
+def test_shared_edges_are_watertight(device):
     """The edges of a fan of 4 x 4 squares pass through the centres of pixels; each is met, from either side of the sheet."""
     # Pixel centres lie 1 / 150 m apart at a distance of one; corners at every third, each in its own, rounded, coordinates.
     x, y = (np.arange(-13, 14, 3) + 0.5) / 150.0, (np.arange(-10, 11, 3) + 0.5) / 150.0
@@ -143,7 +143,7 @@ def test_no_ray_is_lost_between_triangles_that_share_edges(device):
             faces += [(a, b, c), (c, d, a)] if (i + j) % 2 else [(d, a, b), (b, c, d)]
     mesh = triangles(np.array(faces))
     for turn in (UPRIGHT, (1.0, 0.0, 0.0, 0.0)):
-        found = hits_of(ToyScene([entry(mesh)], [[(0, (0.0, 0.0, 0.0, *turn))]], (VIEW,)), device)
+        found = gbuffer_of(ToyScene([entry(mesh)], [[(0, (0.0, 0.0, 0.0, *turn))]], (VIEW,)), device)
         rows, columns = np.nonzero(found["segment"] == 1)
         inside = found["segment"][rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
         assert (inside == 1).all()
@@ -154,7 +154,8 @@ def test_the_order_of_triangles_and_bodies_does_not_matter(device):
     corners = random_triangles(3, 300, 0.05, 0.2)
     shuffled = np.random.default_rng(0).permutation(len(corners))
     first, second = (
-        hits_of(ToyScene([entry(triangles(c))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), device) for c in (corners, corners[shuffled])
+        gbuffer_of(ToyScene([entry(triangles(c))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), device)
+        for c in (corners, corners[shuffled])
     )
     np.testing.assert_array_equal(first["depth"], second["depth"])
     np.testing.assert_array_equal(first["amodal"], second["amodal"])
@@ -162,19 +163,19 @@ def test_the_order_of_triangles_and_bodies_does_not_matter(device):
     np.testing.assert_array_equal(first["triangle"][met], shuffled[second["triangle"][met]])
 
 
-@pytest.mark.parametrize("room", [0, 3, raster.BLOCKS])
-def test_large_triangles_are_done_with_room_for_their_blocks_or_without(device, room, monkeypatch):
+@pytest.mark.parametrize("capacity", [0, 3, raster.BLOCKS])
+def test_large_triangles_are_complete_with_any_capacity_for_blocks(device, capacity, monkeypatch):
     toy = ToyScene([entry(box(0.3, 0.2, 0.1))], [[(0, (0.0, 0.0, 0.0, 0.1, 0.2, 0.3, 0.927))]], (camera(192, 128, 300.0, (0.0, 0.0, 1.0)),))
-    expected = hits_of(toy, device, by_trees=True)
-    monkeypatch.setattr(raster, "BLOCKS", room)
-    found = hits_of(toy, device)
+    expected = gbuffer_of(toy, device, by_rays=True)
+    monkeypatch.setattr(raster, "BLOCKS", capacity)
+    found = gbuffer_of(toy, device)
     np.testing.assert_array_equal(found["segment"], expected["segment"])
     np.testing.assert_array_equal(found["amodal"], (expected["segment"] == 1).astype(np.uint32))
     assert (found["segment"] == 1).sum() > 20 * 256
 
 
-def test_the_backdrop_shows_what_the_tote_itself_would(device):
-    """The same turn as another quaternion is not the pose of the backdrop: then the tote's own triangles are drawn."""
+def test_the_static_background_equals_the_rasterized_tote(device):
+    """The same rotation as another quaternion is not the pose of the background, so the tote is rasterized."""
     fixtures = (Fixture(box(0.5, 0.3, 0.05), GREY), Fixture(box(0.05, 0.05, 0.3), GREY), Fixture(box(0.1, 0.1, 0.1), GREY))
     poses = [(0, (0.05, 0.02, 0.02, 0.1, 0.2, 0.3, 0.927)), (0, (-0.1, 0.0, -0.2, *UPRIGHT))]
     toy = ToyScene(
@@ -190,17 +191,17 @@ def test_the_backdrop_shows_what_the_tote_itself_would(device):
     for name in ("color", "depth", "instance", "amodal", "pixels", "boxes", "exact_depth", "radiance"):
         np.testing.assert_array_equal(getattr(pictures[0], name), getattr(pictures[1], name))
     assert {1, Segment.TABLE, Segment.TOTE, Segment.FINGER} <= set(np.unique(pictures[0].instance))
-    # Who lies under the tote keeps its bits, and only those.
+    # An object under the tote keeps its amodal bits, and is not visible.
     assert ((pictures[0].amodal & 2) != 0).any()
     assert not (pictures[0].instance == 2).any()
 
 
-def test_a_tote_that_stands_elsewhere_or_is_gone_leaves_the_backdrop(device):
+def test_a_moved_or_hidden_tote_does_not_use_the_background(device):
     fixtures = (Fixture(box(0.5, 0.3, 0.05), GREY),) * 3
     toy = ToyScene([entry(box(0.1, 0.1, 0.1))], [[]], (VIEW,), fixtures=fixtures, fixtures_visible=(1, 0, 0))
-    home = hits_of(toy, device)["segment"] == Segment.TOTE
-    moved = hits_of(replace(toy, fixture_poses=((0.1, 0.0, 0.0, *UPRIGHT),) * 3), device)["segment"] == Segment.TOTE
-    gone = hits_of(replace(toy, fixtures_visible=(0, 0, 0)), device)["segment"]
+    home = gbuffer_of(toy, device)["segment"] == Segment.TOTE
+    moved = gbuffer_of(replace(toy, fixture_poses=((0.1, 0.0, 0.0, *UPRIGHT),) * 3), device)["segment"] == Segment.TOTE
+    gone = gbuffer_of(replace(toy, fixtures_visible=(0, 0, 0)), device)["segment"]
     assert home.sum() > 1000
     np.testing.assert_array_equal(np.roll(home, 15, axis=1)[:, 15:], moved[:, 15:])
     assert not gone.any()
@@ -209,4 +210,4 @@ def test_a_tote_that_stands_elsewhere_or_is_gone_leaves_the_backdrop(device):
 def test_a_mesh_with_more_triangles_than_marks_can_name_is_refused(device, monkeypatch):
     monkeypatch.setattr(raster, "MAX_TRIANGLES", 11)
     with pytest.raises(CatalogError, match="a mesh has 12 triangles; at most 11"):
-        hits_of(ToyScene([entry(box(0.1, 0.1, 0.1))], [[]], (VIEW,)), device)
+        gbuffer_of(ToyScene([entry(box(0.1, 0.1, 0.1))], [[]], (VIEW,)), device)

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.stages.render.view_setup import make_views
-from tests.worlds.toy_scene import ToyScene, ball, box, camera, entry, sheet, traced
+from tests.worlds.toy_scene import ToyScene, ball, box, camera, entry, render_gbuffer, sheet
 
 
 def pile(rng, count: int) -> ToyScene:
@@ -21,20 +21,20 @@ def pile(rng, count: int) -> ToyScene:
         quaternion = rng.normal(size=4)
         position = rng.uniform(-0.4, 0.4, 3) * min(index, 1)
         placed.append((int(rng.integers(len(meshes))), (*position, *(quaternion / np.linalg.norm(quaternion)))))
-    return ToyScene([entry(mesh) for mesh in meshes], [placed], (view,), room=count + 2)
+    return ToyScene([entry(mesh) for mesh in meshes], [placed], (view,), instances=count + 2)
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_tile_body_masks_are_conservative(device, seed):
     toy = pile(np.random.default_rng(seed), 14)
-    out, renderer = traced(toy, device)
+    out, renderer = render_gbuffer(toy, device)
     masks = renderer.bodies.body_mask.numpy()[0].copy()
     present = renderer.bodies.present.numpy()[0]
     assert present == 14
     expected = {name: getattr(out, name).numpy().copy() for name in ("instance", "depth", "amodal")}
     renderer.bodies.body_mask.fill_(wp.uint64((1 << 14) - 1))
     zero = wp.zeros(1, dtype=wp.int32, device=device)
-    renderer.rasterizer.rasterize(renderer.bodies, make_views(zero, zero, 1, toy.room), renderer.gbuffer, out)
+    renderer.rasterizer.rasterize(renderer.bodies, make_views(zero, zero, 1, toy.instances), renderer.gbuffer, out)
     for name, image in expected.items():
         np.testing.assert_array_equal(image, getattr(out, name).numpy())
     counts = np.array([int(value).bit_count() for value in masks])
@@ -47,12 +47,12 @@ def test_tile_body_masks_are_conservative(device, seed):
 def test_bodies_are_sorted_front_to_back_with_the_tote_last(device, seed):
     toy = pile(np.random.default_rng(seed), 9)
     toy.fixtures_visible = (1, 0, 1)
-    _, renderer = traced(toy, device)
+    _, renderer = render_gbuffer(toy, device)
     mesh, near, order = (getattr(renderer.bodies, name).numpy()[0] for name in ("mesh", "near", "order"))
     present = int(renderer.bodies.present.numpy()[0])
     visible = np.flatnonzero(mesh >= 0)
     assert present == len(visible) == 11
     assert set(order[:present]) == set(visible)
-    tote = toy.room
+    tote = toy.instances
     others = visible[visible != tote]
     np.testing.assert_array_equal(order[:present], [*others[np.argsort(near[others], kind="stable")], tote])
