@@ -81,7 +81,7 @@ def test_white_furnace(device, metallic, roughness):
 def test_grey_plane_under_a_uniform_map_equals_the_reference(device, table):
     plane = (sheet(0.6, 0.5), surface(HALF, 0.0, 0.7))
     denoised, reference = (
-        render_objects(device, plane, table=table, config=settings(mode, cell_paths=16)).radiance.mean(axis=(0, 1, 2))
+        render_objects(device, plane, table=table, config=settings(mode, coarse_paths=16)).radiance.mean(axis=(0, 1, 2))
         for mode in (FAST, REFERENCE)
     )
     np.testing.assert_allclose(denoised, reference, rtol=0.01)
@@ -97,7 +97,7 @@ def test_plane_under_a_lamp_has_the_analytic_irradiance(device, cosine, degrees)
     radiance = 3.0 / (np.pi * np.sin(radius) ** 2)
     light = lamp(cosine, radius, radiance)
     view = camera(64, 48, 2000.0, (0.0, 0.0, 2.0))
-    picture = render_objects(device, (sheet(1.0, 1.0), surface(HALF)), lights=(light,), view=view, config=settings(cell_paths=32))
+    picture = render_objects(device, (sheet(1.0, 1.0), surface(HALF)), lights=(light,), view=view, config=settings(coarse_paths=32))
     value, _ = evaluate(measure_albedo(device), ((0.5,) * 3, 0.0, 1.0), toward(1.0), toward(cosine))
     np.testing.assert_allclose(picture.radiance[0].mean(axis=(0, 1)), value[0] * 3.0, rtol=0.02)
 
@@ -124,7 +124,7 @@ def test_cluttered_scene_approaches_the_reference(device):
     reference = render_objects(device, *clutter(), lights=lights, view=view, config=settings(REFERENCE, samples=256)).radiance[0]
     quality = {}
     for paths in (1, 4, 16):
-        denoised = render_objects(device, *clutter(), lights=lights, view=view, config=settings(cell_paths=paths)).radiance[0]
+        denoised = render_objects(device, *clutter(), lights=lights, view=view, config=settings(coarse_paths=paths)).radiance[0]
         quality[paths] = psnr(denoised, reference)
         if paths > 1:
             np.testing.assert_allclose(denoised.mean(axis=(0, 1)), reference.mean(axis=(0, 1)), rtol=0.015)
@@ -139,7 +139,7 @@ def test_two_frames_of_a_still_scene_are_identical(device):
     toy = ToyScene([entry(mesh, material) for mesh, material, *_ in clutter()], [[], []], (VIEW,), lights=(sun((0.5, 0.2, 0.8), rows=256),))
     toy.placed[0] = [(index, pose[0] if pose else FLAT) for index, (_, _, *pose) in enumerate(clutter())][1:]
     toy.placed[1] = [(0, (0.0, 0.0, 0.2, *UPRIGHT))]
-    toy.config = settings(cell=4)
+    toy.config = settings(coarse_pixel=4)
     scene = build_scene(toy, device)
     renderer = make_renderer(toy.settings(), scene, toy.instances, 1)
     out = allocate_view_buffers(1, scene.width, scene.height, toy.instances, device)
@@ -156,7 +156,7 @@ def test_two_frames_of_a_still_scene_are_identical(device):
 @pytest.mark.parametrize("size", [(64, 48), (61, 35), (3, 5), (1, 1)])
 def test_coarse_pixels_and_images_of_any_size_render(device, cell, size):
     view = camera(*size, 4.0 * size[0], (0.0, 0.0, 2.0))
-    picture = render_objects(device, *clutter(), lights=(sun((0.5, 0.2, 0.8)),), view=view, table=True, config=settings(cell=cell))
+    picture = render_objects(device, *clutter(), lights=(sun((0.5, 0.2, 0.8)),), view=view, table=True, config=settings(coarse_pixel=cell))
     assert picture.radiance.shape[1:3] == size[::-1]
     assert np.isfinite(picture.radiance).all()
     assert (picture.radiance > 0.0).all()
@@ -165,7 +165,9 @@ def test_coarse_pixels_and_images_of_any_size_render(device, cell, size):
 @pytest.mark.parametrize("cell", [1, 2, 4])
 def test_wider_coarse_pixels_have_the_same_light(device, cell):
     view = camera(160, 120, 700.0, (0.0, 0.0, 1.5))
-    fine, wide = (render_objects(device, *clutter(), view=view, config=settings(cell=size, cell_paths=8)).radiance[0] for size in (1, cell))
+    fine, wide = (
+        render_objects(device, *clutter(), view=view, config=settings(coarse_pixel=size, coarse_paths=8)).radiance[0] for size in (1, cell)
+    )
     np.testing.assert_allclose(wide.mean(axis=(0, 1)), fine.mean(axis=(0, 1)), rtol=0.015)
     assert psnr(wide, fine + 1e-6) > 28.0
 
@@ -174,7 +176,9 @@ def test_wider_coarse_pixels_have_the_same_light(device, cell):
 def test_objects_smaller_than_a_coarse_pixel_are_lit(device, light):
     # 3 px in coarse pixels of 16 px, over background: the middle of none of them lies on it.
     small_sheet = (sheet(0.03, 0.03), surface(HALF), (0.055, 0.035, 0.0, *UPRIGHT))
-    coarse, fine = (render_objects(device, small_sheet, lights=(light,), config=settings(cell=size, cell_paths=16)) for size in (16, 1))
+    coarse, fine = (
+        render_objects(device, small_sheet, lights=(light,), config=settings(coarse_pixel=size, coarse_paths=16)) for size in (16, 1)
+    )
     visible = coarse.instance[0] == 1
     assert 4 <= visible.sum() <= 16
     np.testing.assert_allclose(coarse.radiance[0][visible].mean(), fine.radiance[0][visible].mean(), rtol=0.05)
@@ -200,7 +204,7 @@ def test_sun_shadow_has_its_geometric_outline(device, yaw):
     tables = precompute_environment(light, None)
     direction = tables.sun_direction
     assert tables.sun_irradiance.max() > 0.0
-    lit = render_objects(device, *objects, lights=(light,), view=view, light_yaw=yaw, config=settings(cell_paths=16))
+    lit = render_objects(device, *objects, lights=(light,), view=view, light_yaw=yaw, config=settings(coarse_paths=16))
     ground = lit.instance[0] == 1
     rows, columns = np.mgrid[:160, :160]
     x, y = (columns + 0.5 - 80.0) / 200.0, -(rows + 0.5 - 80.0) / 200.0
@@ -222,7 +226,7 @@ def test_sun_shadow_has_its_geometric_outline(device, yaw):
 
 
 def test_scratch_has_the_size_of_the_scenes_images(device):
-    config = replace(settings(cell=4), cameras=replace(Config().cameras, resolution=(8, 8)))
+    config = replace(settings(coarse_pixel=4), cameras=replace(Config().cameras, resolution=(8, 8)))
     scene = build_render_scene(
         config.render, config.tote, Catalog((entry(sheet(0.1, 0.1)),)), ToyScene([], [], ()).fixtures, (VIEW,), (EVEN,), device
     )
@@ -241,7 +245,7 @@ def test_light_does_not_leak_from_the_rim_of_a_pit_to_its_floor(device):
     objects = [(sheet(0.5, 0.5), surface(HALF), (0.0, 0.0, 0.0, *UPRIGHT)), *rim]
     view = camera(64, 48, 300.0, (0.0, 0.0, 2.0))
     denoised, reference = (
-        render_objects(device, *objects, view=view, instances=5, config=settings(mode, cell=5, cell_paths=16, samples=256))
+        render_objects(device, *objects, view=view, instances=5, config=settings(mode, coarse_pixel=5, coarse_paths=16, samples=256))
         for mode in (FAST, REFERENCE)
     )
     floor = denoised.instance[0] == 1
@@ -258,7 +262,7 @@ def test_indirect_sunlight_equals_the_reference(device, metallic):
         for side, metal in ((-1, metallic), (1, 0.0))
     ]
     low_sun = (sun((-0.9, 0.0, 0.3), sky=0.002),)
-    configs = (settings(cell_paths=16, cell=1), settings(REFERENCE, samples=256))
+    configs = (settings(coarse_paths=16, coarse_pixel=1), settings(REFERENCE, samples=256))
     denoised, reference = (render_objects(device, *slopes, lights=low_sun, config=config) for config in configs)
     for instance in (1, 2):
         inside = cv2.erode((denoised.instance[0] == instance).astype(np.uint8), np.ones((3, 3))) > 0
@@ -273,7 +277,7 @@ def test_specular_highlight_of_a_small_lamp_equals_the_reference(device, metalli
     plate = (sheet(0.3, 0.2), surface((0.8, 0.8, 0.8), metallic, roughness))
     for cosine in (0.9, 0.99):
         light = (lamp(cosine, np.radians(2.0), 500.0, 0.01),)
-        configs = (settings(cell_paths=16, cell=1), settings(REFERENCE, samples=256))
+        configs = (settings(coarse_paths=16, coarse_pixel=1), settings(REFERENCE, samples=256))
         denoised, reference = (render_objects(device, plate, lights=light, config=config) for config in configs)
         inside = cv2.erode((denoised.instance[0] == 1).astype(np.uint8), np.ones((5, 5))) > 0
         assert denoised.radiance[0][inside].mean() == pytest.approx(reference.radiance[0][inside].mean(), rel=0.02)

@@ -128,7 +128,7 @@ def shadow_scene(direction, yaw=0.0, occluder=True):
     """A large sheet and, with `occluder`, a small one 0.1 m above its middle, under a sun."""
     above = [(1, (0.0, 0.0, 0.1, *UPRIGHT))] if occluder else []
     toy = ToyScene([entry(sheet(0.6, 0.4)), entry(sheet(0.08, 0.08))], [[(0, FLAT), *above]], (VIEW,))
-    toy.lights, toy.light_yaw, toy.config = (sun(direction),), yaw, with_render(cell_paths=32)
+    toy.lights, toy.light_yaw, toy.config = (sun(direction),), yaw, with_render(coarse_paths=32)
     return toy
 
 
@@ -158,7 +158,7 @@ def test_walls_occlude_the_ground_between_them(device):
 def test_denoised_plane_shows_no_sampling_pattern(device):
     # Wide filter kernels make a plane beside a wall smooth: the remaining noise has no edges. Two steps of 255 are hardly visible.
     toy = ToyScene([entry(sheet(1.0, 1.0)), entry(box(0.01, 2.0, 0.2))], [[(0, FLAT), (1, (0.25, 0.0, 0.1, *UPRIGHT))]], (VIEW,))
-    toy.config = with_render(cell_paths=8)
+    toy.config = with_render(coarse_paths=8)
     lit = render(toy, device).radiance[0, 8:40, 8:40, 0]
     assert np.abs(np.diff(lit, axis=0)).max() < 2.0 / 255.0
 
