@@ -15,14 +15,14 @@ import zarr
 
 SETTINGS = {
     "sight": "perception",
-    "center_fraction": "center_fraction",
-    "heavy_center_fraction": "heavy_center_fraction",
-    "random_yaw": "random_yaw",
+    "center_share": "center_fraction",
+    "heavy_center_share": "heavy_center_fraction",
+    "turn_lights": "random_yaw",
     "cell": "coarse_pixel",
     "cell_paths": "coarse_paths",
-    "rest_displacement": "rest_displacement",
-    "relaxed_displacement": "relaxed_displacement",
-    "relax_time": "relax_time",
+    "rest_shift": "rest_displacement",
+    "last_shift": "relaxed_displacement",
+    "late_time": "relax_time",
 }
 """Sections and keys of config.toml and manifest.json."""
 ATTEMPTS = {
@@ -35,7 +35,7 @@ ATTEMPTS = {
     "all_above": "ancestors",
 }
 """Keys of a line of attempts.jsonl."""
-RECORDS = {"arrangement": "arrangement", "yaw": "yaw"} | ATTEMPTS
+RECORDS = {"redraw": "arrangement", "turn": "yaw"} | ATTEMPTS
 """Keys of JSON files: lists, manifest entries, scene_camera.json."""
 ARRAYS = {"held": "attached", "goal": "setpoint", "seal_load": "seal_force", "caught": "engaged", "load": "peak_force"}
 """Arrays of the zarr store."""
