@@ -74,8 +74,10 @@ def compare(first: Path, second: Path, renamed: bool = False) -> tuple[dict[str,
     """
     if renamed:
         with tempfile.TemporaryDirectory() as folder:
-            translate(first, Path(folder))
-            return _compare_folders(Path(folder), second, content=True)
+            copies = [Path(folder) / name for name in "ab"]
+            for source, copy in zip((first, second), copies, strict=True):
+                translate(source, copy)
+            return _compare_folders(*copies, content=True)
     return _compare_folders(first, second, content=False)
 
 

@@ -41,14 +41,14 @@ ARRAYS = {"held": "attached", "goal": "setpoint", "seal_load": "seal_force", "ca
 """Arrays of the zarr store."""
 DERIVED = (".sha256",)
 """Suffixes of files that hold checksums of files whose keys changed."""
-
-
+CHECKSUMS = ("checksum", "settings_checksum", "bytes")
+"""Keys whose values are such checksums, or sizes of files whose keys changed; left out."""
 RECORD = "record"
 """Array of the zarr store that holds lines of attempts.jsonl."""
 
 
 def translate(source: Path, target: Path) -> None:
-    """Copy a data set that has the old names to the folder `target`, under the new ones. Checksum files keep the old files' sums."""
+    """Copy a data set to the folder `target`, with old names replaced by the new ones, and without checksums in JSON files."""
     for path in sorted(source.rglob("*")):
         if path.is_file():
             copy = target / renamed_path(path.relative_to(source).as_posix())
@@ -88,7 +88,7 @@ def renamed_text(name: str, data: bytes) -> bytes:
 
 def _renamed(value: Any, table: dict[str, str]) -> Any:
     if isinstance(value, dict):
-        return {table.get(key, key): _renamed(item, table) for key, item in value.items()}
+        return {table.get(key, key): _renamed(item, table) for key, item in value.items() if key not in CHECKSUMS}
     return [_renamed(item, table) for item in value] if isinstance(value, list) else value
 
 
