@@ -84,7 +84,7 @@ def check_kernel(kernel: ast.FunctionDef, lines: list[str], writes: Writes) -> I
     if others.defaults or others.kw_defaults or others.kwonlyargs or others.posonlyargs or others.vararg or others.kwarg:
         yield kernel.lineno, f"{kernel.name} can only have plain parameters without defaults"
     yield from check_groups(kernel, lines)
-    # yield from check_shapes(kernel, lines)
+    yield from check_shapes(kernel, lines)
     certain, possible = written_names(kernel, writes)
     for parameter in parameters:
         name = parameter.arg
