@@ -89,6 +89,8 @@ def test_correct_code_passes(tmp_path, capsys):
         ("    # In:\n", "    # Scene:\n", "27: groups come once, in the order Scene, State, In, Out"),
         ("    # Out:\n", "", "29: sum_out is in the group # In:; names ending in _out, and no others, belong to the group # Out:"),
         ("    # In:\n    offset: wp.vec3,\n    # Out:\n", "    # Out:\n    offset: wp.vec3,\n", "28: offset is in the group # Out:; "),
+        ("  # (body) [m/s]", "", "25: add_kernel: speed needs a comment with the names of its 1 dimensions"),
+        ("(world, body)", "(body)", "31: add_kernel: total_out has 2 dimensions, its comment names (body)"),
     ],
 )
 def test_each_fault_is_found(tmp_path, capsys, old, new, fault):
