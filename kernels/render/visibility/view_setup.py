@@ -73,7 +73,6 @@ def set_up_views_kernel(
         bodies_out.box[view, body] = wp.vec4i(0, 0, -1, -1)
         bodies_out.sphere[view, body] = wp.vec4(0.0, 0.0, 0.0, -1.0)
         return
-
     p = wp.transform_get_translation(placed)
     q = wp.transform_get_rotation(placed)
     position = wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
