@@ -121,7 +121,7 @@ def test_a_world_that_was_not_finite_is_as_good_as_new(device):
 @pytest.fixture(scope="module")
 def resting(device):
     """Four piles with the solver's own settings: reports, energies while they settle (tick, world), and the simulation at its end."""
-    config = settings(bake__worlds=4, bake__episodes=4, settle__rest_ticks=3, settle__late_time=3.0)
+    config = settings(bake__worlds=4, bake__episodes=4, settle__rest_ticks=3, settle__relax_time=3.0)
     simulation = Simulation(config, catalog(), LIGHTS, device)
     reports, energies = [], []
     for _ in range(LONGEST):
