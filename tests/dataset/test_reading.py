@@ -48,9 +48,9 @@ def test_arrays_by_name_are_those_in_memory(folder):
     assert force.shape == (FRAMES * STEP_COUNT, 4, 3)
     np.testing.assert_array_equal(force[4:8], batches[1].steps["contact_force"][0, :, :4])
     np.testing.assert_array_equal(episode.ticks["peak_force"][:], [batch.tick["peak_force"][0] for batch in batches])
-    assert "seal_load" in episode.steps
+    assert "seal_force" in episode.steps
     assert set(episode.arrangement) == {"object_id", "mass", "drop_pose"}
-    with pytest.raises(KeyError, match="speed; there are angular_velocity, contact_force"):
+    with pytest.raises(KeyError, match="speed; there are angular_velocity, attached, contact_force"):
         episode.steps["speed"]
 
 
