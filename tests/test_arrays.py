@@ -28,13 +28,16 @@ from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratc
 from synpick_warp.stages.render.raster import VISIBILITY_BUFFER
 from synpick_warp.stages.render.renderer import SHADED_IMAGE
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS
+from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus
+from synpick_warp.stages.stream import RING
 from tests.worlds.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
     "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_footprint block"
 )
+WORLDS = MIN_GPU_WORLDS + 1
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
 BASE = [
     WorldState,
@@ -129,15 +132,16 @@ def test_dimensions_that_contradict_the_struct_are_an_error(shape, others, messa
 
 
 def test_a_bakes_table_lists_every_array_with_its_copies():
-    config = settings(bake__worlds=7, cameras__resolution=[8, 6])
+    config = settings(bake__worlds=WORLDS, cameras__resolution=[8, 6], render__views_per_batch=3)
     rows = describe_arrays(config)
     names = [name for name, *_ in rows]
     assert {name.split(".")[0] for name in names} == {kind.__name__ for kind in BASE}
     assert names.count("Observation.votes") == names.count("Plan.target") == 3
     assert names.count("Snapshot.pose") == names.count("WorldStatus.table") == 2
-    assert names.count("WorldState.phase") == names.count("ViewBuffers.color") == 1
+    assert names.count("WorldState.phase") == 1
+    assert names.count("ViewBuffers.color") == (RING if pick_device(config.bake.device).is_cuda else 1)
     by_name = {name: (shape, unit, size) for name, shape, unit, size in rows}
-    assert by_name["Snapshot.pose"] == ((7, config.arrangement.max_objects), "m", 28 * 7 * config.arrangement.max_objects)
+    assert by_name["Snapshot.pose"] == ((WORLDS, config.arrangement.max_objects), "m", 28 * WORLDS * config.arrangement.max_objects)
     assert by_name["ViewBuffers.color"] == ((3, 6, 8), "", 3 * 6 * 8 * 3)
 
 
@@ -166,9 +170,9 @@ def test_the_path_traced_reference_has_no_coarse_grid():
 
 @pytest.mark.parametrize("mode", [{"bake__mode": "target"}, {"bake__mode": "mixed", "bake__mix": [1, 0, 3]}])
 def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
-    config = settings(bake__worlds=7, perception__resolution=[64, 48], **mode)
+    config = settings(bake__worlds=WORLDS, perception__resolution=[64, 48], **mode)
     room = config.arrangement.max_objects
-    looks = count_views(config.perception, config.bake.worlds, room, pick_device("cpu"))
+    looks = count_views(config.perception, config.bake.worlds, room, pick_device(config.bake.device))
     rows = describe_arrays(config)
     assert {name.split(".")[0] for name, *_ in rows} == {kind.__name__ for kind in BASE + PERCEPTION}
     shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in PERCEPTION}}

@@ -31,6 +31,7 @@ TINY = {
     "bake.worlds": 2,
     "bake.episodes": EPISODES,
     "cameras.resolution": [WIDTH, HEIGHT],
+    "render.views_per_batch": CAMERAS,
     "physics.step": 4e-3,
     "physics.steps_per_tick": 16,
     "physics.substeps": 1,

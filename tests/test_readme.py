@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.harness.environment import checkout_environment
+
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
 BLOCK = re.compile(r"(?P<skipped><!-- not run: [^\n]* -->\n)?```(?P<language>bash|python)\n(?P<text>.*?)```\n", re.DOTALL)
@@ -40,7 +42,7 @@ def environment(folder) -> dict[str, str]:
     command.parent.mkdir()
     command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m synpick_warp "$@"\n')
     command.chmod(0o755)
-    return os.environ | {"PATH": f"{command.parent}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    return checkout_environment(PATH=f"{command.parent}:{os.environ['PATH']}")
 
 
 def test_the_lines_of_the_readme_run_as_written(folder, environment):

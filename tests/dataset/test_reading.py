@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +13,7 @@ import synpick_warp
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import DatasetError
+from tests.harness.environment import checkout_environment
 from tests.worlds import box_views
 from tests.worlds.trajectories import ATTEMPT, STEP_COUNT, UNSEEN, config, ticks, write_set
 
@@ -108,6 +108,5 @@ def test_no_simulator_is_loaded(folder):
         "data[4].steps['pose'][:2], data.objects, data.cameras\n"
         f"print([name for name in {HEAVY!r} if name in sys.modules])\n"
     )
-    environment = {**os.environ, "PYTHONPATH": str(Path(synpick_warp.__file__).parents[1])}
-    done = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True, check=True, env=environment)
+    done = subprocess.run([sys.executable, "-c", code, str(folder)], capture_output=True, text=True, check=True, env=checkout_environment())
     assert done.stdout.splitlines() == [f"2 {FRAMES} 0 False False", "[]"]

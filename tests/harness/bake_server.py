@@ -16,6 +16,7 @@ from pathlib import Path
 from tests.worlds.small_worlds import QUICK, catalog
 
 TINY = {
+    "bake.device": "cpu",  # A forked process cannot use its parent's CUDA context.
     "bake.worlds": 2,
     "bake.episodes": 4,
     "bake.writers": 1,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -24,6 +23,7 @@ from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties, si
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.meshes import smooth_normals
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
+from tests.harness.environment import checkout_environment
 
 HULL = ShapeRecipe(concave=False, hull_vertices=64, piece_vertices=16, pieces=8, concavity=0.2)
 CONCAVE = replace(HULL, concave=True)
@@ -240,8 +240,9 @@ def test_a_script_without_main_guard_can_decompose(tmp_path):
     """Processes of `multiprocessing` would run the script again in each child, and die."""
     script = tmp_path / "script.py"
     script.write_text(GUARDLESS)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
-    result = subprocess.run([sys.executable, script, tmp_path / "cache"], env=environment, capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        [sys.executable, script, tmp_path / "cache"], env=checkout_environment(), capture_output=True, text=True, check=False
+    )
     assert (result.returncode, result.stdout, result.stderr) == (0, "[1, 1]\n", "")
 
 

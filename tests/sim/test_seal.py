@@ -131,6 +131,7 @@ def test_wrenches_are_opposite_and_give_no_energy(floating, stiffness, damping, 
     floating.start(under(floating, 0.4), break_force=1e9)
     speeds = floating.physics.state.joint_qd.numpy().reshape(2, -1)
     speeds[:, build.GRIPPER_DOFS : build.GRIPPER_DOFS + 6] = (0.3, -0.2, 0.1, 1.0, 2.0, 3.0)
+    floating.physics.state.joint_qd.assign(speeds.reshape(-1))
     floating.physics.refresh_poses()
     energy, momentum = floating.energy(), floating.momentum()
     most = np.zeros(2)

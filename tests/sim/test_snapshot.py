@@ -13,6 +13,7 @@ from synpick_warp.arrays import allocate
 from synpick_warp.device import pick_device
 from synpick_warp.kernels.sim import snapshot
 from synpick_warp.stages.buffers import LastFrame, Snapshot
+from tests.harness.devices import default_device
 from tests.worlds.kernel_worlds import filled
 
 WORLDS, ROOM, FIXTURES = 3, 2, 3
@@ -30,7 +31,7 @@ class Linked:
     """Snapshots one after the other, told by their number: tick t of world w puts t + 10 w into every array."""
 
     def __init__(self) -> None:
-        self.device = pick_device("cpu")
+        self.device = pick_device(default_device())
         self.last = allocate(LastFrame, SIZES, self.device)
         self.count = 0
 

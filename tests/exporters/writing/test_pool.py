@@ -19,6 +19,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing import pool as pool_module
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool, WriteTask, shared_bytes
 from synpick_warp.exporters.writing.worker import NICENESS
+from tests.harness.environment import checkout_environment
 
 SIZE = 1 << 16
 
@@ -318,9 +319,8 @@ with WriterPool(2, 1) as pool:
 def test_a_script_without_main_guard_can_use_the_pool(tmp_path):
     """Processes started by `multiprocessing` with spawn would run the script again, and fail."""
     (tmp_path / "script.py").write_text(UNGUARDED_SCRIPT)
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[3])}
     command = [sys.executable, "script.py"]
-    ran = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
+    ran = subprocess.run(command, cwd=tmp_path, env=checkout_environment(), capture_output=True, text=True, timeout=60)
     assert (ran.returncode, ran.stderr, ran.stdout) == (0, "", "imported\n")
     assert [(tmp_path / name).read_text() for name in ("a", "b")] == ["x", "x"]
 

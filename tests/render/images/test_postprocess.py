@@ -26,6 +26,7 @@ from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.scene import build_cameras, build_grid
 from synpick_warp.stages.render.view_setup import make_views
+from tests.harness.devices import default_device
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, render
 
 WIDTH, HEIGHT = 72, 40
@@ -53,7 +54,7 @@ def make_config(tone: str = "linear", seed: int = 7, **effects: Any) -> Config:
 
 def postprocess(radiance: np.ndarray, config: Config, at: ViewKeys = ONE, stops: float = 0.0, lens=LENS) -> tuple[np.ndarray, np.ndarray]:
     """sRGB bytes (B, H, W, 3) and effect parameters (B, E) of an image of radiance (H, W, 3); each view has a world of its own."""
-    device = pick_device("cpu")
+    device = pick_device(default_device())
     views = len(at.episode)
     lights = Lights()
     lights.exposure = wp.array([GAIN], dtype=wp.float32, device=device)
@@ -129,7 +130,7 @@ def test_all_tone_curves_keep_middle_grey_and_shoulder_is_the_default():
 
 
 def test_effects_that_do_not_touch_radiance_leave_the_bytes_alone():
-    device = pick_device("cpu")
+    device = pick_device(default_device())
     scene = SimpleNamespace(width=8, height=8, device=device)
     plain = PostProcessor(Effects(), "shoulder", 0, scene, 2)
     assert plain.effects is plain.filtered is None

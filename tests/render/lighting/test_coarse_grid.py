@@ -12,14 +12,15 @@ from synpick_warp.kernels.render.lighting.coarse_paths import SEQUENCE_PERIOD
 from synpick_warp.stages.render.denoised import build_coarse_grid, interleaved_threads
 from synpick_warp.stages.render.scene import build_grid
 from tests.harness.denoise_probe import count_visits_kernel, morton_kernel
+from tests.harness.devices import default_device
 
 
 @given(width=st.integers(1, 150), height=st.integers(1, 100), size=st.integers(1, 5), views=st.integers(1, 3))
 def test_interleaved_order_visits_each_coarse_pixel_once(width, height, size, views):
     coarse = build_coarse_grid(build_grid(width, height), size, 1)
     assert (coarse.grid.width, coarse.grid.height) == (-(-width // size), -(-height // size))
-    visits = wp.zeros((views, coarse.grid.height, coarse.grid.width), dtype=wp.int32, device="cpu")
-    wp.launch(count_visits_kernel, views * interleaved_threads(coarse), [coarse], [visits], device="cpu")
+    visits = wp.zeros((views, coarse.grid.height, coarse.grid.width), dtype=wp.int32, device=default_device())
+    wp.launch(count_visits_kernel, views * interleaved_threads(coarse), [coarse], [visits], device=default_device())
     assert (visits.numpy() == 1).all()
 
 

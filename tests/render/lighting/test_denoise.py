@@ -10,15 +10,18 @@ from hypothesis import strategies as st
 
 from synpick_warp.device import pick_device
 from tests.harness.denoise_probe import FlatDenoiser, shrink_kernel
+from tests.harness.devices import default_device
 
 colors = st.tuples(*[st.floats(0.0, 10.0)] * 3)
 
 
 @given(wide=colors, narrow=colors, variance=st.floats(0.0, 20.0))
 def test_shrinkage_follows_the_narrow_kernel_beyond_its_variance(wide, narrow, variance):
-    arrays = [wp.array([value], dtype=wp.vec3, device="cpu") for value in (wide, narrow)]
-    result = wp.empty(1, dtype=wp.vec3, device="cpu")
-    wp.launch(shrink_kernel, 1, [*arrays, wp.array([variance], dtype=wp.float32, device="cpu")], [result], device="cpu")
+    arrays = [wp.array([value], dtype=wp.vec3, device=default_device()) for value in (wide, narrow)]
+    result = wp.empty(1, dtype=wp.vec3, device=default_device())
+    wp.launch(
+        shrink_kernel, 1, [*arrays, wp.array([variance], dtype=wp.float32, device=default_device())], [result], device=default_device()
+    )
     wide, narrow = np.array(wide), np.array(narrow)
     square = float((narrow - wide) @ (0.2126, 0.7152, 0.0722)) ** 2
     expected = wide if square <= variance else wide + (1.0 - variance / square) * (narrow - wide)
@@ -33,7 +36,7 @@ def test_shrinkage_follows_the_narrow_kernel_beyond_its_variance(wide, narrow, v
 @given(width=st.integers(1, 40), height=st.integers(1, 30), seed=st.integers(0, 100))
 def test_constant_visibility_ratios_are_kept_up_to_the_border(width, height, seed):
     # Unoccluded light of any strength, of which the same fraction arrives everywhere.
-    flat = FlatDenoiser(width, height, pick_device("cpu"))
+    flat = FlatDenoiser(width, height, pick_device(default_device()))
     rng = np.random.default_rng(seed)
     for name, ratio in (("diffuse", 0.7), ("specular", 0.4)):
         unoccluded = rng.uniform(0.2, 2.0, (height, width, 3))
@@ -46,7 +49,7 @@ def test_constant_visibility_ratios_are_kept_up_to_the_border(width, height, see
 
 
 def test_steps_without_noise_stay_sharp_and_noise_is_averaged():
-    flat = FlatDenoiser(64, 48, pick_device("cpu"))
+    flat = FlatDenoiser(64, 48, pick_device(default_device()))
     ones = np.ones((48, 64))
     for name in ("unoccluded_diffuse", "unoccluded_specular"):
         flat.assign(name, ones)
@@ -67,7 +70,7 @@ def test_steps_without_noise_stay_sharp_and_noise_is_averaged():
 
 def test_larger_variance_scale_widens_the_kernel():
     """Rare bright samples: a block with some of them looks bright, unless its variance is scaled up, because its estimate is too low."""
-    flat = FlatDenoiser(64, 48, pick_device("cpu"))
+    flat = FlatDenoiser(64, 48, pick_device(default_device()))
     for name in ("unoccluded_diffuse", "unoccluded_specular"):
         flat.assign(name, np.ones((48, 64)))
     rare = 20.0 * (np.random.default_rng(0).uniform(size=(48, 64)) < 0.05)
@@ -80,7 +83,7 @@ def test_larger_variance_scale_widens_the_kernel():
 
 
 def test_other_bodies_and_other_depths_do_not_mix():
-    flat = FlatDenoiser(32, 32, pick_device("cpu"))
+    flat = FlatDenoiser(32, 32, pick_device(default_device()))
     for name in ("unoccluded_diffuse", "unoccluded_specular"):
         flat.assign(name, np.ones((32, 32)))
     left = np.arange(32)[None] * np.ones((32, 1)) < 16

@@ -12,6 +12,7 @@ from synpick_warp.scenes.environment import map_directions
 from synpick_warp.stages.render.light_tables import build_environment_cdf, environment_cdf
 from tests.harness.brdf_probe import sample_environment_kernel, sample_point_kernel
 from tests.harness.denoise_probe import scrambled_kernel, sobol_kernel
+from tests.harness.devices import default_device
 
 BITS = 32
 
@@ -41,8 +42,8 @@ def test_points_are_those_of_sobol(device, first):
 def test_aligned_runs_of_scrambled_points_are_nets(key, dimension, run, power):
     # A (0, 2) sequence: each box of 2^-a by 2^-(k - a) holds one of an aligned run of 2^k points.
     count = 2**power
-    points = wp.empty(count, dtype=wp.vec2, device="cpu")
-    wp.launch(scrambled_kernel, count, [wp.uint64(key), dimension, run * count], [points], device="cpu")
+    points = wp.empty(count, dtype=wp.vec2, device=default_device())
+    wp.launch(scrambled_kernel, count, [wp.uint64(key), dimension, run * count], [points], device=default_device())
     points = points.numpy()
     assert (points >= 0.0).all()
     assert (points < 1.0).all()

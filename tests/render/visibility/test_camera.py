@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.kernels.render.visibility.camera import ImageGrid, camera_ray, in_image, projected_box, tile_pixel
 from synpick_warp.stages.render.scene import build_grid
+from tests.harness.devices import default_device
 from tests.twins.raycast import rotation_of
 
 WIDTH, HEIGHT, FOCAL = 160, 90, 200.0
@@ -43,34 +44,34 @@ def box_kernel(
 
 
 def project(lower, upper, rotation, position):
-    boxes = wp.zeros(1, dtype=wp.vec4i, device="cpu")
+    boxes = wp.zeros(1, dtype=wp.vec4i, device=default_device())
     inputs = [
-        wp.array([lower], dtype=wp.vec3, device="cpu"),
-        wp.array([upper], dtype=wp.vec3, device="cpu"),
-        wp.array([rotation], dtype=wp.mat33d, device="cpu"),
-        wp.array([position], dtype=wp.vec3d, device="cpu"),
+        wp.array([lower], dtype=wp.vec3, device=default_device()),
+        wp.array([upper], dtype=wp.vec3, device=default_device()),
+        wp.array([rotation], dtype=wp.mat33d, device=default_device()),
+        wp.array([position], dtype=wp.vec3d, device=default_device()),
         wp.vec4(FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2),
         build_grid(WIDTH, HEIGHT),
     ]
-    wp.launch(box_kernel, dim=1, inputs=inputs, outputs=[boxes], device="cpu")
+    wp.launch(box_kernel, dim=1, inputs=inputs, outputs=[boxes], device=default_device())
     return boxes.numpy()[0]
 
 
 @pytest.mark.parametrize(("width", "height"), [(8, 4), (1, 1), (33, 17), (7, 9)])
 def test_tiles_visit_every_pixel_once(width, height):
     grid = build_grid(width, height)
-    visits = wp.zeros((2, height, width), dtype=int, device="cpu")
-    wp.launch(visit_kernel, dim=2 * grid.tiles * 32, inputs=[grid], outputs=[visits], device="cpu")
+    visits = wp.zeros((2, height, width), dtype=int, device=default_device())
+    wp.launch(visit_kernel, dim=2 * grid.tiles * 32, inputs=[grid], outputs=[visits], device=default_device())
     assert (visits.numpy() == 1).all()
 
 
 def test_rays_pass_pixel_centres():
-    rays = wp.zeros((2, 3), dtype=wp.vec3, device="cpu")
-    wp.launch(ray_kernel, dim=(2, 3), inputs=[wp.vec4(10.0, 20.0, 1.5, 1.0), wp.vec2(0.0, 0.0)], outputs=[rays], device="cpu")
+    rays = wp.zeros((2, 3), dtype=wp.vec3, device=default_device())
+    wp.launch(ray_kernel, dim=(2, 3), inputs=[wp.vec4(10.0, 20.0, 1.5, 1.0), wp.vec2(0.0, 0.0)], outputs=[rays], device=default_device())
     np.testing.assert_allclose(rays.numpy()[0, 0], [-1.0 / 10.0, -0.5 / 20.0, 1.0], rtol=1e-6)
     np.testing.assert_allclose(rays.numpy()[1, 2], [1.0 / 10.0, 0.5 / 20.0, 1.0], rtol=1e-6)
     np.testing.assert_allclose(rays.numpy()[0, 1][0], 0.0, atol=1e-7)
-    wp.launch(ray_kernel, dim=(2, 3), inputs=[wp.vec4(10.0, 20.0, 1.5, 1.0), wp.vec2(0.5, -0.5)], outputs=[rays], device="cpu")
+    wp.launch(ray_kernel, dim=(2, 3), inputs=[wp.vec4(10.0, 20.0, 1.5, 1.0), wp.vec2(0.5, -0.5)], outputs=[rays], device=default_device())
     np.testing.assert_allclose(rays.numpy()[0, 0], [-0.5 / 10.0, -1.0 / 20.0, 1.0], rtol=1e-6)
 
 

@@ -18,6 +18,7 @@ from synpick_warp.scenes.types import Fixture, TriangleMesh
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render import raster
 from synpick_warp.stages.render.view_setup import make_views
+from tests.harness.devices import default_device
 from tests.harness.trace_probe import trace_gbuffer_kernel
 from tests.worlds.toy_scene import GREY, UPRIGHT, ToyScene, ball, box, camera, entry, flat_shaded, render, render_gbuffer, sheet
 
@@ -76,7 +77,7 @@ def random_triangles(seed: int, count: int, size: float, spread: float) -> np.nd
 def test_loose_triangles_of_any_size_agree_with_float64(seed, count, size):
     """Two metres are much larger than the camera's distance of one: such triangles pass through its plane, and behind it."""
     corners = random_triangles(seed, count, size, 0.2)
-    found = gbuffer_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), pick_device("cpu"))
+    found = gbuffer_of(ToyScene([entry(triangles(corners))], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (VIEW,)), pick_device(default_device()))
     depth, clear = depth_in_float64(corners)
     sure = clear > 0.1
     assert sure.mean() > 0.5
