@@ -29,11 +29,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="device under test; may be repeated (default: cpu, and cuda:0 where there is one for tests with the fixture `device`)",
     )
 
+    parser.addoption("--check-bounds", action="store_true", help="compile kernels in Warp's debug mode, which checks array indices")
+
 
 def pytest_configure(config: pytest.Config) -> None:
     """Start Warp before the first test, so that its messages stay out of captured output."""
     os.environ[VARIABLE] = devices(config)[0]
+    if config.getoption("--check-bounds"):
+        _check_bounds(config)
     start_warp()
+
+
+def _check_bounds(config: pytest.Config) -> None:
+    """Debug mode, with one core a process: in that mode CPU kernels share a static variable, so launches in several threads crash."""
+    wp.config.mode = "debug"
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "")
+    cores = sorted(os.sched_getaffinity(0))
+    if worker or not config.getoption("numprocesses", None):
+        os.sched_setaffinity(0, {cores[int(worker.removeprefix("gw") or 0) % len(cores)]})
 
 
 def devices(config: pytest.Config) -> list[str]:
@@ -56,17 +69,18 @@ def device(request: pytest.FixtureRequest) -> wp.Device:
 @pytest.fixture(scope="session")
 def real_models() -> Path:
     """Folder of the 21 YCB-Video objects in BOP's layout."""
-    return _real("ycbv_models")
+    return _real("ycbv_models", "models_info.json")
 
 
 @pytest.fixture(scope="session")
 def real_lights() -> Path:
     """Folder of Radiance maps and sIBL sets."""
-    return _real("hdri")
+    return _real("hdri", "sibl_kiara_dawn")
 
 
-def _real(name: str) -> Path:
+def _real(name: str, last: str) -> Path:
+    """A folder of real data; a GPU machine may hold a part of it, without its `last` entry."""
     folder = REAL_DATA / name
-    if not folder.is_dir():
-        pytest.skip(f"no real data at {folder}")
+    if not (folder / last).exists():
+        pytest.skip(f"no real data at {folder / last}")
     return folder

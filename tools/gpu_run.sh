@@ -35,7 +35,7 @@
 #     BAKE_RESOLUTION    640x360
 #     BAKE_FORMATS       bop; or any of bop,shards,usd,zarr
 #     BAKE_SETTINGS      "move.rounds=1 move.speed=0.4 pick.failures=1": short episodes
-#     TEST_WORKERS       8: processes of the tests; TESTS "tests": paths of the tests
+#     TEST_WORKERS       14: processes of the tests; TESTS "tests": paths of the tests
 #     REST_LIMIT BENCH_LIMIT RENDER_LIMIT DEVICES_LIMIT SAME_LIMIT PICK_LIMIT BAKE_LIMIT TESTS_LIMIT   maximum seconds of each step (its fraction of the remaining time)
 #     TOTAL_LIMIT        maximum seconds of all steps (490)
 #
@@ -150,10 +150,12 @@ measure_sameness() {
         --episodes "${SAME_EPISODES:-8}" --ticks "${SAME_TICKS:-60}" --set bake.mode=mixed "${settings[@]}" --json "$results/worlds.json"
 }
 
-# The tests on the device, with their results as JUnit XML. Pytest plugins installed on the machine are disabled.
+# The tests on the device: names as they come in tests.log, results as JUnit XML. Pytest plugins installed on the machine are disabled.
 measure_tests() {
-    step "tests" "${TESTS_LIMIT:-$1}" "$python" -m pytest --device "$device" -n "${TEST_WORKERS:-8}" -q --tb=short -p no:benchmark \
-        -p no:cacheprovider --junitxml="$results/tests.xml" "${tests[@]}"
+    step "tests" "${TESTS_LIMIT:-$1}" "$python" -m pytest --device "$device" -n "${TEST_WORKERS:-14}" -v --tb=short -p no:benchmark \
+        -p no:cacheprovider --junitxml="$results/tests.xml" "${tests[@]}" >"$results/tests.log" 2>&1
+    grep -E "^(FAILED|ERROR|== tests)" "$results/tests.log"
+    tail -n 1 "$results/tests.log"
 }
 
 measure_pick() {
