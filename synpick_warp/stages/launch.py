@@ -32,7 +32,8 @@ def launch_pixels(kernel: wp.Kernel, pixels: int, inputs: list[Any], outputs: li
     """Launch a kernel over a flat range of pixels; no two tiles may write the same element.
 
     The kernel's last input is the index of the first pixel. On the CPU, Warp runs a launch in the calling thread and releases the
-    interpreter lock; so pieces of whole tiles run in parallel in a thread pool, which does not change the result.
+    interpreter lock; so pieces of whole tiles run in parallel in a thread pool, which does not change the result. Kernels launched so must
+    not use Warp's tile functions, whose CPU storage is found by one static pointer per module; its debug mode follows that pointer always.
     """
     if device.is_cuda:
         wp.launch(kernel, dim=pixels, inputs=[*inputs, 0], outputs=outputs, device=device, block_dim=PIXEL_BLOCK)
