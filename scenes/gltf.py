@@ -1,4 +1,4 @@
-"""GLB import (glTF 2.0, binary): chunks and JSON are validated and rewritten, so that the reader opens no file and allocates no more than given.
+"""GLB import (glTF 2.0, binary): chunks and JSON are validated and rewritten, so that the reader opens no file by itself.
 
 Of the JSON chunk only what is declared here reaches the reader: geometry, nodes, base colour and metallic-roughness with their images.
 """

@@ -58,7 +58,7 @@ def texture_name(data: bytes, path: Path) -> str | None:
         if len(words) == 3 and words[0] == "comment" and words[1].lower() == "texturefile":
             names.append(words[2].strip())
     if len(set(names)) > 1:
-        raise CatalogError(f"{path}: {len(names)} texture comments, {names[0]!a} and {names[1]!a}; a model has one texture, keep one")
+        raise CatalogError(f"{path}: {len(names)} texture comments, {names[0]!a} and {names[1]!a}; keep one")
     return names[0] if names else None
 
 
@@ -88,9 +88,7 @@ def read_ply(path: Path) -> list[MeshPart]:
         return [part if part.uv is None else MeshPart(part.vertices, part.faces, part.normals, None, part.colors, part.material)]
     texture = decode_texture(found[1], str(path.parent / found[0]))
     if part.uv is None:
-        raise CatalogError(
-            f"{path}: refers to a texture, but its vertices have no texture_u and texture_v; unwrap it or remove the texture"
-        )
+        raise CatalogError(f"{path}: refers to a texture, but its vertices have no texture_u, texture_v; unwrap it or remove the texture")
     return [MeshPart(part.vertices, part.faces, part.normals, part.uv, None, FileMaterial((1.0, 1.0, 1.0), texture, None, None))]
 
 
