@@ -35,7 +35,7 @@ MAX_MAP_PIXELS = 2**25
 """Maximum number of pixels of a map: 8192 x 4096, which take 1.2 GB as 32-bit floats while they are read."""
 MAX_SET_FILE, MAX_SET_LINE = 2**16, 2**10
 """Largest .ibl file [bytes] and its longest line; the parser's time grows with the square of a line."""
-MAX_RADIANCE = 1e12
+MAX_RADIANCE = 1e11
 """Maximum radiance: that of the sun is 2e9 cd/m². Kernels keep products of three radiances as 32-bit floats, which end at 3e38."""
 MAX_GAMMA = 100.0
 """Maximum REFgamma; displays have 2.2."""

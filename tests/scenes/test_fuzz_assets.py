@@ -260,7 +260,7 @@ def check_lights(path: Path) -> None:
 @fuzz
 @given(st.data())
 def test_any_radiance_map_is_one_line_or_a_map(data):
-    image = np.full((8, 16, 3), data.draw(st.sampled_from([0.5, 1e-30, 8e37, 1e12, 3e9])), np.float32)
+    image = np.full((8, 16, 3), data.draw(st.sampled_from([0.5, 1e-30, 8e37, 1e11, 3e9])), np.float32)
     header, _, body = cv2.imencode(".hdr", image)[1].tobytes().partition(b"\n\n")
     lines = mutate_lines(data, [*header.decode().split("\n"), "", body.split(b"\n")[0].decode()], HDR_LINES)
     content = "\n".join(lines).encode() + b"\n" + mutate_bytes(data, body.partition(b"\n")[2])
