@@ -141,7 +141,7 @@ def test_a_picture_does_not_depend_on_the_unit_of_its_light_map(device):
         view = camera(24, 24, 60.0, (0.0, 0.0, 1.0))
         body = entry(sheet(0.2, 0.2), Material((0.6, 0.5, 0.4), None, 0.0, 0.5))
         toy = ToyScene([body], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (view,), lights=(light,))
-        pictures.append(render(toy, device).rgb.astype(int))
+        pictures.append(render(toy, device).color.astype(int))
     assert pictures[0].mean() > 50
     assert np.abs(pictures[0] - pictures[1]).max() <= 2
 
@@ -195,7 +195,8 @@ def test_a_material_that_would_make_pictures_black_is_one_line(tmp_path, capsys)
     data = glb(models / "a.glb", metallicFactor=0.25).read_bytes()
     (models / "a.glb").write_bytes(data.replace(b'"metallicFactor":0.25', b'"metallicFactor":NaN '))
     heard = mistake(capsys, "bake", "--config", "smoke", "--device", "cpu", "--models", models, "--mode", "move", "--out", out)
-    assert heard.startswith(f"{models}/a.glb: its JSON chunk is damaged: JSON is malformed")
+    assert heard.startswith(f"{models}/a.glb: its JSON chunk is damaged: ")
+    assert "malformed" in heard
     assert not out.parent.exists()
 
 
