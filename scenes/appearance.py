@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from synpick_warp.errors import CatalogError
+from synpick_warp.inputs.files import read_file
+from synpick_warp.scenes.asset_files import describe_error, quiet_decoding
+
+MAX_TEXTURE_FILE = 2**27
+"""Largest image file [bytes]: 128 MiB."""
+MAX_TEXTURE_PIXELS = 2**26
+"""Maximum number of pixels of a texture, and of all textures of one model: 8192², which take 0.7 GB while they are decoded."""
+TEXTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF", "PPM", "JPEG2000", "DDS")
+"""Formats that Pillow may decode: rasters only; for others, such as EPS, it starts other programs."""
 
 # Linear segment of the sRGB transfer function (IEC 61966-2-1).
 _SRGB_TOE = 0.04045
@@ -52,7 +62,7 @@ def rgb8(image: Image.Image) -> np.ndarray:
     Alpha is dropped: objects are opaque, and texture bakers pad transparent texels with colour for filtering.
     """
     if image.mode == "F":
-        grey = np.clip(np.asarray(image), 0.0, 1.0) * 255.0
+        grey = np.clip(np.nan_to_num(np.asarray(image)), 0.0, 1.0) * 255.0
     elif image.mode.startswith("I"):
         grey = np.asarray(image).astype(np.float64).clip(0, 65535) / 257.0
     else:
@@ -70,13 +80,35 @@ def read_texture(path: Path, owner: str) -> np.ndarray:
     Raises:
         CatalogError: The file is missing, or not a readable image.
     """
-    if not path.is_file():
+    if not path.exists():
         raise CatalogError(f"{owner} refers to the texture {path.name!r}, but there is no file {path}; add it or remove the reference")
-    try:
-        with Image.open(path) as image:
-            return rgb8(image)
-    except Exception as error:  # Pillow's decoders raise nearly anything on damaged files
-        raise CatalogError(f"{path}: not readable as an image ({error}); use PNG or JPEG") from error
+    return decode_texture(read_file(path, MAX_TEXTURE_FILE, CatalogError), str(path))
+
+
+def decode_texture(data: bytes, source: str) -> np.ndarray:
+    """Decode an image as (H, W, 3) uint8. Its size is taken from the header and checked before any pixel is decoded.
+
+    Args:
+        data: The image file.
+        source: Where it comes from, for errors.
+
+    Raises:
+        CatalogError: The image is too large, of another format, or damaged.
+    """
+    limit = f"allowed: {MAX_TEXTURE_PIXELS} pixels, such as 8192 x 8192; scale it down"
+    with quiet_decoding():
+        try:
+            with Image.open(io.BytesIO(data), formats=TEXTURE_FORMATS) as image:
+                if image.width * image.height <= MAX_TEXTURE_PIXELS:
+                    return rgb8(image)
+                size = f"{image.width} x {image.height}"
+        except Image.DecompressionBombError:
+            raise CatalogError(f"{source}: too large an image; {limit}") from None
+        except UnidentifiedImageError:
+            raise CatalogError(f"{source}: not readable as an image (its format is unknown); use PNG or JPEG") from None
+        except Exception as error:  # Pillow's decoders raise nearly anything on damaged files
+            raise CatalogError(f"{source}: not readable as an image ({describe_error(error)}); use PNG or JPEG") from None
+    raise CatalogError(f"{source}: too large an image, {size} pixels; {limit}")
 
 
 def bake_vertex_colors(faces: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -116,7 +148,7 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
         New texture coordinates of each part, one row (1, 2) for parts without a texture; and the atlas (H, W, 3) uint8.
 
     Raises:
-        CatalogError: A texture repeats, which an atlas does not allow.
+        CatalogError: A texture repeats, which an atlas does not allow, or the atlas is too large.
     """
     blocks, uvs = [], []
     for uv, material in parts:
@@ -124,10 +156,14 @@ def join_textures(parts: list[tuple[np.ndarray | None, FileMaterial]], owner: st
             texture, uv = np.full((4, 4, 3), 255, np.uint8), np.full((1, 2), 0.5)
         else:
             texture = material.texture
-        light = srgb_to_linear(texture / 255.0) * srgb_to_linear(material.color)
-        blocks.append(np.rint(linear_to_srgb(light) * 255.0).astype(np.uint8))
+        # A table of the 256 levels, since whole images in 64-bit floats take eight times the room.
+        levels = srgb_to_linear(np.arange(256) / 255.0)[:, None] * srgb_to_linear(material.color)
+        table = np.rint(linear_to_srgb(levels) * 255.0).astype(np.uint8)
+        blocks.append(np.stack([table[texture[..., channel], channel] for channel in range(3)], axis=-1))
         uvs.append(uv)
     width, height = max(block.shape[1] for block in blocks), sum(block.shape[0] for block in blocks)
+    if width * height > MAX_TEXTURE_PIXELS:
+        raise CatalogError(f"{owner}: its textures together take {width} x {height} pixels; allowed: {MAX_TEXTURE_PIXELS}; scale them down")
     atlas, top, new_uvs = np.zeros((height, width, 3), np.uint8), 0, []
     for block, uv in zip(blocks, uvs, strict=True):
         if uv.min() < -1e-3 or uv.max() > 1.0 + 1e-3:

@@ -15,6 +15,7 @@ from trimesh.bounds import oriented_bounds
 from synpick_warp.configs.schema import Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.appearance import FileMaterial
+from synpick_warp.scenes.asset_files import check_file_name
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
@@ -82,6 +83,8 @@ def _read_folder(folder: Path, config: Config, report: Callable[[str], None]) ->
     if not files:
         raise CatalogError(f"models folder {folder}: it contains no models; add obj_NNNNNN.ply files, or .obj, .glb or .ply meshes")
     models = bop_files(files)
+    for file in models.values() if models else files:
+        check_file_name(file, CatalogError)
     if models:
         if ignored := len(files) - len(models):
             report(f"models folder {folder}: {ignored} meshes that are not named obj_NNNNNN.ply are ignored")

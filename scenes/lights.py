@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import configparser
+import os
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from synpick_warp.errors import LightError
+from synpick_warp.inputs.files import read_file
+from synpick_warp.inputs.paths import path_inside
 from synpick_warp.scenes.appearance import srgb_to_linear
+from synpick_warp.scenes.asset_files import check_file_name
 from synpick_warp.scenes.embedded.skies import skies
-from synpick_warp.scenes.environment import map_directions
+from synpick_warp.scenes.environment import LUMINANCE, map_directions
+from synpick_warp.scenes.image_size import image_size
 from synpick_warp.scenes.types import EnvironmentMap, Sun
 
 MAX_HEIGHT = 512
@@ -24,6 +29,18 @@ MIN_SUN_BRIGHTNESS = 0.5
 """Threshold of brightness, relative to the map's maximum: 8-bit maps have many maxima, rooms several lamps."""
 MAX_SUN_GAIN = 1e6
 """Maximum SUNmulti; no sun outshines its sky by more."""
+MAX_MAP_FILE = 2**29
+"""Largest image file [bytes]: 512 MiB."""
+MAX_MAP_PIXELS = 2**25
+"""Maximum number of pixels of a map: 8192 x 4096, which take 1.2 GB as 32-bit floats while they are read."""
+MAX_SET_FILE, MAX_SET_LINE = 2**16, 2**10
+"""Largest .ibl file [bytes] and its longest line; the parser's time grows with the square of a line."""
+MAX_RADIANCE = 1e11
+"""Maximum radiance: that of the sun is 2e9 cd/m². Kernels keep products of three radiances as 32-bit floats, which end at 3e38."""
+MAX_GAMMA = 100.0
+"""Maximum REFgamma; displays have 2.2."""
+MIN_RADIANCE = 1e-6
+"""Least radiance that a map's brightest texel must have: exposure ends at a white of 1e-9."""
 
 
 def load_lights(folder: str) -> tuple[EnvironmentMap, ...]:
@@ -56,7 +73,9 @@ def load_lights(folder: str) -> tuple[EnvironmentMap, ...]:
 
 def _read_folder(folder: Path) -> list[EnvironmentMap]:
     """Read the maps directly in a folder."""
-    files = sorted(path for path in folder.iterdir() if path.is_file())
+    files = sorted(path for path in folder.iterdir() if not path.is_dir() and path.suffix.lower() in (".hdr", ".ibl"))
+    for path in files:
+        check_file_name(path, LightError)
     sets = [path for path in files if path.suffix.lower() == ".ibl"]
     if sets:
         return [_read_set(path) for path in sets]
@@ -69,14 +88,17 @@ def _read_set(path: Path) -> EnvironmentMap:
     The reflection map is used for diffuse light and background, too: the set's environment map is a blurred copy of it.
     """
     parser = configparser.ConfigParser(interpolation=None, strict=False, comment_prefixes=("#", ";", "--", "//"))
+    text = read_file(path, MAX_SET_FILE, LightError).decode("utf-8-sig", errors="replace")
+    if max(map(len, text.splitlines()), default=0) > MAX_SET_LINE:
+        raise LightError(f"{path} is not an sIBL set file: a line is longer than {MAX_SET_LINE} characters; it must be INI text")
     try:
-        parser.read_string(path.read_text(encoding="utf-8-sig", errors="replace"))
-    except configparser.Error as error:
+        parser.read_string(text)
+    except Exception as error:  # besides its own errors, the parser raises AttributeError on some lines
         raise LightError(f"{path} is not an sIBL set file: {str(error).splitlines()[0]}; it must be INI text") from error
     # The format spells it "Enviroment".
     for section, key in (("Background", "BGfile"), ("Enviroment", "EVfile"), ("Reflection", "REFfile")):
         file = _text(parser, section, key)
-        if file and not (path.parent / file).is_file():
+        if file and not os.path.lexists(path_inside(path.parent, file, path, LightError)):
             raise LightError(f"{path} names {key} = {file}, but there is no such file beside it; add it")
     file = _text(parser, "Reflection", "REFfile")
     if not file:
@@ -84,8 +106,8 @@ def _read_set(path: Path) -> EnvironmentMap:
     if _number(parser, path, "REFmap", 1.0) != 1.0:
         raise LightError(f"{path} has REFmap = {_text(parser, 'Reflection', 'REFmap')}; only 1, a spherical map, can be read")
     gain = _number(parser, path, "REFmulti", 1.0)
-    map_file = path.parent / file
-    image = _read_image(map_file, gamma=_number(parser, path, "REFgamma", 1.0))
+    map_file = path_inside(path.parent, file, path, LightError)
+    image = _read_image(map_file, gamma=_number(parser, path, "REFgamma", 1.0, MAX_GAMMA))
     with np.errstate(over="ignore"):  # infinite values are refused by _validate
         image = image * np.float32(gain)
     sun = _read_sun(parser, path)
@@ -111,7 +133,7 @@ def _read_sun(parser: configparser.ConfigParser, path: Path) -> Sun | None:
     direction = np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
     linear = np.ones(3) if color is None else srgb_to_linear(color / 255.0)
     irradiance = np.pi * (1.0 if gain is None else gain[0]) * linear
-    return Sun(direction, irradiance) if v[0] < 0.5 and irradiance.any() else None
+    return Sun(direction, irradiance) if v[0] < 0.5 and float(irradiance @ LUMINANCE) >= MIN_RADIANCE else None
 
 
 def _sun_numbers(parser: configparser.ConfigParser, path: Path, key: str, count: int, high: float) -> np.ndarray | None:
@@ -144,11 +166,13 @@ def _is_bright(radiance: np.ndarray, direction: np.ndarray) -> bool:
 
 
 def _text(parser: configparser.ConfigParser, section: str, key: str) -> str:
-    return parser.get(section, key, fallback="").strip().strip('"')
+    """Value of a key as one line; values may span several in the format."""
+    text = " ".join(parser.get(section, key, fallback="").split()).strip('"')
+    return text if text.isprintable() else ascii(text)[1:-1]
 
 
-def _number(parser: configparser.ConfigParser, path: Path, key: str, default: float) -> float:
-    """Parse a positive number in the section Reflection."""
+def _number(parser: configparser.ConfigParser, path: Path, key: str, default: float, high: float = float("inf")) -> float:
+    """Parse a positive number up to `high` in the section Reflection."""
     text = _text(parser, "Reflection", key)
     if not text:
         return default
@@ -156,8 +180,9 @@ def _number(parser: configparser.ConfigParser, path: Path, key: str, default: fl
         value = float(text)
     except ValueError:
         value = float("nan")
-    if not (0 < value < float("inf")):
-        raise LightError(f"{path} has {key} = {text}; it must be a positive number")
+    if not (0 < value < float("inf")) or value > high:
+        limit = "" if high == float("inf") else f" up to {high:g}"
+        raise LightError(f"{path} has {key} = {text}; it must be a positive number{limit}")
     return value
 
 
@@ -179,9 +204,16 @@ def _read_image(path: Path, gamma: float) -> np.ndarray:
 
 
 def _decode(path: Path) -> np.ndarray | None:
-    """Decode an image as stored, in OpenCV's channel order; None if it cannot be read. OpenCV's own messages are suppressed."""
-    if not path.stat().st_size:
+    """Decode an image as stored, in OpenCV's channel order; None if it cannot be read. OpenCV's own messages are suppressed.
+
+    The size is read from the header first, since OpenCV allocates up to 2^30 pixels before it reads any.
+    """
+    data = read_file(path, MAX_MAP_FILE, LightError)
+    size = image_size(data)
+    if size is None:
         return None
+    if size[0] * size[1] > MAX_MAP_PIXELS:
+        raise LightError(f"{path} is {size[0]} x {size[1]} pixels; allowed: up to 8192 x 4096; scale it down, {MAX_HEIGHT} rows are used")
     logging = cv2.utils.logging
     level = logging.getLogLevel()
     logging.setLogLevel(logging.LOG_LEVEL_SILENT)
@@ -202,8 +234,10 @@ def _validate(image: np.ndarray, path: Path) -> np.ndarray:
         raise LightError(f"{path} has radiance that is infinite or not a number; replace the map")
     if image.min() < 0:
         raise LightError(f"{path} has negative radiance ({image.min():g}); replace the map")
-    if image.max() <= 0:
-        raise LightError(f"{path} is black; an environment map must contain some light")
+    if image.max() > MAX_RADIANCE:
+        raise LightError(f"{path} has radiance {image.max():g}; allowed: up to {MAX_RADIANCE:g}; scale the map down")
+    if image.max() < MIN_RADIANCE:
+        raise LightError(f"{path} is black: no radiance above {MIN_RADIANCE:g}; an environment map must contain some light")
     if height > MAX_HEIGHT:
         image = cv2.resize(image, (2 * MAX_HEIGHT, MAX_HEIGHT), interpolation=cv2.INTER_AREA)
     # Columns run clockwise as seen from above, azimuth counter-clockwise.

@@ -2,23 +2,50 @@
 
 from __future__ import annotations
 
-import json
+import os
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 
 from synpick_warp.errors import CatalogError
+from synpick_warp.inputs.json import read_json
 
-_NAME = re.compile(r"obj_(\d+)\.ply", re.IGNORECASE)
+MAX_OBJ_ID = 2**31 - 1
+"""Largest obj_id: data sets keep them in 32 bits."""
+MAX_INFO = 2**24
+"""Largest models_info.json [bytes]: 16 MiB; an entry has 1 kB."""
+MAX_DEPTH = 16
+"""Maximum nesting of models_info.json; BOP's has five levels."""
+
+_NAME = re.compile(r"obj_([0-9]+)\.ply", re.IGNORECASE)
 _MILLIMETRE = 1e-3
 # Published matrices have six digits.
 _ROTATION_TOLERANCE = 1e-3
-# Length to which wrong values are truncated in errors.
-_SHOWN = 60
+_ADVICE = "or remove the file to go without symmetries"
+_NEEDED = "diameter above 0 in mm, symmetries_discrete of 16 numbers each, symmetries_continuous of axis and offset of 3 numbers each"
+
+# A coordinate, or a length in mm: larger numbers are mistakes, whose squares overflow.
+_Number = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+
+
+class _Axis(msgspec.Struct):
+    """A continuous symmetry."""
+
+    axis: tuple[_Number, _Number, _Number]
+    offset: tuple[_Number, _Number, _Number] = (0.0, 0.0, 0.0)
+
+
+class _Entry(msgspec.Struct):
+    """What is read of an object's entry; other keys are copied as they are."""
+
+    diameter: Annotated[float, msgspec.Meta(gt=0.0, le=1e9)] | None = None
+    symmetries_discrete: list[Annotated[list[_Number], msgspec.Meta(min_length=16, max_length=16)]] = []
+    symmetries_continuous: list[_Axis] = []
 
 
 @dataclass(frozen=True)
@@ -37,12 +64,14 @@ def bop_files(files: Iterable[Path]) -> dict[int, Path]:
     """Select the files that are BOP models (obj_NNNNNN.ply), by obj_id.
 
     Raises:
-        CatalogError: Two files have the same obj_id.
+        CatalogError: Two files have the same obj_id, or one is too large.
     """
     models: dict[int, Path] = {}
     for file in files:
         if match := _NAME.fullmatch(file.name):
             obj_id = int(match[1])
+            if obj_id > MAX_OBJ_ID:
+                raise CatalogError(f"{file}: the number in its name is too large; allowed: 0 to {MAX_OBJ_ID}; rename the file")
             if obj_id in models:
                 raise CatalogError(f"{models[obj_id]} and {file.name} are both object {obj_id}; keep one of them")
             models[obj_id] = file
@@ -59,55 +88,52 @@ def read_models_info(path: Path, obj_ids: Iterable[int]) -> dict[int, ModelInfo]
     Raises:
         CatalogError: The file is not valid JSON or lacks an object, or an entry's diameter or symmetries are invalid.
     """
-    if not path.is_file():
-        return {}
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise CatalogError(f"{path}: not readable as JSON ({error}); repair it, or remove it to go without symmetries") from error
-    if not isinstance(content, dict):
-        raise CatalogError(f'{path}: a {type(content).__name__}; needed is an object with an entry for each obj_id, such as "1"')
+    entries = read_entries(path)
     infos = {}
-    for obj_id in obj_ids:
-        entry = content.get(str(obj_id))
+    for obj_id in obj_ids if entries is not None else ():
+        place, entry = f"{path}: object {obj_id}", (entries or {}).get(str(obj_id))
         if not isinstance(entry, dict):
-            raise CatalogError(f"{path}: no entry for object {obj_id}; add one, or remove the file to go without symmetries")
-        infos[obj_id] = _info(entry, f"{path}: object {obj_id}")
+            raise CatalogError(f"{path}: no entry for object {obj_id}; add one, {_ADVICE}")
+        try:
+            infos[obj_id] = _info(msgspec.convert(entry, _Entry), place)
+        except msgspec.ValidationError as error:
+            raise CatalogError(f"{place}: {str(error).replace('`', '')}; needed: {_NEEDED}") from None
     return infos
 
 
-def _info(entry: dict[str, Any], place: str) -> ModelInfo:
-    diameter = None
-    if (given := entry.get("diameter")) is not None:
-        if type(given) not in (int, float) or not 0.0 < given < np.inf:
-            raise CatalogError(f"{place}: diameter is {_short(given)}; needed: a number above 0, in mm")
-        diameter = float(given) * _MILLIMETRE
-    discrete = [_rigid(value, where) for where, value in _rows(entry, "symmetries_discrete", place)]
-    continuous = [_axis(value, where) for where, value in _rows(entry, "symmetries_continuous", place)]
-    return ModelInfo(diameter, tuple(discrete), tuple(continuous))
+def read_entries(path: Path) -> dict[str, Any] | None:
+    """Read the objects' entries in models_info.json as they are, by obj_id in decimal; None if the file is missing.
+
+    Raises:
+        CatalogError: The file is not a JSON object, or nested too deeply to be written again.
+    """
+    if not os.path.lexists(path):
+        return None
+    content = read_json(path, dict[str, Any], CatalogError, f"repair it, {_ADVICE}", MAX_INFO)
+    if _depth(content) > MAX_DEPTH:
+        raise CatalogError(f"{path}: nested deeper than {MAX_DEPTH}; repair it, {_ADVICE}")
+    return content
 
 
-def _short(value: Any) -> str:
-    text = json.dumps(value)
-    return text if len(text) <= _SHOWN else text[:_SHOWN] + "…"
+def _depth(content: Any) -> int:
+    """Depth of nested objects and lists; ends a level below MAX_DEPTH."""
+    level, depth = [content], 0
+    while level and depth <= MAX_DEPTH:
+        level = [item for each in level if isinstance(each, dict | list) for item in (each.values() if isinstance(each, dict) else each)]
+        depth += 1
+    return depth
 
 
-def _rows(entry: dict[str, Any], key: str, place: str) -> list[tuple[str, Any]]:
-    """The elements of a list, each with its path for errors."""
-    rows = entry.get(key, [])
-    if not isinstance(rows, list):
-        raise CatalogError(f"{place}: {key} is {_short(rows)}; needed: a list")
-    return [(f"{place}: {key}[{index}]", row) for index, row in enumerate(rows)]
+def _info(entry: _Entry, place: str) -> ModelInfo:
+    return ModelInfo(
+        None if entry.diameter is None else entry.diameter * _MILLIMETRE,
+        tuple(_rigid(matrix, f"{place}: symmetries_discrete[{index}]") for index, matrix in enumerate(entry.symmetries_discrete)),
+        tuple(_axis(axis, f"{place}: symmetries_continuous[{index}]") for index, axis in enumerate(entry.symmetries_continuous)),
+    )
 
 
-def _numbers(value: Any, count: int, place: str) -> np.ndarray:
-    if not isinstance(value, list) or len(value) != count or not all(type(item) in (int, float) and np.isfinite(item) for item in value):
-        raise CatalogError(f"{place} is {_short(value)}; needed: {count} finite numbers")
-    return np.array(value, dtype=np.float64)
-
-
-def _rigid(value: Any, place: str) -> tuple[float, ...]:
-    matrix = _numbers(value, 16, place).reshape(4, 4)
+def _rigid(value: list[float], place: str) -> tuple[float, ...]:
+    matrix = np.array(value, dtype=np.float64).reshape(4, 4)
     rotation = matrix[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max(), abs(np.linalg.det(rotation) - 1.0))
     if off > _ROTATION_TOLERANCE:
@@ -116,11 +142,8 @@ def _rigid(value: Any, place: str) -> tuple[float, ...]:
     return tuple(float(value) for value in matrix.reshape(-1))
 
 
-def _axis(value: Any, place: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    if not isinstance(value, dict):
-        raise CatalogError(f"{place} is {_short(value)}; needed: an object with axis and offset")
-    axis = _numbers(value.get("axis"), 3, f"{place}.axis")
-    offset = _numbers(value.get("offset", [0, 0, 0]), 3, f"{place}.offset") * _MILLIMETRE
+def _axis(value: _Axis, place: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    axis, offset = np.array(value.axis, dtype=np.float64), np.array(value.offset, dtype=np.float64) * _MILLIMETRE
     length = float(np.linalg.norm(axis))
     if length == 0.0:
         raise CatalogError(f"{place}.axis is zero; needed: a direction")

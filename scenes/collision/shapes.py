@@ -12,11 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.errors import CatalogError
+from synpick_warp.inputs.files import check_regular_file
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
-from synpick_warp.scenes.collision.hulls import simplify_hull
+from synpick_warp.scenes.collision.hulls import hull_volume, simplify_hull
 from synpick_warp.scenes.collision.parallel import decompose_all
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
 
+MAX_CACHE_FILE = 2**26
+"""Largest cache file [bytes]: 64 MiB; a decomposition has some 10 kB."""
 # Part of the cache's key, as is the text of ShapeRecipe. Raise it with any change to hulls.py or decomposition.py that gives other shapes
 # for the same input.
 _RECIPE = 1
@@ -79,13 +82,17 @@ def _key(mesh: TriangleMesh, recipe: ShapeRecipe) -> str:
 def _load(file: Path) -> tuple[ConvexPiece, ...] | None:
     """Read a cache file; None if it is missing or damaged."""
     try:
+        check_regular_file(file, MAX_CACHE_FILE, CatalogError)
         # Opened here, because np.load leaves a damaged file open.
         with file.open("rb") as stream, np.load(stream, allow_pickle=False) as data:
+            if sum(item.file_size for item in data.zip.infolist()) > MAX_CACHE_FILE:
+                return None
             vertices, faces, counts = data["vertices"], data["faces"], data["counts"]
         ends = np.cumsum(counts, axis=0)[:-1]
         pairs = zip(np.split(vertices, ends[:, 0]), np.split(faces, ends[:, 1]), strict=True)
         pieces = tuple(ConvexPiece(np.ascontiguousarray(v, np.float32), np.ascontiguousarray(f, np.int32)) for v, f in pairs)
         valid = all(np.isfinite(p.vertices).all() and p.faces.min() >= 0 and p.faces.max() < len(p.vertices) for p in pieces)
+        valid = valid and all(p.vertices.shape[1:] == p.faces.shape[1:] == (3,) and hull_volume(p.vertices) > 0.0 for p in pieces)
     except Exception:  # a damaged file raises nearly anything; whatever it is, the shape is computed again
         return None
     return pieces if valid and pieces else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,11 +22,12 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.appearance import read_texture
 from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.lights import MAX_RADIANCE
 from synpick_warp.scenes.types import Material
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
-from tests.worlds.toy_scene import UPRIGHT, ToyScene, build_scene, camera, entry, even_light, sheet, snapshot
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, build_scene, camera, entry, even_light, render, sheet, snapshot, sun
 
 TEXEL, PIXELS = 0.01, 5
 """Width of a texel on a sheet [m], and in the picture: an odd number, so that some pixel's centre is a texel's."""
@@ -130,6 +132,20 @@ def mistake(capsys, *arguments: object) -> str:
     return line.removeprefix("synpick-warp: error: ")
 
 
+def test_a_picture_does_not_depend_on_the_unit_of_its_light_map(device):
+    """Up to the largest radiance that is allowed: exposure is automatic, and nothing overflows."""
+    dim = sun((0.3, 0.2, 1.0))
+    pictures = []
+    for gain in (1.0, 0.99 * MAX_RADIANCE / dim.radiance.max()):
+        light = replace(dim, radiance=(dim.radiance * np.float32(gain)))
+        view = camera(24, 24, 60.0, (0.0, 0.0, 1.0))
+        body = entry(sheet(0.2, 0.2), Material((0.6, 0.5, 0.4), None, 0.0, 0.5))
+        toy = ToyScene([body], [[(0, (0.0, 0.0, 0.0, *UPRIGHT))]], (view,), lights=(light,))
+        pictures.append(render(toy, device).color.astype(int))
+    assert pictures[0].mean() > 50
+    assert np.abs(pictures[0] - pictures[1]).max() <= 2
+
+
 @pytest.mark.parametrize(
     ("write", "said"),
     [
@@ -142,9 +158,11 @@ def mistake(capsys, *arguments: object) -> str:
         (lambda folder: float_picture(folder / "a.hdr", np.nan), "{folder}/a.hdr has radiance that is infinite or not a number"),
         (lambda folder: float_picture(folder / "a.hdr", np.inf), "{folder}/a.hdr has radiance that is infinite or not a number"),
         (lambda folder: float_picture(folder / "a.hdr", -1.0), "{folder}/a.hdr has negative radiance (-1); replace the map"),
+        (lambda folder: float_picture(folder / "a.hdr", 8e37), "{folder}/a.hdr has radiance 8e+37; allowed: up to 1e+11; "),
+        (lambda folder: os.mkfifo(folder / "a.hdr"), "{folder}/a.hdr is not a regular file"),
         (lambda folder: None, "lights folder {folder} contains no environment map; "),
     ],
-    ids=["truncated", "text", "set without map", "nan", "inf", "negative", "empty folder"],
+    ids=["truncated", "text", "set without map", "nan", "inf", "negative", "overflow", "fifo", "empty folder"],
 )
 def test_lights_that_cannot_be_used_are_one_line(tmp_path, capsys, write, said):
     models, folder, out = box_models(tmp_path / "models"), tmp_path / "lights", tmp_path / "deep" / "data"
@@ -169,4 +187,25 @@ def test_a_texture_cut_short_is_one_line(tmp_path, capsys):
     (models / "t.png").write_bytes(data[: len(data) // 2])
     heard = mistake(capsys, "bake", "--config", "smoke", "--device", "cpu", "--models", models, "--mode", "move", "--out", out)
     assert heard.startswith(f"{models}/t.png: not readable as an image (")
+    assert not out.parent.exists()
+
+
+def test_a_material_that_would_make_pictures_black_is_one_line(tmp_path, capsys):
+    models, out = tmp_path / "models", tmp_path / "deep" / "data"
+    data = glb(models / "a.glb", metallicFactor=0.25).read_bytes()
+    (models / "a.glb").write_bytes(data.replace(b'"metallicFactor":0.25', b'"metallicFactor":NaN '))
+    heard = mistake(capsys, "bake", "--config", "smoke", "--device", "cpu", "--models", models, "--mode", "move", "--out", out)
+    assert heard.startswith(f"{models}/a.glb: its JSON chunk is damaged: ")
+    assert "malformed" in heard
+    assert not out.parent.exists()
+
+
+def test_a_texture_outside_of_the_models_folder_is_one_line(tmp_path, capsys):
+    models, out = tmp_path / "a" / "b" / "models", tmp_path / "deep" / "data"
+    models.mkdir(parents=True)
+    text = trimesh.creation.box((80, 60, 50)).export(file_type="ply", encoding="ascii").decode()
+    (models / "obj_000001.ply").write_text(text.replace("element vertex", "comment TextureFile ../../evil.png\nelement vertex", 1))
+    Image.new("RGB", (2, 2)).save(tmp_path / "a" / "evil.png")
+    heard = mistake(capsys, "bake", "--config", "smoke", "--device", "cpu", "--models", models, "--mode", "move", "--out", out)
+    assert heard == f'{models}/obj_000001.ply names the file "../../evil.png"; allowed: a relative name without .. inside {models}'
     assert not out.parent.exists()

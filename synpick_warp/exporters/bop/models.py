@@ -13,21 +13,23 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.view import MILLIMETERS
 from synpick_warp.exporters.writing.png import encode_png
+from synpick_warp.inputs.paths import path_inside
 from synpick_warp.layer_codec import layer_notes
+from synpick_warp.scenes.appearance import decode_texture
+from synpick_warp.scenes.models_info import read_entries
+from synpick_warp.scenes.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
 
 CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"
 MODEL_FOLDERS = ("models", "models_eval")
 """The toolkit renders the first and evaluates with the second; ours are equal."""
-_TEXTURE_COMMENT = b"comment TextureFile "
-_HEADER_END = b"end_header"
 
 
 def write_constants(out: Path, catalog: Catalog, camera: Camera, depth_scale: float, notes: str) -> list[Path]:
     """Write models/, models_eval/, camera.json and dataset_info.md, replacing existing ones; returns their paths.
 
     Raises:
-        CatalogError: A model file lacks its texture file.
+        CatalogError: A model file or its texture is not what was read for the catalog.
         OSError: A file cannot be written.
     """
     for name in MODEL_FOLDERS:
@@ -50,7 +52,7 @@ def write_models(folder: Path, catalog: Catalog) -> None:
             if entry.material.texture is not None:
                 path.with_suffix(".png").write_bytes(encode_png(_tint_texture(entry.material)))
         else:
-            _copy_model(entry.source, path)
+            _copy_model(entry, entry.source, path)
         infos[str(entry.obj_id)] = _read_source_info(entry) or make_model_info(entry)
     _write_json(folder / "models_info.json", infos)
 
@@ -113,24 +115,27 @@ def _to_millimeters(matrix: tuple[float, ...]) -> list[float]:
 def _read_source_info(entry: CatalogEntry) -> dict[str, Any] | None:
     """The object's entry in the models_info.json beside its source file; None: there is none."""
     path = entry.source.parent / "models_info.json" if entry.source else None
-    if path is None or not path.is_file():
-        return None
-    return json.loads(path.read_bytes()).get(str(entry.obj_id))
+    return None if path is None else (read_entries(path) or {}).get(str(entry.obj_id))
 
 
-def _copy_model(source: Path, path: Path) -> None:
-    """Copy a PLY file and the texture that its header names."""
-    shutil.copyfile(source, path)
-    with source.open("rb") as file:
-        for line in file:
-            if line.startswith(_TEXTURE_COMMENT):
-                name = line.removeprefix(_TEXTURE_COMMENT).strip().decode()
-                if not (source.parent / name).is_file():
-                    raise CatalogError(f"{source} names the texture {name}, and {source.parent} has no such file; put it there")
-                (path.parent / name).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(source.parent / name, path.parent / name)
-            if line.startswith(_HEADER_END):
-                return
+def _copy_model(entry: CatalogEntry, source: Path, path: Path) -> None:
+    """Copy a PLY file, and the texture that its header names, under the same name inside the set.
+
+    Raises:
+        CatalogError: The texture is no longer the one that was read, or has the name of another file of the set.
+    """
+    data = read_ply_file(source)
+    found = read_ply_texture(data, source)
+    if found is not None:
+        name, image = found
+        if not np.array_equal(decode_texture(image, str(source.parent / name)), np.asarray(entry.material.texture)):
+            raise CatalogError(f"{source}: its texture {name} changed since it was read; start again")
+        target = path_inside(path.parent, name, source, CatalogError)
+        if target.suffix.lower() in (".ply", ".json") or (target.exists() and target.read_bytes() != image):
+            raise CatalogError(f"{source} names the texture {name}, but the set has another file of that name; rename it")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(image)
+    path.write_bytes(data)
 
 
 def _tint_texture(material: Material) -> np.ndarray:

@@ -25,6 +25,7 @@ from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, creat
 from synpick_warp.exporters.bop.view import ANNOTATIONS, annotation_block
 from synpick_warp.exporters.writing.files import check_output_folder
 from synpick_warp.exporters.writing.folder import open_folder
+from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.scenes.types import Catalog
 from tests.exporters.writing.test_rle import decode
 from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, feed, finish
@@ -365,12 +366,13 @@ def test_bop_models_are_copied_byte_for_byte(tmp_path):
     (source / "obj_000003.ply").write_bytes(model)
     info = {"diameter": 197.98, "min_x": -80.0, "note": "kept"}
     (source / "models_info.json").write_text(json.dumps({"3": info}))
-    with pytest.raises(CatalogError, match=r"names the texture label\.png"):
+    with pytest.raises(CatalogError, match=r"refers to 'label\.png', but there is no file"):
         write_models(tmp_path / "without", catalog_from_file(source / "obj_000003.ply"))
-    (source / "label.png").write_bytes(b"any bytes")
+    label = encode_png(catalog().entries[0].material.texture)
+    (source / "label.png").write_bytes(label)
     write_models(tmp_path / "models", catalog_from_file(source / "obj_000003.ply"))
     assert (tmp_path / "models/obj_000003.ply").read_bytes() == model
-    assert (tmp_path / "models/label.png").read_bytes() == b"any bytes"
+    assert (tmp_path / "models/label.png").read_bytes() == label
     assert load(tmp_path / "models/models_info.json") == {"3": info}
 
 

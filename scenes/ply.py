@@ -1,0 +1,197 @@
+"""PLY import: header validation before the body is decoded, BOP's texture comments, vertices in the order of the file."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from trimesh.exchange.ply import load_ply
+from trimesh.geometry import triangulate_quads
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.inputs.files import read_file
+from synpick_warp.scenes.appearance import MAX_TEXTURE_FILE, FileMaterial, decode_texture
+from synpick_warp.scenes.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, read_referred
+from synpick_warp.scenes.mesh_parts import GREY, MeshPart
+
+MAX_HEADER = 2**16
+"""Longest header [bytes]; models have less than 1 kB."""
+MAX_PROPERTIES = 256
+"""Maximum number of properties of all elements together."""
+MAX_VALUES = 2**24
+"""Maximum number of values of an ASCII file: rows times properties."""
+
+# Property names of texture coordinates: BOP's first, then those of Blender and MeshLab.
+_UV_COLUMNS = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
+# All that numbers consist of: digits, signs, exponents, "nan", "infinity".
+_NUMBERS = b"0123456789+-.eEnNaAiIfFtTyY \t\r\n"
+
+
+def read_ply_file(path: Path) -> bytes:
+    """Read a PLY file and check its header.
+
+    Raises:
+        CatalogError: It is not a PLY file, or exceeds a limit.
+    """
+    data = read_file(path, MAX_MESH_FILE, CatalogError)
+    lines, start = _header(data, path)
+    _check_elements(lines, data, start, path)
+    return data
+
+
+def texture_name(data: bytes, path: Path) -> str | None:
+    """The image that a PLY header names in a line `comment TextureFile NAME` (in any case); None if there is none.
+
+    Args:
+        data: The file.
+        path: Its path, for errors.
+
+    Raises:
+        CatalogError: The header names several images, or is no PLY header.
+    """
+    names = []
+    for line in _header(data, path)[0]:
+        words = line.split(maxsplit=2)
+        if len(words) == 3 and words[0] == "comment" and words[1].lower() == "texturefile":
+            names.append(words[2].strip())
+    if len(set(names)) > 1:
+        raise CatalogError(f"{path}: {len(names)} texture comments, {names[0]!a} and {names[1]!a}; keep one")
+    return names[0] if names else None
+
+
+def read_ply_texture(data: bytes, path: Path) -> tuple[str, bytes] | None:
+    """Name and content of the texture that a PLY file names, inside the file's folder; None if there is none."""
+    name = texture_name(data, path)
+    return None if name is None else (name, read_referred(path.parent, name, path, MAX_TEXTURE_FILE)[1])
+
+
+def read_ply(path: Path) -> list[MeshPart]:
+    """Read a PLY file in BOP's format; vertices keep their order, since texture coordinates refer to it.
+
+    Raises:
+        CatalogError: The file cannot be read or has no triangles, or its texture is missing.
+    """
+    data = read_ply_file(path)
+    try:
+        # fix_texture would reorder vertices; textures are read below, where a missing one is an error.
+        kwargs = load_ply(io.BytesIO(_without_edges(data, path)), fix_texture=False, skip_materials=True)
+        part = _ply_part(kwargs, path)
+    except CatalogError:
+        raise
+    except Exception as error:  # the reader raises nearly anything on damaged files
+        raise CatalogError(f"{path}: not readable as PLY ({describe_error(error)})") from error
+    found = read_ply_texture(data, path)
+    if found is None:
+        return [part if part.uv is None else MeshPart(part.vertices, part.faces, part.normals, None, part.colors, part.material)]
+    texture = decode_texture(found[1], str(path.parent / found[0]))
+    if part.uv is None:
+        raise CatalogError(f"{path}: refers to a texture, but its vertices have no texture_u, texture_v; unwrap it or remove the texture")
+    return [MeshPart(part.vertices, part.faces, part.normals, part.uv, None, FileMaterial((1.0, 1.0, 1.0), texture, None, None))]
+
+
+def _without_edges(data: bytes, path: Path) -> bytes:
+    """Rename the element edge, from which the reader would make lines."""
+    start = _header(data, path)[1]
+    renamed = re.sub(rb"(?m)^([ \t]*element[ \t]+)edge(?=[ \t])", rb"\1edg_", data[:start])
+    return data if renamed == data[:start] else renamed + data[start:]
+
+
+def _header(data: bytes, path: Path) -> tuple[list[str], int]:
+    """Lines of the header, and where the body begins; ends, as for the reader, at the first line with the word end_header."""
+    lines, start = [], 0
+    while start < min(len(data), MAX_HEADER):
+        end = data.find(b"\n", start, MAX_HEADER) + 1 or len(data)
+        try:
+            lines.append(data[start:end].decode("utf-8").strip())
+        except UnicodeDecodeError:
+            raise CatalogError(
+                f"{path}: not readable as PLY (line {len(lines) + 1} of its header is not UTF-8); save it as UTF-8"
+            ) from None
+        start = end
+        if lines[0] != "ply":
+            raise CatalogError(f"{path}: not readable as PLY (its first line is not ply)")
+        if "end_header" in lines[-1].split():
+            return lines, start
+    raise CatalogError(f"{path}: not readable as PLY (no header that ends within {MAX_HEADER} bytes)")
+
+
+def _check_elements(lines: list[str], data: bytes, start: int, path: Path) -> None:
+    """Check the counts of a header before anything is allocated for them."""
+    elements: dict[str, int] = {}
+    counts: dict[str, set[str]] = {}
+    for number, line in enumerate(lines[2:-1], start=3):
+        words = line.split()
+        if words[:1] == ["element"]:
+            if len(words) != 3 or not words[2].isascii() or not words[2].isdecimal() or words[1] in elements:
+                raise CatalogError(f"{path}: not readable as PLY (line {number}: {line[:80]!a})")
+            if len(words[2]) > 20 or int(words[2]) > MAX_ROWS:
+                raise CatalogError(f"{path}: {line[:80]!a}; allowed: at most {MAX_ROWS} vertices and as many faces; decimate the mesh")
+            elements[words[1]], counts[words[1]] = int(words[2]), set()
+        elif words[:1] == ["property"]:
+            owner = list(counts)[-1] if counts else ""
+            if not owner or words[-1] in counts[owner]:
+                raise CatalogError(f"{path}: not readable as PLY (line {number}: {line[:80]!a})")
+            counts[owner].add(words[-1])
+        elif not words or "element" in words[0] or "property" in words[0]:
+            raise CatalogError(f"{path}: not readable as PLY (line {number}: {line[:80]!a})")
+    if sum(map(len, counts.values())) > MAX_PROPERTIES:
+        raise CatalogError(f"{path}: more than {MAX_PROPERTIES} properties; remove those that are not needed")
+    if len(lines) > 1 and "ascii" in lines[1].lower():
+        _check_ascii(data, start, sum(elements.values()), sum(count * len(counts[name]) for name, count in elements.items()), path)
+
+
+def _check_ascii(data: bytes, start: int, rows: int, values: int, path: Path) -> None:
+    """Check the body of an ASCII file: numbers only, and at least as many rows and values as its header announces."""
+    if len(data) > MAX_TEXT_MESH or values > MAX_VALUES:
+        raise CatalogError(f"{path}: too large for an ASCII file; save it as binary PLY")
+    body = data[start:]
+    if body.translate(None, _NUMBERS):
+        raise CatalogError(f"{path}: not readable as PLY (its body has characters that are not part of numbers)")
+    if body.count(b"\n") + body.count(b"\r") > 4 * MAX_ROWS:
+        raise CatalogError(f"{path}: more than {4 * MAX_ROWS} lines; save it as binary PLY")
+    if body.count(b"\n") + 1 < rows or 2 * values > len(body) + 1:
+        raise CatalogError(f"{path}: not readable as PLY (its header announces {rows} rows, its body is shorter); the file is cut short")
+
+
+def _ply_part(kwargs: dict[str, Any], path: Path) -> MeshPart:
+    """Convert what the reader returns; texture coordinates are None or (V, 2), with vertices split if faces carry them."""
+    elements = kwargs["metadata"]["_ply_raw"]
+    vertex, face = elements.get("vertex", {}), elements.get("face", {})
+    faces = np.asarray(kwargs.get("faces", np.zeros((0, 3))), dtype=np.int64)
+    faces = triangulate_quads(faces, dtype=np.int64) if faces.size else faces
+    if not faces.size:
+        raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
+    corner_uv = _corner_uv(face, len(faces))
+    vertices, normals, colors = (_columns(vertex, names) for names in (("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")))
+    uv = next((rows for names in _UV_COLUMNS if (rows := _columns(vertex, names)) is not None), None)
+    if vertices is None:
+        raise CatalogError(f"{path}: vertices without x, y and z")
+    if colors is not None:
+        scale = 1 if np.dtype(vertex["properties"]["red"]).kind in "iu" else 255
+        colors = np.clip(np.rint(np.nan_to_num(colors) * scale), 0, 255).astype(np.uint8)
+    if corner_uv is not None:
+        order = faces.reshape(-1)
+        if order.min() < 0:
+            raise CatalogError(f"{path}: a triangle refers to vertex {order.min()}; repair the mesh")
+        vertices, uv, faces = vertices[order], corner_uv, np.arange(len(order)).reshape(-1, 3)
+        normals, colors = (None if rows is None else rows[order] for rows in (normals, colors))
+    return MeshPart(vertices, faces, normals, uv, colors, FileMaterial(GREY, None, None, None))
+
+
+def _columns(vertex: dict[str, Any], names: tuple[str, ...]) -> np.ndarray | None:
+    """Stack columns (V, len(names)) float64; None unless all exist."""
+    if not all(name in vertex.get("properties", {}) for name in names):
+        return None
+    return np.stack([np.asarray(vertex["data"][name], dtype=np.float64).reshape(-1) for name in names], axis=1)
+
+
+def _corner_uv(face: dict[str, Any], count: int) -> np.ndarray | None:
+    """Texture coordinates of the triangles' corners (3 F, 2), if the file stores them per face; otherwise None."""
+    if "texcoord" not in face.get("properties", {}):
+        return None
+    data = face["data"]["texcoord"]
+    rows = data["f1"] if getattr(data, "dtype", None) is not None and data.dtype.names else data
+    return np.asarray(rows, dtype=np.float64).reshape(3 * count, 2)
