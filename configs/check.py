@@ -24,7 +24,7 @@ _SHOWN = 60
 
 
 class _MismatchError(Exception):
-    """The value is not of the setting's type."""
+    """The value is not of the setting's type; the message, if any, says what is allowed."""
 
 
 def check_value(key: str, value: object, item: dataclasses.Field[Any], annotation: Any, source: str) -> Any:
@@ -42,8 +42,9 @@ def check_value(key: str, value: object, item: dataclasses.Field[Any], annotatio
     """
     try:
         result = _convert(value, annotation)
-    except _MismatchError:
-        raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {describe_type(annotation)}{_unit(item)}") from None
+    except _MismatchError as mismatch:
+        allowed = str(mismatch) or describe_type(annotation)
+        raise ConfigError(f"{key} is {format_value(value)} {source}; allowed: {allowed}{_unit(item)}") from None
     if not all(_inside(leaf, item) for leaf in _leaves(result)):
         wrong = next(leaf for leaf in _leaves(result) if not _inside(leaf, item))
         hint = suggest(str(wrong), item.metadata["choices"])
@@ -78,15 +79,35 @@ def format_value(value: object) -> str:
     """Format a value as TOML writes it, truncated, on one line."""
     try:
         text = json.dumps(value, ensure_ascii=False)
-    except (TypeError, ValueError):
-        text = str(value).replace("\n", " ")
-    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+    except (TypeError, ValueError, RecursionError):
+        text = _describe(value)
+    return shorten(text)
+
+
+def shorten(text: str) -> str:
+    """Truncate a text for a message, and escape what does not print."""
+    return escape(text if len(text) <= _SHOWN else f"{text[: _SHOWN - 1]}…")
+
+
+def escape(text: str) -> str:
+    """Escape what does not print, such as line breaks and terminal sequences."""
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in text)
 
 
 def suggest(word: str, known: Sequence[str]) -> str:
     """Suggest the most similar known word, as the end of a message; empty if none is similar."""
-    near = difflib.get_close_matches(word, known, n=1)
+    near = difflib.get_close_matches(word[:_SHOWN], known, n=1)
     return f"; did you mean {near[0]}?" if near else ""
+
+
+def _describe(value: object) -> str:
+    """Describe a value that JSON lacks: a date, a circle, or a number with more digits than Python prints."""
+    try:
+        return str(value)
+    except (ValueError, RecursionError):
+        return "a number of thousands of digits" if isinstance(value, int) else f"a {type(value).__name__}"
 
 
 def _convert(value: object, annotation: Any) -> Any:
@@ -96,8 +117,10 @@ def _convert(value: object, annotation: Any) -> Any:
         if not isinstance(value, int | float) or isinstance(value, bool):
             raise _MismatchError
         return _finite(value)
-    if type(value) is not annotation or (annotation is str and not _encodable(str(value))):
+    if type(value) is not annotation or (isinstance(value, str) and not _encodable(value)):
         raise _MismatchError
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise _MismatchError("a whole number of at most 64 bits, as TOML has")
     return value
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+from collections import Counter
 from collections.abc import Iterator
 
 from synpick_warp.configs.check import format_value
@@ -131,9 +132,9 @@ def _bop(config: Config) -> Iterator[Conflict]:
 
 
 def _object_rows(config: Config) -> Iterator[Conflict]:
-    ids = [row.id for row in config.object_rows]
-    for repeated in sorted({row_id for row_id in ids if ids.count(row_id) > 1}):
-        yield "object_rows", f"one row per id; {repeated} comes {ids.count(repeated)} times"
+    counts = Counter(row.id for row in config.object_rows)
+    for repeated in sorted(row_id for row_id, count in counts.items() if count > 1):
+        yield "object_rows", f"one row per id; {repeated} comes {counts[repeated]} times"
 
 
 def _cross(a: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import tomllib
+import os
 import typing
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.check import check_value, format_value, suggest
+from synpick_warp.configs.check import check_value, format_value, shorten, suggest
 from synpick_warp.configs.consistency import find_conflicts
 from synpick_warp.configs.schema import Config, ObjectRow
 from synpick_warp.errors import ConfigError
+from synpick_warp.inputs.toml import decode_toml, read_toml
 
 DEFAULT_PRESET = "synpick"
 COMMAND_LINE = "on the command line"
@@ -72,20 +73,23 @@ def parse_assignment(text: str) -> tuple[str, object]:
     """Parse "section.key=value" into key and value. The value is TOML; quotes of strings and in lists of strings may be omitted.
 
     Raises:
-        ConfigError: There is no "=", or no such setting.
+        ConfigError: There is no "=", no such setting, or more than one setting.
     """
     key, equals, written = text.partition("=")
     key = key.strip()
     if not equals:
-        raise ConfigError(f"--set {text} has no value; write --set section.key=value, as in --set physics.friction=0.4")
+        raise ConfigError(f"--set {shorten(text)} has no value; write --set section.key=value, as in --set physics.friction=0.4")
     section, _, name = key.partition(".")
     _, annotation = _setting(section, name, COMMAND_LINE)
     try:
-        value: object = tomllib.loads(f"value = {written}")["value"]
-    except tomllib.TOMLDecodeError:
+        document = decode_toml(f"value = {written}")
+    except ValueError:  # TOML's errors are ValueErrors.
         # A shell removes the quotes of ["a","b"].
         words = written.strip().removeprefix("[").removesuffix("]").split(",")
-        value = [word.strip() for word in words] if annotation == tuple[str, ...] else written
+        return key, [word.strip() for word in words] if annotation == tuple[str, ...] else written
+    if len(document) > 1:
+        raise ConfigError(f"--set {key} is followed by further lines; write one --set for each setting")
+    value = document["value"]
     return key, written if annotation is str and not isinstance(value, str) else value
 
 
@@ -127,16 +131,9 @@ def _read_preset(name: str, source: str) -> Values:
 
 
 def _parse(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_bytes().decode())
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: {str(error)[:1].lower()}{str(error)[1:]}") from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not valid TOML: byte {error.start} is not UTF-8") from None
-    except FileNotFoundError:
-        raise ConfigError(f"there is no file {path}; give a .toml file or a preset: {', '.join(preset_names())}") from None
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror}") from None
+    if not os.path.lexists(path):
+        raise ConfigError(f"there is no file {path}; give a .toml file or a preset: {', '.join(preset_names())}")
+    return read_toml(path, ConfigError)
 
 
 def _document_values(document: Mapping[str, Any], source: str) -> Values:
@@ -169,7 +166,7 @@ def _check_section(section: str, source: str) -> None:
         # A setting without its section is likelier than a misspelt section.
         keys = [f"{name}.{section}" for name, kind in known.items() if section in settings_of(kind)]
         hint = f"; did you mean {' or '.join(keys)}?" if keys else suggest(section, list(known))
-        raise ConfigError(f"there is no section {section}, set {source}; sections: {', '.join(known)}, {ROWS}{hint}")
+        raise ConfigError(f"there is no section {shorten(section)}, set {source}; sections: {', '.join(known)}, {ROWS}{hint}")
 
 
 def _setting(section: str, name: str, source: str) -> tuple[dataclasses.Field[Any], Any]:
@@ -180,7 +177,7 @@ def _setting(section: str, name: str, source: str) -> tuple[dataclasses.Field[An
         keys = [f"{other}.{name}" for other, kind in sections().items() if name in settings_of(kind)]
         if keys and not hint:
             hint = f"; did you mean {' or '.join(keys)}?"
-        raise ConfigError(f"there is no key {section}.{name}, set {source}; keys of {section}: {', '.join(known)}{hint}")
+        raise ConfigError(f"there is no key {section}.{shorten(name)}, set {source}; keys of {section}: {', '.join(known)}{hint}")
     return known[name]
 
 
@@ -194,7 +191,7 @@ def _row(key: str, content: Mapping[str, Any], source: str) -> ObjectRow:
     known = settings_of(ObjectRow)
     for name in content:
         if name not in known:
-            raise ConfigError(f"there is no key {key}.{name}, set {source}; keys: {', '.join(known)}{suggest(name, list(known))}")
+            raise ConfigError(f"there is no key {key}.{shorten(name)}, set {source}; keys: {', '.join(known)}{suggest(name, list(known))}")
     for name in _ROW_NEEDS:
         if name not in content:
             raise ConfigError(f"{key} has no {name} {source}; a row needs {' and '.join(_ROW_NEEDS)}")

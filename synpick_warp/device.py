@@ -11,9 +11,11 @@ from collections.abc import Iterator
 
 import warp as wp
 
+from synpick_warp.caches import usable_kernel_cache
+from synpick_warp.descriptors import STANDARD_ERROR
 from synpick_warp.errors import DeviceError
 
-_CUDA = re.compile(r"cuda:(\d+)")
+_CUDA = re.compile(r"cuda:([0-9]{1,9})")
 _NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 """Warp's native code prints this regardless of the log level; a machine without a GPU is not a fault."""
 
@@ -43,8 +45,17 @@ def pick_device(name: str) -> wp.Device:
 
 
 def start_warp() -> None:
-    """Initialise Warp without its banner and its messages per loaded kernel; warnings are kept."""
+    """Initialise Warp without its banner and its messages per loaded kernel; warnings are kept.
+
+    A kernel cache that cannot be written is replaced by a temporary one, with a note.
+
+    Raises:
+        CacheError: There is no room for a temporary one.
+    """
     wp.config.log_level = wp.LOG_WARNING
+    if wp.config.kernel_cache_dir is None:  # Else the caller has chosen, or Warp runs already.
+        temporary = usable_kernel_cache(wp.config.version)
+        wp.config.kernel_cache_dir = None if temporary is None else str(temporary)
     with _without_driver_warning():
         wp.init()
 
@@ -56,14 +67,19 @@ def _without_driver_warning() -> Iterator[None]:
         yield
         return
     sys.stderr.flush()
-    kept = os.dup(2)
-    with tempfile.TemporaryFile() as held:
-        os.dup2(held.fileno(), 2)
+    with contextlib.ExitStack() as stack:
+        try:
+            kept = os.dup(STANDARD_ERROR)
+            stack.callback(os.close, kept)
+            held = stack.enter_context(tempfile.TemporaryFile())
+        except OSError:  # The descriptor is closed, or no temporary folder can be written.
+            yield
+            return
+        os.dup2(held.fileno(), STANDARD_ERROR)
         try:
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(kept, STANDARD_ERROR)
             held.seek(0)
             for line in held.read().decode(errors="replace").splitlines():
                 if _NO_DRIVER not in line:

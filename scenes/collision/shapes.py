@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from synpick_warp.caches import USER_VARIABLE, user_cache
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import check_regular_file
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
@@ -26,9 +27,8 @@ _RECIPE = 1
 
 
 def default_cache_dir() -> Path:
-    """Default cache folder: in the user's cache directory (XDG base directory specification)."""
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(base) if os.path.isabs(base) else Path.home() / ".cache") / "synpick-warp" / "collision"
+    """Default cache folder: in the user's cache directory; without a home, a path that nobody can create, which is reported on writing."""
+    return (user_cache() or Path(os.devnull)) / "synpick-warp" / "collision"
 
 
 def collision_shapes(
@@ -113,6 +113,7 @@ def _save(file: Path, pieces: tuple[ConvexPiece, ...], report: Callable[[str], N
             os.unlink(temporary)
             raise
     except OSError as error:
-        report(f"collision shapes are not cached: {file.parent} cannot be written ({error.strerror})")
+        reason = f"{file.parent} cannot be written ({error.strerror})"
+        report(f"collision shapes are not cached: {reason}; set {USER_VARIABLE} to a folder that can")
         return False
     return True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +12,8 @@ import cyclopts
 from cyclopts import App, Parameter
 
 from synpick_warp import __version__
+from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard
+from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
@@ -30,8 +31,6 @@ EXIT_SIGNAL = 128
 """Added to a signal's number, the shell convention."""
 MAX_LISTED = 10
 """Maximum number of indices that a message lists."""
-_SHARD = re.compile(r"(\d{1,9})/(\d{1,9})")
-_RESOLUTION = re.compile(r"(\d{1,9})[xX](\d{1,9})")
 
 app = App(
     name=NAME,
@@ -63,7 +62,7 @@ SetOption = Annotated[
         help=f"Any other setting, as section.key=value; may be repeated. `{NAME} config` prints all, with units, ranges and values.",
     ),
 ]
-WorldsOption = Annotated[int | None, Parameter(help=_help("bake.worlds"))]
+WorldsOption = Annotated[WholeNumber | None, Parameter(help=_help("bake.worlds"))]
 ResolutionOption = Annotated[str | None, Parameter(help=_help("cameras.resolution", " As WIDTHxHEIGHT."))]
 DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
 
@@ -74,14 +73,14 @@ def bake(
     out: Annotated[Path, Parameter(help="Output folder: new, empty, or of an interrupted bake with the same settings.")],
     config: ConfigOption = None,
     worlds: WorldsOption = None,
-    episodes: Annotated[int | None, Parameter(help=_help("bake.episodes"))] = None,
+    episodes: Annotated[WholeNumber | None, Parameter(help=_help("bake.episodes"))] = None,
     mode: Annotated[str | None, Parameter(help=_help("bake.mode", " Weights of mixed: --set bake.mix=[pick, target, move]."))] = None,
-    seed: Annotated[int | None, Parameter(help=_help("bake.seed"))] = None,
+    seed: Annotated[WholeNumber | None, Parameter(help=_help("bake.seed"))] = None,
     device: DeviceOption = None,
     models: Annotated[str | None, Parameter(help=_help("bake.models"))] = None,
     lights: Annotated[str | None, Parameter(help=_help("bake.lights"))] = None,
     resolution: ResolutionOption = None,
-    writers: Annotated[int | None, Parameter(help=_help("bake.writers"))] = None,
+    writers: Annotated[WholeNumber | None, Parameter(help=_help("bake.writers"))] = None,
     formats: Annotated[str | None, Parameter(help=_help("bake.formats", " Joined by commas."))] = None,
     shard: Annotated[
         str | None, Parameter(help="i/n: only episodes with index % n == i, such as 0/4; combine the data sets with merge.")
@@ -166,7 +165,7 @@ def preview(
     /,
     *,
     out: Annotated[Path | None, Parameter(help="PNG file to write (default contact-sheet.png in the data set).")] = None,
-    views: Annotated[int, Parameter(help="Number of views, spread over the data set.")] = 8,
+    views: Annotated[WholeNumber, Parameter(help="Number of views, spread over the data set.")] = 8,
 ) -> int:
     """Draw a contact sheet: colour, depth, instance masks, bounding boxes and layers of sampled views."""
     if views < 1:
@@ -184,8 +183,8 @@ def explain(
     folder: Annotated[Path, Parameter(name="DIR", help="A data set with pick attempts.")],
     /,
     *,
-    episode: Annotated[int, Parameter(help="Index of the episode.")],
-    attempt: Annotated[int | None, Parameter(help="Index of the attempt in the episode (default: all).")] = None,
+    episode: Annotated[WholeNumber, Parameter(help="Index of the episode.")],
+    attempt: Annotated[WholeNumber | None, Parameter(help="Index of the attempt in the episode (default: all).")] = None,
     out: Annotated[
         Path | None,
         Parameter(help="PNG or JPEG file to write (default explain-EPISODE.png or explain-EPISODE-ATTEMPT.png in the data set)."),
@@ -232,45 +231,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: Command line without the program's name; None: `sys.argv`.
     """
+    with SafeStreams() as streams:
+        code = _run(sys.argv[1:] if arguments is None else list(arguments))
+        streams.flush()
+        if streams.fault is None:
+            return code
+        if isinstance(streams.fault, BrokenPipeError):
+            return EXIT_PIPE
+        print(f"{NAME}: error: {describe_fault(streams.fault)}", file=sys.stderr)
+        return EXIT_MISTAKE
+
+
+def _run(arguments: list[str]) -> int:
+    """Run the command line; mistakes are one line on the standard error, except those of the standard output."""
     try:
-        result = app(sys.argv[1:] if arguments is None else list(arguments), exit_on_error=False, print_error=False)
-        sys.stdout.flush()
-        return result or 0
+        return app(arguments, exit_on_error=False, print_error=False) or 0
+    except StreamError:
+        return EXIT_MISTAKE
     except (SynpickError, cyclopts.CycloptsError) as error:
-        print(f"{NAME}: error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"{NAME}: error: {one_line(str(error))}", file=sys.stderr)
         return EXIT_MISTAKE
     except KeyboardInterrupt:
         print(f"{NAME}: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_PIPE
-
-
-def parse_resolution(text: str) -> list[int]:
-    """Parse "640x360" into width and height [px].
-
-    Raises:
-        ConfigError: The text has another form.
-    """
-    match = _RESOLUTION.fullmatch(text)
-    if match is None:
-        raise ConfigError(f'--resolution is "{text}"; allowed: WIDTHxHEIGHT in pixels, such as 640x360')
-    return [int(match[1]), int(match[2])]
-
-
-def parse_shard(text: str, episodes: int) -> tuple[int, int]:
-    """Parse "0/4" into shard index and number of shards.
-
-    Raises:
-        ConfigError: The text has another form, or the shard would have no episode.
-    """
-    match = _SHARD.fullmatch(text)
-    if match is None or not int(match[1]) < int(match[2]):
-        raise ConfigError(f'--shard is "{text}"; allowed: i/n with i from 0 to n - 1, such as 0/4')
-    if int(match[1]) >= episodes:
-        raise ConfigError(f"--shard {text} has none of {episodes} episodes; use fewer shards")
-    return int(match[1]), int(match[2])
 
 
 def _resolve(config: str | None, given: dict[str, object], resolution: str | None, assignments: list[str] | None) -> Config:

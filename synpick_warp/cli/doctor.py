@@ -1,4 +1,4 @@
-"""Machine report: versions, CPU, device and kernel cache, and the memory of a bake's device arrays."""
+"""Machine report: versions, CPU, device and caches, and the memory of a bake's device arrays."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp import __version__
+from synpick_warp.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
 from synpick_warp.configs.schema import Config
 from synpick_warp.device import pick_device
+from synpick_warp.scenes.collision.shapes import default_cache_dir
 
 _PACKAGES = ("warp-lang", "newton", "numpy")
 MIB = 1024**2
@@ -29,7 +31,7 @@ def examine(config: Config, console: Console) -> None:
     """
     device = pick_device(config.bake.device)
     table = Table(show_header=False, box=None)
-    for name, value in [*describe_machine(device), *_cache()]:
+    for name, value in [*describe_machine(device), *_caches()]:
         table.add_row(name, value)
     console.print(table)
     console.print(memory_report(config))
@@ -81,11 +83,20 @@ def _device(device: wp.Device) -> list[tuple[str, str]]:
     return rows
 
 
-def _cache() -> list[tuple[str, str]]:
-    folder = Path(wp.config.kernel_cache_dir or "")
+def _caches() -> list[tuple[str, str]]:
+    kernels, shapes = Path(wp.config.kernel_cache_dir or ""), default_cache_dir()
+    return [
+        ("kernel cache", f"{kernels}: {_describe_folder(kernels, 'modules')}; {KERNEL_VARIABLE} moves it"),
+        ("shape cache", f"{shapes}: {_describe_folder(shapes, 'shapes')}; {USER_VARIABLE} moves it"),
+    ]
+
+
+def _describe_folder(folder: Path, noun: str) -> str:
+    """Number of entries and size of a cache, and why it cannot be written, if so."""
+    fault = find_fault(folder)
     sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
-    modules = sum(1 for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else 0
-    return [("kernel cache", f"{folder}: {modules} modules, {math.fsum(sizes) / MIB:.0f} MiB")]
+    entries = len(list(folder.iterdir())) if folder.is_dir() else 0
+    return f"{entries} {noun}, {math.fsum(sizes) / MIB:.0f} MiB" + (f"; it cannot be written ({fault})" if fault else "")
 
 
 def _dotted(version: tuple[int, int] | None) -> str:

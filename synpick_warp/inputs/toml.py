@@ -32,6 +32,10 @@ def decode_toml(text: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except RecursionError:
         raise ValueError("its values are nested too deeply") from None
+    except tomllib.TOMLDecodeError:
+        raise
+    except ValueError:  # Python's limit on decimal digits; its message advises programmers.
+        raise ValueError("a number has more digits than any setting") from None
 
 
 def read_toml(path: Path, error: type[SynpickError]) -> dict[str, Any]:

@@ -87,7 +87,7 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
     [
         (["--worlds", "0"], "bake.worlds is 0 on the command line; allowed: at least 1, at most 65536"),
         (["--episodes", "0"], "bake.episodes is 0 on the command line; allowed: at least 1"),
-        (["--worlds", "many"], 'Invalid value for --worlds: unable to convert "many" into int.'),
+        (["--worlds", "many"], '--worlds is "many"; allowed: a whole number in decimal digits, such as 8'),
         (["--resolution", "0x0"], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
         (["--resolution", "640"], '--resolution is "640"; allowed: WIDTHxHEIGHT in pixels, such as 640x360'),
         (["--resolution", "640x-1"], '--resolution is "640x-1"; allowed: WIDTHxHEIGHT in pixels, such as 640x360'),

@@ -213,7 +213,7 @@ def test_a_wrong_file_is_reported_with_its_name(tmp_path, text, expected):
 def test_files_that_cannot_be_read(tmp_path):
     assert message(str(tmp_path / "none.toml"), {}).startswith(f"there is no file {tmp_path / 'none.toml'}; ")
     (tmp_path / "folder.toml").mkdir()
-    assert message(str(tmp_path / "folder.toml"), {}) == f"{tmp_path / 'folder.toml'} cannot be read: Is a directory"
+    assert message(str(tmp_path / "folder.toml"), {}) == f"{tmp_path / 'folder.toml'} is not a regular file"
     (tmp_path / "latin.toml").write_bytes(b"# \xe9\n")
     assert message(str(tmp_path / "latin.toml"), {}).endswith("is not valid TOML: byte 2 is not UTF-8")
     assert message("smok", {}).endswith("a file's name ends in .toml; did you mean smoke?")

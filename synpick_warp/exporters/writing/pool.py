@@ -21,6 +21,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from synpick_warp.descriptors import duplicate_above_streams, open_standard_descriptors
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.worker import Failure, SharedImage, TaskMessage, run_task
@@ -99,6 +100,7 @@ class WriterPool:
         Raises:
             OutputError: Memory or processes cannot be allocated.
         """
+        open_standard_descriptors()
         self._slot_bytes = -(-max(slot_bytes, 1) // mmap.PAGESIZE) * mmap.PAGESIZE
         slots = max(1, processes * QUEUE_DEPTH)
         self._free = list(range(slots))
@@ -342,14 +344,21 @@ def _allocate_shared_memory(size: int) -> tuple[int, mmap.mmap]:
 
 
 def _start_worker(memory: int, inherited: tuple[int, ...]) -> _Worker:
+    """Start a process. Its standard output is the null device: nothing is printed there but by mistake, and it may be full or closed."""
     ours, theirs = socket.socketpair()
-    with ours, theirs:
+    with ours, theirs, contextlib.ExitStack() as copies:
+        # A lock that was taken while a standard stream was closed has that stream's number.
+        passed = tuple(map(duplicate_above_streams, inherited))
+        for handle in passed:
+            copies.callback(os.close, handle)
         paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
         process = subprocess.Popen(
             (sys.executable, "-P", "-c", _WORKER, str(theirs.fileno()), str(memory)),
             stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=None if sys.__stderr__ is not None else subprocess.DEVNULL,
             env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": paths},
-            pass_fds=(theirs.fileno(), memory, *inherited),
+            pass_fds=(theirs.fileno(), memory, *passed),
             process_group=0,  # Ctrl-C in a terminal reaches the bake alone, even before the process ignores it.
         )
         return _Worker(process, Connection(ours.detach()))

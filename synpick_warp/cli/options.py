@@ -1,0 +1,69 @@
+"""Option parsers: whole numbers, resolutions, shards; and the one line in which a mistake is reported."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+from cyclopts import Parameter, Token
+
+from synpick_warp.configs.check import escape, format_value
+from synpick_warp.errors import ConfigError
+
+MAX_DIGITS = 100
+"""Most digits of a whole number; which of them are allowed is checked by the setting, with its range in the message."""
+MAX_LINE = 2000
+"""Longest message [characters]: names of files and keys may be of any length."""
+_WHOLE = re.compile(rf"[+-]?[0-9]{{1,{MAX_DIGITS}}}")
+_SHARD = re.compile(r"([0-9]{1,9})/([0-9]{1,9})")
+_RESOLUTION = re.compile(r"([0-9]{1,9})[xX]([0-9]{1,9})")
+
+
+def parse_whole_number(_: Any, tokens: Sequence[Token]) -> int:
+    """Parse the value of an integer option: decimal digits only, since what is rounded or read in another base is a guess.
+
+    Raises:
+        ConfigError: The text has another form.
+    """
+    text = tokens[0].value
+    if _WHOLE.fullmatch(text) is None:
+        option = tokens[0].keyword or "the number"
+        raise ConfigError(f"{option} is {format_value(text)}; allowed: a whole number in decimal digits, such as 8")
+    return int(text)
+
+
+WholeNumber = Annotated[int, Parameter(converter=parse_whole_number)]
+"""Type of all integer options."""
+
+
+def one_line(text: str) -> str:
+    """Join the lines of a message, escape what does not print, such as terminal sequences in file names, and truncate."""
+    line = escape(" ".join(text.split()))
+    return line if len(line) <= MAX_LINE else f"{line[: MAX_LINE - 1]}…"
+
+
+def parse_resolution(text: str) -> list[int]:
+    """Parse "640x360" into width and height [px].
+
+    Raises:
+        ConfigError: The text has another form.
+    """
+    match = _RESOLUTION.fullmatch(text)
+    if match is None:
+        raise ConfigError(f"--resolution is {format_value(text)}; allowed: WIDTHxHEIGHT in pixels, such as 640x360")
+    return [int(match[1]), int(match[2])]
+
+
+def parse_shard(text: str, episodes: int) -> tuple[int, int]:
+    """Parse "0/4" into shard index and number of shards.
+
+    Raises:
+        ConfigError: The text has another form, or the shard would have no episode.
+    """
+    match = _SHARD.fullmatch(text)
+    if match is None or not int(match[1]) < int(match[2]):
+        raise ConfigError(f"--shard is {format_value(text)}; allowed: i/n with i from 0 to n - 1, such as 0/4")
+    if int(match[1]) >= episodes:
+        raise ConfigError(f"--shard {text} has none of {episodes} episodes; use fewer shards")
+    return int(match[1]), int(match[2])

@@ -1,0 +1,174 @@
+"""Standard streams: closed, full, without a reader, in an ASCII locale, on terminals of any width."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from synpick_warp.cli.commands import main
+from synpick_warp.cli.streams import MAX_COLUMNS, MIN_COLUMNS, SafeStreams, clamp_columns
+from tests.harness.fuzz import fuzz_examples
+
+HANG = 20.0
+"""Longest time that a process may take [s]; it takes half a second."""
+FULL = (
+    "synpick-warp: error: the standard output cannot be written: No space left on device; "
+    "send it elsewhere, for instance to a file on another disk\n"
+)
+
+
+def run(arguments: str, redirections: str = "", **variables: str) -> subprocess.CompletedProcess[bytes]:
+    """Run the program in a shell with redirections of its streams."""
+    return subprocess.run(
+        ["sh", "-c", f'exec "{sys.executable}" -m synpick_warp {arguments} {redirections}'],
+        capture_output=True,
+        env={**os.environ, **variables},
+        timeout=HANG,
+        check=False,
+    )
+
+
+def test_a_closed_output_is_no_fault():
+    """Fault 10."""
+    result = run("config", ">&-")
+    assert (result.returncode, result.stderr) == (0, b"")
+    result = run("config --config none", "<&- >&- 2>&-")
+    assert (result.returncode, result.stdout, result.stderr) == (2, b"", b"")
+
+
+@pytest.mark.parametrize("arguments", ["config", "bake --help", "--version"])
+def test_a_full_device_is_one_line(arguments):
+    """Fault 10."""
+    result = run(arguments, ">/dev/full")
+    assert (result.returncode, result.stderr.decode()) == (2, FULL)
+
+
+def test_two_full_devices_leave_the_exit_code():
+    """Fault 10."""
+    assert run("config", ">/dev/full 2>/dev/full").returncode == 2
+    assert run("config --config none", "2>/dev/full").returncode == 2
+
+
+@pytest.mark.parametrize("arguments", ["config", "bake --help"])
+def test_a_reader_that_leaves_ends_the_program_as_sigpipe_does(arguments):
+    """Fault 10. Rich, which prints the help, ends a program with exit code 1."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    result = subprocess.run(
+        [sys.executable, "-m", "synpick_warp", *arguments.split()], stdout=writer, stderr=subprocess.PIPE, timeout=HANG, check=False
+    )
+    os.close(writer)
+    assert (result.returncode, result.stderr) == (141, b"")
+
+
+def test_characters_that_a_locale_lacks_are_escaped():
+    """Fault 10."""
+    result = run("config", PYTHONIOENCODING="ascii")
+    assert (result.returncode, result.stderr) == (0, b"")
+    assert b"\\xb2" in result.stdout
+    result = run("bake --help", PYTHONIOENCODING="ascii", LC_ALL="C")
+    assert (result.returncode, result.stderr) == (0, b"")
+    assert result.stdout.isascii()
+
+
+def test_rich_prints_into_an_ascii_stream(tmp_path, monkeypatch):
+    """Fault 10: progress lines and tables of a bake, in this process."""
+    with (tmp_path / "out").open("w", encoding="ascii") as file:
+        kept = os.dup(1)
+        os.dup2(file.fileno(), 1)
+        monkeypatch.setattr(sys, "stdout", file)
+        monkeypatch.setattr(sys, "__stdout__", file)
+        try:
+            with SafeStreams() as streams:
+                Console(width=80).print("worlds 2 · 3 m³ \ud800")
+                streams.flush()
+                assert streams.fault is None
+        finally:
+            os.dup2(kept, 1)
+            os.close(kept)
+    assert (tmp_path / "out").read_text() == "worlds 2 \\xb7 3 m\\xb3 \\ud800\n"
+
+
+def test_a_bake_on_a_full_device_stops_in_its_first_progress_line(tmp_path):
+    """Fault 10: nothing is left behind."""
+    out = tmp_path / "deep" / "set"
+    result = run(f"bake --config smoke --device cpu --resolution 160x90 --worlds 1 --episodes 1 --mode move --out {out}", ">/dev/full")
+    assert (result.returncode, result.stderr.decode()) == (2, FULL)
+    assert not out.parent.exists()
+
+
+@pytest.mark.parametrize("columns", ["1", "0", "-5", "x", "1000000000", "9" * 5000, "²", ""])
+def test_help_takes_no_time_at_any_width(monkeypatch, capsys, columns):
+    """Fault 18: at width 1 it took 90 s."""
+    monkeypatch.setenv("COLUMNS", columns)
+    monkeypatch.setenv("LINES", columns)
+    started = time.monotonic()
+    assert main(["bake", "--help"]) == 0
+    assert time.monotonic() - started < HANG
+    lines = capsys.readouterr().out.splitlines()
+    assert MIN_COLUMNS <= max(map(len, lines)) <= MAX_COLUMNS
+    assert os.environ["COLUMNS"] == columns
+
+
+def test_a_narrow_terminal_counts_as_wider(monkeypatch):
+    """Fault 18, without the variable."""
+    monkeypatch.delenv("COLUMNS", raising=False)
+    monkeypatch.setattr(os, "get_terminal_size", lambda handle: os.terminal_size((1, 1)))
+    with SafeStreams():
+        assert os.environ["COLUMNS"] == str(MIN_COLUMNS)
+    assert "COLUMNS" not in os.environ
+
+
+@settings(max_examples=fuzz_examples(100))
+@given(columns=st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"), max_size=8) | st.integers().map(str))
+def test_any_columns_give_a_sane_width_or_none(columns):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", columns)
+        clamp_columns()
+        assert MIN_COLUMNS <= Console().width <= MAX_COLUMNS
+
+
+def test_replaced_streams_are_left_alone(capsys):
+    before = sys.stdout, sys.stderr
+    with SafeStreams():
+        assert (sys.stdout, sys.stderr) == before
+        print("kept")
+    assert capsys.readouterr().out == "kept\n"
+
+
+POOL = """
+import os, sys
+from pathlib import Path
+folder = Path(sys.argv[1])
+lock = os.open(folder, os.O_RDONLY)
+assert lock == 1, lock
+from synpick_warp.exporters.writing.pool import WriterPool
+with WriterPool(1, 64, lock) as pool:
+    pool.submit(os.mkdir, (), (str(folder / "new"),), path=folder)
+"""
+
+
+def test_writers_start_when_a_lock_has_the_number_of_the_closed_output(tmp_path):
+    """Fault 5: as for programs that call `bake`; two "Fatal Python error: init_sys_streams" before."""
+    result = subprocess.run(
+        ["sh", "-c", f'exec "{sys.executable}" -c \'{POOL}\' "{tmp_path}" >&-'], stderr=subprocess.PIPE, timeout=HANG, check=False
+    )
+    assert (result.returncode, result.stderr) == (0, b"")
+    assert (tmp_path / "new").is_dir()
+
+
+def test_closed_descriptors_are_taken_before_any_file(tmp_path):
+    """Fault 5: the program itself."""
+    code = (
+        "import os, sys; from synpick_warp.cli.streams import SafeStreams\n"
+        f"with SafeStreams(): sys.exit(os.open({str(tmp_path)!r}, os.O_RDONLY) < 3)"
+    )
+    result = subprocess.run(["sh", "-c", f'exec "{sys.executable}" -c "{code}" <&- >&- 2>&-'], timeout=HANG, check=False)
+    assert result.returncode == 0
