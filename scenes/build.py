@@ -7,6 +7,7 @@ largest variant, and every shape costs time in the broad phase.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import newton
@@ -181,7 +182,10 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
     scene = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(scene)
     scene.replicate(world, copy_count=config.bake.worlds)
-    model = scene.finalize(device=device)
+    with warnings.catch_warnings():
+        # Newton raises the inertia of bodies of a few millimetres to its threshold, and says so for every slot.
+        warnings.filterwarnings("ignore", "Eigenvalues below threshold")
+        model = scene.finalize(device=device)
     layout = Layout(config.bake.worlds, config.arrangement.max_objects, single, compound, world.shape_count, guides, *gripper)
     return BuiltModel(model, layout, variant, empty)
 
