@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 
 from synpick_warp.configs.check import format_value
+from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import FORMATS, MIXED, Config
 
 DEPTH_COUNTS = 65535
@@ -71,7 +72,13 @@ def _cameras(config: Config) -> Iterator[Conflict]:
 
 
 def _times(config: Config) -> Iterator[Conflict]:
-    settle = config.settle
+    settle, step = config.settle, config.physics.step
+    tick = config.physics.steps_per_tick * step
+    counted = [(f"settle.{name}", tick) for name in ("min_time", "max_time", "relax_time", "stuck_time")]
+    for key, unit in [*counted, ("pick.press_time", step)]:
+        section, _, name = key.partition(".")
+        if getattr(getattr(config, section), name) > INT32_MAX * unit:
+            yield key, f"at most {INT32_MAX * unit:g}, {INT32_MAX:,} {'steps' if unit == step else 'ticks'} of physics.step [s]"
     rest = settle.rest_ticks * config.physics.steps_per_tick * config.physics.step
     if settle.max_time < settle.min_time:
         yield "settle.max_time", f"at least settle.min_time, {settle.min_time:g} [s]"

@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import field
 from typing import Any
 
+INT32_MAX = 2**31 - 1
+"""Largest whole number of kernels and largest index of their arrays: the upper limit of settings that become one of them."""
+
 
 def setting(
     default: Any,

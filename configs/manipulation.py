@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from synpick_warp.configs.fields import setting
+from synpick_warp.configs.fields import INT32_MAX, setting
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,9 @@ class Move:
     )
     height: float = setting(0.02, "m", "Height of the TCP above the floor at a corner (released).", low=0.0)
     start_height: float = setting(0.35, "m", "Height of the TCP above the first corner in the first frame.", above=0.0)
-    rounds: int = setting(2, "", "Rounds over all four corners (released: eight corners, drawn with replacement).", low=1)
+    rounds: int = setting(
+        2, "", "Rounds over all four corners (released: eight corners, drawn with replacement).", low=1, high=INT32_MAX // 4
+    )
     repeats: bool = setting(True, "", "Whether an episode may contain several instances of an object (paper: yes).")
 
 
@@ -47,7 +49,7 @@ class Pick:
     )
     lift_height: float = setting(1.0, "m", "Height by which the setpoint is lifted (released).", above=0.0)
     lift_speed: float = setting(0.5, "m/s", "Speed of the setpoint while lifting (released).", above=0.0)
-    failures: int = setting(3, "", "Failed attempts that end the episode (paper: 3; released: 4).", low=1)
+    failures: int = setting(3, "", "Failed attempts that end the episode (paper: 3; released: 4).", low=1, high=INT32_MAX)
     floor: float = setting(-0.1, "m", "Objects below this height are removed from the scene (released).", high=0.0)
     repeats: bool = setting(False, "", "Whether an episode may contain several instances of an object (paper: no).")
 
@@ -75,8 +77,10 @@ class Perception:
         low=16,
         high=8192,
     )
-    views: int = setting(0, "", "Images processed in one batch; 0: chosen by device and resolution.", low=0)
-    contour_points: int = setting(8192, "", "Capacity for the points of one contour; a longer contour ends the episode.", low=16)
+    views: int = setting(0, "", "Images processed in one batch; 0: chosen by device and resolution.", low=0, high=INT32_MAX)
+    contour_points: int = setting(
+        8192, "", "Capacity for the points of one contour; a longer contour ends the episode.", low=16, high=INT32_MAX
+    )
     center_fraction: float = setting(
         0.8,
         "",
@@ -124,7 +128,7 @@ class Suction:
         "Geometry that the rays intersect: hull (collision shapes, on which the cup rests) or mesh (visual mesh: a pitcher is open).",
         choices=("hull", "mesh"),
     )
-    tolerated_misses: int = setting(0, "", "Maximum rays that may miss for a good seal (paper: 0; released: 2).", low=0)
+    tolerated_misses: int = setting(0, "", "Maximum rays that may miss for a good seal (paper: 0; released: 2).", low=0, high=INT32_MAX)
     good_force: float = setting(40.0, "N", "Break force of a good seal (paper).", above=0.0)
     poor_force: float = setting(2.0, "N", "Break force of any other seal (paper: 2; released: 0.2).", above=0.0)
     stiffness: float = setting(2e4, "N/m", "Linear stiffness of a seal; 40 N stretch it by 2 mm, within the paper's 5 mm.", above=0.0)

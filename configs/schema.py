@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from synpick_warp.codes import Tone, names
-from synpick_warp.configs.fields import setting
+from synpick_warp.configs.fields import INT32_MAX, setting
 from synpick_warp.configs.manipulation import Move, Perception, Pick, Suction, Target
 from synpick_warp.configs.sensors import DepthSensor, Effects
 from synpick_warp.layers import LAYER_TABLE
@@ -42,7 +42,7 @@ class Bake:
         (1.0, 1.0, 1.0), "", "Weights with which mode mixed draws pick, target and move for an episode.", low=0.0, high=1000
     )
     worlds: int = setting(4, "", "Totes simulated in parallel; a GPU simulates at least 8.", low=1, high=65536)
-    episodes: int = setting(4, "", "Episodes (sequences) to generate; each becomes one BOP scene per camera.", low=1)
+    episodes: int = setting(4, "", "Episodes (sequences) to generate; each becomes one BOP scene per camera.", low=1, high=INT32_MAX)
     seed: int = setting(0, "", "Random seed, from which every random number of the bake follows.", low=0, high=2**63 - 1)
     device: str = setting("auto", "", "Device: cpu, cuda:N, or auto (the first GPU if there is one).")
     models: str = setting("", "", "Folder of BOP models, or of OBJ, GLB and PLY meshes; empty: the embedded procedural objects.")
@@ -83,7 +83,7 @@ class Objects:
 class ObjectRow:
     """A row of the object table: physical and material properties that model files do not contain."""
 
-    id: int = setting(0, "", "The model's obj_id in its BOP folder.", low=0)
+    id: int = setting(0, "", "The model's obj_id in its BOP folder.", low=0, high=INT32_MAX)
     name: str = setting(
         "", "", "Name of the object; for meshes that are not BOP models the file name without suffix, by which the row is found."
     )
@@ -177,11 +177,11 @@ class Settle:
         4.0, "s", "Time after which relaxed_displacement replaces rest_displacement, since some piles keep jittering slightly.", low=0.0
     )
     relaxed_displacement: float = setting(2e-3, "m", "Relaxed rest threshold after relax_time: displacement in a tick.", above=0.0)
-    rest_ticks: int = setting(8, "", "Consecutive ticks for which all objects must be at rest.", low=1)
+    rest_ticks: int = setting(8, "", "Consecutive ticks for which all objects must be at rest.", low=1, high=INT32_MAX)
     stuck_depth: float = setting(0.01, "m", "An object that penetrates another by more is stuck (released).", above=0.0)
     stuck_time: float = setting(0.4, "s", "An object stuck for this long is dropped again (released).", above=0.0)
-    max_redrops: int = setting(8, "", "Maximum objects dropped again in an arrangement; one with more is resampled.", low=0)
-    tries: int = setting(20, "", "Arrangements tried before an episode is given up.", low=1)
+    max_redrops: int = setting(8, "", "Maximum objects dropped again in an arrangement; one with more is resampled.", low=0, high=INT32_MAX)
+    tries: int = setting(20, "", "Arrangements tried before an episode is given up.", low=1, high=INT32_MAX)
 
 
 @dataclass(frozen=True)
@@ -211,10 +211,10 @@ class Physics:
         "Speed limit of the objects: 4 mm per solver substep are no more than the contact margin of two shapes, so nothing tunnels.",
         above=0.0,
     )
-    contacts_per_world: int = setting(512, "", "Contact capacity per world; about 140 contacts are usual.", low=16)
-    pairs_per_world: int = setting(1024, "", "Broad-phase pair capacity per world.", low=16)
-    rows_per_world: int = setting(1536, "", "Capacity for the objects' contact constraint rows per world.", low=48)
-    gripper_rows_per_world: int = setting(256, "", "Capacity for the gripper's constraint rows per world.", low=48)
+    contacts_per_world: int = setting(512, "", "Contact capacity per world; about 140 contacts are usual.", low=16, high=INT32_MAX)
+    pairs_per_world: int = setting(1024, "", "Broad-phase pair capacity per world.", low=16, high=INT32_MAX)
+    rows_per_world: int = setting(1536, "", "Capacity for the objects' contact constraint rows per world.", low=48, high=INT32_MAX)
+    gripper_rows_per_world: int = setting(256, "", "Capacity for the gripper's constraint rows per world.", low=48, high=INT32_MAX)
     deterministic: bool = setting(True, "", "On a GPU, sort contact rows, so that a bake can be reproduced bit for bit.")
     guide_height: float = setting(8.0, "m", "Height of the temporary walls on the rim that guide the drop.", above=0.0)
 
@@ -266,7 +266,9 @@ class Render:
     layers: tuple[str, ...] = setting(
         (), "", "Additional ground-truth layers (AOVs) of each view: any of the allowed names.", choices=LAYERS
     )
-    views_per_batch: int = setting(0, "", "Views rendered and copied to the host in one batch; 0: chosen by device and resolution.", low=0)
+    views_per_batch: int = setting(
+        0, "", "Views rendered and copied to the host in one batch; 0: chosen by device and resolution.", low=0, high=INT32_MAX
+    )
 
 
 @dataclass(frozen=True)

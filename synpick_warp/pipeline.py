@@ -13,13 +13,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 
-from synpick_warp.arrays import memory_table
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.codes import Phase
-from synpick_warp.configs.modes import may_pick
-from synpick_warp.configs.schema import FAST, Config
+from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
@@ -31,30 +28,19 @@ from synpick_warp.exporters.registry import Exporters, load_exporter_classes, sl
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.interrupt import StopRequest
+from synpick_warp.memory_plan import check_episodes, check_memory, is_shortage, shortage_error
 from synpick_warp.progress import Progress
-from synpick_warp.scenes import build
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
-from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.perception.arrays import Observation, Plan
-from synpick_warp.stages.perception.images import SCRATCH, count_views, perception_sizes
-from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
-from synpick_warp.stages.render.denoised import DENOISED_SCRATCH, scratch_sizes
-from synpick_warp.stages.render.layers import BODY_MOTIONS, MOTION_LAYERS
-from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
-from synpick_warp.stages.render.postprocess import LensArrays, has_lens_filter
-from synpick_warp.stages.render.raster import VISIBILITY_BUFFER, visibility_sizes
-from synpick_warp.stages.render.renderer import SHADED_IMAGE, Renderer
+from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import RECORDS, Simulation
-from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
-from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
-from synpick_warp.stages.stream import RING, FrameStream, TickReader, TickReport, name_lights, tick_batch, view_sizes
+from synpick_warp.stages.stream import FrameStream, TickReader, TickReport, name_lights, tick_batch, view_sizes
 from synpick_warp.stages.timing import scope
 
 
@@ -80,10 +66,11 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
         records_physics: Whether ticks are recorded with their physics.
 
     Raises:
-        SynpickError: Device, models, lights, tote or cameras cannot be used.
+        SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
     """
     device = pick_device(config.bake.device)
     config = with_enough_worlds(config, device)
+    check_memory(config, device, count_writers(config))
     progress.stage("loading objects and lights")
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
@@ -99,6 +86,11 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
     tick_time = config.physics.step * config.physics.steps_per_tick
     stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device)
     return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.perception.resolution, object_ids))
+
+
+def count_writers(config: Config) -> int:
+    """Writer processes of a bake: `bake.writers`, or one per usable CPU core."""
+    return config.bake.writers or len(os.sched_getaffinity(0))
 
 
 def make_renderer(config: Config, scene: RenderScene, instances: int, views: int) -> Renderer:
@@ -128,7 +120,9 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
         SynpickError: An error that the user can correct; committed episodes stay, and the same bake resumes.
     """
     kinds = load_exporter_classes(config.bake.formats)
-    with OutputFolder(out, config, range(shard[0], config.bake.episodes, shard[1])) as output:
+    episodes = range(shard[0], config.bake.episodes, shard[1])
+    check_episodes(len(episodes), config)
+    with OutputFolder(out, config, episodes) as output:
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
             summary.take_record(read_entry(out, episode_entry(episode)) or {})
@@ -143,6 +137,10 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
             if out.exists():
                 raise
             raise OutputError(f"{out} was removed while the bake wrote to it") from error
+        except (MemoryError, RuntimeError) as error:
+            if not is_shortage(error):
+                raise
+            raise shortage_error(config, pick_device(config.bake.device)) from error
         finally:
             output.clean_up()
     return summary
@@ -153,8 +151,7 @@ def _fill(config: Config, output: OutputFolder, kinds: tuple[type[Exporter], ...
     needs_physics = any(kind.needs_physics for kind in kinds)
     with scope("build"):
         factory = build_factory(config, progress, output.remaining, needs_physics) if output.remaining else None
-    writers = config.bake.writers or len(os.sched_getaffinity(0))
-    with WriterPool(writers, slot_bytes(kinds, config), output.lock) as pool:
+    with WriterPool(count_writers(config), slot_bytes(kinds, config), output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
             exporters = Exporters(kinds, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
@@ -285,40 +282,3 @@ class _Meter:
             views_per_s=summary.views / elapsed if elapsed > 0.0 else 0.0,
             seconds_left=left,
         )
-
-
-def describe_arrays(config: Config) -> list[tuple[str, tuple[int, ...], str, int]]:
-    """Memory table: rows (name, shape, unit, bytes) of every device array that a bake declares, one per copy.
-
-    Newton's own arrays are not included. Body slots are counted at their maximum: the object capacity for each slot type.
-    """
-    device: wp.Device = pick_device(config.bake.device)
-    config = with_enough_worlds(config, device)
-    room = config.arrangement.max_objects
-    worlds = world_sizes(config, build.GRIPPER_BODIES + 2 * room)
-    views = view_sizes(config, device)
-    views |= body_sizes(room, *config.cameras.resolution)
-    ring = RING if device.is_cuda else 1
-    groups = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState, LastFrame)]
-    groups += [(kind, worlds, 1 + RECORDS) for kind in (Observation, Plan)]
-    groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS), (ViewBuffers, views, ring)]
-    groups += [(BoundaryBuffers, boundary_sizes(views), ring), (BoundaryScratch, boundary_sizes(views), 1)]
-    groups += [(kind, views, 1) for kind in (VIEW_BODIES, GBUFFER, SHADED_IMAGE)]
-    pixels = visibility_sizes(views["view"], *config.cameras.resolution)
-    groups += [(VISIBILITY_BUFFER, pixels, 1), (GBUFFER, pixels | {"view": len(config.cameras.positions)}, 1)]
-    if any(kind.needs_physics for kind in load_exporter_classes(config.bake.formats)):
-        groups += [(kind, record_sizes(worlds, config.physics.steps_per_tick), 1 + RECORDS) for kind in record_kinds(config.trajectory)]
-    if MOTION_LAYERS.intersection(config.render.layers):
-        groups += [(BODY_MOTIONS, views, 1)]
-    if has_lens_filter(config.effects):
-        groups += [(LensArrays, views, 1)]
-    if may_pick(config):
-        count = count_views(config.perception, worlds["world"], room, device)
-        sizes = perception_sizes(config.perception, room, count)
-        groups += [(kind, sizes, 1) for kind in SCRATCH] + [(GBUFFER, sizes | {"view": 1}, 1)]
-        groups += [(kind, plan_sizes(config.perception, room, count), 1) for kind in (VoteArrays, CYCLES)]
-    rows = [row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)]
-    if config.render.mode == FAST:
-        sizes = views | scratch_sizes(config.render, *config.cameras.resolution)
-        rows += [row for kind, copies in DENOISED_SCRATCH for row in memory_table(kind, sizes) for _ in range(copies)]
-    return rows + ring * memory_table(LayerBuffers, views, config.render.layers)

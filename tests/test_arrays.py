@@ -9,7 +9,7 @@ import warp as wp
 
 from synpick_warp.arrays import StructArrays, allocate, allocate_struct, device_array, memory_table, struct_arrays
 from synpick_warp.device import pick_device
-from synpick_warp.pipeline import describe_arrays
+from synpick_warp.memory_plan import describe_arrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan, SegmentationScratch
 from synpick_warp.stages.perception.images import count_views

@@ -43,18 +43,18 @@ def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
 
 
 def memory_report(config: Config) -> Table:
-    """Table of shape, unit and size of every declared device array of a bake with these settings, and their sum."""
-    from synpick_warp.pipeline import describe_arrays
+    """Table of shape, unit and size of every array in the memory plan of a bake with these settings, and their sum."""
+    from synpick_warp.memory_plan import describe_memory
     from synpick_warp.stages.sim.physics import with_enough_worlds
 
     config = with_enough_worlds(config, pick_device(config.bake.device))
-    rows = describe_arrays(config)
+    rows = describe_memory(config)
     width, height = config.cameras.resolution
     table = Table("array", "shape", "unit", "MiB", title=f"{config.bake.worlds} worlds, {width}x{height}", show_footer=True)
     table.columns[3].justify = "right"
     for name, shape, unit, size in sorted(rows, key=lambda row: -row[3]):
         table.add_row(name, " x ".join(map(str, shape)), unit, f"{size / MIB:.2f}")
-    table.columns[0].footer = "all declared arrays"
+    table.columns[0].footer = "the whole plan"
     table.columns[3].footer = f"{sum(row[3] for row in rows) / MIB:.2f}"
     return table
 

@@ -46,8 +46,10 @@ def bakes(monkeypatch):
     module.result = finished(4)
     module.calls = calls
     module.run_bake = run_bake
-    module.describe_arrays = lambda config: [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
     monkeypatch.setitem(sys.modules, "synpick_warp.pipeline", module)
+    plan = types.ModuleType("synpick_warp.memory_plan")
+    plan.describe_memory = lambda config: [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
+    monkeypatch.setitem(sys.modules, "synpick_warp.memory_plan", plan)
     return module
 
 

@@ -14,7 +14,7 @@ import pytest
 import zarr
 
 import synpick_warp
-from synpick_warp import pipeline
+from synpick_warp import memory_plan, pipeline
 from synpick_warp.configs.schema import Config
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
@@ -124,7 +124,7 @@ def test_what_is_opened_is_what_was_baked(out, mixed):
 def test_the_memory_table_counts_recorded_arrays(mixed):
     """What a tick is written into, and two records; none for formats that ask for none."""
     mixed = replace(mixed, bake=replace(mixed.bake, device="cpu"))  # A GPU gets at least eight worlds.
-    rows = [row for row in pipeline.describe_arrays(mixed) if row[0] == "StepArrays.pose"]
+    rows = [row for row in memory_plan.describe_arrays(mixed) if row[0] == "StepArrays.pose"]
     assert rows == [("StepArrays.pose", (1, 16, 4), "m", 16 * 4 * 28)] * 3
     without = replace(mixed, bake=replace(mixed.bake, formats=("bop",)))
-    assert not any(row[0].startswith("StepArrays") for row in pipeline.describe_arrays(without))
+    assert not any(row[0].startswith("StepArrays") for row in memory_plan.describe_arrays(without))

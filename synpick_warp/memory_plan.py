@@ -1,0 +1,272 @@
+"""Memory budget of a bake: the size of every allocation, worked out in whole numbers before anything is loaded, against what is free.
+
+The plan is a lower bound: what it refuses cannot run on this machine, what it accepts may still run out. Counted are all arrays that a
+bake declares, Newton's by measured factors, the pinned copies of images, shared memory of writers, and the lists of episodes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from synpick_warp.arrays import memory_table
+from synpick_warp.configs.check import format_value
+from synpick_warp.configs.fields import INT32_MAX
+from synpick_warp.configs.modes import may_pick
+from synpick_warp.configs.schema import FAST, Config
+from synpick_warp.device import pick_device
+from synpick_warp.errors import ConfigError
+from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
+from synpick_warp.free_memory import free_device_memory, free_host_memory
+from synpick_warp.scenes import build
+from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.perception.images import SCRATCH, count_views, perception_sizes
+from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
+from synpick_warp.stages.render.denoised import DENOISED_SCRATCH, scratch_sizes
+from synpick_warp.stages.render.layers import BODY_MOTIONS, MOTION_LAYERS
+from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
+from synpick_warp.stages.render.postprocess import LensArrays, has_lens_filter
+from synpick_warp.stages.render.raster import VISIBILITY_BUFFER, visibility_sizes
+from synpick_warp.stages.render.renderer import SHADED_IMAGE
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes
+from synpick_warp.stages.sim.physics import with_enough_worlds
+from synpick_warp.stages.sim.simulate import RECORDS
+from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
+from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
+from synpick_warp.stages.stream import RING, view_sizes
+
+Row = tuple[str, tuple[int, ...], str, int]
+"""Name, shape, unit and size [bytes] of an array."""
+
+EPISODE_BYTES = 100
+"""Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: 108 to 142 were measured by tracemalloc."""
+# Newton's allocations for each item of a world's capacities [bytes]: name, setting, size on a CPU, size on a GPU. Measured on a CPU with
+# Newton 1.8 from the growth of all allocations of model, collision pipeline and solver: 932, 16, 180 and 688. On a GPU rows have other
+# arrays (solve mode "colored"), which were not measured; contacts and pairs have at least those of `newton.Contacts` and their sorter.
+_NEWTON = (
+    ("Newton's contacts", "contacts_per_world", 900, 250),
+    ("Newton's shape pairs", "pairs_per_world", 16, 8),
+    ("Newton's contact rows", "rows_per_world", 160, 40),
+    ("Newton's gripper rows", "gripper_rows_per_world", 640, 40),
+)
+_VIEWS = ("cameras.resolution", "render.views_per_batch", "cameras.positions")
+_CAMERAS = ("cameras.resolution", "cameras.positions")
+_WORLDS = ("bake.worlds", "arrangement.max_objects", "move.rounds")
+_STEPS = ("bake.worlds", "physics.steps_per_tick", "arrangement.max_objects")
+_PERCEPTION = ("perception.resolution", "perception.contour_points", "perception.views", "bake.worlds")
+
+
+@dataclass(frozen=True)
+class Term:
+    """A part of a bake's memory: arrays that grow with the same settings."""
+
+    name: str
+    rows: tuple[Row, ...]
+    """One row for each copy."""
+    settings: tuple[str, ...]
+    """Full keys of the settings by which it grows."""
+    on_device: bool = True
+    """Whether it lies in the device's memory; always False on the CPU, whose memory is the host's."""
+    indexed: bool = True
+    """Whether kernels index the arrays by 32-bit integers."""
+
+    @property
+    def size(self) -> int:
+        """Size [bytes]."""
+        return sum(row[3] for row in self.rows)
+
+
+def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Term]:
+    """Work out what a bake takes on a device, without allocating anything.
+
+    Args:
+        config: All settings.
+        device: Device of the simulation; on a GPU the plan is for `with_enough_worlds`.
+        writers: Writer processes.
+    """
+    config = with_enough_worlds(config, device)
+    terms = [*_simulation(config, device), *_images(config, device), *_perception(config, device)]
+    if not device.is_cuda:
+        terms = [Term(term.name, term.rows, term.settings, False, term.indexed) for term in terms]
+    return [*terms, *_newton(config, device), *_host(config, device, writers)]
+
+
+def check_memory(config: Config, device: wp.Device, writers: int = 1) -> None:
+    """Refuse a bake that certainly exceeds the memory of this machine, or the 32-bit indices of kernels.
+
+    Raises:
+        ConfigError: One line with the largest term, its size, what is available, and the setting to lower.
+    """
+    terms = plan_memory(config, device, writers)
+    for on_device, place in ((True, device.alias), (False, "this machine")):
+        part = [term for term in terms if term.on_device == on_device]
+        needed = sum(term.size for term in part)
+        free = free_device_memory(device) if on_device and device.is_cuda else free_host_memory()
+        if needed > free:
+            largest = max(part, key=lambda term: term.size)
+            raise ConfigError(
+                f"a bake with these settings takes at least {_gib(needed)} of memory, {_gib(largest.size)} of them for {largest.name}, "
+                f"but {place} has {_gib(free)} free; {_advice(largest, config)}"
+            )
+    for term in terms:
+        for name, shape, _, size in term.rows:
+            # Kernels count elements by int32. Warp keeps strides [bytes] as int32, too, and wraps larger ones without a word; that of the
+            # first dimension is the largest, and not used if this has one element.
+            stride = size // shape[0] if shape[0] > 1 else 0
+            if term.indexed and max(math.prod(shape), stride) > INT32_MAX:
+                extents = " x ".join(f"{extent:,}" for extent in shape)
+                raise ConfigError(f"{name} would have {extents} elements, more than 32-bit indices reach; {_advice(term, config)}")
+
+
+def check_episodes(count: int, config: Config) -> None:
+    """Refuse more episodes than this machine can list, before they are listed.
+
+    Args:
+        count: Episodes of this bake, or of its shard.
+        config: All settings.
+
+    Raises:
+        ConfigError: The lists alone exceed the free memory.
+    """
+    needed, free = count * EPISODE_BYTES, free_host_memory()
+    if needed > free:
+        raise ConfigError(
+            f"the lists of {count:,} episodes take at least {_gib(needed)} of memory, but this machine has {_gib(free)} free; "
+            f"lower bake.episodes ({config.bake.episodes}), or bake a part with --shard"
+        )
+
+
+def is_shortage(error: BaseException) -> bool:
+    """Whether an error says that memory ran out: Python's own, or that of Warp's allocators."""
+    return isinstance(error, MemoryError) or str(error).startswith("Failed to allocate")
+
+
+def shortage_error(config: Config, device: wp.Device) -> ConfigError:
+    """Error for memory that ran out although the plan, a lower bound, had accepted the settings."""
+    largest = max(plan_memory(config, device), key=lambda term: term.size)
+    return ConfigError(f"the bake ran out of memory; its largest part are {largest.name}, {_gib(largest.size)}; {_advice(largest, config)}")
+
+
+def describe_memory(config: Config) -> list[Row]:
+    """Memory table: rows (name, shape, unit, bytes) of the plan, one per copy; Newton's and the host's shares are estimates."""
+    return [row for term in plan_memory(config, pick_device(config.bake.device)) for row in term.rows]
+
+
+def describe_arrays(config: Config) -> list[Row]:
+    """Memory table: rows (name, shape, unit, bytes) of every device array that a bake declares, one per copy.
+
+    Newton's own arrays are not included. Body slots are counted at their maximum: the object capacity for each slot type.
+    """
+    device = pick_device(config.bake.device)
+    config = with_enough_worlds(config, device)
+    terms = [*_simulation(config, device), *_images(config, device), *_perception(config, device)]
+    return [row for term in terms for row in term.rows]
+
+
+def _term(name: str, settings: tuple[str, ...], groups: list[tuple[Any, dict[str, int], int]]) -> Term:
+    """Term of declarations: (declaration, extents of its dimensions, copies)."""
+    return Term(name, tuple(row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)), settings)
+
+
+def _simulation(config: Config, device: wp.Device) -> Iterator[Term]:
+    """State, records and step logs of the worlds."""
+    worlds = world_sizes(config, build.GRIPPER_BODIES + 2 * config.arrangement.max_objects)
+    groups: list[tuple[Any, dict[str, int], int]] = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState, LastFrame)]
+    groups += [(kind, worlds, 1 + RECORDS) for kind in (Observation, Plan)]
+    groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS)]
+    yield _term(f"the state of {config.bake.worlds:,} worlds", _WORLDS, groups)
+    if any(kind.needs_physics for kind in load_exporter_classes(config.bake.formats)):
+        sizes = record_sizes(worlds, config.physics.steps_per_tick)
+        yield _term("records of physics steps", _STEPS, [(kind, sizes, 1 + RECORDS) for kind in record_kinds(config.trajectory)])
+
+
+def _images(config: Config, device: wp.Device) -> Iterator[Term]:
+    """Images of a batch of views, and scratch of the renderer."""
+    room, ring = config.arrangement.max_objects, RING if device.is_cuda else 1
+    width, height = config.cameras.resolution
+    views = view_sizes(config, device) | body_sizes(room, width, height)
+    name = f"images of {views['view']:,} views of {width:,}x{height:,} px"
+    boundaries = boundary_sizes(views)
+    groups: list[tuple[Any, dict[str, int], int]] = [(ViewBuffers, views, ring), (BoundaryBuffers, boundaries, ring)]
+    groups += [(BoundaryScratch, boundaries, 1)] + [(kind, views, 1) for kind in (VIEW_BODIES, GBUFFER, SHADED_IMAGE)]
+    groups += [(VISIBILITY_BUFFER, visibility_sizes(views["view"], width, height), 1)]
+    if MOTION_LAYERS.intersection(config.render.layers):
+        groups += [(BODY_MOTIONS, views, 1)]
+    if has_lens_filter(config.effects):
+        groups += [(LensArrays, views, 1)]
+    if config.render.mode == FAST:
+        groups += [(kind, views | scratch_sizes(config.render, width, height), copies) for kind, copies in DENOISED_SCRATCH]
+    term = _term(name, _VIEWS, groups)
+    layers = memory_table(LayerBuffers, views, config.render.layers)
+    yield Term(term.name, (*term.rows, *(ring * layers)), term.settings)
+    cameras = len(config.cameras.positions)
+    background = visibility_sizes(cameras, width, height)
+    yield _term(f"backgrounds of {cameras:,} cameras of {width:,}x{height:,} px", _CAMERAS, [(GBUFFER, background, 1)])
+
+
+def _perception(config: Config, device: wp.Device) -> Iterator[Term]:
+    """Images, contours and votes of a batch of worlds that plan grasps."""
+    if not may_pick(config):
+        return
+    settings, room = config.perception, config.arrangement.max_objects
+    count = count_views(settings, config.bake.worlds, room, device)
+    sizes = perception_sizes(settings, room, count)
+    groups: list[tuple[Any, dict[str, int], int]] = [(kind, sizes, 1) for kind in SCRATCH] + [(GBUFFER, sizes | {"view": 1}, 1)]
+    groups += [(kind, plan_sizes(settings, room, count), 1) for kind in (VoteArrays, CYCLES)]
+    width, height = settings.resolution
+    yield _term(f"perception of {count:,} worlds at {width:,}x{height:,} px", _PERCEPTION, groups)
+
+
+def _newton(config: Config, device: wp.Device) -> Iterator[Term]:
+    """Contacts, pairs and constraint rows of Newton's collision pipeline and solver."""
+    worlds = config.bake.worlds
+    for name, setting, cpu, gpu in _NEWTON:
+        capacity = getattr(config.physics, setting)
+        size = worlds * capacity * (gpu if device.is_cuda else cpu)
+        yield Term(name, ((name, (worlds * capacity,), "", size),), (f"physics.{setting}", "bake.worlds"), device.is_cuda)
+
+
+def _host(config: Config, device: wp.Device, writers: int) -> Iterator[Term]:
+    """Host memory besides that of a CPU's arrays: pinned copies of images, shared memory of writers.
+
+    A writer is counted with one slot of shared memory: those of its queue get memory only once they are used.
+    """
+    if device.is_cuda:
+        views = view_sizes(config, device)
+        groups = [*memory_table(ViewBuffers, views), *memory_table(LayerBuffers, views, config.render.layers)]
+        rows = tuple((f"pinned {name}", shape, unit, size) for name, shape, unit, size in RING * groups)
+        yield Term(f"pinned copies of {views['view']:,} views", rows, _VIEWS, False)
+    size = slot_bytes(load_exporter_classes(config.bake.formats), config)
+    row = ("shared memory of writers", (writers, size), "", writers * size)
+    yield Term(f"images in {writers:,} writers", (row,), ("cameras.resolution", "bake.writers"), False, False)
+
+
+def _advice(term: Term, config: Config) -> str:
+    """Advice to lower the setting that exceeds its default by the largest factor, with its value."""
+    key = max(term.settings, key=lambda name: _amount(name, config) / max(1, _amount(name, Config())))
+    section, _, name = key.partition(".")
+    value = getattr(getattr(config, section), name)
+    return f"lower {key} ({format_value(value) if not _is_list(value) else f'{len(value):,} cameras'})"
+
+
+def _amount(key: str, config: Config) -> int:
+    """Size of a setting: pixels of a resolution, count of cameras, the number itself."""
+    section, _, name = key.partition(".")
+    value = getattr(getattr(config, section), name)
+    return len(value) if _is_list(value) else math.prod(value) if isinstance(value, tuple) else value
+
+
+def _is_list(value: object) -> bool:
+    """Whether a value is a list of vectors, as the positions of cameras."""
+    return isinstance(value, tuple) and bool(value) and isinstance(value[0], tuple)
+
+
+def _gib(size: int) -> str:
+    """Size in GiB, with commas and one decimal place; whole numbers, since sizes may exceed a float's range."""
+    tenths = -(-size * 10 // 1024**3) if size else 0
+    return f"{tenths // 10:,}.{tenths % 10} GiB"

@@ -1,0 +1,295 @@
+"""Memory plan: oversized settings are refused in one line before anything is loaded, and what fits is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+
+from synpick_warp import memory_plan, pipeline
+from synpick_warp.configs.fields import INT32_MAX
+from synpick_warp.configs.load import load_config, sections, settings_of
+from synpick_warp.configs.schema import Config
+from synpick_warp.errors import ConfigError, SynpickError
+from synpick_warp.free_memory import free_host_memory
+from synpick_warp.memory_plan import check_memory, describe_memory, plan_memory
+from synpick_warp.progress import SilentProgress
+from tests.harness.fuzz import fuzz_examples
+from tests.worlds.small_worlds import settings
+
+GIB = 1024**3
+CPU = SimpleNamespace(is_cuda=False, alias="cpu")
+GPU = SimpleNamespace(is_cuda=True, alias="cuda:0")
+"""Stand-ins for devices: the plan asks for no more."""
+
+
+@pytest.fixture(autouse=True)
+def machine(monkeypatch):
+    """A machine with 8 GiB of memory, and 80 GiB on the GPU."""
+    monkeypatch.setattr(memory_plan, "free_host_memory", lambda: 8 * GIB)
+    monkeypatch.setattr(memory_plan, "free_device_memory", lambda device: 80 * GIB)
+
+
+def refusal(tmp_path: Path, monkeypatch, **overrides: object) -> str:
+    """The one line with which a bake is refused before models are loaded; nothing is left behind."""
+
+    def load_catalog(config: Config, report: object) -> None:
+        raise AssertionError("models are loaded")
+
+    monkeypatch.setattr(pipeline, "load_catalog", load_catalog)
+    out = tmp_path / "out"
+    with pytest.raises(ConfigError) as caught:
+        pipeline.run_bake(settings(**{"bake__device": "cpu"} | overrides), out, SilentProgress())
+    assert not out.exists()
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# ---- fault 8 ----
+
+CAMERAS = {"cameras__positions": [[0.0, 0.0, 2.0]] * 1000, "cameras__ups": [[0.0, 1.0, 0.0]] * 1000}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "largest", "advice"),
+    [
+        ({"cameras__resolution": [8192, 8192]}, "images of 3 views of 8,192x8,192 px", "lower cameras.resolution ([8192, 8192])"),
+        (
+            {"cameras__resolution": [8192, 8192], "bake__worlds": 65536, "bake__mode": "pick"},
+            "Newton's contacts",
+            "lower bake.worlds (65536)",
+        ),
+        (
+            CAMERAS | {"cameras__resolution": [1280, 720]},
+            "images of 1,000 views of 1,280x720 px",
+            "lower cameras.positions (1,000 cameras)",
+        ),
+        ({"render__views_per_batch": 10_000}, "images of 10,000 views of 320x180 px", "lower render.views_per_batch (10000)"),
+        ({"physics__contacts_per_world": 10**9}, "Newton's contacts", "lower physics.contacts_per_world (1000000000)"),
+        (
+            {"perception__contour_points": 10**8, "bake__mode": "target", "arrangement__max_objects": 20},
+            "perception of 1 worlds at 640x360 px",
+            "lower perception.contour_points (100000000)",
+        ),
+        ({"bake__worlds": 65536}, "Newton's contacts", "lower bake.worlds (65536)"),
+    ],
+)
+def test_settings_that_exceed_the_memory_are_refused_in_one_line(overrides, largest, advice, tmp_path, monkeypatch):
+    """Fault 8: "Failed to allocate ... bytes on device" as a traceback, or the kernel's out-of-memory killer."""
+    said = refusal(tmp_path, monkeypatch, **overrides)
+    assert said.startswith("a bake with these settings takes at least ")
+    assert f" GiB of them for {largest}, but this machine has 8.0 GiB free; {advice}" in said
+
+
+@pytest.mark.parametrize(
+    ("overrides", "advice"),
+    [
+        ({"render__views_per_batch": 10**9}, "lower render.views_per_batch (1000000000)"),
+        ({"physics__contacts_per_world": INT32_MAX, "bake__worlds": 2}, "lower physics.contacts_per_world (2147483647)"),
+    ],
+)
+def test_arrays_longer_than_32_bit_indices_are_refused_on_any_machine(overrides, advice, tmp_path, monkeypatch):
+    monkeypatch.setattr(memory_plan, "free_host_memory", lambda: 2**60)
+    said = refusal(tmp_path, monkeypatch, **overrides)
+    assert "elements, more than 32-bit indices reach" in said
+    assert said.endswith(advice)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("bake.episodes", 10**12),
+        ("physics.contacts_per_world", 10**18),
+        ("perception.contour_points", 10**12),
+        ("render.views_per_batch", 10**12),
+        ("settle.tries", 10**12),
+        ("move.rounds", 10**9),
+    ],
+)
+def test_whole_numbers_beyond_32_bits_are_out_of_range(key, value):
+    with pytest.raises(ConfigError, match=rf"{key} is {value} in the settings passed; allowed: at least \d+, at most \d+"):
+        load_config("smoke", {key: value})
+
+
+@pytest.mark.parametrize("key", ["settle.max_time", "settle.relax_time", "settle.stuck_time", "pick.press_time"])
+def test_times_of_more_ticks_than_32_bits_count_are_a_conflict(key):
+    """They wrapped around without a word: an episode that may settle for 1e300 s was given up at once."""
+    with pytest.raises(ConfigError, match=rf"{key} is 1e\+300 in the settings passed; allowed: at most .*2,147,483,647 (ticks|steps)"):
+        load_config("smoke", {"settle.max_time": 1e8, key: 1e300})
+
+
+def test_episodes_that_the_memory_cannot_list_are_refused_before_they_are_listed(tmp_path, monkeypatch):
+    said = refusal(tmp_path, monkeypatch, bake__episodes=INT32_MAX)
+    assert said == (
+        "the lists of 2,147,483,647 episodes take at least 200.0 GiB of memory, but this machine has 8.0 GiB free; "
+        "lower bake.episodes (2147483647), or bake a part with --shard"
+    )
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("Failed to allocate 1610612736 bytes on device 'cpu'")])
+def test_memory_that_runs_out_later_is_one_line_too(error, tmp_path, monkeypatch):
+    """The plan is a lower bound, and other programs may take memory at any time."""
+
+    def build_factory(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(pipeline, "build_factory", build_factory)
+    with pytest.raises(
+        ConfigError, match=r"\Athe bake ran out of memory; its largest part are images of 3 views .*; lower cameras\.resolution "
+    ):
+        pipeline.run_bake(settings(bake__device="cpu", cameras__resolution=[2048, 2048]), tmp_path / "out", SilentProgress())
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_runtime_errors_stay_what_they_are(tmp_path, monkeypatch):
+    def build_factory(*_: object) -> None:
+        raise RuntimeError("a fault")
+
+    monkeypatch.setattr(pipeline, "build_factory", build_factory)
+    with pytest.raises(RuntimeError, match="a fault"):
+        pipeline.run_bake(settings(bake__device="cpu"), tmp_path / "out", SilentProgress())
+
+
+# ---- what fits ----
+
+
+@pytest.mark.parametrize("preset", ["smoke", "synpick", "synpick-released"])
+@pytest.mark.parametrize("machine_device", [CPU, GPU], ids=["cpu", "gpu"])
+def test_presets_fit_into_a_common_machine(preset, machine_device):
+    check_memory(load_config(preset, {"bake.mode": "mixed", "bake.worlds": 32}), machine_device, writers=16)
+
+
+def test_the_largest_bakes_that_were_measured_fit():
+    """512 worlds of the paper's settings run on a GPU of 80 GiB beside 64 GiB of host memory."""
+    check_memory(load_config("synpick", {"bake.mode": "mixed", "bake.worlds": 512}), GPU, writers=16)
+
+
+def test_the_gpus_memory_is_its_own(monkeypatch):
+    monkeypatch.setattr(memory_plan, "free_device_memory", lambda device: GIB // 8)
+    with pytest.raises(ConfigError, match=r"for .*, but cuda:0 has 0\.2 GiB free; lower cameras\.resolution|lower bake\.worlds"):
+        check_memory(load_config("synpick", {"bake.worlds": 64}), GPU)
+
+
+def test_the_plan_is_below_what_a_small_bake_allocates(device):
+    """Lower bound: Newton's terms are at most what building its model and solver allocates on a CPU."""
+    if device.is_cuda:
+        pytest.skip("allocations of a GPU's memory pool are not counted by this test")
+    import warp as wp
+
+    from synpick_warp.scenes.build import build_model
+    from synpick_warp.stages.sim.physics import Physics
+    from tests.worlds.small_worlds import catalog
+
+    config = settings(bake__worlds=4, bake__device="cpu", physics__contacts_per_world=2048, physics__gripper_rows_per_world=1024)
+    kind = type(device.default_allocator)
+    sizes: list[int] = []
+    allocate = kind.allocate
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kind, "allocate", lambda self, size: (sizes.append(size), allocate(self, size))[1])
+        physics = Physics(config.physics, build_model(config, catalog(), device))
+    assert physics.layout.worlds == 4
+    planned = sum(term.size for term in plan_memory(config, wp.get_device("cpu")) if term.name.startswith("Newton"))
+    assert sum(sizes) / 2 < planned <= sum(sizes)
+
+
+def test_the_memory_table_has_the_terms_of_the_plan():
+    rows = describe_memory(settings(bake__device="cpu"))
+    names = [name for name, *_ in rows]
+    assert {"WorldState.phase", "ViewBuffers.color", "Newton's contacts", "shared memory of writers"} <= set(names)
+    assert {row[:3] for row in memory_plan.describe_arrays(settings(bake__device="cpu"))} <= {row[:3] for row in rows}
+
+
+# ---- free memory ----
+
+
+def write(root: Path, files: dict[str, str]) -> Path:
+    for name, text in files.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    return root
+
+
+MEMINFO = "MemTotal:       1000 kB\nMemAvailable:    800 kB\nSwapFree:        50 kB\n"
+
+
+@pytest.mark.parametrize(
+    ("files", "kibibytes"),
+    [
+        ({}, 850),
+        ({"proc/self/cgroup": "0::/a/b\n", "sys/fs/cgroup/a/memory.max": "max\n", "sys/fs/cgroup/a/memory.current": "1024\n"}, 850),
+        (
+            {
+                "proc/self/cgroup": "0::/a/b\n",
+                "sys/fs/cgroup/a/memory.max": f"{600 * 1024}\n",
+                "sys/fs/cgroup/a/memory.current": f"{500 * 1024}\n",
+                "sys/fs/cgroup/a/memory.stat": f"anon 7\ninactive_file {100 * 1024}\n",
+            },
+            250,
+        ),
+        ({"proc/self/cgroup": "0::/\n", "sys/fs/cgroup/memory.max": "2048\n", "sys/fs/cgroup/memory.current": "4096\n"}, 50),
+        (
+            {
+                "proc/self/cgroup": "5:cpu:/x\n4:memory:/docker/1\n",
+                "sys/fs/cgroup/memory/memory.limit_in_bytes": f"{300 * 1024}",
+                "sys/fs/cgroup/memory/memory.usage_in_bytes": f"{100 * 1024}",
+            },
+            250,
+        ),
+    ],
+)
+def test_free_memory_counts_caches_swap_and_the_limits_of_control_groups(files, kibibytes, tmp_path):
+    assert free_host_memory(write(tmp_path, {"proc/meminfo": MEMINFO, **files})) == kibibytes * 1024
+
+
+@given(st.dictionaries(st.sampled_from(("memory.max", "memory.current", "memory.stat")), st.binary(max_size=40)), st.binary(max_size=40))
+@hypothesis_settings(max_examples=fuzz_examples(50), deadline=None)
+def test_any_text_in_the_files_of_control_groups_gives_a_number(tmp_path_factory, files, groups):
+    root = write(tmp_path_factory.mktemp("root"), {"proc/meminfo": MEMINFO})
+    (root / "proc/self").mkdir()
+    (root / "proc/self/cgroup").write_bytes(b"0::/\n" + groups)
+    (root / "sys/fs/cgroup").mkdir(parents=True)
+    for name, content in files.items():
+        (root / "sys/fs/cgroup" / name).write_bytes(content)
+    assert 0 <= free_host_memory(root) <= 850 * 1024
+
+
+# ---- any settings ----
+
+NUMBERS = [
+    (f"{section}.{name}", annotation)
+    for section, kind in sections().items()
+    for name, (_, annotation) in settings_of(kind).items()
+    if annotation in (int, float, tuple[int, int])
+]
+WHOLE = st.one_of(
+    st.integers(-1, 4096),
+    st.builds(lambda base, power: base * 10**power, st.integers(1, 9), st.integers(0, 40)),
+    st.integers(2**31 - 2, 2**31 + 1),
+)
+VALUES = {int: WHOLE, float: st.floats(), tuple[int, int]: st.lists(st.one_of(WHOLE, st.integers(1, 8192)), min_size=2, max_size=2)}
+
+
+@hypothesis_settings(max_examples=fuzz_examples(200), deadline=5000)
+@given(data=st.data(), cuda=st.booleans(), mode=st.sampled_from(("pick", "move", "mixed")), cameras=st.sampled_from((None, 1, 1000)))
+def test_extreme_settings_give_a_plan_or_one_line(data, cuda, mode, cameras):
+    chosen = data.draw(st.lists(st.sampled_from(NUMBERS), max_size=4, unique_by=lambda item: item[0]))
+    values: dict[str, object] = {"bake.mode": mode, "bake.formats": data.draw(st.sampled_from((["bop"], ["zarr"], ["bop", "zarr", "usd"])))}
+    values |= {key: data.draw(VALUES[annotation]) for key, annotation in chosen}
+    if cameras:
+        values |= {"cameras.positions": [[0.0, 0.0, 2.0]] * cameras, "cameras.ups": [[0.0, 1.0, 0.0]] * cameras}
+    try:
+        config = load_config("smoke", values)
+        device = GPU if cuda else CPU
+        for term in plan_memory(config, device, writers=config.bake.writers or 2):
+            for _, shape, _, size in term.rows:
+                assert type(size) is int
+                assert size >= 0
+                assert all(type(extent) is int and extent >= 0 for extent in shape)
+            assert term.size > 0 or term.name.startswith("images in")
+        check_memory(config, device, config.bake.writers or 2)
+    except SynpickError as error:
+        assert "\n" not in str(error)  # noqa: PT017 - most examples are errors, some are none

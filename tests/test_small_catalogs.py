@@ -1,0 +1,42 @@
+"""Bakes of catalogs of one or two objects, at the ends of what fits: episodes come, in each mode."""
+
+from __future__ import annotations
+
+import pytest
+import trimesh
+
+from synpick_warp.configs.load import load_config
+from synpick_warp.pipeline import run_bake
+from synpick_warp.progress import SilentProgress
+from tests.harness.bake_server import TINY
+from tests.worlds.small_worlds import QUICK
+
+SETTINGS = {key: value for key, value in (QUICK | TINY).items() if not key.startswith("arrangement.")} | {
+    "bake.worlds": 1,
+    "bake.episodes": 1,
+    "bake.formats": ["bop"],
+    "render.layers": [],
+}
+"""Settings of quick bakes, with the budget and the capacity of the preset `smoke`: 3 litres, 24 objects."""
+
+
+@pytest.mark.parametrize(
+    ("mode", "sizes"),
+    [
+        ("move", [(0.1, 0.1, 0.1)]),
+        ("target", [(0.1, 0.1, 0.1), (0.1, 0.1, 0.1)]),
+        ("move", [(0.003, 0.003, 0.003)]),
+        ("pick", [(0.144, 0.144, 0.144)]),
+    ],
+    ids=["a litre", "twins", "3 mm", "the whole budget"],
+)
+def test_a_catalog_of_one_or_two_objects_gives_episodes(mode, sizes, tmp_path):
+    """Fault 4: with cubes of 100 mm, all 20 arrangements needed more body slots than a world had."""
+    (tmp_path / "models").mkdir()
+    for index, size in enumerate(sizes):
+        trimesh.creation.box(size).export(tmp_path / "models" / f"box_{index}.ply")
+    config = load_config("smoke", SETTINGS | {"bake.mode": mode, "bake.models": str(tmp_path / "models")})
+    summary = run_bake(config, tmp_path / "out", SilentProgress())
+    assert [row.ending.delivers for row in summary.episodes] == [True]
+    assert summary.redraws == 0
+    assert summary.views > 0
