@@ -118,8 +118,11 @@ def test_folders_that_are_no_data_set(tmp_path):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda scene: (scene / "scene_gt.json").unlink(), r"cannot read .*scene_gt\.json: No such file"),
-        (lambda scene: (scene / "scene_gt_info.json").write_text("{"), r"scene_gt_info\.json is not a JSON file"),
+        (lambda scene: (scene / "scene_gt.json").unlink(), r"there is no file .*scene_gt\.json"),
+        (
+            lambda scene: (scene / "scene_gt_info.json").write_text("{"),
+            r"scene_gt_info\.json is damaged: input data was truncated; restore the file",
+        ),
         (lambda scene: (scene / "scene_gt.json").write_text(json.dumps({"0": []})), "do not agree about image"),
         (lambda scene: shutil.rmtree(scene / "rgb"), r"there is no .*rgb/.*\.png or \.jpg"),
         (lambda scene: [path.write_bytes(b"") for path in (scene / "depth").iterdir()], "is not an image"),
