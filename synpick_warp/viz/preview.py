@@ -99,7 +99,7 @@ def write_picture(out: Path, picture: Image) -> Path:
         try:
             # A link of that name in the data set is replaced, never followed.
             with open(partial_file, "xb") as file:
-                file.write(data)
+                file.write(data.tobytes())
             partial_file.replace(out)
         except BaseException:
             partial_file.unlink(missing_ok=True)

@@ -78,7 +78,7 @@ def test_a_point_outside_of_the_image_is_named(tmp_path):
 
 
 def test_a_graph_of_all_edges_ends(tmp_path):
-    pile = [seen_object(index, 1, (index % 90, 30), above=list(range(index))) for index in range(255)]
+    pile = [seen_object(index, 1, (index % 80, 30), above=list(range(index))) for index in range(255)]
     (tmp_path / "attempts.jsonl").write_text(json.dumps(record(pile)))
     [attempt] = read_attempts(tmp_path, 0, None)
     started = time.monotonic()
