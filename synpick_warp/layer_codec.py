@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.image_files import read_image_file
 from synpick_warp.layers import FLOW_STEPS, LAYER_TABLE, MAX_CODE, NORMAL_STEPS, SCENE_FLOW_STEP, ZERO_CODE
 
 
@@ -41,22 +42,28 @@ def decode_layer(name: str, image: np.ndarray) -> np.ndarray:
     return CODECS[LAYER_TABLE[name].encoding].decode(image)
 
 
-def read_layer(scene: Path, name: str, frame: int) -> np.ndarray:
+def read_layer(scene: Path, name: str, frame: int, size: tuple[int, int] | None = None) -> np.ndarray:
     """Read a layer of one image of a BOP scene; the values are those of `decode_layer`.
 
+    Args:
+        scene: Folder of the scene.
+        name: Name of the layer.
+        frame: Index of the image.
+        size: Width and height that it must have [px]; None: any.
+
     Raises:
-        DatasetError: There is no such layer or file, or the file is no image of this layer.
+        DatasetError: There is no such layer or file, or the file is no image of this layer and size.
     """
     if name not in LAYER_TABLE:
         raise DatasetError(f"there is no layer {name}; layers: {', '.join(LAYER_TABLE)}")
     path = layer_path(scene, name, frame)
-    if not path.is_file():
+    if not path.exists():
         raise DatasetError(f"there is no {path}; bake with render.layers naming {name}")
-    dtype, channels = _image_format(name)
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.stat().st_size else None
-    if image is None or image.dtype.name != dtype or image.shape[2:] != channels:
+    dtype, channels = image_format(name)
+    image = read_image_file(path, DatasetError, cv2.IMREAD_UNCHANGED, size)
+    if image.dtype.name != dtype or image.shape[2:] != (() if channels is None else (channels,)):
         raise DatasetError(f"{path} is no image of the layer {name}; bake the data set again")
-    return decode_layer(name, image[..., ::-1] if channels else image)
+    return decode_layer(name, image if channels is None else image[..., ::-1])
 
 
 def layer_path(scene: Path, name: str, frame: int) -> Path:
@@ -69,12 +76,12 @@ def layer_notes(names: tuple[str, ...]) -> str:
     return "".join(f"- `{name}/`: {layer.note}\n" for name, layer in LAYER_TABLE.items() if name in names)
 
 
-def _image_format(name: str) -> tuple[str, tuple[int, ...]]:
-    """Type and channels of a layer's image: raw layers keep theirs, all others have three channels of 16 bits."""
+def image_format(name: str) -> tuple[str, int | None]:
+    """Type and channels (None: two dimensions) of a layer's image: raw layers keep theirs, all others have three channels of 16 bits."""
     layer = LAYER_TABLE[name]
     if layer.encoding != "raw":
-        return "uint16", (3,)
-    return layer.dtype, (layer.components,) if layer.components > 1 else ()
+        return "uint16", 3
+    return layer.dtype, layer.components if layer.components > 1 else None
 
 
 def _keep(values: np.ndarray) -> np.ndarray:

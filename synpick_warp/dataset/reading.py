@@ -10,25 +10,29 @@ needs no simulator; zarr, NumPy and OpenCV are imported when arrays or images ar
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from synpick_warp.dataset.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry, read_entry
+from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
+from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
 from synpick_warp.dataset.trajectory import (
     GROUP_FILE,
     Arrays,
     CameraInfo,
+    GroupContext,
     ObjectInfo,
+    StoreAttributes,
     read_array,
     read_attributes,
     read_cameras,
     read_objects,
 )
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
+from synpick_warp.exporters.trajectory.arrays import EPISODE_GROUPS, EPISODES, STORE
+from synpick_warp.inputs.json import decode_json
+from synpick_warp.inputs.paths import path_inside
 
 if TYPE_CHECKING:
     from synpick_warp.configs.schema import Config
@@ -60,12 +64,34 @@ class Episode:
 
     @cached_property
     def _record(self) -> dict[str, Any] | None:
-        return read_entry(self._data_set.folder, episode_entry(self.index))
+        path = self._data_set.folder / f"{episode_entry(self.index)}.json"
+        return read_checked(path, EpisodeEntry) if path.exists() else None
+
+    @cached_property
+    def _context(self) -> GroupContext:
+        """Sizes and files that the arrays must agree with."""
+        return GroupContext(lambda: self._sizes, lambda: self._files)
+
+    @cached_property
+    def _sizes(self) -> dict[str, int]:
+        """Sizes of the arrays' dimensions."""
+        store = check_content(self._data_set.attributes, StoreAttributes, self._data_set.folder / STORE)
+        return {"tick": len(self), "step": len(self) * store.steps_per_tick}
+
+    @cached_property
+    def _files(self) -> frozenset[Path]:
+        return self._data_set.listed_files(episode_entry(self.index))
+
+    def _arrays(self, name: str) -> Arrays:
+        return Arrays(self._group / name, EPISODE_GROUPS[name], self._context)
 
     @cached_property
     def row(self) -> dict[str, Any]:
         """The episode's line of episodes.jsonl: mode, ending, frames, seconds, counts of objects and attempts."""
-        return self._record["row"] if self._record is not None else self.attributes
+        if self._record is not None:
+            return self._record["row"]
+        check_content(self.attributes, EpisodeRow, self._group / GROUP_FILE)
+        return self.attributes
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
@@ -80,29 +106,33 @@ class Episode:
     @property
     def ticks(self) -> Arrays:
         """Arrays with one row per frame; empty without trajectories, as are the following."""
-        return Arrays(self._group / "ticks")
+        return self._arrays("ticks")
 
     @property
     def steps(self) -> Arrays:
         """Arrays with one row per physics step; empty if steps were not recorded."""
-        return Arrays(self._group / "steps")
+        return self._arrays("steps")
 
     @property
     def arrangement(self) -> Arrays:
         """Arrays of the drawn objects and how they were dropped."""
-        return Arrays(self._group / "arrangement")
+        return self._arrays("arrangement")
 
     @property
     def attempt_arrays(self) -> Arrays:
         """`attempts` as arrays, with one row per attempt."""
-        return Arrays(self._group / "attempts")
+        return self._arrays("attempts")
 
     @cached_property
     def attempts(self) -> tuple[dict[str, Any], ...]:
         """Pick attempts in order; each is a line of attempts.jsonl."""
         if self._record is not None:
-            return tuple(self._record["attempts"])
-        return tuple(json.loads(line) for line in read_array(self.attempt_arrays["record"]).tobytes().splitlines())
+            return tuple(self._record.get("attempts", ()))
+        if "record" not in self.attempt_arrays:
+            raise DatasetError(f"{self._group} has no array attempts/record; {ADVICE}")
+        lines = read_array(self.attempt_arrays["record"]).tobytes().splitlines()
+        source = self._group / "attempts" / "record"
+        return tuple(decode_json(line, dict[str, Any], f"{source}, line {row},", DatasetError, ADVICE) for row, line in enumerate(lines, 1))
 
     @property
     def usd(self) -> Path:
@@ -186,7 +216,24 @@ class DataSet(Mapping[int, Episode]):
             DatasetError: The data set has no trajectories; `models_info` has sizes.
         """
         self.require_store()
-        return read_objects(self._store)
+        return read_objects(self._store, self._constants)
+
+    @cached_property
+    def _constants(self) -> GroupContext:
+        """Files that the arrays of the store's tables must agree with."""
+        return GroupContext(files=lambda: self.listed_files(CONSTANTS))
+
+    def listed_files(self, entry: Path) -> frozenset[Path]:
+        """Files of the trajectory store that a manifest entry lists; none if the data set has no such entry.
+
+        Raises:
+            DatasetError: The list is damaged.
+        """
+        if not (self.folder / f"{entry}.json").exists():
+            return frozenset()
+        source = f"{self.folder / entry}.sha256"
+        names = (name for name in read_checksums(self.folder, entry) if name.startswith(f"{STORE}/"))
+        return frozenset(path_inside(self.folder, name, source, DatasetError) for name in names)
 
     @cached_property
     def models_info(self) -> dict[int, dict[str, Any]]:
@@ -195,15 +242,13 @@ class DataSet(Mapping[int, Episode]):
         Raises:
             DatasetError: The data set has no models, as it has neither the format bop nor shards.
         """
-        from synpick_warp.dataset.view_files import read_json
-
-        return {int(name): info for name, info in read_json(self.folder / "models" / "models_info.json").items()}
+        return read_checked(self.folder / "models" / "models_info.json", dict[Key, ModelInfo])
 
     @cached_property
     def cameras(self) -> tuple[CameraInfo, ...]:
         """The cameras by index."""
         if self.has_store:
-            return read_cameras(self._store)
+            return read_cameras(self._store, self.camera_count if (self.folder / CONFIG_FILE).exists() else None, self._constants)
         import numpy as np
 
         from synpick_warp.scenes.cameras import make_cameras
@@ -239,9 +284,9 @@ class DataSet(Mapping[int, Episode]):
     @cached_property
     def _splits(self) -> tuple[Path, ...]:
         """Folders of BOP scenes and of webdataset shards, which need not exist; none if there are no settings."""
-        if not (self.folder / CONFIG_FILE).is_file():
+        if not (self.folder / CONFIG_FILE).exists():
             return ()
-        split = self.folder / self.config.bop.split
+        split = path_inside(self.folder, self.config.bop.split, self.folder / CONFIG_FILE, DatasetError)
         return split, split.with_name(f"{split.name}_web")
 
     def scene_files(self, episode: int, camera: int) -> SceneFiles:
@@ -254,11 +299,12 @@ class DataSet(Mapping[int, Episode]):
         from synpick_warp.exporters.bop.shard_parts import find_shards
 
         scene = self.camera_count * episode + camera
+        size = self.config.cameras.resolution
         folder, web = self._splits
         if (folder / f"{scene:06d}").is_dir():
-            return SceneFolder(folder / f"{scene:06d}")
+            return SceneFolder(folder / f"{scene:06d}", size)
         if shards := list(find_shards(scene, web)):
-            return SceneShards(shards, scene)
+            return SceneShards(shards, scene, size)
         raise DatasetError(f"{self.folder} has no images of episode {episode}; bake with --formats bop or shards")
 
     def _has_files(self, index: int) -> bool:
@@ -271,10 +317,10 @@ class DataSet(Mapping[int, Episode]):
 
     def _names(self) -> Iterator[int]:
         """Indices of the episodes that have files in some format; an index can occur several times."""
-        yield from (int(path.name) for path in (self._store / EPISODES).glob("[0-9]*"))
-        yield from (int(path.stem) for path in (self.folder / USD).glob("[0-9]*.usdc"))
+        yield from _indices((self._store / EPISODES).glob("[0-9]*"))
+        yield from _indices((self.folder / USD).glob("[0-9]*.usdc"))
         for split, pattern in zip(self._splits, ("[0-9]*", "shard-??????.tar"), strict=False):
-            yield from (int(path.stem.removeprefix("shard-")) // self.camera_count for path in split.glob(pattern))
+            yield from (scene // self.camera_count for scene in _indices(split.glob(pattern)))
 
     def _is_committed(self, index: int) -> bool:
         """Whether an episode has its manifest entry; a data set without manifest, such as a lone store, has none to check."""
@@ -293,6 +339,14 @@ class DataSet(Mapping[int, Episode]):
 
     def __repr__(self) -> str:
         return f"DataSet({str(self.folder)!r}, {len(self)} episodes)"
+
+
+def _indices(paths: Iterable[Path]) -> Iterator[int]:
+    """Indices in file names such as 000012 and shard-000012.tar; other names, such as those of notes, are passed over."""
+    for path in paths:
+        name = path.stem.removeprefix("shard-")
+        if name.isascii() and name.isdecimal() and f"{int(name):06d}" == name:
+            yield int(name)
 
 
 def open_data_set(folder: Path | str) -> DataSet:

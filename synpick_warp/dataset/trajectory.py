@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
+import math
+import os
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from synpick_warp.exporters.trajectory.arrays import CAMERAS, OBJECTS
+from msgspec import Meta, Struct
+
+from synpick_warp.dataset.annotations import ADVICE, check_content
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.trajectory.arrays import CAMERAS, LABELS, OBJECTS, GroupSpec
+from synpick_warp.inputs.files import check_regular_file, describe_bytes, read_file
+from synpick_warp.inputs.json import decode_json
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,6 +23,10 @@ if TYPE_CHECKING:
 
 GROUP_FILE = "zarr.json"
 """Metadata of a zarr group or array (zarr format 3)."""
+MAX_ARRAY = 2**36
+"""Largest array and chunk [bytes]: 64 GiB, the poses of 200 objects in 12 million steps."""
+_MAX_METADATA = 2**24
+"""Largest zarr.json [bytes]; those of a bake have some kilobytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,22 +62,111 @@ class CameraInfo:
     """World to camera (3) float64 [m]."""
 
 
+class _ChunkShape(Struct):
+    chunk_shape: list[Annotated[int, Meta(ge=1, lt=2**40)]]
+
+
+class _ChunkGrid(Struct):
+    name: Literal["regular"]
+    configuration: _ChunkShape
+
+
+class _Codec(Struct):
+    name: Literal["bytes", "zstd", "crc32c", "sharding_indexed"]
+
+
+class _ArrayMetadata(Struct):
+    """The zarr.json of an array, as far as it decides on memory and code: other codecs and types are never loaded."""
+
+    zarr_format: Literal[3]
+    node_type: Literal["array"]
+    shape: Annotated[list[Annotated[int, Meta(ge=0, lt=2**40)]], Meta(max_length=8)]
+    data_type: Literal["bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float32", "float64"]
+    chunk_grid: _ChunkGrid
+    codecs: list[_Codec]
+
+
+class _GroupMetadata(Struct):
+    """The zarr.json of a group."""
+
+    zarr_format: Literal[3]
+    node_type: Literal["group"]
+    attributes: dict[str, Any]
+
+
+class StoreAttributes(Struct):
+    """What the attributes of every trajectory store have, as far as it is used here."""
+
+    steps_per_tick: Annotated[int, Meta(ge=1, lt=2**20)]
+
+
+class _ObjectsAttributes(Struct):
+    names: Annotated[list[str], Meta(max_length=2**16)]
+
+
+@dataclass(frozen=True)
+class GroupContext:
+    """What the arrays of a group must agree with; computed when the first array is opened."""
+
+    sizes: Callable[[], Mapping[str, int]] = dict
+    """Sizes of dimensions by name, such as that of `tick`; others can have any."""
+    files: Callable[[], Collection[Path]] = tuple
+    """Files that the manifest lists; none if there is no manifest."""
+
+
 class Arrays(Mapping[str, "zarr.Array"]):
     """Arrays of one zarr group by name, each opened on access: `arrays["pose"][10:20]` reads these rows only."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, schema: GroupSpec, context: GroupContext | None = None) -> None:
         """
         Args:
             folder: Folder of the group; if there is none, the mapping is empty.
+            schema: Schema of the group.
+            context: What the arrays must agree with.
         """
-        self._folder = folder
+        self._folder, self._schema, self._context = folder, schema, context or GroupContext()
 
     def __getitem__(self, name: str) -> zarr.Array:
-        if "/" in name or not (self._folder / name / GROUP_FILE).is_file():
+        if "/" in name or name in (".", "..") or not (self._folder / name / GROUP_FILE).exists():
             raise KeyError(f"{name}; there are {', '.join(self) or 'no arrays'}")
-        import zarr
+        folder = self._folder / name
+        metadata = decode_json(
+            read_file(folder / GROUP_FILE, _MAX_METADATA, DatasetError), _ArrayMetadata, folder / GROUP_FILE, DatasetError, ADVICE
+        )
+        self._check_layout(folder, metadata)
+        self._check_files(folder)
+        from synpick_warp.dataset.stored_array import open_stored_array
 
-        return zarr.open_array(self._folder / name, mode="r")
+        return open_stored_array(folder)
+
+    def _check_layout(self, folder: Path, metadata: _ArrayMetadata) -> None:
+        """Check type and shape against the schema, and the size of the array."""
+        import numpy as np
+
+        shape, dtype = tuple(metadata.shape), np.dtype(metadata.data_type)
+        spec = self._schema.arrays.get(folder.name)
+        if spec is not None:
+            sizes = dict(self._context.sizes())
+            expected = tuple(len(LABELS[name]) if name in LABELS else sizes.get(name) for name in spec.dims)
+            fits = len(shape) == len(expected) and all(size in (None, given) for size, given in zip(expected, shape, strict=True))
+            if dtype != np.dtype(spec.dtype) or not fits:
+                wanted = " x ".join(name if size is None else str(size) for name, size in zip(spec.dims, expected, strict=True))
+                there = f"{dtype.name} of shape {' x '.join(map(str, shape))}"
+                raise DatasetError(f"the array {folder} is {there}; expected: {np.dtype(spec.dtype).name} of shape {wanted}; {ADVICE}")
+        chunk = metadata.chunk_grid.configuration.chunk_shape
+        if len(chunk) != len(shape) or max(math.prod(shape), math.prod(chunk)) * dtype.itemsize > MAX_ARRAY:
+            raise DatasetError(f"the array {folder} has chunks of another shape, or more than {describe_bytes(MAX_ARRAY)}; {ADVICE}")
+
+    def _check_files(self, folder: Path) -> None:
+        """Check that the chunk files that the manifest lists exist, and that all are regular files.
+
+        Zarr takes a chunk without file for one without values, and those are not written: only the manifest tells a lost one.
+        """
+        present = {folder / entry.name for entry in os.scandir(folder)}
+        for path in sorted(path for path in self._context.files() if path.parent == folder and path not in present):
+            raise DatasetError(f"there is no {path}, which the manifest lists; {ADVICE}")
+        for path in present:
+            check_regular_file(path, MAX_ARRAY, DatasetError)
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted(path.parent.name for path in self._folder.glob(f"*/{GROUP_FILE}")))
@@ -78,23 +178,40 @@ class Arrays(Mapping[str, "zarr.Array"]):
         return f"Arrays({', '.join(self)})"
 
 
-def read_objects(store: Path) -> tuple[ObjectInfo, ...]:
+def read_objects(store: Path, context: GroupContext | None = None) -> tuple[ObjectInfo, ...]:
     """Read the object table of a store, by catalog index."""
-    names = read_attributes(store / "objects")["names"]
-    columns = {name: read_array(array) for name, array in Arrays(store / "objects").items() if name in OBJECTS.arrays}
+    folder = store / "objects"
+    names = check_content(read_attributes(folder), _ObjectsAttributes, folder / GROUP_FILE).names
+    files = (context or GroupContext()).files
+    columns = _read_columns(Arrays(folder, OBJECTS, GroupContext(lambda: {"object": len(names)}, files)), OBJECTS, folder)
     rows = [{name: _to_python(values[row]) for name, values in columns.items()} for row in range(len(names))]
     return tuple(ObjectInfo(name=name, **row) for name, row in zip(names, rows, strict=True))
 
 
-def read_cameras(store: Path) -> tuple[CameraInfo, ...]:
-    """Read the camera table of a store, by camera index."""
-    columns = {name: read_array(array) for name, array in Arrays(store / "cameras").items() if name in CAMERAS.arrays}
-    return tuple(CameraInfo(**{name: values[row] for name, values in columns.items()}) for row in range(len(columns["matrix"])))
+def read_cameras(store: Path, count: int | None, context: GroupContext | None = None) -> tuple[CameraInfo, ...]:
+    """Read the camera table of a store, by camera index; `count` is the number of cameras, if it is known."""
+    sizes = {"width_height": 2, "row": 3, "column": 3} | ({} if count is None else {"camera": count})
+    folder, files = store / "cameras", (context or GroupContext()).files
+    columns = _read_columns(Arrays(folder, CAMERAS, GroupContext(lambda: sizes, files)), CAMERAS, folder)
+    rows = min(len(values) for values in columns.values())
+    return tuple(CameraInfo(**{name: values[row] for name, values in columns.items()}) for row in range(rows))
+
+
+def _read_columns(arrays: Arrays, schema: GroupSpec, folder: Path) -> dict[str, np.ndarray]:
+    """Read all arrays of a table."""
+    if missing := sorted(set(schema.arrays) - set(arrays)):
+        raise DatasetError(f"{folder} has no array {missing[0]}; {ADVICE}")
+    return {name: read_array(arrays[name]) for name in schema.arrays}
 
 
 def read_attributes(group: Path) -> dict[str, Any]:
-    """Read a zarr group's attributes, without zarr."""
-    return json.loads((group / GROUP_FILE).read_bytes())["attributes"]
+    """Read a zarr group's attributes, without zarr.
+
+    Raises:
+        DatasetError: The group's zarr.json is missing or damaged.
+    """
+    path = group / GROUP_FILE
+    return decode_json(read_file(path, _MAX_METADATA, DatasetError), _GroupMetadata, path, DatasetError, ADVICE).attributes
 
 
 def read_array(array: zarr.Array) -> np.ndarray:

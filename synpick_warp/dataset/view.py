@@ -12,11 +12,15 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.configs.schema import LAYERS
-from synpick_warp.dataset.view_files import SceneFiles, ViewRecords
-from synpick_warp.layer_codec import decode_layer
+from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.dataset.view_files import SceneFiles, ViewRecords, check_planes
+from synpick_warp.errors import DatasetError
+from synpick_warp.layer_codec import decode_layer, image_format
 
 MILLIMETERS = 1000.0
 """In a metre: BOP's files are in millimetres, this module is in metres."""
+_ORTHOGONAL = 1e-3
+"""Tolerance of R Rᵀ = 1 for a rotation that is read; files have at least six digits."""
 
 
 class View:
@@ -41,13 +45,17 @@ class View:
     @cached_property
     def rgb(self) -> np.ndarray:
         """Colour image, sRGB (H, W, 3) uint8, red first."""
-        return np.ascontiguousarray(self._files.image("rgb", self.frame)[..., ::-1])
+        return np.ascontiguousarray(self._image("rgb", 3, "uint8")[..., ::-1])
 
     @cached_property
     def depth(self) -> np.ndarray:
         """Planar depth (z in the camera frame) (H, W) float32 [m]; 0: no surface."""
         scale = np.float32(self.records.camera["depth_scale"] / MILLIMETERS)
-        return self._files.image("depth", self.frame) * scale
+        return self._image("depth", None, "uint16") * scale
+
+    def _image(self, name: str, channels: int | None, dtype: str) -> np.ndarray:
+        """An image of the camera's size, with these channels."""
+        return check_planes(self._files.image(name, self.frame), channels, f"{name} of image {self.frame} in {self._files.place}", dtype)
 
     @cached_property
     def masks(self) -> np.ndarray:
@@ -75,19 +83,27 @@ class View:
         Raises:
             DatasetError: The data set has no such layer.
         """
-        image = self._files.image(name, self.frame)
-        return decode_layer(name, image[..., ::-1] if image.ndim == 3 else image)
+        if name not in LAYERS:
+            raise DatasetError(f"there is no layer {name}; layers: {', '.join(LAYERS)}")
+        dtype, channels = image_format(name)
+        image = self._image(name, channels, dtype)
+        return decode_layer(name, image if channels is None else image[..., ::-1])
 
     @cached_property
     def intrinsics(self) -> np.ndarray:
         """Camera matrix K (3, 3) float64 [px]."""
-        return np.reshape(self.records.camera["cam_K"], (3, 3))
+        return np.reshape(np.asarray(self.records.camera["cam_K"], np.float64), (3, 3))
 
     @cached_property
     def world_to_camera(self) -> np.ndarray:
         """Camera extrinsics (4, 4) float64 [m]."""
-        camera = self.records.camera
-        return make_transform(camera["cam_R_w2c"], camera["cam_t_w2c"])
+        camera, place = self.records.camera, f"{self._files.place}: the camera of image {self.frame}"
+        if not {"cam_R_w2c", "cam_t_w2c"} <= camera.keys():
+            raise DatasetError(f"{place} has no cam_R_w2c and cam_t_w2c; {ADVICE}")
+        transform = make_transform(camera["cam_R_w2c"], camera["cam_t_w2c"])
+        if not np.allclose(transform[:3, :3] @ transform[:3, :3].T, np.eye(3), rtol=0.0, atol=_ORTHOGONAL):
+            raise DatasetError(f"{place} has a cam_R_w2c that is no rotation; {ADVICE}")
+        return transform
 
     @cached_property
     def object_to_camera(self) -> np.ndarray:
@@ -107,6 +123,8 @@ class View:
     @cached_property
     def instance_ids(self) -> np.ndarray:
         """Track id of each instance (N) int64: the same object through its whole episode and in all cameras."""
+        if not all("instance_id" in row for row in self.records.gt):
+            raise DatasetError(f"{self._files.place}: an instance of image {self.frame} has no instance_id; {ADVICE}")
         return self._column("gt", "instance_id", np.int64)
 
     @cached_property
@@ -154,6 +172,6 @@ class View:
 def make_transform(rotation: Any, translation: Any) -> np.ndarray:
     """A rigid transform (4, 4) float64 [m] from BOP's rotation (9, row by row) and translation (3) [mm]."""
     transform = np.eye(4)
-    transform[:3, :3] = np.reshape(rotation, (3, 3))
-    transform[:3, 3] = np.asarray(translation) / MILLIMETERS
+    transform[:3, :3] = np.reshape(np.asarray(rotation, np.float64), (3, 3))
+    transform[:3, 3] = np.asarray(translation, np.float64) / MILLIMETERS
     return transform

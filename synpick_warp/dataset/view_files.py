@@ -1,24 +1,28 @@
-"""Image and annotation files of rendered views: BOP scene folders and webdataset shards behind one interface."""
+"""Image and annotation files of rendered views: BOP scene folders and webdataset shards behind one interface.
+
+What is read is checked once: annotations against their schemas, images against the camera's resolution.
+"""
 
 from __future__ import annotations
 
-import json
 import tarfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from synpick_warp.dataset.annotations import ADVICE, MASK_SCHEMA, SCENE_SCHEMAS, VIEW_SCHEMAS, check_json, read_checked
 from synpick_warp.errors import DatasetError
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from synpick_warp.inputs.files import check_regular_file, describe_bytes
+from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image, read_image_file
 
 SUFFIXES = (".png", ".jpg")
 """File formats of images; colour may be either."""
 RECORD_NAMES = ("camera", "gt", "gt_info")
+MAX_SHARD = 2**44
+"""Largest shard [bytes]: the limit of a file on ext4."""
 
 
 class ViewRecords(NamedTuple):
@@ -33,6 +37,11 @@ class ViewRecords(NamedTuple):
 
 class SceneFiles(Protocol):
     """Files of one scene: all frames of one camera in one episode."""
+
+    @property
+    def place(self) -> Path:
+        """Folder or first shard, for messages."""
+        ...
 
     def records(self, frame: int) -> ViewRecords:
         """Annotations of a frame."""
@@ -54,30 +63,41 @@ class SceneFiles(Protocol):
 class SceneFolder:
     """`SceneFiles` of a BOP "scenewise" folder: one file per image and mask."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, size: tuple[int, int] | None = None) -> None:
         """
         Args:
             folder: Scene folder, such as DATA/train_pbr/000000.
+            size: Width and height of the camera's images [px]; None: not checked.
         """
-        self.folder = folder
+        self.folder, self.size = folder, size
+
+    @property
+    def place(self) -> Path:
+        """See `SceneFiles`."""
+        return self.folder
 
     @cached_property
-    def _records(self) -> list[dict[str, Any]]:
-        return [read_json(self.folder / f"scene_{name}.json") for name in RECORD_NAMES]
+    def _records(self) -> list[dict[int, Any]]:
+        return [read_checked(self.folder / f"scene_{name}.json", SCENE_SCHEMAS[name]) for name in RECORD_NAMES]
 
     def records(self, frame: int) -> ViewRecords:
         """See `SceneFiles`."""
-        return _check_records([part.get(str(frame)) for part in self._records], self.folder, frame)
+        return _check_records([part.get(frame) for part in self._records], self.folder, frame)
 
     def image(self, name: str, frame: int) -> np.ndarray:
         """See `SceneFiles`."""
-        return read_image(self.folder / name, f"{frame:06d}")
+        return read_image(self.folder / name, f"{frame:06d}", size=self.size)
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
         """See `SceneFiles`."""
         if not (self.folder / name).is_dir():
             raise DatasetError(f"{self.folder} has no {name}; bake with bop.masks = true")
-        return [read_image(self.folder / name, f"{frame:06d}_{index:06d}") > 0 for index in range(count)]
+        return [self.mask(name, frame, index) for index in range(count)]
+
+    def mask(self, name: str, frame: int, index: int) -> np.ndarray:
+        """One of `masks`."""
+        stem = f"{frame:06d}_{index:06d}"
+        return check_planes(read_image(self.folder / name, stem, size=self.size), None, f"{self.folder / name / stem}.png") > 0
 
     def layers(self) -> set[str]:
         """See `SceneFiles`."""
@@ -87,46 +107,49 @@ class SceneFolder:
 class SceneShards:
     """`SceneFiles` of webdataset shards: tar files of whole views. The index of a tar file is read once, members by their offset."""
 
-    def __init__(self, shards: Sequence[Path], scene: int) -> None:
+    def __init__(self, shards: Sequence[Path], scene: int, size: tuple[int, int]) -> None:
         """
         Args:
             shards: The scene's tar files.
             scene: Index of the scene, with which keys begin.
+            size: Width and height of the camera's images [px].
         """
-        self.shards, self.scene = tuple(shards), scene
+        self.shards, self.scene, self.size = tuple(shards), scene, size
+
+    @property
+    def place(self) -> Path:
+        """See `SceneFiles`."""
+        return self.shards[0]
 
     @cached_property
     def _members(self) -> Mapping[str, tuple[Path, int, int]]:
         """Member name -> (shard, offset, size) [B]."""
-        members = {}
-        for shard in self.shards:
-            try:
-                with tarfile.open(shard, "r:") as file:
-                    members |= {member.name: (shard, member.offset_data, member.size) for member in file}
-            except (OSError, tarfile.TarError) as error:
-                raise DatasetError(f"cannot read {shard}: {error}") from error
-        return members
+        return {name: (shard, offset, size) for shard in self.shards for name, offset, size in list_members(shard)}
 
     def records(self, frame: int) -> ViewRecords:
         """See `SceneFiles`."""
-        parts = [self._read(frame, f"{name}.json") for name in RECORD_NAMES]
-        return _check_records([part and json.loads(part) for part in parts], self.shards[0], frame)
+        parts = [self._json(frame, name, VIEW_SCHEMAS[name]) for name in RECORD_NAMES]
+        return _check_records(parts, self.shards[0], frame)
 
     def image(self, name: str, frame: int) -> np.ndarray:
         """See `SceneFiles`."""
         for suffix in SUFFIXES:
             data = self._read(frame, f"{name}{suffix}")
             if data is not None:
-                return decode_image(data, f"{self._key(frame)}.{name}{suffix} in {self.shards[0].parent}")
+                return decode_image(data, self._source(frame, f"{name}{suffix}"), DatasetError, size=self.size)
         raise DatasetError(f"{self.shards[0].parent} has no {self._key(frame)}.{name}{SUFFIXES[0]}; the data set is not complete")
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
         """See `SceneFiles`."""
-        data = self._read(frame, f"{name}.json")
-        if data is None:
+        records = self._json(frame, name, MASK_SCHEMA)
+        if records is None:
             raise DatasetError(f"{self.shards[0]} has no {name}; bake with bop.masks = true")
-        records = json.loads(data)
-        return [decode_run_lengths(**records[str(index)]) for index in range(count)]
+        source = self._source(frame, f"{name}.json")
+        if missing := set(range(count)) - set(records):
+            raise DatasetError(f"{source} has no mask {min(missing)}, but there are {count} instances; {ADVICE}")
+        for index in range(count):
+            _check_run_lengths(records[index], self.size, f"{source}, mask {index},")
+        return [decode_run_lengths(records[index]["counts"], records[index]["size"]) for index in range(count)]
 
     def layers(self) -> set[str]:
         """See `SceneFiles`."""
@@ -136,14 +159,58 @@ class SceneShards:
     def _key(self, frame: int) -> str:
         return f"{self.scene:06d}_{frame:06d}"
 
+    def _source(self, frame: int, name: str) -> str:
+        """A member in messages."""
+        return f"{self._key(frame)}.{name} in {self.shards[0].parent}"
+
+    def _json(self, frame: int, name: str, schema: Any) -> Any:
+        """Checked content of a JSON member; None: there is none."""
+        data = self._read(frame, f"{name}.json")
+        return None if data is None else check_json(data, schema, self._source(frame, f"{name}.json"))
+
     def _read(self, frame: int, name: str) -> bytes | None:
         """Content of a member; None: there is none."""
         shard, offset, size = self._members.get(f"{self._key(frame)}.{name}", (None, 0, 0))
         if shard is None:
             return None
+        try:
+            with shard.open("rb") as file:
+                file.seek(offset)
+                data = file.read(size)
+        except OSError as error:
+            raise DatasetError(f"{shard} cannot be read: {error.strerror}") from None
+        if len(data) < size:
+            raise DatasetError(f"{shard} is damaged: it ends within {self._key(frame)}.{name}; {ADVICE}")
+        return data
+
+
+def list_members(shard: Path) -> list[tuple[str, int, int]]:
+    """List the members of a tar file: name, offset and size [B]. Only headers are read; members must be regular files, as in shards.
+
+    Raises:
+        DatasetError: The file cannot be read, is truncated, or has another member: a link, a device, a sparse file, an extended header.
+    """
+    check_regular_file(shard, MAX_SHARD, DatasetError)
+    members = []
+    try:
         with shard.open("rb") as file:
-            file.seek(offset)
-            return file.read(size)
+            end = shard.stat().st_size
+            while any(block := file.read(tarfile.BLOCKSIZE)):
+                info = tarfile.TarInfo.frombuf(block, "utf-8", "strict")
+                start = file.tell()
+                if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE):
+                    raise DatasetError(f"{shard} has a member at byte {start - len(block)} that is not a regular file; {ADVICE}")
+                if not 0 <= info.size <= min(MAX_IMAGE_FILE, end - start):
+                    raise DatasetError(
+                        f"{shard} is damaged: the member at byte {start - len(block)} has {describe_bytes(info.size)}; {ADVICE}"
+                    )
+                members.append((info.name, start, info.size))
+                file.seek(start + -(-info.size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE)
+    except OSError as error:
+        raise DatasetError(f"{shard} cannot be read: {error.strerror}") from None
+    except (tarfile.TarError, ValueError) as error:  # Names that are not UTF-8 are ValueErrors.
+        raise DatasetError(f"{shard} is damaged: {error}; {ADVICE}") from None
+    return members
 
 
 def _check_records(parts: list[Any], place: Path, frame: int) -> ViewRecords:
@@ -151,6 +218,36 @@ def _check_records(parts: list[Any], place: Path, frame: int) -> ViewRecords:
     if camera is None or gt is None or info is None or len(gt) != len(info):
         raise DatasetError(f"{place}: scene_camera.json, scene_gt.json and scene_gt_info.json do not agree about image {frame}")
     return ViewRecords(camera, gt, info)
+
+
+def _check_run_lengths(record: Mapping[str, Any], size: tuple[int, int], source: str) -> None:
+    """Check that run lengths cover an image of that width and height exactly."""
+    height, width = record["size"]
+    if (width, height) != size:
+        raise DatasetError(f"{source} has {width} x {height} pixels; the images of this camera have {size[0]} x {size[1]}")
+    if sum(record["counts"]) != width * height:
+        raise DatasetError(f"{source} is damaged: its runs have {sum(record['counts'])} of {width * height} pixels; {ADVICE}")
+
+
+def check_planes(image: np.ndarray, channels: int | None, source: object, dtype: str = "") -> np.ndarray:
+    """Check channels and type of a decoded image; returns it.
+
+    Args:
+        image: (H, W[, C]).
+        channels: Number of channels C; None: the image has two dimensions.
+        source: File, for the message.
+        dtype: NumPy's name of the type; empty: any.
+
+    Raises:
+        DatasetError: The image has others.
+    """
+    expected = () if channels is None else (channels,)
+    if image.shape[2:] != expected or (dtype and image.dtype.name != dtype):
+        kind = f" of type {dtype}" if dtype else ""
+        raise DatasetError(
+            f"{source} has {(*image.shape[2:], 1)[0]} channels of type {image.dtype}; expected: {channels or 1}{kind}; {ADVICE}"
+        )
+    return image
 
 
 def decode_run_lengths(counts: Sequence[int], size: Sequence[int]) -> np.ndarray:
@@ -167,47 +264,20 @@ def decode_run_lengths(counts: Sequence[int], size: Sequence[int]) -> np.ndarray
     return np.repeat(values, counts).reshape(size[1], size[0]).T
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object from a file.
-
-    Raises:
-        DatasetError: The file is missing, or not JSON.
-    """
-    try:
-        return json.loads(path.read_bytes())
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise DatasetError(f"{path} is not a JSON file: {error}") from error
-
-
-def read_image(folder: Path, stem: str, flags: int = -1) -> np.ndarray:
+def read_image(folder: Path, stem: str, flags: int = -1, size: tuple[int, int] | None = None) -> np.ndarray:
     """Decode the PNG or JPEG file of that name without suffix.
 
     Args:
         folder: Where it lies.
         stem: File name without suffix.
         flags: OpenCV's `IMREAD_` flags; -1: unchanged.
+        size: Width and height that it must have [px]; None: any.
 
     Raises:
-        DatasetError: There is none, or OpenCV cannot decode it.
+        DatasetError: There is none, or OpenCV cannot decode it, or it has another size.
     """
     for suffix in SUFFIXES:
         path = folder / f"{stem}{suffix}"
-        if path.is_file():
-            return decode_image(path.read_bytes(), str(path), flags)
+        if path.exists():
+            return read_image_file(path, DatasetError, flags, size)
     raise DatasetError(f"there is no {folder / stem}.png or .jpg; the data set is not complete")
-
-
-def decode_image(data: bytes, name: str, flags: int = -1) -> np.ndarray:
-    """Decode a PNG or JPEG file's content by OpenCV; `name` is for the message.
-
-    Raises:
-        DatasetError: OpenCV cannot decode it.
-    """
-    import cv2
-
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
-    if image is None:
-        raise DatasetError(f"{name} is not an image that OpenCV can decode")
-    return image

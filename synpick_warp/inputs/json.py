@@ -53,4 +53,4 @@ def read_json_lines(
 
 def _describe(fault: Exception) -> str:
     text: Any = "nested too deeply" if isinstance(fault, RecursionError) else str(fault).replace("`", "")
-    return f"{text[:1].lower()}{text[1:]}"
+    return text if text.startswith("JSON") else f"{text[:1].lower()}{text[1:]}"

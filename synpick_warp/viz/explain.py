@@ -15,8 +15,11 @@ import numpy as np
 
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.view_files import read_image, read_json
+from synpick_warp.dataset.annotations import SCENE_SCHEMAS, Key, ModelDiameter, read_checked
+from synpick_warp.dataset.view_files import read_image
 from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.files import check_regular_file
+from synpick_warp.inputs.paths import path_inside
 from synpick_warp.viz.explain_graph import (
     CYCLIC,
     GREY,
@@ -55,6 +58,8 @@ _MODEL_NAME = re.compile(rb"^comment (.+), millimetres\r?$", re.MULTILINE)
 """Comment in a PLY file that the BOP exporter wrote: the object's name."""
 _PLY_HEAD = 2048
 """Size of the part of a PLY file that is searched for comments [B]."""
+_MAX_MODEL = 2**40
+"""Largest PLY file [B]; only its head is read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +91,7 @@ def write_explanation(dataset: Path, out: Path, episode: int, attempt: int | Non
         raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
     attempts = read_attempts(dataset, episode, attempt)
     path = dataset / "config.toml"
-    if not path.is_file():
+    if not path.exists():
         raise DatasetError(f"{dataset} has no config.toml; the settings of the bake are needed to explain what it did")
     config = load_config(str(path), {})
     names = object_names(dataset, config, {one.object_id for each in attempts for one in each.seen})
@@ -96,15 +101,16 @@ def write_explanation(dataset: Path, out: Path, episode: int, attempt: int | Non
 
 def object_names(dataset: Path, config: Config, object_ids: set[int]) -> dict[int, str]:
     """Names of objects (obj_id -> name): from the exported model's comment, else from the settings' object table; some have none."""
-    infos = read_json(dataset / "models" / "models_info.json")
+    infos = read_checked(dataset / "models" / "models_info.json", dict[Key, ModelDiameter])
     names = {}
     for object_id in object_ids:
         path = dataset / "models" / f"obj_{object_id:06d}.ply"
         comment = None
-        if path.is_file():
+        if path.exists():
+            check_regular_file(path, _MAX_MODEL, DatasetError)
             with path.open("rb") as file:
                 comment = _MODEL_NAME.search(file.read(_PLY_HEAD))
-        size = float(infos.get(str(object_id), {}).get("diameter", 0.0)) / 1000.0
+        size = float(infos.get(object_id, {}).get("diameter", 0.0)) / 1000.0
         fits = (row.name for row in config.object_rows if row.id == object_id and _fits(row.diameter, size, config))
         name = comment[1].decode(errors="replace") if comment else next(fits, "")
         if name:
@@ -118,18 +124,19 @@ def _fits(expected: float, size: float, config: Config) -> bool:
 
 
 def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
-    scene = dataset / config.bop.split / f"{len(config.cameras.positions) * attempt.episode:06d}"
+    split = path_inside(dataset, config.bop.split, dataset / "config.toml", DatasetError)
+    scene = split / f"{len(config.cameras.positions) * attempt.episode:06d}"
     stem = f"{attempt.frame:06d}"
-    truth = read_json(scene / "scene_gt.json").get(str(attempt.frame))
+    truth = read_checked(scene / "scene_gt.json", SCENE_SCHEMAS["gt"]).get(attempt.frame)
     if truth is None:
         raise DatasetError(f"{scene}/scene_gt.json has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
-    color = read_image(scene / "rgb", stem, cv2.IMREAD_COLOR)
+    color = read_image(scene / "rgb", stem, cv2.IMREAD_COLOR, config.cameras.resolution)
     masks = None
     folder = scene / "mask_visib"
     if folder.is_dir():
         seen = attempt.objects
         masks = {
-            record["instance_id"]: read_image(folder, f"{stem}_{index:06d}", cv2.IMREAD_GRAYSCALE)
+            record["instance_id"]: read_image(folder, f"{stem}_{index:06d}", cv2.IMREAD_GRAYSCALE, color.shape[1::-1])
             for index, record in enumerate(truth)
             if record.get("instance_id") in seen
         }
@@ -194,7 +201,7 @@ def _draw_image(attempt: Attempt, scene: _Scene) -> Image:
     """Draw contours and suction points on the colour image, which is darkened except for the target."""
     height, width = scene.color.shape[:2]
     scale = image_scale((width, height))
-    size = (round(scale * width), round(scale * height))
+    size = (max(1, round(scale * width)), max(1, round(scale * height)))
     color = cv2.resize(scene.color, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     drawn = (0.62 * color).astype(np.uint8)
     order = sorted(scene.masks or {}, key=lambda instance: instance == attempt.target)

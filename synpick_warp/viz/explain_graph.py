@@ -33,6 +33,8 @@ _MARGIN = 38
 """Distance from the border to the outermost nodes' centres [px]."""
 _SWEEPS = 8
 """Number of downward and upward sweeps; more change nothing in graphs of this size."""
+_MAX_PIECES = 1000
+"""Maximum number of edges between neighbouring layers, whose crossings are counted pair by pair; those of 100 objects are some 200."""
 _BEND = 0.32
 """Offset of the control point of a removed edge's curve, as a fraction of its length; the curve deviates by half of it."""
 _SAMPLES = 12
@@ -93,7 +95,7 @@ def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> L
         size: Width and height of the image [px].
 
     Raises:
-        DatasetError: The kept edges have a cycle.
+        DatasetError: The kept edges have a cycle, or are far more than those of any pile.
     """
     width, height = size
     kept = [(edge.upper, edge.lower) for edge in edges if edge.state == KEPT]
@@ -103,6 +105,8 @@ def lay_out(attempt: Attempt, edges: Sequence[Edge], size: tuple[int, int]) -> L
     for instance, layer in depth.items():
         layers[layer].append(instance)
     chains: dict[tuple[int, int], list[Key]] = {}
+    if sum(depth[lower] - depth[upper] for upper, lower in kept) > _MAX_PIECES:
+        raise DatasetError(f"the clutter graph of attempt {attempt.number} of episode {attempt.episode} has too many edges to be drawn")
     for upper, lower in kept:
         passed: list[Key] = [(upper, lower, layer) for layer in range(depth[upper] + 1, depth[lower])]
         for step, key in enumerate(passed, start=1):

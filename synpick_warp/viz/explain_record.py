@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
+
+from msgspec import Meta, Struct
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.annotations import ADVICE, Index, Side
 from synpick_warp.dataset.manifest import ATTEMPTS_FILE
 from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.files import read_file
+from synpick_warp.inputs.json import MAX_JSON, decode_json
 
 MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
 CANDIDATES = ("pole", "centroid", "midpoint")
@@ -19,6 +23,65 @@ CANDIDATES = ("pole", "centroid", "midpoint")
 
 Pixel = tuple[float, float]
 """Column and row in the perception image; integers are pixel centres."""
+MAX_INSTANCES = 255
+"""Most instances of a scene: their ids are bytes of an image."""
+MAX_ATTEMPTS = 100
+"""Most attempts of one figure."""
+MAX_RUNS = 20
+"""Most ranges of numbers that a message lists."""
+
+
+Instances = Annotated[list[Index], Meta(max_length=MAX_INSTANCES)]
+Amount = Annotated[float, Meta(ge=0.0, le=1e9)]
+
+
+class InstanceSchema(Struct, gc=False):
+    """Schema of an instance in the observation of an attempt."""
+
+    instance: Index
+    object_id: Index
+    visible: Index
+    visible_fraction: Amount
+    pole: Pixel
+    centroid: Pixel
+    midpoint: Pixel
+    distances: tuple[Amount, Amount, Amount]
+    grasp_pixel: Pixel
+    above: Instances
+    ancestors: Instances
+
+
+class ObservationSchema(Struct, gc=False):
+    """Schema of the observation of an attempt."""
+
+    resolution: tuple[Side, Side]
+    instances: Annotated[list[InstanceSchema], Meta(max_length=MAX_INSTANCES)]
+    votes: list[tuple[Index, Index, Amount]]
+
+
+class AttemptKey(Struct, gc=False):
+    """Schema of what every line of attempts.jsonl needs."""
+
+    episode: Index
+    attempt: Index
+
+
+class AttemptSchema(AttemptKey, gc=False):
+    """Schema of a line of attempts.jsonl, as far as it is drawn."""
+
+    mode: Literal["pick", "target"]
+    frame: Index
+    end_frame: Index
+    sentence: Annotated[str, Meta(max_length=1000)]
+    target: Index | None
+    tilt: Annotated[float, Meta(ge=-4.0, le=4.0)] | None
+    rays: Index
+    hits: Index
+    good_seal: bool
+    engaged: Instances
+    picked: Instances
+    peak_force: Annotated[list[Amount], Meta(max_length=100_000)]
+    observation: ObservationSchema
 
 
 @dataclass(frozen=True)
@@ -88,119 +151,92 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
         DatasetError: The file is missing or damaged, or has no such episode or attempt.
     """
     path = dataset / ATTEMPTS_FILE
-    records = _read_records(path)
-    episodes = sorted({record["episode"] for _, record in records})
+    if not path.exists():
+        raise DatasetError(
+            f"{dataset} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target or mixed"
+        )
+    lines = read_file(path, MAX_JSON, DatasetError).splitlines()
+    keys = [decode_json(line, AttemptKey, _line(path, row), DatasetError, ADVICE) for row, line in enumerate(lines)]
+    episodes = sorted({key.episode for key in keys})
     if episode not in episodes:
         raise DatasetError(f"{path} has no attempt of episode {episode}; {_which('episodes that have', episodes)}")
-    rows = sorted((record["attempt"], line, record) for line, record in records if record["episode"] == episode)
+    rows = sorted((key.attempt, row) for row, key in enumerate(keys) if key.episode == episode)
     numbers = [row[0] for row in rows]
     if number is not None and number not in numbers:
         raise DatasetError(f"{path} has no attempt {number} of episode {episode}; {_which('attempts', numbers)}")
-    attempts = []
-    for count, line, record in rows:
-        if number in (None, count):
-            try:
-                attempts.append(_attempt(record))
-            except KeyError as error:
-                raise DatasetError(f"{path}, line {line}: the record has no {error.args[0]}") from error
-            except (TypeError, ValueError, AttributeError, ArithmeticError) as error:
-                raise DatasetError(f"{path}, line {line}: the record of an attempt has a value of the wrong type: {error}") from error
-    return attempts
-
-
-def _read_records(path: Path) -> list[tuple[int, dict[str, Any]]]:
-    """Parse a JSON Lines file: line number and object of every line."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError as error:
+    if len(rows) > MAX_ATTEMPTS and number is None:
         raise DatasetError(
-            f"{path.parent} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target or mixed"
-        ) from error
-    except OSError as error:
-        raise DatasetError(f"cannot read {path}: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise DatasetError(f"{path} is not text: byte {error.start} is not UTF-8") from error
-    records = []
-    for line, text in enumerate(lines, start=1):
-        try:
-            record = json.loads(text)
-        except ValueError as error:
-            raise DatasetError(f"{path}, line {line} is not JSON: {error}") from error
-        if not isinstance(record, dict) or not all(type(record.get(key)) is int for key in ("episode", "attempt")):
-            raise DatasetError(f"{path}, line {line} is not a record of an attempt: it needs integers episode and attempt")
-        records.append((line, record))
-    return records
+            f"{path} has {len(rows)} attempts of episode {episode}; a figure has at most {MAX_ATTEMPTS}: name one by --attempt"
+        )
+    return [
+        _attempt(decode_json(lines[row], AttemptSchema, _line(path, row), DatasetError, ADVICE), _line(path, row))
+        for count, row in rows
+        if number in (None, count)
+    ]
+
+
+def _line(path: Path, row: int) -> str:
+    """A line of a file, in messages."""
+    return f"{path}, line {row + 1},"
 
 
 def _which(what: str, numbers: list[int]) -> str:
-    """List ascending integers with runs merged: "attempts: 0 to 3, 5"."""
+    """List ascending integers with runs merged, up to MAX_RUNS runs: "attempts: 0 to 3, 5"."""
     runs: list[list[int]] = []
     for number in numbers:
         if runs and number == runs[-1][1] + 1:
             runs[-1][1] = number
         else:
             runs.append([number, number])
-    return f"{what}: {', '.join(f'{low}' if low == high else f'{low} to {high}' for low, high in runs) or 'none'}"
+    shown = [f"{low}" if low == high else f"{low} to {high}" for low, high in runs[:MAX_RUNS]] + ["..."] * (len(runs) > MAX_RUNS)
+    return f"{what}: {', '.join(shown) or 'none'}"
 
 
-def _attempt(record: dict[str, Any]) -> Attempt:
-    """Parse and validate the record of an attempt."""
-    observation = record["observation"]
-    width, height = map(int, observation["resolution"])
-    if min(width, height) < 1:
-        raise ValueError(f"resolution is {width} x {height}")
-    seen = tuple(_seen(one) for one in observation["instances"] if one["visible"] > 0)
-    target = None if record["target"] is None else int(record["target"])
-    if target is not None and target not in {one.instance for one in seen}:
-        raise ValueError(f"target is {target}, which was not visible")
-    if record["mode"] not in MODE_WORDS:
-        raise ValueError(f"mode is {json.dumps(record['mode'])}")
+def _attempt(record: AttemptSchema, source: str) -> Attempt:
+    """Check the record of an attempt for consistency, and convert it."""
+    width, height = record.observation.resolution
+    visible = [one for one in record.observation.instances if one.visible > 0]
+    if record.target is not None and record.target not in {one.instance for one in visible}:
+        raise DatasetError(f"{source} is damaged: target is {record.target}, which was not visible; {ADVICE}")
+    for one in visible:
+        points = (one.pole, one.centroid, one.midpoint, one.grasp_pixel)
+        if not all(-1.0 <= column <= width and -1.0 <= row <= height for column, row in points):
+            raise DatasetError(
+                f"{source} is damaged: a point of instance {one.instance} is not in the image of {width} x {height}; {ADVICE}"
+            )
     return Attempt(
-        episode=record["episode"],
-        number=record["attempt"],
-        mode=record["mode"],
-        frame=int(record["frame"]),
-        end_frame=int(record["end_frame"]),
-        sentence=str(record["sentence"]),
-        target=target,
-        tilt=None if record["tilt"] is None else float(record["tilt"]),
-        rays=int(record["rays"] or 0),
-        hits=int(record["hits"] or 0),
-        good_seal=bool(record["good_seal"]),
-        engaged=tuple(map(int, record["engaged"])),
-        picked=tuple(map(int, record["picked"])),
-        peak_force=tuple(map(_finite, record["peak_force"])),
+        episode=record.episode,
+        number=record.attempt,
+        mode=record.mode,
+        frame=record.frame,
+        end_frame=record.end_frame,
+        sentence=record.sentence,
+        target=record.target,
+        tilt=record.tilt,
+        rays=record.rays,
+        hits=record.hits,
+        good_seal=record.good_seal,
+        engaged=tuple(record.engaged),
+        picked=tuple(record.picked),
+        peak_force=tuple(record.peak_force),
         resolution=(width, height),
-        seen=seen,
-        votes={(int(lower), int(upper)): _finite(votes) for lower, upper, votes in observation["votes"]},
+        seen=tuple(map(_seen, visible)),
+        votes={(lower, upper): votes for lower, upper, votes in record.observation.votes},
     )
 
 
-def _seen(record: dict[str, Any]) -> SeenObject:
-    first, second, third = map(_finite, record["distances"])
+def _seen(record: InstanceSchema) -> SeenObject:
     return SeenObject(
-        instance=int(record["instance"]),
-        object_id=int(record["object_id"]),
-        visible=int(record["visible"]),
-        visible_fraction=float(record["visible_fraction"]),
-        candidates=(_pixel(record["pole"]), _pixel(record["centroid"]), _pixel(record["midpoint"])),
-        distances=(first, second, third),
-        grasp_pixel=_pixel(record["grasp_pixel"]),
-        above=frozenset(map(int, record["above"])),
-        ancestors=frozenset(map(int, record["ancestors"])),
+        instance=record.instance,
+        object_id=record.object_id,
+        visible=record.visible,
+        visible_fraction=record.visible_fraction,
+        candidates=(record.pole, record.centroid, record.midpoint),
+        distances=record.distances,
+        grasp_pixel=record.grasp_pixel,
+        above=frozenset(record.above),
+        ancestors=frozenset(record.ancestors),
     )
-
-
-def _pixel(value: Any) -> Pixel:
-    column, row = map(_finite, value)
-    return column, row
-
-
-def _finite(value: Any) -> float:
-    """Check that a number is finite."""
-    if not math.isfinite(value):
-        raise ValueError(f"{value} is not finite")
-    return float(value)
 
 
 def labels(attempt: Attempt) -> dict[int, str]:

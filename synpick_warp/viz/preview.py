@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Callable
+import itertools
+import os
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,12 +14,17 @@ from typing import Any
 import cv2
 import numpy as np
 
-from synpick_warp.dataset.view_files import read_image, read_json
+from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
+from synpick_warp.dataset.view_files import SceneFolder, check_planes, read_image
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.viz.preview_layers import layer_pictures
 
 _PANEL_WIDTH = 480
 """Width of one image on the sheet [px]."""
+_MAX_PANEL_HEIGHT = 1920
+"""Maximum height of one image on the sheet [px]: tall images become narrower."""
+MAX_VIEWS = 200
+"""Maximum number of views on a sheet: some 76,000 rows of pixels."""
 _CAPTION = 20
 """Height of the caption above an image [px]."""
 _GAP = 4
@@ -49,16 +56,16 @@ def write_contact_sheet(dataset: Path, out: Path, views: int) -> Path:
     Args:
         dataset: Folder of the data set; all its splits are sampled.
         out: PNG or JPEG file to write; its folder is created.
-        views: Maximum number of views, spread over cameras, scenes and time.
+        views: Maximum number of views, spread over cameras, scenes and time; the sheet has no more than the data set.
 
     Raises:
         DatasetError: The folder is not a data set, or a file is missing or damaged.
-        OutputError: The image cannot be written.
+        OutputError: The image cannot be written, or has more than MAX_VIEWS views.
     """
     check_picture_name(out)
     if views < 1:
         raise OutputError(f"{views} views requested; a contact sheet has at least 1")
-    rows = [_row(_read_view(scene, frame)) for scene, frame in sample(find_scenes(dataset), views)]
+    rows = [_row(view) for view in _read_views(sample(find_scenes(dataset), views))]
     width = max(row.shape[1] for row in rows)
     sheet = np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows])
     return write_picture(out, sheet)
@@ -77,10 +84,28 @@ def write_picture(out: Path, picture: Image) -> Path:
         OutputError: It cannot be written.
     """
     try:
+        encoded, data = cv2.imencode(out.suffix, picture)
+    except cv2.error:
+        encoded, data = False, np.empty(0, np.uint8)
+    if not encoded:
+        raise OutputError(
+            f"cannot write {out}: OpenCV cannot encode {picture.shape[1]} x {picture.shape[0]} pixels; use .png or fewer views"
+        )
+    partial_file = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_bytes(cv2.imencode(out.suffix, picture)[1].tobytes())
-    except OSError as error:
-        raise OutputError(f"cannot write {out}: {error.strerror}") from error
+        if out.is_dir():
+            raise OutputError(f"cannot write {out}: it is a folder")
+        try:
+            # A link of that name in the data set is replaced, never followed.
+            with open(partial_file, "xb") as file:
+                file.write(data.tobytes())
+            partial_file.replace(out)
+        except BaseException:
+            partial_file.unlink(missing_ok=True)
+            raise
+    except (OSError, ValueError) as error:
+        raise OutputError(f"cannot write {out}: {getattr(error, 'strerror', None) or error}") from error
     return out
 
 
@@ -99,20 +124,29 @@ def find_scenes(dataset: Path) -> list[Path]:
 
 
 def sample(scenes: list[Path], views: int) -> list[tuple[Path, int]]:
-    """Sample views: (scene, frame), sorted and distinct.
+    """Sample views: (scene, frame), sorted and distinct; all views if no more are there than asked for.
 
     Cameras in turn; a camera's scenes evenly; within a scene at frames of a low-discrepancy sequence.
+
+    Raises:
+        DatasetError: A file is damaged, or no scene has a view.
+        OutputError: More views are there and asked for than a sheet shows.
     """
     by_camera: dict[tuple[float, ...], list[tuple[Path, list[int]]]] = {}
     for scene in scenes:
-        cameras = read_json(scene / "scene_camera.json")
+        cameras = read_checked(scene / "scene_camera.json", SCENE_SCHEMAS["camera"])
         if cameras:
-            first = cameras[min(cameras, key=int)]
+            first = cameras[min(cameras)]
             group = by_camera.setdefault((*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())), [])
-            group.append((scene, sorted(map(int, cameras))))
+            group.append((scene, sorted(cameras)))
     groups = list(by_camera.values())
     if not groups:
         raise DatasetError(f"no scene in {scenes[0].parent} has a view; bake the data set again")
+    present = sum(len(frames) for group in groups for _, frames in group)
+    if min(views, present) > MAX_VIEWS:
+        raise OutputError(f"{views} views requested, and the data set has {present}; a contact sheet has at most {MAX_VIEWS}")
+    if views >= present:
+        return sorted((scene, frame) for group in groups for scene, frames in group for frame in frames)
     samples = set()
     for number in range(views):
         group = groups[number % len(groups)]
@@ -122,33 +156,38 @@ def sample(scenes: list[Path], views: int) -> list[tuple[Path, int]]:
     return sorted(samples)
 
 
-def _read_view(scene: Path, frame: int) -> _View:
-    camera, truth, infos = (read_json(scene / f"scene_{name}.json").get(str(frame)) for name in ("camera", "gt", "gt_info"))
-    if camera is None or truth is None or infos is None or len(truth) != len(infos):
-        raise DatasetError(f"{scene}: scene_camera.json, scene_gt.json and scene_gt_info.json do not agree about image {frame}")
-    return _View(scene, frame, float(camera["depth_scale"]), list(zip(truth, infos, strict=True)))
+def _read_views(samples: list[tuple[Path, int]]) -> Iterator[_View]:
+    """Read the annotations of views, which are sorted by scene: those of each scene once."""
+    for scene, group in itertools.groupby(samples, key=lambda one: one[0]):
+        files = SceneFolder(scene)
+        for _, frame in group:
+            camera, truth, infos = files.records(frame)
+            yield _View(scene, frame, float(camera["depth_scale"]), list(zip(truth, infos, strict=True)))
 
 
 def _row(view: _View) -> Image:
     """Draw all panels of a view side by side."""
     stem = f"{view.frame:06d}"
     color = read_image(view.scene / "rgb", stem, cv2.IMREAD_COLOR)
-    depth = read_image(view.scene / "depth", stem, cv2.IMREAD_UNCHANGED) * view.depth_scale
+    size = color.shape[1::-1]
+    counts = read_image(view.scene / "depth", stem, cv2.IMREAD_UNCHANGED, size)
+    depth = check_planes(counts, None, f"{view.scene / 'depth' / stem}.png") * view.depth_scale
     panels: list[tuple[str, Callable[[float], Image]]] = [
         (f"{view.scene.parent.name}/{view.scene.name} image {view.frame}", lambda scale: _fit(color, scale)),
         (_depth_caption(depth), lambda scale: _fit(color_depth(depth), scale, smooth=False)),
         (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
         ("boxes: amodal thin, visible thick; obj_id and visible fraction", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
     ]
-    panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layer_pictures(view.scene, view.frame)]
-    scale = _PANEL_WIDTH / color.shape[1]
+    panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layer_pictures(view.scene, view.frame, size)]
+    scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
     return np.concatenate([_captioned(draw(scale), caption) for caption, draw in panels], axis=1)
 
 
 def _fit(image: Image, scale: float, smooth: bool = True) -> Image:
     """Scale an image to the panel's width; nearest neighbour for ids, masks and colour maps."""
-    size = (_PANEL_WIDTH, max(1, round(image.shape[0] * scale)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA if smooth and scale < 1 else cv2.INTER_NEAREST)
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    fitted = cv2.resize(image, size, interpolation=cv2.INTER_AREA if smooth and scale < 1 else cv2.INTER_NEAREST)
+    return np.pad(fitted, ((0, 0), (0, _PANEL_WIDTH - size[0]), (0, 0)))
 
 
 def _captioned(image: Image, caption: str) -> Image:
@@ -160,7 +199,9 @@ def _captioned(image: Image, caption: str) -> Image:
 
 def put_text(image: Image, text: str, place: tuple[int, int], size: float, color: tuple[int, int, int], thickness: int = 1) -> None:
     """Draw text; `place` is its lower left corner [px], `size` OpenCV's font scale."""
-    cv2.putText(image, text, place, FONT, size, color, thickness, cv2.LINE_AA)
+    # Names of folders and texts of records may have characters that cannot be encoded, or that end OpenCV's string.
+    shown = "".join(letter if letter.isprintable() else "?" for letter in text)
+    cv2.putText(image, shown, place, FONT, size, color, thickness, cv2.LINE_AA)
 
 
 def _depth_limits(depth: np.ndarray) -> tuple[float, float] | None:
@@ -200,7 +241,7 @@ def _color_instances(view: _View, color: Image) -> Image:
         put_text(drawn, "no masks in this data set", (8, 24), 0.5, (230, 230, 230))
         return drawn
     for index, (record, _) in enumerate(view.truth):
-        mask = read_image(folder, f"{view.frame:06d}_{index:06d}", cv2.IMREAD_GRAYSCALE)
+        mask = read_image(folder, f"{view.frame:06d}_{index:06d}", cv2.IMREAD_GRAYSCALE, color.shape[1::-1])
         drawn[mask > 0] = instance_color(record.get("instance_id", index))
     return drawn
 

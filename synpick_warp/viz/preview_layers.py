@@ -28,13 +28,13 @@ def color_layer(name: str, values: np.ndarray) -> Image:
     return _DRAW[name](values)[1]
 
 
-def layer_pictures(scene: Path, frame: int) -> list[tuple[str, Image]]:
-    """Draw each layer of a scene that `_DRAW` has: caption and image.
+def layer_pictures(scene: Path, frame: int, size: tuple[int, int]) -> list[tuple[str, Image]]:
+    """Draw each layer of a scene that `_DRAW` has: caption and image, whose width and height must be `size` [px].
 
     Raises:
-        DatasetError: The scene has a layer, but not for this frame.
+        DatasetError: The scene has a layer, but not for this frame, or not of this size.
     """
-    return [draw(read_layer(scene, name, frame)) for name, draw in _DRAW.items() if (scene / name).is_dir()]
+    return [draw(read_layer(scene, name, frame, size)) for name, draw in _DRAW.items() if (scene / name).is_dir()]
 
 
 def _draw_normals(values: np.ndarray) -> tuple[str, Image]:

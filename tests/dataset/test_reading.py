@@ -95,7 +95,7 @@ def test_opening_reads_nothing(tmp_path, folder):
     episode = data[3]
     assert list(data) == [3]
     assert list(episode.steps) == []
-    with pytest.raises(ValueError, match="Expecting value"):
+    with pytest.raises(DatasetError, match=r"000003/zarr\.json is damaged: JSON is malformed"):
         _ = episode.attributes
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -10,11 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
+from synpick_warp.cli.commands import main
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.view import write_layer
-from synpick_warp.viz.preview import find_scenes, sample, write_contact_sheet
+from synpick_warp.viz.preview import MAX_VIEWS, find_scenes, sample, write_contact_sheet
 from tests.harness.exporter_contract import export
+from tests.harness.hostile import replaced
 from tests.worlds.box_views import cameras, config
 
 FRAMES = 5
@@ -118,8 +121,11 @@ def test_folders_that_are_no_data_set(tmp_path):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda scene: (scene / "scene_gt.json").unlink(), r"cannot read .*scene_gt\.json: No such file"),
-        (lambda scene: (scene / "scene_gt_info.json").write_text("{"), r"scene_gt_info\.json is not a JSON file"),
+        (lambda scene: (scene / "scene_gt.json").unlink(), r"there is no file .*scene_gt\.json"),
+        (
+            lambda scene: (scene / "scene_gt_info.json").write_text("{"),
+            r"scene_gt_info\.json is damaged: input data was truncated; restore the file",
+        ),
         (lambda scene: (scene / "scene_gt.json").write_text(json.dumps({"0": []})), "do not agree about image"),
         (lambda scene: shutil.rmtree(scene / "rgb"), r"there is no .*rgb/.*\.png or \.jpg"),
         (lambda scene: [path.write_bytes(b"") for path in (scene / "depth").iterdir()], "is not an image"),
@@ -142,3 +148,58 @@ def test_what_can_not_be_written_is_one_clear_line(dataset, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         write_contact_sheet(dataset, tmp_path / "file" / "sheet.png", 1)
+
+
+# ---- hostile data sets ----
+
+
+def test_a_sheet_has_at_most_the_views_of_the_set_and_at_most_max_views(dataset, tmp_path, capsys):
+    arguments = ["preview", str(dataset), "--out", str(tmp_path / "sheet.png"), "--views", "1000000000"]
+    assert main(arguments) == 0
+    assert cv2.imread(str(tmp_path / "sheet.png")).shape[0] == len(EPISODES) * 3 * FRAMES * (20 + 360 + 4)
+    (tmp_path / "sheet.png").unlink()
+    path = dataset / "train_pbr" / "000000" / "scene_camera.json"
+    entry = json.loads(path.read_text())["0"]
+    path.write_text(json.dumps({str(frame): entry for frame in range(MAX_VIEWS)}))
+    assert main(arguments) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert f"1000000000 views requested, and the data set has {MAX_VIEWS + 25}; a contact sheet has at most {MAX_VIEWS}" in line
+    assert not (tmp_path / "sheet.png").exists()
+
+
+def test_a_link_in_place_of_the_sheet_is_replaced_and_not_followed(dataset, tmp_path):
+    (tmp_path / "victim").write_text("mine")
+    (dataset / "contact-sheet.png").symlink_to(tmp_path / "victim")
+    assert main(["preview", str(dataset), "--views", "1"]) == 0
+    assert (tmp_path / "victim").read_text() == "mine"
+    assert not (dataset / "contact-sheet.png").is_symlink()
+
+
+@pytest.mark.parametrize("name", ["depth", "mask_visib"])
+def test_an_image_of_another_size_than_the_colour_is_named(dataset, tmp_path, name):
+    for path in dataset.glob(f"*/*/{name}/*.png"):
+        path.write_bytes(cv2.imencode(".png", np.zeros((3, 5), np.uint16 if name == "depth" else np.uint8))[1].tobytes())
+    with pytest.raises(DatasetError, match=rf"{name}/.*\.png has 5 x 3 pixels; the images of this camera have"):
+        write_contact_sheet(dataset, tmp_path / "sheet.png", 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "value", "said"),
+    [
+        ("gt", (0,), "x", r"scene_gt\.json is damaged: expected object, got str"),
+        ("gt", (0, "obj_id"), [], r"expected int, got array"),
+        ("gt_info", (0, "px_count_visib"), "3", r"expected int, got str"),
+        ("gt_info", (0, "bbox_obj"), [1e300] * 4, r"expected int"),
+        ("gt_info", (0, "visib_fract"), float("nan"), r"JSON is malformed"),
+        ("camera", ("depth_scale",), None, r"expected float, got null"),
+        ("camera", ("cam_R_w2c",), 3, r"expected array, got int"),
+    ],
+)
+def test_wrong_types_in_annotations_are_one_line(dataset, capsys, name, place, value, said):
+    for path in dataset.glob(f"*/*/scene_{name}.json"):
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps({frame: replaced(entry, place, value) for frame, entry in content.items()}))
+    assert main(["preview", str(dataset)]) == 2
+    [line] = capsys.readouterr().err.splitlines()
+    assert re.search(said, line)
+    assert not (dataset / "contact-sheet.png").exists()

@@ -1,0 +1,154 @@
+"""Schemas of a data set's JSON files as they are read back: BOP annotations, object infos, run lengths, episodes (msgspec types).
+
+A file is checked once, when it is read; what comes out is its content as plain dictionaries and lists, with all of its keys. Lengths,
+types and ranges hold afterwards: code behind this module does not check again. Numbers are finite, and small enough for every array
+and drawing that they go into.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.files import read_file
+from synpick_warp.inputs.image_files import MAX_SIDE
+from synpick_warp.inputs.json import MAX_JSON, decode_json
+
+_Content = TypeVar("_Content")
+ADVICE = "restore the file, or bake the data set again"
+
+Index = Annotated[int, Meta(ge=0, lt=2**31)]
+"""Index, id or count."""
+Key = Annotated[int, Meta(ge=0, lt=2**31)]
+"""Index as a key of an object."""
+Length = Annotated[float, Meta(ge=-1e9, le=1e9)]
+"""Coordinate in any unit; far beyond every scene, small enough to compute with."""
+Vector3 = Annotated[list[Length], Meta(min_length=3, max_length=3)]
+Matrix3 = Annotated[list[Length], Meta(min_length=9, max_length=9)]
+Rotation = Annotated[list[Annotated[float, Meta(ge=-1.01, le=1.01)]], Meta(min_length=9, max_length=9)]
+Matrix4 = Annotated[list[Length], Meta(min_length=16, max_length=16)]
+Box = Annotated[list[Annotated[int, Meta(ge=-(2**20), le=2**20)]], Meta(min_length=4, max_length=4)]
+"""x, y, width, height [px]."""
+Fraction = Annotated[float, Meta(ge=0.0, le=1.0)]
+Side = Annotated[int, Meta(ge=1, le=MAX_SIDE)]
+"""Width or height of an image [px]."""
+
+
+class CameraEntry(Struct, gc=False):
+    """A view's entry in scene_camera.json [mm]. Data sets of others may lack the extrinsics."""
+
+    cam_K: Matrix3  # noqa: N815
+    depth_scale: Annotated[float, Meta(gt=0.0, le=1e6)]
+    cam_R_w2c: Rotation | UnsetType = UNSET  # noqa: N815
+    cam_t_w2c: Vector3 | UnsetType = UNSET
+
+
+class TruthEntry(Struct, gc=False):
+    """An instance's entry in scene_gt.json [mm]."""
+
+    cam_R_m2c: Rotation  # noqa: N815
+    cam_t_m2c: Vector3
+    obj_id: Index
+    instance_id: Index | UnsetType = UNSET
+
+
+class InfoEntry(Struct, gc=False):
+    """An instance's entry in scene_gt_info.json [px]."""
+
+    bbox_obj: Box
+    bbox_visib: Box
+    px_count_all: Index
+    px_count_valid: Index
+    px_count_visib: Index
+    visib_fract: Fraction
+
+
+class RunLengths(Struct, gc=False):
+    """A mask in COCO's uncompressed run-length encoding."""
+
+    counts: list[Index]
+    size: tuple[Side, Side]
+    """Height and width [px]."""
+
+
+class ContinuousSymmetry(Struct, gc=False):
+    """Axis of rotation of an object and a point on it [mm]."""
+
+    axis: Vector3
+    offset: Vector3
+
+
+class ModelDiameter(Struct, gc=False):
+    """The part of an object's entry in models_info.json that names are found by [mm]."""
+
+    diameter: Annotated[float, Meta(gt=0.0, le=1e9)]
+
+
+class ModelInfo(ModelDiameter, gc=False):
+    """An object's entry in models_info.json [mm]."""
+
+    min_x: Length
+    min_y: Length
+    min_z: Length
+    size_x: Annotated[float, Meta(ge=0.0, le=1e9)]
+    size_y: Annotated[float, Meta(ge=0.0, le=1e9)]
+    size_z: Annotated[float, Meta(ge=0.0, le=1e9)]
+    symmetries_discrete: list[Matrix4] | UnsetType = UNSET
+    symmetries_continuous: list[ContinuousSymmetry] | UnsetType = UNSET
+
+
+class EpisodeRow(Struct, gc=False):
+    """What every row of the episode list has."""
+
+    frames: Index
+    ending: str
+
+
+class EpisodeEntry(Struct, gc=False):
+    """An episode's manifest entry, as far as it is read back."""
+
+    row: EpisodeRow
+    attempts: list[dict[str, Any]] = []
+
+
+VIEW_SCHEMAS: dict[str, Any] = {"camera": CameraEntry, "gt": list[TruthEntry], "gt_info": list[InfoEntry]}
+"""Schema of a view's entry in scene_camera.json, scene_gt.json and scene_gt_info.json."""
+SCENE_SCHEMAS: dict[str, Any] = {name: dict[Key, schema] for name, schema in VIEW_SCHEMAS.items()}
+"""Schema of these files: the entries by frame."""
+MASK_SCHEMA = dict[Key, RunLengths]
+"""Schema of a view's run lengths in a shard: masks by instance index."""
+
+
+def check_json(data: bytes, schema: Any, source: object) -> Any:
+    """Check JSON against a schema; returns its content as dictionaries, lists and numbers, with keys that the schema does not name.
+
+    Keys of the outermost object become integers if the schema has them so.
+
+    Raises:
+        DatasetError: In one line: not JSON, or not of this schema.
+    """
+    decode_json(data, schema, source, DatasetError, ADVICE)
+    by_index = getattr(schema, "__origin__", None) is dict and schema.__args__[0] is Key
+    return decode_json(data, dict[int, Any] if by_index else Any, source, DatasetError, ADVICE)
+
+
+def read_checked(path: Path, schema: Any) -> Any:
+    """Read a JSON file; schema, result and errors as `check_json`."""
+    return check_json(read_file(path, MAX_JSON, DatasetError), schema, path)
+
+
+def check_content(content: Any, schema: type[_Content], source: object) -> _Content:
+    """Check decoded JSON against a schema.
+
+    Raises:
+        DatasetError: In one line: it is not of this schema.
+    """
+    try:
+        return msgspec.convert(content, schema)
+    except (ValueError, RecursionError) as fault:
+        text = str(fault).replace("`", "")
+        raise DatasetError(f"{source} is damaged: {text[:1].lower()}{text[1:]}; {ADVICE}") from None

@@ -1,0 +1,93 @@
+"""Bounded image decoding: PNG and JPEG, whose stated size is checked before a pixel is decoded (prevention of decompression bombs).
+
+Other formats that OpenCV could read are refused: a data set has none. NumPy and OpenCV are imported when the first image is decoded.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from synpick_warp.errors import SynpickError
+from synpick_warp.inputs.files import read_file
+
+if TYPE_CHECKING:
+    import numpy as np
+
+MAX_SIDE = 8192
+"""Largest width and height of an image [px]: the limit of cameras.resolution."""
+MAX_IMAGE_FILE = 2**29
+"""Largest image file [bytes]: an image of MAX_SIDE with three channels of 16 bits, not compressed, has 384 MiB."""
+_PNG = b"\x89PNG\r\n\x1a\n"
+_JPEG = b"\xff\xd8\xff"
+_NO_FRAME = (0xC4, 0xC8, 0xCC)
+"""JPEG markers between SOF0 and SOF15 that begin no frame: Huffman tables, extension, arithmetic conditioning."""
+_BARE = (0x01, *range(0xD0, 0xD9))
+"""JPEG markers without length."""
+
+
+def image_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height [px] that a PNG or JPEG file states; None: it is neither, or ends before."""
+    if data.startswith(_PNG):
+        return struct.unpack_from(">II", data, 16) if len(data) >= 24 and data[12:16] == b"IHDR" else None
+    place = 2 if data.startswith(_JPEG) else len(data)
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        marker = data[place + 1]
+        if marker == 0xFF or marker in _BARE:
+            place += 1 if marker == 0xFF else 2
+            continue
+        if 0xC0 <= marker <= 0xCF and marker not in _NO_FRAME:
+            height, width = struct.unpack_from(">HH", data, place + 5)
+            return width, height
+        place += 2 + max(2, int.from_bytes(data[place + 2 : place + 4], "big"))
+    return None
+
+
+def decode_image(
+    data: bytes, source: object, error: type[SynpickError], flags: int = -1, size: tuple[int, int] | None = None
+) -> np.ndarray:
+    """Decode a PNG or JPEG file's content by OpenCV.
+
+    Args:
+        data: Content of the file.
+        source: Where it comes from, for messages.
+        error: Class of the exception.
+        flags: OpenCV's `IMREAD_` flags; -1: unchanged.
+        size: Width and height that it must have [px]; None: any up to MAX_SIDE.
+
+    Returns:
+        Image (H, W[, 3]), blue first.
+
+    Raises:
+        SynpickError: As `error`, in one line: it is not an image of that size.
+    """
+    stated = image_size(data)
+    if stated is None:
+        raise error(f"{source} is not an image: neither PNG nor JPEG")
+    if size is not None and stated != size:
+        raise error(f"{source} has {_show(stated)} pixels; the images of this camera have {_show(size)}")
+    if not (min(stated) > 0 and max(stated) <= MAX_SIDE):
+        raise error(f"{source} has {_show(stated)} pixels; allowed: up to {MAX_SIDE} x {MAX_SIDE}")
+    import cv2
+    import numpy as np
+
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        image = None
+    # Metadata may ask for a rotation.
+    if image is None or sorted(image.shape[:2]) != sorted(stated):
+        raise error(f"{source} is not an image that OpenCV can decode")
+    if size is not None and image.shape[1::-1] != size:
+        raise error(f"{source} has {_show(image.shape[1::-1])} pixels; the images of this camera have {_show(size)}")
+    return image
+
+
+def read_image_file(path: Path, error: type[SynpickError], flags: int = -1, size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read and decode a PNG or JPEG file; arguments and errors as `decode_image` and `read_file`."""
+    return decode_image(read_file(path, MAX_IMAGE_FILE, error), path, error, flags, size)
+
+
+def _show(size: tuple[int, ...]) -> str:
+    return f"{size[0]} x {size[1]}"
