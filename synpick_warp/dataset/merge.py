@@ -62,12 +62,12 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
         DatasetError: A part is not a data set, or parts do not match.
         OutputError: A file cannot be written.
     """
-    _check_folders(parts, out)
     manifest = read_manifest(parts[0])
     for part in parts[1:]:
         said = describe_differences(read_manifest(part), manifest)
         if said:
             raise DatasetError(f"{part} was made with other settings than {parts[0]}: {said}; only parts of one data set can be merged")
+    _check_folders(parts, out)
     sources = _sources(parts)
     config = _config(parts, manifest)
     check_output_folder(out)
@@ -98,13 +98,12 @@ def _check_folders(parts: Sequence[Path], out: Path) -> None:
         target = out.resolve()
         for part in parts:
             state, place = part.stat(), part.resolve()
-            first = known.setdefault((state.st_dev, state.st_ino), part)
-            if first is not part:
+            first = known.get((state.st_dev, state.st_ino))
+            if first is not None:
                 raise DatasetError(f"{first} and {part} are the same folder; name each part once")
+            known[state.st_dev, state.st_ino] = part
             if target.is_relative_to(place) or place.is_relative_to(target):
                 raise DatasetError(f"--out is {out}, which is, holds or lies in the part {part}; name a folder outside of the parts")
-    except FileNotFoundError as error:
-        raise DatasetError(f"there is no folder {error.filename}; name the folder of a data set that synpick-warp baked") from None
     except (OSError, RuntimeError, ValueError) as error:  # Links in a circle; a name with a null byte.
         raise DatasetError(f"a part or --out cannot be read: {getattr(error, 'strerror', None) or error}") from None
 

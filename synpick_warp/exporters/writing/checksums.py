@@ -72,7 +72,7 @@ def parse_checksums(lines: bytes, folder: Path, source: Path, advice: str) -> di
         digest, name = match.groups()
         parent, _, last = name.rpartition("/")
         # Resolving a path takes system calls: once for each folder, whose other names are then compared as text.
-        if parent not in folders or last in (".", "..") or not last.isprintable():
+        if parent not in folders or name.startswith("/") or last in (".", "..") or not last.isprintable():
             path_inside(folder, name, f"{source}, line {number},", DatasetError)
             folders.add(parent)
         if name in known or name != str(Path(name)) or name.partition("/")[0] in _RESERVED:
