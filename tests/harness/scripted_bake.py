@@ -54,6 +54,12 @@ def settings(episodes: int = 2, formats: tuple[str, ...] = FORMATS) -> Config:
     return dataclasses.replace(config, bake=bake, cameras=cameras)
 
 
+def small_settings() -> Config:
+    """Settings of two episodes as scenes and shards, of few files."""
+    config = settings(2, ("bop", "shards"))
+    return dataclasses.replace(config, bop=dataclasses.replace(config.bop, split="train", color_format="png", masks=False, coco=False))
+
+
 def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after: int | None = None) -> BakeSummary:
     """Write a data set, or the remaining episodes of one, as `pipeline.run_bake` does; `stop_after` episodes it is stopped."""
     classes = load_exporter_classes(config.bake.formats)
@@ -99,3 +105,11 @@ def snapshot(folder: Path) -> dict[str, tuple[str, bytes]]:
             content = os.readlink(path).encode() if kind == "link" else path.read_bytes() if kind == "file" else b""
             found[str(path.relative_to(folder))] = (kind, content)
     return found
+
+
+def make_victim(folder: Path) -> Path:
+    """Make a folder beside a data set that nothing may touch."""
+    victim = folder / "victim"
+    (victim / "train").mkdir(parents=True)
+    (victim / "thesis.txt").write_text("ten years")
+    return victim
