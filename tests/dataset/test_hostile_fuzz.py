@@ -135,7 +135,7 @@ def fix_digests(data_set: Path) -> None:
         content = json.loads(path.read_bytes())
         settings_ = json.dumps(content["settings"], sort_keys=True).encode()
         path.write_text(json.dumps(content | {"settings_checksum": hashlib.sha256(settings_).hexdigest()}))
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError, RecursionError, OSError):
         pass
     for entry in (data_set / "manifest").glob("*.json"):
         try:
