@@ -15,14 +15,26 @@ import dataclasses
 import hashlib
 import importlib.metadata
 import json
+import os
+import re
+import stat
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from synpick_warp import __version__
+from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.records import Entry, EpisodeEntry, IndicesEntry, Manifest, read_record
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.writing.checksums import parse_checksums
 from synpick_warp.exporters.writing.files import MANIFEST_FILE
+from synpick_warp.inputs.files import check_regular_file, read_file
+from synpick_warp.inputs.json import MAX_JSON, read_json
+from synpick_warp.inputs.paths import path_inside
+from synpick_warp.inputs.toml import MAX_TOML
 
 ENTRIES = Path("manifest")
 """Folder of the entries, in the data set."""
@@ -51,6 +63,17 @@ FREE_SETTINGS = (
 of their folder. A device of another type computes the same episodes up to rounding."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
 """Packages whose versions the output depends on."""
+MAX_DIFFERENCES, MAX_SHOWN = 8, 80
+"""Differences, and characters of a value, that an error message shows."""
+_EPISODE = re.compile(r"[0-9]{6,12}")
+"""Name of an episode's entry."""
+_NEW_FOLDER = "restore the file, or bake again into another folder"
+
+
+class _Format(msgspec.Struct):
+    """Version of a manifest, which is read first: other versions may have other keys."""
+
+    format: int
 
 
 def make_manifest(config: Config) -> dict[str, Any]:
@@ -96,35 +119,37 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Read a data set's manifest.
 
     Raises:
-        DatasetError: There is none, or it is damaged.
+        DatasetError: There is none, it is damaged, or has been changed by hand.
     """
-    content = read_json(folder / MANIFEST_FILE)
-    if content is None:
+    path = path_inside(folder, MANIFEST_FILE, folder, DatasetError)
+    if not os.path.lexists(path):
         raise DatasetError(f"{folder} has no {MANIFEST_FILE}; name the folder of a data set that synpick-warp baked")
-    if content.get("format") != FORMAT:
-        raise DatasetError(f"{folder / MANIFEST_FILE} has the format {content.get('format')}; this version reads {FORMAT}")
-    if content.get("settings_checksum") != _digest(content.get("settings")):
-        raise DatasetError(f"the settings in {folder / MANIFEST_FILE} do not match their checksum; it has been changed by hand")
+    version = read_json(path, _Format, DatasetError, _NEW_FOLDER).format
+    if version != FORMAT:
+        raise DatasetError(f"{path} has the format {version}; this version reads {FORMAT}")
+    manifest, content = read_record(path, Manifest, _NEW_FOLDER)
+    bake = manifest.settings.get("bake")
+    if manifest.settings_checksum != _digest(content["settings"]) or not isinstance(bake, dict):
+        raise DatasetError(f"the settings in {path} do not match their checksum: it has been changed by hand; {_NEW_FOLDER}")
+    if type(bake.get("seed")) is not int or bake["seed"] != manifest.seed:
+        raise DatasetError(f"the seed in {path} is not that of its settings: it has been changed by hand; {_NEW_FOLDER}")
     return content
 
 
-def read_json(path: Path) -> dict[str, Any] | None:
-    """Read a JSON object from a file that a bake wrote; None: no such file.
+def read_settings(folder: Path, manifest: Mapping[str, Any]) -> Config:
+    """Read config.toml, the settings of the last bake, and compare them with the manifest.
 
     Raises:
-        DatasetError: The file cannot be read, or is damaged.
+        ConfigError: It is not a file of settings.
+        DatasetError: It does not match the manifest.
     """
-    try:
-        content = json.loads(path.read_bytes())
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise DatasetError(f"{path} is damaged: {error}") from None
-    if not isinstance(content, dict):
-        raise DatasetError(f"{path} is damaged: it is not a JSON object")
-    return content
+    path = path_inside(folder, CONFIG_FILE, folder, DatasetError)
+    check_regular_file(path, MAX_TOML, DatasetError)
+    config = load_config(str(path), {})
+    said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": manifest["settings"]})
+    if said:
+        raise DatasetError(f"{path} does not match the manifest: {said}")
+    return config
 
 
 def differences(here: Mapping[str, Any], there: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any, Any]]:
@@ -142,8 +167,18 @@ def describe_differences(here: Mapping[str, Any], there: Mapping[str, Any]) -> s
     parts = []
     for key, first, second in differences(here, there):
         if key not in ("settings_checksum", "seed"):
-            parts.append(f"{key.removeprefix('settings.')} is {json.dumps(first)}, there {json.dumps(second)}")
-    return "; ".join(parts)
+            parts.append(f"{_show_key(key.removeprefix('settings.'))} is {_show(first)}, there {_show(second)}")
+    more = len(parts) - MAX_DIFFERENCES
+    return "; ".join(parts[:MAX_DIFFERENCES] + ([f"and {more} more"] if more > 0 else []))
+
+
+def _show(value: object) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"
+
+
+def _show_key(key: str) -> str:
+    return key if key.isprintable() and len(key) <= MAX_SHOWN else _show(key)
 
 
 def episode_entry(episode: int) -> Path:
@@ -152,32 +187,49 @@ def episode_entry(episode: int) -> Path:
 
 
 def committed_episodes(folder: Path) -> list[int]:
-    """Indices of the episodes that have a manifest entry, sorted."""
-    entries = folder / ENTRIES
+    """Indices of the episodes that have a manifest entry, sorted.
+
+    Raises:
+        DatasetError: The folder of the entries is a link that leads out of the data set.
+    """
+    entries = path_inside(folder, str(ENTRIES), folder, DatasetError)
     names = (path.stem for path in entries.iterdir() if path.suffix == ".json") if entries.is_dir() else ()
-    return sorted(int(name) for name in names if name.isdecimal())
+    return sorted(int(name) for name in names if _EPISODE.fullmatch(name) and name == episode_entry(int(name)).name)
 
 
 def read_entry(folder: Path, entry: Path) -> dict[str, Any] | None:
-    """Read a manifest entry; None: there is none."""
-    return read_json(folder / f"{entry}.json")
+    """Read a manifest entry; None: there is none.
+
+    Raises:
+        DatasetError: It cannot be read, or is damaged.
+    """
+    path = path_inside(folder, f"{entry}.json", folder, DatasetError)
+    if not os.path.lexists(path):
+        return None
+    schema = {CONSTANTS: Entry, INDICES: IndicesEntry}.get(entry, EpisodeEntry)
+    content, raw = read_record(path, schema, entry_advice(entry))
+    if isinstance(content, EpisodeEntry) and content.episode != int(entry.name):
+        raise DatasetError(f"{path} is damaged: it is of episode {content.episode}; {entry_advice(entry)}")
+    return raw
+
+
+def entry_advice(entry: Path) -> str:
+    """What to do about a damaged manifest entry."""
+    return f"remove {entry}.json and {entry}.sha256, and resume the bake: it makes their files again"
 
 
 def read_checksums(folder: Path, entry: Path) -> dict[str, str]:
-    """Read the checksums of an entry's files: path relative to the data set -> SHA-256.
+    """Read the checksums of an entry's files: path relative to the data set -> SHA-256. The paths are inside the data set.
 
     Raises:
-        DatasetError: The list is missing, or does not match its entry.
+        DatasetError: The list is missing, does not match its entry, or is damaged.
     """
-    path, content = folder / f"{entry}.sha256", read_entry(folder, entry)
-    try:
-        lines = path.read_bytes()
-    except OSError as error:
-        raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    if content is None or hashlib.sha256(lines).hexdigest() != content.get("checksum"):
-        raise DatasetError(f"{path} does not match {path.with_suffix('.json')}")
-    pairs = (line.split("  ", 1) for line in lines.decode().splitlines())
-    return {name: digest for digest, name in pairs}
+    content = read_entry(folder, entry)
+    path = path_inside(folder, f"{entry}.sha256", folder, DatasetError)
+    lines = read_file(path, MAX_JSON, DatasetError)
+    if content is None or hashlib.sha256(lines).hexdigest() != content["checksum"]:
+        raise DatasetError(f"{path} does not match {path.with_suffix('.json')}; {entry_advice(entry)}")
+    return parse_checksums(lines, folder, path, entry_advice(entry))
 
 
 def is_complete(folder: Path, entry: Path) -> bool:
@@ -186,6 +238,7 @@ def is_complete(folder: Path, entry: Path) -> bool:
     if content is None:
         return False
     try:
-        return sum((folder / name).stat().st_size for name in read_checksums(folder, entry)) == content.get("bytes")
-    except (FileNotFoundError, NotADirectoryError, DatasetError):
+        states = [(folder / name).lstat() for name in read_checksums(folder, entry)]
+    except (OSError, DatasetError):
         return False
+    return all(stat.S_ISREG(state.st_mode) for state in states) and sum(state.st_size for state in states) == content["bytes"]

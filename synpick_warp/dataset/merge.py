@@ -1,15 +1,18 @@
-"""Merge the shards of a data set that several bakes wrote: hard links of all committed episodes, then new indices."""
+"""Merge the shards of a data set that several bakes wrote: hard links of all committed episodes, then new indices.
+
+Parts may have been edited: names come from checked lists only, symbolic links are refused, and files are created, never overwritten.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
-import shutil
-from collections.abc import Sequence
+import stat
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
-from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.manifest import (
@@ -19,15 +22,24 @@ from synpick_warp.dataset.manifest import (
     committed_episodes,
     describe_differences,
     encode_manifest,
+    entry_advice,
     episode_entry,
     read_checksums,
+    read_entry,
     read_manifest,
+    read_settings,
 )
 from synpick_warp.dataset.writing import finalize_data_set, lock_folder
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
+from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import MANIFEST_FILE, check_output_folder, output_error, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
+
+MAX_EPISODES = 10_000_000
+"""Most episodes of a merged data set: its missing ones are listed."""
+_COPY_BYTES = 1 << 20
+"""Size of a copy block [B]."""
 
 
 class Merged(NamedTuple):
@@ -55,13 +67,16 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
         said = describe_differences(read_manifest(part), manifest)
         if said:
             raise DatasetError(f"{part} was made with other settings than {parts[0]}: {said}; only parts of one data set can be merged")
+    _check_folders(parts, out)
     sources = _sources(parts)
-    config = _config(parts)
+    config = _config(parts, manifest)
     check_output_folder(out)
     if (out / MANIFEST_FILE).exists():
         raise DatasetError(f"{out} is already a data set; --out takes a new or an empty folder")
-    locks = [lock_folder(part) for part in parts]
+    locks = []
     try:
+        for part in parts:
+            locks.append(lock_folder(part))  # noqa: PERF401 (those that are locked must be closed)
         _fill(out, sources, config, encode_manifest(manifest))
     except OSError as error:
         raise output_error(out, error) from error
@@ -72,45 +87,76 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
     return Merged(len(there), sorted(set(range(config.bake.episodes)) - set(there)))
 
 
+def _check_folders(parts: Sequence[Path], out: Path) -> None:
+    """Check that every part is another folder, and the output folder outside of them.
+
+    Raises:
+        DatasetError: Two parts are the same folder, or the output folder is one, within one, or around one.
+    """
+    known: dict[tuple[int, int], Path] = {}
+    try:
+        target = out.resolve()
+        for part in parts:
+            state, place = part.stat(), part.resolve()
+            first = known.get((state.st_dev, state.st_ino))
+            if first is not None:
+                raise DatasetError(f"{first} and {part} are the same folder; name each part once")
+            known[state.st_dev, state.st_ino] = part
+            if target.is_relative_to(place) or place.is_relative_to(target):
+                raise DatasetError(f"--out is {out}, which is, holds or lies in the part {part}; name a folder outside of the parts")
+    except (OSError, RuntimeError, ValueError) as error:  # Links in a circle; a name with a null byte.
+        raise DatasetError(f"a part or --out cannot be read: {getattr(error, 'strerror', None) or error}") from None
+
+
 def _sources(parts: Sequence[Path]) -> dict[Path, Path]:
-    """Choose the part that each manifest entry is taken from: entry -> part."""
+    """Choose the part that each manifest entry is taken from: entry -> part. Reads, and so validates, all entries and checksum lists."""
     sources: dict[Path, Path] = {}
+    owners: dict[str, Path] = {}
     for part in parts:
         for entry in (CONSTANTS, *map(episode_entry, committed_episodes(part))):
-            known = sources.setdefault(entry, part)
-            if known != part and read_checksums(known, entry) != read_checksums(part, entry):
-                raise DatasetError(f"{known} and {part} have different files for {entry.name}; only parts of one data set can be merged")
+            checksums, known = read_checksums(part, entry), sources.setdefault(entry, part)
+            if known is not part:
+                if read_checksums(known, entry) != checksums or read_entry(known, entry) != read_entry(part, entry):
+                    raise DatasetError(
+                        f"{known} and {part} have different files for {entry.name}; only parts of one data set can be merged"
+                    )
+                continue
+            for name in checksums:
+                if owners.setdefault(name, entry) != entry:
+                    raise DatasetError(f"{part / entry}.sha256 names {name}, as does {owners[name]}.sha256; {entry_advice(entry)}")
     if not any(entry != CONSTANTS for entry in sources):
         raise DatasetError(f"{' and '.join(map(str, parts))} have no committed episode")
     return sources
 
 
-def _config(parts: Sequence[Path]) -> Config:
+def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
     """Settings of the first part, with the largest `bake.episodes` of all."""
-    configs = [load_config(str(part / CONFIG_FILE), {}) for part in parts]
+    configs = [read_settings(part, manifest) for part in parts]
     episodes = max(config.bake.episodes for config in configs)
+    if episodes > MAX_EPISODES:
+        raise DatasetError(f"bake.episodes is {episodes} in the {CONFIG_FILE} of a part; allowed: up to {MAX_EPISODES}; correct it there")
     return dataclasses.replace(configs[0], bake=dataclasses.replace(configs[0].bake, episodes=episodes))
 
 
 def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes) -> None:
     """Link all files, then all entries, and build the indices; once the manifest is there, a bake can resume the data set."""
     kinds = load_exporter_classes(config.bake.formats)
-    new = not out.exists()
-    out.mkdir(parents=True, exist_ok=True)
+    added = _Added(out)
     lock = lock_folder(out)
     try:
         try:
-            (out / ENTRIES).mkdir()
+            added.make_folder(out / ENTRIES)
             for entry, part in sources.items():
                 for name in read_checksums(part, entry):
-                    _link(part / name, out / name)
+                    added.link(part / name, out / name)
                 for suffix in (".sha256", ".json"):
-                    _link(part / f"{entry}{suffix}", out / f"{entry}{suffix}")
+                    added.link(part / f"{entry}{suffix}", out / f"{entry}{suffix}")
             write_atomically(out / CONFIG_FILE, config_to_toml(config).encode())
+            added.paths.append(out / CONFIG_FILE)
+            write_atomically(out / MANIFEST_FILE, manifest)
         except BaseException:
-            _empty(out, new)
+            added.remove()
             raise
-        write_atomically(out / MANIFEST_FILE, manifest)
         writers = config.bake.writers or len(os.sched_getaffinity(0))
         with WriterPool(writers, slot_bytes(kinds, config), lock) as pool:
             finalize_data_set(out, config, kinds, pool)
@@ -118,20 +164,73 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
         os.close(lock)
 
 
-def _link(source: Path, target: Path) -> None:
-    """Hard-link a file, or copy it where links are not possible."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(source, target)
-    except FileNotFoundError:
-        raise DatasetError(f"{source} is missing; `synpick-warp verify` names what is damaged") from None
-    except OSError:
-        shutil.copy2(source, target)
+class _Added:
+    """Files and folders that the merge adds to the output folder, which an error removes again; nothing else is removed."""
+
+    def __init__(self, out: Path) -> None:
+        self.paths: list[Path] = []
+        """In order of creation."""
+        self._folders: set[Path] = set()
+        self.make_folder(out)
+
+    def make_folder(self, folder: Path) -> None:
+        """Create a folder and its parents, where they are missing."""
+        if folder not in self._folders:
+            if not folder.is_dir():
+                self.make_folder(folder.parent)
+                folder.mkdir()
+                self.paths.append(folder)
+            self._folders.add(folder)
+
+    def link(self, source: Path, target: Path) -> None:
+        """Hard-link a regular file, or copy it where links are not possible. An existing file is never written to: it may be a hard link.
+
+        Raises:
+            DatasetError: The source is missing, is a symbolic link or no regular file, or cannot be read.
+            OSError: The target cannot be written.
+        """
+        self.make_folder(target.parent)
+        try:
+            handle = open_regular(source)
+        except FileNotFoundError:
+            raise DatasetError(f"{source} is missing; `synpick-warp verify` names what is damaged") from None
+        except OSError as error:
+            raise DatasetError(f"{source} cannot be read: {error.strerror}; `synpick-warp verify` names what is damaged") from None
+        with open(source, "rb", opener=lambda *_: handle) as file:
+            try:
+                os.link(source, target, follow_symlinks=False)
+            except FileExistsError:
+                raise
+            except OSError:
+                self._copy(file, target)
+        self.paths.append(target)
+
+    def _copy(self, source: BinaryIO, target: Path) -> None:
+        with open(target, "xb") as file:
+            self.paths.append(target)
+            try:
+                for block in _read_blocks(source):
+                    file.write(block)
+                file.flush()
+                state = os.fstat(source.fileno())
+                os.fchmod(file.fileno(), stat.S_IMODE(state.st_mode))
+                os.utime(file.fileno(), ns=(state.st_atime_ns, state.st_mtime_ns))
+            except OSError as error:
+                raise OSError(error.errno, error.strerror, str(target)) from error
+
+    def remove(self) -> None:
+        """Remove all that was added."""
+        for path in dict.fromkeys(reversed(self.paths)):
+            with contextlib.suppress(OSError):
+                path.rmdir() if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
-def _empty(out: Path, remove_folder: bool) -> None:
-    """Remove a folder's content, and the folder itself if it was new."""
-    for path in out.iterdir():
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-    if remove_folder:
-        out.rmdir()
+def _read_blocks(source: BinaryIO) -> Iterator[bytes]:
+    while True:
+        try:
+            block = source.read(_COPY_BYTES)
+        except OSError as error:
+            raise DatasetError(f"{source.name} cannot be read: {error.strerror}") from None
+        if not block:
+            return
+        yield block

@@ -9,18 +9,15 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
-from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.manifest import (
-    CONFIG_FILE,
     CONSTANTS,
     INDICES,
     committed_episodes,
-    describe_differences,
     episode_entry,
-    make_manifest,
     read_checksums,
     read_entry,
     read_manifest,
+    read_settings,
 )
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.checksums import checksum
@@ -52,35 +49,23 @@ def verify(folder: Path) -> Verdict:
     """
     manifest = read_manifest(folder)
     episodes = committed_episodes(folder)
-    indices = read_entry(folder, INDICES)
-    finished = indices is not None and indices.get("episodes") == episodes
-    entries = [CONSTANTS, *map(episode_entry, episodes), *([INDICES] if indices else [])]
     files = 0
-    if problem := _check_settings(folder, manifest):
-        return Verdict(problem, len(episodes), files, finished)
-    for entry in entries if episodes or indices else []:
-        try:
-            known = read_checksums(folder, entry)
-        except DatasetError as error:
-            return Verdict(str(error), len(episodes), files, finished)
-        for name, problem in _check_files(folder, known):
-            files += 1
-            if problem:
-                return Verdict(f"{folder / name} {problem}", len(episodes), files, finished)
+    finished = False
+    try:
+        read_settings(folder, manifest)
+        indices = read_entry(folder, INDICES)
+        finished = indices is not None and indices["episodes"] == episodes
+        entries = [CONSTANTS, *map(episode_entry, episodes), *([INDICES] if indices else [])]
+        for entry in entries if episodes or indices else []:
+            for name, problem in _check_files(folder, read_checksums(folder, entry)):
+                files += 1
+                if problem:
+                    return Verdict(f"{folder / name} {problem}", len(episodes), files, finished)
+    except (ConfigError, DatasetError) as error:
+        return Verdict(str(error), len(episodes), files, finished)
     missing = sorted(set(indices["episodes"]) - set(episodes)) if indices else []
     problem = f"{folder / episode_entry(missing[0])}.json is missing" if missing else ""
     return Verdict(problem, len(episodes), files, finished)
-
-
-def _check_settings(folder: Path, manifest: dict) -> str:
-    """Compare config.toml with the manifest; returns the problem, or an empty string."""
-    path = folder / CONFIG_FILE
-    try:
-        config = load_config(str(path), {})
-    except ConfigError as error:
-        return str(error)
-    said = describe_differences({"settings": make_manifest(config)["settings"]}, {"settings": manifest["settings"]})
-    return f"{path} does not match the manifest: {said}" if said else ""
 
 
 def _check_files(folder: Path, known: dict[str, str]) -> Iterator[tuple[str, str]]:

@@ -1,7 +1,8 @@
 """Output folder of a bake: lock, resume check, atomic commit of episodes, removal of partial files, indices over all episodes.
 
 An episode is committed when its manifest entry is written, after its files have been renamed into place; anything without entry is partial,
-and is removed when the bake is resumed.
+and is removed when the bake is resumed. Only names that the formats define are removed, whatever lists in the folder say; the manifest
+marks the folder as ours: it is written first and removed last.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import errno
 import fcntl
 import json
 import os
+import re
 import shutil
 import time
 from collections.abc import Sequence
@@ -35,22 +37,27 @@ from synpick_warp.dataset.manifest import (
     episode_entry,
     is_complete,
     make_manifest,
-    read_checksums,
     read_entry,
     read_manifest,
 )
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
-from synpick_warp.exporters.base import Exporter
-from synpick_warp.exporters.registry import Exporters, finalize
+from synpick_warp.exporters.base import Exporter, SharedFiles
+from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes, shared_files
 from synpick_warp.exporters.writing.checksums import write_manifest_entry
 from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, sync_folder, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
+from synpick_warp.inputs.files import check_regular_file
+from synpick_warp.inputs.toml import MAX_TOML
 
 LOCK_TIMEOUT = 20.0
 """Longest wait for the writer processes of a killed bake to exit [s]."""
 _LOCK_INTERVAL = 0.1
 """Time between two attempts to lock [s]."""
+_INDEXED = re.compile(r"(?:shard-)?([0-9]{6,12})(?:\.[a-z0-9]+)?")
+"""Name of an episode's or a scene's file, folder or entry."""
+_TEMPORARY = re.compile(r"\.(?:constants|joined|[0-9]{6,12})\.(?:json|sha256)\.new")
+"""What `write_atomically` leaves of an entry if the bake is killed."""
 _ADVICE = "resume with the same, or name another folder with --out"
 
 
@@ -75,6 +82,8 @@ class OutputFolder:
         """
         self.out, self.config, self.episodes = out, config, list(episodes)
         self._manifest = make_manifest(config)
+        self._shared = shared_files(load_exporter_classes(config.bake.formats), config)
+        self._exporters: Exporters | None = None
         check_output_folder(out)
         self._created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
         try:
@@ -100,18 +109,19 @@ class OutputFolder:
     def _scan(self) -> None:
         """Compare settings, and sort episodes into committed, remaining and partial ones."""
         out, episodes = self.out, self.config.bake.episodes
-        self._known = read_manifest(out) if (out / MANIFEST_FILE).exists() else None
+        self._known = read_manifest(out) if os.path.lexists(out / MANIFEST_FILE) else None
+        self._is_ours = self._known is not None
         if self._known:
             said = describe_differences(self._manifest, {name: self._known[name] for name in self._known if name != INPUTS})
             if said:
                 raise ConfigError(f"{out} was started with other settings: {said}; {_ADVICE}")
+            _check_links(out, self._shared)
         entries = committed_episodes(out)
         if entries and entries[-1] >= episodes:
             raise ConfigError(f"bake.episodes is {episodes}, but {out} has episode {entries[-1]}; a data set can only grow")
-        complete = {index for index in entries if is_complete(self.out, episode_entry(index))}
-        self.committed = sorted(complete.intersection(self.episodes))
-        self.remaining = sorted(set(self.episodes) - complete)
-        self._partial = sorted(set(range(max(episodes, _planned_episodes(out)))) - complete) if self._known else []
+        self._complete = {index for index in entries if is_complete(self.out, episode_entry(index))}
+        self.committed = sorted(self._complete.intersection(self.episodes))
+        self.remaining = sorted(set(self.episodes) - self._complete)
 
     def is_finished(self) -> bool:
         """Whether all episodes are committed and the indices cover them."""
@@ -133,20 +143,21 @@ class OutputFolder:
         differing = [name for name in inputs if self._known and self._known.get(INPUTS, {}).get(name) != inputs[name]]
         if differing:
             raise ConfigError(f"{self.out} was started with other {' and '.join(differing)}; {_ADVICE}")
+        self._exporters = exporters
         try:
-            shutil.rmtree(self.out / PARTIAL, ignore_errors=True)
-            if not self._known:
+            if self._known:
+                shutil.rmtree(self.out / PARTIAL, ignore_errors=True)
+            else:
                 write_atomically(self.out / MANIFEST_FILE, encode_manifest({**self._manifest, INPUTS: inputs}))
+            self._is_ours = True
             (self.out / ENTRIES).mkdir(exist_ok=True)
-            self._remove_files(INDICES)
-            for episode in self._partial:
-                self._remove_entry(episode_entry(episode))
-                for path in exporters.files(episode):
-                    _remove(self.out / path)
+            self._remove_indices()
+            if self._known:
+                self._remove_partial(max(self.config.bake.episodes, _planned_episodes(self.out)))
             write_atomically(self.out / CONFIG_FILE, config_to_toml(self.config).encode())
             (self.out / PARTIAL).mkdir()
             if not is_complete(self.out, CONSTANTS):
-                self._remove_entry(CONSTANTS)
+                self._remove_constants()
                 paths = self._write_constants(exporters)
                 pool.submit(write_manifest_entry, (), (self.out, CONSTANTS, paths, {}), path=self.out / CONSTANTS)
                 pool.wait()
@@ -155,21 +166,44 @@ class OutputFolder:
 
     def _write_constants(self, exporters: Exporters) -> list[Path]:
         """Have constants written; an error removes what was added."""
-        before = set(os.listdir(self.out))
         try:
             return exporters.write_constants()
         except BaseException:
             with contextlib.suppress(OSError):
-                for name in set(os.listdir(self.out)) - before:
-                    _remove(self.out / name)
+                self._remove_constants()
             raise
 
-    def _remove_files(self, entry: Path) -> None:
-        """Remove a manifest entry and its files."""
-        with contextlib.suppress(DatasetError):
-            for name in read_checksums(self.out, entry) if read_entry(self.out, entry) else ():
-                _remove(self.out / name)
-        self._remove_entry(entry)
+    def _remove_indices(self) -> None:
+        for name in (EPISODES_FILE, ATTEMPTS_FILE, *self._shared.indices):
+            (self.out / name).unlink(missing_ok=True)
+        self._remove_entry(INDICES)
+
+    def _remove_constants(self) -> None:
+        """Remove constants, and the folders of the formats that are then empty."""
+        self._remove_entry(CONSTANTS)
+        for name in self._shared.constants:
+            _remove(self.out / name)
+        for name in self._shared.folders:
+            with contextlib.suppress(OSError):
+                (self.out / name).rmdir()
+
+    def _remove_partial(self, end: int) -> None:
+        """Remove the files of all episodes below `end` that are not complete: names that the formats give to an episode."""
+        assert self._exporters is not None
+        for episode in sorted(index for index in self._named_episodes() - self._complete if index < end):
+            self._remove_entry(episode_entry(episode))
+            for path in self._exporters.files(episode):
+                _remove(self.out / path)
+
+    def _named_episodes(self) -> set[int]:
+        """Episodes that may have files: the index in a file's name is an episode's or a scene's."""
+        cameras = len(self.config.cameras.positions)
+        found: set[int] = set()
+        for folder in (ENTRIES, *self._shared.folders):
+            names = os.listdir(self.out / folder) if (self.out / folder).is_dir() else []
+            for index in (int(match[1]) for match in map(_INDEXED.fullmatch, names) if match):
+                found |= {index, index // cameras}
+        return found
 
     def _remove_entry(self, entry: Path) -> None:
         for suffix in (".json", ".sha256"):
@@ -182,17 +216,35 @@ class OutputFolder:
         pool.submit(write_manifest_entry, (), (self.out, entry, exporters.files(end.episode), content), path=self.out / entry)
 
     def clean_up(self) -> None:
-        """Remove partial files, after success or an error; a data set without committed episodes is removed entirely."""
-        shutil.rmtree(self.out / PARTIAL, ignore_errors=True)
+        """Remove partial files, after success or an error; a data set without committed episodes is removed entirely.
+
+        Removed are names that the formats define, in a folder with our manifest: everything else, such as hidden files of the user's,
+        and folders that existed before, stay.
+        """
         with contextlib.suppress(OSError, DatasetError):
-            if not committed_episodes(self.out):
-                self._remove_files(CONSTANTS)
-                shutil.rmtree(self.out / ENTRIES, ignore_errors=True)
-                for name in (CONFIG_FILE, MANIFEST_FILE):
-                    (self.out / name).unlink(missing_ok=True)
-                _remove_empty_folders(self.out)
-                for folder in self._created:
-                    folder.rmdir()
+            if self._is_ours:
+                shutil.rmtree(self.out / PARTIAL, ignore_errors=True)
+                if not committed_episodes(self.out):
+                    self._remove_data_set()
+        with contextlib.suppress(OSError):
+            for folder in self._created:
+                folder.rmdir()
+
+    def _remove_data_set(self) -> None:
+        """Remove a data set without episodes. While anything of it stays, the manifest does, so that a bake can resume it."""
+        self._complete = set()
+        if self._exporters is not None:
+            self._remove_partial(self.config.bake.episodes)
+        self._remove_indices()
+        self._remove_constants()
+        if any(os.path.lexists(self.out / folder) for folder in self._shared.folders):
+            return
+        if (self.out / ENTRIES).is_dir():
+            for name in filter(_TEMPORARY.fullmatch, os.listdir(self.out / ENTRIES)):
+                (self.out / ENTRIES / name).unlink()
+            (self.out / ENTRIES).rmdir()
+        for name in (CONFIG_FILE, MANIFEST_FILE):
+            (self.out / name).unlink(missing_ok=True)
 
 
 def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:
@@ -217,7 +269,9 @@ def build_lists(out: Path, config: Config) -> list[Path]:
     for path in paths:
         with (out / PARTIAL / path).open("w", encoding="ascii") as file:
             for index in committed_episodes(out):
-                entry = read_entry(out, episode_entry(index)) or {}
+                entry = read_entry(out, episode_entry(index))
+                if entry is None:
+                    raise OutputError(f"{out / episode_entry(index)}.json was removed while the lists were written; resume the bake")
                 rows = [{**entry["row"], "checksum": entry["checksum"]}] if path.name == EPISODES_FILE else entry["attempts"]
                 file.writelines(json.dumps(row, allow_nan=False) + "\n" for row in rows)
             file.flush()
@@ -229,9 +283,26 @@ def build_lists(out: Path, config: Config) -> list[Path]:
 
 def _planned_episodes(out: Path) -> int:
     """`bake.episodes` of the last bake of the folder; 0 if its settings cannot be read."""
-    with contextlib.suppress(ConfigError):
+    with contextlib.suppress(ConfigError, DatasetError):
+        check_regular_file(out / CONFIG_FILE, MAX_TOML, DatasetError)
         return load_config(str(out / CONFIG_FILE), {}).bake.episodes
     return 0
+
+
+def _check_links(out: Path, shared: SharedFiles) -> None:
+    """Refuse symbolic links where a bake writes or removes files: they may lead out of the folder.
+
+    Raises:
+        OutputError: There is one.
+    """
+    names = [ENTRIES, PARTIAL, CONFIG_FILE, EPISODES_FILE, ATTEMPTS_FILE, *shared.constants, *shared.indices, *shared.folders]
+    links = [out / name for name in names if (out / name).is_symlink()]
+    for folder in shared.folders:
+        if (out / folder).is_dir() and not links:
+            with os.scandir(out / folder) as children:
+                links = [Path(child.path) for child in children if child.is_symlink()]
+    if links:
+        raise OutputError(f"{links[0]} is a symbolic link, through which a bake does not write; replace it by what it names")
 
 
 def lock_folder(out: Path) -> int:
@@ -260,11 +331,3 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def _remove_empty_folders(out: Path) -> None:
-    """Remove all empty folders below a folder, deepest first."""
-    for folder, _, _ in os.walk(out, topdown=False):
-        if Path(folder) != out:
-            with contextlib.suppress(OSError):
-                os.rmdir(folder)

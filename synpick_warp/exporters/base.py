@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Protocol
+from typing import ClassVar, NamedTuple, Protocol
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.writing.pool import WriterPool, shared_bytes
@@ -30,6 +30,21 @@ class ExportContext:
     lights: tuple[EnvironmentMap, ...]
     pool: WriterPool
     """Writes all files of episodes. Exporters neither close nor abort it."""
+
+
+class SharedFiles(NamedTuple):
+    """Names that a format gives to what it writes beside episodes, relative to the data set.
+
+    They follow from the settings: a bake that removes partial files takes the names from here and from `Exporter.files`, never from lists
+    in the data set, which may have been edited.
+    """
+
+    constants: tuple[Path, ...] = ()
+    """Files that all episodes share, or folders that hold nothing else."""
+    indices: tuple[Path, ...] = ()
+    """Files that span episodes."""
+    folders: tuple[Path, ...] = ()
+    """Folders that hold episodes or constants, each after the folders within it."""
 
 
 class Exporter(Protocol):
@@ -57,6 +72,11 @@ class Exporter(Protocol):
     @staticmethod
     def slot_bytes(config: Config) -> int:
         """Maximum size of the images of one task in the pool's shared memory [B]."""
+        ...
+
+    @staticmethod
+    def shared_files(config: Config) -> SharedFiles:
+        """Names of constants, indices and folders. Looks at nothing."""
         ...
 
     @staticmethod

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError
-from synpick_warp.exporters.base import ExportContext, Exporter
+from synpick_warp.exporters.base import ExportContext, Exporter, SharedFiles
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 
@@ -85,6 +85,10 @@ class Exporters:
         for exporter in self._all:
             exporter.end_episode(end, count_down)
 
+    def shared_files(self, config: Config) -> SharedFiles:
+        """See `Exporter`."""
+        return shared_files(map(type, self._all), config)
+
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
         return sorted(path for exporter in self._all for path in exporter.files(episode))
@@ -103,6 +107,15 @@ class Exporters:
 def slot_bytes(classes: Iterable[type[Exporter]], config: Config) -> int:
     """Maximum size of the images of any task in the pool's shared memory [B]."""
     return max(exporter_class.slot_bytes(config) for exporter_class in classes)
+
+
+def shared_files(classes: Iterable[type[Exporter]], config: Config) -> SharedFiles:
+    """Names of constants, indices and folders of every format, each once."""
+    all_names = [exporter_class.shared_files(config) for exporter_class in classes]
+    constants, indices, folders = (
+        tuple(dict.fromkeys(name for names in group for name in names)) for group in zip(*all_names, strict=True)
+    )
+    return SharedFiles(constants, indices, folders)
 
 
 def finalize(classes: Iterable[type[Exporter]], out: Path, config: Config, pool: WriterPool) -> list[Path]:

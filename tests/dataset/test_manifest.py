@@ -17,6 +17,7 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import list_files, write_manifest_entry
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, EnvironmentMap, Material, Sun, TriangleMesh
+from tests.harness.entries import episode_content
 from tests.worlds.small_worlds import catalog, settings
 
 
@@ -83,9 +84,11 @@ def test_a_manifest_comes_back(tmp_path):
     ("text", "said"),
     [
         ("{", "is damaged"),
-        ("[]", "it is not a JSON object"),
+        ("[]", "is damaged: expected object, got array; restore the file, or bake again into another folder"),
         ('{"format": 9}', "has the format 9; this version reads 1"),
-        ('{"format": 1, "settings": {}, "settings_checksum": "0"}', "changed by hand"),
+        ('{"format": 1, "settings": {}, "settings_checksum": "0", "seed": 0, "versions": {}}', "changed by hand"),
+        ('{"format": 1, "settings": {}, "settings_checksum": "0", "seed": "x", "versions": {}}', r"expected int, got str - at \$\.seed"),
+        ('{"format": 1, "settings": {"bake": NaN}}', "is damaged"),
     ],
 )
 def test_manifests_that_are_none(tmp_path, text, said):
@@ -142,10 +145,10 @@ def test_a_record_has_every_file_once_and_is_whole_while_they_are_there(tmp_path
     given = [manifest.Path("three"), manifest.Path("a"), manifest.Path("a/one")]
     assert [str(path) for path in list_files(tmp_path, given)] == ["a/deep/two", "a/one", "three"]
     assert not manifest.is_complete(tmp_path, place)
-    write_manifest_entry(tmp_path, place, given, {"row": {"frames": 3}})
+    write_manifest_entry(tmp_path, place, given, episode_content(7, frames=3))
     record = manifest.read_entry(tmp_path, place)
     assert record is not None
-    assert (record["row"], record["files"], record["bytes"]) == ({"frames": 3}, 3, 20)
+    assert (record["row"]["frames"], record["files"], record["bytes"]) == (3, 3, 20)
     assert list(manifest.read_checksums(tmp_path, place)) == ["a/deep/two", "a/one", "three"]
     assert manifest.committed_episodes(tmp_path) == [7]
     assert manifest.is_complete(tmp_path, place)

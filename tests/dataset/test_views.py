@@ -16,13 +16,15 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.frames import FrameBatch
+from tests.harness.entries import episode_content
 from tests.harness.exporter_contract import FRAMES, LENSES, export
+from tests.worlds import trajectories
 from tests.worlds.box_views import OBJECT_IDS, SIZES, batches, config
 
 EPISODES = (0, 2)
 PRESENT = np.flatnonzero(OBJECT_IDS >= 0)
 LAYERS = ("classes", "flow")
-ATTEMPT = {"episode": 2, "attempt": 0, "outcome": "dropped"}
+ATTEMPT = trajectories.ATTEMPT | {"episode": 2, "outcome": "dropped"}
 
 
 def write_set(folder: Path, exporter: type, **bop: object) -> Path:
@@ -33,9 +35,8 @@ def write_set(folder: Path, exporter: type, **bop: object) -> Path:
     (folder / MANIFEST_FILE).write_text("{}")
     (folder / ENTRIES).mkdir()
     for episode in EPISODES:
-        row = {"episode": episode, "ending": "finished", "frames": FRAMES, "mode": "move"}
-        content = {"row": row, "attempts": [ATTEMPT] if episode == 2 else []}
-        (folder / f"{episode_entry(episode)}.json").write_text(json.dumps(content))
+        content = episode_content(episode, FRAMES, [ATTEMPT] if episode == 2 else [])
+        (folder / f"{episode_entry(episode)}.json").write_text(json.dumps(content | {"files": 0, "bytes": 0, "checksum": 64 * "0"}))
     return folder
 
 
@@ -53,7 +54,7 @@ def test_episodes_and_their_rows(data):
     assert list(data) == [0, 2]
     assert 2 in data
     assert 1 not in data
-    assert (len(data[2]), data[2].row["mode"], repr(data[2])) == (FRAMES, "move", "Episode(2: 3 frames, finished)")
+    assert (len(data[2]), data[2].row["mode"], repr(data[2])) == (FRAMES, "pick", "Episode(2: 3 frames, finished)")
     assert data[0].attempts == ()
     assert list(data.attempts) == [ATTEMPT]
 

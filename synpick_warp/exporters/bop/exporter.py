@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.schema import Bop, Config
-from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
-from synpick_warp.exporters.bop.scene_exporter import SceneExporter
-from synpick_warp.exporters.bop.targets import BOP19, BOP24, concatenate_targets, write_scene_targets
+from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
+from synpick_warp.exporters.bop.targets import BOP19, BOP24, concatenate_targets, find_scenes, write_scene_targets
 from synpick_warp.exporters.bop.view import write_layer, write_view
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -35,6 +35,11 @@ class BopExporter(SceneExporter):
         return bop.split
 
     @staticmethod
+    def shared_files(config: Config) -> SharedFiles:
+        """See `Exporter`."""
+        return SharedFiles(CONSTANTS, (Path(BOP19), Path(BOP24)), (Path(config.bop.split),))
+
+    @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
         """See `Exporter`: the lists of evaluation targets."""
         parts = out / PARTIAL / BopExporter.staging / "targets"
@@ -43,7 +48,7 @@ class BopExporter(SceneExporter):
             shutil.rmtree(parts, ignore_errors=True)
             for name in (parts, parts / BOP19, parts / BOP24):
                 name.mkdir()
-            for scene in sorted((out / config.bop.split).iterdir()):
+            for scene in find_scenes(out / config.bop.split):
                 pool.submit(write_scene_targets, (), (scene, parts, config.bop.target_visibility), path=scene)
             pool.wait()
             concatenate_targets(parts, out)

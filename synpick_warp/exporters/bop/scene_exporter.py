@@ -13,12 +13,15 @@ from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Bop, Config
 from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.exporters.base import ExportContext, view_bytes
-from synpick_warp.exporters.bop.models import describe_dataset, write_constants
+from synpick_warp.exporters.bop.models import CAMERA_FILE, MODEL_FOLDERS, NOTES_FILE, describe_dataset, write_constants
 from synpick_warp.exporters.bop.scene import discard_scenes
 from synpick_warp.exporters.bop.view import ViewSettings, make_camera_constants, make_view_task
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+
+CONSTANTS = tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, NOTES_FILE)))
+"""Names of the files that all scenes share."""
 
 
 @dataclass(eq=False)

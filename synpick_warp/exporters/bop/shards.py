@@ -8,8 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.schema import Bop, Config
-from synpick_warp.exporters.bop.scene_exporter import SceneExporter
-from synpick_warp.exporters.bop.shard_parts import commit_shards, find_shards, list_keys, shard_index, write_shard_layer, write_shard_view
+from synpick_warp.exporters.base import SharedFiles
+from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
+from synpick_warp.exporters.bop.shard_parts import (
+    commit_shards,
+    find_shards,
+    list_keys,
+    list_shards,
+    shard_index,
+    write_shard_layer,
+    write_shard_view,
+)
 from synpick_warp.exporters.writing.files import PARTIAL, output_error, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 
@@ -32,6 +41,12 @@ class ShardsExporter(SceneExporter):
         return f"{bop.split}_web"
 
     @staticmethod
+    def shared_files(config: Config) -> SharedFiles:
+        """See `Exporter`."""
+        split = Path(ShardsExporter.split(config.bop))
+        return SharedFiles(CONSTANTS, (split / KEYS_FILE,), (split,))
+
+    @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
         """See `Exporter`: the index of views and shards."""
         split, parts = out / ShardsExporter.split(config.bop), out / PARTIAL / ShardsExporter.staging / "keys"
@@ -39,7 +54,7 @@ class ShardsExporter(SceneExporter):
             parts.parent.mkdir(exist_ok=True)
             shutil.rmtree(parts, ignore_errors=True)
             parts.mkdir()
-            for shard in sorted(split.glob("shard-*.tar")):
+            for shard in list_shards(split):
                 pool.submit(list_keys, (), (shard, parts), path=shard)
             pool.wait()
             lines = [line for part in sorted(parts.iterdir(), key=shard_index) for line in part.read_bytes().splitlines()]

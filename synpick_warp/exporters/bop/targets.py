@@ -3,12 +3,39 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from pathlib import Path
+from typing import Annotated, TypeVar
 
+import msgspec
+
+from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import write_atomically
+from synpick_warp.inputs.json import read_json
+from synpick_warp.inputs.paths import path_inside
 
 BOP19, BOP24 = "test_targets_bop19.json", "test_targets_bop24.json"
+
+_SCENE = re.compile(r"[0-9]{6,12}")
+"""Name of a scene's folder."""
+_Frame = Annotated[str, msgspec.Meta(pattern=r"\A(0|[1-9][0-9]{0,8})\Z")]
+"""Key of a frame in a scene's JSON files."""
+_Content = TypeVar("_Content")
+_ADVICE = "remove the scene and its episode's two files in manifest/, and resume the bake"
+
+
+class _Truth(msgspec.Struct):
+    obj_id: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+
+
+class _Info(msgspec.Struct):
+    visib_fract: float
+
+
+def find_scenes(split: Path) -> list[Path]:
+    """Find the scene folders of a split, sorted; other names, and links, are not ours."""
+    return sorted(path for path in split.iterdir() if _SCENE.fullmatch(path.name) and path.is_dir() and not path.is_symlink())
 
 
 def write_scene_targets(scene: Path, folder: Path, visibility: float) -> None:
@@ -16,19 +43,23 @@ def write_scene_targets(scene: Path, folder: Path, visibility: float) -> None:
 
     BOP19: for each image and object, the number of instances whose visible fraction is at least `visibility`. BOP24: every image.
     """
-    truth = json.loads((scene / "scene_gt.json").read_bytes())
-    infos = json.loads((scene / "scene_gt_info.json").read_bytes())
+    truth = _read(scene, "scene_gt.json", dict[_Frame, list[_Truth]])
+    infos = _read(scene, "scene_gt_info.json", dict[_Frame, list[_Info]])
+    if {frame: len(entries) for frame, entries in truth.items()} != {frame: len(entries) for frame, entries in infos.items()}:
+        raise DatasetError(f"{scene} has other objects in scene_gt.json than in scene_gt_info.json; {_ADVICE}")
     scene_id = int(scene.name)
     localize, detect = [], []
     for frame in sorted(truth, key=int):
-        visible = Counter(
-            entry["obj_id"] for entry, info in zip(truth[frame], infos[frame], strict=True) if info["visib_fract"] >= visibility
-        )
+        visible = Counter(entry.obj_id for entry, info in zip(truth[frame], infos[frame], strict=True) if info.visib_fract >= visibility)
         image = {"im_id": int(frame)}
         localize += [{**image, "inst_count": count, "obj_id": obj_id, "scene_id": scene_id} for obj_id, count in sorted(visible.items())]
         detect.append({**image, "scene_id": scene_id})
     for name, targets in ((BOP19, localize), (BOP24, detect)):
         (folder / name / scene.name).write_text("".join(json.dumps(target) + "\n" for target in targets), encoding="ascii")
+
+
+def _read(scene: Path, name: str, schema: type[_Content]) -> _Content:
+    return read_json(path_inside(scene, name, scene, DatasetError), schema, DatasetError, _ADVICE)
 
 
 def concatenate_targets(folder: Path, out: Path) -> None:

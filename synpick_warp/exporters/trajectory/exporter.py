@@ -13,11 +13,11 @@ import numpy as np
 
 from synpick_warp.codes import Ending, Mode
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
 from synpick_warp.exporters.trajectory.episode import ROWS, EpisodeContent, EpisodeSettings, discard_episode, write_episode
 from synpick_warp.exporters.trajectory.spool import SPOOL_TICKS, batch_type, count_instances, fill_row, spool_bytes, write_rows
-from synpick_warp.exporters.trajectory.store import write_constants
+from synpick_warp.exporters.trajectory.store import constant_places, write_constants
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool, shared_bytes
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
@@ -75,6 +75,11 @@ class TrajectoryExporter:
         """See `Exporter`: some ticks of an episode."""
         size = spool_bytes(config.arrangement.max_objects, config.physics.steps_per_tick, config.trajectory.steps)
         return shared_bytes((size,))
+
+    @staticmethod
+    def shared_files(config: Config) -> SharedFiles:
+        """See `Exporter`."""
+        return SharedFiles(tuple(constant_places(STORE)), (), (STORE / EPISODES, STORE))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:

@@ -77,6 +77,11 @@ def chunk_layout(settings: Trajectory, ticks: int, rows_per_tick: int) -> tuple[
     return chunk, chunks * chunk
 
 
+def constant_places(store: Path) -> list[Path]:
+    """Files and folders of the store that all episodes share."""
+    return [store / "zarr.json", *(store / name for name in CONSTANT_GROUPS), store / EPISODES / "zarr.json"]
+
+
 def write_constants(
     store: Path, seed: int, physics: Physics, level: int, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...]
 ) -> list[Path]:
@@ -94,7 +99,7 @@ def write_constants(
     Returns:
         Files and folders that were written.
     """
-    places = [store / "zarr.json", *(store / name for name in CONSTANT_GROUPS), store / EPISODES / "zarr.json"]
+    places = constant_places(store)
     for place in places:
         if place.is_dir():
             shutil.rmtree(place)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.usd.episode import discard_episode, write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
 from synpick_warp.exporters.usd.spool import TickSpool
@@ -43,6 +43,11 @@ class UsdExporter:
     def slot_bytes(config: Config) -> int:
         """See `Exporter`: tasks have no images."""
         return 0
+
+    @staticmethod
+    def shared_files(config: Config) -> SharedFiles:
+        """See `Exporter`."""
+        return SharedFiles((LIBRARY,), (), (FOLDER,))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:

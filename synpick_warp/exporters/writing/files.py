@@ -10,7 +10,10 @@ from pathlib import Path
 from synpick_warp.errors import OutputError
 
 PARTIAL = ".partial"
-"""Staging folder in the data set for uncommitted files: on the same file system, so that a rename commits them atomically."""
+"""Staging folder in the data set for uncommitted files: on the same file system, so that a rename commits them atomically.
+
+The name is reserved beside a manifest, which is written first and removed last; a folder of this name without a manifest is not ours, and
+is neither used nor removed."""
 MANIFEST_FILE = "manifest.json"
 """Marks a folder as a data set."""
 _ALLOWED = "--out takes a new or an empty folder"
@@ -25,9 +28,11 @@ def check_output_folder(out: Path) -> None:
     created = [folder for folder in (out, *out.parents) if not os.path.lexists(folder)]
     try:
         out.mkdir(parents=True, exist_ok=True)
-        # A bake killed before its first commit leaves hidden names only.
-        if not (out / MANIFEST_FILE).exists() and any(not path.name.startswith(".") for path in out.iterdir()):
-            raise OutputError(f"{out} is not empty; {_ALLOWED}, or a data set to go on with")
+        # Other hidden names are never touched: what a bake leaves that was killed before its manifest, or the user's, such as .git.
+        names = [] if (out / MANIFEST_FILE).exists() else [name for name in os.listdir(out) if name == PARTIAL or not name.startswith(".")]
+        if names:
+            reason = f": it has a folder {PARTIAL} of another program" if names == [PARTIAL] else ""
+            raise OutputError(f"{out} is not empty{reason}; {_ALLOWED}, or a data set to go on with")
         probe = out / f".{uuid.uuid4().hex}"
         probe.write_bytes(b"\0")
         probe.unlink()
@@ -54,6 +59,7 @@ def write_atomically(path: Path, data: bytes) -> None:
     """
     temporary = path.with_name(f".{path.name}.new")
     try:
+        temporary.unlink(missing_ok=True)  # A link of this name is not followed.
         write_synced(temporary, data)
         temporary.replace(path)
     except OSError:

@@ -1,0 +1,170 @@
+"""JSON schemas of a data set's own records: the manifest and the entries of constants, episodes and indices.
+
+The files are validated when they are read; code behind may index their content without checks. Unknown keys are allowed and kept.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+
+from synpick_warp.codes import Ending, Mode, Outcome, names
+from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.files import read_file
+from synpick_warp.inputs.json import MAX_JSON, decode_json
+
+Index = Annotated[int, msgspec.Meta(ge=0, le=2**31 - 1)]
+"""Index or count."""
+Number = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31 - 1)]
+"""32-bit integer."""
+Checksum = Annotated[str, msgspec.Meta(pattern=r"\A[0-9a-f]{64}\Z")]
+"""SHA-256 in hexadecimal."""
+Vector = tuple[float, float, float]
+Pixel = tuple[float, float]
+_Value = bool | int | float | str | None
+_Section = dict[str, _Value | list[_Value | list[_Value]]]
+"""Settings of a section, or of an object row."""
+_Schema = TypeVar("_Schema", bound=msgspec.Struct)
+
+
+class Manifest(msgspec.Struct):
+    """Content of manifest.json."""
+
+    format: int
+    seed: int
+    versions: dict[str, str]
+    settings_checksum: str
+    settings: dict[str, _Section | list[_Section]]
+    inputs: dict[str, str] = msgspec.field(default_factory=dict)
+
+
+class Entry(msgspec.Struct):
+    """Entry of constants: what every entry has."""
+
+    files: Index
+    """Number of files."""
+    bytes: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+    """Their total size."""
+    checksum: Checksum
+    """SHA-256 of the checksum list."""
+
+
+class IndicesEntry(Entry):
+    """Entry of the indices over all episodes."""
+
+    episodes: list[Index]
+    """Episodes that the indices cover, sorted."""
+
+
+class Row(msgspec.Struct):
+    """Line of episodes.jsonl, see `episodes.EpisodeRow`."""
+
+    episode: Index
+    arrangement: Index
+    ending: str
+    frames: Index
+    seconds: Annotated[float, msgspec.Meta(ge=0.0)]
+    mode: str
+    objects: Index
+    attempts: Index
+    picked: Index
+    lost: Number
+    left: Index
+    sentence: str
+
+    def __post_init__(self) -> None:
+        _check_name("ending", self.ending, names(Ending)[1:])
+        _check_name("mode", self.mode, names(Mode))
+
+
+class InstanceObservation(msgspec.Struct):
+    """Perception result of an instance, see `attempts.InstanceObservation`."""
+
+    instance: Index
+    object_id: Number
+    visible: Number
+    visible_fraction: float
+    pole: Pixel
+    centroid: Pixel
+    midpoint: Pixel
+    distances: Vector
+    grasp_pixel: tuple[Number, Number]
+    depth: float
+    above: list[Index]
+    ancestors: list[Index]
+
+
+class Observation(msgspec.Struct):
+    """Perception result of an attempt, see `attempts.ObservationRecord`."""
+
+    resolution: tuple[Index, Index]
+    instances: list[InstanceObservation]
+    votes: list[tuple[Index, Index, float]]
+
+
+class Attempt(msgspec.Struct):
+    """Line of attempts.jsonl, see `attempts.AttemptRecord`."""
+
+    episode: Index
+    attempt: Index
+    mode: str
+    frame: Index
+    end_frame: Index
+    outcome: str
+    sentence: str
+    target: Index | None
+    object_id: Number | None
+    point: Vector | None
+    normal: Vector | None
+    yaw: float | None
+    tilt: float | None
+    rays: Index
+    hits: Index
+    good_seal: bool
+    engaged: list[Index]
+    picked: list[Index]
+    peak_force: list[float]
+    observation: Observation
+
+    def __post_init__(self) -> None:
+        _check_name("outcome", self.outcome, names(Outcome)[1:])
+        _check_name("mode", self.mode, names(Mode))
+
+
+class EpisodeEntry(Entry):
+    """Entry of a committed episode."""
+
+    episode: Index
+    row: Row
+    attempts: list[Attempt]
+
+    def __post_init__(self) -> None:
+        if any(record.episode != self.episode for record in (self.row, *self.attempts)):
+            raise ValueError(f"its row or an attempt is of another episode than {self.episode}")
+        if self.row.attempts != len(self.attempts):
+            raise ValueError(f"its row counts {self.row.attempts} attempts, but it has {len(self.attempts)}")
+
+
+def _check_name(key: str, value: str, allowed: tuple[str, ...]) -> None:
+    if value not in allowed:
+        raise ValueError(f"the {key} is {msgspec.json.encode(value[:40]).decode()}, allowed: {', '.join(allowed)}")
+
+
+def read_record(path: Path, schema: type[_Schema], advice: str) -> tuple[_Schema, dict[str, Any]]:
+    """Read and validate a JSON file.
+
+    Args:
+        path: The file.
+        schema: Its type.
+        advice: What to do if it is damaged.
+
+    Returns:
+        The content as `schema`, and as it stands in the file, with unknown keys and the order of keys.
+
+    Raises:
+        DatasetError: It cannot be read, or is damaged.
+    """
+    data = read_file(path, MAX_JSON, DatasetError)
+    return decode_json(data, schema, path, DatasetError, advice), decode_json(data, dict[str, Any], path, DatasetError, advice)

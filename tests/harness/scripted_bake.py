@@ -1,0 +1,115 @@
+"""Bake without simulation: episodes of scripted views and ticks go through output folder, exporters, commit and lists, in this process."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+
+from synpick_warp.codes import Ending
+from synpick_warp.configs.schema import FORMATS, Config
+from synpick_warp.dataset.manifest import episode_entry, read_entry
+from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
+from synpick_warp.episodes import BakeSummary, EpisodeRow
+from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.registry import Exporters, load_exporter_classes, slot_bytes
+from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.frames import EpisodeEnd
+from synpick_warp.scenes.embedded.skies import skies
+from tests.worlds import box_views, trajectories
+
+FRAMES = 2
+INPUTS = {"objects": 64 * "0", "lights": 64 * "1"}
+ATTEMPT = trajectories.ATTEMPT | {
+    "observation": {
+        "resolution": [4, 3],
+        "instances": [
+            {
+                "instance": 2,
+                "object_id": 7,
+                "visible": 5,
+                "visible_fraction": 0.5,
+                "pole": [1.0, 1.0],
+                "centroid": [1.0, 1.5],
+                "midpoint": [1.0, 1.25],
+                "distances": [1.0, 0.5, 0.75],
+                "grasp_pixel": [1, 1],
+                "depth": 1.9,
+                "above": [],
+                "ancestors": [3],
+            }
+        ],
+        "votes": [[2, 3, 0.5]],
+    }
+}
+_LENSES = box_views.cameras(16, 12)
+
+
+def settings(episodes: int = 2, formats: tuple[str, ...] = FORMATS) -> Config:
+    """Settings with tiny images."""
+    config = trajectories.config()
+    bake = dataclasses.replace(config.bake, formats=formats, episodes=episodes, mode="pick", writers=1)
+    cameras = dataclasses.replace(config.cameras, resolution=(16, 12), positions=config.cameras.positions[: len(_LENSES)])
+    return dataclasses.replace(config, bake=bake, cameras=cameras)
+
+
+def small_settings() -> Config:
+    """Settings of two episodes as scenes and shards, of few files."""
+    config = settings(2, ("bop", "shards"))
+    return dataclasses.replace(config, bop=dataclasses.replace(config.bop, split="train", color_format="png", masks=False, coco=False))
+
+
+def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after: int | None = None) -> BakeSummary:
+    """Write a data set, or the remaining episodes of one, as `pipeline.run_bake` does; `stop_after` episodes it is stopped."""
+    classes = load_exporter_classes(config.bake.formats)
+    with OutputFolder(out, config, range(shard[0], config.bake.episodes, shard[1])) as output:
+        summary = BakeSummary(len(output.episodes))
+        for episode in output.committed:
+            summary.take_record(read_entry(out, episode_entry(episode)) or {})
+        if output.is_finished():
+            return summary
+        try:
+            with WriterPool(0, slot_bytes(classes, config), output.lock) as pool:
+                exporters = Exporters(classes, ExportContext(out, config, box_views.catalog(), _LENSES, skies(), pool))
+                if output.remaining:
+                    output.prepare(exporters, INPUTS, pool)
+                for episode in output.remaining[:stop_after]:
+                    _write_episode(output, exporters, pool, episode)
+                pool.wait()
+                exporters.close()
+                if stop_after is None:
+                    finalize_data_set(out, config, classes, pool)
+        finally:
+            output.clean_up()
+    return summary
+
+
+def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool, episode: int) -> None:
+    for batch in trajectories.ticks((episode,), FRAMES):
+        exporters.write_ticks(batch)
+    for batch in box_views.batches(len(_LENSES), (episode,), FRAMES, _LENSES):
+        exporters.write_views(batch)
+    row = EpisodeRow(episode, 0, Ending.FINISHED, FRAMES, 0.5, "pick", 3, 1, 1, 0, 2)
+    end = EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (json.dumps(ATTEMPT | {"episode": episode}) + "\n",))
+    exporters.end_episode(end, lambda: output.commit(exporters, pool, end))
+
+
+def snapshot(folder: Path) -> dict[str, tuple[str, bytes]]:
+    """Everything below a folder: type and content of files, target of links."""
+    found = {}
+    for root, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = Path(root, name)
+            kind = "link" if path.is_symlink() else "folder" if path.is_dir() else "file" if path.is_file() else "other"
+            content = os.readlink(path).encode() if kind == "link" else path.read_bytes() if kind == "file" else b""
+            found[str(path.relative_to(folder))] = (kind, content)
+    return found
+
+
+def make_victim(folder: Path) -> Path:
+    """Make a folder beside a data set that nothing may touch."""
+    victim = folder / "victim"
+    (victim / "train").mkdir(parents=True)
+    (victim / "thesis.txt").write_text("ten years")
+    return victim
