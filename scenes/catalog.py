@@ -14,14 +14,14 @@ from trimesh.bounds import oriented_bounds
 
 from synpick_warp.configs.schema import Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.appearance import FileMaterial
-from synpick_warp.scenes.asset_files import check_file_name
+from synpick_warp.scenes.assets.appearance import FileMaterial
+from synpick_warp.scenes.assets.asset_files import check_file_name
+from synpick_warp.scenes.assets.meshes import SUFFIXES, read_mesh, signed_volume
+from synpick_warp.scenes.assets.models_info import ModelInfo, bop_files, read_models_info
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
-from synpick_warp.scenes.meshes import SUFFIXES, read_mesh, signed_volume
-from synpick_warp.scenes.models_info import ModelInfo, bop_files, read_models_info
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, Material, RawObject, TriangleMesh
 
 _MILLIMETRE = 1e-3

@@ -12,11 +12,11 @@ import numpy as np
 from synpick_warp.errors import LightError
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.paths import path_inside
-from synpick_warp.scenes.appearance import srgb_to_linear
-from synpick_warp.scenes.asset_files import check_file_name
+from synpick_warp.scenes.assets.appearance import srgb_to_linear
+from synpick_warp.scenes.assets.asset_files import check_file_name
+from synpick_warp.scenes.assets.image_size import image_size
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import LUMINANCE, map_directions
-from synpick_warp.scenes.image_size import image_size
 from synpick_warp.scenes.types import EnvironmentMap, Sun
 
 MAX_HEIGHT = 512

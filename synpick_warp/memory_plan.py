@@ -18,10 +18,8 @@ from synpick_warp.configs.check import format_value
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import FAST, Config
-from synpick_warp.device import pick_device
 from synpick_warp.errors import ConfigError
 from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
-from synpick_warp.free_memory import free_device_memory, free_host_memory
 from synpick_warp.scenes import build
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.perception.arrays import Observation, Plan
@@ -39,12 +37,14 @@ from synpick_warp.stages.sim.simulate import RECORDS
 from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.stream import RING, view_sizes
+from synpick_warp.system.device import pick_device
+from synpick_warp.system.free_memory import free_device_memory, free_host_memory
 
 Row = tuple[str, tuple[int, ...], str, int]
 """Name, shape, unit and size [bytes] of an array."""
 
 EPISODE_BYTES = 100
-"""Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: 108 to 142 were measured by tracemalloc."""
+"""Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: tracemalloc has 115 for two million."""
 # Newton's allocations for each item of a world's capacities [bytes]: name, setting, size on a CPU, size on a GPU. Measured on a CPU with
 # Newton 1.8 from the growth of all allocations of model, collision pipeline and solver: 932, 16, 180 and 688. On a GPU rows have other
 # arrays (solve mode "colored"), which were not measured; contacts and pairs have at least those of `newton.Contacts` and their sorter.

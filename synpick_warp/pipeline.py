@@ -20,14 +20,12 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
-from synpick_warp.device import pick_device
 from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import Exporters, load_exporter_classes, slot_bytes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
-from synpick_warp.interrupt import StopRequest
 from synpick_warp.memory_plan import check_episodes, check_memory, is_shortage, shortage_error
 from synpick_warp.progress import Progress
 from synpick_warp.scenes.cameras import make_cameras
@@ -42,6 +40,8 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import RECORDS, Simulation
 from synpick_warp.stages.stream import FrameStream, TickReader, TickReport, name_lights, tick_batch, view_sizes
 from synpick_warp.stages.timing import scope
+from synpick_warp.system.device import pick_device
+from synpick_warp.system.interrupt import StopRequest
 
 
 @dataclass(frozen=True, eq=False)

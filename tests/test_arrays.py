@@ -8,7 +8,6 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import StructArrays, allocate, allocate_struct, device_array, memory_table, struct_arrays
-from synpick_warp.device import pick_device
 from synpick_warp.memory_plan import describe_arrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan, SegmentationScratch
@@ -31,6 +30,7 @@ from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, VIEWS
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus
 from synpick_warp.stages.stream import RING
+from synpick_warp.system.device import pick_device
 from tests.worlds.small_worlds import settings
 
 NAMES = (

@@ -297,8 +297,8 @@ def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], trace: Pat
 def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:
     """Check device and folders, which is cheap, then bake."""
     from synpick_warp.cli.display import make_console, make_progress, print_summary
-    from synpick_warp.device import pick_device
     from synpick_warp.exporters.writing.files import check_output_folder
+    from synpick_warp.system.device import pick_device
 
     pick_device(config.bake.device)
     models, lights = config.bake.models, config.bake.lights

@@ -13,10 +13,10 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp import __version__
-from synpick_warp.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
 from synpick_warp.configs.schema import Config
-from synpick_warp.device import pick_device
 from synpick_warp.scenes.collision.shapes import default_cache_dir
+from synpick_warp.system.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
+from synpick_warp.system.device import pick_device
 
 _PACKAGES = ("warp-lang", "newton", "numpy")
 MIB = 1024**2

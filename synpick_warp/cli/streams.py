@@ -15,8 +15,8 @@ import sys
 import threading
 from typing import TYPE_CHECKING, Any, Self
 
-from synpick_warp.descriptors import open_standard_descriptors
 from synpick_warp.errors import SynpickError
+from synpick_warp.system.descriptors import open_standard_descriptors
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer

@@ -16,12 +16,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.errors import CatalogError
+from synpick_warp.scenes.assets.meshes import smooth_normals
 from synpick_warp.scenes.collision import parallel
 from synpick_warp.scenes.collision import shapes as collision
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
 from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties, simplify_hull
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
-from synpick_warp.scenes.meshes import smooth_normals
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
 from tests.harness.environment import checkout_environment
 

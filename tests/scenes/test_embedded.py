@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, cKDTree
 
+from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
 from synpick_warp.scenes.catalog import diameter
 from synpick_warp.scenes.embedded.meshes import (
     BOX_FACES,
@@ -25,7 +26,6 @@ from synpick_warp.scenes.embedded.meshes import (
 )
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.embedded.textures import PADDING, blank, pack
-from synpick_warp.scenes.meshes import merge_positions, signed_volume
 from tests.twins.rays import edges_match
 
 TABLE = {

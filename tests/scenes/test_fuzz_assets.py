@@ -22,9 +22,9 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError, LightError, SynpickError
+from synpick_warp.scenes.assets.meshes import read_mesh
+from synpick_warp.scenes.assets.models_info import read_models_info
 from synpick_warp.scenes.lights import MAX_RADIANCE, load_lights
-from synpick_warp.scenes.meshes import read_mesh
-from synpick_warp.scenes.models_info import read_models_info
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, places, removed, replaced
 

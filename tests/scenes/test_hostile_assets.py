@@ -19,13 +19,13 @@ import trimesh
 from synpick_warp.configs.schema import Bake, Config
 from synpick_warp.errors import CatalogError, LightError
 from synpick_warp.exporters.bop.models import write_models
-from synpick_warp.scenes.asset_files import MAX_ROWS
+from synpick_warp.scenes.assets.asset_files import MAX_ROWS
+from synpick_warp.scenes.assets.image_size import image_size
+from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
 from synpick_warp.scenes.collision.shapes import collision_shapes
-from synpick_warp.scenes.image_size import image_size
 from synpick_warp.scenes.lights import MAX_MAP_PIXELS, MAX_RADIANCE, load_lights
-from synpick_warp.scenes.meshes import read_mesh
 from synpick_warp.stages.render.light_tables import precompute_environment
 from tests.scenes.test_fuzz_assets import BINARY, CORNERS, DOCUMENT, FACES, OBJ, glb, picture
 

@@ -16,8 +16,8 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.appearance import bake_vertex_colors, linear_to_srgb, rgb8, srgb_to_linear
-from synpick_warp.scenes.meshes import merge_positions, read_mesh, signed_volume, smooth_normals
+from synpick_warp.scenes.assets.appearance import bake_vertex_colors, linear_to_srgb, rgb8, srgb_to_linear
+from synpick_warp.scenes.assets.meshes import merge_positions, read_mesh, signed_volume, smooth_normals
 
 CORNERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
 FACES = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]

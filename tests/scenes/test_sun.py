@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.errors import LightError
-from synpick_warp.scenes.appearance import srgb_to_linear
+from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS, SOLAR_ANGULAR_RADIUS, draw_sun_disc, extract_sun, replace_sun

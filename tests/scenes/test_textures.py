@@ -15,8 +15,8 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.appearance import read_texture
-from synpick_warp.scenes.meshes import read_mesh
+from synpick_warp.scenes.assets.appearance import read_texture
+from synpick_warp.scenes.assets.meshes import read_mesh
 
 CORNERS = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
 UNWRAPPED_OBJ = "mtllib a.mtl\n" + "".join(f"v {corner}\n" for corner in CORNERS) + "usemtl skin\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"

@@ -28,7 +28,6 @@ from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import GIB, describe_machine
 from synpick_warp.codes import Status
 from synpick_warp.configs.schema import Config
-from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.pipeline import Factory, build_factory, run_bake
@@ -38,6 +37,7 @@ from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
+from synpick_warp.system.device import pick_device
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
 from tools.bench.sensor import measure_sensor
 from tools.bench.write import measure_writing

@@ -21,7 +21,6 @@ from rich.table import Table
 
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, Config
-from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
 from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
@@ -31,6 +30,7 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.system.device import pick_device
 from tools.options import configure, fail, make_parser, write_json
 from tools.reports.render_checks import with_mode
 from tools.reports.render_piles import next_frame, settle_piles

@@ -24,7 +24,6 @@ from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import MIXED, Config
 from synpick_warp.configs.schema import MODES as MIX
-from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
 from synpick_warp.pipeline import Factory, build_factory
 from synpick_warp.progress import SilentProgress
@@ -33,6 +32,7 @@ from synpick_warp.stages.render.annotate import annotate
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.simulate import RECORDS
 from synpick_warp.stages.stream import HostCopy, TickReader, TickReport
+from synpick_warp.system.device import pick_device
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, print_machine, write_json
 from tools.reports.pick_tally import MODES, PAPER, ModeRow, Tally, report, sum_visibility
 

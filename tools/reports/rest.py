@@ -21,7 +21,6 @@ from rich.console import Console
 from synpick_warp.cli.doctor import describe_machine
 from synpick_warp.codes import Ending, Phase
 from synpick_warp.configs.schema import Config
-from synpick_warp.device import pick_device
 from synpick_warp.errors import SynpickError
 from synpick_warp.scenes import build
 from synpick_warp.scenes.catalog import load_catalog
@@ -29,6 +28,7 @@ from synpick_warp.scenes.types import Catalog
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
+from synpick_warp.system.device import pick_device
 from tools.options import INTERRUPTED, Row, configure, fail, make_parser, print_machine, print_rows, write_json
 
 MAX_SPEED = 0.2

@@ -15,9 +15,9 @@ from synpick_warp.exporters.bop.view import MILLIMETERS
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.inputs.paths import path_inside
 from synpick_warp.layer_codec import layer_notes
-from synpick_warp.scenes.appearance import decode_texture
-from synpick_warp.scenes.models_info import read_entries
-from synpick_warp.scenes.ply import read_ply_file, read_ply_texture
+from synpick_warp.scenes.assets.appearance import decode_texture
+from synpick_warp.scenes.assets.models_info import read_entries
+from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
 
 CAMERA_FILE, NOTES_FILE = "camera.json", "dataset_info.md"

@@ -19,7 +19,7 @@ from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdSemantics, UsdSh
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import write_synced
 from synpick_warp.exporters.writing.png import encode_png
-from synpick_warp.scenes.appearance import srgb_to_linear
+from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import ConvexPiece, Material, TriangleMesh
 
 TEXTURES = "textures"

@@ -21,10 +21,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from synpick_warp.descriptors import duplicate_above_streams, open_standard_descriptors
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.worker import Failure, SharedImage, TaskMessage, run_task
+from synpick_warp.system.descriptors import duplicate_above_streams, open_standard_descriptors
 
 _WORKER = "from synpick_warp.exporters.writing.worker import main; main()"
 """Program of a writer process: imported, not run as `__main__`, so that pickled tasks name the module's own classes."""

@@ -15,7 +15,7 @@ from synpick_warp.kernels.render.lighting.materials import Surfaces
 from synpick_warp.kernels.render.lighting.path_tracing import PathScene
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
-from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.light_tables import build_environment_cdf, measure_albedo, precompute_environment

@@ -15,7 +15,7 @@ from pxr import Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdSemantics, UsdShade, U
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.usd.exporter import UsdExporter
 from synpick_warp.exporters.usd.parts import new_asset, save_layer
-from synpick_warp.scenes.appearance import srgb_to_linear
+from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from tests.harness.exporter_contract import ExporterContract, digests
 from tests.worlds import small_worlds, usd_sets
 

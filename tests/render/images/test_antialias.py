@@ -10,7 +10,7 @@ import pytest
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.kernels.render.images import antialias
-from synpick_warp.scenes.appearance import srgb_to_linear
+from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import Material, TriangleMesh
 from tests.worlds.toy_scene import UPRIGHT, RenderedViews, ToyScene, box, camera, entry, even_light, render, sheet, sun
 

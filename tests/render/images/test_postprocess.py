@@ -16,16 +16,16 @@ from synpick_warp.codes import Effect, Tone, names
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import Effects, effect_ranges
-from synpick_warp.device import pick_device
 from synpick_warp.errors import ConfigError
 from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.kernels.render.images.camera_effects import EffectParameters
 from synpick_warp.kernels.render.lighting.environment import Lights
 from synpick_warp.memory_plan import describe_arrays
-from synpick_warp.scenes.appearance import linear_to_srgb, srgb_to_linear
+from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.stages.render.postprocess import PostProcessor
 from synpick_warp.stages.render.scene import build_cameras, build_grid
 from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.system.device import pick_device
 from tests.harness.devices import default_device
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, box, camera, entry, render
 

@@ -10,7 +10,7 @@ import pytest
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.render.visibility import gbuffer
-from synpick_warp.scenes.meshes import read_mesh
+from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.types import Fixture
 from synpick_warp.stages import buffers
 from tests.twins.raycast import cast_scene

@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from synpick_warp.interrupt import SIGNALS, StopRequest
+from synpick_warp.system.interrupt import SIGNALS, StopRequest
 
 
 @pytest.mark.parametrize("number", SIGNALS)

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 
 import warp as wp
 
-from synpick_warp.caches import usable_kernel_cache
-from synpick_warp.descriptors import STANDARD_ERROR
 from synpick_warp.errors import DeviceError
+from synpick_warp.system.caches import usable_kernel_cache
+from synpick_warp.system.descriptors import STANDARD_ERROR
 
 _CUDA = re.compile(r"cuda:([0-9]{1,9})")
 _NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.appearance import FileMaterial, as_color, bake_vertex_colors, join_textures
-from synpick_warp.scenes.asset_files import MAX_ROWS, quiet_decoding
-from synpick_warp.scenes.mesh_parts import MeshPart
-from synpick_warp.scenes.ply import read_ply
-from synpick_warp.scenes.scene_files import read_scene
+from synpick_warp.scenes.assets.appearance import FileMaterial, as_color, bake_vertex_colors, join_textures
+from synpick_warp.scenes.assets.asset_files import MAX_ROWS, quiet_decoding
+from synpick_warp.scenes.assets.mesh_parts import MeshPart
+from synpick_warp.scenes.assets.ply import read_ply
+from synpick_warp.scenes.assets.scene_files import read_scene
 from synpick_warp.scenes.types import TriangleMesh
 
 SUFFIXES = (".ply", ".obj", ".glb")

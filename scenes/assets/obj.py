@@ -9,8 +9,8 @@ import numpy as np
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import read_file
-from synpick_warp.scenes.appearance import MAX_TEXTURE_FILE, MAX_TEXTURE_PIXELS, decode_texture
-from synpick_warp.scenes.asset_files import MAX_PARTS, MAX_ROWS, MAX_TEXT_MESH, FileTable, read_referred
+from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, MAX_TEXTURE_PIXELS, decode_texture
+from synpick_warp.scenes.assets.asset_files import MAX_PARTS, MAX_ROWS, MAX_TEXT_MESH, FileTable, read_referred
 
 MAX_LIBRARY = 2**22
 """Largest material library [bytes]: 4 MiB."""

@@ -17,8 +17,8 @@ import msgspec
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.json import decode_json
-from synpick_warp.scenes.appearance import MAX_TEXTURE_FILE, MAX_TEXTURE_PIXELS, decode_texture
-from synpick_warp.scenes.asset_files import MAX_MESH_FILE, MAX_PARTS, MAX_ROWS, FileTable, read_referred
+from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, MAX_TEXTURE_PIXELS, decode_texture
+from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_PARTS, MAX_ROWS, FileTable, read_referred
 
 MAX_DEPTH = 256
 """Maximum depth of the tree of nodes."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synpick_warp.scenes.appearance import FileMaterial
+from synpick_warp.scenes.assets.appearance import FileMaterial
 
 # Default base colour (sRGB): a light grey, since highlights do not show on pure white.
 GREY = (0.7, 0.7, 0.7)

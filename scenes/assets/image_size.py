@@ -8,7 +8,7 @@ import struct
 
 from PIL import Image
 
-from synpick_warp.scenes.asset_files import quiet_decoding
+from synpick_warp.scenes.assets.asset_files import quiet_decoding
 
 MAX_HEADER = 2**16
 """Longest header of a Radiance file [bytes]."""

@@ -13,9 +13,9 @@ from trimesh.geometry import triangulate_quads
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import read_file
-from synpick_warp.scenes.appearance import MAX_TEXTURE_FILE, FileMaterial, decode_texture
-from synpick_warp.scenes.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, read_referred
-from synpick_warp.scenes.mesh_parts import GREY, MeshPart
+from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, FileMaterial, decode_texture
+from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, read_referred
+from synpick_warp.scenes.assets.mesh_parts import GREY, MeshPart
 
 MAX_HEADER = 2**16
 """Longest header [bytes]; models have less than 1 kB."""

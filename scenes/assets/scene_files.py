@@ -14,16 +14,18 @@ from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.appearance import FileMaterial, as_color, linear_to_srgb, rgb8
-from synpick_warp.scenes.asset_files import describe_error
-from synpick_warp.scenes.gltf import prepare_glb
-from synpick_warp.scenes.mesh_parts import GREY, MeshPart
-from synpick_warp.scenes.obj import prepare_obj
+from synpick_warp.scenes.assets.appearance import FileMaterial, as_color, linear_to_srgb, rgb8
+from synpick_warp.scenes.assets.asset_files import describe_error
+from synpick_warp.scenes.assets.gltf import prepare_glb
+from synpick_warp.scenes.assets.mesh_parts import GREY, MeshPart
+from synpick_warp.scenes.assets.obj import prepare_obj
 
 # glTF 2.0, section 3.9.2: a material without factors is white, fully metallic and fully rough.
 _GLTF_FACTOR = 1.0
 # Factors may exceed 0..1 by rounding.
 _FACTOR_TOLERANCE = 1e-3
+_SUFFIX = 7
+"""Length of the reader's random suffixes: "_" and six characters."""
 
 
 def read_scene(path: Path) -> list[MeshPart]:
@@ -38,7 +40,7 @@ def read_scene(path: Path) -> list[MeshPart]:
         scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=table, process=False)
         parts, textures = [], {}
         # Sorted, since the reader's order of nodes is not deterministic.
-        for node in sorted(scene.graph.nodes_geometry):
+        for node in sorted(scene.graph.nodes_geometry, key=lambda node: _node_order(scene, node)):
             transform, name = scene.graph[node]
             mesh = scene.geometry[name]
             if isinstance(mesh, trimesh.Trimesh):
@@ -50,6 +52,14 @@ def read_scene(path: Path) -> list[MeshPart]:
     if not parts:
         raise CatalogError(f"{path}: no triangles; a model needs a surface, a point cloud has none")
     return parts
+
+
+def _node_order(scene: trimesh.Scene, node: str) -> tuple[str, str]:
+    """Sort key of a node: its name; for the primitives of one glTF mesh, whose nodes get random suffixes, the mesh's node and the part."""
+    parent = node[:-_SUFFIX]
+    if scene.graph.transforms.parents.get(node) == parent:
+        return parent, scene.graph[node][1]
+    return node, ""
 
 
 def _transform_part(part: MeshPart, transform: np.ndarray) -> MeshPart:

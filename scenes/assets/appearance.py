@@ -12,7 +12,7 @@ from PIL import Image, UnidentifiedImageError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import read_file
-from synpick_warp.scenes.asset_files import describe_error, quiet_decoding
+from synpick_warp.scenes.assets.asset_files import describe_error, quiet_decoding
 
 MAX_TEXTURE_FILE = 2**27
 """Largest image file [bytes]: 128 MiB."""
