@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.cli.commands import main
+from synpick_warp.cli.commands import EXIT_MISTAKE, main
 from synpick_warp.dataset import writing
 from synpick_warp.dataset.manifest import CONSTANTS, committed_episodes, episode_entry, read_checksums
 from synpick_warp.dataset.merge import merge
@@ -24,7 +24,10 @@ from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import PARTIAL
 from tests.harness.bake_server import TINY, BakeServer
 
-KILLS = 20
+KILLS = int(os.environ.get("SYNPICK_KILLS", 20))
+"""Kills of the test at random times; the long form has 200."""
+WRITERS_KILLED = 0.25
+"""Fraction of these kills that meet a writer."""
 EPISODES = TINY["bake.episodes"]
 PAGE = os.sysconf("SC_PAGE_SIZE")
 FILES_OF_THE_MANIFEST = 2 + 2 * (EPISODES + 2)
@@ -55,8 +58,8 @@ def expected(whole) -> dict[str, str]:
 
 
 def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_bake(server, expected, tmp_path):
-    """The time of each kill is drawn anew; whenever a bake comes to its end in between, another folder is begun. The longest time to a kill
-    follows the bakes that end: a machine may be busy while the first is timed."""
+    """The time of each kill is drawn anew, and whether the bake is killed or its writer; whenever a bake comes to its end in between, another
+    folder is begun. The longest time to a kill follows the bakes that end: a machine may be busy while the first is timed."""
     numbers = random.Random(0)
     started = time.monotonic()
     assert server.bake(tmp_path / "timed") == 0
@@ -67,9 +70,9 @@ def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_ba
         started = time.monotonic()
         process = server.start(out)
         if kills < KILLS:
-            kill_after(process, numbers.uniform(0.0, longest))
+            kill_after(process, numbers.uniform(0.0, longest), writer=numbers.random() < WRITERS_KILLED)
         code = server.wait()
-        assert code in (0, -signal.SIGKILL)
+        assert code in (0, -signal.SIGKILL, EXIT_MISTAKE)
         kills += code != 0
         if code == 0:
             assert digests(out) == expected
@@ -77,14 +80,14 @@ def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_ba
             longest = min(longest, 2.0 * (time.monotonic() - started))
 
 
-def kill_after(process: int, seconds: float) -> None:
-    """Kill a process, or see it end before."""
+def kill_after(process: int, seconds: float, writer: bool) -> None:
+    """Kill a process, or its writer if there is one yet; or see it end before."""
     end = time.monotonic() + seconds
-    with contextlib.suppress(ProcessLookupError):
+    with contextlib.suppress(ProcessLookupError, FileNotFoundError):
         while time.monotonic() < end:
             os.kill(process, 0)
             time.sleep(0.01)
-        os.kill(process, signal.SIGKILL)
+        os.kill(([process, *children(process)] if writer else [process])[-1], signal.SIGKILL)
 
 
 @pytest.fixture(scope="module")
