@@ -375,14 +375,15 @@ def test_a_chunk_that_the_manifest_lists_must_be_there(store):
     with pytest.raises(DatasetError, match=r"there is no .*objects/mass/c\.0, which the manifest lists"):
         _ = synpick_warp.open(store).objects
     write_entry(store, f"{'0' * 64}  trajectory.zarr/../../outside\n")
-    with pytest.raises(DatasetError, match=r"constants\.sha256 names the file"):
+    with pytest.raises(DatasetError, match=r"constants\.sha256, line 1, names the file"):
         _ = synpick_warp.open(store).objects
 
 
 def write_entry(store: Path, lines: str) -> None:
     """Write the manifest entry of the constants."""
+    content = {"files": lines.count("\n"), "checksum": hashlib.sha256(lines.encode()).hexdigest(), "bytes": 0}
     (store / f"{CONSTANTS}.sha256").write_text(lines)
-    (store / f"{CONSTANTS}.json").write_bytes(encode_manifest({"checksum": hashlib.sha256(lines.encode()).hexdigest(), "bytes": 0}))
+    (store / f"{CONSTANTS}.json").write_bytes(encode_manifest(content))
 
 
 def test_tables_whose_lengths_differ_are_named(store):
