@@ -34,8 +34,7 @@ from tests.harness.hostile import places, replaced
 from tests.worlds import trajectories
 from tests.worlds.box_views import config
 
-SIZE = (LENSES[0].width, LENSES[0].height)
-FRAMES = 2
+SIZE, FRAMES = (LENSES[0].width, LENSES[0].height), 2
 
 
 def open_set(folder: Path, exporter: type) -> synpick_warp.DataSet:

@@ -58,8 +58,8 @@ def expected(whole) -> dict[str, str]:
 
 
 def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_bake(server, expected, tmp_path):
-    """The time of each kill is drawn anew, and whether it meets the bake or its writer; whenever a bake comes to its end in between, another
-    folder is begun. The longest time to a kill follows the bakes that end: a machine may be busy while the first is timed."""
+    """The time of each kill is drawn anew, and whether it meets the bake or its writer; whenever a bake ends in between, another folder is
+    begun. The longest time to a kill follows the bakes that end: a machine may be busy while the first is timed."""
     numbers = random.Random(0)
     started = time.monotonic()
     assert server.bake(tmp_path / "timed") == 0
