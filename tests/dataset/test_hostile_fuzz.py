@@ -243,3 +243,13 @@ def check_entry(folder: Path) -> None:
     BakeSummary().take_record(content)
     for row in ({**content["row"], "checksum": content["checksum"]}, *content["attempts"]):
         assert json.loads(json.dumps(row, allow_nan=False)) == row
+
+
+@pytest.mark.parametrize("last", ["/etc/passwd", "/x", "a/..", "..", "link", "a/link"])
+def test_a_name_is_checked_after_others_of_its_folder_too(tmp_path, last):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "link").symlink_to("..")
+    (tmp_path / "a" / "link").symlink_to("../..")
+    lines = "".join(f"{'0' * 64}  {name}\n" for name in ("first", "a/first", last))
+    with pytest.raises(DatasetError, match="line 3"):
+        parse_checksums(lines.encode(), tmp_path, Path("LIST"), "ADVICE")

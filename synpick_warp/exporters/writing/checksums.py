@@ -71,8 +71,9 @@ def parse_checksums(lines: bytes, folder: Path, source: Path, advice: str) -> di
             raise DatasetError(f"{source}, line {number}, is damaged: it is not a SHA-256 and a name; {advice}")
         digest, name = match.groups()
         parent, _, last = name.rpartition("/")
-        # Resolving a path takes system calls: once for each folder, whose other names are then compared as text.
-        if parent not in folders or name.startswith("/") or last in (".", "..") or not last.isprintable():
+        # Resolving a path takes several system calls: once for each folder, and for those of its names that are links.
+        plain = not name.startswith("/") and last not in (".", "..") and last.isprintable()
+        if parent not in folders or not plain or os.path.islink(f"{folder}/{name}"):
             path_inside(folder, name, f"{source}, line {number},", DatasetError)
             folders.add(parent)
         if name in known or name != str(Path(name)) or name.partition("/")[0] in _RESERVED:
