@@ -64,8 +64,10 @@ class Axis:
 
     def fraction(self, values: np.ndarray) -> np.ndarray:
         """Position of values between the ends of the axis; 0 to 1 inside."""
-        low, high, values = (np.log(one) if self.log else one for one in (self.low, self.high, np.asarray(values, np.float64)))
-        return (values - low) / (high - low)
+        values = np.asarray(values, np.float64)
+        if self.log:
+            return np.log(values / self.low) / math.log(self.high / self.low)
+        return (values - self.low) / (self.high - self.low)
 
     def labelled_ticks(self, count: int) -> tuple[tuple[float, str], ...]:
         """Given ticks, or at most about `count` round values."""
@@ -94,7 +96,7 @@ class Line:
     def draw(self, canvas: Image, place: Place) -> None:
         points = place(self.x, self.y)
         thickness = max(1, round(_SUPER * self.width))
-        known = np.isfinite(points).all(axis=1)
+        known = np.asarray(np.isfinite(points).all(axis=1))
         for run in np.split(np.arange(len(points)), 1 + np.flatnonzero(known[1:] != known[:-1])):
             if not len(run) or not known[run[0]]:
                 continue

@@ -57,10 +57,7 @@ def filter_poses(
     tracks = find_tracks(table) if tracks is None else _check_tracks(table, tracks)
     if not len(table):
         return table
-    try:
-        measured = Rotation.from_matrix(table.rotation)
-    except ValueError as fault:
-        raise DatasetError(f"a pose has no rotation ({fault}); rotations are orthonormal with determinant 1") from None
+    measured = _to_quaternions(table.rotation, "the estimates")
     steps = _steps(tracks, table.image)
     translation, rotation = _run_filter(table.translation, measured, steps, alpha, _Symmetries(table, symmetries or {}))
     columns = {name: getattr(table, name) for name in table.__dataclass_fields__}
@@ -73,6 +70,15 @@ def check_alpha(alpha: float) -> None:
         raise ConfigError(
             f"alpha {alpha} is not allowed: it is the weight of the new estimate, above 0 and at most 1 (paper: 0.05 and 0.2)"
         )
+
+
+def _to_quaternions(matrices: np.ndarray, source: str) -> np.ndarray:
+    """Quaternions (N, 4), scalar last, of the rotations next to matrices (N, 3, 3); DatasetError if one is singular or left-handed."""
+    try:
+        return Rotation.from_matrix(matrices).as_quat()
+    except ValueError:
+        wrong = int(np.argmin(np.linalg.det(matrices)))
+        raise DatasetError(f"matrix {wrong} of {source} is no rotation; rotations are orthonormal with determinant 1") from None
 
 
 def _check_tracks(table: PoseTable, tracks: np.ndarray) -> np.ndarray:
@@ -102,22 +108,30 @@ def _steps(tracks: np.ndarray, image: np.ndarray) -> list[np.ndarray]:
 
 
 def _run_filter(
-    position: np.ndarray, measured: Rotation, steps: list[np.ndarray], alpha: float, symmetries: _Symmetries
+    position: np.ndarray, measured: np.ndarray, steps: list[np.ndarray], alpha: float, symmetries: _Symmetries
 ) -> tuple[np.ndarray, np.ndarray]:
     """Run the recursion on all tracks at once: one NumPy step per frame.
+
+    Args:
+        position: Measured translation (N, 3) [m].
+        measured: Measured rotation as quaternion (N, 4), scalar last.
+        steps: Rows of the n-th estimate of each track, as `_steps` gives them.
+        alpha: Weight of the new estimate.
+        symmetries: Equivalent poses.
 
     Returns:
         Filtered translation (N, 3) [m] and rotation (N, 3, 3).
     """
-    translation, quaternion = np.array(position), measured.as_quat()
-    mean, turn = position[steps[0]], measured[steps[0]]
+    translation, quaternion = np.array(position), np.array(measured)
+    mean, state = position[steps[0]], measured[steps[0]]
     for rows in steps[1:]:
-        mean, turn = mean[: len(rows)], turn[: len(rows)]
-        new_position, new_rotation = symmetries.nearest(rows, turn, position[rows], measured[rows])
-        mean = (1.0 - alpha) * mean + alpha * new_position
+        turn = Rotation.from_quat(state[: len(rows)])
+        new_position, new_quaternion = symmetries.nearest(rows, turn, position[rows], measured[rows])
+        mean = (1.0 - alpha) * mean[: len(rows)] + alpha * new_position
         # Slerp as a fraction of the relative rotation: a rotation vector has at most 180°, hence the shorter arc.
-        turn = turn * Rotation.from_rotvec(alpha * (turn.inv() * new_rotation).as_rotvec())
-        translation[rows], quaternion[rows] = mean, turn.as_quat()
+        relative = turn.inv() * Rotation.from_quat(new_quaternion)
+        state = (turn * Rotation.from_rotvec(alpha * relative.as_rotvec())).as_quat()
+        translation[rows], quaternion[rows] = mean, state
     return translation, Rotation.from_quat(quaternion).as_matrix()
 
 
@@ -126,27 +140,42 @@ class _Symmetries:
 
     def __init__(self, table: PoseTable, symmetries: Mapping[int, np.ndarray]) -> None:
         self._object_id = table.object_id
-        self._transforms = {}
+        self._transforms: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        """obj_id -> quaternions (K, 4) and translations (K, 3) [m]."""
         for object_id, transforms in symmetries.items():
             transforms = np.asarray(transforms, np.float64)
             if transforms.ndim != 3 or transforms.shape[1:] != (4, 4) or not len(transforms) or not np.isfinite(transforms).all():
                 raise DatasetError(f"symmetries of object {object_id} have shape {transforms.shape}; give finite transforms (K, 4, 4)")
-            self._transforms[object_id] = Rotation.from_matrix(transforms[:, :3, :3]), transforms[:, :3, 3]
+            self._transforms[object_id] = (
+                _to_quaternions(transforms[:, :3, :3], f"the symmetries of object {object_id}"),
+                transforms[:, :3, 3],
+            )
 
-    def nearest(self, rows: np.ndarray, turn: Rotation, position: np.ndarray, measured: Rotation) -> tuple[np.ndarray, Rotation]:
-        """Replace each estimate by its equivalent with the smallest angle to the filtered rotation `turn`."""
+    def nearest(self, rows: np.ndarray, turn: Rotation, position: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Replace estimates by their equivalents with the smallest angle to the filtered rotations.
+
+        Args:
+            rows: Rows of the table (n,).
+            turn: Filtered rotations (n).
+            position: Measured translation (n, 3) [m].
+            measured: Measured quaternion (n, 4).
+
+        Returns:
+            Translation (n, 3) [m] and quaternion (n, 4).
+        """
+        state = turn.as_quat()
         for object_id, (rotations, shifts) in self._transforms.items():
             chosen = np.flatnonzero(self._object_id[rows] == object_id)
             if not len(chosen):
                 continue
             count = len(rotations)
             every = np.repeat(chosen, count)
-            equivalent = measured[every] * Rotation.concatenate([rotations] * len(chosen))
-            angle = (turn[every].inv() * equivalent).magnitude().reshape(-1, count)
-            best = np.argmin(angle, axis=1)
-            position = position.copy()
-            position[chosen] += measured[chosen].apply(shifts[best])
-            quaternion = measured.as_quat()
-            quaternion[chosen] = equivalent[np.arange(len(chosen)) * count + best].as_quat()
-            measured = Rotation.from_quat(quaternion)
+            equivalent = (Rotation.from_quat(measured[every]) * Rotation.from_quat(np.tile(rotations, (len(chosen), 1)))).as_quat()
+            # The angle between two rotations falls as the product of their quaternions grows in size.
+            likeness = np.abs((state[every] * equivalent).sum(axis=1)).reshape(-1, count)
+            best = np.argmax(likeness, axis=1)
+            position, turned = position.copy(), Rotation.from_quat(measured[chosen])
+            position[chosen] += turned.apply(shifts[best])
+            measured = measured.copy()
+            measured[chosen] = equivalent[np.arange(len(chosen)) * count + best]
         return position, measured

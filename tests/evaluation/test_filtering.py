@@ -169,11 +169,13 @@ def test_a_pose_that_is_none_is_refused_with_its_place(name, value):
         filter_poses(table)
 
 
-def test_a_left_handed_rotation_is_refused():
+def test_a_left_handed_or_singular_rotation_is_refused():
     table = true_poses(Motion())
     table.rotation[3] = np.diag([1.0, 1.0, -1.0])
-    with pytest.raises(DatasetError, match="rotations are orthonormal"):
+    with pytest.raises(DatasetError, match=r"^matrix 3 of the estimates is no rotation"):
         filter_poses(table)
+    with pytest.raises(DatasetError, match=r"^matrix 1 of the symmetries of object 5 is no rotation"):
+        filter_poses(true_poses(Motion()), symmetries={5: np.stack((np.eye(4), np.diag([1.0, 0.0, 0.0, 1.0])))})
 
 
 def test_tracks_that_do_not_fit_are_refused():
