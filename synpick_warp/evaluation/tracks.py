@@ -5,7 +5,7 @@ picking scenes an object occurs at most once, so that scene and object identify 
 What it leaves open, and what is chosen here:
 
 - Several instances of an object (scenes of mode `move`): in each image, the one-to-one assignment of estimates to tracks of least total
-  distance (Kuhn, 1955). A track is where the median of its last five estimates is: one outlier does not move it.
+  distance (Kuhn, 1955). A track is where the medoid of its last five estimates is: one outlier does not move it, nor the choice of axes.
 - A track begins only where an image has more estimates than there are tracks; no distance is too far unless a `gate` is given.
 - Missing frames: a track waits, however long, unless `max_gap` is given.
 - Rows with a known instance form tracks by that instance.
@@ -23,7 +23,7 @@ from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.evaluation.poses import PoseTable
 
 _HISTORY = 5
-"""Number of estimates whose median is a track's position: outliers up to two in succession are outvoted, motion lags by two frames."""
+"""Number of estimates whose medoid is a track's position: outliers up to two in succession are outvoted, motion lags by two frames."""
 _MAX_COORDINATE = 1e6
 """Largest coordinate of a translation [m]: far beyond every scene, small enough to compute with."""
 _MAX_ENTRY = 1.01
@@ -121,8 +121,7 @@ def _assign(image: np.ndarray, position: np.ndarray, gate: float | None, max_gap
     for start, end in itertools.pairwise(starts):
         now, seen = image[start], position[start:end]
         live = np.flatnonzero(now - last[:count] <= (math.inf if max_gap is None else max_gap))
-        place = np.sort(history[live], axis=1)[:, _HISTORY // 2]
-        distance = np.linalg.norm(seen[:, None] - place[None], axis=2)
+        distance = np.linalg.norm(seen[:, None] - _medoids(history[live])[None], axis=2)
         rows, columns = linear_sum_assignment(distance if gate is None else np.where(distance <= gate, distance, _TOO_FAR))
         allowed = distance[rows, columns] <= (math.inf if gate is None else gate)
         rows, chosen = rows[allowed], live[columns[allowed]]
@@ -137,3 +136,39 @@ def _assign(image: np.ndarray, position: np.ndarray, gate: float | None, max_gap
         last[track] = now
         tracks[start:end] = track
     return tracks
+
+
+def _medoids(points: np.ndarray) -> np.ndarray:
+    """Of each set of points (n, k, 3), the one with the least total distance to the others (n, 3)."""
+    total = np.linalg.norm(points[:, :, None] - points[:, None], axis=3).sum(axis=2)
+    return points[np.arange(len(points)), np.argmin(total, axis=1)]
+
+
+def track_of_instance(truth: PoseTable, table: PoseTable, tracks: np.ndarray) -> np.ndarray:
+    """Find the track of a true instance: in each image the nearest estimate votes for its track; ties go to the lower index.
+
+    Args:
+        truth: True poses of one instance: one scene, one object, one row an image.
+        table: N estimates.
+        tracks: Track of each row (N,), as `find_tracks` gives them.
+
+    Returns:
+        Rows of the track (n,) int64, sorted by image; empty if the instance was never estimated.
+
+    Raises:
+        DatasetError: `truth` has several scenes or objects, or several rows of an image.
+    """
+    scenes, objects, images = (np.unique(column) for column in (truth.scene, truth.object_id, truth.image))
+    if len(scenes) > 1 or len(objects) > 1 or len(images) < len(truth):
+        raise DatasetError("the true poses are of several instances; select the rows of one scene and one instance")
+    rows = np.flatnonzero(np.isin(table.scene, scenes) & np.isin(table.object_id, objects) & np.isin(table.image, images))
+    if not len(rows):
+        return rows
+    order = np.argsort(truth.image)
+    place = truth.translation[order][np.searchsorted(images, table.image[rows])]
+    distance = np.linalg.norm(table.translation[rows] - place, axis=1)
+    ranked = rows[np.lexsort((tracks[rows], distance, table.image[rows]))]
+    _, nearest = np.unique(table.image[ranked], return_index=True)
+    names, votes = np.unique(tracks[ranked[nearest]], return_counts=True)
+    members = np.flatnonzero(tracks == names[np.argmax(votes)])
+    return members[np.argsort(table.image[members])]

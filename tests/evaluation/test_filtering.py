@@ -239,3 +239,20 @@ def test_fuzz_a_rigid_change_of_the_camera_frame_commutes_with_the_filter(table,
     straight, after = filter_poses(table, alpha), filter_poses(moved, alpha)
     np.testing.assert_allclose(after.translation, straight.translation @ turn.T + shift, atol=1e-9)
     np.testing.assert_allclose(after.rotation, turn @ straight.rotation, atol=1e-6)
+
+
+@given(st.lists(st.integers(0, 3), min_size=2, max_size=20), st.floats(0.3, 1.0), st.integers(0, 2**31))
+@settings(max_examples=fuzz_examples(50), deadline=None)
+def test_fuzz_with_symmetries_it_does_not_matter_which_equivalent_pose_came(choices, alpha, seed):
+    # Quarter turns about an axis beside the model's origin; motion and noise stay far below the 45° where two are as near.
+    quarter = np.eye(4)
+    quarter[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    quarter[:3, 3] = [0.03, -0.01, 0]
+    group = np.stack([np.linalg.matrix_power(quarter, power) for power in range(4)])
+    table = estimates(true_poses(Motion(spin=(0.2, 0.3, -0.4), images=len(choices))), seed, noise=0.01, angle=0.03)
+    chosen = group[[0, *choices[1:]]]
+    translation = table.translation + np.einsum("nij,nj->ni", table.rotation, chosen[:, :3, 3])
+    jumping = dataclasses.replace(table, rotation=table.rotation @ chosen[:, :3, :3], translation=translation)
+    smooth, filtered = filter_poses(table, alpha), filter_poses(jumping, alpha, symmetries={17: group})
+    np.testing.assert_allclose(filtered.translation, smooth.translation, atol=1e-9)
+    np.testing.assert_allclose(filtered.rotation, smooth.rotation, atol=1e-9)

@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 from hypothesis import given, settings
+from scipy.spatial.transform import Rotation
 
 from synpick_warp.errors import ConfigError, DatasetError
-from synpick_warp.evaluation import PoseTable, find_tracks
+from synpick_warp.evaluation import PoseTable, find_tracks, track_of_instance
 from tests.evaluation.test_filtering import noisy_tables
 from tests.harness.fuzz import fuzz_examples
 from tests.worlds.noisy_tracks import Motion, estimates, true_poses
@@ -48,6 +49,14 @@ def test_an_outlier_next_to_another_instance_does_not_swap_tracks():
     assert purity(find_tracks(hidden), truth.instance) == 1.0
 
 
+def test_the_choice_of_axes_does_not_matter_among_crowded_instances():
+    crowd = true_poses(*(Motion(start=(0.05 * instance, 0, 2), instance=instance, images=60) for instance in range(4)))
+    table = estimates(crowd, noise=0.05)
+    turn = Rotation.from_rotvec([0.4, -0.7, 1.1])
+    turned = dataclasses.replace(table, translation=turn.apply(table.translation))
+    np.testing.assert_array_equal(find_tracks(turned), find_tracks(table))
+
+
 def test_the_instance_that_stays_keeps_its_track_when_the_other_is_picked():
     truth = true_poses(Motion(start=(0, 0, 2), images=30), Motion(start=(0.2, 0, 2), instance=1))
     hidden = dataclasses.replace(truth, instance=np.full(len(truth), -1))
@@ -82,6 +91,25 @@ def test_a_gap_beyond_the_largest_begins_a_new_track():
     for gate in (None, 1.0):
         tracks = find_tracks(kept, gate=gate, max_gap=3)
         assert tracks.tolist() == (kept.image > 8).astype(int).tolist()
+
+
+def test_the_track_of_a_true_instance_is_the_one_most_often_nearest():
+    truth = true_poses(Motion(start=(0, 0, 2)), Motion(start=(0.2, 0, 2), instance=1), Motion(scene=2), Motion(object_id=3))
+    table = estimates(truth, noise=0.02, outliers=0.1, missing=0.2)
+    tracks = find_tracks(table)
+    for instance in range(2):
+        one = truth.select((truth.scene == 1) & (truth.object_id == 17) & (truth.instance == instance))
+        rows = track_of_instance(one, table, tracks)
+        assert (table.scene[rows] == 1).all()
+        assert (table.object_id[rows] == 17).all()
+        assert (np.diff(table.image[rows]) > 0).all()
+        np.testing.assert_allclose(np.median(table.translation[rows], axis=0), one.translation[0], atol=0.01)
+        shuffled = np.random.default_rng(0).permutation(len(table))
+        np.testing.assert_array_equal(shuffled[track_of_instance(one, table.select(shuffled), tracks[shuffled])], rows)
+    gone = dataclasses.replace(one, object_id=one.object_id + 100)
+    assert len(track_of_instance(gone, table, tracks)) == 0
+    with pytest.raises(DatasetError, match="of several instances"):
+        track_of_instance(truth, table, tracks)
 
 
 def test_settings_out_of_range_are_refused():
