@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.evaluation import PAPER_ALPHAS, PoseTable, filter_poses
 from tests.harness.fuzz import fuzz_examples
-from tests.worlds.noisy_tracks import FRAME, Motion, estimates, true_poses
+from tests.worlds.noisy_tracks import FRAME, Motion, estimates, noisy_tables, true_poses
 
 ALPHAS = (0.05, 0.2, 0.5, 0.9)
 
@@ -188,25 +188,6 @@ def test_tracks_that_do_not_fit_are_refused():
         filter_poses(dataclasses.replace(table, image=table.image[:2]))
     with pytest.raises(DatasetError, match="symmetries of object 2 have shape"):
         filter_poses(table, symmetries={2: np.eye(4)})
-
-
-@st.composite
-def noisy_tables(draw: st.DrawFn) -> PoseTable:
-    """Estimates of up to 5 instances, which may share scene and object, with noise, outliers and gaps."""
-    motions = [
-        Motion(
-            scene=draw(st.integers(0, 2)),
-            object_id=draw(st.integers(1, 2)),
-            start=tuple(draw(st.floats(-0.3, 0.3)) for _ in range(3)),
-            velocity=tuple(draw(st.floats(-0.5, 0.5)) for _ in range(3)),
-            spin=tuple(draw(st.floats(-2.0, 2.0)) for _ in range(3)),
-            images=draw(st.integers(1, 12)),
-            instance=instance,
-        )
-        for instance in range(draw(st.integers(1, 5)))
-    ]
-    seed, known = draw(st.integers(0, 2**31)), draw(st.booleans())
-    return estimates(true_poses(*motions), seed, noise=0.02, angle=0.3, outliers=0.1, missing=0.2, known=known)
 
 
 @given(noisy_tables(), st.floats(0.01, 1.0), st.integers(0, 2**31))

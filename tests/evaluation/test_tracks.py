@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.evaluation import PoseTable, find_tracks, track_of_instance
-from tests.evaluation.test_filtering import noisy_tables
 from tests.harness.fuzz import fuzz_examples
-from tests.worlds.noisy_tracks import Motion, estimates, true_poses
+from tests.worlds.noisy_tracks import Motion, estimates, noisy_tables, true_poses
 
 
 def purity(tracks: np.ndarray, truth: np.ndarray) -> float:

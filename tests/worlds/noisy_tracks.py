@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.evaluation import PoseTable
@@ -85,3 +86,22 @@ def estimates(
     instance = truth.instance if known else np.full(count, -1)
     table = PoseTable(truth.scene, truth.image, truth.object_id, rotation, translation, rng.random(count), truth.seconds, instance)
     return table.select(rng.random(count) >= missing)
+
+
+@st.composite
+def noisy_tables(draw: st.DrawFn) -> PoseTable:
+    """Estimates of up to 5 instances, which may share scene and object, with noise, outliers and gaps."""
+    motions = [
+        Motion(
+            scene=draw(st.integers(0, 2)),
+            object_id=draw(st.integers(1, 2)),
+            start=tuple(draw(st.floats(-0.3, 0.3)) for _ in range(3)),
+            velocity=tuple(draw(st.floats(-0.5, 0.5)) for _ in range(3)),
+            spin=tuple(draw(st.floats(-2.0, 2.0)) for _ in range(3)),
+            images=draw(st.integers(1, 12)),
+            instance=instance,
+        )
+        for instance in range(draw(st.integers(1, 5)))
+    ]
+    seed, known = draw(st.integers(0, 2**31)), draw(st.booleans())
+    return estimates(true_poses(*motions), seed, noise=0.02, angle=0.3, outliers=0.1, missing=0.2, known=known)
