@@ -1,4 +1,4 @@
-"""Command line interface: bake, verify, merge, preview, explain, eval, doctor, config. User errors are one line on stderr and exit code 2."""
+"""Command line interface: bake, verify, merge, preview, explain, eval, doctor, config. User errors: one line on stderr, exit code 2."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Command `eval`: score pose estimates of one or several methods on a data set, and print the BOP toolkit's command for BOP's own scores."""
+"""Command `eval`: score pose estimates of one or several methods, and print the BOP toolkit's command for BOP's own scores."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -109,7 +110,7 @@ def error_bands(errors: np.ndarray, values: np.ndarray, edges: Sequence[float]) 
         edges: Rising limits of the bands.
     """
     index, bands = band_indices(values, edges), []
-    for number, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for number, (low, high) in enumerate(pairwise(edges)):
         inside = errors[index == number]
         found = inside[inside < LIMIT]
         recall = len(found) / len(inside) if len(inside) else float("nan")

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 _CHUNK = 2**20
 """Points that are transformed at once; some 50 MB."""
@@ -49,7 +49,7 @@ def adds_errors(
     true_rotation: np.ndarray,
     true_translation: np.ndarray,
     vertices: np.ndarray,
-    tree: cKDTree | None = None,
+    tree: KDTree | None = None,
 ) -> np.ndarray:
     """ADD-S (ADI): mean distance from a vertex in the true pose to the nearest vertex in the estimated pose.
 
@@ -67,13 +67,13 @@ def adds_errors(
         (P,) [m].
     """
     errors = np.empty(len(estimated_rotation))
-    tree = cKDTree(vertices) if tree is None else tree
+    nearest = KDTree(vertices) if tree is None else tree
     inverse = np.linalg.inv(estimated_rotation)
     rotation = inverse @ true_rotation
     translation = np.einsum("pij,pj->pi", inverse, true_translation - estimated_translation)
     for rows in _chunks(len(errors), len(vertices)):
         points = vertices @ rotation[rows].transpose(0, 2, 1) + translation[rows, None]
-        errors[rows] = tree.query(points.reshape(-1, 3), workers=-1)[0].reshape(points.shape[:2]).mean(axis=1)
+        errors[rows] = nearest.query(points.reshape(-1, 3), workers=-1)[0].reshape(points.shape[:2]).mean(axis=1)
     return errors
 
 

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.errors import CatalogError, DatasetError
@@ -36,9 +36,9 @@ class Model:
     """Whether models_info.json lists a symmetry: then ADD(-S) is ADD-S, else ADD."""
 
     @cached_property
-    def tree(self) -> cKDTree:
+    def tree(self) -> KDTree:
         """k-d tree of the vertices."""
-        return cKDTree(self.vertices)
+        return KDTree(self.vertices)
 
     @cached_property
     def center(self) -> np.ndarray:

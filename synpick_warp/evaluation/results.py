@@ -10,6 +10,7 @@ import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -140,7 +141,7 @@ def _show(text: bytes) -> str:
 def _check_rows(indices: np.ndarray, reals: np.ndarray, numbers: np.ndarray, path: Path) -> None:
     """Check ranges, rotations and duplicates; names the first line at fault."""
 
-    def refuse(bad: np.ndarray, text: str) -> None:
+    def refuse(bad: Any, text: str) -> None:
         if bad.any():
             raise ResultError(f"{path}, line {numbers[np.argmax(bad)]}: {text}")
 
@@ -149,8 +150,8 @@ def _check_rows(indices: np.ndarray, reals: np.ndarray, numbers: np.ndarray, pat
         bad = (values < 0) | (values > MAX_INDEX)
         refuse(bad, f"{name} is {values[np.argmax(bad)]}; allowed: 0 to {MAX_INDEX}")
     for name, part in (("score", slice(0, 1)), ("R", slice(1, 10)), ("t", slice(10, 13)), ("time", slice(13, 14))):
-        refuse(~np.isfinite(reals[:, part]).all(axis=1), f"{name} is not finite; leave out rows without a pose")
-        refuse((np.abs(reals[:, part]) > MAX_NUMBER).any(axis=1), f"{name} has a number above {MAX_NUMBER:g}")
+        refuse(np.any(~np.isfinite(reals[:, part]), axis=1), f"{name} is not finite; leave out rows without a pose")
+        refuse(np.any(np.abs(reals[:, part]) > MAX_NUMBER, axis=1), f"{name} has a number above {MAX_NUMBER:g}")
     rotation = reals[:, 1:10].reshape(-1, 3, 3)
     off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     worst = off[np.argmax(off > TOLERANCE)]
@@ -225,7 +226,8 @@ def _check_units(results: ResultFile, truth: Truth) -> None:
         return
     line = int(results.lines.min())
     raise ResultError(
-        f"{results.path}, line {line}: {reason} (median distance from the camera {1e3 * estimated:.4g} mm, in the data set {1e3 * true:.4g} mm)"
+        f"{results.path}, line {line}: {reason}"
+        f" (median distance from the camera {1e3 * estimated:.4g} mm, in the data set {1e3 * true:.4g} mm)"
     )
 
 

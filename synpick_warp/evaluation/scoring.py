@@ -91,14 +91,17 @@ def _pair_errors(truth: PoseTable, estimates: PoseTable, pairs: Pairs, models: M
         offset = (theirs.rotation - ours.rotation) @ model.center + theirs.translation - ours.translation
         distance = np.linalg.norm(offset, axis=1)
         # A mean of lengths is at least the length of the mean; a nearest vertex is not nearer than the bounding sphere.
-        for metric, near, function in (
-            ("ADD", distance < LIMIT, lambda *poses, model=model: add_errors(*poses, model.vertices)),
-            ("ADD-S", distance < LIMIT + 1.01 * model.radius, lambda *poses, model=model: adds_errors(*poses, model.vertices, model.tree)),
-        ):
-            poses = theirs.rotation[near], theirs.translation[near], ours.rotation[near], ours.translation[near]
-            errors[metric][rows[near]] = function(*poses)
+        near = np.flatnonzero(distance < LIMIT)
+        errors["ADD"][rows[near]] = add_errors(*_poses(theirs, near), *_poses(ours, near), model.vertices)
+        near = np.flatnonzero(distance < LIMIT + 1.01 * model.radius)
+        errors["ADD-S"][rows[near]] = adds_errors(*_poses(theirs, near), *_poses(ours, near), model.vertices, model.tree)
         errors["ADD(-S)"][rows] = errors["ADD-S" if model.symmetric else "ADD"][rows]
     return errors
+
+
+def _poses(table: PoseTable, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (N, 3, 3) and translations (N, 3) of rows."""
+    return table.rotation[rows], table.translation[rows]
 
 
 def _motion_errors(

@@ -13,6 +13,7 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -79,7 +80,7 @@ def _labels(group: str, truth: Truth, target: np.ndarray, names: Mapping[int, st
         (VISIBILITY_EDGES, truth.visibility[target], "visible") if group == "visibility" else (SPEED_EDGES, truth.speed[target], "m/s")
     )
     index = band_indices(values, edges)
-    return [(f"{_interval(low, high)} {unit}", index == band) for band, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True))]
+    return [(f"{_interval(low, high)} {unit}", index == band) for band, (low, high) in enumerate(pairwise(edges))]
 
 
 def _interval(low: float, high: float) -> str:

@@ -34,9 +34,9 @@ def test_hand_computed_errors():
     # Quarter turn: one vertex stays, the other moves by √2; its nearest vertex in the estimated pose is the origin.
     assert add_errors(quarter, zero, one, zero, vertices) == pytest.approx([np.sqrt(2.0) / 2.0])
     assert adds_errors(quarter, zero, one, zero, vertices) == pytest.approx([0.5])
-    assert add_errors(one, zero + (3, 4, 0), one, zero, vertices) == pytest.approx([5.0])
-    assert adds_errors(one, zero + (1, 0, 0), one, zero, vertices) == pytest.approx([0.5])
-    assert translation_errors(zero + (3, 4, 0), zero) == pytest.approx([5.0])
+    assert add_errors(one, np.array([[3.0, 4.0, 0.0]]), one, zero, vertices) == pytest.approx([5.0])
+    assert adds_errors(one, np.array([[1.0, 0.0, 0.0]]), one, zero, vertices) == pytest.approx([0.5])
+    assert translation_errors(np.array([[3.0, 4.0, 0.0]]), zero) == pytest.approx([5.0])
     assert rotation_errors(quarter, one) == pytest.approx([90.0])
 
 

@@ -84,10 +84,9 @@ def test_blocks_of_lines_make_no_difference(tmp_path, monkeypatch):
     poses = table(50, 1)
     monkeypatch.setattr(results, "_BLOCK", 7)
     assert_equal(read(tmp_path, encode_results(poses)).poses, poses)
-    with pytest.raises(ResultError, match="line 40: R has"):
-        lines = encode_results(poses).split(b"\n")
-        lines[39] = lines[39].replace(b" ", b" 1-1 ", 1).replace(b" ", b" ", 1)
-        lines[39] = b",".join(b" ".join(part.split()[:9]) for part in lines[39].split(b","))
+    lines = encode_results(poses).split(b"\n")
+    lines[39] = lines[39].rpartition(b" ")[0] + b" 1-1,-1"
+    with pytest.raises(ResultError, match='line 40: t has "1-1", which is no number'):
         read(tmp_path, b"\n".join(lines))
 
 
@@ -139,11 +138,13 @@ def test_any_bytes_are_read_or_refused(tmp_path_factory, data, where):
     good = f"{HEADER}\n{GOOD}\n{OTHER}\n".encode()
     for content in (data, good[:where] + data + good[where:], good[:where] + data + good[where + len(data) :]):
         path.write_bytes(content)
+        fault, poses = "", None
         try:
             poses = read_results(path).poses
         except ResultError as error:
-            assert "\n" not in str(error)
-        else:
+            fault = str(error)
+        assert "\n" not in fault
+        if poses is not None:
             assert np.isfinite(poses.translation).all()
             assert np.abs(poses.rotation @ poses.rotation.transpose(0, 2, 1) - np.eye(3)).max() < 2e-3
 

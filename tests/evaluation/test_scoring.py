@@ -45,6 +45,11 @@ def rows(truth, *scores) -> dict[str, dict[str, float]]:
     return {row.label: row.cells[0] for row in summarize(truth, scores, NAMES)}
 
 
+def pose(poses: PoseTable, row: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation and translation of a row."""
+    return poses.rotation[row], poses.translation[row]
+
+
 def joined(*tables: PoseTable) -> PoseTable:
     """Rows of several tables, sorted."""
     columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in vars(tables[0])}
@@ -153,7 +158,6 @@ def test_scores_are_those_of_one_pair_at_a_time(truth, models, seed, spread):
                 np.flatnonzero((poses.scene == key[0]) & (poses.image == key[1]) & (poses.object_id == key[2]))
                 for poses in (truth.poses, estimates)
             )
-            pose = lambda poses, row: (poses.rotation[row], poses.translation[row])  # noqa: E731
             vertices = models[int(key[2])].vertices
             errors = np.array([[function(*pose(estimates, e), *pose(truth.poses, g), vertices) for g in ours] for e in theirs])
             matched = twin.match_poses(estimates.score[theirs].tolist(), errors, 0.1, [True] * len(ours))
@@ -192,7 +196,7 @@ def test_methods_stand_beside_each_other_in_every_style(truth, models, style):
         assert len(lines) == 2 * len(summarize(truth, scores, NAMES))
         mean = [line for line in lines if line["group"] == "mean"]
         assert [float(line["ADD exact"]) for line in mean] == pytest.approx([100.0, 50.0])
-        assert [line["method"] for line in mean][0] == "good_one"
+        assert mean[0]["method"] == "good_one"
     else:
         first, second = json.loads(output)["methods"]
         assert first["rows"][-1]["ADD vocap"] == pytest.approx(100.0)

@@ -125,5 +125,5 @@ def test_vertices_that_are_no_points_are_refused(tmp_path, body):
     path = tmp_path / "a.ply"
     header = "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
     path.write_text(header.format(1 if body else 0) + body + "\n")
-    with pytest.raises(CatalogError, match="not a finite number|no vertices|not readable"):
+    with pytest.raises(CatalogError, match=r"not a finite number|no vertices|not readable"):
         read_ply_vertices(path)

@@ -57,7 +57,8 @@ def write_evaluation_set(folder: Path) -> Path:
     for object_id, mesh in shapes().items():
         mesh.export(folder / "models" / f"obj_{object_id:06d}.ply")
     (folder / "models" / "models_info.json").write_text(json.dumps(infos()))
-    overrides = {"physics.step": PERIOD / 10, "physics.steps_per_tick": 10, "physics.substeps": 10, "bake.episodes": len(MODES)}
+    overrides: dict[str, object] = {"physics.step": PERIOD / 10, "physics.steps_per_tick": 10, "physics.substeps": 10}
+    overrides |= {"bake.episodes": len(MODES), "bop.split": "train_pbr", "bop.color_format": "jpg"}
     config = load_config("smoke", overrides)
     assert len(config.cameras.positions) == CAMERAS
     (folder / "config.toml").write_text(config_to_toml(config))
