@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from synpick_warp.cli.options import WholeNumber
+from synpick_warp.configs.check import escape, format_value
 from synpick_warp.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
     from synpick_warp.evaluation.scoring import PoseStep
 
-_STYLES = ("text", "latex", "csv", "json")
-_CONVENTIONS = ("exact", "vocap")
 _MAX_VERTICES = 10**7
 
 
@@ -53,7 +52,7 @@ def evaluate(
         print(f"\n{command}" if format_ == "text" else command, file=sys.stdout if format_ == "text" else sys.stderr)
         return 0
     write_table(out, table)
-    print(f"table: {out}\n{command}")
+    print(f"table: {escape(str(out))}\n{command}")
     return 0
 
 
@@ -109,10 +108,12 @@ def check_options(
         ConfigError: A value is not allowed, or the output would replace a result file.
         OutputError: The output's folder does not exist, or it is a folder itself.
     """
-    if style not in _STYLES:
-        raise ConfigError(f"--format is {style!r}; allowed: {', '.join(_STYLES)}")
-    if convention not in _CONVENTIONS:
-        raise ConfigError(f"--convention is {convention!r}; allowed: {', '.join(_CONVENTIONS)}")
+    from synpick_warp.evaluation.auc import CONVENTIONS
+    from synpick_warp.evaluation.tables import FORMATS
+
+    for option, value, allowed in (("--format", style, FORMATS), ("--convention", convention, CONVENTIONS)):
+        if value not in allowed:
+            raise ConfigError(f"{option} is {format_value(value)}; allowed: {', '.join(allowed)}")
     if not 0.0 <= visib_min <= 1.0:
         raise ConfigError(f"--visib-min is {visib_min:g}; allowed: 0 to 1")
     if not -1 <= top <= 2**31 - 1:
@@ -148,11 +149,11 @@ def object_names(data_set: DataSet) -> dict[int, str]:
 
 def method_names(results: Sequence[Path]) -> list[str]:
     """Name of each method: its file's up to the first underscore, as BOP has it; the whole path where two would be equal."""
-    short = [path.stem.partition("_")[0] or path.stem for path in results]
-    stems = [path.stem for path in results]
+    stems = [escape(path.stem) for path in results]
+    short = [stem.partition("_")[0] or stem for stem in stems]
     if len(set(short)) == len(short):
         return short
-    return stems if len(set(stems)) == len(stems) else [str(path) for path in results]
+    return stems if len(set(stems)) == len(stems) else [escape(str(path)) for path in results]
 
 
 def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
@@ -181,4 +182,4 @@ def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
         f"BOP_PATH={shlex.quote(str(folder.parent))} python scripts/eval_bop19_pose.py --results_path={where} --eval_path={where}"
         f" --result_filenames={shlex.quote(','.join(files))} --targets_filename=test_targets_bop19.json"
     )
-    return "\n".join(lines)
+    return "\n".join(map(escape, lines))

@@ -1,7 +1,7 @@
 """Greedy matching of pose estimates to true instances by descending score, as the BOP toolkit's `pose_matching.match_poses`.
 
 Estimates and instances meet per image and object. An estimate takes, of the instances that are left, the one with the smallest error, if
-that is below the threshold. All groups of one image and object are worked on at once: in round k every group's k-th best estimate.
+that is below the threshold. All images and objects are worked on at once: a round matches the best remaining estimate of each.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ ALL = 0
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs of an estimate and a true instance of the same image and object, by estimate in descending score, then by instance."""
+    """Pairs of an estimate and a true instance of the same image and object, by group, then by descending score, then by instance."""
 
     estimate: np.ndarray
     """Row of the estimate (P,) int64."""
     truth: np.ndarray
     """Row of the instance (P,) int64."""
-    rank: np.ndarray
-    """Position of the estimate by descending score in its image and object (P,) int64."""
+    group: np.ndarray
+    """Index of the image and object (P,) int64, rising."""
 
 
 def make_pairs(truth: PoseTable, target: np.ndarray, estimates: PoseTable, top: int = PER_INSTANCE) -> Pairs:
@@ -54,7 +54,7 @@ def make_pairs(truth: PoseTable, target: np.ndarray, estimates: PoseTable, top: 
     rows, rank = rows[rank < limit], rank[rank < limit]
     partners = counts[estimate_group[rows]]
     first = np.repeat(starts[estimate_group[rows]], partners)
-    return Pairs(np.repeat(rows, partners), truth_rows[first + _ranks_of_runs(partners)], np.repeat(rank, partners))
+    return Pairs(np.repeat(rows, partners), truth_rows[first + _ranks_of_runs(partners)], np.repeat(estimate_group[rows], partners))
 
 
 def match(pairs: Pairs, errors: np.ndarray, threshold: float, instances: int) -> np.ndarray:
@@ -70,15 +70,17 @@ def match(pairs: Pairs, errors: np.ndarray, threshold: float, instances: int) ->
         Index of each instance's pair (N,) int64; -1: missed.
     """
     result = np.full(instances, -1, np.int64)
-    candidates = np.flatnonzero(errors < threshold)
-    candidates = candidates[np.argsort(pairs.rank[candidates], kind="stable")]
-    rounds = np.flatnonzero(np.diff(pairs.rank[candidates], prepend=-1)) if len(candidates) else []
-    for rows in np.split(candidates, rounds):
-        free = rows[result[pairs.truth[rows]] < 0]
-        # By estimate, then by error; equal errors keep the order of the instances, as in the toolkit.
-        free = free[np.lexsort((errors[free], pairs.estimate[free]))]
-        best = free[np.diff(pairs.estimate[free], prepend=-1) != 0]
+    left = np.flatnonzero(errors < threshold)
+    while len(left):  # As many rounds as an image has instances of an object, since each round matches one of them.
+        starts = np.flatnonzero(np.diff(pairs.group[left], prepend=-1))
+        leaders = np.repeat(pairs.estimate[left[starts]], np.diff(starts, append=len(left)))
+        leading = pairs.estimate[left] == leaders
+        rows = left[leading]
+        # By group, then by error; equal errors keep the order of the instances, as in the toolkit.
+        rows = rows[np.lexsort((errors[rows], pairs.group[rows]))]
+        best = rows[np.diff(pairs.group[rows], prepend=-1) != 0]
         result[pairs.truth[best]] = best
+        left = left[~leading & (result[pairs.truth[left]] < 0)]
     return result
 
 

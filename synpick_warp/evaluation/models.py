@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.errors import CatalogError, DatasetError
+from synpick_warp.evaluation.errors import LEAF_SIZE
 from synpick_warp.inputs.paths import path_inside
 from synpick_warp.scenes.assets.models_info import ModelInfo, read_models_info
 from synpick_warp.scenes.assets.ply import read_ply_vertices
@@ -38,7 +39,7 @@ class Model:
     @cached_property
     def tree(self) -> KDTree:
         """k-d tree of the vertices."""
-        return KDTree(self.vertices)
+        return KDTree(self.vertices, leafsize=LEAF_SIZE)
 
     @cached_property
     def center(self) -> np.ndarray:

@@ -86,8 +86,8 @@ def test_methods_have_different_names(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--format", "html"], "--format is 'html'; allowed: text, latex, csv, json"),
-        (["--convention", "coco"], "--convention is 'coco'; allowed: exact, vocap"),
+        (["--format", "html"], '--format is "html"; allowed: text, latex, csv, json'),
+        (["--convention", "coco"], '--convention is "coco"; allowed: exact, vocap'),
         (["--visib-min", "1.5"], "--visib-min is 1.5; allowed: 0 to 1"),
         (["--visib-min", "nan"], "--visib-min is nan; allowed: 0 to 1"),
         (["--top", "-2"], "--top is -2; allowed: -1 for as many as instances, 0 for all"),
@@ -133,3 +133,12 @@ def test_a_bake_does_not_import_the_evaluation():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
     assert done.stdout.strip().splitlines()[-1] == "[]"
+
+
+def test_names_that_do_not_print_are_escaped(folder, files, capsys, tmp_path):
+    odd = tmp_path / "a\nb\x1b\udcff.csv"
+    odd.write_bytes(files[0].read_bytes())
+    for style in ("text", "latex", "csv", "json"):
+        assert run("--data", folder, "--results", odd, "--format", style, "--out", tmp_path / style) == 0
+        assert "\x1b" not in (tmp_path / style).read_text()
+        assert "\x1b" not in capsys.readouterr().out

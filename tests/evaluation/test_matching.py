@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -61,6 +63,16 @@ def test_no_estimates_and_no_targets():
         pairs = make_pairs(truth, np.array(target, bool), estimates)
         assert len(pairs.truth) == 0
         assert match(pairs, np.empty(0), 0.1, len(truth)).tolist() == [-1] * len(truth)
+
+
+def test_many_hypotheses_take_as_many_rounds_as_instances():
+    count = 20_000
+    truth, estimates = table([(0, 0, 1), (0, 0, 1)]), table([(0, 0, 1)] * count, np.linspace(1.0, 0.0, count).tolist())
+    pairs = make_pairs(truth, np.ones(2, bool), estimates, ALL)
+    errors = np.where(pairs.truth == 0, 0.01, 0.02)
+    started = time.monotonic()
+    assert match(pairs, errors, 0.1, 2).tolist() == [0, 3]
+    assert time.monotonic() - started < 5.0
 
 
 KEYS = st.lists(st.tuples(st.integers(0, 1), st.integers(0, 1), st.integers(1, 2)), max_size=12)

@@ -210,3 +210,35 @@ def test_a_table_without_scores_has_dashes(truth, models):
     text = render(summarize(truth, [nothing], NAMES), truth, [nothing], "text", "vocap")
     assert "convention vocap" in text
     assert text.splitlines()[-4].split() == ["mean", "72", "0.0", "0.0", "0.0", "0.0", "-", "-"]
+
+
+@given(
+    names=st.lists(st.text(st.characters(exclude_categories=["C", "Zl", "Zp"]), min_size=1, max_size=90), min_size=1, max_size=3),
+    data=st.data(),
+)
+@settings(max_examples=fuzz_examples(50))
+def test_tables_hold_any_names_and_values(truth, models, names, data):
+    """CSV and JSON give back names and values; LaTeX rows have one cell a column; text lines have one width for every block."""
+    target = np.flatnonzero(truth.visibility >= 0.1)
+    errors = st.sampled_from([0.0, 0.03, 0.0999, np.inf])
+    scores = []
+    for name in names:
+        values = np.resize(np.array(data.draw(st.lists(errors, min_size=1, max_size=7))), len(target))
+        unknown = np.where(np.isfinite(values), 1.0, np.nan)
+        scores.append(scoring.Scores(name, target, dict.fromkeys(METRICS, values), unknown, unknown, math.nan))
+    table = summarize(truth, scores, {BRICK: names[0]})
+    assert sum(row.targets for row in table if row.group == "object") == len(target)
+    for row in table:
+        for cells in row.cells:
+            assert all(math.isnan(value) or value >= 0.0 for value in cells.values())
+            assert cells["ADD exact"] <= cells["ADD vocap"] + 1e-9 <= 100.0 + 1e-6
+    lines = list(csv.DictReader(io.StringIO(render(table, truth, scores, "csv"))))
+    assert [line["method"] for line in lines] == names * len(table)
+    for line, cells in zip(lines, [cells for row in table for cells in row.cells], strict=True):
+        assert float(line["ADD-S exact"]) == pytest.approx(cells["ADD-S exact"], rel=1e-5, abs=1e-5)
+    content = json.loads(render(table, truth, scores, "json"))
+    assert [each["method"] for each in content["methods"]] == names
+    latex = [line for line in render(table, truth, scores, "latex").splitlines() if line.endswith("\\\\")]
+    assert {line.replace("\\&", "").count("&") for line in latex[1:]} == {3 * len(names)}
+    text = render(table, truth, scores, "text")
+    assert len(text.splitlines()) == len(table) + len({row.group for row in table}) + 5
