@@ -26,7 +26,8 @@ def evaluate(
     *,
     data: Annotated[Path, Parameter(help="A data set in the format bop or shards.")],
     results: Annotated[
-        list[Path], Parameter(negative=(), help="BOP result file of a method; may be repeated: methods stand side by side in the table.")
+        list[Path],
+        Parameter(negative=(), consume_multiple=True, help="BOP result files, one per method; methods stand side by side in the table."),
     ],
     format_: Annotated[str, Parameter(name="--format", help="text, latex, csv or json; csv and json have both conventions.")] = "text",
     out: Annotated[Path | None, Parameter(help="File to write (default: the standard output).")] = None,

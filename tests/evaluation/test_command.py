@@ -36,8 +36,9 @@ def run(*arguments: object) -> int:
     return main(["eval", *map(str, arguments)])
 
 
-def test_methods_stand_beside_each_other(folder, files, capsys):
-    assert run("--data", folder, "--results", files[0], "--results", files[1]) == 0
+@pytest.mark.parametrize("repeated", [("--results",), ()])
+def test_methods_stand_beside_each_other(folder, files, capsys, repeated):
+    assert run("--data", folder, "--results", files[0], *repeated, files[1]) == 0
     output, error = capsys.readouterr()
     assert error == ""
     lines = output.splitlines()
