@@ -29,3 +29,7 @@ class OutputError(SynpickError):
 
 class DatasetError(SynpickError):
     """A folder is not a data set, or a file in it is missing or damaged."""
+
+
+class ResultError(SynpickError):
+    """A file of pose estimates cannot be used."""

@@ -14,7 +14,7 @@ from trimesh.geometry import triangulate_quads
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import read_file
 from synpick_warp.scenes.assets.appearance import MAX_TEXTURE_FILE, FileMaterial, decode_texture
-from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, read_referred
+from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE, MAX_ROWS, MAX_TEXT_MESH, describe_error, quiet_decoding, read_referred
 from synpick_warp.scenes.assets.mesh_parts import GREY, MeshPart
 
 MAX_HEADER = 2**16
@@ -90,6 +90,28 @@ def read_ply(path: Path) -> list[MeshPart]:
     if part.uv is None:
         raise CatalogError(f"{path}: refers to a texture, but its vertices have no texture_u, texture_v; unwrap it or remove the texture")
     return [MeshPart(part.vertices, part.faces, part.normals, part.uv, None, FileMaterial((1.0, 1.0, 1.0), texture, None, None))]
+
+
+def read_ply_vertices(path: Path) -> np.ndarray:
+    """Read the vertices of a PLY file as they are stored (V, 3) float64, in the file's unit; faces and texture are not read.
+
+    Raises:
+        CatalogError: The file cannot be read, has no vertices, or one that is not finite.
+    """
+    data = read_ply_file(path)
+    try:
+        with quiet_decoding():
+            content = load_ply(io.BytesIO(_without_edges(data, path)), fix_texture=False, skip_materials=True)
+        vertices = _columns(content["metadata"]["_ply_raw"].get("vertex", {}), ("x", "y", "z"))
+    except CatalogError:
+        raise
+    except Exception as error:  # the reader raises nearly anything on damaged files
+        raise CatalogError(f"{path}: not readable as PLY ({describe_error(error)})") from error
+    if vertices is None or not len(vertices):
+        raise CatalogError(f"{path}: no vertices with x, y and z")
+    if not np.isfinite(vertices).all():
+        raise CatalogError(f"{path}: a vertex is not a finite number; repair the mesh")
+    return vertices
 
 
 def _without_edges(data: bytes, path: Path) -> bytes:

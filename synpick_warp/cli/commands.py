@@ -1,4 +1,4 @@
-"""Command line interface: bake, verify, merge, preview, explain, doctor, config. User errors are one line on stderr and exit code 2."""
+"""Command line interface: bake, verify, merge, preview, explain, eval, doctor, config. User errors: one line on stderr, exit code 2."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import cyclopts
 from cyclopts import App, Parameter
 
 from synpick_warp import __version__
+from synpick_warp.cli.evaluate import evaluate
 from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
 from synpick_warp.configs.check import describe_allowed
@@ -223,6 +224,9 @@ def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
     """Print all settings as TOML with meaning, unit and range: a template for your own file."""
     print(config_to_toml(_resolve(config, {}, None, set_), comments=True), end="")
     return 0
+
+
+app.command(evaluate, name="eval")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,0 +1,186 @@
+"""Command `eval`: score pose estimates of one or several methods, and print the BOP toolkit's command for BOP's own scores."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from synpick_warp.cli.options import WholeNumber
+from synpick_warp.configs.check import escape, format_value
+from synpick_warp.errors import ConfigError, OutputError
+
+if TYPE_CHECKING:
+    from synpick_warp.dataset.reading import DataSet
+    from synpick_warp.evaluation.scoring import PoseStep
+
+_MAX_VERTICES = 10**7
+
+
+def evaluate(
+    *,
+    data: Annotated[Path, Parameter(help="A data set in the format bop or shards.")],
+    results: Annotated[
+        list[Path],
+        Parameter(negative=(), consume_multiple=True, help="BOP result files, one per method; methods stand side by side in the table."),
+    ],
+    format_: Annotated[str, Parameter(name="--format", help="text, latex, csv or json; csv and json have both conventions.")] = "text",
+    out: Annotated[Path | None, Parameter(help="File to write (default: the standard output).")] = None,
+    visib_min: Annotated[float, Parameter(help="Smallest visible fraction of an instance that is to be found, from 0 to 1.")] = 0.1,
+    convention: Annotated[str, Parameter(help="Area under the curve in text and LaTeX: exact, or vocap (PoseCNN's).")] = "exact",
+    top: Annotated[
+        WholeNumber, Parameter(help="Estimates that count per image and object, by score; -1: as many as instances to be found; 0: all.")
+    ] = -1,
+    vertices: Annotated[WholeNumber, Parameter(help="Vertices of a model that errors are averaged over, evenly chosen; 0: all.")] = 0,
+) -> int:
+    """Score pose estimates: AUC of ADD, ADD-S and ADD(-S) to 0.1 m, per object, mode, camera, visibility and speed.
+
+    Instances without an estimate count as missed. BOP's own scores come from the BOP toolkit, by the command that is printed.
+    """
+    check_options(results, format_, out, visib_min, convention, top, vertices)
+    from synpick_warp.dataset.reading import open_data_set
+
+    data_set = open_data_set(data)
+    table = make_table(data_set, results, format_, visib_min=visib_min, convention=convention, top=top, vertices=vertices)
+    command = toolkit_command(data_set, results)
+    if out is None:
+        print(table, end="")
+        print(f"\n{command}" if format_ == "text" else command, file=sys.stdout if format_ == "text" else sys.stderr)
+        return 0
+    write_table(out, table)
+    print(f"table: {escape(str(out))}\n{command}")
+    return 0
+
+
+def make_table(
+    data_set: DataSet,
+    results: Sequence[Path],
+    style: str,
+    *,
+    visib_min: float,
+    convention: str,
+    top: int,
+    vertices: int,
+    steps: Sequence[PoseStep] = (),
+) -> str:
+    """Score result files and write the table.
+
+    Args:
+        data_set: Where the ground truth is.
+        results: BOP result files.
+        style: Format of the table.
+        visib_min: Smallest visible fraction of a target.
+        convention: Convention of the area.
+        top: Maximum number of estimates per image and object.
+        vertices: Number of vertices of a model; 0: all.
+        steps: Changes of the estimates before they are scored: the place of a filter.
+    """
+    from synpick_warp.evaluation.models import read_models
+    from synpick_warp.evaluation.results import check_results, read_results
+    from synpick_warp.evaluation.scoring import score
+    from synpick_warp.evaluation.tables import render, summarize
+    from synpick_warp.evaluation.truth import read_truth
+
+    # Result files first: their mistakes are the likely ones, and quick to find.
+    files = [read_results(path) for path in results]
+    truth = read_truth(data_set)
+    models = read_models(data_set.folder, truth.poses.object_id.tolist(), vertices)
+    known = set(data_set.models_info) | set(models)
+    for file in files:
+        check_results(file, truth, known)
+    if not (truth.visibility >= visib_min).any():
+        raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
+    labels = method_names(results)
+    scores = [score(label, truth, file.poses, models, visib_min, top, steps) for label, file in zip(labels, files, strict=True)]
+    return render(summarize(truth, scores, object_names(data_set)), truth, scores, style, convention)
+
+
+def check_options(
+    results: Sequence[Path], style: str, out: Path | None, visib_min: float, convention: str, top: int, vertices: int
+) -> None:
+    """Check the options before anything is read.
+
+    Raises:
+        ConfigError: A value is not allowed, or the output would replace a result file.
+        OutputError: The output's folder does not exist, or it is a folder itself.
+    """
+    from synpick_warp.evaluation.auc import CONVENTIONS
+    from synpick_warp.evaluation.tables import FORMATS
+
+    for option, value, allowed in (("--format", style, FORMATS), ("--convention", convention, CONVENTIONS)):
+        if value not in allowed:
+            raise ConfigError(f"{option} is {format_value(value)}; allowed: {', '.join(allowed)}")
+    if not 0.0 <= visib_min <= 1.0:
+        raise ConfigError(f"--visib-min is {visib_min:g}; allowed: 0 to 1")
+    if not -1 <= top <= 2**31 - 1:
+        raise ConfigError(f"--top is {top}; allowed: -1 for as many as instances, 0 for all, or a number of estimates")
+    if not 0 <= vertices <= _MAX_VERTICES:
+        raise ConfigError(f"--vertices is {vertices}; allowed: 0 for all, to {_MAX_VERTICES}")
+    if out is None:
+        return
+    if any(out.resolve() == path.resolve() for path in results):
+        raise ConfigError(f"--out is {out}, one of the result files; name another file")
+    if out.is_dir() or not out.absolute().parent.is_dir():
+        raise OutputError(f"--out is {out}; allowed: a file in an existing folder")
+
+
+def write_table(out: Path, table: str) -> None:
+    """Write the table's file atomically.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    from synpick_warp.exporters.writing.files import output_error, write_atomically
+
+    try:
+        write_atomically(out, table.encode("utf-8"))
+    except OSError as error:
+        raise output_error(out, error) from error
+
+
+def object_names(data_set: DataSet) -> dict[int, str]:
+    """Names of objects by obj_id, which the trajectory store has; empty without."""
+    return {item.object_id: item.name for item in data_set.objects} if data_set.has_store else {}
+
+
+def method_names(results: Sequence[Path]) -> list[str]:
+    """Name of each method: its file's up to the first underscore, as BOP has it; the whole path where two would be equal."""
+    stems = [escape(path.stem) for path in results]
+    short = [stem.partition("_")[0] or stem for stem in stems]
+    if len(set(short)) == len(short):
+        return short
+    return stems if len(set(stems)) == len(stems) else [escape(str(path)) for path in results]
+
+
+def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
+    """Command that computes BOP's scores (VSD, MSSD, MSPD), with comments about names that the toolkit needs otherwise."""
+    folder = data_set.folder.absolute()
+    name = re.sub("[^A-Za-z0-9]", "", folder.name).lower() or "synpick"
+    split, _, kind = data_set.config.bop.split.partition("_")
+    ending = f"{name}-{split}{f'-{kind}' if kind else ''}"
+    lines = [f"# BOP scores by the BOP toolkit, once `{name}` is in its dataset_params.py:"]
+    if name != folder.name:
+        lines.append(f"ln -sfn {shlex.quote(str(folder))} {shlex.quote(str(folder.parent / name))}")
+    place = results[0].absolute().parent
+    files: list[str] = []
+    for path in results:
+        file = path.name if path.absolute().parent == place else str(path.absolute())
+        if not re.fullmatch(rf"[^_.-]+_{re.escape(ending)}(_[^.]*)?\.csv", path.name):
+            method = re.sub("[^A-Za-z0-9]", "", path.stem) or "method"
+            file = f"{method}_{ending}.csv"
+            while file in files:
+                method += "B"
+                file = f"{method}_{ending}.csv"
+            lines.append(f"cp {shlex.quote(str(path.absolute()))} {shlex.quote(str(place / file))}")
+        files.append(file)
+    where = shlex.quote(str(place))
+    lines.append(
+        f"BOP_PATH={shlex.quote(str(folder.parent))} python scripts/eval_bop19_pose.py --results_path={where} --eval_path={where}"
+        f" --result_filenames={shlex.quote(','.join(files))} --targets_filename=test_targets_bop19.json"
+    )
+    return "\n".join(map(escape, lines))

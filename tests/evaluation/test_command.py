@@ -1,0 +1,145 @@
+"""Command `eval`: tables, files, the BOP toolkit's command, and one line for each mistake."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import subprocess
+import sys
+
+import pytest
+
+import synpick_warp
+from synpick_warp.cli.commands import main
+from synpick_warp.cli.evaluate import method_names, toolkit_command
+from synpick_warp.evaluation.results import write_results
+from synpick_warp.evaluation.truth import read_truth
+from tests.worlds.evaluation_set import moved, write_evaluation_set
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_evaluation_set(tmp_path_factory.mktemp("command") / "synpick")
+
+
+@pytest.fixture(scope="module")
+def files(folder):
+    """Result files: perfect, and off by 5 cm."""
+    poses = read_truth(synpick_warp.open(folder)).poses
+    good, bad = folder.parent / "icg_synpick-train-pbr.csv", folder.parent / "bad.csv"
+    write_results(good, poses)
+    write_results(bad, moved(poses, (0.0, 0.0, 0.05)))
+    return good, bad
+
+
+def run(*arguments: object) -> int:
+    return main(["eval", *map(str, arguments)])
+
+
+@pytest.mark.parametrize("repeated", [("--results",), ()])
+def test_methods_stand_beside_each_other(folder, files, capsys, repeated):
+    assert run("--data", folder, "--results", files[0], *repeated, files[1]) == 0
+    output, error = capsys.readouterr()
+    assert error == ""
+    lines = output.splitlines()
+    assert lines[0].split() == ["icg", "bad"]
+    mean = next(line for line in lines if line.startswith("mean"))
+    assert mean.split()[1:3] == ["72", "100.0"]
+    assert mean.split()[8] == "50.0"
+    assert lines[-1].startswith("BOP_PATH=")
+
+
+def test_other_styles_keep_the_standard_output_clean(folder, files, capsys):
+    assert run("--data", folder, "--results", files[1], "--format", "json", "--visib-min", "0", "--top", "0", "--vertices", "5") == 0
+    output, error = capsys.readouterr()
+    assert json.loads(output)["methods"][0]["rows"][-1]["targets"] == 96
+    assert "eval_bop19_pose.py" in error
+
+
+def test_a_table_is_written_to_a_file(folder, files, tmp_path, capsys):
+    out = tmp_path / "table.tex"
+    assert run("--data", folder, "--results", files[0], "--format", "latex", "--convention", "vocap", "--out", out) == 0
+    assert "convention vocap" in out.read_text()
+    assert capsys.readouterr().out.startswith(f"table: {out}\n# BOP scores")
+    assert [path.name for path in tmp_path.iterdir()] == ["table.tex"]
+
+
+def test_the_toolkits_command_has_the_names_that_the_toolkit_parses(folder, files):
+    data = synpick_warp.open(folder)
+    lines = toolkit_command(data, files).splitlines()
+    assert lines[1] == f"cp {files[1]} {folder.parent / 'bad_synpick-train-pbr.csv'}"
+    words = shlex.split(lines[-1])
+    assert words[:3] == [f"BOP_PATH={folder.parent}", "python", "scripts/eval_bop19_pose.py"]
+    assert "--result_filenames=icg_synpick-train-pbr.csv,bad_synpick-train-pbr.csv" in words
+    assert "--targets_filename=test_targets_bop19.json" in words
+    other = write_evaluation_set(folder.parent / "my set_1")
+    lines = toolkit_command(synpick_warp.open(other), files[:1]).splitlines()
+    assert shlex.split(lines[1]) == ["ln", "-sfn", str(other), str(folder.parent / "myset1")]
+    assert shlex.split(lines[2])[2] == str(folder.parent / "icgsynpicktrainpbr_myset1-train-pbr.csv")
+
+
+def test_methods_have_different_names(tmp_path):
+    assert method_names([tmp_path / "a_set-test.csv", tmp_path / "b.csv"]) == ["a", "b"]
+    assert method_names([tmp_path / "a_set-test.csv", tmp_path / "a_set-val.csv"]) == ["a_set-test", "a_set-val"]
+    assert method_names([tmp_path / "1" / "a.csv", tmp_path / "2" / "a.csv"]) == [str(tmp_path / name / "a.csv") for name in "12"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--format", "html"], '--format is "html"; allowed: text, latex, csv, json'),
+        (["--convention", "coco"], '--convention is "coco"; allowed: exact, vocap'),
+        (["--visib-min", "1.5"], "--visib-min is 1.5; allowed: 0 to 1"),
+        (["--visib-min", "nan"], "--visib-min is nan; allowed: 0 to 1"),
+        (["--top", "-2"], "--top is -2; allowed: -1 for as many as instances, 0 for all"),
+        (["--vertices", "-1"], "--vertices is -1; allowed: 0 for all"),
+        (["--top", "1.5"], '--top is "1.5"; allowed: a whole number'),
+        (["--out", "{folder}/none/table.txt"], "/none/table.txt; allowed: a file in an existing folder"),
+        (["--out", "{folder}"], "; allowed: a file in an existing folder"),
+        (["--out", "{good}"], ", one of the result files; name another file"),
+        (["--results", "{folder}/none.csv"], "there is no file {folder}/none.csv"),
+        (["--results", "{folder}/config.toml"], "/config.toml, line 1 has 1 columns; allowed: 7 separated by commas"),
+    ],
+)
+def test_mistakes_are_one_line(folder, files, capsys, arguments, message):
+    before = sorted(folder.rglob("*"))
+    given = [text.format(folder=folder, good=files[0]) for text in arguments]
+    assert run("--data", folder, "--results", files[0], *given) == 2
+    output, error = capsys.readouterr()
+    assert output == ""
+    assert error.startswith("synpick-warp: error: ")
+    assert message.format(folder=folder) in error
+    assert error.count("\n") == 1
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_folders_that_are_no_data_sets_are_refused(files, tmp_path, capsys):
+    assert run("--data", tmp_path, "--results", files[0]) == 2
+    assert "is not a data set" in capsys.readouterr().err
+    assert run("--data", tmp_path) == 2
+    assert run("--results", files[0]) == 2
+
+
+def test_visibility_that_no_instance_has_is_refused(folder, files, tmp_path, capsys):
+    hidden = write_evaluation_set(tmp_path / "hidden")
+    for path in hidden.rglob("scene_gt_info.json"):
+        path.write_text(path.read_text().replace('"visib_fract": 1.0', '"visib_fract": 0.5'))
+    assert run("--data", hidden, "--results", files[0], "--visib-min", "0.9") == 2
+    assert "--visib-min is 0.9; no instance of" in capsys.readouterr().err
+
+
+def test_a_bake_does_not_import_the_evaluation():
+    program = (
+        "import sys, synpick_warp.cli.commands, synpick_warp.pipeline; print([n for n in sys.modules if n.startswith('synpick_warp.eval')])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True)
+    assert done.stdout.strip().splitlines()[-1] == "[]"
+
+
+def test_names_that_do_not_print_are_escaped(folder, files, capsys, tmp_path):
+    odd = tmp_path / "a\nb\x1b\udcff.csv"
+    odd.write_bytes(files[0].read_bytes())
+    for style in ("text", "latex", "csv", "json"):
+        assert run("--data", folder, "--results", odd, "--format", style, "--out", tmp_path / style) == 0
+        assert "\x1b" not in (tmp_path / style).read_text()
+        assert "\x1b" not in capsys.readouterr().out
