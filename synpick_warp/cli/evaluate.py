@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
     from synpick_warp.evaluation.scoring import PoseStep
 
+FILTER = "ema"
+"""Exponential moving average: the only filter."""
 _MAX_VERTICES = 10**7
 
 
@@ -37,16 +39,22 @@ def evaluate(
         WholeNumber, Parameter(help="Estimates that count per image and object, by score; -1: as many as instances to be found; 0: all.")
     ] = -1,
     vertices: Annotated[WholeNumber, Parameter(help="Vertices of a model that errors are averaged over, evenly chosen; 0: all.")] = 0,
+    filter_: Annotated[
+        str | None,
+        Parameter(name="--filter", help="ema: score each method a second time, through the tracking filter of the SynPick paper."),
+    ] = None,
+    alpha: Annotated[float | None, Parameter(help="Weight of the new estimate in --filter ema, above 0, at most 1 (default 0.05).")] = None,
 ) -> int:
     """Score pose estimates: AUC of ADD, ADD-S and ADD(-S) to 0.1 m, per object, mode, camera, visibility and speed.
 
     Instances without an estimate count as missed. BOP's own scores come from the BOP toolkit, by the command that is printed.
     """
     check_options(results, format_, out, visib_min, convention, top, vertices)
+    weight = check_filter(filter_, alpha)
     from synpick_warp.dataset.reading import open_data_set
 
     data_set = open_data_set(data)
-    table = make_table(data_set, results, format_, visib_min=visib_min, convention=convention, top=top, vertices=vertices)
+    table = make_table(data_set, results, format_, visib_min=visib_min, convention=convention, top=top, vertices=vertices, alpha=weight)
     command = toolkit_command(data_set, results)
     if out is None:
         print(table, end="")
@@ -66,7 +74,7 @@ def make_table(
     convention: str,
     top: int,
     vertices: int,
-    steps: Sequence[PoseStep] = (),
+    alpha: float | None = None,
 ) -> str:
     """Score result files and write the table.
 
@@ -78,12 +86,13 @@ def make_table(
         convention: Convention of the area.
         top: Maximum number of estimates per image and object.
         vertices: Number of vertices of a model; 0: all.
-        steps: Changes of the estimates before they are scored: the place of a filter.
+        alpha: Weight of the new estimate in the tracking filter, with which each method is scored once more; None: no filter.
     """
     from synpick_warp.evaluation.models import read_models
     from synpick_warp.evaluation.results import check_results, read_results
     from synpick_warp.evaluation.scoring import score
     from synpick_warp.evaluation.tables import render, summarize
+    from synpick_warp.evaluation.tracking.filtering import filter_poses
     from synpick_warp.evaluation.truth import read_truth
 
     # Result files first: their mistakes are the likely ones, and quick to find.
@@ -96,7 +105,14 @@ def make_table(
     if not (truth.visibility >= visib_min).any():
         raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
     labels = method_names(results)
-    scores = [score(label, truth, file.poses, models, visib_min, top, steps) for label, file in zip(labels, files, strict=True)]
+    variants: list[tuple[str, Sequence[PoseStep]]] = [("", ())]
+    if alpha is not None:
+        variants.append((f" + EMA {alpha:g}", (lambda poses: filter_poses(poses, alpha),)))
+    scores = [
+        score(f"{label}{ending}", truth, file.poses, models, visib_min, top, steps)
+        for label, file in zip(labels, files, strict=True)
+        for ending, steps in variants
+    ]
     return render(summarize(truth, scores, object_names(data_set)), truth, scores, style, convention)
 
 
@@ -127,6 +143,25 @@ def check_options(
         raise ConfigError(f"--out is {out}, one of the result files; name another file")
     if out.is_dir() or not out.absolute().parent.is_dir():
         raise OutputError(f"--out is {out}; allowed: a file in an existing folder")
+
+
+def check_filter(name: str | None, alpha: float | None) -> float | None:
+    """Weight of the new estimate of `--filter` and `--alpha`; None: no filter.
+
+    Raises:
+        ConfigError: There is no such filter, or the weight is out of range or without one.
+    """
+    from synpick_warp.evaluation.tracking.filtering import PAPER_ALPHAS, check_alpha
+
+    if name is None:
+        if alpha is not None:
+            raise ConfigError(f"--alpha is {alpha:g}, but there is no filter; add --filter ema")
+        return None
+    if name != FILTER:
+        raise ConfigError(f"--filter is {format_value(name)}; allowed: {FILTER}")
+    alpha = PAPER_ALPHAS[0] if alpha is None else alpha
+    check_alpha(alpha)
+    return alpha
 
 
 def write_table(out: Path, table: str) -> None:

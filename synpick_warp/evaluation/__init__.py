@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from synpick_warp.evaluation.filtering import PAPER_ALPHAS, filter_poses
 from synpick_warp.evaluation.poses import PoseTable
-from synpick_warp.evaluation.sweep import SWEEP_ALPHAS, AlphaSweep, split_by_mode, sweep_alpha
-from synpick_warp.evaluation.tracks import find_tracks, track_of_instance
+from synpick_warp.evaluation.tracking.filtering import PAPER_ALPHAS, filter_poses
+from synpick_warp.evaluation.tracking.sweep import SWEEP_ALPHAS, AlphaSweep, split_by_mode, sweep_alpha
+from synpick_warp.evaluation.tracking.tracks import find_tracks, track_of_instance
 
 __all__ = [
     "PAPER_ALPHAS",

@@ -29,7 +29,7 @@ from synpick_warp.evaluation.charts import (
     draw_chart,
 )
 from synpick_warp.evaluation.poses import PoseTable
-from synpick_warp.evaluation.sweep import AlphaSweep
+from synpick_warp.evaluation.tracking.sweep import AlphaSweep
 
 _CENTIMETERS = 100.0
 _RAW: Color = (170, 178, 188)

@@ -56,6 +56,24 @@ def test_other_styles_keep_the_standard_output_clean(folder, files, capsys):
     assert "eval_bop19_pose.py" in error
 
 
+def test_the_filter_scores_each_method_once_more(folder, files, capsys):
+    """With weight 1 it changes nothing; with the paper's 0.05 it lags behind what moves, and only there."""
+
+    def methods(*arguments: object) -> dict[str, dict[str, float]]:
+        assert run("--data", folder, "--results", *files, "--format", "json", "--vertices", 50, "--filter", "ema", *arguments) == 0
+        found = json.loads(capsys.readouterr().out)["methods"]
+        return {one["method"]: {f"{row['group']} {row['label']}": row["ADD exact"] for row in one["rows"]} for one in found}
+
+    neutral = methods("--alpha", 1)
+    assert list(neutral) == ["icg", "icg + EMA 1", "bad", "bad + EMA 1"]
+    assert neutral["icg + EMA 1"] == pytest.approx(neutral["icg"])
+    assert neutral["bad + EMA 1"] == pytest.approx(neutral["bad"])
+    paper = methods()
+    lost = {row: value - paper["icg + EMA 0.05"][row] for row, value in paper["icg"].items() if row.startswith("speed")}
+    assert list(lost.values())[0] == pytest.approx(0.0, abs=1e-6)
+    assert max(lost.values()) > 10.0
+
+
 def test_a_table_is_written_to_a_file(folder, files, tmp_path, capsys):
     out = tmp_path / "table.tex"
     assert run("--data", folder, "--results", files[0], "--format", "latex", "--convention", "vocap", "--out", out) == 0
@@ -92,6 +110,9 @@ def test_methods_have_different_names(tmp_path):
         (["--visib-min", "1.5"], "--visib-min is 1.5; allowed: 0 to 1"),
         (["--visib-min", "nan"], "--visib-min is nan; allowed: 0 to 1"),
         (["--top", "-2"], "--top is -2; allowed: -1 for as many as instances, 0 for all"),
+        (["--alpha", "0.1"], "--alpha is 0.1, but there is no filter; add --filter ema"),
+        (["--filter", "kalman"], '--filter is "kalman"; allowed: ema'),
+        (["--filter", "ema", "--alpha", "0"], "alpha 0.0 is not allowed: it is the weight of the new estimate, above 0 and at most 1"),
         (["--vertices", "-1"], "--vertices is -1; allowed: 0 for all"),
         (["--top", "1.5"], '--top is "1.5"; allowed: a whole number'),
         (["--out", "{folder}/none/table.txt"], "/none/table.txt; allowed: a file in an existing folder"),

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.evaluation.poses import PoseTable
-from synpick_warp.evaluation.tracks import check_poses, find_tracks
+from synpick_warp.evaluation.tracking.tracks import check_poses, find_tracks
 
 PAPER_ALPHAS = (0.05, 0.2)
 """Weights of the new estimate in the paper's table and figure; the first is the better one."""

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from synpick_warp.errors import ConfigError, DatasetError
-from synpick_warp.evaluation.filtering import check_alpha, filter_poses
 from synpick_warp.evaluation.poses import PoseTable
-from synpick_warp.evaluation.tracks import find_tracks
+from synpick_warp.evaluation.tracking.filtering import check_alpha, filter_poses
+from synpick_warp.evaluation.tracking.tracks import find_tracks
 
 ScoreFunction = Callable[[PoseTable], float]
 """Score of estimates, larger is better; misses are counted by it, against the truth that it knows."""

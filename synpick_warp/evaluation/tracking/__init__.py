@@ -1,0 +1,1 @@
+"""Tracking over time: association of estimates, the filter of the SynPick paper, and the sweep of its weight."""
