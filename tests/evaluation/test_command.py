@@ -70,7 +70,7 @@ def test_the_filter_scores_each_method_once_more(folder, files, capsys):
     assert neutral["bad + EMA 1"] == pytest.approx(neutral["bad"])
     paper = methods()
     lost = {row: value - paper["icg + EMA 0.05"][row] for row, value in paper["icg"].items() if row.startswith("speed")}
-    assert list(lost.values())[0] == pytest.approx(0.0, abs=1e-6)
+    assert next(iter(lost.values())) == pytest.approx(0.0, abs=1e-6)
     assert max(lost.values()) > 10.0
 
 
