@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
+import pickle
 import selectors
 import signal
 import socket
@@ -183,7 +184,7 @@ class WriterPool:
         try:
             self.wait()
             for worker in self._workers:
-                worker.link.send(None)
+                _send(worker.link, None)
             for worker in self._workers:
                 worker.process.wait(_END_TIMEOUT)
         except (OSError, subprocess.TimeoutExpired) as error:
@@ -272,7 +273,7 @@ class WriterPool:
             _await_copy(queued)
             worker.tasks.append(queued)
             try:
-                worker.link.send(queued.message)
+                _send(worker.link, queued.message)
             except OSError:
                 self._fail_dead_worker(worker)
 
@@ -330,6 +331,12 @@ def _copy(targets: Sequence[np.ndarray], images: Sequence[np.ndarray]) -> None:
 def _await_copy(queued: _QueuedTask) -> None:
     if queued.copying is not None:
         queued.copying.result()
+
+
+def _send(link: Connection, message: TaskMessage | None) -> None:
+    """Send a message as bytes: `Connection.send` keeps a view of a BytesIO, on which CPython 3.12.1 crashes in a garbage collection if
+    the send fails and the error is part of a reference cycle."""
+    link.send_bytes(pickle.dumps(message))
 
 
 def _allocate_shared_memory(size: int) -> tuple[int, mmap.mmap]:
