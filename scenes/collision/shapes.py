@@ -27,7 +27,8 @@ _RECIPE = 1
 
 
 def default_cache_dir() -> Path:
-    """Default cache folder: in the user's cache directory; without a home, a path that nobody can create, which is reported on writing."""
+    """Default cache folder, in the user's cache directory. Without a home directory: a path below the null device, where
+    writing always fails, so that shapes are computed each time and a note says so."""
     return (user_cache() or Path(os.devnull)) / "synpick-warp" / "collision"
 
 

@@ -51,7 +51,7 @@ def _group_limits(root: Path) -> Iterator[int]:
 
 
 def _walk(folder: Path, path: str, limit_name: str, used_name: str, cached: tuple[str, ...]) -> Iterator[int]:
-    """Free memory under the limits of a control group and of all above it; inside a container the root is the container's own."""
+    """Free memory that each limited control group leaves, from the given group up to the root [bytes]; a container sees its own as root."""
     parts = [part for part in path.split("/") if part not in ("", "..")]
     for depth in range(len(parts), -1, -1):
         group = folder.joinpath(*parts[:depth])
@@ -68,7 +68,7 @@ def _read_table(path: Path) -> dict[str, int]:
 
 
 def _read(path: Path) -> str:
-    """Text of a file of the kernel; empty if there is none."""
+    """Read a file of the kernel's interface (procfs, cgroupfs); empty text if it cannot be read."""
     try:
         return path.read_text()
     except (OSError, UnicodeDecodeError):

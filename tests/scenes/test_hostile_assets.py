@@ -92,7 +92,7 @@ def test_a_texture_that_is_read_is_copied_into_the_set(tmp_path, line):
 
 
 def test_only_the_texture_that_was_read_is_copied(tmp_path):
-    """Between reading and copying the folder may change: the set then keeps neither another picture nor a file that is none."""
+    """A texture that is replaced between reading and copying is not copied, whether by another image or by a file that is no image."""
     folder = folder_of(tmp_path, "comment TextureFile skin.png")
     catalog = load_catalog(Config(bake=Bake(models=str(folder))), tmp_path / "cache")
     other = cv2.imencode(".png", np.zeros((4, 3, 3), np.uint8))[1].tobytes()
