@@ -14,7 +14,6 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from synpick_warp.dataset import merge as merging
 from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.merge import merge
 from synpick_warp.dataset.verify import verify
@@ -22,11 +21,11 @@ from synpick_warp.errors import DatasetError, SynpickError
 from synpick_warp.exporters.bop import targets
 from synpick_warp.exporters.bop.shard_parts import list_keys
 from synpick_warp.exporters.writing.checksums import parse_checksums
-from synpick_warp.exporters.writing.pool import WriterPool
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, WHOLE, hostile_contents, places, replaced
 from tests.harness.scripted_bake import ATTEMPT, bake, make_victim, small_settings, snapshot
 
+pytestmark = pytest.mark.usefixtures("inline")
 CONFIG = small_settings()
 SECONDS = 5.0
 """Longest time of a command on a hostile data set."""
@@ -34,22 +33,6 @@ RECORDS = (
     "manifest.json",
     *(f"manifest/{name}.{kind}" for name in ("constants", "000000", "000001", "joined") for kind in ("json", "sha256")),
 )
-
-
-@pytest.fixture(scope="module", autouse=True)
-def inline():
-    """Merges write in this process."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(merging, "WriterPool", lambda _, size, handle: WriterPool(0, size, handle))
-        yield
-
-
-@pytest.fixture(scope="module")
-def ready(tmp_path_factory) -> Path:
-    """A finished data set."""
-    out = tmp_path_factory.mktemp("ready") / "set"
-    bake(out, CONFIG)
-    return out
 
 
 def check_line(error: Exception, case: str = "", advice: str = "") -> None:

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from synpick_warp.dataset import merge as merging
 from synpick_warp.dataset.manifest import episode_entry, read_checksums
 from synpick_warp.dataset.merge import merge
 from synpick_warp.dataset.verify import verify
@@ -21,28 +20,12 @@ from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.exporters.writing.checksums import checksum, parse_checksums
 from synpick_warp.exporters.writing.files import check_output_folder
-from synpick_warp.exporters.writing.pool import WriterPool
 from tests.harness.scripted_bake import bake, make_victim, small_settings, snapshot
 
+pytestmark = pytest.mark.usefixtures("inline")
 CONFIG = small_settings()
 SECONDS = 5.0
 """Longest time of a command on a hostile data set."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def inline():
-    """Merges write in this process."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(merging, "WriterPool", lambda _, size, handle: WriterPool(0, size, handle))
-        yield
-
-
-@pytest.fixture(scope="module")
-def ready(tmp_path_factory) -> Path:
-    """A finished data set."""
-    out = tmp_path_factory.mktemp("ready") / "set"
-    bake(out, CONFIG)
-    return out
 
 
 @pytest.fixture(scope="module")
