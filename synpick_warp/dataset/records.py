@@ -6,23 +6,28 @@ The files are validated when they are read; code behind may index their content 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
 from synpick_warp.codes import Ending, Mode, Outcome, names
+from synpick_warp.dataset.annotations import Index, Side
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.json import MAX_JSON, decode_json
 
-Index = Annotated[int, msgspec.Meta(ge=0, le=2**31 - 1)]
-"""Index or count."""
 Number = Annotated[int, msgspec.Meta(ge=-(2**31), le=2**31 - 1)]
 """32-bit integer."""
 Checksum = Annotated[str, msgspec.Meta(pattern=r"\A[0-9a-f]{64}\Z")]
 """SHA-256 in hexadecimal."""
+MAX_INSTANCES = 255
+"""Most instances of a scene: their ids are bytes of an image."""
+Instances = Annotated[list[Index], msgspec.Meta(max_length=MAX_INSTANCES)]
+Amount = Annotated[float, msgspec.Meta(ge=0.0, le=1e9)]
+"""Non-negative quantity in any unit; small enough for every drawing."""
 Vector = tuple[float, float, float]
 Pixel = tuple[float, float]
+"""Column and row in the perception image; integers are pixel centres."""
 _Value = bool | int | float | str | None
 _Section = dict[str, _Value | list[_Value | list[_Value]]]
 """Settings of a section, or of an object row."""
@@ -83,54 +88,58 @@ class InstanceObservation(msgspec.Struct):
     """Perception result of an instance, see `attempts.InstanceObservation`."""
 
     instance: Index
-    object_id: Number
-    visible: Number
-    visible_fraction: float
+    object_id: Index
+    visible: Index
+    visible_fraction: Amount
     pole: Pixel
     centroid: Pixel
     midpoint: Pixel
-    distances: Vector
+    distances: tuple[Amount, Amount, Amount]
     grasp_pixel: tuple[Number, Number]
     depth: float
-    above: list[Index]
-    ancestors: list[Index]
+    above: Instances
+    ancestors: Instances
 
 
 class Observation(msgspec.Struct):
     """Perception result of an attempt, see `attempts.ObservationRecord`."""
 
-    resolution: tuple[Index, Index]
-    instances: list[InstanceObservation]
-    votes: list[tuple[Index, Index, float]]
+    resolution: tuple[Side, Side]
+    instances: Annotated[list[InstanceObservation], msgspec.Meta(max_length=MAX_INSTANCES)]
+    votes: list[tuple[Index, Index, Amount]]
 
 
-class Attempt(msgspec.Struct):
-    """Line of attempts.jsonl, see `attempts.AttemptRecord`."""
+class AttemptKey(msgspec.Struct):
+    """What a line of attempts.jsonl is found by."""
 
     episode: Index
     attempt: Index
-    mode: str
+
+
+class Attempt(AttemptKey):
+    """Line of attempts.jsonl, see `attempts.AttemptRecord`."""
+
+    mode: Literal["pick", "target"]
     frame: Index
     end_frame: Index
     outcome: str
-    sentence: str
+    sentence: Annotated[str, msgspec.Meta(max_length=1000)]
     target: Index | None
     object_id: Number | None
     point: Vector | None
     normal: Vector | None
     yaw: float | None
-    tilt: float | None
+    tilt: Annotated[float, msgspec.Meta(ge=-4.0, le=4.0)] | None
     rays: Index
     hits: Index
     good_seal: bool
-    engaged: list[Index]
-    picked: list[Index]
-    peak_force: list[float]
+    engaged: Instances
+    picked: Instances
+    peak_force: Annotated[list[Amount], msgspec.Meta(max_length=100_000)]
     observation: Observation
 
     def __post_init__(self) -> None:
         _check_name("outcome", self.outcome, names(Outcome)[1:])
-        _check_name("mode", self.mode, names(Mode))
 
 
 class EpisodeEntry(Entry):

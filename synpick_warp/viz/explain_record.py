@@ -6,13 +6,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
-
-from msgspec import Meta, Struct
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.annotations import ADVICE, Index, Side
+from synpick_warp.dataset import records
+from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.dataset.manifest import ATTEMPTS_FILE
+from synpick_warp.dataset.records import Pixel
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.json import MAX_JSON, decode_json
@@ -21,67 +20,10 @@ MODE_WORDS = {"pick": "untargeted", "target": "targeted"}
 CANDIDATES = ("pole", "centroid", "midpoint")
 """Candidates of the suction point, in the order of `SeenObject.distances`."""
 
-Pixel = tuple[float, float]
-"""Column and row in the perception image; integers are pixel centres."""
-MAX_INSTANCES = 255
-"""Most instances of a scene: their ids are bytes of an image."""
 MAX_ATTEMPTS = 100
 """Most attempts of one figure."""
 MAX_RUNS = 20
 """Most ranges of numbers that a message lists."""
-
-
-Instances = Annotated[list[Index], Meta(max_length=MAX_INSTANCES)]
-Amount = Annotated[float, Meta(ge=0.0, le=1e9)]
-
-
-class InstanceSchema(Struct, gc=False):
-    """Schema of an instance in the observation of an attempt."""
-
-    instance: Index
-    object_id: Index
-    visible: Index
-    visible_fraction: Amount
-    pole: Pixel
-    centroid: Pixel
-    midpoint: Pixel
-    distances: tuple[Amount, Amount, Amount]
-    grasp_pixel: Pixel
-    above: Instances
-    ancestors: Instances
-
-
-class ObservationSchema(Struct, gc=False):
-    """Schema of the observation of an attempt."""
-
-    resolution: tuple[Side, Side]
-    instances: Annotated[list[InstanceSchema], Meta(max_length=MAX_INSTANCES)]
-    votes: list[tuple[Index, Index, Amount]]
-
-
-class AttemptKey(Struct, gc=False):
-    """Schema of what every line of attempts.jsonl needs."""
-
-    episode: Index
-    attempt: Index
-
-
-class AttemptSchema(AttemptKey, gc=False):
-    """Schema of a line of attempts.jsonl, as far as it is drawn."""
-
-    mode: Literal["pick", "target"]
-    frame: Index
-    end_frame: Index
-    sentence: Annotated[str, Meta(max_length=1000)]
-    target: Index | None
-    tilt: Annotated[float, Meta(ge=-4.0, le=4.0)] | None
-    rays: Index
-    hits: Index
-    good_seal: bool
-    engaged: Instances
-    picked: Instances
-    peak_force: Annotated[list[Amount], Meta(max_length=100_000)]
-    observation: ObservationSchema
 
 
 @dataclass(frozen=True)
@@ -156,7 +98,7 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
             f"{dataset} has no {path.name}: it has no pick attempts; explain draws those of a bake with mode pick, target or mixed"
         )
     lines = read_file(path, MAX_JSON, DatasetError).splitlines()
-    keys = [decode_json(line, AttemptKey, _line(path, row), DatasetError, ADVICE) for row, line in enumerate(lines)]
+    keys = [decode_json(line, records.AttemptKey, _line(path, row), DatasetError, ADVICE) for row, line in enumerate(lines)]
     episodes = sorted({key.episode for key in keys})
     if episode not in episodes:
         raise DatasetError(f"{path} has no attempt of episode {episode}; {_which('episodes that have', episodes)}")
@@ -169,7 +111,7 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
             f"{path} has {len(rows)} attempts of episode {episode}; a figure has at most {MAX_ATTEMPTS}: name one by --attempt"
         )
     return [
-        _attempt(decode_json(lines[row], AttemptSchema, _line(path, row), DatasetError, ADVICE), _line(path, row))
+        _attempt(decode_json(lines[row], records.Attempt, _line(path, row), DatasetError, ADVICE), _line(path, row))
         for count, row in rows
         if number in (None, count)
     ]
@@ -192,7 +134,7 @@ def _which(what: str, numbers: list[int]) -> str:
     return f"{what}: {', '.join(shown) or 'none'}"
 
 
-def _attempt(record: AttemptSchema, source: str) -> Attempt:
+def _attempt(record: records.Attempt, source: str) -> Attempt:
     """Check the record of an attempt for consistency, and convert it."""
     width, height = record.observation.resolution
     visible = [one for one in record.observation.instances if one.visible > 0]
@@ -225,7 +167,7 @@ def _attempt(record: AttemptSchema, source: str) -> Attempt:
     )
 
 
-def _seen(record: InstanceSchema) -> SeenObject:
+def _seen(record: records.InstanceObservation) -> SeenObject:
     return SeenObject(
         instance=record.instance,
         object_id=record.object_id,

@@ -113,8 +113,9 @@ def test_another_target_another_highlight(dataset):
 
 @pytest.mark.parametrize(("resolution", "factor"), [([96, 72], 1.0), ([192, 144], 2.0), ([48, 36], 0.5)])
 def test_suction_points_are_drawn_where_they_are_at_any_sight_resolution(dataset, resolution, factor):
-    place = (21.0, 52.0)  # Nothing else is drawn there.
-    pixel = tuple((value + 0.5) * factor - 0.5 for value in place)
+    near = (21.0, 52.0)  # Nothing else is drawn there.
+    pixel = tuple(round((value + 0.5) * factor - 0.5) for value in near)
+    place = tuple((value + 0.5) / factor - 0.5 for value in pixel)
     boxes = [seen_object(2, 7, pixel)]
     write(dataset, record(boxes, episode=1, observation={"resolution": resolution, "instances": boxes, "votes": []}))
     rows, columns = np.nonzero((image_of(drawn(dataset)) == instance_color(2)).all(axis=2))

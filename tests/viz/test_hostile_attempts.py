@@ -70,8 +70,9 @@ def test_hostile_lines_are_drawn_or_named(tmp_path, part):
             read_and_draw(tmp_path, content)
 
 
-def test_a_point_outside_of_the_image_is_named(tmp_path):
-    one = seen_object(2, 7, (50, 38), grasp_pixel=[1e300, 3])
+@pytest.mark.parametrize("point", [{"pole": [1e300, 3]}, {"grasp_pixel": [2**31 - 1, 3]}])
+def test_a_point_outside_of_the_image_is_named(tmp_path, point):
+    one = seen_object(2, 7, (50, 38), **point)
     (tmp_path / "attempts.jsonl").write_text(json.dumps(record([one])))
     with pytest.raises(DatasetError, match="line 1, is damaged: a point of instance 2 is not in the image of 96 x 72"):
         read_attempts(tmp_path, 0, None)

@@ -19,7 +19,7 @@ def seen_object(instance: int, object_id: int, suction: tuple[float, float], **o
         "centroid": [column + 8.0, row],
         "midpoint": [column + 4.0, row],
         "distances": [6.0, 3.0, 5.1],
-        "grasp_pixel": [column, row],
+        "grasp_pixel": [round(column), round(row)],
         "depth": 1.4,
         "above": [],
         "ancestors": [],
@@ -36,7 +36,7 @@ def record(seen: list[dict[str, Any]], **other: Any) -> dict[str, Any]:
         "mode": "pick",
         "frame": 0,
         "end_frame": 4,
-        "outcome": "TARGET_PICKED",
+        "outcome": "target_picked",
         "sentence": "the target hung on the cup after the lift",
         "target": target,
         "object_id": seen[0]["object_id"] if seen else None,
@@ -59,7 +59,7 @@ def nothing_seen(**other: Any) -> dict[str, Any]:
     """The line of an attempt that ended before it began."""
     gone = {
         "sentence": "no object in the tote is visible",
-        "outcome": "NOTHING_SEEN",
+        "outcome": "nothing_seen",
         "point": None,
         "normal": None,
         "yaw": None,
