@@ -21,6 +21,8 @@ from synpick_warp.cli.commands import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import SynpickError
+from synpick_warp.evaluation.results import write_results
+from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from tests.harness.fuzz import fuzz_examples
@@ -58,6 +60,8 @@ class Sandbox:
         """Files by their last name, so that each kind comes as often as the 68 zarr.json."""
         for name in self.files:
             self.kinds.setdefault(name.rpartition("/")[2], []).append(name)
+        self.results = scratch / "own_results.csv"
+        write_results(self.results, read_truth(synpick_warp.open(folder)).poses)
 
     @contextmanager
     def replaced(self, name: str, content: bytes | None) -> Iterator[None]:
@@ -196,9 +200,18 @@ def show_settings(sandbox: Sandbox) -> None:
     run_command("config", "--config", sandbox.folder / "config.toml")
 
 
+def evaluate(sandbox: Sandbox) -> None:
+    """Run `eval` on the set's own poses."""
+    table = sandbox.scratch / "table.txt"
+    code = run_command("eval", "--data", sandbox.folder, "--results", sandbox.results, "--filter", "ema", "--vertices", 20, "--out", table)
+    assert (code == 0) == table.exists()
+    table.unlink(missing_ok=True)
+
+
 READERS = {
     "open": lambda sandbox: use_set(sandbox.folder),
     "draw": draw,
+    "evaluate": evaluate,
     "check and merge": check_and_merge,
     "config": show_settings,
 }
@@ -210,6 +223,7 @@ def test_the_set_itself_is_read_by_every_command(sandbox):
     data = synpick_warp.open(sandbox.folder)
     assert [len(data[0].attempts), data[0].view(0).layers] == [2, ("classes", "flow")]
     draw(sandbox)
+    evaluate(sandbox)
     assert run_command("verify", sandbox.folder) == 0
     show_settings(sandbox)
 
