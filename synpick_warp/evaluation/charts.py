@@ -43,6 +43,18 @@ _FAR = 20_000.0
 """Limit of coordinates [px]: what lies outside a panel is clipped, and must fit OpenCV's integers."""
 _MAX_LABEL = 36
 """Maximum number of letters of a legend entry."""
+_LINE = 2.5
+"""Width of a line [px]."""
+_DOT = 2.5
+"""Radius of a dot relative to the line's width."""
+_RING, _RING_LINE = 15, 3
+"""Radius of a ring around a point, and width of its line [px]."""
+_EVENT_ROW, _EVENT = 12.0, 8.0
+"""Distance of the discs of events from the upper edge, and their radius [px]."""
+_BAR_GAP = 6
+"""Distance of a bar from the edges of its bin [supersampled px]."""
+_BAND_OPACITY = 0.2
+"""Opacity of bands behind their lines."""
 INK, SOFT, GRID = (30, 30, 30), (110, 110, 110), (226, 226, 226)
 PALETTE: tuple[Color, ...] = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
 """Colours that colour-blind readers tell apart (Okabe and Ito, 2008)."""
@@ -88,7 +100,7 @@ class Line:
     x: np.ndarray
     y: np.ndarray
     color: Color
-    width: float = 2.5
+    width: float = _LINE
     """[px]"""
     dots: bool = False
     """Whether each point is marked."""
@@ -102,7 +114,7 @@ class Line:
                 continue
             cv2.polylines(canvas, [_fixed(points[run])], False, self.color, thickness, cv2.LINE_AA, _SHIFT)
             for point in points[run] if self.dots else points[run[:1]] if len(run) == 1 else ():
-                _disc(canvas, point, _SUPER * (2.5 * self.width if self.dots else self.width), self.color)
+                _disc(canvas, point, _SUPER * (_DOT * self.width if self.dots else self.width), self.color)
 
 
 @dataclass(frozen=True)
@@ -121,7 +133,7 @@ class Band:
                 outline = np.concatenate((place(self.x[run], self.low[run]), place(self.x[run], self.high[run])[::-1]))
                 layer = canvas.copy()
                 cv2.fillPoly(layer, [_fixed(outline)], self.color, cv2.LINE_AA, _SHIFT)
-                cv2.addWeighted(layer, 0.2, canvas, 0.8, 0.0, canvas)
+                cv2.addWeighted(layer, _BAND_OPACITY, canvas, 1.0 - _BAND_OPACITY, 0.0, canvas)
 
 
 @dataclass(frozen=True)
@@ -135,7 +147,7 @@ class Bars:
     def draw(self, canvas: Image, place: Place) -> None:
         for left, right, height in zip(self.edges[:-1], self.edges[1:], self.heights, strict=True):
             first, second = np.rint(place(np.array([left, right]), np.array([0.0, height]))).astype(int)
-            cv2.rectangle(canvas, (int(first[0]) + 6, int(second[1])), (int(second[0]) - 6, int(first[1])), self.color, -1)
+            cv2.rectangle(canvas, (int(first[0]) + _BAR_GAP, int(second[1])), (int(second[0]) - _BAR_GAP, int(first[1])), self.color, -1)
 
 
 @dataclass(frozen=True)
@@ -148,7 +160,7 @@ class Rings:
 
     def draw(self, canvas: Image, place: Place) -> None:
         for point in _fixed(place(self.x, self.y)):
-            cv2.circle(canvas, point.tolist(), round(_SUPER * 15) << _SHIFT, self.color, 3 * _SUPER, cv2.LINE_AA, _SHIFT)
+            cv2.circle(canvas, point.tolist(), (_SUPER * _RING) << _SHIFT, self.color, _RING_LINE * _SUPER, cv2.LINE_AA, _SHIFT)
 
 
 @dataclass(frozen=True)
@@ -163,7 +175,7 @@ class Events:
         pale = tuple(255 - (255 - part) // 3 for part in self.color)
         for x in place(self.x, np.zeros(len(self.x)))[:, 0]:
             if self.discs:
-                _disc(canvas, np.array([x, 12.0 * _SUPER]), 8.0 * _SUPER, self.color)
+                _disc(canvas, np.array([x, _EVENT_ROW * _SUPER]), _EVENT * _SUPER, self.color)
             else:
                 ends = np.array([[x, 0.0], [x, len(canvas)]])
                 cv2.polylines(canvas, [_fixed(ends)], False, pale, _SUPER, cv2.LINE_AA, _SHIFT)

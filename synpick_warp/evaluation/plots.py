@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from synpick_warp.errors import DatasetError
+from synpick_warp.evaluation.auc import LIMIT
 from synpick_warp.evaluation.charts import (
     INK,
     PALETTE,
@@ -37,12 +38,10 @@ _RAW: Color = (170, 178, 188)
 _MAX_BRIDGE = 5
 """Largest number of missing frames that a trajectory's curve bridges; longer gaps stay open."""
 _EVENT: Color = (200, 40, 40)
-VISIBILITY_EDGES = tuple(round(0.1 * number, 1) for number in range(11))
-"""Default bins of the visible fraction."""
-SPEED_EDGES = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
-"""Default bins of an object's speed [m/s]; all columns have the same width."""
-MAX_ERROR = 0.1
-"""Largest error of recall curves, and value of misses in medians [m]: the limit of the area under the curve."""
+VISIBILITY_BINS = tuple(round(0.1 * number, 1) for number in range(11))
+"""Default bin edges of the visible fraction: finer than the bands of tables."""
+SPEED_BINS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
+"""Default bin edges of an object's speed [m/s], finer than the bands of tables; all columns have the same width."""
 
 
 def plot_trajectory(
@@ -87,7 +86,7 @@ def plot_trajectory(
     return draw_chart(Axis("Frame", first, max(last, first + 1)), panels, legend)
 
 
-def plot_recall(errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", max_error: float = MAX_ERROR) -> Image:
+def plot_recall(errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", max_error: float = LIMIT) -> Image:
     """Accuracy-threshold curves: the fraction of instances with an error of at most the threshold.
 
     Args:
@@ -104,7 +103,7 @@ def plot_recall(errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", max_
 
 
 def plot_error_by_visibility(
-    visibility: np.ndarray, errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", edges: Sequence[float] = VISIBILITY_EDGES
+    visibility: np.ndarray, errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", edges: Sequence[float] = VISIBILITY_BINS
 ) -> Image:
     """Error against the visible fraction of instances (N,), from 0 to 1; otherwise as `plot_error_by_speed`."""
     ticks = [f"{100 * edge:g}" for edge in edges]
@@ -112,13 +111,13 @@ def plot_error_by_visibility(
 
 
 def plot_error_by_speed(
-    speed: np.ndarray, errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", edges: Sequence[float] = SPEED_EDGES
+    speed: np.ndarray, errors: Mapping[str, np.ndarray], *, metric: str = "ADD-S", edges: Sequence[float] = SPEED_BINS
 ) -> Image:
     """Error against speed: median and quartiles of each bin, and below them the number of instances.
 
     Args:
         speed: Speed of each true instance (N,) [m/s].
-        errors: Name of a method -> error of each instance (N,) [m]; infinity for misses, which count as `MAX_ERROR` as larger errors do.
+        errors: Name of a method -> error of each instance (N,) [m]; infinity for misses, which count as `LIMIT` as larger errors do.
         metric: Name of the error.
         edges: Rising bin edges [m/s]; values beyond them count in the outermost bins.
     """
@@ -159,7 +158,7 @@ def _plot_bins(values: np.ndarray, errors: Mapping[str, np.ndarray], metric: str
     for (name, one), color in zip(errors.items(), colors, strict=True):
         if len(_checked(name, one)) != len(values):
             raise DatasetError(f"{name} has {len(one)} errors for {len(values)} instances; give infinity for misses")
-        quartiles = _CENTIMETERS * np.array(list(_quartiles(np.minimum(one, MAX_ERROR), index, len(counts)))).T
+        quartiles = _CENTIMETERS * np.array(list(_quartiles(np.minimum(one, LIMIT), index, len(counts)))).T
         marks.append(Band(middle, quartiles[0], quartiles[2], color))
         lines.append(Line(middle, quartiles[1], color, 3.5, dots=True))
     x = Axis(label, 0.0, len(counts), ticks=tuple((float(place), text) for place, text in enumerate(ticks)))
