@@ -1,0 +1,1 @@
+"""Object pose estimation from masks, depth and colour: observations, residuals, refinement, template search, hypotheses."""

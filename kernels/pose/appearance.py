@@ -1,0 +1,111 @@
+"""Silhouette and colour residuals of a hypothesis, from the samples of its model."""
+
+import warp as wp
+
+from synpick_warp.kernels.pose.lighting import CHANNELS, Lighting, harmonics
+from synpick_warp.kernels.pose.observation import CROP, Images, Observation, Targets
+from synpick_warp.kernels.pose.residuals import LANES, Cost, Models, Sums, jacobian, tukey_weight
+from synpick_warp.kernels.pose.samples import PROTRUDING, VISIBLE, SampleView, has_color, interpolate_color, view_sample
+
+wp.set_module_options({"enable_backward": False})
+
+DEADBAND = wp.constant(0.75)
+"""Distance from the mask that its sampling explains [crop px]."""
+
+
+@wp.struct
+class Way:
+    """How a protruding sample gets back into the mask."""
+
+    distance: float
+    """[m]; 0: it lies within the deadband."""
+    direction: wp.vec3
+    """Unit direction across the ray through the sample, in the camera frame."""
+
+
+@wp.func
+def way_to_mask(observation: Observation, instance: int, sample: SampleView, focal: float) -> Way:
+    """Way from a sample to the nearest pixel of the mask, by the feature transform of the crop; `focal` is fx [px]."""
+    column = wp.clamp(int(wp.round(sample.crop[0])), 0, CROP - 1)
+    row = wp.clamp(int(wp.round(sample.crop[1])), 0, CROP - 1)
+    target = observation.nearest[instance, row, column] + wp.vec2(float(column), float(row))
+    offset = target - sample.crop
+    pixels = wp.length(offset)
+    result = Way()
+    result.distance = wp.max(pixels - DEADBAND, 0.0) * observation.pitch[instance] * sample.position[2] / focal
+    if result.distance > 0.0:
+        offset = offset / pixels
+        slope = (offset[0] * sample.position[0] + offset[1] * sample.position[1]) / sample.position[2]
+        result.direction = wp.normalize(wp.vec3(offset[0], offset[1], -slope))
+    return result
+
+
+@wp.func
+def intensity_gradient(across: float, down: float, intrinsics: wp.vec4, pitch: float, point: wp.vec3) -> wp.vec3:
+    """Derivative of an intensity by the point that is projected [1/m], from its derivatives along the crop's columns and rows."""
+    along = intrinsics[0] * across / (pitch * point[2])
+    below = intrinsics[1] * down / (pitch * point[2])
+    return wp.vec3(along, below, -(along * point[0] + below * point[1]) / point[2])
+
+
+@wp.kernel
+def accumulate_samples_kernel(
+    # Scene:
+    models: Models,
+    cost: Cost,
+    # In:
+    images: Images,
+    targets: Targets,
+    observation: Observation,
+    lighting: Lighting,
+    pose: wp.array[wp.transform],  # (pose) [m]
+    hypotheses: int,
+    # Out:
+    sums_inout: Sums,
+):
+    """Silhouette and colour residuals of the model's samples; added to the sums of the points.
+
+    A protruding sample is drawn to the nearest pixel of the mask. The colour residual of a visible one is intensity - base colour x
+    light, relative to the instance's mean intensity; its derivative is the image gradient.
+    """
+    index, lane = wp.tid()
+    instance = index // hypotheses
+    model = targets.model[instance]
+    origin = wp.transform_get_translation(pose[index])
+    radius, intrinsics = models.radius[model], images.intrinsics[targets.view[instance]]
+    mean = observation.intensity[instance]
+    hessian = wp.spatial_matrix()
+    gradient = wp.spatial_vector()
+    total = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    samples = models.position.shape[1]
+    if observation.points[instance] == 0:
+        samples = 0
+    for k in range(lane * cost.step, samples, LANES * cost.step):
+        sample = view_sample(models, images, targets, observation, cost, instance, pose[index], k)
+        area = sample.area * float(cost.step)
+        if sample.state == PROTRUDING:
+            way = way_to_mask(observation, instance, sample, intrinsics[0])
+            total[0] += area * wp.min(way.distance / cost.truncation, 1.0)
+            if way.distance > 0.0:
+                weight = cost.silhouette * area * wp.min(1.0, cost.cutoff / way.distance)
+                line = jacobian(sample.position, origin, way.direction, radius)
+                hessian += weight * wp.outer(line, line)
+                gradient += weight * way.distance * line
+        if sample.state == VISIBLE:
+            total[1] += area
+            if cost.color > 0.0 and mean > 0.0 and has_color(observation, instance, sample.crop):
+                intensity, across, down = interpolate_color(observation, instance, sample.crop)
+                basis = harmonics(sample.normal)
+                total[3] += area
+                for channel in range(CHANNELS):
+                    light = wp.max(wp.dot(lighting.coefficients[index, channel], basis), 0.0)
+                    error = (intensity[channel] - models.color[model, k][channel] * light) / mean
+                    total[2] += area * wp.min(wp.abs(error) / cost.color_cutoff, 1.0) / float(CHANNELS)
+                    change = intensity_gradient(across[channel], down[channel], intrinsics, observation.pitch[instance], sample.position)
+                    line = jacobian(sample.position, origin, cost.color / mean * change, radius)
+                    weight = area * tukey_weight(error, cost.color_cutoff) / float(CHANNELS)
+                    hessian += weight * wp.outer(line, line)
+                    gradient -= weight * cost.color * error * line
+    sums_inout.hessian[index, lane] = sums_inout.hessian[index, lane] + hessian
+    sums_inout.gradient[index, lane] = sums_inout.gradient[index, lane] + gradient
+    sums_inout.samples[index, lane] = total

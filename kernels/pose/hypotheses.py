@@ -1,0 +1,263 @@
+"""Pose hypotheses of a tracker: motion models, turns that depth cannot tell apart, their colour correlation, and the choice of the best."""
+
+import warp as wp
+
+from synpick_warp.kernels.pose.observation import Images, Observation, Targets
+from synpick_warp.kernels.pose.residuals import Cost, Models
+from synpick_warp.kernels.pose.samples import VISIBLE, has_color, interpolate_color, view_sample
+
+wp.set_module_options({"enable_backward": False})
+
+MOTIONS = wp.constant(3)
+"""Motion hypotheses per instance: at rest, constant velocity, shift with the observed centroid."""
+CORRELATION_LANES = wp.constant(8)
+"""Threads that share the correlation of one turn."""
+MIN_SAMPLES = wp.constant(24)
+"""Smallest number of coloured samples for a correlation."""
+NO_CORRELATION = wp.constant(-2.0)
+"""Below any correlation: there are too few samples."""
+FAST_MEAN = wp.constant(0.1)
+SLOW_MEAN = wp.constant(0.02)
+"""Weights of a new correlation in its running mean: usually, and while it is so low that turns are considered."""
+
+
+@wp.struct
+class Track:
+    """State of the tracks, one per instance."""
+
+    pose: wp.array[wp.transform]
+    """(instance): last estimate, object to camera [m]."""
+    before: wp.array[wp.transform]
+    """(instance): estimate of the frame before [m]."""
+    centroid: wp.array[wp.vec3]
+    """(instance): centroid of the points observed last [m]."""
+    frames: wp.array[int]
+    """(instance): number of consecutive frames with an estimate, up to the last; 0: none yet."""
+    correlation: wp.array[float]
+    """(instance): running mean of the correlation between image and base colours at the estimates; `NO_CORRELATION`: none yet."""
+
+
+@wp.struct
+class Turns:
+    """Rotations about an object's centre that change its shape little, by model. Constant."""
+
+    rotation: wp.array2d[wp.quat]
+    """(model, turn): in the model's axes; the first is the identity."""
+    count: wp.array[int]
+    """(model): number of turns."""
+    center: wp.array[wp.vec3]
+    """(model): fixed point of the turns, in the model's frame [m]."""
+
+
+@wp.struct
+class Correlation:
+    """Partial sums of the zero-mean normalized cross-correlation between intensity and base colour."""
+
+    intensity: wp.array2d[wp.vec3]
+    """(candidate, lane): sum of the intensities."""
+    base: wp.array2d[wp.vec3]
+    """(candidate, lane): sum of the base colours."""
+    squares: wp.array2d[wp.vec4]
+    """(candidate, lane): sums of intensity², base², intensity x base over the channels, and the number of samples."""
+
+
+@wp.kernel
+def propose_motions_kernel(
+    # State:
+    track: Track,
+    # In:
+    observation: Observation,
+    # Out:
+    pose_out: wp.array[wp.transform],  # (pose) [m]
+):
+    """Motion hypotheses: at rest; constant velocity; displaced as the centroid of the observed points."""
+    instance = wp.tid()
+    pose = track.pose[instance]
+    rotation = wp.transform_get_rotation(pose)
+    position = wp.transform_get_translation(pose)
+    first = instance * MOTIONS
+    pose_out[first] = pose
+    pose_out[first + 1] = pose
+    pose_out[first + 2] = pose
+    if track.frames[instance] > 1:
+        before = track.before[instance]
+        turn = rotation * wp.quat_inverse(wp.transform_get_rotation(before))
+        shift = position - wp.transform_get_translation(before)
+        pose_out[first + 1] = wp.transform(position + shift, wp.normalize(turn * rotation))
+    if track.frames[instance] > 0 and observation.points[instance] > 0:
+        shift = observation.centroid[instance] - track.centroid[instance]
+        pose_out[first + 2] = wp.transform(position + shift, rotation)
+
+
+@wp.kernel
+def turn_poses_kernel(
+    # Scene:
+    turns: Turns,
+    # In:
+    targets: Targets,
+    pose: wp.array[wp.transform],  # (instance) [m]
+    capacity: int,
+    # Out:
+    pose_out: wp.array[wp.transform],  # (candidate) [m]
+):
+    """Turn poses about the object's centre, candidate = instance x capacity + turn."""
+    index = wp.tid()
+    instance = index // capacity
+    turn = index % capacity
+    model = targets.model[instance]
+    result = pose[instance]
+    if turn < turns.count[model]:
+        rotation = turns.rotation[model, turn]
+        center = turns.center[model]
+        result = result * wp.transform(center - wp.quat_rotate(rotation, center), rotation)
+    pose_out[index] = result
+
+
+@wp.kernel
+def correlate_turns_kernel(
+    # Scene:
+    models: Models,
+    turns: Turns,
+    cost: Cost,
+    # In:
+    images: Images,
+    targets: Targets,
+    observation: Observation,
+    pose: wp.array[wp.transform],  # (candidate) [m]
+    capacity: int,
+    # Out:
+    correlation_out: Correlation,
+):
+    """Sums of intensity and base colour over the visible samples of each turned pose."""
+    index, lane = wp.tid()
+    instance = index // capacity
+    model = targets.model[instance]
+    intensities = wp.vec3()
+    bases = wp.vec3()
+    squares = wp.vec4()
+    if observation.points[instance] > 0 and index % capacity < turns.count[model]:
+        for k in range(lane, models.position.shape[1], CORRELATION_LANES):
+            sample = view_sample(models, images, targets, observation, cost, instance, pose[index], k)
+            if sample.state == VISIBLE and has_color(observation, instance, sample.crop):
+                intensity, across, down = interpolate_color(observation, instance, sample.crop)
+                base = models.color[model, k]
+                intensities += intensity
+                bases += base
+                squares += wp.vec4(wp.dot(intensity, intensity), wp.dot(base, base), wp.dot(intensity, base), 1.0)
+    correlation_out.intensity[index, lane] = intensities
+    correlation_out.base[index, lane] = bases
+    correlation_out.squares[index, lane] = squares
+
+
+@wp.func
+def correlation_of(correlation: Correlation, index: int) -> float:
+    """Zero-mean normalized cross-correlation of a candidate, the means removed per channel; `NO_CORRELATION`: too few samples."""
+    intensity = wp.vec3()
+    base = wp.vec3()
+    squares = wp.vec4()
+    for lane in range(CORRELATION_LANES):
+        intensity += correlation.intensity[index, lane]
+        base += correlation.base[index, lane]
+        squares += correlation.squares[index, lane]
+    count = squares[3]
+    if count < float(MIN_SAMPLES):
+        return NO_CORRELATION
+    spread = (squares[0] - wp.dot(intensity, intensity) / count) * (squares[1] - wp.dot(base, base) / count)
+    if spread <= 0.0:
+        return 0.0
+    return (squares[2] - wp.dot(intensity, base) / count) / wp.sqrt(spread)
+
+
+@wp.kernel
+def choose_turns_kernel(
+    # Scene:
+    turns: Turns,
+    # State:
+    mean_inout: wp.array[float],  # (instance)
+    # In:
+    targets: Targets,
+    correlation: Correlation,
+    pose: wp.array[wp.transform],  # (candidate) [m]
+    capacity: int,
+    gain: float,
+    # Out:
+    pose_out: wp.array[wp.transform],  # (pose) [m]
+):
+    """Two hypotheses per instance: the pose as it is, and the turn that correlates best.
+
+    A turn is considered only where colours fit by `gain` worse than they used to, and the turn by `gain` better than the pose: light and
+    gloss alone make some turns of a still object fit better than the truth.
+    """
+    instance = wp.tid()
+    first = instance * capacity
+    best = first
+    start = correlation_of(correlation, first)
+    mean = mean_inout[instance]
+    if start > NO_CORRELATION:
+        if mean == NO_CORRELATION:
+            mean = start
+        weight = float(FAST_MEAN)
+        if start < mean - gain:
+            weight = float(SLOW_MEAN)
+            most = start + gain
+            for turn in range(1, turns.count[targets.model[instance]]):
+                value = correlation_of(correlation, first + turn)
+                if value > most:
+                    most = value
+                    best = first + turn
+        mean_inout[instance] = mean + weight * (start - mean)
+    pose_out[2 * instance] = pose[first]
+    pose_out[2 * instance + 1] = pose[best]
+
+
+@wp.kernel
+def choose_poses_kernel(
+    # In:
+    pose: wp.array[wp.transform],  # (pose) [m]
+    cost: wp.array[float],  # (pose)
+    hypotheses: int,
+    loyalty: float,
+    # Out:
+    pose_out: wp.array[wp.transform],  # (instance) [m]
+    cost_out: wp.array[float],  # (instance)
+):
+    """The hypothesis of least cost; another than the first must be better by the factor 1 - `loyalty`."""
+    instance = wp.tid()
+    first = instance * hypotheses
+    best = first
+    least = cost[first] * (1.0 - loyalty)
+    for k in range(1, hypotheses):
+        if cost[first + k] < least:
+            least = cost[first + k]
+            best = first + k
+    pose_out[instance] = pose[best]
+    cost_out[instance] = cost[best]
+
+
+@wp.kernel
+def update_tracks_kernel(
+    # In:
+    observation: Observation,
+    pose: wp.array[wp.transform],  # (instance) [m]
+    start: wp.array[wp.transform],  # (instance) [m]
+    starting: wp.array[int],  # (instance)
+    min_points: int,
+    # Out:
+    track_out: Track,
+):
+    """Take new estimates over. An instance with too few observed points keeps its pose, at rest; tracks that start get their start pose."""
+    instance = wp.tid()
+    if starting[instance] != 0:
+        track_out.pose[instance] = start[instance]
+        track_out.before[instance] = start[instance]
+        track_out.centroid[instance] = observation.centroid[instance]
+        track_out.correlation[instance] = NO_CORRELATION
+        track_out.frames[instance] = 1
+        return
+    if track_out.frames[instance] == 0:
+        return
+    track_out.before[instance] = track_out.pose[instance]
+    if observation.points[instance] >= min_points:
+        track_out.pose[instance] = pose[instance]
+        track_out.centroid[instance] = observation.centroid[instance]
+        track_out.frames[instance] = track_out.frames[instance] + 1

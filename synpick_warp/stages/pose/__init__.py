@@ -1,0 +1,1 @@
+"""Launchers of the pose estimation kernels: observation, refinement, template search, tracking."""

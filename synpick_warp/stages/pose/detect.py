@@ -1,0 +1,78 @@
+"""Single-frame pose estimation: template search, refinement of many hypotheses, turns told apart by colour, refinement of the best."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import warp as wp
+
+from synpick_warp.kernels.pose.hypotheses import choose_poses_kernel
+from synpick_warp.stages.pose.models import PoseModels
+from synpick_warp.stages.pose.observe import Observer
+from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule
+from synpick_warp.stages.pose.templates import SearchSettings, TemplateSearch
+from synpick_warp.stages.pose.turns import TurnSearch
+
+COARSE = Schedule(iterations=12, cutoffs=(0.03, 0.01), step=2, color=0.0)
+"""Refinement of the many hypotheses of the template search."""
+FINE = Schedule(iterations=10, cutoffs=(0.012, 0.005), step=1, color=0.005)
+"""Refinement of the best one and its best turn."""
+
+
+@dataclass(frozen=True)
+class DetectSettings:
+    """Settings of single-frame estimates."""
+
+    search: SearchSettings = field(default_factory=SearchSettings)
+    hypotheses: int = 24
+    """Poses of the template search that are refined."""
+    coarse: Schedule = COARSE
+    fine: Schedule = FINE
+    color: bool = True
+    turn_gain: float = 0.05
+    """Correlation by which a turn must be better to become a hypothesis."""
+    turn_loyalty: float = 0.0
+    """Relative cost by which a turn must be better after refinement."""
+
+
+class Detector:
+    """Estimates poses from single views. `detect` only launches kernels."""
+
+    def __init__(self, models: PoseModels, templates: Any, observer: Observer, settings: DetectSettings, scales: CostScales) -> None:
+        """
+        Args:
+            models: The object models.
+            templates: The struct `Templates`.
+            observer: Observes the instances.
+            settings: Settings.
+            scales: Scales of the residuals.
+        """
+        self.observer, self.settings, self.device, n = observer, settings, observer.device, observer.instances
+        self.search = TemplateSearch(templates, observer, settings.hypotheses, settings.search)
+        self.many = Refiner(models, observer, settings.hypotheses, scales)
+        self.turns = TurnSearch(models, observer, scales)
+        self.pair = Refiner(models, observer, self.turns.hypotheses, scales)
+        self.many_pose = wp.zeros(n * settings.hypotheses, dtype=wp.transform, device=self.device)
+        self.pair_pose = wp.zeros(n * self.turns.hypotheses, dtype=wp.transform, device=self.device)
+        self.best = wp.zeros(n, dtype=wp.transform, device=self.device)
+        self.cost = wp.zeros(n, dtype=float, device=self.device)
+        # Any correlation is below this mean, so that turns are always considered.
+        self.no_memory = wp.zeros(n, dtype=float, device=self.device)
+
+    def detect(self) -> None:
+        """Estimate the poses of the observed views: `best` and `cost` of each instance."""
+        settings = self.settings
+        self.search.search(self.many_pose)
+        self.many.refine(self.many_pose, settings.coarse)
+        cost = self.many.score(self.many_pose, color=settings.color)
+        self._choose(self.many_pose, cost, settings.hypotheses, 0.0)
+        self.no_memory.fill_(1.0e3)
+        self.turns.propose(self.best, self.no_memory, settings.turn_gain, self.pair_pose, color=settings.color)
+        self.pair.refine(self.pair_pose, settings.fine)
+        cost = self.pair.score(self.pair_pose, color=settings.color)
+        self._choose(self.pair_pose, cost, self.turns.hypotheses, settings.turn_loyalty)
+
+    def _choose(self, pose: wp.array, cost: wp.array, hypotheses: int, loyalty: float) -> None:
+        inputs, outputs = [pose, cost, hypotheses, loyalty], [self.best, self.cost]
+        wp.launch(choose_poses_kernel, dim=self.observer.instances, inputs=inputs, outputs=outputs, device=self.device)

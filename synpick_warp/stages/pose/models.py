@@ -1,0 +1,172 @@
+"""Object models on the device: meshes for closest points, surface samples with normals and colours, and turns that keep the shape."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from synpick_warp.arrays import allocate_struct, struct_arrays
+from synpick_warp.kernels.pose.hypotheses import Turns
+from synpick_warp.kernels.pose.residuals import Models
+from synpick_warp.scenes.assets.appearance import srgb_to_linear
+from synpick_warp.scenes.types import Material, TriangleMesh
+from synpick_warp.stages.pose.batch import ObjectModel
+from synpick_warp.stages.render.scene import mip_levels
+
+SAMPLES = 2048
+"""Surface samples of a model: 3 mm apart on a can, 6 mm on a large box."""
+TEXELS = 96
+"""Resolution of sample colours: a texel of the mip level is at most a diameter over this, about a crop pixel."""
+TURN_STEP = 15.0
+"""Step of the angles about an object's principal axes that are tried as turns [°]."""
+TURN_TOLERANCE = 0.025
+"""Largest mean distance of the turned surface from the surface for a turn, relative to the diameter."""
+MAX_TURNS = 72
+
+MODELS = struct_arrays(
+    Models,
+    "model",
+    position=("model", "sample"),
+    normal=("model", "sample"),
+    color=("model", "sample"),
+    units={"radius": "m", "sample_area": "m²", "position": "m"},
+)
+TURNS = struct_arrays(Turns, "model", rotation=("model", "turn"), units={"center": "m"})
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSamples:
+    """Points evenly spread over a surface, in an order in which every prefix is evenly spread, too."""
+
+    position: np.ndarray
+    """(S, 3) float32 [m]."""
+    normal: np.ndarray
+    """Outward unit normals of the triangles (S, 3) float32."""
+    color: np.ndarray
+    """Base colour (S, 3) float32, linear."""
+    area: float
+    """Area of the surface [m²]."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseModels:
+    """Device data of the object models."""
+
+    models: Any
+    """The struct `Models`."""
+    turns: Any
+    """The struct `Turns`."""
+    objects: tuple[ObjectModel, ...]
+    diameters: np.ndarray
+    """Largest extent of each model about its centre (model) float64 [m]: twice the bounding sphere's radius."""
+    meshes: tuple[wp.Mesh, ...]
+    """Owners of the meshes whose handles `models` holds."""
+
+
+def build_models(objects: Sequence[ObjectModel], device: wp.Device, samples: int = SAMPLES) -> PoseModels:
+    """Sample the surfaces of objects, find their turns and upload both."""
+    surfaces = [sample_surface(item.mesh, item.material, samples) for item in objects]
+    centers = [surface.position.mean(axis=0) for surface in surfaces]
+    turns = [shape_turns(surface.position) for surface in surfaces]
+    radii = np.array([np.linalg.norm(item.mesh.vertices, axis=1).max() for item in objects])
+    meshes = tuple(
+        wp.Mesh(
+            points=wp.array(item.mesh.vertices, dtype=wp.vec3, device=device),
+            indices=wp.array(item.mesh.faces.reshape(-1), dtype=wp.int32, device=device),
+            bvh_constructor="sah",
+            bvh_leaf_size=1,
+        )
+        for item in objects
+    )
+    models = allocate_struct(MODELS, {"model": len(objects), "sample": samples}, device)
+    models.mesh.assign(np.array([mesh.id for mesh in meshes], np.uint64))
+    models.radius.assign(radii.astype(np.float32))
+    models.sample_area.assign(np.array([surface.area / samples for surface in surfaces], np.float32))
+    for name in ("position", "normal", "color"):
+        getattr(models, name).assign(np.stack([getattr(surface, name) for surface in surfaces]))
+    table = allocate_struct(TURNS, {"model": len(objects), "turn": max(len(turn) for turn in turns)}, device)
+    rotation = np.zeros((*table.rotation.shape, 4), np.float32)
+    rotation[..., 3] = 1.0
+    for row, turn in enumerate(turns):
+        rotation[row, : len(turn)] = turn
+    table.rotation.assign(rotation)
+    table.count.assign(np.array([len(turn) for turn in turns], np.int32))
+    table.center.assign(np.array(centers, np.float32))
+    return PoseModels(models, table, tuple(objects), 2.0 * radii, meshes)
+
+
+def sample_surface(mesh: TriangleMesh, material: Material, count: int) -> SurfaceSamples:
+    """Sample a surface evenly by area: a golden-ratio (Weyl) sequence over the cumulative area, and one in each triangle (R2 sequence)."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    areas = 0.5 * np.linalg.norm(doubled, axis=1)
+    cumulative = np.cumsum(areas)
+    index = np.arange(1, count + 1)
+    place = np.mod(index * ((np.sqrt(5.0) - 1.0) / 2.0), 1.0) * cumulative[-1]
+    face = np.minimum(np.searchsorted(cumulative, place, side="right"), len(areas) - 1)
+    # R2 sequence (Roberts, 2018): the plastic number's powers.
+    plastic = 1.324717957244746
+    u, v = np.mod(index[:, None] / plastic ** np.array([1.0, 2.0]), 1.0).T
+    fold = u + v > 1.0
+    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
+    weights = np.stack([1.0 - u - v, u, v], axis=1)
+    position = np.einsum("sk,skc->sc", weights, corners[face])
+    normal = doubled[face] / np.linalg.norm(doubled[face], axis=1, keepdims=True)
+    uv = np.einsum("sk,skc->sc", weights, mesh.uv[mesh.faces[face]].astype(np.float64))
+    color = sample_color(mesh, material, uv)
+    return SurfaceSamples(position.astype(np.float32), normal.astype(np.float32), color, float(cumulative[-1]))
+
+
+def sample_color(mesh: TriangleMesh, material: Material, uv: np.ndarray) -> np.ndarray:
+    """Base colour (S, 3) float32, linear, at texture coordinates (S, 2): the mip level whose texels are as wide as a crop pixel."""
+    factor = srgb_to_linear(np.array(material.color))
+    if material.texture is None:
+        return np.broadcast_to(factor, (len(uv), 3)).astype(np.float32)
+    corners, flat = mesh.vertices[mesh.faces].astype(np.float64), mesh.uv[mesh.faces].astype(np.float64)
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    edge, other = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
+    uv_area = np.abs(edge[:, 0] * other[:, 1] - edge[:, 1] * other[:, 0]).sum()
+    diameter = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
+    width = np.sqrt(area / max(uv_area, 1e-12)) / material.texture.shape[1]
+    levels = mip_levels(material.texture)
+    level = levels[int(np.clip(np.floor(np.log2(max(diameter / TEXELS / width, 1.0))), 0, len(levels) - 1))]
+    height, columns = level.shape[:2]
+    column = np.clip(np.floor(np.mod(uv[:, 0], 1.0) * columns), 0, columns - 1).astype(np.int64)
+    row = np.clip(np.floor((1.0 - np.mod(uv[:, 1], 1.0)) * height), 0, height - 1).astype(np.int64)
+    return (srgb_to_linear(level[row, column] / 255.0) * factor).astype(np.float32)
+
+
+def shape_turns(points: np.ndarray) -> np.ndarray:
+    """Rotations about the centroid that keep a surface nearly in place: about its principal axes in steps, and flips of these.
+
+    Args:
+        points: Samples of the surface (S, 3).
+
+    Returns:
+        Quaternions (T, 4) float32, x y z w; the first is the identity.
+    """
+    centered = points.astype(np.float64) - points.mean(axis=0)
+    tree = KDTree(centered)
+    probes = centered[:256]
+    size = 2.0 * np.linalg.norm(centered, axis=1).max()
+    # Distances between samples alone are not zero: what the identity would have if its own sample did not count.
+    spacing = tree.query(probes, k=2)[0][:, 1].mean()
+    axes = np.linalg.svd(centered, full_matrices=False)[2]
+    angles = np.deg2rad(np.arange(TURN_STEP, 360.0, TURN_STEP))
+    candidates = [Rotation.from_rotvec(angle * axis) for axis in axes for angle in angles]
+    kept = [turn for turn in candidates if tree.query(turn.apply(probes))[0].mean() < spacing + TURN_TOLERANCE * size]
+    flips = [turn for turn in kept if np.isclose(turn.magnitude(), np.pi)]
+    rotations = [Rotation.identity(), *kept]
+    for turn in kept:
+        rotations += [flip * turn for flip in flips]
+    unique: list[Rotation] = []
+    for turn in rotations:
+        if all((turn * other.inv()).magnitude() > np.deg2rad(TURN_STEP) / 2.0 for other in unique):
+            unique.append(turn)
+    return np.array([turn.as_quat() for turn in unique[:MAX_TURNS]], np.float32)

@@ -1,0 +1,120 @@
+"""Pose refinement: Gauss-Newton on surface distances, silhouette and colour, for all hypotheses of all instances at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from synpick_warp.arrays import allocate_struct, struct_arrays
+from synpick_warp.kernels.pose.appearance import accumulate_samples_kernel
+from synpick_warp.kernels.pose.lighting import CHANNELS, Lighting, accumulate_lighting_kernel, fit_lighting_kernel
+from synpick_warp.kernels.pose.residuals import LANES, Cost, Sums
+from synpick_warp.kernels.pose.solve import StepLimits, score_poses_kernel, step_poses_kernel
+from synpick_warp.kernels.pose.surface import accumulate_points_kernel
+from synpick_warp.stages.pose.models import PoseModels
+from synpick_warp.stages.pose.observe import Observer
+
+SUMS = struct_arrays(Sums, "pose", "lane", units={"hessian": "m²", "gradient": "m³", "points": "m²", "samples": "m²"})
+LIGHTING = struct_arrays(Lighting, "pose", "lane", "channel", coefficients=("pose", "channel"))
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Iterations of a refinement, from coarse to fine."""
+
+    iterations: int
+    cutoffs: tuple[float, float]
+    """Outlier distance of the first and the last iteration [m], geometric between."""
+    step: int
+    """Every n-th point and sample is used."""
+    color: float
+    """Length that a colour residual of the mean intensity counts as [m]; 0: no colour."""
+    prior: float = 0.0
+    """Weight of staying at the start, relative to the observation."""
+
+
+@dataclass(frozen=True)
+class CostScales:
+    """Scales of the residuals that do not change in the course of a refinement."""
+
+    truncation: float = 0.01
+    """Distance at which costs are truncated [m]."""
+    margin: float = 0.006
+    """Depth by which a model sample may lie in front of another surface without protruding [m]; more than the depth's noise."""
+    silhouette: float = 0.5
+    color_cutoff: float = 0.5
+    """Colour residual that counts as an outlier, relative to the mean intensity."""
+    color_cost: float = 0.3
+    damping: float = 1e-4
+    max_distance: float = 0.02
+    """Of a step [m]."""
+    max_angle: float = 0.25
+    """Of a step [rad]."""
+
+
+class Refiner:
+    """Refines and scores pose hypotheses. Owns its sums; only launches kernels."""
+
+    def __init__(self, models: PoseModels, observer: Observer, hypotheses: int, scales: CostScales) -> None:
+        """
+        Args:
+            models: The object models.
+            observer: Observes the instances.
+            hypotheses: Hypotheses per instance.
+            scales: Scales of the residuals.
+        """
+        self.models, self.observer, self.hypotheses, self.scales = models, observer, hypotheses, scales
+        self.device, poses = observer.device, observer.instances * hypotheses
+        sizes = {"pose": poses, "lane": int(LANES), "channel": int(CHANNELS)}
+        self.sums = allocate_struct(SUMS, sizes, self.device)
+        self.lighting = allocate_struct(LIGHTING, sizes, self.device)
+        self.prior = wp.zeros(poses, dtype=wp.transform, device=self.device)
+        self.cost = wp.zeros(poses, dtype=float, device=self.device)
+
+    def refine(self, pose: wp.array, schedule: Schedule) -> None:
+        """Refine poses (pose) in place."""
+        wp.copy(self.prior, pose)
+        limits = StepLimits()
+        limits.prior, limits.damping = schedule.prior, self.scales.damping
+        limits.distance, limits.angle = self.scales.max_distance, self.scales.max_angle
+        first, last = schedule.cutoffs
+        observer = self.observer
+        for iteration in range(schedule.iterations):
+            cutoff = first * (last / first) ** (iteration / max(schedule.iterations - 1, 1))
+            # The light changes slowly: fitting it every other step is enough.
+            self._accumulate(pose, make_cost(self.scales, cutoff, schedule.step, schedule.color), fit_light=iteration % 2 == 0)
+            inputs = [self.models.models, limits, observer.targets, observer.observation, self.sums, self.prior, self.hypotheses]
+            wp.launch(step_poses_kernel, dim=len(pose), inputs=inputs, outputs=[pose], device=self.device)
+
+    def score(self, pose: wp.array, *, color: bool, step: int = 1) -> wp.array:
+        """Costs of poses (pose) float32, valid until the next call: unexplained and protruding fraction of the visible area, and colour."""
+        cost = make_cost(self.scales, self.scales.truncation, step, 1.0 if color else 0.0)
+        self._accumulate(pose, cost, fit_light=True)
+        inputs = [cost, self.observer.observation, self.sums, self.hypotheses]
+        wp.launch(score_poses_kernel, dim=len(pose), inputs=inputs, outputs=[self.cost], device=self.device)
+        return self.cost
+
+    def _accumulate(self, pose: wp.array, cost: Any, *, fit_light: bool) -> None:
+        """Normal equations and costs of all residuals."""
+        observer, models, device = self.observer, self.models.models, self.device
+        images, targets, observation = observer.images, observer.targets, observer.observation
+        dim, hypotheses = (len(pose), int(LANES)), self.hypotheses
+        inputs = [models, cost, targets, observation, pose, hypotheses]
+        wp.launch(accumulate_points_kernel, dim=dim, inputs=inputs, outputs=[self.sums], device=device)
+        if cost.color > 0.0 and fit_light:
+            inputs = [models, cost, images, targets, observation, pose, hypotheses]
+            wp.launch(accumulate_lighting_kernel, dim=dim, inputs=inputs, outputs=[self.lighting], device=device)
+            wp.launch(fit_lighting_kernel, dim=len(pose), outputs=[self.lighting], device=device)
+        inputs = [models, cost, images, targets, observation, self.lighting, pose, hypotheses]
+        wp.launch(accumulate_samples_kernel, dim=dim, inputs=inputs, outputs=[self.sums], device=device)
+
+
+def make_cost(scales: CostScales, cutoff: float, step: int, color: float) -> Any:
+    """The struct `Cost`; see `Schedule` for the parameters that change in the course of a refinement."""
+    cost = Cost()
+    cost.cutoff, cost.step, cost.color = cutoff, step, color
+    for name in ("truncation", "margin", "silhouette", "color_cutoff", "color_cost"):
+        setattr(cost, name, getattr(scales, name))
+    return cost

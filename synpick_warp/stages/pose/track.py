@@ -1,0 +1,96 @@
+"""Tracking of object poses from frame to frame: motion hypotheses, refinement, turns told apart by colour, no restart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.arrays import allocate_struct, struct_arrays
+from synpick_warp.kernels.pose.hypotheses import (
+    MOTIONS,
+    Track,
+    choose_poses_kernel,
+    propose_motions_kernel,
+    update_tracks_kernel,
+)
+from synpick_warp.stages.pose.models import PoseModels
+from synpick_warp.stages.pose.observe import Observer
+from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule
+from synpick_warp.stages.pose.turns import TurnSearch
+
+TRACK = struct_arrays(Track, "instance", units={"pose": "m", "before": "m", "centroid": "m"})
+
+COARSE = Schedule(iterations=6, cutoffs=(0.03, 0.01), step=2, color=0.0, prior=1e-3)
+"""Refinement of the motion hypotheses."""
+FINE = Schedule(iterations=8, cutoffs=(0.012, 0.005), step=1, color=0.005, prior=1e-3)
+"""Refinement of the best one and its best turn."""
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """Settings of the tracker."""
+
+    coarse: Schedule = COARSE
+    fine: Schedule = FINE
+    color: bool = True
+    """Use colour: in the fine refinement, to choose turns, and in costs."""
+    loyalty: float = 0.1
+    """Relative cost by which a motion must be better than rest."""
+    turn_gain: float = 0.15
+    """Correlation by which a turn must be better to become a hypothesis."""
+    turn_loyalty: float = 0.15
+    """Relative cost by which a turn must be better after refinement."""
+    min_points: int = 24
+    """Observed points with fewer than which an instance keeps its pose."""
+
+
+class Tracker:
+    """Tracks the instances of an observer. `start` and `track` only launch kernels."""
+
+    def __init__(self, models: PoseModels, observer: Observer, settings: TrackSettings, scales: CostScales) -> None:
+        """
+        Args:
+            models: The object models.
+            observer: Observes the instances.
+            settings: Settings of the tracker.
+            scales: Scales of the residuals.
+        """
+        self.models, self.observer, self.settings = models, observer, settings
+        self.device, n = observer.device, observer.instances
+        self.motions = Refiner(models, observer, int(MOTIONS), scales)
+        self.turns = TurnSearch(models, observer, scales)
+        self.pair = Refiner(models, observer, self.turns.hypotheses, scales)
+        self.track_state = allocate_struct(TRACK, {"instance": n}, self.device)
+        self.motion_pose = wp.zeros(n * int(MOTIONS), dtype=wp.transform, device=self.device)
+        self.pair_pose = wp.zeros(n * self.turns.hypotheses, dtype=wp.transform, device=self.device)
+        self.best = wp.zeros(n, dtype=wp.transform, device=self.device)
+        self.cost = wp.zeros(n, dtype=float, device=self.device)
+        self.start_pose = wp.zeros(n, dtype=wp.transform, device=self.device)
+        self.starting = wp.zeros(n, dtype=int, device=self.device)
+
+    def start(self, pose: np.ndarray, rows: np.ndarray) -> None:
+        """Set the poses (N, 7) of the rows (N,) bool in the frame that is tracked next; the other tracks go on."""
+        self.start_pose.assign(pose.astype(np.float32))
+        self.starting.assign(rows.astype(np.int32))
+
+    def track(self) -> None:
+        """Estimate the poses of the observed frame: the state of the tracks, and `cost` of each instance."""
+        settings, observer, device, n = self.settings, self.observer, self.device, self.observer.instances
+        state, observation = self.track_state, observer.observation
+        wp.launch(propose_motions_kernel, dim=n, inputs=[state, observation], outputs=[self.motion_pose], device=device)
+        self.motions.refine(self.motion_pose, settings.coarse)
+        cost = self.motions.score(self.motion_pose, color=settings.color)
+        self._choose(self.motion_pose, cost, int(MOTIONS), settings.loyalty)
+        self.turns.propose(self.best, state.correlation, settings.turn_gain, self.pair_pose, color=settings.color)
+        self.pair.refine(self.pair_pose, settings.fine)
+        cost = self.pair.score(self.pair_pose, color=settings.color)
+        self._choose(self.pair_pose, cost, self.turns.hypotheses, settings.turn_loyalty)
+        inputs = [observation, self.best, self.start_pose, self.starting, settings.min_points]
+        wp.launch(update_tracks_kernel, dim=n, inputs=inputs, outputs=[state], device=device)
+        self.starting.zero_()
+
+    def _choose(self, pose: wp.array, cost: wp.array, hypotheses: int, loyalty: float) -> None:
+        inputs, outputs = [pose, cost, hypotheses, loyalty], [self.best, self.cost]
+        wp.launch(choose_poses_kernel, dim=self.observer.instances, inputs=inputs, outputs=outputs, device=self.device)
