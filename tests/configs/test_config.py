@@ -149,7 +149,7 @@ def test_whole_numbers_are_allowed_for_floats():
         ("physics.gravity", float("inf"), "physics.gravity is Infinity on the command line; allowed: a finite number [m/s²]"),
         ("render.table", 1, "render.table is 1 on the command line; allowed: true or false"),
         ("bake.models", 3, "bake.models is 3 on the command line; allowed: a string"),
-        ("bake.mode", "mvoe", 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed; did you mean move?'),
+        ("bake.mode", "mvoe", 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed, cycle; did you mean move?'),
         ("bake.mix", [1, -1, 1], "bake.mix is [1, -1, 1] on the command line; allowed: each at least 0, at most 1000"),
         ("bake.mix", [1, 1], "bake.mix is [1, 1] on the command line; allowed: 3 numbers in a list"),
         ("perception.exact_cycle", 13, "perception.exact_cycle is 13 on the command line; allowed: at least 2, at most 12"),
