@@ -102,8 +102,11 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
         (["--device", "tpu"], 'bake.device is "tpu"; allowed: cpu, cuda:N such as cuda:0, or auto'),
         (["--models", "no-such"], "there is no models folder no-such; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes"),
         (["--lights", "no-such"], "there is no lights folder no-such; --lights takes a folder of .hdr maps and sIBL sets"),
-        (["--config", "no-such.toml"], "there is no file no-such.toml; give a .toml file or a preset: smoke, synpick, synpick-released"),
-        (["--config", "smook"], 'there is no preset "smook"; presets: smoke, synpick, synpick-released; '),
+        (
+            ["--config", "no-such.toml"],
+            "there is no file no-such.toml; give a .toml file or a preset: smoke, synpick, synpick-hard, synpick-released, synpick-test",
+        ),
+        (["--config", "smook"], 'there is no preset "smook"; presets: smoke, synpick, synpick-hard, synpick-released, '),
         (["--set", "physics.stepp=1"], "there is no key physics.stepp, set on the command line; keys of physics: step, "),
         (["--set", "physics.step"], "--set physics.step has no value; "),
         (["--wrlds", "3"], "Unknown option: --wrlds. Did you mean --worlds?"),
