@@ -22,6 +22,8 @@ COMMAND_LINE = "on the command line"
 ROWS = "object_rows"
 _BASE = "preset"
 _ROW_NEEDS = ("id", "diameter")
+_ROW_IDENTITY = ("id", "name", "diameter")
+"""Keys by which a row finds its model."""
 
 Values = dict[str, tuple[Any, str]]
 """Full key -> (checked value, its source for error messages)."""
@@ -116,7 +118,7 @@ def _read(preset_or_file: str) -> Values:
         base = document.pop(_BASE, DEFAULT_PRESET)
         if not isinstance(base, str):
             raise ConfigError(f"{_BASE} is {format_value(base)} in {preset_or_file}; allowed: {', '.join(preset_names())}")
-        return _read_preset(base, f" in {preset_or_file}") | _document_values(document, f"in {preset_or_file}")
+        return _override(_read_preset(base, f" in {preset_or_file}"), document, f"in {preset_or_file}")
     return _read_preset(preset_or_file, "")
 
 
@@ -127,7 +129,7 @@ def _read_preset(name: str, source: str) -> Values:
         raise ConfigError(f"there is no preset {format_value(name)}{source}; {known}{suggest(name, names)}")
     document = _parse(_folder() / f"{name}.toml")
     base = document.pop(_BASE, None)
-    return (_read_preset(base, "") if base else {}) | _document_values(document, f"in the preset {name}")
+    return _override(_read_preset(base, "") if base else {}, document, f"in the preset {name}")
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -136,10 +138,13 @@ def _parse(path: Path) -> dict[str, Any]:
     return read_toml(path, ConfigError)
 
 
-def _document_values(document: Mapping[str, Any], source: str) -> Values:
-    values: Values = {}
+def _override(base: Values, document: Mapping[str, Any], source: str) -> Values:
+    """Override the values of a preset by those of a document that builds on it."""
+    values = dict(base)
     for name, content in document.items():
-        if name == ROWS:
+        if name == ROWS and isinstance(content, dict):
+            values[ROWS] = (_changed_rows(base[ROWS][0] if ROWS in base else (), content, source), source)
+        elif name == ROWS:
             values[ROWS] = (_rows(content, source), source)
         elif name in sections() and not isinstance(content, dict):
             raise ConfigError(f"{name} is {format_value(content)} {source}; allowed: a section, [{name}]")
@@ -185,6 +190,17 @@ def _rows(content: Any, source: str) -> tuple[ObjectRow, ...]:
     if not isinstance(content, list) or not all(isinstance(row, dict) for row in content):
         raise ConfigError(f"{ROWS} is {format_value(content)} {source}; allowed: [[{ROWS}]] tables")
     return tuple(_row(f"{ROWS}[{index}]", row, source) for index, row in enumerate(content))
+
+
+def _changed_rows(rows: tuple[ObjectRow, ...], changes: Mapping[str, Any], source: str) -> tuple[ObjectRow, ...]:
+    """Rows of a preset with the values of an [object_rows] table, which holds for all of them."""
+    known = {name: pair for name, pair in settings_of(ObjectRow).items() if name not in _ROW_IDENTITY}
+    for name in changes:
+        if name not in known:
+            rule = f"keys that may hold for every row: {', '.join(known)}; [[{ROWS}]] tables have all"
+            raise ConfigError(f"[{ROWS}] has the key {shorten(name)} {source}; {rule}{suggest(name, list(known))}")
+    values = {name: check_value(f"{ROWS}.{name}", value, *known[name], source) for name, value in changes.items()}
+    return tuple(dataclasses.replace(row, **values) for row in rows)
 
 
 def _row(key: str, content: Mapping[str, Any], source: str) -> ObjectRow:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from synpick_warp.configs.schema import MIXED, MODES, Config
+from synpick_warp.configs.schema import CYCLE, MIXED, MODES, Config
 
 
 def mode_weights(config: Config) -> dict[str, float]:
     """Unnormalized probability of each of MODES; 0: never."""
     if config.bake.mode == MIXED:
         return dict(zip(MODES, config.bake.mix, strict=True))
-    return {mode: float(mode == config.bake.mode) for mode in MODES}
+    return {mode: float(config.bake.mode in (mode, CYCLE)) for mode in MODES}
 
 
 def may_pick(config: Config) -> bool:

@@ -18,6 +18,8 @@ MODES = ("pick", "target", "move")
 """Tasks of the gripper in an episode."""
 MIXED = "mixed"
 """Each episode draws its mode."""
+CYCLE = "cycle"
+"""Round robin: episode i has the mode MODES[i % 3], so every three episodes in a row have one of each."""
 FAST = "fast"
 REFERENCE = "reference"
 RENDER_MODES = (FAST, REFERENCE)
@@ -35,8 +37,9 @@ class Bake:
     mode: str = setting(
         "pick",
         "",
-        "Task of the gripper: pick (empty the tote), target (dig for the most occluded object), move (stir), mixed (drawn per episode).",
-        choices=(*MODES, MIXED),
+        "Task of the gripper: pick (empty the tote), target (dig for the most occluded object), move (stir), mixed (drawn per episode), "
+        "cycle (pick, target, move in turn: equal numbers).",
+        choices=(*MODES, MIXED, CYCLE),
     )
     mix: tuple[float, float, float] = setting(
         (1.0, 1.0, 1.0), "", "Weights with which mode mixed draws pick, target and move for an episode.", low=0.0, high=1000

@@ -129,6 +129,8 @@ class ModeData:
     """Probability of PICK."""
     pick_or_target_share: float
     """Probability of PICK or TARGET."""
+    cycle: int
+    """Period of a round robin [episodes], whose episodes have evenly spaced samples instead of random ones; 0: random."""
 
 
 @wp.struct

@@ -253,6 +253,7 @@ def test_worlds_do_not_disturb_each_other(device, plans):
         ("move", [1, 1, 1], False),
         ("mixed", [0, 0, 1], False),
         ("mixed", [0, 2, 1], True),
+        ("cycle", [0, 0, 1], True),
     ],
 )
 def test_which_bakes_may_pick(mode, mix, expected):

@@ -67,6 +67,8 @@ resolved configuration is stored in each data set as `config.toml`.
 | `synpick` | default: the values of the paper, and the object table of the 21 YCB-Video objects |
 | `synpick-released` | the released generator, where it differs from the paper |
 | `smoke` | small and fast: two sequences of stirring in small images, in a minute or two on two CPU cores; not for training |
+| `synpick-test` | data set to evaluate on, of the shape of the paper's test sets |
+| `synpick-hard` | hard cases to evaluate on: more occluded, faster, shinier |
 
 `synpick-released` differs from `synpick` in five settings:
 
@@ -81,11 +83,54 @@ resolved configuration is stored in each data set as `config.toml`.
 `smoke` sets `bake.mode` to move with 2 worlds and 2 episodes, 320x180 images (perception: 640x360, its settings scaled along), a volume
 budget of 3 l, one round of stirring at 0.4 m/s, and PNG images in a split named `train`.
 
+### Data sets to evaluate on
+
+```bash
+synpick-warp bake --config synpick-test --models MODELS --lights LIGHTS --out TEST
+synpick-warp bake --config synpick-hard --models MODELS --lights LIGHTS --out HARD
+```
+
+`synpick-test` has the paper's number of test sequences: 20 of each mode (`bake.mode` cycle, 60 episodes, three cameras: 180 scenes). They
+are in the split `test_pbr`, in JPEG like the training images, which BOP's toolkit reads from such splits only. Its seed shares no random
+numbers with the default seed of `synpick`. Images have 960x540 pixels, a quarter of the paper's: the paper's test sets are 100,911 views,
+90 GB at the 0.9 MB of a full-HD view. Since `perception.resolution` stays, the episodes are those of full HD.
+
+`synpick-hard` builds on `synpick-test`, with a seed of its own:
+
+| setting | `synpick-test` | `synpick-hard` |
+|---|---|---|
+| `arrangement.volume`, `arrangement.max_objects` | 7 l, 24 | 14 l, 32; solver capacities for them |
+| `pick.repeats` | false | true, so that folders of few or small objects fill the tote, too |
+| `pick.lift_speed` | 0.5 m/s | 1 m/s |
+| `move.speed`, `move.force`, `move.rounds` | 0.1 m/s, 30 N, 2 | 0.4 m/s, 60 N, 8: as many frames |
+| metallic and roughness, in all rows and `[objects]` | 0.25 and 0.45 on average | 0.9 and 0.15 |
+
+Shortened bakes (2026-11-22, CPU, YCB-Video models, real lights). Both were stopped at five of six episodes, one pick, two target and two
+move, so the figures show the direction, not the third digit:
+
+| what | `synpick-test`: pick / target / move | `synpick-hard`: pick / target / move |
+|---|---|---|
+| mean visibility | 0.81 / 0.64 / 0.78 | 0.61 / 0.49 / 0.51 |
+| instances of which less than half is visible | 3 / 36 / 17 % | 29 / 52 / 48 % |
+| instances a view | 10 / 11 / 9 | 18 / 20 / 26 |
+| median speed of objects above 0.05 m/s | 0.50 / 0.06 / 0.08 m/s | 0.99 / 0.11 / 0.10 m/s |
+| 95th percentile of speed, objects at rest included | 0.00 / 0.01 / 0.05 m/s | 0.00 / 0.03 / 0.11 m/s |
+
+The median of all objects is below 2 mm/s in every cell: most are at rest in any frame. The command for each preset, and the report:
+
+```bash
+synpick-warp bake --config PRESET --models MODELS --lights LIGHTS --out DIR --device cpu --resolution 160x90 --episodes 6 --worlds 6 \\
+    --set cameras.positions=[[0,0,2]] --set cameras.ups=[[0,1,0]] --set bop.masks=false --set bop.coco=false \\
+    --set move.rounds=1 --set pick.failures=1 --set target.forgive=false
+python -m tools.reports.difficulty TEST HARD
+```
+
 ## Object table
 
 Model files do not contain mass, concavity or material. `[[object_rows]]` tables in a file add them, and replace those of the preset. A
 row applies to the BOP model with its `id`, or to another mesh whose file name is its `name`, if the diameter agrees within
-`objects.diameter_tolerance`. What a mesh file says of its material has priority over the row, the row over `[objects]`.
+`objects.diameter_tolerance`. What a mesh file says of its material has priority over the row, the row over `[objects]`. The embedded
+objects have masses and materials of their own.
 
 ```toml
 [[object_rows]]
@@ -96,6 +141,13 @@ mass = 0.147
 concave = true
 metallic = 0.6
 roughness = 0.3
+```
+
+A single table `[object_rows]` keeps the rows of the preset, and sets mass, concave, metallic or roughness in all of them:
+
+```toml
+[object_rows]
+roughness = 0.2
 ```
 
 ## Sections

@@ -71,12 +71,16 @@ def sample_modes_kernel(
 ):
     """Sample the mode of starting episodes: PICK if u < p, else TARGET if u < p + t, else MOVE, with fractions p and t of the modes.
 
-    u is the first sample of the stream (seed, episode, 0, Stream.MODE): a resampled arrangement of the episode has the same mode.
+    u is the first sample of the stream (seed, episode, 0, Stream.MODE): a resampled arrangement of the episode has the same mode. In a
+    round robin of n episodes, episode i has the midpoint of stratum i mod n instead: u = (i mod n + 1/2) / n.
     """
     world = wp.tid()
     if phase[world] != Phase.START:
         return
-    u = uniform(stream_key(seed, arrangement_id[world][0], 0, Stream.MODE), 0)
+    episode = arrangement_id[world][0]
+    u = uniform(stream_key(seed, episode, 0, Stream.MODE), 0)
+    if mode.cycle > 0:
+        u = (float(episode % mode.cycle) + 0.5) / float(mode.cycle)
     if u < mode.pick_share:
         mode_out[world] = Mode.PICK
     elif u < mode.pick_or_target_share:

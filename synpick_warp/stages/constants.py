@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.modes import mode_weights
-from synpick_warp.configs.schema import Config, Gripper, Move, Physics, Settle, Suction, Tote
+from synpick_warp.configs.schema import CYCLE, MODES, Config, Gripper, Move, Physics, Settle, Suction, Tote
 from synpick_warp.kernels import structs
 from synpick_warp.scenes import build
 from synpick_warp.scenes.types import Catalog, CatalogEntry
@@ -131,7 +131,8 @@ def _mode_data(config: Config) -> structs.ModeData:
     weights = mode_weights(config)
     pick, target, move = weights["pick"], weights["target"], weights["move"]
     total = pick + target + move
-    return fill(structs.ModeData, pick_share=pick / total, pick_or_target_share=(pick + target) / total)
+    cycle = len(MODES) if config.bake.mode == CYCLE else 0
+    return fill(structs.ModeData, pick_share=pick / total, pick_or_target_share=(pick + target) / total, cycle=cycle)
 
 
 def _drop_data(config: Config, lights: int) -> structs.DropData:

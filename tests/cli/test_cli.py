@@ -94,7 +94,7 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
         (["--resolution", "640"], '--resolution is "640"; allowed: WIDTHxHEIGHT in pixels, such as 640x360'),
         (["--resolution", "640x-1"], '--resolution is "640x-1"; allowed: WIDTHxHEIGHT in pixels, such as 640x360'),
         (["--mode", "juggle"], 'bake.mode is "juggle" on the command line; allowed: pick, target, move, mixed'),
-        (["--mode", "mvoe"], 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed; did you mean move?'),
+        (["--mode", "mvoe"], 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed, cycle; did you mean move?'),
         (["--mode", ""], 'bake.mode is "" on the command line; allowed: pick, target, move, mixed'),
         (["--mode", "mixed", "--set", "bake.mix=[0, 0, 0]"], "bake.mix is [0.0, 0.0, 0.0] on the command line; allowed: at least one "),
         (["--mode", "mixed", "--set", "bake.mix=pick"], 'bake.mix is "pick" on the command line; allowed: 3 numbers in a list'),
@@ -102,8 +102,11 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
         (["--device", "tpu"], 'bake.device is "tpu"; allowed: cpu, cuda:N such as cuda:0, or auto'),
         (["--models", "no-such"], "there is no models folder no-such; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes"),
         (["--lights", "no-such"], "there is no lights folder no-such; --lights takes a folder of .hdr maps and sIBL sets"),
-        (["--config", "no-such.toml"], "there is no file no-such.toml; give a .toml file or a preset: smoke, synpick, synpick-released"),
-        (["--config", "smook"], 'there is no preset "smook"; presets: smoke, synpick, synpick-released; '),
+        (
+            ["--config", "no-such.toml"],
+            "there is no file no-such.toml; give a .toml file or a preset: smoke, synpick, synpick-hard, synpick-released, synpick-test",
+        ),
+        (["--config", "smook"], 'there is no preset "smook"; presets: smoke, synpick, synpick-hard, synpick-released, '),
         (["--set", "physics.stepp=1"], "there is no key physics.stepp, set on the command line; keys of physics: step, "),
         (["--set", "physics.step"], "--set physics.step has no value; "),
         (["--wrlds", "3"], "Unknown option: --wrlds. Did you mean --worlds?"),
@@ -254,10 +257,10 @@ def test_help_says_how_modes_are_mixed(capsys):
     assert main(["bake", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "Weights of mixed: --set bake.mix=[pick, target, move]" in text
-    assert "(pick, target, move, mixed; default pick; bake.mode)" in text
+    assert "(pick, target, move, mixed, cycle; default pick; bake.mode)" in text
 
 
-@pytest.mark.parametrize("mode", ["pick", "target", "move", "mixed"])
+@pytest.mark.parametrize("mode", ["pick", "target", "move", "mixed", "cycle"])
 def test_every_mode_is_passed_on(tmp_path, bakes, mode):
     assert main(["bake", "--out", str(tmp_path), "--device", "cpu", "--mode", mode, "--set", "bake.mix=[1, 2, 0]"]) == 0
     [(config, *_)] = bakes.calls

@@ -71,7 +71,7 @@ def test_object_rows_have_the_diameters_of_the_real_models(real_models):
 
 
 def test_other_presets_build_on_the_default_preset():
-    assert preset_names() == ["smoke", "synpick", "synpick-released"]
+    assert preset_names() == ["smoke", "synpick", "synpick-hard", "synpick-released", "synpick-test"]
     released = load_config("synpick-released", {})
     assert released.move.damping == 1.0
     assert released.object_rows == load_config(None, {}).object_rows
@@ -149,7 +149,7 @@ def test_whole_numbers_are_allowed_for_floats():
         ("physics.gravity", float("inf"), "physics.gravity is Infinity on the command line; allowed: a finite number [m/s²]"),
         ("render.table", 1, "render.table is 1 on the command line; allowed: true or false"),
         ("bake.models", 3, "bake.models is 3 on the command line; allowed: a string"),
-        ("bake.mode", "mvoe", 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed; did you mean move?'),
+        ("bake.mode", "mvoe", 'bake.mode is "mvoe" on the command line; allowed: pick, target, move, mixed, cycle; did you mean move?'),
         ("bake.mix", [1, -1, 1], "bake.mix is [1, -1, 1] on the command line; allowed: each at least 0, at most 1000"),
         ("bake.mix", [1, 1], "bake.mix is [1, 1] on the command line; allowed: 3 numbers in a list"),
         ("perception.exact_cycle", 13, "perception.exact_cycle is 13 on the command line; allowed: at least 2, at most 12"),
@@ -197,8 +197,8 @@ def test_an_unknown_key_is_reported_with_a_suggestion(key, hint):
         ("[fysics]\nstep = 1\n", "there is no section fysics, set in {path}; sections: bake, objects, "),
         ("physics = 3\n", "physics is 3 in {path}; allowed: a section, [physics]"),
         ("worlds = 3\n", "there is no section worlds, set in {path}; "),
-        ('preset = "synpik"\n', 'there is no preset "synpik" in {path}; presets: smoke, synpick, synpick-released; '),
-        ("preset = 3\n", "preset is 3 in {path}; allowed: smoke, synpick, synpick-released"),
+        ('preset = "synpik"\n', 'there is no preset "synpik" in {path}; presets: smoke, synpick, synpick-hard, synpick-released, '),
+        ("preset = 3\n", "preset is 3 in {path}; allowed: smoke, synpick, synpick-hard, synpick-released, synpick-test"),
         ("object_rows = 3\n", "object_rows is 3 in {path}; allowed: [[object_rows]] tables"),
         ("[[object_rows]]\nid = 1\n", "object_rows[0] has no diameter in {path}; a row needs id and diameter"),
         ("[[object_rows]]\nid = 1\nweight = 2\n", "there is no key object_rows[0].weight, set in {path}; keys: id, "),
@@ -310,7 +310,7 @@ def test_invalid_assignments(text):
         parse_assignment(text)
 
 
-@pytest.mark.parametrize("name", ["smoke", "synpick", "synpick-released"])
+@pytest.mark.parametrize("name", preset_names())
 @pytest.mark.parametrize("comments", [False, True])
 def test_presets_survive_writing_and_reading(tmp_path, name, comments):
     config = load_config(name, {})

@@ -263,6 +263,7 @@ def test_the_first_object_is_redrawn_until_it_fits_and_the_next_that_does_not_fi
         ("mixed", (0, 0, 1), (False, True), {True}),
         ("mixed", (0, 1, 1), (True, True), {True}),
         ("mixed", (0, 1, 1), (True, False), {False, True}),
+        ("cycle", (0, 0, 1), (False, True), {False, True}),
     ],
 )
 def test_repeat_rules_of_the_possible_modes(mode, mix, rules, expected):

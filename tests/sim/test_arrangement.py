@@ -130,6 +130,14 @@ def test_shares_of_modes_are_the_weights(built, device, mix):
         assert (found == code).mean() == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / episodes))
 
 
+@given(mix=st.tuples(*[st.integers(0, 5)] * 3), first=st.integers(0, 2**31 - WORLDS))
+def test_a_cycle_has_each_mode_once_in_three_episodes(mix, first, built, device):
+    """Of any three episodes in a row, whatever the weights of mode mixed."""
+    episodes = first + np.arange(WORLDS)
+    found = modes(built, device, "cycle", mix, episodes)
+    np.testing.assert_array_equal(found, np.array((Mode.PICK, Mode.TARGET, Mode.MOVE))[episodes % 3])
+
+
 def test_an_episode_keeps_its_mode_in_any_world_and_arrangement(built, device):
     """Whatever world has the episode, of however many, and however often its arrangement was expected_arrangements again."""
     mix, episodes = (1.0, 1.0, 1.0), np.arange(60)

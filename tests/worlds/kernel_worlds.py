@@ -93,7 +93,7 @@ class KernelWorlds:
             self._catalog(),
             fill(structs.DropData, **(DROP | self.drop)),
             fill(structs.SettleData, **(SETTLE | self.settle)),
-            fill(structs.ModeData, pick_share=0.0, pick_or_target_share=0.0),
+            fill(structs.ModeData, pick_share=0.0, pick_or_target_share=0.0, cycle=0),
             fill(structs.MoveData, **(MOVE | self.move)),
             filled(structs.PickData(), self.pick),
             structs.PerceptionData(),
