@@ -166,7 +166,7 @@ def place_crops_kernel(
     corner_out: wp.array[wp.vec2],  # (instance) [px]
     pitch_out: wp.array[float],  # (instance) [px]
 ):
-    """Square crop around the mask's box with a margin; a crop pixel is at least an image pixel wide."""
+    """Square crop around the mask's box with a margin; a crop pixel is at least an image pixel wide, and then coincides with one."""
     instance = wp.tid()
     width = float(box[instance, 2] - box[instance, 0] + 1)
     height = float(box[instance, 3] - box[instance, 1] + 1)
@@ -174,7 +174,10 @@ def place_crops_kernel(
     pitch = wp.max(extent / float(CROP), 1.0)
     half = 0.5 * pitch * float(CROP)
     center = wp.vec2(float(box[instance, 0]) + 0.5 * width, float(box[instance, 1]) + 0.5 * height)
-    corner_out[instance] = center - wp.vec2(half, half)
+    corner = center - wp.vec2(half, half)
+    if pitch == 1.0:
+        corner = wp.vec2(wp.floor(corner[0]), wp.floor(corner[1]))
+    corner_out[instance] = corner
     pitch_out[instance] = pitch
 
 
