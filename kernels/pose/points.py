@@ -13,7 +13,7 @@ MIN_NEIGHBOURS = wp.constant(6.0)
 MIN_SPREAD = wp.constant(1.0e-3)
 """Smallest determinant of the points' covariance relative to that of uncorrelated axes; below, they lie on a line."""
 MAX_SLOPE = wp.constant(6.0)
-"""Largest change of depth per lateral distance across which two pixels count as one surface: 80° of tilt."""
+"""Largest change of distance along the ray per distance across it with which two pixels count as one surface: 80° of tilt."""
 
 
 @wp.func
@@ -38,8 +38,10 @@ def crop_point(observation: Observation, images: Images, instance: int, view: in
 
 @wp.func
 def on_surface(a: wp.vec3, b: wp.vec3) -> bool:
-    """True if two neighbouring points are so close in depth that they may lie on one smooth surface."""
-    return wp.abs(a[2] - b[2]) <= MAX_SLOPE * wp.length(wp.vec2(a[0] - b[0], a[1] - b[1]))
+    """True if two neighbouring points are so close along the ray through `a` that they may lie on one smooth surface."""
+    ray = wp.normalize(a)
+    along = wp.dot(b - a, ray)
+    return wp.abs(along) <= MAX_SLOPE * wp.length(b - a - along * ray)
 
 
 @wp.func
