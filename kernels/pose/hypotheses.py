@@ -64,28 +64,37 @@ class Correlation:
 @wp.kernel
 def propose_motions_kernel(
     # State:
-    track: Track,
+    track_inout: Track,
     # In:
     observation: Observation,
+    start: wp.array[wp.transform],  # (instance) [m]
+    starting: wp.array[int],  # (instance)
     # Out:
     pose_out: wp.array[wp.transform],  # (pose) [m]
 ):
-    """Motion hypotheses: at rest; constant velocity; displaced as the centroid of the observed points."""
+    """Motion hypotheses: at rest; constant velocity; displaced as the centroid of the observed points.
+
+    A track that starts begins anew at its start pose, so that its cost is that of this pose and nothing is left of another track.
+    """
     instance = wp.tid()
-    pose = track.pose[instance]
+    if starting[instance] != 0:
+        track_inout.pose[instance] = start[instance]
+        track_inout.correlation[instance] = NO_CORRELATION
+        track_inout.frames[instance] = 0
+    pose = track_inout.pose[instance]
     rotation = wp.transform_get_rotation(pose)
     position = wp.transform_get_translation(pose)
     first = instance * MOTIONS
     pose_out[first] = pose
     pose_out[first + 1] = pose
     pose_out[first + 2] = pose
-    if track.frames[instance] > 1:
-        before = track.before[instance]
+    if track_inout.frames[instance] > 1:
+        before = track_inout.before[instance]
         turn = rotation * wp.quat_inverse(wp.transform_get_rotation(before))
         shift = position - wp.transform_get_translation(before)
         pose_out[first + 1] = wp.transform(position + shift, wp.normalize(turn * rotation))
-    if track.frames[instance] > 0 and observation.points[instance] > 0:
-        shift = observation.centroid[instance] - track.centroid[instance]
+    if track_inout.frames[instance] > 0 and observation.points[instance] > 0:
+        shift = observation.centroid[instance] - track_inout.centroid[instance]
         pose_out[first + 2] = wp.transform(position + shift, rotation)
 
 

@@ -63,6 +63,7 @@ class Tracker:
         self.turns = TurnSearch(models, observer, scales)
         self.pair = Refiner(models, observer, self.turns.hypotheses, scales)
         self.track_state = allocate_struct(TRACK, {"instance": n}, self.device)
+        self.track_state.pose.fill_(wp.transform_identity())
         self.motion_pose = wp.zeros(n * int(MOTIONS), dtype=wp.transform, device=self.device)
         self.pair_pose = wp.zeros(n * self.turns.hypotheses, dtype=wp.transform, device=self.device)
         self.best = wp.zeros(n, dtype=wp.transform, device=self.device)
@@ -79,7 +80,8 @@ class Tracker:
         """Estimate the poses of the observed frame: the state of the tracks, and `cost` of each instance."""
         settings, observer, device, n = self.settings, self.observer, self.device, self.observer.instances
         state, observation = self.track_state, observer.observation
-        wp.launch(propose_motions_kernel, dim=n, inputs=[state, observation], outputs=[self.motion_pose], device=device)
+        inputs = [state, observation, self.start_pose, self.starting]
+        wp.launch(propose_motions_kernel, dim=n, inputs=inputs, outputs=[self.motion_pose], device=device)
         self.motions.refine(self.motion_pose, settings.coarse)
         cost = self.motions.score(self.motion_pose, color=settings.color)
         self._choose(self.motion_pose, cost, int(MOTIONS), settings.loyalty)
