@@ -39,6 +39,9 @@ def evaluate(
         WholeNumber, Parameter(help="Estimates that count per image and object, by score; -1: as many as instances to be found; 0: all.")
     ] = -1,
     vertices: Annotated[WholeNumber, Parameter(help="Vertices of a model that errors are averaged over, evenly chosen; 0: all.")] = 0,
+    targets: Annotated[
+        Path | None, Parameter(help="Score only images and objects of this list, such as estimate writes or BOP's test_targets_bop19.json.")
+    ] = None,
     filter_: Annotated[
         str | None,
         Parameter(name="--filter", help="ema: score each method a second time, through the tracking filter of the SynPick paper."),
@@ -54,7 +57,9 @@ def evaluate(
     from synpick_warp.dataset.reading import open_data_set
 
     data_set = open_data_set(data)
-    table = make_table(data_set, results, format_, visib_min=visib_min, convention=convention, top=top, vertices=vertices, alpha=weight)
+    table = make_table(
+        data_set, results, format_, visib_min=visib_min, convention=convention, top=top, vertices=vertices, alpha=weight, targets=targets
+    )
     command = toolkit_command(data_set, results)
     if out is None:
         print(table, end="")
@@ -75,6 +80,7 @@ def make_table(
     top: int,
     vertices: int,
     alpha: float | None = None,
+    targets: Path | None = None,
 ) -> str:
     """Score result files and write the table.
 
@@ -87,11 +93,13 @@ def make_table(
         top: Maximum number of estimates per image and object.
         vertices: Number of vertices of a model; 0: all.
         alpha: Weight of the new estimate in the tracking filter, with which each method is scored once more; None: no filter.
+        targets: Target list; None: all images.
     """
     from synpick_warp.evaluation.models import read_models
     from synpick_warp.evaluation.results import check_results, read_results
     from synpick_warp.evaluation.scoring import score
     from synpick_warp.evaluation.tables import render, summarize
+    from synpick_warp.evaluation.targets import read_targets, select_targets
     from synpick_warp.evaluation.tracking.filtering import filter_poses
     from synpick_warp.evaluation.truth import read_truth
 
@@ -102,6 +110,8 @@ def make_table(
     known = set(data_set.models_info) | set(models)
     for file in files:
         check_results(file, truth, known)
+    if targets is not None:
+        truth = select_targets(truth, read_targets(targets))
     if not (truth.visibility >= visib_min).any():
         raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
     labels = method_names(results)
