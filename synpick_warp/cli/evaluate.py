@@ -18,9 +18,14 @@ from synpick_warp.errors import ConfigError, OutputError
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
     from synpick_warp.evaluation.charts import Image
+    from synpick_warp.evaluation.figures import Method
+    from synpick_warp.evaluation.scoring import Scores
+    from synpick_warp.evaluation.truth import Truth
 
 FILTER = "ema"
 """Exponential moving average: the only filter."""
+MAX_FAILURES = 12
+"""Objects on a sheet of failures."""
 _MAX_VERTICES = 10**7
 _TRACK = re.compile(r"([0-9]{1,9}):([0-9]{1,9})")
 
@@ -43,6 +48,9 @@ def evaluate(
         WholeNumber,
         Parameter(help="Vertices of a model that errors are averaged over; 0: all. 1000 is faster, ADD-S a point lower."),
     ] = 0,
+    targets: Annotated[
+        Path | None, Parameter(help="Score only images and objects of this list, such as estimate writes or BOP's test_targets_bop19.json.")
+    ] = None,
     filter_: Annotated[
         str | None,
         Parameter(name="--filter", help="ema: score each method a second time, through the tracking filter of the SynPick paper."),
@@ -50,7 +58,9 @@ def evaluate(
     alpha: Annotated[float | None, Parameter(help="Weight of the new estimate in --filter ema, above 0, at most 1 (default 0.05).")] = None,
     plots: Annotated[
         Path | None,
-        Parameter(help="New or empty folder for pictures: recall, error by visibility and speed, trajectory, sweep of alpha."),
+        Parameter(
+            help="New or empty folder for pictures: recall, error by visibility and speed, trajectory, sweep of alpha, worst estimates."
+        ),
     ] = None,
     track: Annotated[
         str | None, Parameter(help="SCENE:INSTANCE of the trajectory in --plots (default: the one that moves farthest).")
@@ -66,7 +76,7 @@ def evaluate(
     from synpick_warp.dataset.reading import open_data_set
 
     data_set = open_data_set(data)
-    given = {"visib_min": visib_min, "convention": convention, "top": top, "vertices": vertices, "alpha": weight}
+    given = {"visib_min": visib_min, "convention": convention, "top": top, "vertices": vertices, "alpha": weight, "targets": targets}
     table, pictures = make_table(data_set, results, format_, **given, plots=plots, track=chosen)
     if out is not None:
         write_table(out, table)
@@ -97,6 +107,7 @@ def make_table(
     top: int,
     vertices: int,
     alpha: float | None = None,
+    targets: Path | None = None,
     plots: Path | None = None,
     track: tuple[int, int] | None = None,
 ) -> tuple[str, dict[str, Image]]:
@@ -111,6 +122,7 @@ def make_table(
         top: Maximum number of estimates per image and object.
         vertices: Number of vertices of a model; 0: all.
         alpha: Weight of the new estimate in the tracking filter, with which each method is scored once more; None: no filter.
+        targets: Target list; None: all images.
         plots: Folder of the pictures; None: none are drawn.
         track: Scene and instance of the trajectory; None: the one that moves farthest.
 
@@ -122,6 +134,7 @@ def make_table(
     from synpick_warp.evaluation.results import check_results, read_results
     from synpick_warp.evaluation.scoring import score
     from synpick_warp.evaluation.tables import render, summarize
+    from synpick_warp.evaluation.targets import read_targets, select_targets
     from synpick_warp.evaluation.tracking.filtering import filter_poses
     from synpick_warp.evaluation.truth import read_truth
 
@@ -132,6 +145,8 @@ def make_table(
     known = set(data_set.models_info) | set(models)
     for file in files:
         check_results(file, truth, known)
+    if targets is not None:
+        truth = select_targets(truth, read_targets(targets))
     if not (truth.visibility >= visib_min).any():
         raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
     methods, scores = [], []
@@ -144,7 +159,24 @@ def make_table(
     if plots is None:
         return table, {}
     frames = attempt_frames(data_set)
-    return table, draw_figures(truth, methods, scores, Settings(models, visib_min, top), track, frames)
+    pictures = draw_figures(truth, methods, scores, Settings(models, visib_min, top), track, frames)
+    return table, pictures | draw_failure_sheets(data_set, truth, methods, scores)
+
+
+def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, Image]:
+    """Sheets of the worst estimate of each object, one for each method; file name -> picture."""
+    from synpick_warp.estimation.failures import draw_failures, find_failures
+    from synpick_warp.estimation.models import read_object_models
+    from synpick_warp.evaluation.figures import file_names
+    from synpick_warp.system.device import pick_device
+
+    by_name = {each.name: each for each in scores}
+    pictures, objects = {}, object_names(data_set)
+    for method, name in zip(methods, file_names([method.name for method in methods]), strict=True):
+        failures = find_failures(truth, by_name[method.name], method.poses, MAX_FAILURES)
+        models = read_object_models(data_set.folder, [int(truth.poses.object_id[each.truth]) for each in failures])
+        pictures[f"failures_{name}.png"] = draw_failures(data_set, truth, method.poses, failures, models, objects, pick_device("auto"))
+    return pictures
 
 
 def attempt_frames(data_set: DataSet) -> dict[int, list[int]]:

@@ -90,7 +90,7 @@ def draw_figures(
     """
     pictures = _draw_errors(truth, scores)
     chosen = _farthest_track(truth, methods, settings.min_visibility) if track is None else track
-    names = _file_names([method.name for method in methods])
+    names = file_names([method.name for method in methods])
     if chosen is not None:
         rows = _track_rows(truth, chosen)
         frames = (attempts or {}).get(int(truth.episode[rows[0]]), ())
@@ -191,7 +191,7 @@ def _part(truth: Truth, rows: np.ndarray) -> Truth:
     return replace(truth, poses=truth.poses.select(rows), **{name: getattr(truth, name)[rows] for name in names})
 
 
-def _file_names(names: Sequence[str]) -> list[str]:
+def file_names(names: Sequence[str]) -> list[str]:
     """Names of methods as parts of file names, all different."""
     plain = [re.sub("[^A-Za-z0-9.-]+", "_", name).strip("_.")[:60] or "method" for name in names]
     return plain if len({name.lower() for name in plain}) == len(plain) else [f"{number}_{name}" for number, name in enumerate(plain, 1)]
