@@ -13,12 +13,13 @@ from cyclopts import Parameter
 
 from synpick_warp.cli.options import WholeNumber
 from synpick_warp.configs.check import escape, format_value
-from synpick_warp.errors import ConfigError, OutputError
+from synpick_warp.errors import ConfigError, DatasetError, OutputError
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
     from synpick_warp.evaluation.charts import Image
     from synpick_warp.evaluation.figures import Method
+    from synpick_warp.evaluation.results import ResultFile
     from synpick_warp.evaluation.scoring import Scores
     from synpick_warp.evaluation.truth import Truth
 
@@ -129,13 +130,12 @@ def make_table(
     Returns:
         The table, and file name -> picture.
     """
-    from synpick_warp.evaluation.figures import Method, Settings, draw_figures
+    from synpick_warp.evaluation.figures import Settings, draw_figures
     from synpick_warp.evaluation.models import read_models
     from synpick_warp.evaluation.results import check_results, read_results
     from synpick_warp.evaluation.scoring import score
     from synpick_warp.evaluation.tables import render, summarize
     from synpick_warp.evaluation.targets import read_targets, select_targets
-    from synpick_warp.evaluation.tracking.filtering import filter_poses
     from synpick_warp.evaluation.truth import read_truth
 
     # Result files first: their mistakes are the likely ones, and quick to find.
@@ -149,18 +149,28 @@ def make_table(
         truth = select_targets(truth, read_targets(targets))
     if not (truth.visibility >= visib_min).any():
         raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
-    methods, scores = [], []
-    for name, file in zip(method_names(results), files, strict=True):
-        filtered = None if alpha is None else filter_poses(file.poses, alpha)
-        methods.append(Method(name, file.poses, filtered, alpha))
-        for label, poses in methods[-1].variants():
-            scores.append(score(label, truth, poses, models, visib_min, top))
+    methods = make_methods(results, files, alpha)
+    scores = [score(label, truth, poses, models, visib_min, top) for method in methods for label, poses in method.variants()]
     table = render(summarize(truth, scores, object_names(data_set)), truth, scores, style, convention)
     if plots is None:
         return table, {}
     frames = attempt_frames(data_set)
     pictures = draw_figures(truth, methods, scores, Settings(models, visib_min, top), track, frames)
-    return table, pictures | draw_failure_sheets(data_set, truth, methods, scores)
+    try:
+        return table, pictures | draw_failure_sheets(data_set, truth, methods, scores)
+    except DatasetError as error:
+        # Figures need poses alone, sheets the images, too.
+        print(f"no pictures of the worst estimates: {error}", file=sys.stderr)
+        return table, pictures
+
+
+def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: float | None) -> list[Method]:
+    """Named estimates of each file, with the filtered ones if there is a weight `alpha`."""
+    from synpick_warp.evaluation.figures import Method
+    from synpick_warp.evaluation.tracking.filtering import filter_poses
+
+    named = zip(method_names(results), files, strict=True)
+    return [Method(name, file.poses, None if alpha is None else filter_poses(file.poses, alpha), alpha) for name, file in named]
 
 
 def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, Image]:
