@@ -154,14 +154,8 @@ def make_table(
     table = render(summarize(truth, scores, object_names(data_set)), truth, scores, style, convention)
     if plots is None:
         return table, {}
-    frames = attempt_frames(data_set)
-    pictures = draw_figures(truth, methods, scores, Settings(models, visib_min, top), track, frames)
-    try:
-        return table, pictures | draw_failure_sheets(data_set, truth, methods, scores)
-    except DatasetError as error:
-        # Figures need poses alone, sheets the images, too.
-        print(f"no pictures of the worst estimates: {error}", file=sys.stderr)
-        return table, pictures
+    pictures = draw_figures(truth, methods, scores, Settings(models, visib_min, top), track, attempt_frames(data_set))
+    return table, pictures | draw_failure_sheets(data_set, truth, methods, scores)
 
 
 def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: float | None) -> list[Method]:
@@ -174,7 +168,7 @@ def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: fl
 
 
 def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, Image]:
-    """Sheets of the worst estimate of each object, one for each method; file name -> picture."""
+    """Sheets of the worst estimate of each object, one for each method: file name -> picture. None without the images they need."""
     from synpick_warp.estimation.failures import draw_failures, find_failures
     from synpick_warp.estimation.models import read_object_models
     from synpick_warp.evaluation.figures import file_names
@@ -185,7 +179,12 @@ def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Metho
     for method, name in zip(methods, file_names([method.name for method in methods]), strict=True):
         failures = find_failures(truth, by_name[method.name], method.poses, MAX_FAILURES)
         models = read_object_models(data_set.folder, [int(truth.poses.object_id[each.truth]) for each in failures])
-        pictures[f"failures_{name}.png"] = draw_failures(data_set, truth, method.poses, failures, models, objects, pick_device("auto"))
+        try:
+            sheet = draw_failures(data_set, truth, method.poses, failures, models, objects, pick_device("auto"))
+        except DatasetError as error:
+            print(f"no pictures of the worst estimates: {error}", file=sys.stderr)
+            return {}
+        pictures[f"failures_{name}.png"] = sheet
     return pictures
 
 
