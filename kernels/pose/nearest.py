@@ -48,19 +48,19 @@ def can_be_nearest(vertex: wp.vec3d, nearest: wp.vec3d, center: wp.vec3d, edge: 
 @wp.kernel
 def list_candidates_kernel(
     # In:
-    vertex: wp.array[wp.vec3d],  # (vertex,)
-    corner: wp.array[wp.vec3d],  # (parent,)
-    list_start: wp.array[int],  # (parent,)
-    list_length: wp.array[int],  # (parent,)
-    candidate: wp.array[int],  # (entry,)
-    child_start: wp.array[int],  # (cell,)
+    vertex: wp.array[wp.vec3d],  # (vertex)
+    corner: wp.array[wp.vec3d],  # (parent)
+    list_start: wp.array[int],  # (parent)
+    list_length: wp.array[int],  # (parent)
+    candidate: wp.array[int],  # (entry)
+    child_start: wp.array[int],  # (cell)
     edge: wp.float64,
     grid_edge: wp.float64,
     fill: int,
     first: int,
     # Out:
-    child_length_out: wp.array[int],  # (cell,)
-    child_candidate_out: wp.array[int],  # (child_entry,)
+    child_length_out: wp.array[int],  # (cell)
+    child_candidate_out: wp.array[int],  # (child_entry)
 ):
     """List the vertices of a parent's list that can be nearest to a point of its child cell; launched twice, to count and to fill.
 
@@ -96,13 +96,13 @@ def list_candidates_kernel(
 @wp.kernel
 def sum_distances_kernel(
     # In:
-    rotation: wp.array[wp.mat33d],  # (pose,)
-    translation: wp.array[wp.vec3d],  # (pose,)
-    query: wp.array[wp.vec3d],  # (vertex,)
-    weight: wp.array[wp.float64],  # (vertex,)
-    vertex: wp.array[wp.vec3d],  # (vertex,)
-    node: wp.array[int],  # (node,)
-    candidate: wp.array[int],  # (entry,)
+    rotation: wp.array[wp.mat33d],  # (pose)
+    translation: wp.array[wp.vec3d],  # (pose)
+    query: wp.array[wp.vec3d],  # (vertex)
+    weight: wp.array[wp.float64],  # (vertex)
+    vertex: wp.array[wp.vec3d],  # (vertex)
+    node: wp.array[int],  # (node)
+    candidate: wp.array[int],  # (entry)
     cells_per_meter: wp.float64,
     first: int,
     # Out:
