@@ -84,7 +84,8 @@ class NearestVertices:
             sums = wp.empty((len(shift), blocks), dtype=wp.float64, device=self._device)
             inputs = [self._upload(rotation[rows], wp.mat33d), self._upload(shift, wp.vec3d), self._query, self._weight, self._vertex]
             inputs += [self._node, self._candidate, ROOT / (2.0 * self._half)]
-            _launch_tasks(device_code.sum_distances_kernel, len(shift) * blocks, _TASKS, inputs, [sums], self._device)
+            pieces = -(-len(shift) * blocks // _TASKS)
+            launch_views(device_code.sum_distances_kernel, pieces, _TASKS, inputs, [sums], self._device)
             result[rows] = sums.numpy().sum(axis=1)
         return result
 
@@ -124,12 +125,12 @@ class NearestVertices:
         length = wp.empty(cells, dtype=wp.int32, device=self._device)
         numbers = [edge, 2.0 * self._half]
         nothing = wp.empty(1, dtype=wp.int32, device=self._device)
-        kernel = device_code.list_candidates_kernel
-        _launch_tasks(kernel, cells, _CELLS, [*inputs, length, *numbers, 0], [length, nothing], self._device)
+        kernel, pieces = device_code.list_candidates_kernel, -(-cells // _CELLS)
+        launch_views(kernel, pieces, _CELLS, [*inputs, length, *numbers, 0], [length, nothing], self._device)
         lengths = length.numpy().astype(np.int64)
         starts = np.cumsum(lengths) - lengths
         candidate = wp.empty(int(lengths.sum()), dtype=wp.int32, device=self._device)
-        _launch_tasks(kernel, cells, _CELLS, [*inputs, self._upload(starts, wp.int32), *numbers, 1], [length, candidate], self._device)
+        launch_views(kernel, pieces, _CELLS, [*inputs, self._upload(starts, wp.int32), *numbers, 1], [length, candidate], self._device)
         place = np.arange(CHILDREN)
         offset = np.stack((place % BRANCH, place // BRANCH % BRANCH, place // BRANCH**2), axis=1)
         corner = (level.corner[:, None] + edge * offset).reshape(-1, 3)
@@ -137,11 +138,6 @@ class NearestVertices:
 
     def _upload(self, values: np.ndarray, dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self._device)
-
-
-def _launch_tasks(kernel: wp.Kernel, tasks: int, piece: int, inputs: list[Any], outputs: list[Any], device: wp.Device) -> None:
-    """Launch a kernel over tasks that share nothing; on the CPU in pieces, which run in parallel. Its last input is the first task."""
-    launch_views(kernel, -(-tasks // piece), piece, inputs, outputs, device)
 
 
 def _longest(length: np.ndarray) -> np.ndarray:
