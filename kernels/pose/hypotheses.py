@@ -19,6 +19,8 @@ NO_CORRELATION = wp.constant(-2.0)
 FAST_MEAN = wp.constant(0.1)
 SLOW_MEAN = wp.constant(0.02)
 """Weights of a new correlation in its running mean: usually, and while it is so low that turns are considered."""
+COST_MEAN = wp.constant(0.2)
+"""Weight of a new cost in its running mean."""
 
 
 @wp.struct
@@ -32,9 +34,27 @@ class Track:
     centroid: wp.array[wp.vec3]
     """(instance): centroid of the points observed last [m]."""
     frames: wp.array[int]
-    """(instance): number of consecutive frames with an estimate, up to the last; 0: none yet."""
+    """(instance): number of frames with an estimate; 0: none yet."""
+    cost: wp.array[float]
+    """(instance): running mean of the costs of the estimates."""
+    held: wp.array[int]
+    """(instance): number of consecutive frames, up to the last, whose estimate was not taken because its cost was too high."""
     correlation: wp.array[float]
     """(instance): running mean of the correlation between image and base colours at the estimates; `NO_CORRELATION`: none yet."""
+
+
+@wp.struct
+class TrackPolicy:
+    """When a track takes an estimate over."""
+
+    min_points: int
+    """Observed points with fewer than which an instance keeps its pose."""
+    surprise: float
+    """Cost above the running mean with which an estimate is not taken ..."""
+    patience: int
+    """... for at most this many consecutive frames."""
+    first_cost: float
+    """Running mean at the start."""
 
 
 @wp.struct
@@ -245,16 +265,22 @@ def choose_poses_kernel(
 
 @wp.kernel
 def update_tracks_kernel(
+    # Scene:
+    policy: TrackPolicy,
     # In:
     observation: Observation,
     pose: wp.array[wp.transform],  # (instance) [m]
+    cost: wp.array[float],  # (instance)
     start: wp.array[wp.transform],  # (instance) [m]
     starting: wp.array[int],  # (instance)
-    min_points: int,
     # Out:
     track_out: Track,
 ):
-    """Take new estimates over. An instance with too few observed points keeps its pose, at rest; tracks that start get their start pose."""
+    """Take new estimates over; tracks that start get their start pose.
+
+    An instance keeps its pose, at rest, if it shows too few points, or if its estimate costs much more than its last ones: then its mask is
+    probably another's. After a few such frames the estimate counts nevertheless.
+    """
     instance = wp.tid()
     if starting[instance] != 0:
         track_out.pose[instance] = start[instance]
@@ -262,11 +288,20 @@ def update_tracks_kernel(
         track_out.centroid[instance] = observation.centroid[instance]
         track_out.correlation[instance] = NO_CORRELATION
         track_out.frames[instance] = 1
+        track_out.cost[instance] = policy.first_cost
+        track_out.held[instance] = 0
         return
     if track_out.frames[instance] == 0:
         return
     track_out.before[instance] = track_out.pose[instance]
-    if observation.points[instance] >= min_points:
-        track_out.pose[instance] = pose[instance]
-        track_out.centroid[instance] = observation.centroid[instance]
-        track_out.frames[instance] = track_out.frames[instance] + 1
+    if observation.points[instance] < policy.min_points:
+        return
+    mean = track_out.cost[instance]
+    if cost[instance] > mean + policy.surprise and track_out.held[instance] < policy.patience:
+        track_out.held[instance] = track_out.held[instance] + 1
+        return
+    track_out.held[instance] = 0
+    track_out.pose[instance] = pose[instance]
+    track_out.centroid[instance] = observation.centroid[instance]
+    track_out.frames[instance] = track_out.frames[instance] + 1
+    track_out.cost[instance] = mean + COST_MEAN * (cost[instance] - mean)

@@ -7,8 +7,58 @@ from synpick_warp.kernels.pose.residuals import LANES, Cost, Models, Sums, jacob
 
 wp.set_module_options({"enable_backward": False})
 
+MIN_AGREEMENT = wp.constant(-0.5)
+"""Smallest cosine between the normals of a point and of its closest triangle: noise tilts a fitted normal by some tens of degrees."""
 MIN_DIRECTION = wp.constant(1.0e-6)
 """Distance below which the triangle's normal replaces the direction to the closest point [m]."""
+
+
+@wp.struct
+class Match:
+    """Correspondence of an observed point on the mesh, in the model's frame."""
+
+    found: bool
+    point: wp.vec3
+    """On the mesh [m]."""
+    distance: float
+    """[m]"""
+    direction: wp.vec3
+    """Unit direction in which the distance is measured, from the mesh to the observed point."""
+
+
+@wp.func
+def match_point(mesh: wp.uint64, local: wp.vec3, seen: wp.vec3, eye: wp.vec3, reach: float) -> Match:
+    """Closest point of the mesh, if its triangle can be what the camera at `eye` sees; else the first hit of the camera's ray.
+
+    The closest triangle is rejected if it faces away, or opposes the point's normal `seen`: the point then lies beyond the middle of a thin
+    part, and would be drawn to its back. Rejecting such points alone would leave those before the surface, and draw thin objects
+    towards the camera.
+    """
+    result = Match()
+    query = wp.mesh_query_point_no_sign(mesh, local, reach)
+    if not query.result:
+        return result
+    normal = wp.mesh_eval_face_normal(mesh, query.face)
+    if wp.dot(normal, local - eye) <= 0.0 and wp.dot(seen, normal) >= MIN_AGREEMENT:
+        result.found = True
+        result.point = wp.mesh_eval_position(mesh, query.face, query.u, query.v)
+        result.distance = wp.length(local - result.point)
+        result.direction = normal
+        if result.distance > MIN_DIRECTION:
+            result.direction = (local - result.point) / result.distance
+        return result
+    distance = wp.length(local - eye)
+    ray = (local - eye) / distance
+    hit = wp.mesh_query_ray(mesh, eye, ray, distance + reach)
+    if hit.result and hit.t > distance - reach:
+        result.found = True
+        result.point = eye + hit.t * ray
+        offset = wp.dot(local - result.point, hit.normal)
+        result.distance = wp.abs(offset)
+        result.direction = hit.normal
+        if offset < 0.0:
+            result.direction = -hit.normal
+    return result
 
 
 @wp.kernel
@@ -24,15 +74,13 @@ def accumulate_points_kernel(
     # Out:
     sums_out: Sums,
 ):
-    """Distances from observed points to the mesh: r = |p - q| along n = (p - q) / r, q the closest point of the mesh.
-
-    A point whose normal opposes that of the closest triangle lies on the other side of a thin wall: an outlier at full cost.
-    """
+    """Distances r of observed points p from the mesh: r = |n · (p - q)|, with q and n of `match_point`; without a match at full cost."""
     index, lane = wp.tid()
     instance = index // hypotheses
     model = targets.model[instance]
     origin = wp.transform_get_translation(pose[index])
     inverse = wp.transform_inverse(pose[index])
+    eye = wp.transform_get_translation(inverse)
     mesh = models.mesh[model]
     area = observation.area[instance] * float(cost.step)
     reach = wp.max(cost.cutoff, cost.truncation)
@@ -40,25 +88,17 @@ def accumulate_points_kernel(
     gradient = wp.spatial_vector()
     total = wp.vec2(0.0, 0.0)
     for k in range(lane * cost.step, observation.points[instance], LANES * cost.step):
-        point = observation.point[instance, k]
-        local = wp.transform_point(inverse, point)
+        local = wp.transform_point(inverse, observation.point[instance, k])
+        seen = wp.transform_vector(inverse, observation.normal[instance, k])
         price = float(1.0)
-        query = wp.mesh_query_point_no_sign(mesh, local, reach)
-        if query.result:
-            offset = local - wp.mesh_eval_position(mesh, query.face, query.u, query.v)
-            normal = wp.mesh_eval_face_normal(mesh, query.face)
-            distance = wp.length(offset)
-            seen = wp.transform_vector(inverse, observation.normal[instance, k])
-            if wp.dot(seen, normal) >= 0.0:
-                price = wp.min(distance / cost.truncation, 1.0)
-                direction = normal
-                if distance > MIN_DIRECTION:
-                    direction = offset / distance
-                weight = area * tukey_weight(distance, cost.cutoff)
-                closest = wp.transform_point(pose[index], local - offset)
-                row = jacobian(closest, origin, wp.transform_vector(pose[index], direction), models.radius[model])
-                hessian += weight * wp.outer(row, row)
-                gradient += weight * distance * row
+        match = match_point(mesh, local, seen, eye, reach)
+        if match.found:
+            price = wp.min(match.distance / cost.truncation, 1.0)
+            weight = area * tukey_weight(match.distance, cost.cutoff)
+            point = wp.transform_point(pose[index], match.point)
+            row = jacobian(point, origin, wp.transform_vector(pose[index], match.direction), models.radius[model])
+            hessian += weight * wp.outer(row, row)
+            gradient += weight * match.distance * row
         total += area * wp.vec2(price, 1.0)
     sums_out.hessian[index, lane] = hessian
     sums_out.gradient[index, lane] = gradient

@@ -1,4 +1,4 @@
-"""Command line interface: bake, verify, merge, preview, explain, eval, doctor, config. User errors: one line on stderr, exit code 2."""
+"""Command line: bake, verify, merge, preview, explain, eval, estimate, doctor, config. User errors: one line on stderr, exit code 2."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import cyclopts
 from cyclopts import App, Parameter
 
 from synpick_warp import __version__
+from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
 from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
@@ -227,6 +228,7 @@ def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
 
 
 app.command(evaluate, name="eval")
+app.command(estimate)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Progress display and final summary of a bake: a live line on a terminal, plain lines elsewhere."""
+"""Progress display of a bake and of an estimation, and a bake's summary: a live line on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 from rich.table import Table
 
@@ -103,6 +103,40 @@ class PlainProgress:
         """Print a line with the time since the start."""
         self._console.print(f"{_duration(time.monotonic() - self._started):>7}  {text}", markup=False, soft_wrap=True)
         self._console.file.flush()
+
+
+class ViewCounter:
+    """Progress of an estimation: a live bar on a terminal, plain lines elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._bar = Bar(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(bar_width=30),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task("starting", total=None)
+        self._printed_at = time.monotonic()
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._bar.stop()
+
+    def report(self, unit: str, done: int, total: int) -> None:
+        """See `estimation.run.Report`."""
+        self._bar.update(self._task, description=unit, completed=done, total=total)
+        now = time.monotonic()
+        if not self._console.is_terminal and now - self._printed_at >= PLAIN_INTERVAL:
+            self._printed_at = now
+            self._console.print(f"{unit} {done:,}/{total:,}", markup=False)
+            self._console.file.flush()
 
 
 def print_summary(console: Console, summary: BakeSummary, out: Path) -> None:

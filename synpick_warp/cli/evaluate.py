@@ -5,23 +5,30 @@ from __future__ import annotations
 import re
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TextIO
 
 from cyclopts import Parameter
 
 from synpick_warp.cli.options import WholeNumber
 from synpick_warp.configs.check import escape, format_value
-from synpick_warp.errors import ConfigError, OutputError
+from synpick_warp.errors import ConfigError, DatasetError, OutputError
 
 if TYPE_CHECKING:
     from synpick_warp.dataset.reading import DataSet
-    from synpick_warp.evaluation.scoring import PoseStep
+    from synpick_warp.evaluation.charts import Image
+    from synpick_warp.evaluation.figures import Method
+    from synpick_warp.evaluation.results import ResultFile
+    from synpick_warp.evaluation.scoring import Scores
+    from synpick_warp.evaluation.truth import Truth
 
 FILTER = "ema"
 """Exponential moving average: the only filter."""
+MAX_FAILURES = 12
+"""Objects on a sheet of failures."""
 _MAX_VERTICES = 10**7
+_TRACK = re.compile(r"([0-9]{1,9}):([0-9]{1,9})")
 
 
 def evaluate(
@@ -38,12 +45,27 @@ def evaluate(
     top: Annotated[
         WholeNumber, Parameter(help="Estimates that count per image and object, by score; -1: as many as instances to be found; 0: all.")
     ] = -1,
-    vertices: Annotated[WholeNumber, Parameter(help="Vertices of a model that errors are averaged over, evenly chosen; 0: all.")] = 0,
+    vertices: Annotated[
+        WholeNumber,
+        Parameter(help="Vertices of a model that errors are averaged over; 0: all. 1000 is faster, ADD-S a point lower."),
+    ] = 0,
+    targets: Annotated[
+        Path | None, Parameter(help="Score only images and objects of this list, such as estimate writes or BOP's test_targets_bop19.json.")
+    ] = None,
     filter_: Annotated[
         str | None,
         Parameter(name="--filter", help="ema: score each method a second time, through the tracking filter of the SynPick paper."),
     ] = None,
     alpha: Annotated[float | None, Parameter(help="Weight of the new estimate in --filter ema, above 0, at most 1 (default 0.05).")] = None,
+    plots: Annotated[
+        Path | None,
+        Parameter(
+            help="New or empty folder for pictures: recall, error by visibility and speed, trajectory, sweep of alpha, worst estimates."
+        ),
+    ] = None,
+    track: Annotated[
+        str | None, Parameter(help="SCENE:INSTANCE of the trajectory in --plots (default: the one that moves farthest).")
+    ] = None,
 ) -> int:
     """Score pose estimates: AUC of ADD, ADD-S and ADD(-S) to 0.1 m, per object, mode, camera, visibility and speed.
 
@@ -51,18 +73,29 @@ def evaluate(
     """
     check_options(results, format_, out, visib_min, convention, top, vertices)
     weight = check_filter(filter_, alpha)
+    chosen = check_plots(plots, track)
     from synpick_warp.dataset.reading import open_data_set
 
     data_set = open_data_set(data)
-    table = make_table(data_set, results, format_, visib_min=visib_min, convention=convention, top=top, vertices=vertices, alpha=weight)
-    command = toolkit_command(data_set, results)
-    if out is None:
-        print(table, end="")
-        print(f"\n{command}" if format_ == "text" else command, file=sys.stdout if format_ == "text" else sys.stderr)
-        return 0
-    write_table(out, table)
-    print(f"table: {escape(str(out))}\n{command}")
+    given = {"visib_min": visib_min, "convention": convention, "top": top, "vertices": vertices, "alpha": weight, "targets": targets}
+    table, pictures = make_table(data_set, results, format_, **given, plots=plots, track=chosen)
+    if out is not None:
+        write_table(out, table)
+        print(f"table: {escape(str(out))}")
+    else:
+        print(table, end="\n" if format_ == "text" else "")
+    show_rest(toolkit_command(data_set, results), plots, pictures, sys.stdout if format_ == "text" or out is not None else sys.stderr)
     return 0
+
+
+def show_rest(command: str, plots: Path | None, pictures: Mapping[str, Image], stream: TextIO) -> None:
+    """Write the pictures, and print their paths and the toolkit's command, where they don't mix with a table for a program."""
+    if plots is not None:
+        from synpick_warp.evaluation.figures import write_figures
+
+        for path in write_figures(plots, pictures):
+            print(f"picture: {escape(str(path))}", file=stream)
+    print(command, file=stream)
 
 
 def make_table(
@@ -75,8 +108,11 @@ def make_table(
     top: int,
     vertices: int,
     alpha: float | None = None,
-) -> str:
-    """Score result files and write the table.
+    targets: Path | None = None,
+    plots: Path | None = None,
+    track: tuple[int, int] | None = None,
+) -> tuple[str, dict[str, Image]]:
+    """Score result files, write the table and draw the pictures.
 
     Args:
         data_set: Where the ground truth is.
@@ -87,12 +123,19 @@ def make_table(
         top: Maximum number of estimates per image and object.
         vertices: Number of vertices of a model; 0: all.
         alpha: Weight of the new estimate in the tracking filter, with which each method is scored once more; None: no filter.
+        targets: Target list; None: all images.
+        plots: Folder of the pictures; None: none are drawn.
+        track: Scene and instance of the trajectory; None: the one that moves farthest.
+
+    Returns:
+        The table, and file name -> picture.
     """
+    from synpick_warp.evaluation.figures import Settings, draw_figures
     from synpick_warp.evaluation.models import read_models
     from synpick_warp.evaluation.results import check_results, read_results
     from synpick_warp.evaluation.scoring import score
     from synpick_warp.evaluation.tables import render, summarize
-    from synpick_warp.evaluation.tracking.filtering import filter_poses
+    from synpick_warp.evaluation.targets import read_targets, select_targets
     from synpick_warp.evaluation.truth import read_truth
 
     # Result files first: their mistakes are the likely ones, and quick to find.
@@ -102,18 +145,73 @@ def make_table(
     known = set(data_set.models_info) | set(models)
     for file in files:
         check_results(file, truth, known)
+    if targets is not None:
+        truth = select_targets(truth, read_targets(targets))
     if not (truth.visibility >= visib_min).any():
         raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
-    labels = method_names(results)
-    variants: list[tuple[str, Sequence[PoseStep]]] = [("", ())]
-    if alpha is not None:
-        variants.append((f" + EMA {alpha:g}", (lambda poses: filter_poses(poses, alpha),)))
-    scores = [
-        score(f"{label}{ending}", truth, file.poses, models, visib_min, top, steps)
-        for label, file in zip(labels, files, strict=True)
-        for ending, steps in variants
-    ]
-    return render(summarize(truth, scores, object_names(data_set)), truth, scores, style, convention)
+    methods = make_methods(results, files, alpha)
+    scores = [score(label, truth, poses, models, visib_min, top) for method in methods for label, poses in method.variants()]
+    table = render(summarize(truth, scores, object_names(data_set)), truth, scores, style, convention)
+    if plots is None:
+        return table, {}
+    pictures = draw_figures(truth, methods, scores, Settings(models, visib_min, top), track, attempt_frames(data_set))
+    return table, pictures | draw_failure_sheets(data_set, truth, methods, scores)
+
+
+def make_methods(results: Sequence[Path], files: Sequence[ResultFile], alpha: float | None) -> list[Method]:
+    """Named estimates of each file, with the filtered ones if there is a weight `alpha`."""
+    from synpick_warp.evaluation.figures import Method
+    from synpick_warp.evaluation.tracking.filtering import filter_poses
+
+    named = zip(method_names(results), files, strict=True)
+    return [Method(name, file.poses, None if alpha is None else filter_poses(file.poses, alpha), alpha) for name, file in named]
+
+
+def draw_failure_sheets(data_set: DataSet, truth: Truth, methods: Sequence[Method], scores: Sequence[Scores]) -> dict[str, Image]:
+    """Sheets of the worst estimate of each object, one for each method: file name -> picture. None without the images they need."""
+    from synpick_warp.estimation.failures import draw_failures, find_failures
+    from synpick_warp.estimation.models import read_object_models
+    from synpick_warp.evaluation.figures import file_names
+    from synpick_warp.system.device import pick_device
+
+    by_name = {each.name: each for each in scores}
+    pictures, objects = {}, object_names(data_set)
+    for method, name in zip(methods, file_names([method.name for method in methods]), strict=True):
+        failures = find_failures(truth, by_name[method.name], method.poses, MAX_FAILURES)
+        models = read_object_models(data_set.folder, [int(truth.poses.object_id[each.truth]) for each in failures])
+        try:
+            sheet = draw_failures(data_set, truth, method.poses, failures, models, objects, pick_device("auto"))
+        except DatasetError as error:
+            print(f"no pictures of the worst estimates: {error}", file=sys.stderr)
+            return {}
+        pictures[f"failures_{name}.png"] = sheet
+    return pictures
+
+
+def attempt_frames(data_set: DataSet) -> dict[int, list[int]]:
+    """Frames of the pick attempts of each episode; none of data sets that hold no trajectories."""
+    if not data_set.has_store:
+        return {}
+    return {index: [int(attempt["frame"]) for attempt in episode.attempts] for index, episode in data_set.items()}
+
+
+def check_plots(folder: Path | None, track: str | None) -> tuple[int, int] | None:
+    """Scene and instance of `--track`; None: to be chosen.
+
+    Raises:
+        ConfigError: The track has another form, or there are no plots.
+        OutputError: The folder of the plots is neither new nor empty.
+    """
+    from synpick_warp.evaluation.figures import check_folder
+
+    match = None if track is None else _TRACK.fullmatch(track)
+    if track is not None and match is None:
+        raise ConfigError(f"--track is {format_value(track)}; allowed: SCENE:INSTANCE, such as 3:12")
+    if track is not None and folder is None:
+        raise ConfigError(f"--track is {track}, but there are no plots; add --plots DIR")
+    if folder is not None:
+        check_folder(folder)
+    return None if match is None else (int(match[1]), int(match[2]))
 
 
 def check_options(

@@ -1,4 +1,4 @@
-"""Line charts as RGB images: stacked panels with axes, ticks, legend, lines, bands and marks (OpenCV for shapes, Pillow for text).
+"""Line charts as RGB images: stacked panels with axes, ticks, legend, lines, bars and marks (OpenCV for shapes, Pillow for text).
 
 Drawn for a column of a paper: at a width of 3.5 inches the text has some 7 points. Shapes are drawn at twice the size with anti-aliasing
 and reduced, so that lines have fractions of pixels; text is set at the final size.
@@ -53,8 +53,6 @@ _EVENT_ROW, _EVENT = 12.0, 8.0
 """Distance of the discs of events from the upper edge, and their radius [px]."""
 _BAR_GAP = 6
 """Distance of a bar from the edges of its bin [supersampled px]."""
-_BAND_OPACITY = 0.2
-"""Opacity of bands behind their lines."""
 INK, SOFT, GRID = (30, 30, 30), (110, 110, 110), (226, 226, 226)
 PALETTE: tuple[Color, ...] = ((0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233))
 """Colours that colour-blind readers tell apart (Okabe and Ito, 2008)."""
@@ -118,25 +116,6 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Band:
-    """Area between two curves, in a lightened colour."""
-
-    x: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    color: Color
-
-    def draw(self, canvas: Image, place: Place) -> None:
-        known = np.isfinite(self.low) & np.isfinite(self.high)
-        for run in np.split(np.arange(len(self.x)), 1 + np.flatnonzero(known[1:] != known[:-1])):
-            if len(run) and known[run[0]]:
-                outline = np.concatenate((place(self.x[run], self.low[run]), place(self.x[run], self.high[run])[::-1]))
-                layer = canvas.copy()
-                cv2.fillPoly(layer, [_fixed(outline)], self.color, cv2.LINE_AA, _SHIFT)
-                cv2.addWeighted(layer, _BAND_OPACITY, canvas, 1.0 - _BAND_OPACITY, 0.0, canvas)
-
-
-@dataclass(frozen=True)
 class Bars:
     """Histogram: bars from 0 between edges."""
 
@@ -181,7 +160,7 @@ class Events:
                 cv2.polylines(canvas, [_fixed(ends)], False, pale, _SUPER, cv2.LINE_AA, _SHIFT)
 
 
-Mark = Line | Band | Bars | Rings | Events
+Mark = Line | Bars | Rings | Events
 
 
 @dataclass(frozen=True)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.errors import CatalogError, DatasetError
-from synpick_warp.evaluation.errors import LEAF_SIZE
+from synpick_warp.evaluation.nearest import VertexSearch
 from synpick_warp.inputs.paths import path_inside
 from synpick_warp.scenes.assets.models_info import ModelInfo, read_models_info
 from synpick_warp.scenes.assets.ply import read_ply_vertices
@@ -37,19 +36,16 @@ class Model:
     """Whether models_info.json lists a symmetry: then ADD(-S) is ADD-S, else ADD."""
 
     @cached_property
-    def tree(self) -> KDTree:
-        """k-d tree of the vertices."""
-        return KDTree(self.vertices, leafsize=LEAF_SIZE)
+    def search(self) -> VertexSearch:
+        """Search of nearest vertices."""
+        return VertexSearch(self.vertices)
 
-    @cached_property
-    def center(self) -> np.ndarray:
-        """Centroid of the vertices (3,) [m]."""
-        return self.vertices.mean(axis=0)
-
-    @cached_property
-    def radius(self) -> float:
-        """Largest distance of a vertex from the centroid [m]."""
-        return float(np.linalg.norm(self.vertices - self.center, axis=1).max())
+    def thinned(self, count: int) -> Model:
+        """The model with at most so many vertices, evenly in their order; 0: all."""
+        if not 0 < count < len(self.vertices):
+            return self
+        rows = np.linspace(0, len(self.vertices) - 1, count).round().astype(np.int64)
+        return replace(self, vertices=self.vertices[rows])
 
 
 def read_models(folder: Path, object_ids: Iterable[int], vertices: int = 0) -> dict[int, Model]:
@@ -81,10 +77,8 @@ def _read_model(folder: Path, object_id: int, info: ModelInfo, count: int) -> Mo
     points = _METERS * read_ply_vertices(path)
     if np.abs(points).max() > 1e6:
         raise CatalogError(f"{path}: a vertex is more than 1e9 mm from the origin; repair the mesh")
-    if 0 < count < len(points):
-        points = points[np.linspace(0, len(points) - 1, count).round().astype(np.int64)]
     symmetric = bool(info.symmetries_discrete or info.symmetries_continuous)
-    return Model(object_id, points, expand_symmetries(info), symmetric)
+    return Model(object_id, points, expand_symmetries(info), symmetric).thinned(count)
 
 
 def expand_symmetries(info: ModelInfo) -> np.ndarray:

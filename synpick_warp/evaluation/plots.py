@@ -17,7 +17,6 @@ from synpick_warp.evaluation.charts import (
     PALETTE,
     SOFT,
     Axis,
-    Band,
     Bars,
     Color,
     Entry,
@@ -38,6 +37,10 @@ _RAW: Color = (170, 178, 188)
 _MAX_BRIDGE = 5
 """Largest number of missing frames that a trajectory's curve bridges; longer gaps stay open."""
 _EVENT: Color = (200, 40, 40)
+_BESIDE = 0.5
+"""Part of a bin's width in which the methods stand beside each other."""
+_WHISKER = 9.0
+"""Width of the line from the lower to the upper quartile [px]."""
 VISIBILITY_BINS = tuple(round(0.1 * number, 1) for number in range(11))
 """Default bin edges of the visible fraction: finer than the bands of tables."""
 SPEED_BINS = (0.0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
@@ -153,16 +156,19 @@ def _plot_bins(values: np.ndarray, errors: Mapping[str, np.ndarray], metric: str
     counts = np.bincount(index, minlength=len(edges) - 1)
     marks: list[Mark] = []
     lines: list[Mark] = []
-    colors = _colors(len(errors))
+    colors, top = _colors(len(errors)), 0.0
     middle = np.arange(len(counts)) + 0.5
-    for (name, one), color in zip(errors.items(), colors, strict=True):
+    for number, ((name, one), color) in enumerate(zip(errors.items(), colors, strict=True)):
         if len(_checked(name, one)) != len(values):
             raise DatasetError(f"{name} has {len(one)} errors for {len(values)} instances; give infinity for misses")
         quartiles = _CENTIMETERS * np.array(list(_quartiles(np.minimum(one, LIMIT), index, len(counts)))).T
-        marks.append(Band(middle, quartiles[0], quartiles[2], color))
-        lines.append(Line(middle, quartiles[1], color, 3.5, dots=True))
+        # Beside each other, since quartiles of several methods on one place hide each other.
+        place = middle + _BESIDE * (number - (len(errors) - 1) / 2) / max(1, len(errors))
+        ends = np.stack((quartiles[0], quartiles[2], np.full(len(counts), np.nan)), axis=1)
+        marks.append(Line(np.repeat(place, 3), ends.ravel(), _lighten(color), _WHISKER))
+        lines.append(Line(place, quartiles[1], color, 3.5, dots=True))
+        top = max(top, np.nanmax(quartiles[2], initial=0.0))
     x = Axis(label, 0.0, len(counts), ticks=tuple((float(place), text) for place, text in enumerate(ticks)))
-    top = max([float(np.nanmax(mark.high)) for mark in marks if isinstance(mark, Band)], default=1.0)
     error = Panel(Axis(f"{metric} error [cm]", 0.0, max(1.04 * top, 0.1)), [*marks, *lines], 560)
     bars = Bars(np.arange(len(edges), dtype=np.float64), 100 * counts / max(1, len(values)), SOFT)
     share = Panel(Axis("Instances [%]", 0.0, max(1.0, 110 * counts.max() / max(1, len(values)))), [bars], 250)

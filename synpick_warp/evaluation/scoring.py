@@ -15,6 +15,7 @@ from synpick_warp.evaluation.auc import LIMIT
 from synpick_warp.evaluation.errors import add_errors, adds_errors, rotation_errors, translation_errors
 from synpick_warp.evaluation.matching import PER_INSTANCE, Pairs, make_pairs, match
 from synpick_warp.evaluation.models import Model
+from synpick_warp.evaluation.nearest import NEAR
 from synpick_warp.evaluation.poses import PoseTable
 from synpick_warp.evaluation.truth import Truth
 
@@ -88,13 +89,13 @@ def _pair_errors(truth: PoseTable, estimates: PoseTable, pairs: Pairs, models: M
         model = models[int(object_id)]
         rows = np.flatnonzero(object_ids == object_id)
         ours, theirs = truth.select(pairs.truth[rows]), estimates.select(pairs.estimate[rows])
-        offset = (theirs.rotation - ours.rotation) @ model.center + theirs.translation - ours.translation
+        offset = (theirs.rotation - ours.rotation) @ model.search.center + theirs.translation - ours.translation
         distance = np.linalg.norm(offset, axis=1)
         # A mean of lengths is at least the length of the mean; a nearest vertex is not nearer than the bounding sphere.
         near = np.flatnonzero(distance < LIMIT)
         errors["ADD"][rows[near]] = add_errors(*_poses(theirs, near), *_poses(ours, near), model.vertices)
-        near = np.flatnonzero(distance < LIMIT + 1.01 * model.radius)
-        errors["ADD-S"][rows[near]] = adds_errors(*_poses(theirs, near), *_poses(ours, near), model.vertices, model.tree)
+        near = np.flatnonzero(distance < LIMIT + NEAR * model.search.radius)
+        errors["ADD-S"][rows[near]] = adds_errors(*_poses(theirs, near), *_poses(ours, near), model.vertices, model.search)
         errors["ADD(-S)"][rows] = errors["ADD-S" if model.symmetric else "ADD"][rows]
     return errors
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from synpick_warp.cli.display import LiveProgress, PlainProgress, print_summary
+from synpick_warp.cli import display
+from synpick_warp.cli.display import LiveProgress, PlainProgress, ViewCounter, print_summary
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.episodes import BakeSummary, EpisodeRow
 from synpick_warp.progress import Progress, SilentProgress
@@ -95,3 +96,16 @@ def test_what_was_there_before_is_told_apart():
         BakeSummary(3, [row(number, 0, Ending.FINISHED, 10, 1.0) for number in range(3)], views=30, wall_seconds=10.0, resumed=2)
     )
     assert "3 of 3 episodes (2 of them before) and 30 views in 0:10 (3.0 views/s)" in text
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_an_estimation_counts_views(terminal, monkeypatch):
+    """A bar on a terminal, which is gone at the end; lines elsewhere."""
+    monkeypatch.setattr(display, "PLAIN_INTERVAL", 0.0)
+    console = Console(file=io.StringIO(), width=80, force_terminal=terminal)
+    with ViewCounter(console) as counter:
+        counter.report("views", 128, 3600)
+        counter.report("views", 3600, 3600)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert ("views 128/3,600\n" in text) is not terminal
+    assert "3600/3600" in text or not terminal

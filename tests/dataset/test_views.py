@@ -2,42 +2,21 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp.configs.write import config_to_toml
-from synpick_warp.dataset.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry
+from synpick_warp.dataset.manifest import episode_entry
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.frames import FrameBatch
-from tests.harness.entries import episode_content
-from tests.harness.exporter_contract import FRAMES, LENSES, export
-from tests.worlds import trajectories
-from tests.worlds.box_views import OBJECT_IDS, SIZES, batches, config
+from tests.harness.exporter_contract import FRAMES, LENSES
+from tests.worlds.box_sets import ATTEMPT, EPISODES, LAYERS, write_set
+from tests.worlds.box_views import OBJECT_IDS, SIZES, batches
 
-EPISODES = (0, 2)
 PRESENT = np.flatnonzero(OBJECT_IDS >= 0)
-LAYERS = ("classes", "flow")
-ATTEMPT = trajectories.ATTEMPT | {"episode": 2, "outcome": "dropped"}
-
-
-def write_set(folder: Path, exporter: type, **bop: object) -> Path:
-    """A finished data set of boxes, with settings and manifest."""
-    settings = config(LAYERS, **({"split": "train", "color_format": "png"} | bop))
-    export(exporter, folder, settings, EPISODES)
-    (folder / CONFIG_FILE).write_text(config_to_toml(settings))
-    (folder / MANIFEST_FILE).write_text("{}")
-    (folder / ENTRIES).mkdir()
-    for episode in EPISODES:
-        content = episode_content(episode, FRAMES, [ATTEMPT] if episode == 2 else [])
-        (folder / f"{episode_entry(episode)}.json").write_text(json.dumps(content | {"files": 0, "bytes": 0, "checksum": 64 * "0"}))
-    return folder
 
 
 @pytest.fixture(scope="module", params=[BopExporter, ShardsExporter], ids=["bop", "shards"])

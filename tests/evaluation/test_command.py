@@ -7,11 +7,13 @@ import shlex
 import subprocess
 import sys
 
+import cv2
 import pytest
 
 import synpick_warp
 from synpick_warp.cli.commands import main
 from synpick_warp.cli.evaluate import method_names, toolkit_command
+from synpick_warp.evaluation.charts import WIDTH
 from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
 from tests.worlds.evaluation_set import moved, write_evaluation_set
@@ -118,6 +120,12 @@ def test_methods_have_different_names(tmp_path):
         (["--out", "{folder}/none/table.txt"], "/none/table.txt; allowed: a file in an existing folder"),
         (["--out", "{folder}"], "; allowed: a file in an existing folder"),
         (["--out", "{good}"], ", one of the result files; name another file"),
+        (["--plots", "{folder}"], "--plots is {folder}; allowed: a new folder, or an empty one"),
+        (["--plots", "{good}"], "; allowed: a new folder, or an empty one"),
+        (["--plots", "{good}/below"], "/below, but {good} is a file; name another folder"),
+        (["--track", "0:1"], "--track is 0:1, but there are no plots; add --plots DIR"),
+        (["--plots", "{folder}/new", "--track", "one"], '--track is "one"; allowed: SCENE:INSTANCE, such as 3:12'),
+        (["--plots", "{folder}/new", "--track", "9:1"], "--track is 9:1; the data set has no such scene and instance"),
         (["--results", "{folder}/none.csv"], "there is no file {folder}/none.csv"),
         (["--results", "{folder}/config.toml"], "/config.toml, line 1 has 1 columns; allowed: 7 separated by commas"),
     ],
@@ -129,7 +137,7 @@ def test_mistakes_are_one_line(folder, files, capsys, arguments, message):
     output, error = capsys.readouterr()
     assert output == ""
     assert error.startswith("synpick-warp: error: ")
-    assert message.format(folder=folder) in error
+    assert message.format(folder=folder, good=files[0]) in error
     assert error.count("\n") == 1
     assert sorted(folder.rglob("*")) == before
 
@@ -164,3 +172,57 @@ def test_names_that_do_not_print_are_escaped(folder, files, capsys, tmp_path):
         assert run("--data", folder, "--results", odd, "--format", style, "--out", tmp_path / style) == 0
         assert "\x1b" not in (tmp_path / style).read_text()
         assert "\x1b" not in capsys.readouterr().out
+
+
+ERRORS = ("error_by_speed", "error_by_visibility", "recall")
+PICTURES = [f"{name}_{metric}.png" for name in ERRORS for metric in ("add", "add_or_s", "add_s")]
+KINDS = (("alpha_sweep", ""), ("trajectory", "_scene_000004_instance_1"))
+
+
+def test_plots_are_written_to_a_new_or_empty_folder(folder, files, tmp_path, capsys):
+    """One of the two moving bricks is faster: instance 3 of the first scene in which it is so."""
+    for name in ("new/deep", "empty"):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        assert run("--data", folder, "--results", *files, "--plots", tmp_path / name) == 0
+        found = {path.name for path in (tmp_path / name).iterdir()}
+        assert found == {*PICTURES, *(f"trajectory_{method}_scene_000000_instance_3.png" for method in ("icg", "bad"))}
+        lines = capsys.readouterr().out.splitlines()
+        assert {line.removeprefix("picture: ") for line in lines if line.startswith("picture: ")} == {
+            str(tmp_path / name / each) for each in found
+        }
+        assert lines[-1].startswith("BOP_PATH=")
+        for each in found:
+            assert cv2.imread(str(tmp_path / name / each)).shape[1] == WIDTH
+
+
+def test_plots_with_a_filter_have_a_sweep_of_each_method(folder, files, tmp_path, capsys):
+    given = ("--filter", "ema", "--format", "csv", "--plots", tmp_path / "plots", "--track", "4:1", "--vertices", 20)
+    assert run("--data", folder, "--results", *files, *given) == 0
+    output, error = capsys.readouterr()
+    assert output.startswith("group,")
+    assert "picture: " not in output
+    names = {path.name for path in (tmp_path / "plots").iterdir()}
+    assert names == {*PICTURES, *(f"{kind}_{method}{end}.png" for kind, end in KINDS for method in ("icg", "bad"))}
+    assert error.count("picture: ") == len(names)
+
+
+def test_a_track_that_a_method_lacks_is_not_chosen_and_is_refused(folder, files, tmp_path, capsys):
+    poses = read_truth(synpick_warp.open(folder)).poses
+    slow = tmp_path / "slow.csv"
+    write_results(slow, poses.select((poses.scene == 2) & (poses.instance == 1)))
+    assert run("--data", folder, "--results", files[0], slow, "--plots", tmp_path / "plots") == 0
+    trajectories = sorted(path.name for path in (tmp_path / "plots").glob("trajectory*"))
+    assert trajectories == [f"trajectory_{method}_scene_000002_instance_1.png" for method in ("icg", "slow")]
+    capsys.readouterr()
+    assert run("--data", folder, "--results", files[0], slow, "--plots", tmp_path / "other", "--track", "0:3") == 2
+    assert "--track is 0:3; slow has no estimate of it; choose another one" in capsys.readouterr().err
+    assert not (tmp_path / "other").exists()
+
+
+def test_methods_of_odd_names_have_pictures_of_their_own(folder, files, tmp_path):
+    for name in ("a b", "a+b", "Ground truth"):
+        (tmp_path / f"{name}.csv").write_bytes(files[0].read_bytes())
+    assert run("--data", folder, "--results", *sorted(tmp_path.glob("*.csv")), "--plots", tmp_path / "plots") == 0
+    ending = "scene_000000_instance_3.png"
+    names = {path.name for path in (tmp_path / "plots").glob("trajectory*")}
+    assert names == {f"trajectory_{number}_{name}_{ending}" for number, name in ((1, "Ground_truth"), (2, "a_b"), (3, "a_b"))}

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.evaluation.errors import add_errors, adds_errors, rotation_errors, translation_errors
 from synpick_warp.evaluation.models import expand_symmetries
+from synpick_warp.evaluation.nearest import VertexSearch
 from synpick_warp.scenes.assets.models_info import ModelInfo
 from tests.harness.fuzz import fuzz_examples
 from tests.twins import pose_errors as twin
@@ -53,10 +53,10 @@ def test_adds_searches_from_the_true_to_the_estimated_pose():
 def test_errors_agree_with_the_toolkit(size):
     vertices = np.random.default_rng(size).normal(0.0, 0.05, (size, 3))
     pairs = random_pairs(size, fuzz_examples(200))
-    tree = cKDTree(vertices)
+    search = VertexSearch(vertices)
     rows = list(zip(*pairs, strict=True))
     assert add_errors(*pairs, vertices) == pytest.approx([twin.add(*row, vertices) for row in rows], abs=1e-6)
-    assert adds_errors(*pairs, vertices, tree) == pytest.approx([twin.adi(*row, vertices) for row in rows], abs=1e-6)
+    assert adds_errors(*pairs, vertices, search) == pytest.approx([twin.adi(*row, vertices) for row in rows], abs=1e-6)
     assert translation_errors(pairs[1], pairs[3]) == pytest.approx([twin.te(row[1], row[3]) for row in rows], abs=1e-6)
     # The toolkit's arccos has half of the digits near 0.
     assert rotation_errors(pairs[0], pairs[2]) == pytest.approx([twin.re(row[0], row[2]) for row in rows], abs=2e-6)
@@ -66,7 +66,8 @@ def test_errors_of_many_pairs_are_those_of_each_pair(monkeypatch):
     vertices = np.random.default_rng(1).normal(0.0, 0.05, (7, 3))
     pairs = random_pairs(2, 23)
     whole = add_errors(*pairs, vertices), adds_errors(*pairs, vertices)
-    monkeypatch.setattr("synpick_warp.evaluation.errors._CHUNK", 20)
+    for module in ("errors", "nearest"):
+        monkeypatch.setattr(f"synpick_warp.evaluation.{module}._CHUNK", 20)
     for function, expected in zip((add_errors, adds_errors), whole, strict=True):
         np.testing.assert_allclose(function(*pairs, vertices), expected, rtol=1e-12, atol=1e-15)
 

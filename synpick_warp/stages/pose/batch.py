@@ -52,7 +52,7 @@ class InstanceTable:
     """Instances whose poses are estimated, one row each; rows stay the same for all frames of the views' scenes."""
 
     view: np.ndarray
-    """Index of the view in the batch (N,) int32."""
+    """Index of the view in the batch (N,) int32; every view has an instance."""
     slot: np.ndarray
     """Slot in the view (N,) int32: label - 1."""
     model: np.ndarray

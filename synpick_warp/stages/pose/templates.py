@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.arrays import allocate, allocate_struct, struct_arrays
+from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.templates import (
     EMPTY,
     TEMPLATE,
@@ -21,14 +21,11 @@ from synpick_warp.kernels.pose.templates import (
     sample_probes_kernel,
     search_templates_kernel,
 )
-from synpick_warp.kernels.render.visibility.gbuffer import Table
 from synpick_warp.scenes.types import Camera
-from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
-from synpick_warp.stages.render.raster import Rasterizer
-from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid, build_meshes
-from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_views, set_up_views
+from synpick_warp.stages.pose.render import object_scene, render_object
+from synpick_warp.stages.render.scene import build_meshes
 
 DISTANCE = 8.0
 """Distance of template cameras from an object's origin, in diameters: large bin objects are seen from seven, small ones from twenty."""
@@ -116,8 +113,8 @@ def render_templates(models: PoseModels, directions: int, device: wp.Device) -> 
     depth = np.empty(result.depth.shape, np.float32)
     for row, diameter in enumerate(models.diameters):
         cameras = tuple(template_camera(matrix, diameter) for matrix in Rotation.from_quat(rotation).as_matrix())
-        scene = template_scene(meshes, keep, cameras, device)
-        depth[row] = render_object(scene, row) - np.float32(DISTANCE * diameter)
+        scene = object_scene(meshes, keep, cameras, device)
+        depth[row] = render_object(scene, row).depth.numpy() - np.float32(DISTANCE * diameter)
     depth[depth > DISTANCE * models.diameters.max()] = float(EMPTY)
     result.depth.assign(depth)
     return result
@@ -129,36 +126,3 @@ def template_camera(rotation: np.ndarray, diameter: float) -> Camera:
     focal = size * DISTANCE / float(TEMPLATE_MARGIN)
     matrix = np.array([[focal, 0.0, size / 2.0], [0.0, focal, size / 2.0], [0.0, 0.0, 1.0]])
     return Camera(size, size, matrix, rotation, np.array([0.0, 0.0, distance]))
-
-
-def template_scene(meshes: Any, keep: tuple[wp.Mesh, ...], cameras: tuple[Camera, ...], device: wp.Device) -> RenderScene:
-    """Scene of objects alone, without light: enough to rasterize."""
-    size = int(TEMPLATE)
-    return RenderScene(
-        meshes=meshes,
-        surfaces=None,
-        cameras=build_cameras(cameras, device),
-        lights=None,
-        table=Table(),
-        paths=None,
-        grid=build_grid(size, size),
-        obj_id=wp.zeros(len(keep), dtype=wp.int32, device=device),
-        camera_count=len(cameras),
-        device=device,
-        keep=keep,
-    )
-
-
-def render_object(scene: RenderScene, model: int) -> np.ndarray:
-    """Depth images (camera, row, column) float32 [m] of a model at the origin from all cameras; `FAR` where it is not."""
-    device, count = scene.device, scene.camera_count
-    world = allocate(Snapshot, {"world": 1, "instance": 1, "fixture": len(FIXTURES)}, device)
-    world.catalog_index.fill_(model)
-    world.pose.fill_(wp.transform_identity())
-    sizes = {"view": count, "row": scene.height, "column": scene.width} | body_sizes(1, scene.width, scene.height)
-    first_world = wp.zeros(count, dtype=wp.int32, device=device)
-    views = make_views(first_world, wp.array(range(count), dtype=wp.int32, device=device), count, 1)
-    bodies, gbuffer = allocate_struct(VIEW_BODIES, sizes, device), allocate_struct(GBUFFER, sizes, device)
-    set_up_views(scene, scene.cameras, scene.grid, world, world.fixture_visible, views, bodies)
-    Rasterizer(scene, 1.0, count, background=gbuffer).rasterize(bodies, views, gbuffer)
-    return gbuffer.depth.numpy()

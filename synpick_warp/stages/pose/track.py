@@ -11,6 +11,7 @@ from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.hypotheses import (
     MOTIONS,
     Track,
+    TrackPolicy,
     choose_poses_kernel,
     propose_motions_kernel,
     update_tracks_kernel,
@@ -43,7 +44,10 @@ class TrackSettings:
     turn_loyalty: float = 0.15
     """Relative cost by which a turn must be better after refinement."""
     min_points: int = 24
-    """Observed points with fewer than which an instance keeps its pose."""
+    surprise: float = 0.4
+    patience: int = 5
+    first_cost: float = 0.5
+    """See `TrackPolicy`."""
 
 
 class Tracker:
@@ -70,6 +74,9 @@ class Tracker:
         self.cost = wp.zeros(n, dtype=float, device=self.device)
         self.start_pose = wp.zeros(n, dtype=wp.transform, device=self.device)
         self.starting = wp.zeros(n, dtype=int, device=self.device)
+        self.policy = TrackPolicy()
+        for name in ("min_points", "surprise", "patience", "first_cost"):
+            setattr(self.policy, name, getattr(settings, name))
 
     def start(self, pose: np.ndarray, rows: np.ndarray) -> None:
         """Set the poses (N, 7) of the rows (N,) bool in the frame that is tracked next; the other tracks go on."""
@@ -89,7 +96,7 @@ class Tracker:
         self.pair.refine(self.pair_pose, settings.fine)
         cost = self.pair.score(self.pair_pose, color=settings.color)
         self._choose(self.pair_pose, cost, self.turns.hypotheses, settings.turn_loyalty)
-        inputs = [observation, self.best, self.start_pose, self.starting, settings.min_points]
+        inputs = [self.policy, observation, self.best, self.cost, self.start_pose, self.starting]
         wp.launch(update_tracks_kernel, dim=n, inputs=inputs, outputs=[state], device=device)
         self.starting.zero_()
 

@@ -21,10 +21,12 @@ from synpick_warp.cli.commands import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import SynpickError
+from synpick_warp.estimation import device as factories
 from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
+from tests.estimation.fakes import FakeEstimator
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, WHOLE, places, removed, replaced
 from tests.worlds.sights import SHORT
@@ -208,10 +210,23 @@ def evaluate(sandbox: Sandbox) -> None:
     table.unlink(missing_ok=True)
 
 
+def estimate(sandbox: Sandbox) -> int:
+    """Run `estimate` with an estimator that answers with the masks' centroids; returns the exit code."""
+    out = sandbox.scratch / "single.csv"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(factories, "make_factory", lambda *_, **__: lambda table, height, width: FakeEstimator(table))
+        options = ("--every", 1, "--masks", "noisy", "--visib-min", 0)
+        code = run_command("estimate", "--data", sandbox.folder, "--method", "single", *options, "--out", out)
+    assert (code == 0) == out.exists()
+    out.unlink(missing_ok=True)
+    return code
+
+
 READERS = {
     "open": lambda sandbox: use_set(sandbox.folder),
     "draw": draw,
     "evaluate": evaluate,
+    "estimate": estimate,
     "check and merge": check_and_merge,
     "config": show_settings,
 }
@@ -224,6 +239,7 @@ def test_the_set_itself_is_read_by_every_command(sandbox):
     assert [len(data[0].attempts), data[0].view(0).layers] == [2, ("classes", "flow")]
     draw(sandbox)
     evaluate(sandbox)
+    assert estimate(sandbox) == 0
     assert run_command("verify", sandbox.folder) == 0
     show_settings(sandbox)
 

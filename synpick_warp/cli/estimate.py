@@ -1,0 +1,201 @@
+"""Command `estimate`: estimate the poses of a data set's objects, and write them as a BOP result file."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from synpick_warp.cli.options import WholeNumber
+from synpick_warp.configs.check import escape, format_value
+from synpick_warp.errors import ConfigError, OutputError
+
+if TYPE_CHECKING:
+    from synpick_warp.estimation.run import Options, Run
+    from synpick_warp.estimation.selection import Selection
+
+DEFAULT_VISIBILITY = 0.1
+"""As in `eval` and in BOP."""
+_MASKS = ("exact", "noisy")
+_MAX_SEED = 2**63 - 1
+_MAX_INDEX = 2**31 - 1
+_RANGE = re.compile(r"\s*([0-9]{1,9})\s*(?:-\s*([0-9]{1,9})\s*)?")
+_MAX_RANGE = 10**6
+"""Most indices of an option: more are a mistake."""
+
+
+def estimate(
+    *,
+    data: Annotated[Path, Parameter(help="A data set in the format bop or shards, with masks (bop.masks).")],
+    out: Annotated[Path, Parameter(help="BOP result file to write, such as METHOD_DATASET-SPLIT.csv; an existing file is replaced.")],
+    method: Annotated[
+        str,
+        Parameter(
+            help="single: each frame by itself; refine: from the truth moved by 2 cm and turned by 15°; track: from the truth in an"
+            " instance's first frame on, without restart; gicp: small_gicp from the start of refine, on the CPU."
+        ),
+    ],
+    depth: Annotated[str, Parameter(help="Depth images: clean, or sensor for the layer depth_sensor.")] = "clean",
+    masks: Annotated[str, Parameter(help="exact, or noisy: 5 % each eroded, dilated and swapped with a neighbour.")] = "exact",
+    color: Annotated[bool, Parameter(help="Use colour; --no-color leaves depth and masks. gicp never uses it.")] = True,
+    every: Annotated[
+        WholeNumber | None, Parameter(help="Every n-th frame of a scene, from the first one (default 20; track takes every frame).")
+    ] = None,
+    targets: Annotated[
+        Path | None, Parameter(help="Images and objects to estimate, as in BOP's test_targets_bop19.json; instead of --every.")
+    ] = None,
+    modes: Annotated[str | None, Parameter(help="Only episodes of these modes: pick, target, move; joined by commas.")] = None,
+    cameras: Annotated[str | None, Parameter(help="Only these cameras, such as 0,2.")] = None,
+    episodes: Annotated[str | None, Parameter(help="Only these episodes, such as 0-9,12.")] = None,
+    visib_min: Annotated[float, Parameter(help="Smallest visible fraction of an instance that is estimated, from 0 to 1.")] = (
+        DEFAULT_VISIBILITY
+    ),
+    seed: Annotated[WholeNumber, Parameter(help="Seed of disturbed starts and of noisy masks.")] = 0,
+    batch: Annotated[WholeNumber, Parameter(help="Views that are estimated at a time; 0: as many as memory allows, up to 128.")] = 0,
+    device: Annotated[str, Parameter(help="cpu, cuda:N, or auto: the first GPU if there is one.")] = "auto",
+    threads: Annotated[WholeNumber, Parameter(help="Threads that read images, and that gicp uses; 0: one per core.")] = 0,
+) -> int:
+    """Estimate object poses, given the visible masks of the instances, and write a BOP result file for `eval`.
+
+    Unless all images of the data set are estimated, their list is written beside it as OUT-targets.json, for `eval --targets`.
+    """
+    selection = make_selection(method, every, targets, modes, cameras, episodes)
+    options = make_options(method, depth, masks, visib_min, seed, batch, threads)
+    check_output(out, selection)
+    if options.method == "gicp":
+        from synpick_warp.estimation.gicp import load_small_gicp
+
+        load_small_gicp()
+    run, listed = run_method(data, selection, options, device, out, color=color)
+    print(describe_run(run))
+    print(f"results: {escape(str(out))}")
+    if listed is not None:
+        print(f"targets: {escape(str(listed))}; eval --targets {escape(str(listed))}")
+    return 0
+
+
+def run_method(data: Path, selection: Selection, options: Options, device: str, out: Path, *, color: bool) -> tuple[Run, Path | None]:
+    """Estimate, and write the files; returns the run, and the file of targets if it was written."""
+    from synpick_warp.cli.display import ViewCounter, make_console
+    from synpick_warp.dataset.reading import open_data_set
+    from synpick_warp.estimation import device as factories
+    from synpick_warp.estimation.models import read_object_models
+    from synpick_warp.estimation.run import list_targets, read_scenes, run_estimation
+    from synpick_warp.estimation.selection import plan_scenes
+    from synpick_warp.evaluation.results import write_results
+    from synpick_warp.evaluation.targets import encode_targets
+    from synpick_warp.exporters.writing.files import output_error, write_atomically
+
+    data_set = open_data_set(data)
+    plans, complete = plan_scenes(data_set, selection)
+    with ViewCounter(make_console()) as counter:
+        scenes = read_scenes(data_set, plans, options, selection.targets, counter.report)
+        wanted = sorted({int(object_id) for scene in scenes for object_id in scene.object_ids[scene.asked.any(axis=0)]})
+        models = read_object_models(data_set.folder, wanted)
+        noise = factories.sensor_noise(data_set.config.depth_sensor, scenes) if options.depth == "sensor" else 0.0
+        factory = factories.make_factory(options.method, models, device, options.threads, color=color, depth_noise=noise)
+        run = run_estimation(scenes, [model.object_id for model in models], factory, options, counter.report)
+    listed = None if complete else targets_file(out)
+    if listed is not None:
+        try:
+            write_atomically(listed, encode_targets(list_targets(scenes)))
+        except OSError as error:
+            raise output_error(listed, error) from error
+    write_results(out, run.poses)
+    return run, listed
+
+
+def make_selection(
+    method: str, every: int | None, targets: Path | None, modes: str | None, cameras: str | None, episodes: str | None
+) -> Selection:
+    """Check the options that choose images.
+
+    Raises:
+        ConfigError: A value is not allowed, or two exclude each other.
+        ResultError: The target list cannot be read.
+    """
+    from synpick_warp.estimation.methods import METHODS, SPARSE, TRACK
+    from synpick_warp.estimation.selection import Selection
+    from synpick_warp.evaluation.targets import read_targets
+
+    if method not in METHODS:
+        raise ConfigError(f"--method is {format_value(method)}; allowed: {', '.join(METHODS)}")
+    if every is not None and not 1 <= every <= _MAX_INDEX:
+        raise ConfigError(f"--every is {every}; allowed: 1 for all frames, or more")
+    if method == TRACK and (targets is not None or every not in (None, 1)):
+        raise ConfigError("--method track takes every frame, so neither --every nor --targets; `eval --targets` scores some of them")
+    if targets is not None and every is not None:
+        raise ConfigError("--every and --targets both choose images; drop one of them")
+    return Selection(
+        modes=None if modes is None else tuple(name.strip() for name in modes.split(",")),
+        cameras=None if cameras is None else parse_indices("--cameras", cameras),
+        episodes=None if episodes is None else parse_indices("--episodes", episodes),
+        every=1 if method == TRACK or targets is not None else SPARSE if every is None else every,
+        targets=None if targets is None else read_targets(targets),
+    )
+
+
+def make_options(method: str, depth: str, masks: str, visib_min: float, seed: int, batch: int, threads: int) -> Options:
+    """Check the other options.
+
+    Raises:
+        ConfigError: A value is not allowed.
+    """
+    from synpick_warp.estimation.reading import DEPTHS
+    from synpick_warp.estimation.run import Options
+
+    for option, value, allowed in (("--depth", depth, tuple(DEPTHS)), ("--masks", masks, _MASKS)):
+        if value not in allowed:
+            raise ConfigError(f"{option} is {format_value(value)}; allowed: {', '.join(allowed)}")
+    if not 0.0 <= visib_min <= 1.0:
+        raise ConfigError(f"--visib-min is {visib_min:g}; allowed: 0 to 1")
+    for option, number, most in (("--seed", seed, _MAX_SEED), ("--batch", batch, 4096), ("--threads", threads, 1024)):
+        if not 0 <= number <= most:
+            raise ConfigError(f"{option} is {number}; allowed: 0 to {most}")
+    given = {"threads": threads} if threads else {}
+    return Options(method, depth, masks == "noisy", visib_min, seed, batch, **given)
+
+
+def parse_indices(option: str, text: str) -> tuple[int, ...]:
+    """Parse "0-2,5" into 0, 1, 2, 5.
+
+    Raises:
+        ConfigError: The text has another form, or names too many.
+    """
+    indices: set[int] = set()
+    for part in text.split(","):
+        match = _RANGE.fullmatch(part)
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if not 0 <= last - first < _MAX_RANGE:
+            raise ConfigError(f"{option} is {format_value(text)}; allowed: indices and ranges joined by commas, such as 0-9,12")
+        indices.update(range(first, last + 1))
+    return tuple(sorted(indices))
+
+
+def targets_file(out: Path) -> Path:
+    """File beside the results that lists what was estimated."""
+    return out.with_name(f"{out.stem}-targets.json")
+
+
+def check_output(out: Path, selection: Selection) -> None:
+    """Check the output before anything is read.
+
+    Raises:
+        OutputError: Its folder does not exist, it or the list beside it is a folder, or it would replace the list that is read.
+    """
+    if out.is_dir() or not out.absolute().parent.is_dir() or targets_file(out).is_dir():
+        raise OutputError(f"--out is {out}; allowed: a file in an existing folder")
+    given = selection.targets
+    if given is not None and given.path.resolve() in (out.resolve(), targets_file(out).resolve()):
+        raise OutputError(f"--out is {out}, which would replace {given.path}; name another file")
+
+
+def describe_run(run: Run) -> str:
+    """Summary in one line."""
+    wall = max(run.wall, 1e-9)
+    rate = f"{len(run.poses) / wall:,.0f} poses/s, {run.views / wall:,.0f} views/s"
+    parts = f"waiting for images {run.reading / wall:.0%}, estimating {run.estimating / wall:.0%}"
+    left = f"; {run.skipped:,} estimates were not finite and are left out" if run.skipped else ""
+    return f"{run.views:,} views, {len(run.poses):,} poses in {run.wall:.1f} s ({rate}; {parts}){left}"

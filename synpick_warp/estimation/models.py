@@ -1,0 +1,56 @@
+"""Object models of a data set for pose estimation: textured meshes and symmetries from its models folder, in metres."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.paths import path_inside
+from synpick_warp.scenes.assets.meshes import read_mesh
+from synpick_warp.scenes.assets.models_info import ModelInfo, read_models_info
+from synpick_warp.scenes.types import Material
+from synpick_warp.stages.pose.batch import ObjectModel
+
+_MILLIMETRE = 1e-3
+_METALLIC, _ROUGHNESS = 0.0, 0.5
+"""Of materials, which PLY files do not state; estimators compare colours, not highlights."""
+
+
+def read_object_models(folder: Path, object_ids: Iterable[int]) -> list[ObjectModel]:
+    """Read the models of objects, ordered by obj_id.
+
+    Args:
+        folder: The data set.
+        object_ids: Objects that are needed.
+
+    Raises:
+        DatasetError: The data set has no models, or an object has none.
+        CatalogError: A model or its texture is missing or damaged.
+    """
+    info_path = folder / "models" / "models_info.json"
+    if not info_path.is_file():
+        raise DatasetError(f"{folder} has no models/models_info.json; poses are estimated with models: bake with --formats bop or shards")
+    wanted = sorted(set(object_ids))
+    infos = read_models_info(info_path, wanted)
+    return [_read_model(folder, object_id, infos[object_id]) for object_id in wanted]
+
+
+def _read_model(folder: Path, object_id: int, info: ModelInfo) -> ObjectModel:
+    name = f"models/obj_{object_id:06d}.ply"
+    path = path_inside(folder, name, folder, DatasetError)
+    if not path.is_file():
+        raise DatasetError(f"{folder} has no {name}, the model of an object in its ground truth; restore it, or bake the data set again")
+    mesh, given = read_mesh(path, _MILLIMETRE)
+    return ObjectModel(
+        object_id=object_id,
+        mesh=mesh,
+        material=Material(
+            given.color,
+            given.texture,
+            _METALLIC if given.metallic is None else given.metallic,
+            _ROUGHNESS if given.roughness is None else given.roughness,
+        ),
+        symmetries_discrete=info.symmetries_discrete,
+        symmetries_continuous=info.symmetries_continuous,
+    )

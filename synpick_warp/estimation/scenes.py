@@ -1,0 +1,132 @@
+"""Scenes of an estimation: which frames of an episode's camera are read, and their ground truth as arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.dataset.reading import DataSet
+from synpick_warp.dataset.view_files import SceneFiles
+from synpick_warp.errors import DatasetError
+from synpick_warp.stages.pose.batch import MAX_SLOTS
+
+_METERS = 1e-3
+"""In a millimetre."""
+_ORTHOGONAL = 1e-3
+"""Tolerance of R Rᵀ = 1 for a rotation that is read, as in `dataset.view`."""
+ABSENT = -1
+
+
+@dataclass(frozen=True)
+class ScenePlan:
+    """Frames of a scene that are read, in order."""
+
+    scene: int
+    """Index of the scene."""
+    episode: int
+    camera: int
+    frames: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene's F planned frames and S instances, its slots in the order of instance indices."""
+
+    plan: ScenePlan
+    files: SceneFiles
+    """Where its images are."""
+    size: tuple[int, int]
+    """Width and height of the images [px]."""
+    instances: np.ndarray
+    """Instance index by slot (S,) int64."""
+    object_ids: np.ndarray
+    """obj_id by slot (S,) int64."""
+    index: np.ndarray
+    """Index of the instance in the image's ground truth (F, S) int32; ABSENT: the image does not have it."""
+    poses: np.ndarray
+    """Object to camera (F, S, 4, 4) float64 [m]; the identity where absent."""
+    visibility: np.ndarray
+    """Visible fraction (F, S) float64; 0 where absent."""
+    boxes: np.ndarray
+    """Visible box (F, S, 4) int64 [px]: x, y, width, height as BOP has them; -1: nothing is visible."""
+    intrinsics: np.ndarray
+    """fx, fy, cx, cy (F, 4) float32 [px]."""
+    depth_scale: np.ndarray
+    """Depth of one count (F,) float32 [m]."""
+    asked: np.ndarray
+    """Whether the instance is estimated in the frame (F, S) bool."""
+
+    def __len__(self) -> int:
+        """Number of frames F."""
+        return len(self.plan.frames)
+
+
+def read_scene(data_set: DataSet, plan: ScenePlan) -> Scene:
+    """Read the ground truth of a scene's planned frames; images are not read.
+
+    Raises:
+        DatasetError: A file is missing or damaged, or an instance has no index, two object ids, or is one of more than MAX_SLOTS.
+    """
+    # Records stay in memory as long as the object that has read them: images get another one.
+    source = data_set.scene_files(plan.episode, plan.camera)
+    place = source.place
+    records = [source.records(frame) for frame in plan.frames]
+    known: dict[int, int] = {}
+    for frame, record in zip(plan.frames, records, strict=True):
+        for entry in record.gt:
+            if "instance_id" not in entry:
+                raise DatasetError(f"{place}: an instance of image {frame} has no instance_id; {ADVICE}")
+            if known.setdefault(entry["instance_id"], entry["obj_id"]) != entry["obj_id"]:
+                raise DatasetError(f"{place}: instance {entry['instance_id']} of image {frame} has another obj_id than before; {ADVICE}")
+    if len(known) > MAX_SLOTS:
+        raise DatasetError(f"{place} has {len(known)} instances; allowed: {MAX_SLOTS}")
+    instances = np.array(sorted(known), np.int64)
+    slots = {instance: slot for slot, instance in enumerate(instances.tolist())}
+    shape = len(records), len(instances)
+    index, visibility = np.full(shape, ABSENT, np.int32), np.zeros(shape)
+    poses, boxes = np.tile(np.eye(4), (*shape, 1, 1)), np.full((*shape, 4), -1, np.int64)
+    for row, (frame, record) in enumerate(zip(plan.frames, records, strict=True)):
+        order = [slots[entry["instance_id"]] for entry in record.gt]
+        if len(set(order)) < len(order):
+            raise DatasetError(f"{place}: image {frame} has an instance_id twice; {ADVICE}")
+        if order:
+            index[row, order] = np.arange(len(order))
+            visibility[row, order] = [info["visib_fract"] for info in record.gt_info]
+            boxes[row, order] = [info["bbox_visib"] for info in record.gt_info]
+            poses[row, order, :3, :3] = np.reshape([entry["cam_R_m2c"] for entry in record.gt], (-1, 3, 3))
+            poses[row, order, :3, 3] = _METERS * np.array([entry["cam_t_m2c"] for entry in record.gt])
+    _check_rotations(poses[..., :3, :3], plan, place)
+    matrices = np.reshape([record.camera["cam_K"] for record in records], (-1, 9))
+    if not (matrices[:, [0, 4]] > 0.0).all():
+        raise DatasetError(f"{place}: a focal length in cam_K is not above 0; {ADVICE}")
+    return Scene(
+        plan=plan,
+        files=data_set.scene_files(plan.episode, plan.camera),
+        size=data_set.config.cameras.resolution,
+        instances=instances,
+        object_ids=np.array([known[instance] for instance in instances.tolist()], np.int64),
+        index=index,
+        poses=poses,
+        visibility=visibility,
+        boxes=boxes,
+        intrinsics=matrices[:, [0, 4, 2, 5]].astype(np.float32),
+        depth_scale=(_METERS * np.array([record.camera["depth_scale"] for record in records])).astype(np.float32),
+        asked=index != ABSENT,
+    )
+
+
+def _check_rotations(rotations: np.ndarray, plan: ScenePlan, place: object) -> None:
+    """Check that matrices (F, S, 3, 3) are rotations."""
+    off = np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max(axis=(2, 3), initial=0.0)
+    off = np.where(np.linalg.det(rotations) > 0.0, off, np.inf).max(axis=1, initial=0.0)
+    if (off > _ORTHOGONAL).any():
+        raise DatasetError(f"{place}: a cam_R_m2c of image {plan.frames[int(np.argmax(off > _ORTHOGONAL))]} is no rotation; {ADVICE}")
+
+
+def group_scenes(plans: Sequence[ScenePlan], views: int) -> list[list[ScenePlan]]:
+    """Divide scenes into groups of at most `views` that are read side by side; scenes of similar length share a group."""
+    ordered = sorted(plans, key=lambda plan: (-len(plan.frames), plan.scene))
+    return [ordered[start : start + views] for start in range(0, len(ordered), views)]

@@ -1,0 +1,67 @@
+"""Renders single objects without light or surroundings, by the rasterizer: depth templates, and pictures of estimated poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.arrays import allocate, allocate_struct
+from synpick_warp.kernels.render.visibility.gbuffer import Table
+from synpick_warp.scenes.types import Camera
+from synpick_warp.stages.buffers import FIXTURES, Snapshot
+from synpick_warp.stages.render.raster import Rasterizer
+from synpick_warp.stages.render.scene import RenderScene, build_cameras, build_grid
+from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_views, set_up_views
+
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def object_scene(meshes: Any, keep: tuple[wp.Mesh, ...], cameras: Sequence[Camera], device: wp.Device) -> RenderScene:
+    """Scene of objects alone, enough to rasterize.
+
+    Args:
+        meshes: The struct `Meshes`.
+        keep: Their owners.
+        cameras: Cameras of one image size.
+        device: Device of the arrays.
+    """
+    return RenderScene(
+        meshes=meshes,
+        surfaces=None,
+        cameras=build_cameras(tuple(cameras), device),
+        lights=None,
+        table=Table(),
+        paths=None,
+        grid=build_grid(cameras[0].width, cameras[0].height),
+        obj_id=wp.zeros(len(keep), dtype=wp.int32, device=device),
+        camera_count=len(cameras),
+        device=device,
+        keep=keep,
+    )
+
+
+def render_object(scene: RenderScene, model: int, pose: Sequence[float] | np.ndarray = IDENTITY) -> Any:
+    """Render a model from all cameras of a scene.
+
+    Args:
+        scene: The scene; see `object_scene`.
+        model: Row of its meshes.
+        pose: Object to world: x, y, z [m] and quaternion x, y, z, w.
+
+    Returns:
+        The struct `GBuffer`, one view a camera; segmentation id 1 and depth [m] where the object is, 0 and `FAR` elsewhere.
+    """
+    device, count = scene.device, scene.camera_count
+    world = allocate(Snapshot, {"world": 1, "instance": 1, "fixture": len(FIXTURES)}, device)
+    world.catalog_index.fill_(model)
+    world.pose.fill_(wp.transform(*np.asarray(pose, np.float64).tolist()))
+    sizes = {"view": count, "row": scene.height, "column": scene.width} | body_sizes(1, scene.width, scene.height)
+    first_world = wp.zeros(count, dtype=wp.int32, device=device)
+    views = make_views(first_world, wp.array(range(count), dtype=wp.int32, device=device), count, 1)
+    bodies, gbuffer = allocate_struct(VIEW_BODIES, sizes, device), allocate_struct(GBUFFER, sizes, device)
+    set_up_views(scene, scene.cameras, scene.grid, world, world.fixture_visible, views, bodies)
+    Rasterizer(scene, 1.0, count, background=gbuffer).rasterize(bodies, views, gbuffer)
+    return gbuffer

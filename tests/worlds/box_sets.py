@@ -1,0 +1,45 @@
+"""Finished data sets of boxes, written by the exporters without a bake: two episodes of three frames and cameras, three instances."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+
+from synpick_warp.configs.write import config_to_toml
+from synpick_warp.dataset.manifest import CONFIG_FILE, ENTRIES, MANIFEST_FILE, episode_entry
+from tests.harness.entries import episode_content
+from tests.harness.exporter_contract import FRAMES, export
+from tests.worlds import trajectories
+from tests.worlds.box_views import config
+
+EPISODES = (0, 2)
+LAYERS = ("classes", "flow")
+ATTEMPT = trajectories.ATTEMPT | {"episode": 2, "outcome": "dropped"}
+HOLE = 10
+"""Columns of sensor depth, from the left, that `add_sensor_depth` empties."""
+
+
+def write_set(folder: Path, exporter: type, **bop: object) -> Path:
+    """A finished data set of boxes, with settings and manifest."""
+    settings = config(LAYERS, **({"split": "train", "color_format": "png"} | bop))
+    export(exporter, folder, settings, EPISODES)
+    (folder / CONFIG_FILE).write_text(config_to_toml(settings))
+    (folder / MANIFEST_FILE).write_text("{}")
+    (folder / ENTRIES).mkdir()
+    for episode in EPISODES:
+        content = episode_content(episode, FRAMES, [ATTEMPT] if episode == 2 else [])
+        (folder / f"{episode_entry(episode)}.json").write_text(json.dumps(content | {"files": 0, "bytes": 0, "checksum": 64 * "0"}))
+    return folder
+
+
+def add_sensor_depth(folder: Path) -> None:
+    """Add the layer depth_sensor to a BOP data set: its depth images with holes at the left."""
+    for scene in sorted((folder / "train").iterdir()):
+        shutil.copytree(scene / "depth", scene / "depth_sensor")
+        for path in (scene / "depth_sensor").iterdir():
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            image[:, :HOLE] = 0
+            cv2.imwrite(str(path), image)
