@@ -12,6 +12,7 @@ from synpick_warp.kernels.pose.hypotheses import (
     MOTIONS,
     NO_CORRELATION,
     SLOW_MEAN,
+    TrackPolicy,
     choose_poses_kernel,
     choose_turns_kernel,
     correlate_turns_kernel,
@@ -206,32 +207,88 @@ def test_the_least_cost_wins_unless_the_first_is_nearly_as_good(device, costs, l
     assert least.numpy() == pytest.approx([costs[chosen]] * 2)
 
 
-@pytest.mark.parametrize(("starting", "frames", "min_points"), [(0, 0, 12), (0, 3, 12), (0, 3, 10_000), (1, 0, 12), (1, 5, 10_000)])
-def test_tracks_take_new_estimates_over(device, starting, frames, min_points):
-    """Too few points: the pose stays, at rest. A track that has not started has none."""
-    observer = two_discs(device)
-    track = allocate_struct(TRACK, {"instance": 2}, device)
-    track.pose.assign(np.stack([NOW, NOW]))
-    track.before.assign(np.stack([BEFORE, BEFORE]))
-    track.frames.assign(np.full(2, frames, np.int32))
-    track.correlation.fill_(0.5)
-    new, start = turned_poses(2), turned_poses(4)[2:]
-    inputs = [observer.observation, as_poses(new, device), as_poses(start, device), wp.array([starting] * 2, dtype=int, device=device)]
-    wp.launch(update_tracks_kernel, dim=2, inputs=[*inputs, min_points], outputs=[track], device=device)
-    pose, before, count = track.pose.numpy(), track.before.numpy(), track.frames.numpy().tolist()
-    if starting:
-        assert np.array_equal(pose, start)
-        assert np.array_equal(before, start)
-        assert count == [1, 1]
-        assert track.correlation.numpy().tolist() == [float(NO_CORRELATION)] * 2
-    elif frames == 0:
-        assert np.array_equal(pose, np.stack([NOW, NOW]))
-        assert count == [0, 0]
-    else:
-        seen = min_points < 1000
-        assert np.array_equal(before, np.stack([NOW, NOW]))
-        assert np.array_equal(pose, np.stack([new[0] if seen else NOW, NOW]))
-        assert count == [frames + seen, frames]
+def policy(min_points: int = 12) -> TrackPolicy:
+    """Estimates that cost 0.4 more than usual are not taken, for two frames."""
+    result = TrackPolicy()
+    result.min_points, result.surprise, result.patience, result.first_cost = min_points, 0.4, 2, 0.5
+    return result
+
+
+class Tracks:
+    """Two tracks with the pose NOW, the first of which is visible; both are offered new poses at a cost."""
+
+    def __init__(self, device, frames: int) -> None:
+        self.device, self.observer = device, two_discs(device)
+        self.state = allocate_struct(TRACK, {"instance": 2}, device)
+        self.state.pose.assign(np.stack([NOW, NOW]))
+        self.state.before.assign(np.stack([BEFORE, BEFORE]))
+        self.state.frames.assign(np.full(2, frames, np.int32))
+        self.state.correlation.fill_(0.5)
+        self.state.cost.fill_(0.3)
+        self.new, self.start = turned_poses(2), turned_poses(4)[2:]
+
+    def update(self, cost: float = 0.3, starting: int = 0, min_points: int = 12) -> None:
+        costs = wp.array([cost, cost], dtype=float, device=self.device)
+        inputs = [policy(min_points), self.observer.observation, as_poses(self.new, self.device), costs, as_poses(self.start, self.device)]
+        inputs += [wp.array([starting] * 2, dtype=int, device=self.device)]
+        wp.launch(update_tracks_kernel, dim=2, inputs=inputs, outputs=[self.state], device=self.device)
+
+    def pose(self) -> np.ndarray:
+        return self.state.pose.numpy()
+
+
+@pytest.mark.parametrize("min_points", [12, 10_000])
+def test_tracks_take_new_estimates_over(device, min_points):
+    """With too few points the pose stays, at rest."""
+    tracks = Tracks(device, frames=3)
+    tracks.update(min_points=min_points)
+    seen = min_points < 1000
+    assert np.array_equal(tracks.pose(), np.stack([tracks.new[0] if seen else NOW, NOW]))
+    assert np.array_equal(tracks.state.before.numpy(), np.stack([NOW, NOW]))
+    assert tracks.state.frames.numpy().tolist() == [3 + seen, 3]
+    centroid = tracks.observer.observation.centroid.numpy()[0] if seen else np.zeros(3)
+    assert np.array_equal(tracks.state.centroid.numpy()[0], centroid)
+
+
+@pytest.mark.parametrize("frames", [0, 5])
+def test_tracks_start_at_their_start_pose(device, frames):
+    tracks = Tracks(device, frames)
+    tracks.update(starting=1, min_points=10_000)
+    assert np.array_equal(tracks.pose(), tracks.start)
+    assert np.array_equal(tracks.state.before.numpy(), tracks.start)
+    assert tracks.state.frames.numpy().tolist() == [1, 1]
+    assert tracks.state.correlation.numpy().tolist() == [float(NO_CORRELATION)] * 2
+    assert tracks.state.cost.numpy().tolist() == [0.5, 0.5]
+
+
+def test_a_track_that_has_not_started_waits(device):
+    tracks = Tracks(device, frames=0)
+    tracks.update()
+    assert np.array_equal(tracks.pose(), np.stack([NOW, NOW]))
+    assert tracks.state.frames.numpy().tolist() == [0, 0]
+
+
+def test_an_estimate_that_costs_too_much_waits_for_two_frames(device):
+    """Wrong masks are short; after `patience` frames it counts nevertheless."""
+    tracks = Tracks(device, frames=3)
+    for held in (1, 2):
+        tracks.update(cost=0.75)
+        assert np.array_equal(tracks.pose()[0], NOW)
+        assert tracks.state.held.numpy().tolist() == [held, 0]
+        assert tracks.state.frames.numpy().tolist() == [3, 3]
+    tracks.update(cost=0.75)
+    assert np.array_equal(tracks.pose()[0], tracks.new[0])
+    assert tracks.state.held.numpy()[0] == 0
+    assert tracks.state.cost.numpy() == pytest.approx([0.3 + 0.2 * 0.45, 0.3])
+
+
+def test_an_ordinary_cost_ends_the_wait(device):
+    tracks = Tracks(device, frames=3)
+    tracks.update(cost=0.75)
+    tracks.update(cost=0.65)
+    assert np.array_equal(tracks.pose()[0], tracks.new[0])
+    assert tracks.state.held.numpy()[0] == 0
+    assert tracks.state.cost.numpy()[0] == pytest.approx(0.3 + 0.2 * 0.35)
 
 
 def test_a_box_has_its_turns_in_the_table(device):

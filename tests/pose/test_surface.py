@@ -13,7 +13,11 @@ from tests.worlds.pose_views import drawn, model_of, observe, pose_of, table_of
 from tests.worlds.toy_scene import ball, box
 
 MESHES = {"ball": ball(0.06, 2), "box": box(0.12, 0.08, 0.05)}
-POSE = pose_of((0.02, -0.01, 0.6), Rotation.from_rotvec([0.4, -0.7, 0.3]))
+POSE = pose_of((0.02, -0.01, 0.6), Rotation.from_rotvec([0.6, -0.7, 0.3]))
+EYE = Rotation.from_quat(POSE[3:]).inv().apply(-POSE[:3])
+"""The camera in the object's axes."""
+SEEN = np.sign(EYE)
+"""Signs of the sides of a box that the camera sees."""
 FAR = 10.0
 """Cutoff and truncation beyond all distances [m]: Tukey's weights are then 1 to within 1e-4."""
 
@@ -49,13 +53,15 @@ class Points:
 
 
 def around(mesh, count: int, seed: int, spread: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) within `spread` of a mesh and outward normals of the triangles they were taken from, in its axes."""
+    """Points (N, 3) within `spread` of the side of a mesh that the camera sees, and outward normals of their triangles, in its axes."""
     random = np.random.default_rng(seed)
-    face = random.integers(0, len(mesh.faces), count)
-    corners = mesh.vertices[mesh.faces[face]].astype(np.float64)
-    weights = random.dirichlet((2.0, 2.0, 2.0), count)
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    shown = np.flatnonzero(np.einsum("fc,fc->f", normal, EYE - corners.mean(axis=1)) > 0.15 * np.linalg.norm(EYE))
+    face = shown[random.integers(0, len(shown), count)]
+    corners, normal = corners[face], normal[face]
+    weights = random.dirichlet((2.0, 2.0, 2.0), count)
     place = np.einsum("nk,nkc->nc", weights, corners)
     return place + normal * random.uniform(-spread / 10.0, spread, (count, 1)), normal
 
@@ -63,7 +69,8 @@ def around(mesh, count: int, seed: int, spread: float = 0.01) -> tuple[np.ndarra
 def test_known_distances_from_a_box(device):
     points = Points(device, MESHES["box"])
     local = np.array([(0.0, 0.0, 0.025 + 0.003), (0.06 + 0.004, 0.01, 0.0), (0.06 + 0.003, 0.04 + 0.004, 0.0), (0.0, 0.0, 0.025 + 0.5)])
-    normal = np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+    normal = SEEN * np.array([(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+    local *= SEEN
     for row, price in enumerate([0.3, 0.4, 0.5, 1.0]):
         points.put(local[row : row + 1], normal[row : row + 1])
         found = points.sums(cutoff=0.02, truncation=0.01)
@@ -74,7 +81,7 @@ def test_known_distances_from_a_box(device):
 
 def test_a_point_on_the_mesh_draws_along_its_normal_alone(device):
     points = Points(device, MESHES["box"])
-    points.put(np.array([(0.0, 0.0, 0.025)]), np.array([(0.0, 0.0, 1.0)]))
+    points.put(SEEN * np.array([(0.0, 0.0, 0.025)]), SEEN * np.array([(0.0, 0.0, 1.0)]))
     found = points.sums()
     axis = Rotation.from_quat(POSE[3:]).apply((0.0, 0.0, 1.0))
     line = np.concatenate([np.zeros(3), axis])
@@ -88,7 +95,8 @@ def test_the_gradient_is_that_of_the_sum_of_squares(device, name, seed):
     """Central differences of ½ Σ area distance² by brute force in float64; a step moves the mesh."""
     mesh, points = MESHES[name], Points(device, MESHES[name])
     pose = POSE.copy()
-    pose[:3] += (0.003, -0.002, 0.004)
+    # Towards the points, so that none gets to lie behind the surface.
+    pose[:3] += (0.001, -0.002, 0.004)
     seen = points.put(*around(mesh, 60, seed))
     found = points.sums(pose)
     numeric = twin.numeric_gradient(lambda step: twin.surface_energy(pose, step, points.radius, seen, mesh))
@@ -110,23 +118,41 @@ def test_steps_along_the_gradient_bring_the_box_back(device):
     assert np.degrees((Rotation.from_quat(pose[3:]) * Rotation.from_quat(POSE[3:]).inv()).magnitude()) < 0.1
 
 
-def test_the_other_side_of_a_thin_wall_is_no_match(device):
-    """The normal of the observed point decides, however near the wall is; without a normal the point counts."""
-    points = Points(device, box(0.1, 0.1, 0.002))
-    local = np.array([(0.01, 0.02, 0.001 + 0.0004)])
-    points.put(local, np.array([(0.0, 0.0, -1.0)]))
+THICKNESS = 0.004
+FRONT = THICKNESS / 2.0
+
+
+@pytest.mark.parametrize("depth", [-0.001, 0.001, 0.003, 0.005])
+@pytest.mark.parametrize("normal", [1.0, 0.0, -1.0])
+def test_points_of_a_thin_wall_are_drawn_to_its_front(device, depth, normal):
+    """Whether they lie before it, in its front half, in its back half or behind: the camera cannot see the back.
+
+    The point's own normal decides nothing here: an opposing one only makes the camera's ray the judge.
+    """
+    points = Points(device, box(0.1, 0.1, THICKNESS))
+    local = np.array([(0.01, 0.02, FRONT - depth)]) * SEEN
+    points.put(local, normal * SEEN * np.array([(0.0, 0.0, 1.0)]))
+    found = points.sums(cutoff=0.02, truncation=0.02)
+    assert found["points"] == pytest.approx([abs(depth) / 0.02 * points.area, points.area], rel=2e-3)
+    axis = Rotation.from_quat(POSE[3:]).apply(SEEN * (0.0, 0.0, 1.0))
+    drawn_by = -depth * points.area * (1.0 - (depth / 0.02) ** 2) ** 2
+    assert found["gradient"][3:] == pytest.approx(drawn_by * axis, rel=2e-3, abs=1e-12)
+
+
+def test_what_the_camera_cannot_see_is_no_match(device):
+    """Points behind a thick box, and beside it in its shadow: at full cost, without weight."""
+    points = Points(device, MESHES["box"])
+    local = np.array([(0.0, 0.0, -0.025 - 0.001), (-0.06 - 0.001, -0.03, -0.02)]) * SEEN
+    points.put(local, SEEN * np.array([(0.0, 0.0, -1.0), (-1.0, 0.0, 0.0)]))
     found = points.sums(cutoff=0.01, truncation=0.01)
-    assert found["points"] == pytest.approx([points.area, points.area])
+    assert found["points"] == pytest.approx([2.0 * points.area, 2.0 * points.area])
     assert (found["gradient"] == 0.0).all()
     assert (found["hessian"] == 0.0).all()
-    for normal in ((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)):
-        points.put(local, np.array([normal]))
-        assert points.sums(cutoff=0.01, truncation=0.01)["points"] == pytest.approx([0.04 * points.area, points.area], rel=1e-2)
 
 
 def test_outliers_have_no_weight(device):
     points = Points(device, MESHES["box"])
-    points.put(np.array([(0.0, 0.0, 0.025 + 0.012)]), np.array([(0.0, 0.0, 1.0)]))
+    points.put(SEEN * np.array([(0.0, 0.0, 0.025 + 0.012)]), SEEN * np.array([(0.0, 0.0, 1.0)]))
     assert (points.sums(cutoff=0.01, truncation=0.02)["gradient"] == 0.0).all()
     found = points.sums(cutoff=0.02, truncation=0.02)
     assert np.linalg.norm(found["gradient"][3:]) == pytest.approx(points.area * 0.012 * (1.0 - 0.36) ** 2, rel=1e-3)
