@@ -17,8 +17,9 @@ EVERY = 2
 """Of the frames every second is estimated alone and refined."""
 TOLERANCE = 0.5
 """Allowed difference of scores [points]: on a GPU rounding differs."""
-SCORES = {"single": (94.25, 99.63), "refine": (98.13, 99.60), "track": (99.74, 99.78)}
-"""AUC of ADD and ADD-S [points] that were measured on the CPU when the estimators were written; a change for the better is stored anew."""
+SCORES = {"single": (95.50, 99.76), "refine": (98.25, 99.66), "track": (99.75, 99.79)}
+"""AUC of ADD and ADD-S [points], measured on the CPU. A change of the estimators that is meant stores them anew; those below 99 in ADD are
+turns that shape cannot tell: cartons from one side, and tins that were disturbed about their axis."""
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +83,8 @@ def test_scores_are_those_of_the_first_day(scene, estimator, method):
 def test_two_runs_agree_to_the_bit(scene, shared, estimator, method):
     """Also on a GPU: all sums are formed in a fixed order."""
     other = PoseEstimator(shared, scene.table, *scene.frames[0].label.shape[1:])
-    short = Scene(scene.objects, scene.frames[:3], scene.table, scene.pose[:3])
+    count = 1 if method == "single" else 3
+    short = Scene(scene.objects, scene.frames[:count], scene.table, scene.pose[:count])
     first, second = run(method, short, estimator), run(method, short, other)
     for frame in first:
         for name in ("pose", "score", "valid"):
