@@ -65,7 +65,7 @@ class Observation:
     inside: wp.array3d[wp.uint8]
     """(instance, row, column): 1: the image pixel at the crop pixel's centre belongs to the mask."""
     color: wp.array3d[wp.vec3]
-    """(instance, row, column): mean linear RGB of the crop pixel's footprint."""
+    """(instance, row, column): mean linear RGB of the mask's pixels in the crop pixel's footprint; 0: there are none."""
     nearest: wp.array3d[wp.vec2]
     """(instance, row, column): offset (columns, rows) [crop px] to the nearest crop pixel of the mask: a feature transform."""
     row_nearest: wp.array3d[int]
@@ -189,7 +189,7 @@ def sample_crops_kernel(
     # Out:
     observation_out: Observation,
 ):
-    """Crops: whether a crop pixel's centre lies in the mask, and the mean colour of its footprint (box filter in linear light)."""
+    """Crops: whether a crop pixel's centre lies in the mask, and the mean colour of the mask in its footprint (linear light)."""
     instance, row, column = wp.tid()
     if observation_out.pixels[instance] == 0:
         return
@@ -207,13 +207,18 @@ def sample_crops_kernel(
     observation_out.inside[instance, row, column] = inside
     taps = wp.clamp(int(wp.round(pitch)), 1, MAX_TAPS)
     total = wp.vec3(0.0, 0.0, 0.0)
+    count = float(0.0)
     for i in range(taps):
         for j in range(taps):
             u = corner[0] + (float(column) + (float(j) + 0.5) / float(taps)) * pitch
             v = corner[1] + (float(row) + (float(i) + 0.5) / float(taps)) * pitch
-            texel = images.color[view, wp.clamp(int(wp.floor(v)), 0, images.height - 1), wp.clamp(int(wp.floor(u)), 0, images.width - 1)]
-            total += wp.vec3(images.linear[int(texel[0])], images.linear[int(texel[1])], images.linear[int(texel[2])])
-    observation_out.color[instance, row, column] = total / float(taps * taps)
+            y = wp.clamp(int(wp.floor(v)), 0, images.height - 1)
+            x = wp.clamp(int(wp.floor(u)), 0, images.width - 1)
+            if int(images.label[view, y, x]) == targets.label[instance]:
+                texel = images.color[view, y, x]
+                total += wp.vec3(images.linear[int(texel[0])], images.linear[int(texel[1])], images.linear[int(texel[2])])
+                count += 1.0
+    observation_out.color[instance, row, column] = total / wp.max(count, 1.0)
 
 
 @wp.kernel

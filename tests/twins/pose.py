@@ -31,14 +31,16 @@ def sample_mask(mask: np.ndarray, corner: np.ndarray, pitch: float) -> np.ndarra
     return padded[np.clip(y + CROP, 0, padded.shape[0] - 1)][:, np.clip(x + CROP, 0, padded.shape[1] - 1)]
 
 
-def sample_color(linear: np.ndarray, corner: np.ndarray, pitch: float) -> np.ndarray:
-    """Mean of the linear image (H, W, 3) at regular taps in each crop pixel's footprint; the image's edge is repeated."""
+def sample_color(linear: np.ndarray, mask: np.ndarray, corner: np.ndarray, pitch: float) -> np.ndarray:
+    """Mean of the linear image (H, W, 3) at regular taps in each crop pixel's footprint that the mask shows; the edge is repeated."""
     height, width = linear.shape[:2]
     taps = int(np.clip(np.rint(pitch), 1, MAX_TAPS))
     steps = (np.arange(CROP)[:, None] + (np.arange(taps) + 0.5) / taps).reshape(-1)
     x = np.clip(np.floor(corner[0] + steps * pitch).astype(int), 0, width - 1)
     y = np.clip(np.floor(corner[1] + steps * pitch).astype(int), 0, height - 1)
-    return linear[y][:, x].reshape(CROP, taps, CROP, taps, 3).mean(axis=(1, 3))
+    weights = mask[y][:, x].astype(np.float64)[..., None]
+    sums = [(values[y][:, x] * weights).reshape(CROP, taps, CROP, taps, -1).sum(axis=(1, 3)) for values in (linear, np.ones_like(linear))]
+    return sums[0] / np.maximum(sums[1], 1.0)
 
 
 def chosen_ranks(total: int, capacity: int) -> np.ndarray:
