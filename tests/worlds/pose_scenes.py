@@ -48,14 +48,14 @@ TIN, MUG, DRILL = 0, 1, 2
 def moving_scene(device: wp.Device) -> Scene:
     """One view: a soup tin that turns about its axis, which depth cannot see; a mug that a card passes; a drill that flies and tumbles.
 
-    From frame to frame the tin turns by 3°, and the drill moves by 6 mm and turns by 4°.
+    From frame to frame the tin turns by 5°, and the drill moves by 6 mm and turns by 4°.
     """
     objects = embedded(4, 14, 15, 7)
     upright = Rotation.from_euler("x", 105.0, degrees=True)
     poses = np.empty((MOVING, 3, 7), np.float32)
     placed = []
     for frame in range(MOVING):
-        turn = Rotation.from_euler("z", 3.0 * frame, degrees=True)
+        turn = Rotation.from_euler("z", 5.0 * frame, degrees=True)
         poses[frame, TIN] = pose_of((-0.12, -0.03, 0.4), upright * turn)
         poses[frame, MUG] = pose_of((0.0, 0.06, 0.6), Rotation.from_euler("xyz", [115.0, 20.0, 30.0], degrees=True))
         tumble = Rotation.from_rotvec(np.deg2rad(4.0 * frame) * np.array([0.0, 0.6, 0.8]))

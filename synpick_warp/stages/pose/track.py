@@ -23,7 +23,7 @@ from synpick_warp.stages.pose.turns import TurnSearch
 
 TRACK = struct_arrays(Track, "instance", units={"pose": "m", "before": "m", "centroid": "m"})
 
-COARSE = Schedule(iterations=6, cutoffs=(0.03, 0.01), step=2, color=0.0, prior=1e-3)
+COARSE = Schedule(iterations=6, cutoffs=(0.03, 0.01), step=2, color=0.005, prior=1e-3)
 """Refinement of the motion hypotheses."""
 FINE = Schedule(iterations=8, cutoffs=(0.012, 0.005), step=1, color=0.005, prior=1e-3)
 """Refinement of the best one and its best turn."""
@@ -37,9 +37,9 @@ class TrackSettings:
     fine: Schedule = FINE
     color: bool = True
     """Use colour: in the fine refinement, to choose turns, and in costs."""
-    loyalty: float = 0.1
+    loyalty: float = 0.05
     """Relative cost by which a motion must be better than rest."""
-    turn_gain: float = 0.15
+    turn_gain: float = 0.1
     """Correlation by which a turn must be better to become a hypothesis."""
     turn_loyalty: float = 0.15
     """Relative cost by which a turn must be better after refinement."""
