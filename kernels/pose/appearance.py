@@ -15,7 +15,7 @@ DEADBAND = wp.constant(0.75)
 
 @wp.struct
 class Way:
-    """How a protruding sample gets back into the mask."""
+    """Silhouette residual of a protruding sample: the shortest way back into the mask, at the sample's depth."""
 
     distance: float
     """[m]; 0: it lies within the deadband."""
@@ -24,17 +24,19 @@ class Way:
 
 
 @wp.func
-def way_to_mask(observation: Observation, instance: int, sample: SampleView, focal: float) -> Way:
-    """Way from a sample to the nearest pixel of the mask, by the feature transform of the crop; `focal` is fx [px]."""
+def way_to_mask(observation: Observation, instance: int, sample: SampleView, intrinsics: wp.vec4) -> Way:
+    """Way from a sample to the nearest crop pixel of the mask, by the feature transform, less the deadband."""
     column = wp.clamp(int(wp.round(sample.crop[0])), 0, CROP - 1)
     row = wp.clamp(int(wp.round(sample.crop[1])), 0, CROP - 1)
     target = observation.nearest[instance, row, column] + wp.vec2(float(column), float(row))
     offset = target - sample.crop
     pixels = wp.length(offset)
     result = Way()
-    result.distance = wp.max(pixels - DEADBAND, 0.0) * observation.pitch[instance] * sample.position[2] / focal
-    if result.distance > 0.0:
-        offset = offset / pixels
+    if pixels > DEADBAND:
+        scale = observation.pitch[instance] * sample.position[2]
+        offset = wp.vec2(scale * offset[0] / intrinsics[0], scale * offset[1] / intrinsics[1])
+        result.distance = wp.length(offset) * (1.0 - DEADBAND / pixels)
+        offset = wp.normalize(offset)
         slope = (offset[0] * sample.position[0] + offset[1] * sample.position[1]) / sample.position[2]
         result.direction = wp.normalize(wp.vec3(offset[0], offset[1], -slope))
     return result
@@ -63,9 +65,9 @@ def accumulate_samples_kernel(
     # Out:
     sums_inout: Sums,
 ):
-    """Silhouette and colour residuals of the model's samples; added to the sums of the points.
+    """Normal equations of silhouette (Huber) and photometric (Tukey) residuals; added to the sums of the points.
 
-    A protruding sample is drawn to the nearest pixel of the mask. The colour residual of a visible one is intensity - base colour x
+    A protruding sample is pulled towards the nearest pixel of the mask. The colour residual of a visible one is intensity - base colour x
     light, relative to the instance's mean intensity; its derivative is the image gradient.
     """
     index, lane = wp.tid()
@@ -84,7 +86,7 @@ def accumulate_samples_kernel(
         sample = view_sample(models, images, targets, observation, cost, instance, pose[index], k)
         area = sample.area * float(cost.step)
         if sample.state == PROTRUDING:
-            way = way_to_mask(observation, instance, sample, intrinsics[0])
+            way = way_to_mask(observation, instance, sample, intrinsics)
             total[0] += area * wp.min(way.distance / cost.truncation, 1.0)
             if way.distance > 0.0:
                 weight = cost.silhouette * area * wp.min(1.0, cost.cutoff / way.distance)

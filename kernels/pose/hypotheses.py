@@ -32,15 +32,15 @@ class Track:
     before: wp.array[wp.transform]
     """(instance): estimate of the frame before [m]."""
     centroid: wp.array[wp.vec3]
-    """(instance): centroid of the points observed last [m]."""
+    """(instance): centroid of the points in the last frame whose estimate was taken [m]."""
     frames: wp.array[int]
     """(instance): number of frames with an estimate; 0: none yet."""
     cost: wp.array[float]
     """(instance): running mean of the costs of the estimates."""
     held: wp.array[int]
-    """(instance): number of consecutive frames, up to the last, whose estimate was not taken because its cost was too high."""
+    """(instance): number of frames since the last one whose estimate was taken."""
     correlation: wp.array[float]
-    """(instance): running mean of the correlation between image and base colours at the estimates; `NO_CORRELATION`: none yet."""
+    """(instance): running mean of the correlation between image and base colours, before turns; `NO_CORRELATION`: none yet."""
 
 
 @wp.struct
@@ -50,9 +50,9 @@ class TrackPolicy:
     min_points: int
     """Observed points with fewer than which an instance keeps its pose."""
     surprise: float
-    """Cost above the running mean with which an estimate is not taken ..."""
+    """Increase of the cost over its running mean above which an estimate is rejected."""
     patience: int
-    """... for at most this many consecutive frames."""
+    """Number of frames without an estimate after which any is taken, and its cost becomes the mean."""
     first_cost: float
     """Running mean at the start."""
 
@@ -94,7 +94,7 @@ def propose_motions_kernel(
 ):
     """Motion hypotheses: at rest; constant velocity; displaced as the centroid of the observed points.
 
-    A track that starts begins anew at its start pose, so that its cost is that of this pose and nothing is left of another track.
+    A track that starts begins anew at its start pose, so that nothing is left of another track.
     """
     instance = wp.tid()
     if starting[instance] != 0:
@@ -113,7 +113,7 @@ def propose_motions_kernel(
         turn = rotation * wp.quat_inverse(wp.transform_get_rotation(before))
         shift = position - wp.transform_get_translation(before)
         pose_out[first + 1] = wp.transform(position + shift, wp.normalize(turn * rotation))
-    if track_inout.frames[instance] > 0 and observation.points[instance] > 0:
+    if track_inout.frames[instance] > 0 and observation.points[instance] > 0 and track_inout.centroid[instance][2] > 0.0:
         shift = observation.centroid[instance] - track_inout.centroid[instance]
         pose_out[first + 2] = wp.transform(position + shift, rotation)
 
@@ -294,12 +294,17 @@ def update_tracks_kernel(
     if track_out.frames[instance] == 0:
         return
     track_out.before[instance] = track_out.pose[instance]
-    if observation.points[instance] < policy.min_points:
-        return
     mean = track_out.cost[instance]
-    if cost[instance] > mean + policy.surprise and track_out.held[instance] < policy.patience:
-        track_out.held[instance] = track_out.held[instance] + 1
+    held = track_out.held[instance]
+    surprising = cost[instance] > mean + policy.surprise
+    if observation.points[instance] < policy.min_points or (surprising and held < policy.patience):
+        track_out.held[instance] = held + 1
         return
+    # What has moved during several frames tells no velocity.
+    if held > 0:
+        track_out.before[instance] = pose[instance]
+    if surprising:
+        mean = cost[instance]
     track_out.held[instance] = 0
     track_out.pose[instance] = pose[instance]
     track_out.centroid[instance] = observation.centroid[instance]

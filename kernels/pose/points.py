@@ -11,7 +11,7 @@ NORMAL_REACH = wp.constant(2)
 MIN_NEIGHBOURS = wp.constant(6.0)
 """Smallest number of points of a plane fit."""
 MIN_SPREAD = wp.constant(1.0e-3)
-"""Smallest determinant of the points' covariance relative to that of uncorrelated axes; below, they lie on a line."""
+"""Smallest determinant of the points' covariance relative to that of uncorrelated axes, 1 - ρ²; below, they lie on a line."""
 MAX_SLOPE = wp.constant(6.0)
 """Largest change of distance along the ray per distance across it with which two pixels count as one surface: 80° of tilt."""
 
@@ -114,7 +114,7 @@ def sample_points_kernel(
     # Out:
     observation_out: Observation,
 ):
-    """Surface points: of n mask pixels in scanline order those whose rank r is the first with r capacity // n."""
+    """Surface points: of n mask pixels in scanline order those whose rank r is the first with r min(n, capacity) // n."""
     instance, row = wp.tid()
     rank = int(0)
     total = int(0)

@@ -32,14 +32,14 @@ class Models:
 
 @wp.struct
 class Cost:
-    """Scales and weights of the residuals."""
+    """Parameters of the robust losses: cutoffs, weights, and the stride with which points and samples are taken."""
 
     cutoff: float
-    """Distance from which a surface residual counts as an outlier (Tukey's biweight) [m]."""
+    """Distance from which a surface residual is an outlier (Tukey's biweight), and a silhouette residual grows linearly (Huber) [m]."""
     truncation: float
     """Distance at which the costs of hypotheses are truncated [m]."""
     margin: float
-    """Depth by which a model sample may lie in front of another surface without protruding [m]."""
+    """Depth by which a sample may lie in front of another surface without protruding, or behind its own and be visible [m]."""
     silhouette: float
     """Weight of silhouette residuals."""
     color: float

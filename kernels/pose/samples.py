@@ -22,8 +22,9 @@ class SampleView:
     state: int
     """HIDDEN, VISIBLE or PROTRUDING."""
     position: wp.vec3
+    """In the camera frame [m]."""
     normal: wp.vec3
-    """Camera frame [m]."""
+    """Unit normal in the camera frame."""
     crop: wp.vec2
     """Crop coordinates (column, row) relative to the centre of the first crop pixel [crop px]."""
     area: float
@@ -43,7 +44,7 @@ def view_sample(
     pose: wp.transform,
     sample: int,
 ) -> SampleView:
-    """Project a model sample and compare it with the label and depth of its pixel."""
+    """Visibility test of a model sample against the label and depth of its pixel."""
     result = SampleView()
     result.state = HIDDEN
     model = targets.model[instance]

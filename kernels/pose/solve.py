@@ -1,4 +1,4 @@
-"""Gauss-Newton steps on SE(3): damped normal equations solved by Cholesky factorization, and costs of hypotheses."""
+"""Gauss-Newton steps on SO(3) x R³: damped normal equations solved by Cholesky factorization, and costs of hypotheses."""
 
 import warp as wp
 
@@ -31,7 +31,7 @@ class StepLimits:
 
 @wp.func
 def solve_cholesky(matrix: wp.spatial_matrix, right: wp.spatial_vector) -> wp.spatial_vector:
-    """Solve a symmetric positive definite system by A = L Lᵀ; a pivot that vanishes leaves its unknown at 0."""
+    """Solve a symmetric positive definite system by A = L Lᵀ; pivots are at least `MIN_PIVOT`."""
     lower = wp.spatial_matrix()
     for j in range(6):
         pivot = matrix[j, j]
@@ -83,7 +83,7 @@ def pose_difference(target: wp.transform, start: wp.transform, radius: float) ->
 
 @wp.func
 def apply_step(pose: wp.transform, step: wp.spatial_vector, radius: float) -> wp.transform:
-    """Exponential map of a step about the object's origin, after the pose."""
+    """Retraction on SO(3) x R³: exp(w / ρ) times the rotation, v plus the translation; the object's origin is the pivot."""
     turn = wp.spatial_top(step) / radius
     angle = wp.length(turn)
     rotation = wp.transform_get_rotation(pose)
@@ -140,7 +140,10 @@ def score_poses_kernel(
     # Out:
     cost_out: wp.array[float],  # (pose)
 ):
-    """Cost of each hypothesis, 0 to about 2: (unexplained points + protruding samples) / observed area, + colour."""
+    """Cost of each hypothesis: truncated distances of points and protruding samples per observed area, + colour.
+
+    The colour term is between 0 and `color_cost`, which it is where too few samples show colour.
+    """
     index = wp.tid()
     if observation.points[index // hypotheses] == 0:
         cost_out[index] = UNSEEN

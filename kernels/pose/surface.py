@@ -30,8 +30,10 @@ class Match:
 def match_point(mesh: wp.uint64, local: wp.vec3, seen: wp.vec3, eye: wp.vec3, reach: float) -> Match:
     """Closest point of the mesh, if its triangle can be what the camera at `eye` sees; else the first hit of the camera's ray.
 
+    No match: no point of the mesh lies within `reach` [m], or the ray's first hit is nearer to the camera by more than that.
+
     The closest triangle is rejected if it faces away, or opposes the point's normal `seen`: the point then lies beyond the middle of a thin
-    part, and would be drawn to its back. Rejecting such points alone would leave those before the surface, and draw thin objects
+    part, and would be pulled to its back. Rejecting such points alone would leave those before the surface, and pull thin objects
     towards the camera.
     """
     result = Match()

@@ -38,14 +38,14 @@ class Templates:
 
 @wp.struct
 class Probes:
-    """Points that a template is compared at, in units of metres across the viewing direction of the crop's centre."""
+    """Points that a template is compared at, in metres across and along the viewing direction of the centroid."""
 
     inside: wp.array2d[wp.vec3]
     """(instance, probe): observed surface points: offset (x, y) from the centroid, and depth [m]."""
     insides: wp.array[int]
     """(instance): number of them."""
     outside: wp.array2d[wp.vec3]
-    """(instance, probe): points beside the mask, and the depth behind which the object may lie there [m]."""
+    """(instance, probe): points beside the mask: offset (x, y) from the centroid, and the depth seen there [m]."""
     outsides: wp.array[int]
     """(instance): number of them."""
     weight: wp.array[float]
@@ -56,7 +56,7 @@ class Probes:
 
 @wp.struct
 class Search:
-    """Grid of the search."""
+    """Search grid and loss."""
 
     turns: int
     """Turns about the optical axis."""
@@ -127,7 +127,7 @@ def sample_probes_kernel(
 
 @wp.struct
 class Placement:
-    """A template before an observation: direction, turn about the optical axis, and offset of the object's centre from the centroid."""
+    """Alignment of a template: direction, turn about the optical axis, and offset of the object's origin from the centroid."""
 
     model: int
     direction: int
@@ -259,9 +259,10 @@ def choose_directions_kernel(
     cost_inout: wp.array3d[float],  # (instance, direction, turn)
     pose_out: wp.array[wp.transform],  # (pose) [m]
 ):
-    """The best placements of an instance as poses: the best turn of each direction, and of these the best; used costs are overwritten.
+    """The best placements of an instance as poses, by greedy non-maximum suppression over turns; used costs are overwritten.
 
-    Where there are fewer, the best is repeated.
+    A placement suppresses turns of its direction within 60°. Where there are fewer, the best is repeated; without any, the pose is the
+    centroid without rotation.
     """
     instance = wp.tid()
     ray = probes.ray[instance]

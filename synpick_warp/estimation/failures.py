@@ -79,7 +79,7 @@ class _Window:
 
 
 def find_failures(truth: Truth, scores: Scores, estimates: PoseTable, count: int) -> list[Failure]:
-    """The worst instance of each object by ADD-S, worst first; misses with an estimate before those without.
+    """The worst instance of each object by ADD-S, worst first; an object's misses with an estimate before those without.
 
     Args:
         truth: Ground truth.
@@ -268,7 +268,7 @@ def _outline(image: Image, mask: np.ndarray, color: Color) -> None:
 def _color_residual(observed: np.ndarray, rendered: np.ndarray, mask: np.ndarray) -> Image:
     """Depth difference in colour: white 0, red the scene lies behind the estimate, blue before it; grey: only one of mask and estimate.
 
-    Pixels outside both are pale.
+    Pixels outside both, or without observed depth, are pale.
     """
     both = mask.astype(bool) & (rendered > 0.0) & (observed > 0.0)
     difference = np.clip((observed - rendered) / _RANGE, -1.0, 1.0)

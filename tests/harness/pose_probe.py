@@ -92,7 +92,7 @@ def view_samples_kernel(
     area_out[instance, k] = sample.area
     intrinsics = images.intrinsics[targets.view[instance]]
     if sample.area > 0.0:
-        way = way_to_mask(observation, instance, sample, intrinsics[0])
+        way = way_to_mask(observation, instance, sample, intrinsics)
         way_out[instance, k] = wp.vec4(way.direction[0], way.direction[1], way.direction[2], way.distance)
     if sample.state == VISIBLE and has_color(observation, instance, sample.crop):
         colored_out[instance, k] = 1

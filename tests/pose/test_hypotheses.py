@@ -269,17 +269,19 @@ def test_a_track_that_has_not_started_waits(device):
 
 
 def test_an_estimate_that_costs_too_much_waits_for_two_frames(device):
-    """Wrong masks are short; after `patience` frames it counts nevertheless."""
+    """Wrong masks are short; after `patience` frames it counts nevertheless, and is the new mean. Hidden instances wait, too."""
     tracks = Tracks(device, frames=3)
     for held in (1, 2):
         tracks.update(cost=0.75)
         assert np.array_equal(tracks.pose()[0], NOW)
-        assert tracks.state.held.numpy().tolist() == [held, 0]
+        assert tracks.state.held.numpy().tolist() == [held, held]
         assert tracks.state.frames.numpy().tolist() == [3, 3]
     tracks.update(cost=0.75)
     assert np.array_equal(tracks.pose()[0], tracks.new[0])
     assert tracks.state.held.numpy()[0] == 0
-    assert tracks.state.cost.numpy() == pytest.approx([0.3 + 0.2 * 0.45, 0.3])
+    assert tracks.state.cost.numpy() == pytest.approx([0.75, 0.3])
+    # What has moved during several frames tells no velocity.
+    assert np.array_equal(tracks.state.before.numpy()[0], tracks.new[0])
 
 
 def test_an_ordinary_cost_ends_the_wait(device):

@@ -24,12 +24,13 @@ APPROACH = Schedule(iterations=8, cutoffs=(0.03, 0.01), step=2, color=0.0)
 POLISH = Schedule(iterations=10, cutoffs=(0.01, 0.005), step=1, color=0.005)
 """Second refinement of a disturbed pose."""
 _NOISE_MARGIN, _NOISE_TRUNCATION, _NOISE_CUTOFF = 2.5, 1.5, 1.5
-"""Increase of the scales of residuals per standard deviation of the depth: nine of ten points then count as if there were no noise."""
+"""Increase of `CostScales.margin`, of `CostScales.truncation`, and of the last cutoff of a schedule, per standard deviation of the depth:
+nine of ten points then count as if there were no noise."""
 
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """What an estimator relies on."""
+    """Inputs and limits of an estimator."""
 
     color: bool = True
     """Use colour beside depth and masks."""
@@ -37,8 +38,8 @@ class PoseSettings:
     """Standard deviation of the depth [m]."""
     points: int = 256
     """Maximum surface points of an instance."""
-    min_points: int = 12
-    """Surface points below which an instance has no estimate."""
+    min_points: int = 16
+    """Surface points below which an instance has no estimate, and a track keeps its pose."""
 
 
 class EstimatorModels:
@@ -54,7 +55,7 @@ class EstimatorModels:
         self.settings, self.device = settings, device
         self.models: PoseModels = build_models(objects, device)
         self.detection = adapt(DetectSettings(), settings)
-        self.tracking = adapt(TrackSettings(), settings)
+        self.tracking = replace(adapt(TrackSettings(), settings), min_points=settings.min_points)
         noise, scales = settings.depth_noise, CostScales()
         self.scales = replace(
             scales, margin=scales.margin + _NOISE_MARGIN * noise, truncation=scales.truncation + _NOISE_TRUNCATION * noise
@@ -67,7 +68,7 @@ class EstimatorModels:
 
 
 class PoseEstimator:
-    """Estimates the poses of the instances of a table. Owns its arrays; host and device meet once in each batch."""
+    """Estimates the poses of the instances of a table. Owns its arrays; a batch goes to the device and back once."""
 
     def __init__(self, shared: EstimatorModels, instances: InstanceTable, height: int, width: int) -> None:
         """
@@ -112,13 +113,14 @@ class PoseEstimator:
         return self._run(batch, refine, lambda: (poses, refiner.cost))
 
     def start(self, pose: np.ndarray, rows: np.ndarray) -> None:
-        """Set the poses (N, 7) float32 of the rows (N,) bool, in the frame that the next `track` is given; others go on, or wait."""
+        """Set the poses (N, 7) float32 of the rows (N,) bool, in the frame that the next `track` is given; the others continue."""
         self._tracker.start(pose, rows)
 
     def track(self, batch: ViewBatch) -> Estimates:
         """Estimate the poses of all instances that were started from their last poses; called for every frame in turn.
 
-        An instance that shows too few points keeps its pose, and has no estimate.
+        An instance that shows too few points keeps its pose, and has no estimate. Where an estimate is rejected because it suddenly costs
+        too much, the pose is the kept one, and the score, which is low, that of the rejected one.
         """
         tracker = self._tracker
         result = self._run(batch, tracker.track, lambda: (tracker.track_state.pose, tracker.cost))

@@ -64,7 +64,7 @@ class PoseModels:
     """The struct `Turns`."""
     objects: tuple[ObjectModel, ...]
     diameters: np.ndarray
-    """Largest extent of each model about its centre (model) float64 [m]: twice the bounding sphere's radius."""
+    """Diameter of each model's bounding sphere about its origin (model) float64 [m]."""
     meshes: tuple[wp.Mesh, ...]
     """Owners of the meshes whose handles `models` holds."""
 
@@ -133,7 +133,7 @@ def sample_color(mesh: TriangleMesh, material: Material, uv: np.ndarray) -> np.n
     edge, other = flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0]
     uv_area = np.abs(edge[:, 0] * other[:, 1] - edge[:, 1] * other[:, 0]).sum()
     diameter = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
-    width = np.sqrt(area / max(uv_area, 1e-12)) / material.texture.shape[1]
+    width = np.sqrt(area / max(uv_area, 1e-12) / (material.texture.shape[0] * material.texture.shape[1]))
     levels = mip_levels(material.texture)
     level = levels[int(np.clip(np.floor(np.log2(max(diameter / TEXELS / width, 1.0))), 0, len(levels) - 1))]
     height, columns = level.shape[:2]
@@ -143,7 +143,7 @@ def sample_color(mesh: TriangleMesh, material: Material, uv: np.ndarray) -> np.n
 
 
 def shape_turns(points: np.ndarray) -> np.ndarray:
-    """Rotations about the centroid that keep a surface nearly in place: about its principal axes in steps, and flips of these.
+    """Near-symmetries: rotations about the centroid that keep a surface nearly in place, about principal axes in steps, and half turns.
 
     Args:
         points: Samples of the surface (S, 3).
@@ -160,6 +160,10 @@ def shape_turns(points: np.ndarray) -> np.ndarray:
     axes = np.linalg.svd(centered, full_matrices=False)[2]
     angles = np.deg2rad(np.arange(TURN_STEP, 360.0, TURN_STEP))
     candidates = [Rotation.from_rotvec(angle * axis) for axis in axes for angle in angles]
+    # Half turns about all axes across a principal one: where two principal moments are equal, their axes are arbitrary.
+    for first, second in ((0, 1), (1, 2), (2, 0)):
+        half = [np.pi * (np.cos(angle) * axes[first] + np.sin(angle) * axes[second]) for angle in angles[angles < np.pi]]
+        candidates += [Rotation.from_rotvec(vector) for vector in half]
     kept = [turn for turn in candidates if tree.query(turn.apply(probes))[0].mean() < spacing + TURN_TOLERANCE * size]
     flips = [turn for turn in kept if np.isclose(turn.magnitude(), np.pi)]
     rotations = [Rotation.identity(), *kept]

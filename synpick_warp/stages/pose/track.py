@@ -36,22 +36,22 @@ class TrackSettings:
     coarse: Schedule = COARSE
     fine: Schedule = FINE
     color: bool = True
-    """Use colour: in the fine refinement, to choose turns, and in costs."""
+    """Use colours to choose turns, and in costs; in refinements the schedules say so."""
     loyalty: float = 0.05
     """Relative cost by which a motion must be better than rest."""
     turn_gain: float = 0.1
-    """Correlation by which a turn must be better to become a hypothesis."""
+    """Correlation by which colours must fit worse than before for turns to be considered, and a turn better than the pose."""
     turn_loyalty: float = 0.15
     """Relative cost by which a turn must be better after refinement."""
-    min_points: int = 24
+    min_points: int = 16
+    """See `TrackPolicy`, as for the next three."""
     surprise: float = 0.4
     patience: int = 5
     first_cost: float = 0.5
-    """See `TrackPolicy`."""
 
 
 class Tracker:
-    """Tracks the instances of an observer. `start` and `track` only launch kernels."""
+    """Tracks the instances of an observer. `track` only launches kernels."""
 
     def __init__(self, models: PoseModels, observer: Observer, settings: TrackSettings, scales: CostScales) -> None:
         """
