@@ -17,8 +17,9 @@ import pytest
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing import pool as pool_module
-from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool, WriteTask, shared_bytes
+from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool, WriteTask
 from synpick_warp.exporters.writing.worker import NICENESS
+from synpick_warp.system.shared_memory import shared_bytes
 from tests.harness.environment import checkout_environment
 
 SIZE = 1 << 16
