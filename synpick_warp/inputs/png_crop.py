@@ -16,8 +16,10 @@ _GREY = (0, 0, 0, 0)
 """Colour type, compression, filter method and interlacing of greyscale (PNG specification, section 11.2.2)."""
 _NONE, _UP = b"\0", b"\2"
 """Filter types of the PNG specification, section 9.2."""
-_CHANGING = (b"tRNS", b"eXIf")
-"""Optional chunks by which a decoder may change an image: transparency, orientation."""
+_HARMLESS = (b"tEXt", b"pHYs", b"tIME")
+"""Optional chunks that are passed over; others may change the image, such as transparency, orientation or animation."""
+_PEEK = 512
+"""Compressed bytes from which the first row's filter is decoded before all others [B]."""
 
 
 def decode_grey_crop(data: bytes, size: tuple[int, int], rows: slice, columns: slice, bits: int = 8) -> np.ndarray | None:
@@ -40,6 +42,8 @@ def decode_grey_crop(data: bytes, size: tuple[int, int], rows: slice, columns: s
     itemsize = bits // 8
     stride = 1 + width * itemsize
     try:
+        if isal_zlib.decompressobj().decompress(stream[:_PEEK], max_length=1) not in (b"", _NONE, _UP):
+            return None
         raw = isal_zlib.decompressobj().decompress(stream, max_length=height * stride)
     except isal_zlib.error:
         return None
@@ -64,7 +68,8 @@ def _join_data(data: bytes, width: int, height: int, bits: int) -> bytes | None:
     """Compressed stream of a greyscale file of that size and bit depth; None: it is of another kind, or a checksum is wrong."""
     if len(data) < 33 or not data.startswith(_SIGNATURE) or data[12:16] != b"IHDR":
         return None
-    if struct.unpack_from(">IIBBBBB", data, 16) != (width, height, bits, *_GREY):
+    header = struct.unpack_from(">IIBBBBBI", data, 16)
+    if header != (width, height, bits, *_GREY, isal_zlib.crc32(data[12:29])):
         return None
     parts, place = [], 33
     while place + 12 <= len(data):
@@ -75,9 +80,7 @@ def _join_data(data: bytes, width: int, height: int, bits: int) -> bytes | None:
             if data[end : end + 4] != isal_zlib.crc32(data[place + 4 : end]).to_bytes(4, "big"):
                 return None
             parts.append(data[place + 8 : end])
-        elif kind[0] < ord("a"):  # Other chunks that a decoder must know, such as a palette, and the end.
+        elif kind not in _HARMLESS:
             return b"".join(parts) if kind == b"IEND" else None
-        elif kind in _CHANGING:
-            return None
         place = end + 4
     return None

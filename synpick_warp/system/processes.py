@@ -19,12 +19,17 @@ from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
 
+from synpick_warp.errors import SynpickError
 from synpick_warp.system.descriptors import duplicate_above_streams
 
 END_TIMEOUT = 10.0
 """How long an idle process may take to exit [s]."""
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 """The processes are the parallelism: libraries start no threads within them."""
+
+
+class ProcessError(SynpickError):
+    """Worker processes cannot be started, or one has died."""
 
 
 @dataclass(eq=False)
