@@ -13,7 +13,7 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
 from synpick_warp.exporters.writing.rle import find_run_boundaries
 from synpick_warp.inputs.image_files import decode_image
-from synpick_warp.inputs.png_crop import decode_grey_crop
+from synpick_warp.inputs.png_crop import _WIDE, decode_grey_crop
 
 SIZE = 70, 50
 """Width and height."""
@@ -63,6 +63,12 @@ def test_images_of_16_bits_equal_opencv():
         assert image.dtype == np.dtype("=u2")
         np.testing.assert_array_equal(image, depth)
     assert decode_grey_crop(encode_png(IMAGE), SIZE, ROWS, COLUMNS, bits=16) is None
+
+
+@pytest.mark.parametrize("width", [_WIDE // 2 - 1, _WIDE // 2, _WIDE])
+def test_narrow_and_wide_crops_are_the_same(width):
+    depth = np.random.default_rng(2).integers(0, 1 << 16, (9, width), dtype=np.uint16)
+    np.testing.assert_array_equal(decode_image(encode_png(depth), "depth.png", DatasetError), depth)
 
 
 def test_what_opencv_writes_is_equal_or_left_to_it():
