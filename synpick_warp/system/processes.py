@@ -14,7 +14,7 @@ import socket
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from typing import Any
@@ -63,7 +63,9 @@ class WorkerProcess:
         return f"was ended by {signal.Signals(-code).name}" if code and code < 0 else f"ended with exit code {code}", remedy
 
 
-def start_process(program: str, handles: Sequence[int] = (), inherited: Sequence[int] = ()) -> WorkerProcess:
+def start_process(
+    program: str, handles: Sequence[int] = (), inherited: Sequence[int] = (), environment: Mapping[str, str] = {}
+) -> WorkerProcess:
     """Start a process. Its standard output is the null device: nothing is printed there but by mistake, and it may be full or closed.
 
     Args:
@@ -71,6 +73,7 @@ def start_process(program: str, handles: Sequence[int] = (), inherited: Sequence
             name the module's own classes.
         handles: File handles that it uses; sys.argv[1] is the number of its link's handle, the following those of these.
         inherited: File handles that it keeps open until it exits, such as one that holds a lock.
+        environment: Environment variables that it has besides those of this process.
 
     Raises:
         OSError: Processes, memory or descriptors are used up.
@@ -87,7 +90,7 @@ def start_process(program: str, handles: Sequence[int] = (), inherited: Sequence
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=None if sys.__stderr__ is not None else subprocess.DEVNULL,
-            env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": paths},
+            env={**os.environ, **_ENVIRONMENT, **environment, "PYTHONPATH": paths},
             pass_fds=(theirs.fileno(), *handles, *passed),
             process_group=0,  # Ctrl-C in a terminal reaches the parent alone, even before the process ignores it.
         )
