@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,7 +56,7 @@ def estimate(
     seed: Annotated[WholeNumber, Parameter(help="Seed of disturbed starts and of noisy masks.")] = 0,
     batch: Annotated[WholeNumber, Parameter(help="Views that are estimated at a time; 0: as many as memory allows, up to 128.")] = 0,
     device: Annotated[str, Parameter(help="cpu, cuda:N, or auto: the first GPU if there is one.")] = "auto",
-    threads: Annotated[WholeNumber, Parameter(help="Threads that read images, and that gicp uses; 0: one per core.")] = 0,
+    threads: Annotated[WholeNumber, Parameter(help="Processes or threads that read images, threads of gicp; 0: one per core.")] = 0,
 ) -> int:
     """Estimate object poses, given the visible masks of the instances, and write a BOP result file for `eval`.
 
@@ -81,6 +82,7 @@ def run_method(data: Path, selection: Selection, options: Options, device: str, 
     from synpick_warp.cli.display import ViewCounter, make_console
     from synpick_warp.dataset.reading import open_data_set
     from synpick_warp.estimation import device as factories
+    from synpick_warp.estimation.decoder_pool import open_pool
     from synpick_warp.estimation.models import read_object_models
     from synpick_warp.estimation.run import list_targets, read_scenes, run_estimation
     from synpick_warp.estimation.selection import plan_scenes
@@ -90,13 +92,14 @@ def run_method(data: Path, selection: Selection, options: Options, device: str, 
 
     data_set = open_data_set(data)
     plans, complete = plan_scenes(data_set, selection)
-    with ViewCounter(make_console()) as counter:
-        scenes = read_scenes(data_set, plans, options, selection.targets, counter.report)
+    processes = open_pool(options.threads, sum(len(plan.frames) for plan in plans))
+    with processes or nullcontext() as pool, ViewCounter(make_console()) as counter:
+        scenes = read_scenes(data_set, plans, options, selection.targets, counter.report, pool)
         wanted = sorted({int(object_id) for scene in scenes for object_id in scene.object_ids[scene.asked.any(axis=0)]})
         models = read_object_models(data_set.folder, wanted)
         noise = factories.sensor_noise(data_set.config.depth_sensor, scenes) if options.depth == "sensor" else 0.0
         factory = factories.make_factory(options.method, models, device, options.threads, color=color, depth_noise=noise)
-        run = run_estimation(scenes, [model.object_id for model in models], factory, options, counter.report)
+        run = run_estimation(scenes, [model.object_id for model in models], factory, options, counter.report, pool)
     listed = None if complete else targets_file(out)
     if listed is not None:
         try:

@@ -5,6 +5,7 @@ What is read is checked once: annotations against their schemas, images against 
 
 from __future__ import annotations
 
+import os
 import tarfile
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -15,8 +16,8 @@ import numpy as np
 
 from synpick_warp.dataset.annotations import ADVICE, MASK_SCHEMA, SCENE_SCHEMAS, VIEW_SCHEMAS, check_json, read_checked
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import check_regular_file, describe_bytes
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image, read_image_file
+from synpick_warp.inputs.files import check_regular_file, describe_bytes, read_file_if_present
+from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image
 
 SUFFIXES = (".png", ".jpg")
 """File formats of images; colour may be either."""
@@ -276,8 +277,10 @@ def read_image(folder: Path, stem: str, flags: int = -1, size: tuple[int, int] |
     Raises:
         DatasetError: There is none, or OpenCV cannot decode it, or it has another size.
     """
+    base = f"{folder}{os.sep}{stem}"
     for suffix in SUFFIXES:
-        path = folder / f"{stem}{suffix}"
-        if path.exists():
-            return read_image_file(path, DatasetError, flags, size)
+        path = f"{base}{suffix}"
+        data = read_file_if_present(path, MAX_IMAGE_FILE, DatasetError)
+        if data is not None:
+            return decode_image(data, path, DatasetError, flags, size)
     raise DatasetError(f"there is no {folder / stem}.png or .jpg; the data set is not complete")

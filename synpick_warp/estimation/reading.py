@@ -1,26 +1,24 @@
-"""Prefetching reader: colour, depth and label images of many scenes side by side, decoded by threads; one frame of each scene a step.
+"""Prefetching reader: colour, depth and label images of many scenes side by side, decoded ahead; one frame of each scene a step.
 
-OpenCV and ISA-L decode without Python's global lock, so that threads run in parallel.
+Processes decode into shared memory. Threads of this process do where images are few: OpenCV and ISA-L decode without Python's global lock,
+but half of a view's time is Python.
 """
 
 from __future__ import annotations
 
+import mmap
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
-from typing import Self
+from typing import Any, Protocol, Self
 
 import cv2
-import numpy as np
 
-from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, check_planes
-from synpick_warp.errors import DatasetError
-from synpick_warp.estimation.mask_errors import disturb_labels
-from synpick_warp.estimation.scenes import ABSENT, Scene
-from synpick_warp.inputs.files import read_file
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
-from synpick_warp.inputs.png_crop import decode_grey_crop
+from synpick_warp.estimation.decoder import DecodeViews
+from synpick_warp.estimation.decoder_pool import DecoderPool, open_pool
+from synpick_warp.estimation.decoding import DecodeJob
+from synpick_warp.estimation.scenes import Scene
 from synpick_warp.stages.pose.batch import ViewBatch
 
 AHEAD = 2
@@ -29,36 +27,51 @@ BYTES_PER_PIXEL = 6
 """Of a view in a `ViewBatch`: colour, depth and label."""
 DEPTHS = {"clean": "depth", "sensor": "depth_sensor"}
 """Choices of depth images, and the folders they are in."""
-_MARGIN = 2
-"""Pixels around a visible box that are searched for its mask: conventions of boxes differ by one."""
+MAX_VIEWS_PER_TASK = 8
+"""Views of a message to a process: enough to make its cost small."""
+_TASKS_PER_PROCESS = 2
+"""Messages of a step per process, if it has enough views: small ones at the end keep all processes busy."""
 
 
 class SceneReader:
     """Reader of scenes of equal image size; iterate over its steps within `with`."""
 
     def __init__(
-        self, scenes: Sequence[Scene], depth: str = "clean", *, mask_seed: int | None = None, threads: int = 1, ahead: int = AHEAD
+        self,
+        scenes: Sequence[Scene],
+        depth: str = "clean",
+        *,
+        mask_seed: int | None = None,
+        threads: int = 1,
+        ahead: int = AHEAD,
+        pool: DecoderPool | None = None,
     ) -> None:
         """
         Args:
             scenes: Scenes that are read side by side.
             depth: Key of DEPTHS.
             mask_seed: Seed of mask errors; None: exact masks.
-            threads: Number of decoding threads.
+            threads: Number of decoding processes, or of threads if there are few images.
             ahead: Steps that are decoded ahead.
+            pool: Processes that decode, instead of own ones; the caller closes it.
+
+        Raises:
+            ProcessError: Processes cannot be started.
         """
         self.scenes = tuple(scenes)
         self.steps = max((len(scene) for scene in scenes), default=0)
-        self._depth, self._mask_seed, self._ahead = DEPTHS[depth], mask_seed, ahead
-        self._pool = ThreadPoolExecutor(max(1, threads), "read")
-        # Threads decode whole images each; OpenCV's own would only compete with them.
-        cv2.setNumThreads(1)
+        self._job = DecodeJob(self.scenes, DEPTHS[depth], mask_seed, min(self.steps, 1 + ahead))
+        self._own_pool = open_pool(threads, sum(map(len, scenes))) if pool is None else None
+        pool = pool or self._own_pool
+        self._source: _Source = _Threads(self._job, threads) if pool is None else _Processes(self._job, pool)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._source.close()
+        if self._own_pool is not None:
+            self._own_pool.close()
 
     def __iter__(self) -> Iterator[ViewBatch]:
         """Batches of step 0, 1, ...; view v shows the step's frame of scene v, or is zero in all images if that scene has ended.
@@ -69,21 +82,17 @@ class SceneReader:
 
         Raises:
             DatasetError: An image or mask is missing or damaged, or has another size.
+            ProcessError: A process died, or there is no memory.
         """
-        pending: deque[tuple[ViewBatch, list[Future[None]]]] = deque()
-        free = [self._allocate() for _ in range(min(self.steps, 1 + self._ahead))]
-        submitted = 0
-        for _ in range(self.steps):
-            while submitted < self.steps and free:
-                batch = free.pop()
-                jobs = [self._pool.submit(self._fill, batch, view, submitted) for view in range(len(self.scenes))]
-                pending.append((batch, jobs))
-                submitted += 1
-            batch, jobs = pending.popleft()
-            for job in jobs:
-                job.result()
-            yield batch
-            free.append(batch)
+        batches = self._source.open()
+        pending: deque[list[Future[Any]]] = deque()
+        for step in range(self.steps):
+            # The batch of the last step is free from now on.
+            for ahead in range(step + len(pending), min(self.steps, step + len(batches))):
+                pending.append(self._source.submit(ahead % len(batches), ahead))
+            for future in pending.popleft():
+                self._source.wait(future)
+            yield batches[step % len(batches)]
 
     def check(self, step: int) -> None:
         """Read the views of one step, to find out early that images or masks cannot be read. Raises as the iteration."""
@@ -92,84 +101,89 @@ class SceneReader:
             self._fill(batch, view, step)
 
     def _allocate(self) -> ViewBatch:
-        views = len(self.scenes)
-        width, height = self.scenes[0].size
-        return ViewBatch(
-            color=np.zeros((views, height, width, 3), np.uint8),
-            depth=np.zeros((views, height, width), np.uint16),
-            depth_scale=np.ones(views, np.float32),
-            label=np.zeros((views, height, width), np.uint8),
-            intrinsics=np.ones((views, 4), np.float32),
-        )
+        return _allocate(self._job)[0]
 
     def _fill(self, batch: ViewBatch, view: int, step: int) -> None:
-        """Task: decode the images of a view into the batch."""
-        scene = self.scenes[view]
-        if step >= len(scene):
-            if step - len(scene) <= self._ahead:  # Once for each of the batches, which come in turn.
-                batch.color[view], batch.depth[view], batch.label[view] = 0, 0, 0
-            return
-        frame = scene.plan.frames[step]
-        batch.intrinsics[view], batch.depth_scale[view] = scene.intrinsics[step], scene.depth_scale[step]
-        color = _read_image(scene.files, "rgb", frame, 3, "uint8")
-        cv2.cvtColor(color, cv2.COLOR_BGR2RGB, dst=batch.color[view])
-        batch.depth[view] = _read_image(scene.files, self._depth, frame, None, "uint16")
-        paint_label(scene, step, batch.label[view])
-        if self._mask_seed is not None:
-            plan = scene.plan
-            disturb_labels(batch.label[view], scene.boxes[step], scene.instances, self._mask_seed, plan.scene, plan.frames[step])
-        _hide(batch.label[view], np.flatnonzero((scene.index[step] != ABSENT) & ~scene.asked[step]))
+        self._job.fill_view(batch, view, step)
 
 
-def _read_image(files: SceneFiles, name: str, frame: int, channels: int | None, dtype: str) -> np.ndarray:
-    return check_planes(files.image(name, frame), channels, f"{name} of image {frame} in {files.place}", dtype)
+class _Source(Protocol):
+    """What decodes."""
+
+    def open(self) -> list[ViewBatch]:
+        """Allocate the batches."""
+        ...
+
+    def submit(self, batch: int, step: int) -> list[Future[Any]]:
+        """Begin to decode a step into a batch; returns the tasks' results to come."""
+        ...
+
+    def wait(self, future: Future[Any]) -> None:
+        """Block until a task is done; raises its error."""
+        ...
+
+    def close(self) -> None:
+        """Stop."""
+        ...
 
 
-def paint_label(scene: Scene, step: int, label: np.ndarray) -> None:
-    """Read the visible masks of a frame into a label image.
+class _Threads:
+    """`_Source` within this process: a view is a task."""
 
-    Args:
-        scene: The scene.
-        step: Index of the frame among the planned ones.
-        label: (H, W) uint8; becomes 0 for nothing, 1 + slot for the instance in that slot.
+    def __init__(self, job: DecodeJob, threads: int) -> None:
+        self._job, self._batches = job, []
+        self._pool = ThreadPoolExecutor(max(1, threads), "read")
+        # Threads decode whole images each; OpenCV's own would only compete with them.
+        cv2.setNumThreads(1)
 
-    Raises:
-        DatasetError: The data set has no masks, or one is missing or damaged.
-    """
-    label[:] = 0
-    shown = np.flatnonzero((scene.index[step] != ABSENT) & (scene.boxes[step, :, 2] >= 0))
-    frame = scene.plan.frames[step]
-    if isinstance(scene.files, SceneFolder):
-        if not (scene.files.folder / "mask_visib").is_dir():
-            raise DatasetError(f"{scene.files.folder} has no mask_visib; bake with bop.masks = true")
-        for slot in shown.tolist():
-            rows, columns = _crop(scene.boxes[step, slot], scene.size)
-            label[rows, columns][_read_mask(scene.files, frame, int(scene.index[step, slot]), scene.size, rows, columns)] = 1 + slot
-        return
-    masks = scene.files.masks("mask_visib", frame, int((scene.index[step] != ABSENT).sum()))
-    for slot in shown.tolist():
-        rows, columns = _crop(scene.boxes[step, slot], scene.size)
-        label[rows, columns][masks[scene.index[step, slot]][rows, columns]] = 1 + slot
+    def open(self) -> list[ViewBatch]:
+        """See `_Source`."""
+        self._batches = _allocate(self._job)
+        return self._batches
 
+    def submit(self, batch: int, step: int) -> list[Future[Any]]:
+        """See `_Source`."""
+        return [self._pool.submit(self._job.fill_view, self._batches[batch], view, step) for view in range(len(self._job.scenes))]
 
-def _hide(label: np.ndarray, slots: np.ndarray) -> None:
-    """Set the labels of slots to 0, in place."""
-    if len(slots):
-        table = np.arange(256, dtype=np.uint8)
-        table[1 + slots] = 0
-        cv2.LUT(label, table, dst=label)
+    def wait(self, future: Future[Any]) -> None:
+        """See `_Source`."""
+        future.result()
+
+    def close(self) -> None:
+        """See `_Source`."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _crop(box: np.ndarray, size: tuple[int, int]) -> tuple[slice, slice]:
-    """Rows and columns of a visible box x, y, width, height with a margin, within the image."""
-    x, y, width, height = box.tolist()
-    columns = slice(min(max(0, x - _MARGIN), size[0]), max(0, min(size[0], x + width + 1 + _MARGIN)))
-    rows = slice(min(max(0, y - _MARGIN), size[1]), max(0, min(size[1], y + height + 1 + _MARGIN)))
-    return slice(rows.start, max(rows.start, rows.stop)), slice(columns.start, max(columns.start, columns.stop))
+class _Processes:
+    """`_Source` in other processes: a few views are a task."""
+
+    def __init__(self, job: DecodeJob, pool: DecoderPool) -> None:
+        self._job, self._pool = job, pool
+        self._opening: list[Future[Any]] = []
+
+    def open(self) -> list[ViewBatch]:
+        """See `_Source`."""
+        batches, self._opening = self._pool.open_job(self._job)
+        return batches
+
+    def submit(self, batch: int, step: int) -> list[Future[Any]]:
+        """See `_Source`."""
+        views = len(self._job.scenes)
+        size = max(1, min(MAX_VIEWS_PER_TASK, -(-views // (_TASKS_PER_PROCESS * len(self._pool)))))
+        futures, self._opening = self._opening, []
+        # The same views go to the same process if it is free: it has read the index of their shards.
+        for index, first in enumerate(range(0, views, size)):
+            futures.append(self._pool.submit(DecodeViews(batch, step, first, min(views, first + size)), affinity=index))
+        return futures
+
+    def wait(self, future: Future[Any]) -> None:
+        """See `_Source`."""
+        self._pool.wait(future)
+
+    def close(self) -> None:
+        """See `_Source`. The pool goes on; what it still decodes is left to it."""
 
 
-def _read_mask(files: SceneFolder, frame: int, index: int, size: tuple[int, int], rows: slice, columns: slice) -> np.ndarray:
-    """Crop of a visible mask (rows, columns) bool."""
-    path = files.folder / "mask_visib" / f"{frame:06d}_{index:06d}.png"
-    crop = decode_grey_crop(read_file(path, MAX_IMAGE_FILE, DatasetError), size, rows, columns) if path.exists() else None
-    return files.mask("mask_visib", frame, index)[rows, columns] if crop is None else crop > 0
+def _allocate(job: DecodeJob) -> list[ViewBatch]:
+    """Batches of a job in memory of this process."""
+    return job.new_batches(mmap.mmap(-1, job.memory_bytes()))

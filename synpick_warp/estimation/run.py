@@ -11,6 +11,8 @@ import numpy as np
 
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
+from synpick_warp.estimation.decoder import ReadScene
+from synpick_warp.estimation.decoder_pool import DecoderPool
 from synpick_warp.estimation.methods import EstimatorFactory, Group, ask, estimate_frame, make_group, to_rotations
 from synpick_warp.estimation.reading import AHEAD, BYTES_PER_PIXEL, DEPTHS, SceneReader
 from synpick_warp.estimation.scenes import Scene, ScenePlan, group_scenes, read_scene
@@ -41,7 +43,7 @@ class Options:
     views: int = 0
     """Views at a time; 0: automatic."""
     threads: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
-    """Threads that decode images."""
+    """Processes that read scenes and images, or threads if there are few."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +63,12 @@ class Run:
 
 
 def read_scenes(
-    data_set: DataSet, plans: Sequence[ScenePlan], options: Options, targets: TargetList | None = None, report: Report = lambda *_: None
+    data_set: DataSet,
+    plans: Sequence[ScenePlan],
+    options: Options,
+    targets: TargetList | None = None,
+    report: Report = lambda *_: None,
+    pool: DecoderPool | None = None,
 ) -> list[Scene]:
     """Read the ground truth of scenes, and check that there are images to estimate on.
 
@@ -71,16 +78,20 @@ def read_scenes(
         options: Method and inputs.
         targets: Objects that count in each image; None: all.
         report: Observer.
+        pool: Processes that read; None: this one.
 
     Raises:
         DatasetError: A file is missing or damaged; there are no depth images or masks as they are asked; nothing is visible enough.
     """
     listed = None if targets is None else targets.objects
     scenes = []
-    for done, plan in enumerate(plans):
-        report("scenes", done, len(plans))
+    messages = (ReadScene(data_set.folder, plan) for plan in plans)
+    read = (read_scene(data_set, plan) for plan in plans) if pool is None else pool.map_ordered(messages)
+    report("scenes", 0, len(plans))
+    for plan, scene in zip(plans, read, strict=True):
         objects = [None if listed is None else listed[plan.scene, frame] for frame in plan.frames]
-        scenes.append(ask(read_scene(data_set, plan), options.method, options.min_visibility, objects))
+        scenes.append(ask(scene, options.method, options.min_visibility, objects))
+        report("scenes", len(scenes), len(plans))
     layer = DEPTHS[options.depth]
     for scene in scenes:
         if layer != "depth" and layer not in scene.files.layers():
@@ -119,7 +130,12 @@ def count_views(scenes: Sequence[Scene], views: int, free: int | None = None) ->
 
 
 def run_estimation(
-    scenes: Sequence[Scene], object_ids: Sequence[int], factory: EstimatorFactory, options: Options, report: Report = lambda *_: None
+    scenes: Sequence[Scene],
+    object_ids: Sequence[int],
+    factory: EstimatorFactory,
+    options: Options,
+    report: Report = lambda *_: None,
+    pool: DecoderPool | None = None,
 ) -> Run:
     """Estimate the poses of all instances that are asked.
 
@@ -129,6 +145,7 @@ def run_estimation(
         factory: Makes an estimator for each group of scenes.
         options: Method and inputs.
         report: Observer.
+        pool: Processes that decode images; None: as `SceneReader` chooses.
 
     Raises:
         DatasetError: An image or mask is missing or damaged, or has another size than the data set's.
@@ -145,7 +162,7 @@ def run_estimation(
         estimator = factory(group.table, height, width)
         collector.estimating += time.perf_counter() - clock
         seed = options.seed if options.noisy_masks else None
-        with SceneReader(group.scenes, options.depth, mask_seed=seed, threads=options.threads) as reader:
+        with SceneReader(group.scenes, options.depth, mask_seed=seed, threads=options.threads, pool=pool) as reader:
             clock = time.perf_counter()
             for step, batch in enumerate(reader):
                 ready = time.perf_counter()

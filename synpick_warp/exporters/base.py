@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import ClassVar, NamedTuple, Protocol
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.writing.pool import WriterPool, shared_bytes
+from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
+from synpick_warp.system.shared_memory import shared_bytes
 
 PIXEL_BYTES = (3, 2, 1, 4)
 """Bytes of a pixel of `FrameBatch`'s color, depth, instance and amodal."""

@@ -9,9 +9,11 @@ from pathlib import Path
 from synpick_warp.errors import SynpickError
 
 _FLAGS = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY
+_BLOCK = 1 << 20
+"""Read at a time after the stated size [bytes]."""
 
 
-def read_file(path: Path, limit: int, error: type[SynpickError]) -> bytes:
+def read_file(path: Path | str, limit: int, error: type[SynpickError]) -> bytes:
     """Read a regular file, or what a symbolic link to one names.
 
     Args:
@@ -22,18 +24,25 @@ def read_file(path: Path, limit: int, error: type[SynpickError]) -> bytes:
     Raises:
         SynpickError: As `error`, in one line: there is no such file, it is not a regular file, is too large, or cannot be read.
     """
+    data = read_file_if_present(path, limit, error)
+    if data is None:
+        raise error(f"there is no file {path}")
+    return data
+
+
+def read_file_if_present(path: Path | str, limit: int, error: type[SynpickError]) -> bytes | None:
+    """Read a regular file as `read_file`; None: there is no such file."""
     try:
         handle = os.open(path, _FLAGS)
     except FileNotFoundError:
-        raise error(f"there is no file {path}") from None
+        return None
     except (OSError, ValueError) as fault:  # ValueError: a name with a null byte.
         raise error(f"{path} cannot be read: {getattr(fault, 'strerror', None) or fault}") from None
     try:
         state = os.fstat(handle)
         if not stat.S_ISREG(state.st_mode):
             raise error(f"{path} is not a regular file")
-        with open(handle, "rb", closefd=False) as file:
-            data = file.read(limit + 1) if state.st_size <= limit else None
+        data = _read_all(handle, state.st_size, limit) if state.st_size <= limit else None
     except OSError as fault:
         raise error(f"{path} cannot be read: {fault.strerror}") from None
     finally:
@@ -41,6 +50,18 @@ def read_file(path: Path, limit: int, error: type[SynpickError]) -> bytes:
     if data is None or len(data) > limit:
         raise error(f"{path} is larger than {describe_bytes(limit)}, the limit for such files")
     return data
+
+
+def _read_all(handle: int, size: int, limit: int) -> bytes:
+    """Read to the end, or one byte more than `limit`: a file may be longer than the `size` that it has stated."""
+    data = os.read(handle, size + 1)
+    if len(data) == size:
+        return data
+    parts = [data]
+    while data and (left := limit + 1 - sum(map(len, parts))) > 0:
+        data = os.read(handle, min(left, _BLOCK))
+        parts.append(data)
+    return b"".join(parts)
 
 
 def check_regular_file(path: Path, limit: int, error: type[SynpickError]) -> None:

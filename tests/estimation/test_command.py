@@ -13,6 +13,7 @@ import pytest
 from synpick_warp.cli.commands import main
 from synpick_warp.cli.estimate import parse_indices
 from synpick_warp.errors import ConfigError
+from synpick_warp.estimation import decoder_pool
 from synpick_warp.estimation import device as factories
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import ShardsExporter
@@ -64,6 +65,27 @@ def test_tracks_are_scored(folder, tmp_path, capsys):
     row = score(folder, out)
     assert row["targets"] == 54
     assert 60.0 < row["ADD exact"] < 100.0
+
+
+def test_processes_and_threads_write_the_same(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(decoder_pool, "VIEWS_PER_PROCESS", 1)
+    tables = []
+    for threads in (1, 2):
+        out = tmp_path / f"{threads}.csv"
+        assert run(folder, "--method", "track", "--masks", "noisy", "--batch", 3, "--threads", threads, "--out", out) == 0
+        # The last column is time.
+        tables.append([line.rpartition(",")[0] for line in out.read_text().splitlines()])
+    assert tables[0] == tables[1]
+    assert len(tables[0]) > 40
+
+
+def test_an_image_that_is_damaged_ends_processes_in_one_line(bop, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(decoder_pool, "VIEWS_PER_PROCESS", 1)
+    path = bop / "train" / "000002" / "depth" / "000002.png"
+    path.write_bytes(path.read_bytes()[:70])
+    assert run(bop, "--method", "track", "--threads", 2, "--out", tmp_path / "a.csv") == 2
+    assert "000002.png is not an image that OpenCV can decode" in capsys.readouterr().err.splitlines()[-1]
+    assert not (tmp_path / "a.csv").exists()
 
 
 def test_some_images_have_a_target_list(folder, tmp_path, capsys):

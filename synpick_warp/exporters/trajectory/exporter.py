@@ -19,8 +19,9 @@ from synpick_warp.exporters.trajectory.episode import ROWS, EpisodeContent, Epis
 from synpick_warp.exporters.trajectory.spool import SPOOL_TICKS, batch_type, count_instances, fill_row, spool_bytes, write_rows
 from synpick_warp.exporters.trajectory.store import constant_places, write_constants
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
-from synpick_warp.exporters.writing.pool import WriterPool, shared_bytes
+from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.system.shared_memory import shared_bytes
 
 _FOLDER = "trajectory"
 """Folder in `PARTIAL`."""

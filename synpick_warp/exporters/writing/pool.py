@@ -5,18 +5,12 @@ from __future__ import annotations
 import contextlib
 import mmap
 import os
-import pickle
 import selectors
-import signal
-import socket
 import subprocess
-import sys
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -24,21 +18,17 @@ import numpy as np
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing.files import output_error
-from synpick_warp.exporters.writing.worker import Failure, SharedImage, TaskMessage, run_task
-from synpick_warp.system.descriptors import duplicate_above_streams, open_standard_descriptors
+from synpick_warp.exporters.writing.worker import Failure, TaskMessage, run_task
+from synpick_warp.system.descriptors import open_standard_descriptors
+from synpick_warp.system.processes import END_TIMEOUT, WorkerProcess, send, start_process
+from synpick_warp.system.shared_memory import SharedArray, allocate_shared_memory, shared_bytes
 
 _WORKER = "from synpick_warp.exporters.writing.worker import main; main()"
-"""Program of a writer process: imported, not run as `__main__`, so that pickled tasks name the module's own classes."""
+"""Program of a writer process."""
 QUEUE_DEPTH = 4
 """Tasks in flight per process, including the running one: enough to bridge the time in which the bake prepares the next batch."""
 PROCESSES_PER_COPY_THREAD = 4
 """Writer processes per thread that copies images into shared memory: one core cannot copy as fast as many cores write."""
-_ALIGNMENT = 64
-"""Images start at a multiple of a cache line [B]."""
-_END_TIMEOUT = 10.0
-"""How long an idle process may take to exit [s]."""
-_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
-"""The processes are the parallelism: libraries start no threads within them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,25 +60,10 @@ class _QueuedTask:
     """The thread's copy of the images in progress; None: they are in place."""
 
 
-@dataclass(eq=False)
-class _Worker:
-    process: subprocess.Popen[bytes]
-    link: Connection
-    tasks: deque[_QueuedTask] = field(default_factory=deque)
-    """Tasks sent to the process and not yet answered, in order."""
-
-
-def shared_bytes(sizes: Iterable[int]) -> int:
-    """Shared memory that images of these sizes take, with alignment [B]."""
-    return sum(-(-size // _ALIGNMENT) * _ALIGNMENT for size in sizes)
-
-
 class WriterPool:
     """Pool of writer processes with back-pressure. As a context manager it closes after success and aborts after an error.
 
-    Each process is a fresh interpreter started by `subprocess`: not forked, because CUDA and threads do not survive a fork, and not
-    spawned by `multiprocessing`, which would import the main script again, and with it the whole simulator (and fail for scripts
-    without `if __name__ == "__main__":`). The shared memory is anonymous, so nothing leaks however the bake ends.
+    The processes are fresh interpreters, and the shared memory is anonymous, so nothing leaks however the bake ends.
     """
 
     def __init__(self, processes: int, slot_bytes: int, inherited_handle: int | None = None) -> None:
@@ -106,7 +81,7 @@ class WriterPool:
         slots = max(1, processes * QUEUE_DEPTH)
         self._free = list(range(slots))
         self._waiting: deque[_QueuedTask] = deque()
-        self._workers: list[_Worker] = []
+        self._workers: list[WorkerProcess] = []
         self._links = selectors.DefaultSelector()
         self._failure: OutputError | None = None
         self._ended = False
@@ -114,12 +89,12 @@ class WriterPool:
         self._copy_threads = ThreadPoolExecutor(max(1, processes // PROCESSES_PER_COPY_THREAD))
         self._copies_inline = processes < 2 * PROCESSES_PER_COPY_THREAD
         try:
-            handle, self._memory = _allocate_shared_memory(slots * self._slot_bytes)
+            handle, self._memory = allocate_shared_memory(slots * self._slot_bytes)
         except OSError as error:
             raise OutputError(f"no shared memory for {processes} writer processes: {error}; set bake.writers lower") from error
         try:
             for _ in range(processes):
-                worker = _start_worker(handle, () if inherited_handle is None else (inherited_handle,))
+                worker = start_process(_WORKER, (handle,), () if inherited_handle is None else (inherited_handle,))
                 self._workers.append(worker)
                 self._links.register(worker.link, selectors.EVENT_READ, worker)
         except OSError as error:
@@ -184,9 +159,9 @@ class WriterPool:
         try:
             self.wait()
             for worker in self._workers:
-                _send(worker.link, None)
+                send(worker.link, None)
             for worker in self._workers:
-                worker.process.wait(_END_TIMEOUT)
+                worker.process.wait(END_TIMEOUT)
         except (OSError, subprocess.TimeoutExpired) as error:
             raise OutputError(f"a writer process did not end: {error}") from error
         finally:
@@ -196,9 +171,7 @@ class WriterPool:
         """Kill the processes. Never raises."""
         self._ended = True
         for worker in self._workers:
-            worker.process.kill()
-            worker.process.wait()
-            worker.link.close()
+            worker.kill()
         self._workers.clear()
         self._waiting.clear()
         self._links.close()
@@ -220,16 +193,16 @@ class WriterPool:
             self._progress(None)
         return self._free.pop()
 
-    def _copy_to_slot(self, images: Sequence[np.ndarray], slot: int | None) -> tuple[tuple[SharedImage, ...], Future[None] | None]:
+    def _copy_to_slot(self, images: Sequence[np.ndarray], slot: int | None) -> tuple[tuple[SharedArray, ...], Future[None] | None]:
         """Copy images into a slot of shared memory; returns their places, and the copy in progress if a thread makes it."""
         if slot is None:
             return (), None
         if (size := shared_bytes(image.nbytes for image in images)) > self._slot_bytes:
             raise ValueError(f"images of {size} bytes exceed the {self._slot_bytes} of a slot of this pool")
         offset = slot * self._slot_bytes
-        places: list[SharedImage] = []
+        places: list[SharedArray] = []
         for image in images:
-            places.append(SharedImage(offset, image.shape, image.dtype.str))
+            places.append(SharedArray(offset, image.shape, image.dtype.str))
             offset += shared_bytes((image.nbytes,))
         targets = [place.map(self._memory) for place in places]
         if self._copies_inline:
@@ -255,7 +228,7 @@ class WriterPool:
 
     def _receive_results(self, timeout: float | None) -> None:
         for key, _ in self._links.select(timeout):
-            worker: _Worker = key.data
+            worker: WorkerProcess = key.data
             try:
                 failure: Failure | None = worker.link.recv()
             except (EOFError, OSError):
@@ -273,7 +246,7 @@ class WriterPool:
             _await_copy(queued)
             worker.tasks.append(queued)
             try:
-                _send(worker.link, queued.message)
+                send(worker.link, queued.message)
             except OSError:
                 self._fail_dead_worker(worker)
 
@@ -290,15 +263,8 @@ class WriterPool:
         if queued.on_done is not None:
             queued.on_done()
 
-    def _fail_dead_worker(self, worker: _Worker) -> NoReturn:
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            worker.process.wait(_END_TIMEOUT)
-        code = worker.process.returncode
-        # The kernel's out-of-memory killer sends SIGKILL; any other end has left its reason on the standard error stream.
-        remedy = "see its message above, if any, and please report it"
-        if code == -signal.SIGKILL:
-            remedy = "if memory ran out, set bake.writers to a smaller number"
-        how = f"was ended by {signal.Signals(-code).name}" if code and code < 0 else f"ended with exit code {code}"
+    def _fail_dead_worker(self, worker: WorkerProcess) -> NoReturn:
+        how, remedy = worker.describe_end("bake.writers")
         activity = f"while it wrote {worker.tasks[0].path}" if worker.tasks else "while it had nothing to do"
         self._fail(OutputError(f"a writer process {how} {activity}; {remedy}"), "")
 
@@ -331,41 +297,3 @@ def _copy(targets: Sequence[np.ndarray], images: Sequence[np.ndarray]) -> None:
 def _await_copy(queued: _QueuedTask) -> None:
     if queued.copying is not None:
         queued.copying.result()
-
-
-def _send(link: Connection, message: TaskMessage | None) -> None:
-    """Send a message as bytes: `Connection.send` keeps a view of a BytesIO, on which CPython 3.12.1 crashes in a garbage collection if
-    the send fails and the error is part of a reference cycle."""
-    link.send_bytes(pickle.dumps(message))
-
-
-def _allocate_shared_memory(size: int) -> tuple[int, mmap.mmap]:
-    """Allocate anonymous shared memory (memfd): file handle and mapping. Unlike /dev/shm, containers do not limit its size."""
-    if hasattr(os, "memfd_create"):
-        handle = os.memfd_create("synpick-warp")
-    else:
-        with tempfile.TemporaryFile() as file:
-            handle = os.dup(file.fileno())
-    os.ftruncate(handle, size)
-    return handle, mmap.mmap(handle, size)
-
-
-def _start_worker(memory: int, inherited: tuple[int, ...]) -> _Worker:
-    """Start a process. Its standard output is the null device: nothing is printed there but by mistake, and it may be full or closed."""
-    ours, theirs = socket.socketpair()
-    with ours, theirs, contextlib.ExitStack() as copies:
-        # A lock that was taken while a standard stream was closed has that stream's number.
-        passed = tuple(map(duplicate_above_streams, inherited))
-        for handle in passed:
-            copies.callback(os.close, handle)
-        paths = os.pathsep.join(path or os.getcwd() for path in sys.path)
-        process = subprocess.Popen(
-            (sys.executable, "-P", "-c", _WORKER, str(theirs.fileno()), str(memory)),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=None if sys.__stderr__ is not None else subprocess.DEVNULL,
-            env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": paths},
-            pass_fds=(theirs.fileno(), memory, *passed),
-            process_group=0,  # Ctrl-C in a terminal reaches the bake alone, even before the process ignores it.
-        )
-        return _Worker(process, Connection(ours.detach()))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import mmap
 import os
-import signal
 import sys
 import traceback
 from collections.abc import Callable
@@ -12,26 +11,12 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-import numpy as np
-
 from synpick_warp.errors import SynpickError
+from synpick_warp.system.processes import serve
+from synpick_warp.system.shared_memory import SharedArray
 
 NICENESS = 10
 """Increment of the processes' niceness (nice(2)): when they keep all cores busy, the bake, which feeds them and the GPU, has priority."""
-
-
-@dataclass(frozen=True)
-class SharedImage:
-    """Descriptor of an image in the shared memory."""
-
-    offset: int
-    """First byte [B]."""
-    shape: tuple[int, ...]
-    dtype: str
-
-    def map(self, memory: mmap.mmap) -> np.ndarray:
-        """View of the image, without a copy."""
-        return np.ndarray(self.shape, np.dtype(self.dtype), memory, self.offset)
 
 
 @dataclass(frozen=True)
@@ -39,7 +24,7 @@ class TaskMessage:
     """Message to a writer process: call `function(*images, *arguments)`. Functions are pickled by name, so they are top-level ones."""
 
     function: Callable[..., None]
-    images: tuple[SharedImage, ...]
+    images: tuple[SharedArray, ...]
     arguments: tuple[Any, ...]
 
 
@@ -70,12 +55,6 @@ def run_task(task: TaskMessage, memory: mmap.mmap) -> Failure | None:
 
 def main() -> None:
     """Serve tasks from the socket with handle argv[1] on the memory with handle argv[2], until `None` arrives or the bake is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # The bake handles Ctrl-C.
     os.nice(NICENESS)
-    link = Connection(int(sys.argv[1]))
     memory = mmap.mmap(int(sys.argv[2]), 0)
-    try:
-        while (task := link.recv()) is not None:
-            link.send(run_task(task, memory))
-    except (EOFError, ConnectionError):
-        return  # The bake has ended; nobody is left to receive an answer.
+    serve(Connection(int(sys.argv[1])), lambda task: run_task(task, memory))

@@ -17,9 +17,11 @@ import pytest
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.writing import pool as pool_module
-from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool, WriteTask, shared_bytes
+from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool, WriteTask
 from synpick_warp.exporters.writing.worker import NICENESS
+from synpick_warp.system.shared_memory import shared_bytes
 from tests.harness.environment import checkout_environment
+from tests.harness.processes import wait_until_gone
 
 SIZE = 1 << 16
 
@@ -299,10 +301,7 @@ os.kill(os.getpid(), signal.SIGKILL)
     killed = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert killed.returncode == -signal.SIGKILL
     assert killed.stderr == ""
-    deadline = time.monotonic() + 30
-    while any(_alive(int(pid)) for pid in killed.stdout.split()):
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    wait_until_gone([int(pid) for pid in killed.stdout.split()])
 
 
 UNGUARDED_SCRIPT = """
@@ -323,11 +322,3 @@ def test_a_script_without_main_guard_can_use_the_pool(tmp_path):
     ran = subprocess.run(command, cwd=tmp_path, env=checkout_environment(), capture_output=True, text=True, timeout=60)
     assert (ran.returncode, ran.stderr, ran.stdout) == (0, "", "imported\n")
     assert [(tmp_path / name).read_text() for name in ("a", "b")] == ["x", "x"]
-
-
-def _alive(pid: int) -> bool:
-    """Whether a process runs; a zombie does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
