@@ -1,4 +1,4 @@
-"""Nearest-vertex search by a precomputed spatial subdivision: a grid whose cells list the vertices that can be nearest to a point in them.
+"""Exact nearest-neighbour search in a hierarchical grid (64³ root, 4³ branching) with a list of candidate vertices per leaf cell.
 
 A cell with a long list is divided into 4 x 4 x 4 cells, and so on. A vertex is left out of a cell's list only if the vertex that is nearest
 to the cell's centre is nearer everywhere in the cell, so that the search is exact: a query walks down to its cell and compares a handful

@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.visibility.camera import PIXEL_CENTER
+from synpick_warp.kernels.render.visibility.camera import camera_ray
 
 wp.set_module_options({"enable_backward": False})
 
@@ -91,9 +91,7 @@ class Observation:
 @wp.func
 def back_project(intrinsics: wp.vec4, row: int, column: int, depth: float) -> wp.vec3:
     """Point of the camera frame [m] at a pixel's centre and planar depth."""
-    x = (float(column) + PIXEL_CENTER - intrinsics[2]) / intrinsics[0]
-    y = (float(row) + PIXEL_CENTER - intrinsics[3]) / intrinsics[1]
-    return wp.vec3(x * depth, y * depth, depth)
+    return depth * camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
 
 
 @wp.func

@@ -17,9 +17,13 @@ TEMPLATE = wp.constant(48)
 TEMPLATE_MARGIN = wp.constant(1.05)
 """Width of a template relative to the object's diameter."""
 EMPTY = wp.constant(1.0e6)
-"""Depth of a template's pixel beside the object [m]."""
+"""Background value of a template's depth image [m]."""
 PROBED = wp.constant(2.0)
 """Width of the region around the crop whose pixels beside the mask are probed, in crops."""
+SUPPRESSED = wp.constant(6)
+"""A placement suppresses others of its direction within this part of a full turn: they converge to the same pose."""
+MIN_COVERED = wp.constant(0.5)
+"""Smallest fraction of the observed points on a template at a placement."""
 NO_COST = wp.constant(1.0e6)
 """Cost of a placement that is not possible."""
 
@@ -230,7 +234,7 @@ def search_templates_kernel(
     for k in range(shifts):
         place.x = float(k % side - search.shifts) * step
         place.y = float(k // side - search.shifts) * step
-        start = center_depth(templates, probes, place, instance, 0.0, EMPTY, 0.5 * float(count))
+        start = center_depth(templates, probes, place, instance, 0.0, EMPTY, MIN_COVERED * float(count))
         if start < EMPTY:
             depth = center_depth(templates, probes, place, instance, start, 2.0 * search.truncation, 1.0)
             if depth == EMPTY:
@@ -289,5 +293,5 @@ def choose_directions_kernel(
             for j in range(search.turns):
                 # One turn and its neighbours lead to the same pose; the opposite turns of a direction are another.
                 apart = wp.abs(j - turn)
-                if wp.min(apart, search.turns - apart) <= search.turns / 6:
+                if wp.min(apart, search.turns - apart) <= search.turns / SUPPRESSED:
                     cost_inout[instance, direction, j] = NO_COST

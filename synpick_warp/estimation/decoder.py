@@ -22,7 +22,7 @@ from synpick_warp.system.processes import serve
 
 
 class Decoder:
-    """State of the process: the job that was opened last, and its batches."""
+    """State of the process: the current job and its batches."""
 
     def __init__(self, link: Connection) -> None:
         self.link = link
@@ -34,13 +34,13 @@ class Message(Protocol):
     """Message to a decoder process; it is pickled, and answered by what `run` returns."""
 
     def run(self, decoder: Decoder) -> Any:
-        """Do it, in the process."""
+        """Execute the message in the decoder process."""
         ...
 
 
 @dataclass(frozen=True)
 class OpenJob:
-    """Message: take up a job. The handle of its memory follows on the link."""
+    """Message: open a job. The file descriptor of its shared memory follows on the link."""
 
     job: DecodeJob
 
@@ -93,7 +93,7 @@ class Answer:
 
 
 def answer(message: Message, decoder: Decoder) -> Answer:
-    """Run a message; errors become part of the answer, those that are no user's as a RuntimeError in one line."""
+    """Execute a message and catch its errors. User errors are returned as they are, unexpected ones as a RuntimeError of one line."""
     try:
         return Answer(message.run(decoder))
     except SynpickError as error:
@@ -109,7 +109,7 @@ def _open(folder: Path) -> DataSet:
 
 
 def main() -> None:
-    """Serve messages from the socket with handle argv[1] until the estimation ends the process, or is gone."""
+    """Serve messages from the socket with handle argv[1] until the parent ends the process or exits."""
     link = Connection(int(sys.argv[1]))
     decoder = Decoder(link)
     serve(link, lambda message: answer(message, decoder))

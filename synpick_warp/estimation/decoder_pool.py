@@ -1,4 +1,4 @@
-"""Decoder process pool: messages to the process with the fewest unanswered ones, batches in shared memory, errors raised in the caller.
+"""Decoder process pool: messages go to the least busy process, batches are in shared memory, errors raised in the caller.
 
 Python's global lock lets threads decode some 150 views/s, however many cores there are; processes have one each.
 """
@@ -26,13 +26,13 @@ _ENVIRONMENT = {"MALLOC_TRIM_THRESHOLD_": str(64 << 20), "MALLOC_MMAP_THRESHOLD_
 """glibc's allocator keeps the memory of freed images up to these sizes [B] (mallopt(3)). Otherwise the kernel takes it back, and clears it
 for the next image, which is a fifth of a view's time."""
 VIEWS_PER_PROCESS = 100
-"""Fewest views for which a process is started: starting one takes 0.3 s of CPU time, which decodes some 100 views of 640 x 360."""
+"""Minimum number of views per process: starting one takes 0.3 s of CPU time, which decodes some 100 views of 640 x 360."""
 _WINDOW = 2
 """Unanswered messages per process in `map_ordered`; answers are large."""
 
 
 def open_pool(threads: int, views: int) -> DecoderPool | None:
-    """Start a pool for a number of views; None: they are so few, or the threads, that reading within this process is faster.
+    """Start a pool sized for a number of views; None: with so few views or threads, reading in the calling process is faster.
 
     Raises:
         ProcessError: Processes cannot be started.
@@ -82,7 +82,7 @@ class DecoderPool:
         self._links.close()
 
     def open_job(self, job: DecodeJob) -> tuple[list[ViewBatch], list[Future[Any]]]:
-        """Let all processes take up a job; messages that follow refer to it.
+        """Open a job in all processes; later messages refer to it.
 
         Returns:
             Its batches, which lie in shared memory, and the answers to come.
@@ -111,7 +111,7 @@ class DecoderPool:
         return batches, futures
 
     def submit(self, message: Message, affinity: int = 0) -> Future[Any]:
-        """Send a message to the process with the fewest unanswered ones.
+        """Send a message to the process with the fewest pending answers.
 
         Args:
             message: The message; it is pickled.
@@ -131,7 +131,7 @@ class DecoderPool:
         return _expect(worker)
 
     def map_ordered(self, messages: Iterable[Message]) -> Iterator[Any]:
-        """Answers to messages, in their order; a few are sent ahead. Raises as `wait`."""
+        """Answers to messages, in order; some are sent ahead. Raises the errors of `wait`."""
         pending: deque[Future[Any]] = deque()
         for message in messages:
             pending.append(self.submit(message))
@@ -152,7 +152,7 @@ class DecoderPool:
         return future.result()
 
     def _receive(self, timeout: float | None) -> None:
-        """Take the answers that have come; a timeout of None blocks until there is one."""
+        """Receive available answers; a timeout of None blocks until there is one."""
         for key, _ in self._links.select(timeout):
             worker: WorkerProcess = key.data
             try:
@@ -172,7 +172,7 @@ class DecoderPool:
 
 
 def _expect(worker: WorkerProcess) -> Future[Any]:
-    """Record that a message was sent; returns its answer to come."""
+    """Record a sent message; returns its pending answer."""
     future: Future[Any] = Future()
     worker.tasks.append(future)
     return future

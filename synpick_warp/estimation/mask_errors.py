@@ -60,9 +60,9 @@ def swap_masks(label: np.ndarray, first: int, second: int) -> None:
 
 
 def resize_mask(label: np.ndarray, slot: int, *, grow: bool) -> None:
-    """Dilate or erode a slot's mask by RADIUS, in place (threshold of the Euclidean distance transform).
+    """Dilate or erode a slot's mask in place, by thresholding the Euclidean distance transform at RADIUS times the root of the area.
 
-    Dilation takes pixels from whatever lies there, as a segmentation does; erosion leaves at least the innermost pixels.
+    Dilation overwrites neighbouring masks; erosion keeps at least the innermost pixels.
     """
     mask = (label == 1 + slot).view(np.uint8)
     left, top, width, height = cv2.boundingRect(mask)

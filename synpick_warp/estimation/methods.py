@@ -1,4 +1,4 @@
-"""Protocols of pose estimation: what an estimator is given in each frame, and which frames and instances are estimated.
+"""Evaluation protocols of pose estimation: initialization and input of each method, and the frames and instances it estimates.
 
 `single`: nothing but the frame. `refine` and `gicp`: the truth, disturbed. `track`: the truth in an instance's first frame, afterwards its
 own estimate, without restart (ICG's protocol). All are given the visible masks of the instances.
@@ -24,7 +24,7 @@ SPARSE = 20
 
 
 class Estimator(Protocol):
-    """Estimator of the poses of an `InstanceTable`. A method needs `estimate`, `refine`, or `start` and `track` only."""
+    """Pose estimator of an `InstanceTable`: `estimate` serves single, `refine` refine and gicp, `start` and `track` track."""
 
     def estimate(self, batch: ViewBatch) -> Estimates:
         """Estimate poses from one frame."""
@@ -35,11 +35,11 @@ class Estimator(Protocol):
         ...
 
     def start(self, pose: np.ndarray, rows: np.ndarray) -> None:
-        """Set the poses (N, 7) float32 of the rows (N,) bool, in the frame that the next `track` is given; others go on, or wait."""
+        """Set the poses (N, 7) float32 of the rows (N,) bool, in the frame of the next `track`; other tracks are unaffected."""
         ...
 
     def track(self, batch: ViewBatch) -> Estimates:
-        """Estimate the poses of all instances that were started from their last poses; called for every frame in turn."""
+        """Update all started tracks with the next frame."""
         ...
 
 
@@ -52,9 +52,9 @@ class FrameTruth:
     """Ground truth of the N instances of a group in one step."""
 
     asked: np.ndarray
-    """Whether the instance is estimated (N,) bool."""
+    """Mask of the instances to estimate (N,) bool."""
     starting: np.ndarray
-    """Whether its track starts (N,) bool."""
+    """Mask of the instances whose tracks start (N,) bool."""
     poses: np.ndarray
     """Object to camera (N, 4, 4) float64 [m]; the identity where not asked."""
 
@@ -83,7 +83,7 @@ class Group:
 
 
 def make_group(scenes: Sequence[Scene], object_ids: Sequence[int]) -> Group:
-    """List the instances of scenes that are asked in any frame, by scene, then by slot.
+    """List the instances that are to be estimated in any frame, by scene, then by slot.
 
     Args:
         scenes: The scenes.
@@ -105,7 +105,7 @@ def make_group(scenes: Sequence[Scene], object_ids: Sequence[int]) -> Group:
 
 
 def ask(scene: Scene, method: str, min_visibility: float, objects: Sequence[frozenset[int] | None]) -> Scene:
-    """Choose which instances are estimated in which frames.
+    """Select the instances to estimate in each frame.
 
     Tracks are asked in all frames from the first one on in which the instance is visible enough, as long as the image has it. Other
     methods are asked where it is visible enough, and of an object that counts.
@@ -156,7 +156,7 @@ def estimate_frame(method: str, estimator: Estimator, batch: ViewBatch, group: G
 
 
 def _disturb(truth: FrameTruth, group: Group, step: int, seed: int) -> np.ndarray:
-    """Disturbed true poses (N, 4, 4) of the instances that are asked; the identity for others."""
+    """Perturbed ground-truth poses (N, 4, 4) of the instances to estimate; the identity for others."""
     poses = truth.poses.copy()
     for view, scene in enumerate(group.scenes):
         rows = np.flatnonzero(truth.asked & (group.table.view == view))

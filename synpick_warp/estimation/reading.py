@@ -95,7 +95,11 @@ class SceneReader:
             yield batches[step % len(batches)]
 
     def check(self, step: int) -> None:
-        """Read the views of one step, to find out early that images or masks cannot be read. Raises as the iteration."""
+        """Read the views of one step, so that missing or damaged images are found early.
+
+        Raises:
+            DatasetError: See `__iter__`.
+        """
         batch = self._allocate()
         for view in range(len(self.scenes)):
             self._fill(batch, view, step)

@@ -12,12 +12,12 @@ from synpick_warp.estimation.scenes import ScenePlan
 from synpick_warp.evaluation.targets import TargetList
 
 MAX_LISTED = 10
-"""Most values that a message lists."""
+"""Maximum number of values that a message lists."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Which images are estimated; None: all."""
+    """Filters of the images to estimate; None: no filter."""
 
     modes: tuple[str, ...] | None = None
     cameras: tuple[int, ...] | None = None

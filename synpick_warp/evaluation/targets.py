@@ -22,7 +22,7 @@ _Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 
 
 class Target(msgspec.Struct, frozen=True, order=True, omit_defaults=True):
-    """Object of an image. `inst_count` is written, and not used: the ground truth has it."""
+    """Entry of a target list. `inst_count` is written but not read, since the ground truth has it."""
 
     scene_id: _Index
     im_id: _Index
@@ -33,14 +33,14 @@ class Target(msgspec.Struct, frozen=True, order=True, omit_defaults=True):
 
 @dataclass(frozen=True)
 class TargetList:
-    """Targets of a file."""
+    """Target list read from a file."""
 
     path: Path
     targets: tuple[Target, ...]
 
     @cached_property
     def objects(self) -> dict[tuple[int, int], frozenset[int] | None]:
-        """(scene, image) -> obj_ids that count; None: all."""
+        """(scene, image) -> obj_ids of the targets; None: all objects."""
         found: dict[tuple[int, int], set[int] | None] = {}
         for target in self.targets:
             known = found.setdefault((target.scene_id, target.im_id), set())
@@ -69,7 +69,7 @@ def encode_targets(targets: Sequence[Target]) -> bytes:
 
 
 def count_targets(rows: Sequence[tuple[int, int, int]]) -> list[Target]:
-    """Targets of instances, each given by scene, image and obj_id."""
+    """Count instances, given as (scene, image, obj_id), per target."""
     return [Target(scene, image, object_id, count) for (scene, image, object_id), count in Counter(rows).items()]
 
 

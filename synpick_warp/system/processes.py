@@ -34,15 +34,15 @@ class ProcessError(SynpickError):
 
 @dataclass(eq=False)
 class WorkerProcess:
-    """A running process, as its parent holds it."""
+    """Handle of a running worker process."""
 
     process: subprocess.Popen[bytes]
     link: Connection
     tasks: deque[Any] = field(default_factory=deque)
-    """The parent's records of messages that were sent and not yet answered, in order."""
+    """Pending requests, oldest first: one record per message without an answer."""
 
     def kill(self) -> None:
-        """End the process at once, and wait until it has ended."""
+        """Kill the process and wait for its exit."""
         self.process.kill()
         self.process.wait()
         self.link.close()
@@ -66,7 +66,7 @@ class WorkerProcess:
 def start_process(
     program: str, handles: Sequence[int] = (), inherited: Sequence[int] = (), environment: Mapping[str, str] = {}
 ) -> WorkerProcess:
-    """Start a process. Its standard output is the null device: nothing is printed there but by mistake, and it may be full or closed.
+    """Start a process. Its standard output is the null device, since the inherited one may be full or closed.
 
     Args:
         program: Python code that imports and calls the main function. It is imported, not run as `__main__`, so that pickled messages
@@ -104,7 +104,7 @@ def send(link: Connection, message: Any) -> None:
 
 
 def serve(link: Connection, answer: Callable[[Any], Any]) -> None:
-    """Main loop of a worker process: answer messages until `None` arrives or the parent is gone. SIGINT is left to the parent."""
+    """Main loop of a worker process: answer messages until `None` arrives or the parent exits. SIGINT is ignored; the parent handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         while (message := link.recv()) is not None:

@@ -63,8 +63,7 @@ def test_the_hard_preset_is_the_test_preset_with_fuller_faster_shinier_totes():
 
 
 def test_no_two_presets_to_evaluate_on_or_to_train_on_share_random_numbers():
-    """A stream's key is mix(mix(seed + γ) ^ episode + γ) at first, and mix is a bijection: keys meet only if seeds' keys agree above the
-    bits of episodes."""
+    """Streams of two seeds can coincide only if mix(seed + γ) agrees in the bits above the episode index, as mix is a bijection."""
     configs = [load_config(name) for name in ("synpick", "synpick-test", "synpick-hard")]
     assert [config.bop.split.split("_")[0] for config in configs] == ["train", "test", "test"]
     keys = [int(rng.mix(np.uint64((config.bake.seed + int(rng.GAMMA)) % 2**64))) >> EPISODE_BITS for config in configs]

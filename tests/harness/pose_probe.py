@@ -26,7 +26,7 @@ def solve_kernel(
     right: wp.array[wp.spatial_vector],
     result_out: wp.array[wp.spatial_vector],
 ):
-    """Solutions of 6 x 6 systems."""
+    """Cholesky solutions of 6 x 6 systems."""
     i = wp.tid()
     result_out[i] = solve_cholesky(matrix[i], right[i])
 
@@ -40,7 +40,7 @@ def step_kernel(
     back_out: wp.array[wp.spatial_vector],
     log_out: wp.array[wp.vec3],
 ):
-    """Stepped poses, the steps that lead there from the poses, and the logarithms of the stepped poses' rotations."""
+    """Apply steps to poses: new poses, the differences from the old ones, and the rotation vectors of the new ones."""
     i = wp.tid()
     moved = apply_step(pose[i], step[i], radius)
     pose_out[i] = moved
@@ -58,7 +58,7 @@ def residual_kernel(
     line_out: wp.array[wp.spatial_vector],
     weight_out: wp.array[float],
 ):
-    """Jacobians of points' motions, and Tukey weights of their x."""
+    """Jacobian of each point's motion, and the Tukey weight of its x coordinate taken as a residual."""
     i = wp.tid()
     line_out[i] = jacobian(point[i], origin, direction[i], radius)
     weight_out[i] = tukey_weight(point[i][0], cutoff)
@@ -82,7 +82,7 @@ def view_samples_kernel(
     color_out: wp.array2d[wp.vec3],
     line_out: wp.array2d[wp.vec3],
 ):
-    """Samples of the instances' models: what `view_sample` finds, the way to the mask (direction, distance), colour, gradient of red."""
+    """Evaluate `view_sample` for every model sample, with its silhouette offset (direction, distance), colour and gradient of red."""
     instance, k = wp.tid()
     sample = view_sample(models, images, targets, observation, cost, instance, pose[instance], k)
     state_out[instance, k] = sample.state
@@ -106,7 +106,7 @@ OUTPUTS |= {"colored": int, "color": wp.vec3, "line": wp.vec3}
 
 
 def view_samples(models: PoseModels, cost: Any, observer: Observer, pose: np.ndarray) -> dict[str, np.ndarray]:
-    """What `view_samples_kernel` writes (instance, sample, ...) for poses (N, 7)."""
+    """Outputs of `view_samples_kernel` by name (instance, sample, ...), for poses (N, 7)."""
     shape = (observer.instances, models.models.position.shape[1])
     outputs = {name: wp.zeros(shape, dtype=kind, device=observer.device) for name, kind in OUTPUTS.items()}
     poses = wp.array(np.atleast_2d(pose).astype(np.float32), dtype=wp.transform, device=observer.device)
@@ -116,7 +116,7 @@ def view_samples(models: PoseModels, cost: Any, observer: Observer, pose: np.nda
 
 
 class Normals:
-    """Normal equations of poses, from observed points and from model samples, apart; one hypothesis per instance."""
+    """Normal equations of one hypothesis per instance: from observed points, or from model samples."""
 
     def __init__(self, models: PoseModels, observer: Observer) -> None:
         self.models, self.observer, self.device = models, observer, observer.device
@@ -126,7 +126,7 @@ class Normals:
         self.even_light(1.0)
 
     def even_light(self, intensity: float) -> None:
-        """Set the light to b = 0 and this b₀."""
+        """Set uniform light: b = 0, with the given b₀."""
         shape = self.lighting.coefficients.shape
         self.lighting.coefficients.assign(np.tile(np.array([0.0, 0.0, 0.0, intensity], np.float32), (*shape, 1)))
 
@@ -150,7 +150,7 @@ class Normals:
         return self._read("hessian", "gradient", "samples")
 
     def step(self, pose: np.ndarray, limits: Any, prior: np.ndarray | None = None) -> np.ndarray:
-        """Poses (N, 7) after a step with the sums accumulated last."""
+        """Poses (N, 7) after one Gauss-Newton step with the sums accumulated last."""
         poses, observer = self.poses(pose), self.observer
         start = self.poses(pose if prior is None else prior)
         inputs = [self.models.models, limits, observer.targets, observer.observation, self.sums, start, 1]

@@ -208,7 +208,7 @@ def test_the_least_cost_wins_unless_the_first_is_nearly_as_good(device, costs, l
 
 
 def policy(min_points: int = 12) -> TrackPolicy:
-    """Estimates that cost 0.4 more than usual are not taken, for two frames."""
+    """Policy of the tests: a cost rise above 0.4 rejects an estimate, for at most two frames."""
     result = TrackPolicy()
     result.min_points, result.surprise, result.patience, result.first_cost = min_points, 0.4, 2, 0.5
     return result

@@ -95,7 +95,7 @@ def test_the_gradient_is_that_of_the_sum_of_squares(device, name, seed):
     """Central differences of ½ Σ area distance² by brute force in float64; a step moves the mesh."""
     mesh, points = MESHES[name], Points(device, MESHES[name])
     pose = POSE.copy()
-    # Towards the points, so that none gets to lie behind the surface.
+    # The surface moves towards the points, so that none ends up behind it.
     pose[:3] += (0.001, -0.002, 0.004)
     seen = points.put(*around(mesh, 60, seed))
     found = points.sums(pose)

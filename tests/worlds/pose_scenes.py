@@ -14,7 +14,7 @@ from tests.worlds.pose_views import embedded, pose_of, rendered, table_of
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Views of instances with known poses."""
+    """Rendered frames of objects with known poses."""
 
     objects: tuple[ObjectModel, ...]
     frames: tuple[ViewBatch, ...]
@@ -25,17 +25,17 @@ class Scene:
 
 
 def select(batch: ViewBatch, views: slice | list[int]) -> ViewBatch:
-    """Some views of a batch."""
+    """Subset of the views of a batch."""
     return ViewBatch(**{name: array[views] for name, array in vars(batch).items()})
 
 
 def without(batch: ViewBatch, slot: int) -> ViewBatch:
-    """The same images without the mask of a slot."""
+    """Copy of a batch in which the mask of one slot is removed."""
     return ViewBatch(**(vars(batch) | {"label": np.where(batch.label == slot + 1, 0, batch.label).astype(np.uint8)}))
 
 
 def card(x: float) -> np.ndarray:
-    """Pose of the flat carton (obj_id 7) that passes at 0.4 m before the mug."""
+    """Pose of the flat carton (obj_id 7), the occluder that passes in front of the mug at a depth of 0.4 m."""
     return pose_of((x, 0.075, 0.4), Rotation.from_euler("xz", [5.0, 90.0], degrees=True))
 
 

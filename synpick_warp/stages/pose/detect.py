@@ -7,10 +7,9 @@ from typing import Any
 
 import warp as wp
 
-from synpick_warp.kernels.pose.hypotheses import choose_poses_kernel
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
-from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule
+from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule, choose_poses
 from synpick_warp.stages.pose.templates import SearchSettings, TemplateSearch
 from synpick_warp.stages.pose.turns import TurnSearch
 
@@ -66,13 +65,9 @@ class Detector:
         self.search.search(self.many_pose)
         self.many.refine(self.many_pose, settings.coarse)
         cost = self.many.score(self.many_pose, color=settings.color)
-        self._choose(self.many_pose, cost, settings.hypotheses, 0.0)
+        choose_poses(self.many_pose, cost, settings.hypotheses, 0.0, [self.best, self.cost], self.device)
         self.no_memory.fill_(1.0e3)
         self.turns.propose(self.best, self.no_memory, settings.turn_gain, self.pair_pose, color=settings.color)
         self.pair.refine(self.pair_pose, settings.fine)
         cost = self.pair.score(self.pair_pose, color=settings.color)
-        self._choose(self.pair_pose, cost, self.turns.hypotheses, settings.turn_loyalty)
-
-    def _choose(self, pose: wp.array, cost: wp.array, hypotheses: int, loyalty: float) -> None:
-        inputs, outputs = [pose, cost, hypotheses, loyalty], [self.best, self.cost]
-        wp.launch(choose_poses_kernel, dim=self.observer.instances, inputs=inputs, outputs=outputs, device=self.device)
+        choose_poses(self.pair_pose, cost, self.turns.hypotheses, settings.turn_loyalty, [self.best, self.cost], self.device)

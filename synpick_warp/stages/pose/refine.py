@@ -9,6 +9,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.appearance import accumulate_samples_kernel
+from synpick_warp.kernels.pose.hypotheses import choose_poses_kernel
 from synpick_warp.kernels.pose.lighting import CHANNELS, Lighting, accumulate_lighting_kernel, fit_lighting_kernel
 from synpick_warp.kernels.pose.residuals import LANES, Cost, Sums
 from synpick_warp.kernels.pose.solve import StepLimits, score_poses_kernel, step_poses_kernel
@@ -118,3 +119,17 @@ def make_cost(scales: CostScales, cutoff: float, step: int, color: float) -> Any
     for name in ("truncation", "margin", "silhouette", "color_cutoff", "color_cost"):
         setattr(cost, name, getattr(scales, name))
     return cost
+
+
+def choose_poses(pose: wp.array, cost: wp.array, hypotheses: int, loyalty: float, out: list[wp.array], device: wp.Device) -> None:
+    """Choose the hypothesis of least cost for each instance.
+
+    Args:
+        pose: Hypotheses (pose).
+        cost: Their costs (pose) float32.
+        hypotheses: Hypotheses per instance.
+        loyalty: Relative cost by which another hypothesis must be better than the first.
+        out: Pose and cost (instance) of the chosen ones; written.
+        device: Device of the arrays.
+    """
+    wp.launch(choose_poses_kernel, dim=len(pose) // hypotheses, inputs=[pose, cost, hypotheses, loyalty], outputs=out, device=device)

@@ -12,13 +12,12 @@ from synpick_warp.kernels.pose.hypotheses import (
     MOTIONS,
     Track,
     TrackPolicy,
-    choose_poses_kernel,
     propose_motions_kernel,
     update_tracks_kernel,
 )
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
-from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule
+from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule, choose_poses
 from synpick_warp.stages.pose.turns import TurnSearch
 
 TRACK = struct_arrays(Track, "instance", units={"pose": "m", "before": "m", "centroid": "m"})
@@ -91,15 +90,11 @@ class Tracker:
         wp.launch(propose_motions_kernel, dim=n, inputs=inputs, outputs=[self.motion_pose], device=device)
         self.motions.refine(self.motion_pose, settings.coarse)
         cost = self.motions.score(self.motion_pose, color=settings.color)
-        self._choose(self.motion_pose, cost, int(MOTIONS), settings.loyalty)
+        choose_poses(self.motion_pose, cost, int(MOTIONS), settings.loyalty, [self.best, self.cost], self.device)
         self.turns.propose(self.best, state.correlation, settings.turn_gain, self.pair_pose, color=settings.color)
         self.pair.refine(self.pair_pose, settings.fine)
         cost = self.pair.score(self.pair_pose, color=settings.color)
-        self._choose(self.pair_pose, cost, self.turns.hypotheses, settings.turn_loyalty)
+        choose_poses(self.pair_pose, cost, self.turns.hypotheses, settings.turn_loyalty, [self.best, self.cost], self.device)
         inputs = [self.policy, observation, self.best, self.cost, self.start_pose, self.starting]
         wp.launch(update_tracks_kernel, dim=n, inputs=inputs, outputs=[state], device=device)
         self.starting.zero_()
-
-    def _choose(self, pose: wp.array, cost: wp.array, hypotheses: int, loyalty: float) -> None:
-        inputs, outputs = [pose, cost, hypotheses, loyalty], [self.best, self.cost]
-        wp.launch(choose_poses_kernel, dim=self.observer.instances, inputs=inputs, outputs=outputs, device=self.device)
