@@ -149,7 +149,7 @@ class SceneShards:
         if missing := set(range(count)) - set(records):
             raise DatasetError(f"{source} has no mask {min(missing)}, but there are {count} instances; {ADVICE}")
         for index in range(count):
-            _check_run_lengths(records[index], self.size, f"{source}, mask {index},")
+            check_run_lengths(records[index], self.size, f"{source}, mask {index},")
         return [decode_run_lengths(records[index]["counts"], records[index]["size"]) for index in range(count)]
 
     def layers(self) -> set[str]:
@@ -221,7 +221,7 @@ def _check_records(parts: list[Any], place: Path, frame: int) -> ViewRecords:
     return ViewRecords(camera, gt, info)
 
 
-def _check_run_lengths(record: Mapping[str, Any], size: tuple[int, int], source: str) -> None:
+def check_run_lengths(record: Mapping[str, Any], size: tuple[int, int], source: str) -> None:
     """Check that run lengths cover an image of that width and height exactly."""
     height, width = record["size"]
     if (width, height) != size:
