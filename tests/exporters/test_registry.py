@@ -103,4 +103,6 @@ def test_views_and_physics_are_needed_if_one_exporter_needs_them():
         (False, False),
         (True, True),
     ]
-    assert [one.needs_views for one in load_exporter_classes(FORMATS)] == [name in ("bop", "shards") for name in registry.EXPORTERS]
+    assert [one.needs_views for one in load_exporter_classes(FORMATS)] == [
+        name in ("bop", "shards", "lerobot") for name in registry.EXPORTERS
+    ]
