@@ -1,4 +1,4 @@
-"""Command line: bake, verify, merge, preview, explain, eval, estimate, doctor, config. User errors: one line on stderr, exit code 2."""
+"""Command line: bake, verify, merge, preview, explain, eval, estimate, convert, doctor, config. A user error is one line; exit code 2."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import cyclopts
 from cyclopts import App, Parameter
 
 from synpick_warp import __version__
+from synpick_warp.cli.convert import convert
 from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
 from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard
@@ -229,6 +230,7 @@ def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
 
 app.command(evaluate, name="eval")
 app.command(estimate)
+app.command(convert)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

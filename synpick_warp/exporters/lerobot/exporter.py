@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
@@ -86,14 +86,8 @@ class LerobotExporter:
         self._staging = context.out / PARTIAL / FOLDER.name
         self._episodes: dict[int, _Episode] = {}
         self._arrangements = 0
-        camera = context.cameras[0]
-        self._settings = EpisodeSettings(
-            out=context.out,
-            cameras=len(context.cameras),
-            size=(camera.width, camera.height),
-            rate=video_rate(context.config),
-            objects={entry.obj_id: entry.name for entry in context.catalog.entries},
-        )
+        objects = {entry.obj_id: entry.name for entry in context.catalog.entries}
+        self._settings = episode_settings(context.config, context.out, objects)
 
     @staticmethod
     def slot_bytes(config: Config) -> int:
@@ -137,7 +131,7 @@ class LerobotExporter:
         for world in range(len(batch)):
             index = int(batch.episode[world])
             episode = self._episodes.get(index) or self._stage_episode(index)
-            episode.ticks += _make_tick(batch, world).tobytes()
+            episode.ticks += make_tick(batch, world).tobytes()
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """See `Exporter`."""
@@ -153,8 +147,7 @@ class LerobotExporter:
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: part and videos."""
-        places = [part_path(episode), *(video_path(camera, episode) for camera in range(self._settings.cameras))]
-        return sorted(place for place in places if os.path.lexists(self._context.out / place))
+        return episode_files(self._context.out, episode, self._settings.cameras)
 
     def close(self) -> None:
         """See `Exporter`."""
@@ -222,6 +215,17 @@ class LerobotExporter:
         )
 
 
+def episode_settings(config: Config, out: Path, objects: Mapping[int, str]) -> EpisodeSettings:
+    """Settings of the tasks of all episodes; `objects`: obj_id -> name."""
+    return EpisodeSettings(out, len(config.cameras.positions), config.cameras.resolution, video_rate(config), objects)
+
+
+def episode_files(out: Path, episode: int, cameras: int) -> list[Path]:
+    """Committed files of an episode: part and videos, relative to the data set, sorted."""
+    places = [part_path(episode), *(video_path(camera, episode) for camera in range(cameras))]
+    return sorted(place for place in places if os.path.lexists(out / place))
+
+
 def make_content(end: EpisodeEnd, ticks: bytes) -> EpisodeContent:
     """What the part of an episode is made of."""
     row = end.row
@@ -230,7 +234,7 @@ def make_content(end: EpisodeEnd, ticks: bytes) -> EpisodeContent:
     )
 
 
-def _make_tick(batch: TickBatch, world: int) -> np.ndarray:
+def make_tick(batch: TickBatch, world: int) -> np.ndarray:
     """One world's tick, as a row of `TICK`."""
     row = np.zeros((), TICK)
     row["pose"] = batch.fixture_pose[world, _CUP]

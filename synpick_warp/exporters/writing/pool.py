@@ -152,6 +152,12 @@ class WriterPool:
         while self._waiting or any(worker.tasks for worker in self._workers):
             self._progress(None)
 
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        """Block until a condition holds that callbacks make true, or no task is left. Raises like `submit`."""
+        self._check()
+        while not condition() and (self._waiting or any(worker.tasks for worker in self._workers)):
+            self._progress(None)
+
     def close(self) -> None:
         """Wait until every task is done, then stop the processes. Raises like `submit`; the processes stop in any case."""
         if self._ended:
