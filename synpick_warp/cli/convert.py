@@ -15,14 +15,14 @@ def convert(
     folder: Annotated[Path, Parameter(name="DIR", help="A data set; its committed episodes are converted.")],
     /,
     *,
-    to: Annotated[str, Parameter(help="Formats to write, joined by commas: bop, shards, usd, lerobot.")],
+    to: Annotated[str, Parameter(help="Formats to write, joined by commas: bop, shards, usd, lerobot, coco.")],
     out: Annotated[Path, Parameter(help="Folder of the converted data set: new, empty, or of an interrupted conversion.")],
     processes: Annotated[WholeNumber, Parameter(help="Processes that convert; 0: one per core.")] = 0,
 ) -> int:
     """Convert a data set to other formats. After an interruption, the same command resumes with the remaining episodes.
 
-    Sources: shards and bop need the other of the two; usd needs zarr; lerobot needs zarr, and bop or shards. Files are those that a
-    bake would have written, but for LeRobot's videos from JPEG images. Exit codes: 0, converted; 2, an error.
+    Sources: shards and bop need the other of the two; usd needs zarr; coco needs bop or shards; lerobot needs zarr, and bop or shards.
+    Files are those that a bake would have written, but for LeRobot's videos from JPEG images. Exit codes: 0, converted; 2, an error.
     """
     if not 0 <= processes <= 1024:
         raise ConfigError(f"--processes is {processes}; allowed: 0 to 1024")

@@ -12,16 +12,18 @@ from fractions import Fraction
 from pathlib import Path
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.conversion.scenes import SceneContent, SceneSource, place_shards, write_scene, write_shards, write_video_group
+from synpick_warp.conversion.scenes import SceneContent, SceneSource, place_shards, write_coco, write_scene, write_shards, write_video_group
 from synpick_warp.conversion.source import Source, SourceEpisode
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import ExportContext
+from synpick_warp.exporters.bop import coco
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS
 from synpick_warp.exporters.bop.shard_parts import find_shards
 from synpick_warp.exporters.registry import Exporters
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.scenes.types import Catalog, EnvironmentMap
 
 Done = Callable[[], None]
 
@@ -168,21 +170,53 @@ class BopConverter(_SceneConverter):
         self.submit_all(tasks, lambda: self.pool.submit(commit_scenes, (), (moves, settings), path=self.split, on_done=on_committed))
 
 
+class CocoConverter(_SceneConverter):
+    """To COCO: images are copied."""
+
+    def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
+        super().__init__(source, out, config, pool)
+        if not config.bop.masks:
+            raise DatasetError(f"{source.folder} has no masks, which COCO needs; bake it with bop.masks = true")
+
+    @property
+    def split(self) -> Path:
+        """See base class."""
+        return self.out / coco.FOLDER
+
+    def write_constants(self) -> list[Path]:
+        """See base class."""
+        data = self.source.data
+        if data.has_store:
+            names = {item.object_id: item.name for item in data.objects}
+        else:
+            names = {entry.obj_id: entry.name for entry in load_assets(self.source)[0].entries}
+        coco.write_categories(self.out, names)
+        return [coco.CATEGORIES]
+
+    def files(self, episode: int) -> list[Path]:
+        """See `Exporter`."""
+        return coco.scene_files(self.out, self.scene_ids(episode))
+
+    def convert(self, episode: SourceEpisode, on_committed: Done) -> None:
+        """See base class."""
+        folder = self.stage("coco", episode)
+        scenes = episode.scenes()
+        staged = tuple((folder / f"{scene.scene:06d}", scene.scene) for scene in scenes)
+        tasks = [(write_coco, (scene, place), place) for scene, (place, _) in zip(scenes, staged, strict=True)]
+        arguments = (staged, self.out)
+        self.submit_all(tasks, lambda: self.pool.submit(coco.commit_scenes, (), arguments, path=self.split, on_done=on_committed))
+
+
 class UsdConverter(Converter):
     """To USD, from the trajectories; objects and lights are loaded again, and compared with the source's."""
 
     def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
         super().__init__(source, out, config, pool)
-        from synpick_warp.dataset.digests import digest_inputs
         from synpick_warp.exporters.usd.exporter import UsdExporter
         from synpick_warp.scenes.cameras import make_cameras
-        from synpick_warp.scenes.catalog import load_catalog
-        from synpick_warp.scenes.lights import load_lights
 
         source.data.require_store()
-        catalog, lights = load_catalog(config), load_lights(config.bake.lights)
-        if digest_inputs(catalog, lights) != source.inputs:
-            raise DatasetError(f"the objects or lights of {source.folder} have changed since its bake, and USD needs them; restore them")
+        catalog, lights = load_assets(source)
         self._exporter = UsdExporter(ExportContext(out, config, catalog, make_cameras(config.cameras), lights, pool))
 
     def write_constants(self) -> list[Path]:
@@ -236,11 +270,28 @@ class LerobotConverter(Converter):
         self.submit_all(tasks, lambda: self.pool.submit(commit_episode, (), arguments, path=place, on_done=on_committed))
 
 
+def load_assets(source: Source) -> tuple[Catalog, tuple[EnvironmentMap, ...]]:
+    """Load the objects and lights of a data set again.
+
+    Raises:
+        DatasetError: They are not those that it was baked from.
+    """
+    from synpick_warp.dataset.digests import digest_inputs
+    from synpick_warp.scenes.catalog import load_catalog
+    from synpick_warp.scenes.lights import load_lights
+
+    catalog, lights = load_catalog(source.config), load_lights(source.config.bake.lights)
+    if digest_inputs(catalog, lights) != source.inputs:
+        raise DatasetError(f"the objects or lights of {source.folder} have changed since its bake, but are needed; restore them")
+    return catalog, lights
+
+
 CONVERTERS: dict[str, type[Converter]] = {
     "bop": BopConverter,
     "shards": ShardsConverter,
     "usd": UsdConverter,
     "lerobot": LerobotConverter,
+    "coco": CocoConverter,
 }
 """Format -> converter."""
 

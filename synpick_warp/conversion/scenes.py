@@ -17,6 +17,7 @@ import numpy as np
 from synpick_warp.conversion.masks import read_masks
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, SceneShards, ViewRecords, check_planes
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.bop.coco import make_annotations, write_image
 from synpick_warp.exporters.bop.scene import create_scene_folders
 from synpick_warp.exporters.bop.shard_parts import END_OF_ARCHIVE, MAX_SHARD_VIEWS, mask_json, shard_name, tar_entry, view_key
 from synpick_warp.exporters.bop.view import (
@@ -135,6 +136,19 @@ def write_video_group(source: SceneSource, first: int, rate: Fraction, path: Pat
         levels += count_levels(color)
         planes.append(split_planes(color))
     write_group(planes, levels, rate, path)
+
+
+def write_coco(source: SceneSource, staging: Path) -> None:
+    """Task: write the images and annotations of a COCO scene to a staging folder, which it creates."""
+    files = source.open()
+    staging.mkdir()
+    width, height = source.size
+    for frame in range(source.frames):
+        suffix, data = files.image_file("rgb", frame)
+        records = files.records(frame)
+        masks = read_masks(files, frame, records.gt_info, source.size)
+        object_ids, instance_ids = ([row[key] for row in records.gt] for key in ("obj_id", "instance_id"))
+        write_image(staging, frame, suffix, data, make_annotations(object_ids, instance_ids, records.gt_info, masks, height, width))
 
 
 def place_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int) -> None:

@@ -30,6 +30,7 @@ EXPORTERS = {
     "usd": ("usd.exporter", "UsdExporter"),
     "zarr": ("trajectory.exporter", "TrajectoryExporter"),
     "lerobot": ("lerobot.exporter", "LerobotExporter"),
+    "coco": ("bop.coco", "CocoExporter"),
 }
 """Format -> (module in this package, class in it). Modules are imported when their format is used."""
 

@@ -39,6 +39,7 @@ def sets(tmp_path_factory) -> dict[str, Path]:
         "bop": settings("bop"),
         "lerobot": settings("lerobot"),
         "usd": settings("usd"),
+        "coco": settings("coco"),
         "jpg": settings("bop", jpg=True),
         "jpg shards": settings("shards", jpg=True),
     }
@@ -67,6 +68,8 @@ def run(source: Path, out: Path, *formats: str, report=lambda *_: None):
         ("shards", ("bop",), "bop"),
         ("source", ("lerobot",), "lerobot"),
         ("source", ("usd",), "usd"),
+        ("source", ("coco",), "coco"),
+        ("shards", ("coco",), "coco"),
         ("jpg", ("shards",), "jpg shards"),
         ("jpg shards", ("bop",), "jpg"),
     ],
@@ -127,7 +130,7 @@ def test_episodes_that_delivered_nothing_stay_in_the_lists(sets, tmp_path):
 @pytest.mark.parametrize(
     ("source", "formats", "error", "message"),
     [
-        ("source", ("zarr",), ConfigError, "allowed: bop, shards, usd, lerobot; no other format has the physics"),
+        ("source", ("zarr",), ConfigError, "allowed: bop, shards, usd, lerobot, coco; no other format has the physics"),
         ("source", ("hdf5",), ConfigError, "--to names hdf5; allowed"),
         ("source", ("bop",), ConfigError, "has already"),
         ("usd", ("shards",), DatasetError, "has no images"),

@@ -104,5 +104,5 @@ def test_views_and_physics_are_needed_if_one_exporter_needs_them():
         (True, True),
     ]
     assert [one.needs_views for one in load_exporter_classes(FORMATS)] == [
-        name in ("bop", "shards", "lerobot") for name in registry.EXPORTERS
+        name in ("bop", "shards", "lerobot", "coco") for name in registry.EXPORTERS
     ]
