@@ -159,18 +159,32 @@ def shape_turns(points: np.ndarray) -> np.ndarray:
     spacing = tree.query(probes, k=2)[0][:, 1].mean()
     axes = np.linalg.svd(centered, full_matrices=False)[2]
     angles = np.deg2rad(np.arange(TURN_STEP, 360.0, TURN_STEP))
-    candidates = [Rotation.from_rotvec(angle * axis) for axis in axes for angle in angles]
+    vectors = [angle * axis for axis in axes for angle in angles]
     # Half turns about all axes across a principal one: where two principal moments are equal, their axes are arbitrary.
     for first, second in ((0, 1), (1, 2), (2, 0)):
-        half = [np.pi * (np.cos(angle) * axes[first] + np.sin(angle) * axes[second]) for angle in angles[angles < np.pi]]
-        candidates += [Rotation.from_rotvec(vector) for vector in half]
-    kept = [turn for turn in candidates if tree.query(turn.apply(probes))[0].mean() < spacing + TURN_TOLERANCE * size]
-    flips = [turn for turn in kept if np.isclose(turn.magnitude(), np.pi)]
-    rotations = [Rotation.identity(), *kept]
-    for turn in kept:
-        rotations += [flip * turn for flip in flips]
-    unique: list[Rotation] = []
-    for turn in rotations:
-        if all((turn * other.inv()).magnitude() > np.deg2rad(TURN_STEP) / 2.0 for other in unique):
-            unique.append(turn)
-    return np.array([turn.as_quat() for turn in unique[:MAX_TURNS]], np.float32)
+        vectors += [np.pi * (np.cos(angle) * axes[first] + np.sin(angle) * axes[second]) for angle in angles[angles < np.pi]]
+    candidates = Rotation.from_rotvec(vectors)
+    distances = tree.query(np.einsum("tij,pj->tpi", candidates.as_matrix(), probes))[0]
+    kept = candidates[distances.mean(axis=1) < spacing + TURN_TOLERANCE * size]
+    flips = kept[np.isclose(kept.magnitude(), np.pi)]
+    rotations = [Rotation.identity().as_quat()[None], kept.as_quat()]
+    rotations += [(flips * turn).as_quat() for turn in kept if len(flips)]
+    return distinct_rotations(np.concatenate(rotations), np.deg2rad(TURN_STEP) / 2.0, MAX_TURNS).astype(np.float32)
+
+
+def distinct_rotations(quaternions: np.ndarray, angle: float, limit: int) -> np.ndarray:
+    """Non-maximum suppression of rotations in their order: each one kept is farther than `angle` [rad] from those kept before it.
+
+    Args:
+        quaternions: Unit quaternions (N, 4), the best first.
+        angle: Smallest angle between two that are kept [rad].
+        limit: Maximum number that is kept.
+    """
+    kept = np.empty((0, 4))
+    for quaternion in quaternions:
+        # Opposite quaternions are one rotation.
+        if (np.abs(kept @ quaternion) < np.cos(angle / 2.0)).all():
+            kept = np.concatenate((kept, quaternion[None]))
+            if len(kept) == limit:
+                break
+    return kept
