@@ -81,7 +81,7 @@ def run_method(data: Path, selection: Selection, options: Options, device: str, 
     """Estimate, and write the files; returns the run, and the file of targets if it was written."""
     from synpick_warp.cli.display import ViewCounter, make_console
     from synpick_warp.dataset.reading import open_data_set
-    from synpick_warp.estimation import device as factories
+    from synpick_warp.estimation import factories
     from synpick_warp.estimation.decoder_pool import open_pool
     from synpick_warp.estimation.models import read_object_models
     from synpick_warp.estimation.run import list_targets, read_scenes, run_estimation

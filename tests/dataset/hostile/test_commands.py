@@ -21,7 +21,7 @@ from synpick_warp.cli.commands import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import SynpickError
-from synpick_warp.estimation import device as factories
+from synpick_warp.estimation import factories
 from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.pipeline import run_bake
