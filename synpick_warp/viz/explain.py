@@ -15,6 +15,7 @@ import numpy as np
 
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import bop_folder
 from synpick_warp.dataset.annotations import SCENE_SCHEMAS, Key, ModelDiameter, read_checked
 from synpick_warp.dataset.view_files import read_image
 from synpick_warp.errors import DatasetError
@@ -124,7 +125,7 @@ def _fits(expected: float, size: float, config: Config) -> bool:
 
 
 def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
-    split = path_inside(dataset, config.bop.split, dataset / "config.toml", DatasetError)
+    split = path_inside(dataset, bop_folder(config, attempt.episode), dataset / "config.toml", DatasetError)
     scene = split / f"{len(config.cameras.positions) * attempt.episode:06d}"
     stem = f"{attempt.frame:06d}"
     truth = read_checked(scene / "scene_gt.json", SCENE_SCHEMAS["gt"]).get(attempt.frame)
