@@ -1,4 +1,4 @@
-"""Command line: bake, verify, merge, preview, explain, eval, estimate, doctor, config. User errors: one line on stderr, exit code 2."""
+"""Command line: bake, verify, merge, preview, explain, eval, estimate, stats, doctor, config. User errors: one line, exit code 2."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from synpick_warp import __version__
 from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
 from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard, parse_splits
+from synpick_warp.cli.statistics import show_statistics
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
@@ -238,6 +239,7 @@ def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
 
 app.command(evaluate, name="eval")
 app.command(estimate)
+app.command(show_statistics, name="stats")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

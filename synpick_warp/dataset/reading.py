@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from synpick_warp.configs.check import format_value
-from synpick_warp.configs.splits import bop_folder, bop_folders, episode_range
+from synpick_warp.configs.splits import bop_folder, bop_folders, episode_range, plan_episodes
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
 from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
 from synpick_warp.dataset.trajectory import (
@@ -303,6 +303,11 @@ class DataSet(Mapping[int, Episode]):
         if name not in self.splits:
             raise DatasetError(f"{self.folder} has no split {format_value(name)}; splits: {', '.join(self.splits) or 'none'}")
         return self.splits[name]
+
+    @cached_property
+    def planned(self) -> int:
+        """Number of episodes that the settings plan."""
+        return sum(len(each) for each in plan_episodes(self.config) if self._only in (None, each))
 
     @cached_property
     def _folders(self) -> dict[str, tuple[Path, Path]]:
