@@ -67,5 +67,6 @@ def show_statistics(
     elif csv is None:
         print_statistics(make_console(), statistics)
     rate = f"{collected.views / wall:,.0f} views/s"
-    print(f"{collected.views:,} views in {wall:.1f} s ({rate}); peak memory {collected.memory / MEBIBYTE:,.0f} MiB", file=sys.stderr)
+    summary = f"{collected.views:,} views in {wall:.1f} s ({rate}); peak memory {collected.memory / MEBIBYTE:,.0f} MiB"
+    print(summary, file=sys.stderr if json else sys.stdout)
     return 0
