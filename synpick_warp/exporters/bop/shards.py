@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Bop, Config
+from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import SharedFiles
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
 from synpick_warp.exporters.bop.shard_parts import (
@@ -36,37 +36,25 @@ class ShardsExporter(SceneExporter):
     write_view = staticmethod(write_shard_view)
 
     @staticmethod
-    def split(bop: Bop) -> str:
+    def folder_name(split: str) -> str:
         """See `SceneExporter`: the toolkit's name."""
-        return f"{bop.split}_web"
+        return f"{split}_web"
 
     @staticmethod
     def shared_files(config: Config) -> SharedFiles:
         """See `Exporter`."""
-        split = Path(ShardsExporter.split(config.bop))
-        return SharedFiles(CONSTANTS, (split / KEYS_FILE,), (split,))
+        splits = ShardsExporter.folders(config)
+        return SharedFiles(CONSTANTS, tuple(split / KEYS_FILE for split in splits), splits)
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
-        """See `Exporter`: the index of views and shards."""
-        split, parts = out / ShardsExporter.split(config.bop), out / PARTIAL / ShardsExporter.staging / "keys"
-        try:
-            parts.parent.mkdir(exist_ok=True)
-            shutil.rmtree(parts, ignore_errors=True)
-            parts.mkdir()
-            for shard in list_shards(split):
-                pool.submit(list_keys, (), (shard, parts), path=shard)
-            pool.wait()
-            lines = [line for part in sorted(parts.iterdir(), key=shard_index) for line in part.read_bytes().splitlines()]
-            write_atomically(split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
-        except OSError as error:
-            raise output_error(split, error) from error
-        return [(split / KEYS_FILE).relative_to(out)]
+        """See `Exporter`: the index of views and shards of each split."""
+        return [_write_keys(out, split, pool) for split in ShardsExporter.folders(config)]
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the shards of its scenes."""
         scenes = (self.scene_id(episode, camera) for camera in range(len(self._cameras)))
-        return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._split))
+        return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._folder(scene)))
 
     def _stage_scene(self, scene: Path) -> None:
         scene.mkdir()
@@ -75,4 +63,21 @@ class ShardsExporter(SceneExporter):
         return write_shard_layer, (scene, scene_id, name, frame)
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return commit_shards, (scenes, self._split, frames, self._layers)
+        return commit_shards, (scenes, self._folder(scenes[0][1]), frames, self._layers)
+
+
+def _write_keys(out: Path, split: Path, pool: WriterPool) -> Path:
+    """Write the index of a split's views and shards; returns the file, relative to the data set."""
+    parts = out / PARTIAL / ShardsExporter.staging / "keys"
+    try:
+        parts.parent.mkdir(exist_ok=True)
+        shutil.rmtree(parts, ignore_errors=True)
+        parts.mkdir()
+        for shard in list_shards(out / split):
+            pool.submit(list_keys, (), (shard, parts), path=shard)
+        pool.wait()
+        lines = [line for part in sorted(parts.iterdir(), key=shard_index) for line in part.read_bytes().splitlines()]
+        write_atomically(out / split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
+    except OSError as error:
+        raise output_error(out / split, error) from error
+    return split / KEYS_FILE
