@@ -1,4 +1,4 @@
-"""Command line: bake, verify, merge, preview, explain, eval, estimate, doctor, config. User errors: one line on stderr, exit code 2."""
+"""Command line: bake, verify, validate, merge, preview, explain, eval, estimate, doctor, config. User errors: one line on stderr, exit code 2."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
 from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
+from synpick_warp.cli.validate import validate
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
@@ -229,6 +230,7 @@ def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
 
 app.command(evaluate, name="eval")
 app.command(estimate)
+app.command(validate)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

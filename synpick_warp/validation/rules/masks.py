@@ -129,7 +129,7 @@ def check_valid_count(view: ViewSubject) -> _Finding:
 def check_amodal_count(view: ViewSubject) -> _Finding:
     """Counts of silhouettes."""
     for index, mask, info in _pairs(view, "mask"):
-        inside = not _touches(mask)
+        inside = not _touched_sides(mask)
         if (inside and _differ(info.px_count_all, mask.count)) or info.px_count_all + COUNT_SLACK < mask.count * (1.0 - COUNT_FRACTION):
             yield _file(view), f"image {view.image}, instance {index}: px_count_all is {info.px_count_all}, {mask.file} has {mask.count}"
 
@@ -158,15 +158,15 @@ def check_amodal_box(view: ViewSubject) -> _Finding:
     for index, mask, info in _pairs(view, "mask"):
         if mask.box is None or info.bbox_obj == EMPTY:
             continue
-        if not _touches(mask):
-            if info.bbox_obj != bop_box(mask.box):
-                yield _file(view), f"image {view.image}, instance {index}: bbox_obj is {_describe(info.bbox_obj, mask.box)}"
-            continue
-        x, y, width, height = bop_box(mask.box)
-        left, top, wide, high = info.bbox_obj
-        sides = (left, x, 0), (top, y, 0), (-left - wide, -x - width, 1 - mask.size[0]), (-top - high, -y - height, 1 - mask.size[1])
-        if any(max(stated, border) != seen for stated, seen, border in sides):
-            yield _file(view), f"image {view.image}, instance {index}: bbox_obj {info.bbox_obj}, cut at the border, is not the box of {mask.file}"
+        box, tight = info.bbox_obj, bop_box(mask.box)
+        touched = _touched_sides(mask)
+        stated, seen = _sides(box), _sides(tight)
+        # What lies beyond a border may be wider than what is seen, but cannot move the side opposite to that border.
+        wrong = [side for side in range(4) if stated[side] < seen[side] or (touched <= {(side + 2) % 4} and stated[side] != seen[side])]
+        if wrong and not touched:
+            yield _file(view), f"image {view.image}, instance {index}: bbox_obj is {_describe(box, mask.box)}"
+        elif wrong:
+            yield _file(view), f"image {view.image}, instance {index}: bbox_obj {box}, cut at the border, is not the box of {mask.file}"
 
 
 def bop_box(box: tuple[int, int, int, int]) -> list[int]:
@@ -174,12 +174,18 @@ def bop_box(box: tuple[int, int, int, int]) -> list[int]:
     return [box[0], box[1], box[2] - 1, box[3] - 1]
 
 
-def _touches(mask: Mask) -> bool:
-    """Whether a silhouette reaches the image's border, or is empty and may lie outside."""
+def _sides(box: list[int]) -> tuple[int, int, int, int]:
+    """How far a box reaches to the left, top, right and bottom."""
+    return -box[0], -box[1], box[0] + box[2], box[1] + box[3]
+
+
+def _touched_sides(mask: Mask) -> set[int]:
+    """Borders of the image that a silhouette reaches, as in `_sides`; all, if it is empty and may lie outside."""
     if mask.box is None:
-        return True
+        return {0, 1, 2, 3}
     left, top, width, height = mask.box
-    return left == 0 or top == 0 or left + width == mask.size[0] or top + height == mask.size[1]
+    reached = left == 0, top == 0, left + width == mask.size[0], top + height == mask.size[1]
+    return {side for side, reaches in enumerate(reached) if reaches}
 
 
 def _differ(count: int, expected: int) -> bool:
