@@ -1,0 +1,25 @@
+"""A correct data set has no violation, and every planted fault is found and named."""
+
+from __future__ import annotations
+
+import pytest
+
+from synpick_warp.validation.registry import load_rules
+from tests.validation.faults import FAULTS
+
+
+def test_a_correct_set_has_no_violation(good, check):
+    assert check(good) == []
+
+
+@pytest.mark.parametrize("planted", FAULTS, ids=lambda planted: planted.name)
+def test_a_planted_fault_is_found(copy, check, planted):
+    planted.plant(copy)
+    found = [violation for violation in check(copy, sample=None) if violation.rule == planted.rule]
+    assert found, planted.rule
+    assert any(planted.words in violation.text for violation in found), [violation.text for violation in found]
+    assert all(violation.file for violation in found)
+
+
+def test_every_rule_has_its_fault():
+    assert {planted.rule for planted in FAULTS} >= set(load_rules()) - {"model-units", "model-origin"}
