@@ -1,4 +1,4 @@
-"""Command line: bake, verify, validate, merge, preview, explain, eval, estimate, doctor, config. User errors: one line on stderr, exit code 2."""
+"""Command line: bake, verify, merge, preview, explain, eval, estimate, validate, doctor, config. User errors: one line, exit code 2."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ _MAX_THREADS = 1024
 
 
 def validate(
-    folder: Annotated[Path | None, Parameter(name="DIR", help="A BOP data set: the folder that contains train_pbr, test, models, ...")] = None,
+    folder: Annotated[Path | None, Parameter(name="DIR", help="A BOP data set: the folder that contains train_pbr, models, ...")] = None,
     /,
     *,
     sample: Annotated[

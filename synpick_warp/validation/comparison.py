@@ -15,11 +15,11 @@ from synpick_warp.validation.rendering import ObjectRenderer, Patch
 from synpick_warp.validation.subjects import ViewSubject
 
 EXACT_DEPTH, MEASURED_DEPTH = 1.0, 15.0
-"""Largest difference of depth from the model [mm]: where depth is rendered, and where a sensor measured it (BOP's tolerance of visibility)."""
+"""Largest difference of depth from the model [mm]: of rendered depth, and of a sensor's (BOP's tolerance of visibility)."""
 MIN_PIXELS = 40
 """Smallest silhouette or mask that is compared [px]: smaller ones consist of their border."""
 OUTLINE = 0.4
-"""Pixels that may differ per pixel of outline: renderers that sample pixels at other places differ by 0.3, a shift by 1 px by about 0.65."""
+"""Pixels that may differ per pixel of outline: by 0.3 if pixels are sampled at their corners, by 0.65 if a mask is shifted by 1 px."""
 AREA = 0.02
 """Pixels that may differ, as a fraction of the area."""
 MARGIN = 24
@@ -117,7 +117,7 @@ class RenderedView:
         patches: list[Patch | None] = []
         for item in view.truths:
             rotation, translation = np.reshape(np.array(item.cam_R_m2c, np.float64), (3, 3)), np.array(item.cam_t_m2c, np.float64)
-            usable = item.obj_id in view.scene.layout.model_files and abs(np.linalg.det(rotation) - 1.0) < 0.01
+            usable = self.renderer.has(item.obj_id) and abs(np.linalg.det(rotation) - 1.0) < 0.01
             patches.append(self.renderer.render(item.obj_id, rotation, translation, matrix, view.size) if usable else None)
         nearest = np.full((view.size[1], view.size[0]), np.inf, np.float32)
         for patch in patches:
@@ -133,7 +133,9 @@ class RenderedView:
         masks = [self._mask(kind, index) for kind in ("mask", "mask_visib")]
         present = [mask for mask in masks if mask is not None]
         rows, columns = patch.depth.shape
-        boxes = [mask.box for mask in present if mask.box is not None] + ([(patch.left, patch.top, columns, rows)] if patch.depth.size else [])
+        boxes = [mask.box for mask in present if mask.box is not None] + (
+            [(patch.left, patch.top, columns, rows)] if patch.depth.size else []
+        )
         if not boxes or not present:
             return None
         left, top = min(box[0] for box in boxes), min(box[1] for box in boxes)

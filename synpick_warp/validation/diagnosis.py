@@ -79,7 +79,9 @@ def diagnose(rendered: RenderedView) -> list[Finding]:
             other = _find_swapped(item, [other for other in bad if other.index not in done and other is not item])
             if other is not None:
                 done |= {item.index, other.index}
-                findings.append(Finding(Kind.SWAP, item.index, f"image {rendered.view.image}: instances {item.index} and {other.index} look swapped"))
+                findings.append(
+                    Finding(Kind.SWAP, item.index, f"image {rendered.view.image}: instances {item.index} and {other.index} look swapped")
+                )
     findings += [_explain(item, rendered) for item in bad if item.index not in done]
     for item in instances:
         if fits[item.index]:
@@ -110,17 +112,19 @@ def _check_depth(rendered: RenderedView, instances: list[Instance]) -> tuple[lis
     parts = [item for item in instances if np.count_nonzero(item.seen) >= 20]
     if not parts or rendered.matrix is None:
         return [], None
-    ratios = np.array([np.median(item.depth[item.seen] / item.rendered[item.seen]) for item in parts if item.depth is not None])
-    planar = np.concatenate([np.abs(item.depth - item.rendered)[item.seen] for item in parts if item.depth is not None])
-    rays = np.concatenate([np.abs(item.depth - item.rendered * _ray(item, rendered.matrix))[item.seen] for item in parts if item.depth is not None])
+    pairs = [(item.depth[item.seen], item.rendered[item.seen]) for item in parts if item.depth is not None]
+    ratios = np.array([np.median(depth / model) for depth, model in pairs])
+    planar = np.concatenate([np.abs(depth - model) for depth, model in pairs])
+    lengths = [_ray(item, rendered.matrix)[item.seen] for item in parts]
+    rays = np.concatenate([np.abs(depth - model * length) for (depth, model), length in zip(pairs, lengths, strict=True)])
     error = float(np.percentile(planar, 75))
     if error > tolerance and float(np.percentile(rays, 75)) < min(tolerance, RAY_GAIN * error):
         return [Finding(Kind.RAY, None, f"image {view.image}: depth is the length of the ray, not planar depth")], None
     ratio = float(np.median(ratios))
     distance = float(np.median(np.concatenate([item.rendered[item.seen] for item in parts])))
-    if abs(ratio - 1.0) * distance > tolerance and np.abs(ratios - ratio).max() < SCALE_SPREAD:
-        if len(parts) > 1 or abs(ratio - 1.0) > SCALE_SPREAD:
-            return [Finding(Kind.SCALE, None, f"image {view.image}: depth is {ratio:.4g} times the rendered depth")], ratio
+    scaled = abs(ratio - 1.0) * distance > tolerance and float(np.abs(ratios - ratio).max()) < SCALE_SPREAD
+    if scaled and (len(parts) > 1 or abs(ratio - 1.0) > SCALE_SPREAD):
+        return [Finding(Kind.SCALE, None, f"image {view.image}: depth is {ratio:.4g} times the rendered depth")], ratio
     return [], None
 
 
@@ -158,9 +162,15 @@ def _explain(item: Instance, rendered: RenderedView) -> Finding:
     mask, silhouette = _reference(item, tolerance)
     fit = fit_masks(mask, silhouette)
     if not silhouette.any() and mask.any():
-        return Finding(Kind.POSE, item.index, f"{place}: the object is outside of the image or hidden at this pose, its mask has {mask.sum()} px")
+        return Finding(
+            Kind.POSE,
+            item.index,
+            f"{place}: the object is outside of the image or hidden at this pose, its mask is not empty",
+        )
     if not mask.any():
-        return Finding(Kind.MASK, item.index, f"{place}: the mask is empty, but {np.count_nonzero(silhouette)} px of the object are in the image")
+        return Finding(
+            Kind.MASK, item.index, f"{place}: the mask is empty, but {np.count_nonzero(silhouette)} px of the object are in the image"
+        )
     right, down = best_shift(mask, silhouette)
     shifts = (right or down) and fit_masks(moved(mask, -right, -down), silhouette).iou > max(0.9, fit.iou)
     if _pose_agrees(item, tolerance):
@@ -177,7 +187,8 @@ def _pose_agrees(item: Instance, tolerance: float) -> bool:
         return False
     part &= item.depth > 0.0
     count = np.count_nonzero(part)
-    return count > 0 and np.count_nonzero(np.abs(item.depth - item.rendered)[part] <= tolerance) >= AGREEING * count
+    agreeing = np.count_nonzero(np.abs(item.depth - item.rendered)[part] <= tolerance)
+    return bool(count > 0 and agreeing >= AGREEING * count)
 
 
 def _describe_offset(item: Instance, rendered: RenderedView, shift: tuple[int, int] | None, iou: float) -> str:

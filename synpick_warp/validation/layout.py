@@ -86,7 +86,9 @@ class Layout:
     @cached_property
     def model_files(self) -> dict[int, tuple[str, str]]:
         """Model by obj_id, as (models folder, file name): those that ground truth is rendered with."""
-        order = [name for name in _RENDERING_MODELS if name in self.models] + [name for name in self.models if name not in _RENDERING_MODELS]
+        order = [name for name in _RENDERING_MODELS if name in self.models] + [
+            name for name in self.models if name not in _RENDERING_MODELS
+        ]
         for folder in order:
             found = {int(match[1]): (folder, match[0]) for name in self.models[folder].files if (match := MODEL_FILE.fullmatch(name))}
             if found:

@@ -112,7 +112,7 @@ def decode_mask(data: bytes, file: str) -> Mask:
     image = decode_picture(data, file)
     size, kind = (image.shape[1], image.shape[0]), png_type(data)
     if image.ndim != 2 or image.dtype != np.uint8:
-        flat = image.reshape(*image.shape[:2], -1).any(axis=2)
+        flat = np.asarray(image.reshape(*image.shape[:2], -1).any(axis=2))
         return crop_mask(flat, file, binary=False, kind=kind or (8 * image.itemsize, f"of {image.shape[2:] or 1} channels"))
     left, top, width, height = cv2.boundingRect(image)
     crop = image[top : top + height, left : left + width]

@@ -47,8 +47,7 @@ def _run_parallel(folder: Path, tasks: Iterable[Task], processes: int) -> Iterat
     open_standard_descriptors()
     workers: list[WorkerProcess] = []
     try:
-        for _ in range(processes):
-            workers.append(_start(folder))
+        workers.extend(_start(folder) for _ in range(processes))
         idle = list(workers)
         queue, done, running = iter(enumerate(tasks)), {}, {}
         turn, exhausted = 0, False

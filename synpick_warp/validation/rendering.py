@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.errors import CatalogError, DatasetError
+from synpick_warp.errors import CatalogError, DatasetError, SynpickError
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.types import Camera, TriangleMesh
 from synpick_warp.stages.pose.render import object_scene, render_object
@@ -43,6 +43,7 @@ class ObjectRenderer:
         self.layout = layout
         self.device = pick_device("cpu")
         self._models: dict[int, tuple[TriangleMesh, Any, tuple[wp.Mesh, ...]]] = {}
+        self._damaged: set[int] = set()
 
     def render(self, obj_id: int, rotation: np.ndarray, translation: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> Patch:
         """Render an object.
@@ -69,9 +70,14 @@ class ObjectRenderer:
         depth = depth[: bottom - top, : right - left].astype(np.float32)
         return Patch(left, top, np.where(depth < _FAR, depth / np.float32(_MILLIMETRE), np.float32(np.inf)))
 
-    def radius(self, obj_id: int) -> float:
-        """Radius of the sphere around the origin that contains the object [mm]; raises as `render`."""
-        return float(np.linalg.norm(self._load(obj_id)[0].vertices, axis=1).max()) / _MILLIMETRE
+    def has(self, obj_id: int) -> bool:
+        """Whether an object has a model that can be rendered; others are left to the rules about models."""
+        if obj_id not in self._damaged:
+            try:
+                self._load(obj_id)
+            except SynpickError:
+                self._damaged.add(obj_id)
+        return obj_id not in self._damaged
 
     def _load(self, obj_id: int) -> tuple[TriangleMesh, Any, tuple[wp.Mesh, ...]]:
         found = self._models.pop(obj_id, None)
@@ -90,7 +96,7 @@ class ObjectRenderer:
 
 
 def _crop(points: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Left, top, right and bottom of the part of the image that shows points (V, 3) [m], with a pixel around it; right and bottom exclusive."""
+    """Part of the image that shows points (V, 3) [m], with a pixel around it: left, top, right, bottom; the last two exclusive."""
     width, height = size
     if points[:, 2].max() <= _NEAR:
         return 0, 0, 0, 0

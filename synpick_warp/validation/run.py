@@ -77,7 +77,7 @@ def validate(folder: Path, options: Options, summary: Summary, report: Report = 
     summary.scenes = len(scenes)
     total = sum(len(images) for _, images in scenes)
     for violation in _check_folders(layout, lists):
-        yield _count(violation, summary)
+        yield _finish(violation, layout, summary)
     models = list(_plan_models(layout, summary))
     tasks: list[Task] = [*models, *_plan_scenes(scenes, lists, options), *_plan_rigs(layout, scenes)]
     processes = max(1, min(options.threads, -(-total // VIEWS_PER_PROCESS) if options.images else 1, len(tasks)))
@@ -86,15 +86,17 @@ def validate(folder: Path, options: Options, summary: Summary, report: Report = 
         summary.rendered += checked.rendered
         report("views" if options.images else "scenes", summary.views, total)
         for violation in checked.violations:
-            yield _count(violation, summary)
+            yield _finish(violation, layout, summary)
 
 
-def _count(violation: Violation, summary: Summary) -> Violation:
+def _finish(violation: Violation, layout: Layout, summary: Summary) -> Violation:
+    """Count a violation, and shorten its text: paths relative to the data set, and the file's own name not twice."""
     if violation.level is Level.ERROR:
         summary.errors += 1
     else:
         summary.warnings += 1
-    return violation
+    text = violation.text.replace(f"{layout.root}/", "").removeprefix(violation.file).lstrip(" :,")
+    return violation._replace(text=text)
 
 
 def _check_folders(layout: Layout, lists: TargetLists) -> Iterator[Violation]:

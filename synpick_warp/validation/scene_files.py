@@ -125,9 +125,7 @@ class FolderScene:
         for kind, listing in self.listings.items():
             matches = [match for name in listing.files if (match := _STEM.fullmatch(name)) and match[3].lower() in SUFFIXES]
             paired = kind.startswith("mask")
-            result[kind] = {
-                (int(match[1]), int(match[2]) if match[2] else None): match[0] for match in matches if bool(match[2]) == paired
-            }
+            result[kind] = {(int(match[1]), int(match[2]) if match[2] else None): match[0] for match in matches if bool(match[2]) == paired}
         return result
 
     def indices(self, kind: str) -> dict[tuple[int, int | None], str]:
@@ -229,9 +227,13 @@ class KeyedScene:
             file.seek(member.offset)
             return file.read(min(member.size, limit))
 
-    @cached_property
+    @property
     def kinds(self) -> set[str]:
         """See `SceneFiles`."""
+        return self._kinds
+
+    @cached_property
+    def _kinds(self) -> set[str]:
         return {content.split(".")[0] for _, content in self.members} & set(_KINDS)
 
     @cached_property
@@ -242,7 +244,7 @@ class KeyedScene:
             if name not in records or name == content:
                 continue
             try:
-                entry = decode_json(self._content(member, MAX_JSON), Any, member.file, DatasetError)
+                entry: Any = decode_json(self._content(member, MAX_JSON), object, member.file, DatasetError)
             except DatasetError as error:
                 records[name].faults.append((member.file, str(error)))
                 continue

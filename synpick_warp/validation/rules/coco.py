@@ -139,7 +139,10 @@ def check_boxes(view: ViewSubject) -> _Finding:
         if mask is not None and mask.box is not None and annotation.bbox != list(mask.box):
             x, y, width, height = mask.box
             hint = "; + 1 is missing" if annotation.bbox == [x, y, width - 1, height - 1] else ""
-            yield coco.file, f"image {view.image}, annotation {annotation.id}: bbox is {annotation.bbox}, the mask's is {list(mask.box)}{hint}"
+            yield (
+                coco.file,
+                f"image {view.image}, annotation {annotation.id}: bbox is {annotation.bbox}, the mask's is {list(mask.box)}{hint}",
+            )
 
 
 @rule(
@@ -152,10 +155,10 @@ def check_ignore(view: ViewSubject) -> _Finding:
     """Flag `ignore`."""
     for coco, annotation, _, _, index in _matched(view):
         fraction = view.infos[index].visib_fract if view.infos else IGNORED_VISIBILITY
-        if annotation.ignore is not UNSET and abs(fraction - IGNORED_VISIBILITY) > FRACTION_SLACK:
-            if annotation.ignore != (fraction < IGNORED_VISIBILITY):
-                shown = str(annotation.ignore).lower()
-                yield coco.file, f"image {view.image}, annotation {annotation.id}: ignore is {shown}, visib_fract {fraction:.4g}"
+        clear = annotation.ignore is not UNSET and abs(fraction - IGNORED_VISIBILITY) > FRACTION_SLACK
+        if clear and annotation.ignore != (fraction < IGNORED_VISIBILITY):
+            shown = str(annotation.ignore).lower()
+            yield coco.file, f"image {view.image}, annotation {annotation.id}: ignore is {shown}, visib_fract {fraction:.4g}"
 
 
 def run_lengths(mask: Mask) -> list[int]:

@@ -97,7 +97,10 @@ def check_visible_count(view: ViewSubject) -> _Finding:
     """Counts of visible pixels."""
     for index, mask, info in _pairs(view, "mask_visib"):
         if _differ(info.px_count_visib, mask.count):
-            yield _file(view), f"image {view.image}, instance {index}: px_count_visib is {info.px_count_visib}, {mask.file} has {mask.count}"
+            yield (
+                _file(view),
+                f"image {view.image}, instance {index}: px_count_visib is {info.px_count_visib}, {mask.file} has {mask.count}",
+            )
 
 
 @rule(
@@ -115,9 +118,12 @@ def check_valid_count(view: ViewSubject) -> _Finding:
         count = 0
         if mask.box is not None:
             left, top, width, height = mask.box
-            count = np.count_nonzero(mask.crop & (depth[top : top + height, left : left + width] > 0))
+            count = int(np.count_nonzero(mask.crop & (depth[top : top + height, left : left + width] > 0)))
         if _differ(info.px_count_valid, count):
-            yield _file(view), f"image {view.image}, instance {index}: px_count_valid is {info.px_count_valid}; in {mask.file} {count} have depth"
+            yield (
+                _file(view),
+                f"image {view.image}, instance {index}: px_count_valid is {info.px_count_valid}; in {mask.file} {count} have depth",
+            )
 
 
 @rule(

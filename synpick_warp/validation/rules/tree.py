@@ -105,8 +105,24 @@ def check_set_files(tree: TreeSubject) -> _Finding:
     for name, listing in layout.models.items():
         if "models_info.json" not in listing.files:
             yield listing.name("models_info.json"), f"missing; diameters and symmetries of {name} are not known"
+    for obj_id in sorted(layout.model_files) if "models_eval" in layout.models else ():
+        if f"obj_{obj_id:06d}.ply" not in layout.models["models_eval"].files:
+            yield layout.models["models_eval"].name(f"obj_{obj_id:06d}.ply"), f"missing; {layout.model_files[obj_id][0]} has this object"
     if layout.splits and "test_targets_bop19.json" not in layout.listing.files:
         yield "test_targets_bop19.json", "missing; the toolkit's calc_gt_masks.py and calc_gt_coco.py open it"
+
+
+@rule(
+    TreeSubject,
+    "bake-finished",
+    "A bake of ours is finished.",
+    "the command that started the bake resumes it",
+    level=Level.WARNING,
+)
+def check_finished(tree: TreeSubject) -> _Finding:
+    """The manifest's last entry."""
+    if tree.layout.ours and "joined.json" not in tree.layout.listing.enter("manifest").files:
+        yield "manifest/joined.json", "missing: the bake was interrupted, so lists and episodes are missing"
 
 
 @rule(
