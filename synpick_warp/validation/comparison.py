@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import UNSET
 from scipy.signal import fftconvolve
 
-from synpick_warp.validation.pictures import Mask
+from synpick_warp.validation.pictures import Mask, crop_mask
 from synpick_warp.validation.rendering import ObjectRenderer, Patch
 from synpick_warp.validation.subjects import ViewSubject
 
@@ -18,10 +18,10 @@ EXACT_DEPTH, MEASURED_DEPTH = 1.0, 15.0
 """Largest difference of depth from the model [mm]: of rendered depth, and of a sensor's (BOP's tolerance of visibility)."""
 MIN_PIXELS = 40
 """Smallest silhouette or mask that is compared [px]: smaller ones consist of their border."""
-OUTLINE = 0.4
-"""Pixels that may differ per pixel of outline: by 0.3 if pixels are sampled at their corners, by 0.65 if a mask is shifted by 1 px."""
-AREA = 0.02
-"""Pixels that may differ, as a fraction of the area."""
+EXACT_AREA, EXACT_OUTLINE = 0.002, 0.1
+"""Pixels that may differ in data sets of ours, as a fraction of the area and per pixel of outline: a shift by 1 px exceeds it."""
+AREA, OUTLINE = 0.02, 0.4
+"""As above, in other data sets: sampling pixels at their corners, which moves masks by half a pixel, does not exceed it; 2 px do."""
 MARGIN = 24
 """Largest shift of a mask that is looked for [px]."""
 
@@ -91,6 +91,11 @@ class RenderedView:
         count = scale if isinstance(scale, float | int) else 0.0
         return max(EXACT_DEPTH if self.view.scene.exact else MEASURED_DEPTH, 1.5 * count)
 
+    @property
+    def exact_masks(self) -> bool:
+        """Whether masks are those of the bake's rasterizer."""
+        return self.view.scene.layout.ours
+
     @cached_property
     def matrix(self) -> np.ndarray | None:
         """Intrinsics (3, 3); None: the image has none, or another camera model."""
@@ -128,6 +133,20 @@ class RenderedView:
         found = [self._instance(index, patch, nearest) for index, patch in enumerate(patches) if patch is not None]
         return [item for item in found if item is not None]
 
+    def render_other(self, item: Instance, obj_id: int) -> np.ndarray:
+        """Silhouette of another object at the pose of an instance, in its window (h, w)."""
+        truth: Any = self.view.truths[item.index]
+        result = np.zeros(item.rendered.shape, bool)
+        if self.matrix is None or self.view.size is None or not self.renderer.has(obj_id):
+            return result
+        rotation = np.reshape(np.array(truth.cam_R_m2c, np.float64), (3, 3))
+        patch = self.renderer.render(obj_id, rotation, item.translation, self.matrix, self.view.size)
+        shown = crop_mask(np.isfinite(patch.depth), "") if patch.depth.size else None
+        if shown is None:
+            return result
+        moved_mask = replace(shown, left=shown.left + patch.left, top=shown.top + patch.top)
+        return moved_mask.window(item.left, item.top, result.shape[1], result.shape[0])
+
     def _instance(self, index: int, patch: Patch, nearest: np.ndarray) -> Instance | None:
         """Cut an instance's window; None: too few pixels, or nothing to compare them with."""
         masks = [self._mask(kind, index) for kind in ("mask", "mask_visib")]
@@ -157,12 +176,13 @@ class RenderedView:
         return found if found is not None and found.size == self.view.size else None
 
 
-def fit_masks(one: np.ndarray, other: np.ndarray) -> Fit:
-    """Compare two masks (h, w)."""
+def fit_masks(one: np.ndarray, other: np.ndarray, *, exact: bool = False) -> Fit:
+    """Compare two masks (h, w); `exact`: with the bounds of data sets of ours."""
     differing = int(np.count_nonzero(one ^ other))
     union = int(np.count_nonzero(one | other))
     outline = max(_outline(one), _outline(other))
-    return Fit(differing, 1.0 - differing / max(union, 1), differing <= AREA * union + OUTLINE * outline + 4)
+    area, line = (EXACT_AREA, EXACT_OUTLINE) if exact else (AREA, OUTLINE)
+    return Fit(differing, 1.0 - differing / max(union, 1), differing <= area * union + line * outline + 4)
 
 
 def _outline(mask: np.ndarray) -> int:

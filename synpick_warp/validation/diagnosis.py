@@ -20,10 +20,16 @@ RAY_GAIN = 0.25
 """Depth is taken for the ray's length if that leaves less than this fraction of the error."""
 AGREEING = 0.8
 """Fraction of a pose's visible pixels whose depth agrees with it, for the pose to be right."""
+AGREEING_BESIDE = 0.5
+"""The same of pixels beside the mask: there depth shows either the object or what is behind it."""
+MIN_BESIDE = 10
+"""Smallest number of pixels beside the mask that decide [px]."""
 BEYOND = 0.2
 """Largest fraction of a visible mask whose depth is off by more than the tolerance."""
 SWAPPED = 0.85
 """Intersection over union from which a mask is that of another instance."""
+MAX_OTHERS = 8
+"""Most other objects that are tried at a pose."""
 LEFT_OUT = 0.05
 """Largest fraction of the pixels that depth shows to be visible that mask_visib may leave out."""
 
@@ -34,7 +40,9 @@ class Kind(StrEnum):
     SCALE = "depth scale"
     RAY = "ray length"
     SHIFT = "shifted mask"
+    SHIFT_VISIBLE = "shifted visible mask"
     SWAP = "swapped instances"
+    OBJECT = "object"
     POSE = "pose"
     MASK = "mask"
     DEPTH = "depth"
@@ -63,7 +71,7 @@ class DiagnosedView(RenderedView):
 def diagnose(rendered: RenderedView) -> list[Finding]:
     """All contradictions of a view."""
     instances = rendered.instances
-    fits = {item.index: _outline_fits(item, rendered.tolerance) for item in instances}
+    fits = {item.index: _outline_fits(item, rendered) for item in instances}
     findings, ratio = _check_depth(rendered, [item for item in instances if fits[item.index]])
     if findings and ratio is None:
         return findings
@@ -71,7 +79,7 @@ def diagnose(rendered: RenderedView) -> list[Finding]:
         for item in instances:
             item.depth = None if item.depth is None else item.depth / np.float32(ratio)
         # Which pixels are occluded depends on depth.
-        fits = {item.index: _outline_fits(item, rendered.tolerance) for item in instances}
+        fits = {item.index: _outline_fits(item, rendered) for item in instances}
     bad = [item for item in instances if not fits[item.index]]
     done: set[int] = set()
     for item in bad:
@@ -97,12 +105,11 @@ def _reference(item: Instance, tolerance: float) -> tuple[np.ndarray, np.ndarray
     return item.visible, item.visible_part(tolerance)
 
 
-def _outline_fits(item: Instance, tolerance: float) -> bool:
+def _outline_fits(item: Instance, rendered: RenderedView) -> bool:
     """Whether mask and silhouette agree. Without amodal masks it is enough that visible pixels lie in the silhouette."""
-    mask, silhouette = _reference(item, tolerance)
+    mask, silhouette = _reference(item, rendered.tolerance)
     if item.mask is not None:
-        fits = fit_masks(mask, silhouette).good
-        return fits and (item.visible is None or fit_masks(item.visible & silhouette, item.visible).good)
+        return fit_masks(mask, silhouette, exact=rendered.exact_masks).good
     return fit_masks(mask & item.silhouette, mask).good and (item.depth is None or fit_masks(mask, silhouette).iou > 1.0 - AGREEING)
 
 
@@ -171,37 +178,61 @@ def _explain(item: Instance, rendered: RenderedView) -> Finding:
         return Finding(
             Kind.MASK, item.index, f"{place}: the mask is empty, but {np.count_nonzero(silhouette)} px of the object are in the image"
         )
-    right, down = best_shift(mask, silhouette)
-    shifts = (right or down) and fit_masks(moved(mask, -right, -down), silhouette).iou > max(0.9, fit.iou)
-    if _pose_agrees(item, tolerance):
-        if shifts:
-            return Finding(Kind.SHIFT, item.index, f"{place}: the mask is shifted by ({right}, {down}) px")
+    shift = _find_shift(mask, silhouette)
+    if _pose_agrees(item, mask, tolerance):
+        if shift is not None:
+            return Finding(Kind.SHIFT, item.index, f"{place}: the mask is shifted by ({shift[0]}, {shift[1]}) px")
         return Finding(Kind.MASK, item.index, f"{place}: the mask differs from the silhouette in {fit.differing} px (IoU {fit.iou:.2f})")
-    return Finding(Kind.POSE, item.index, f"{place}: {_describe_offset(item, rendered, (right, down) if shifts else None, fit.iou)}")
+    if shift is None and (other := _find_object(item, mask, rendered)) is not None:
+        return Finding(Kind.OBJECT, item.index, f"{place}: the mask shows object {other} at this pose, obj_id is {item.obj_id}")
+    return Finding(Kind.POSE, item.index, f"{place}: {_describe_offset(item, rendered, shift, fit.iou)}")
 
 
-def _pose_agrees(item: Instance, tolerance: float) -> bool:
-    """Whether the depth image shows the object where its pose is: masks then have no part in it."""
+def _find_shift(mask: np.ndarray, silhouette: np.ndarray) -> tuple[int, int] | None:
+    """Columns and rows by which a mask is shifted; None: a shift does not explain how it differs."""
+    right, down = best_shift(mask, silhouette)
+    if not (right or down):
+        return None
+    before, after = fit_masks(mask, silhouette).iou, fit_masks(moved(mask, -right, -down), silhouette).iou
+    return (right, down) if after > max(0.9, before) else None
+
+
+def _find_object(item: Instance, mask: np.ndarray, rendered: RenderedView) -> int | None:
+    """Another object of the view whose silhouette at this pose is the mask."""
+    if item.mask is None:
+        return None
+    others = dict.fromkeys(truth.obj_id for truth in rendered.view.truths if truth.obj_id != item.obj_id)
+    return next((other for other in list(others)[:MAX_OTHERS] if fit_masks(mask, rendered.render_other(item, other)).good), None)
+
+
+def _pose_agrees(item: Instance, mask: np.ndarray, tolerance: float) -> bool:
+    """Whether the depth image shows the object where its pose is: beside the mask, if the silhouette reaches there, else everywhere."""
     part = item.visible_part(tolerance)
     if item.depth is None:
         return False
     part &= item.depth > 0.0
+    agreeing = part & (np.abs(item.depth - item.rendered) <= tolerance)
+    beside = np.count_nonzero(part & ~mask)
+    if beside >= MIN_BESIDE:
+        return bool(np.count_nonzero(agreeing & ~mask) >= AGREEING_BESIDE * beside)
     count = np.count_nonzero(part)
-    agreeing = np.count_nonzero(np.abs(item.depth - item.rendered)[part] <= tolerance)
-    return bool(count > 0 and agreeing >= AGREEING * count)
+    return bool(count > 0 and np.count_nonzero(agreeing) >= AGREEING * count)
 
 
 def _describe_offset(item: Instance, rendered: RenderedView, shift: tuple[int, int] | None, iou: float) -> str:
     """Size of a pose error: sideways from the shift of the mask, along the ray from depth in it."""
     assert rendered.matrix is not None
     distance = float(item.translation[2])
-    away = 0.0
+    away, spread = 0.0, 0.0
     if item.depth is not None and item.visible is not None:
         there = item.silhouette if shift is None else moved(item.silhouette, *shift)
         known = there & item.visible & (item.depth > 0.0)
         model = item.rendered if shift is None else _moved_depth(item.rendered, *shift)
         errors = (item.depth - model)[known & np.isfinite(model)]
         away = float(np.median(errors)) if errors.size else 0.0
+        spread = float(np.percentile(np.abs(errors - away), 75)) if errors.size else 0.0
+    if shift is None and abs(away) > rendered.tolerance > spread:
+        return f"the pose is off by about {abs(away):.2g} mm along the optical axis"
     if shift is None:
         return f"the pose does not fit the image: IoU of mask and silhouette {iou:.2f}, depth differs by a median of {away:+.3g} mm"
     x, y = shift[0] * distance / rendered.matrix[0, 0], shift[1] * distance / rendered.matrix[1, 1]
@@ -219,6 +250,11 @@ def _check_instance(item: Instance, rendered: RenderedView) -> list[Finding]:
     if item.depth is None or item.visible is None:
         return []
     tolerance, place = rendered.tolerance, f"image {rendered.view.image}, instance {item.index}"
+    if item.mask is not None and rendered.view.scene.exact:
+        expected = item.visible_part(tolerance)
+        shift = _find_shift(item.visible, expected) if not fit_masks(item.visible, expected).good else None
+        if shift is not None and _pose_agrees(item, item.visible, tolerance):
+            return [Finding(Kind.SHIFT_VISIBLE, item.index, f"{place}: mask_visib is shifted by ({shift[0]}, {shift[1]}) px")]
     errors = (item.depth - item.rendered)[item.seen]
     if errors.size >= 20:
         median, beyond = float(np.median(errors)), float(np.mean(np.abs(errors) > tolerance))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from importlib import import_module
 from typing import Any, NamedTuple, TypeVar
 
@@ -50,7 +51,7 @@ class Rule:
 
 
 RULES: dict[str, Rule] = {}
-"""All rules by name, once `load_rules` has been called."""
+"""Declared rules by name, in the order of imports; see `load_rules`."""
 
 
 def rule(subject: type, name: str, sentence: str, cure: str, level: Level = Level.ERROR) -> Callable[[_Check], _Check]:
@@ -72,11 +73,13 @@ def rule(subject: type, name: str, sentence: str, cure: str, level: Level = Leve
     return declare
 
 
+@cache
 def load_rules() -> dict[str, Rule]:
-    """Import the modules of the rules; returns all rules by name, in the order in which they are documented."""
-    for module in MODULES:
-        import_module(f"synpick_warp.validation.rules.{module}")
-    return RULES
+    """Import the modules of the rules; returns all rules by name, in the order of MODULES and of the declarations in each."""
+    names = [f"synpick_warp.validation.rules.{module}" for module in MODULES]
+    for name in names:
+        import_module(name)
+    return dict(sorted(RULES.items(), key=lambda item: names.index(item[1].check.__module__)))
 
 
 def apply_rules(subject: object) -> Iterator[Violation]:

@@ -176,6 +176,19 @@ def mask_shifted_by_one_pixel(folder):
     write(mask_path(folder, 1), np.roll(read(mask_path(folder, 1)), -1, axis=0))
 
 
+@fault("mask-shifted", "mask_visib is shifted by (4, 0)")
+def visible_masks_shifted(folder):
+    write(mask_path(folder, 0, "mask_visib"), np.roll(read(mask_path(folder, 0, "mask_visib")), 4, axis=1))
+
+
+@fault("object-shown", "object 7")
+def object_ids_swapped(folder):
+    def change(content):
+        content["1"][1]["obj_id"], content["1"][2]["obj_id"] = content["1"][2]["obj_id"], content["1"][1]["obj_id"]
+
+    edit(folder / SCENE / "scene_gt.json", change)
+
+
 @fault("instances-swapped", "instances 0 and 2")
 def masks_swapped(folder):
     for kind in ("mask", "mask_visib"):

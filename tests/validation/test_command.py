@@ -80,7 +80,10 @@ def test_a_sample_of_views_is_rendered(good, capsys):
     assert "0 views, 0 of them" in run(capsys, good, "--fast")[1][-1]
 
 
-@pytest.mark.parametrize("options", [("--fast", "--poses"), ("--poses", "--sample", 3), ("--sample", -1), ("--limit", -1), ("--threads", 9999)])
+WRONG = [("--fast", "--poses"), ("--poses", "--sample", 3), ("--sample", -1), ("--limit", -1), ("--threads", 9999)]
+
+
+@pytest.mark.parametrize("options", WRONG)
 def test_bad_options_are_one_line(good, capsys, options):
     code, lines, err = run(capsys, good, *options)
     assert (code, lines, len(err.splitlines())) == (2, [], 1)
@@ -104,7 +107,8 @@ def test_every_rule_says_what_holds_and_how_to_mend_it():
     for item in load_rules().values():
         assert item.sentence.endswith("."), item.name
         assert not item.cure.endswith("."), item.name
-        assert item.name == item.name.lower() and " " not in item.name
+        assert item.name == item.name.lower()
+        assert " " not in item.name
 
 
 def test_the_committed_table_of_rules_is_up_to_date():

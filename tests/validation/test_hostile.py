@@ -44,7 +44,8 @@ def run(capsys, *arguments: object) -> tuple[int, list[str], list[str]]:
 @pytest.mark.parametrize("name", FILES)
 def test_whatever_a_file_says_is_reported_in_lines(copy, check, name):
     path = copy / name
-    contents = list(hostile_contents(path.read_bytes())) if path.suffix == ".json" else [("text", b"[bake]\nmode = 3"), ("binary", b"\xff\0")]
+    other = [("text", b"[bake]\nmode = 3"), ("binary", b"\xff\0")]
+    contents = list(hostile_contents(path.read_bytes())) if path.suffix == ".json" else other
     offset = FILES.index(name)
     whole = contents[:16]
     for description, content in [*whole, *islice(contents, 16 + offset, None, max(EVERY, len(contents) // 12))]:
@@ -60,7 +61,8 @@ def test_images_that_do_not_decode_are_named(copy, check, part, content):
     whole = path.read_bytes()
     header = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sIIBBBBB", 13, b"IHDR", 60_000, 60_000, 8, 0, 0, 0, 0)
     bomb = header + struct.pack(">I", zlib.crc32(header[12:]))
-    path.write_bytes({"empty": b"", "text": b"no image", "bomb": bomb, "truncated": whole[: len(whole) // 2], "tiff": b"II*\0\xff\xff\xff\0"}[content])
+    contents = {"empty": b"", "text": b"no image", "bomb": bomb, "truncated": whole[: len(whole) // 2], "tiff": b"II*\0\xff\xff\xff\0"}
+    path.write_bytes(contents[content])
     found = [violation for violation in check(copy) if violation.rule == "image-decodes"]
     assert [violation.file for violation in found] == [f"{SCENE}/{part}"]
 
@@ -88,7 +90,7 @@ def test_links_out_of_the_set_are_not_followed_and_nothing_is_written(copy, chec
     os.symlink(copy / "loop", copy / "loop")
     os.symlink("/dev/zero", copy / SCENE / "mask/000001_000009.png")
     os.mkfifo(copy / SCENE / "depth/000005.png")
-    before = snapshot(tmp_path / "victim"), {path for path in copy.rglob("*")}
+    before = snapshot(tmp_path / "victim"), set(copy.rglob("*"))
     found = check(copy)
     assert {violation.file for violation in found if violation.rule in ("link-outside", "scene-links")} == {
         "models_eval",
@@ -98,7 +100,7 @@ def test_links_out_of_the_set_are_not_followed_and_nothing_is_written(copy, chec
         f"{SCENE}/mask/000001_000009.png",
         f"{SCENE}/depth/000005.png",
     }
-    assert (snapshot(tmp_path / "victim"), {path for path in copy.rglob("*")}) == before
+    assert (snapshot(tmp_path / "victim"), set(copy.rglob("*"))) == before
 
 
 def test_a_huge_file_is_not_read(copy, check):

@@ -16,8 +16,8 @@ def _found(rendered: DiagnosedView, *kinds: Kind) -> _Finding:
     for finding in rendered.findings:
         if finding.kind not in kinds:
             continue
-        if finding.kind in (Kind.SHIFT, Kind.MASK, Kind.VISIBLE):
-            visible = finding.kind is Kind.VISIBLE or "mask" not in view.masks
+        if finding.kind in (Kind.SHIFT, Kind.SHIFT_VISIBLE, Kind.MASK, Kind.VISIBLE):
+            visible = finding.kind in (Kind.VISIBLE, Kind.SHIFT_VISIBLE) or "mask" not in view.masks
             yield view.scene.files.file("mask_visib" if visible else "mask", view.image, finding.index), finding.text
         elif finding.kind in (Kind.SCALE, Kind.RAY, Kind.DEPTH):
             yield view.scene.files.file("depth", view.image), finding.text
@@ -55,7 +55,7 @@ def check_planar(rendered: DiagnosedView) -> _Finding:
 )
 def check_shift(rendered: DiagnosedView) -> _Finding:
     """Masks beside their objects, where depth says that the pose is right."""
-    yield from _found(rendered, Kind.SHIFT)
+    yield from _found(rendered, Kind.SHIFT, Kind.SHIFT_VISIBLE)
 
 
 @rule(
@@ -67,6 +67,17 @@ def check_shift(rendered: DiagnosedView) -> _Finding:
 def check_swapped(rendered: DiagnosedView) -> _Finding:
     """Pairs of instances with each other's masks."""
     yield from _found(rendered, Kind.SWAP)
+
+
+@rule(
+    DiagnosedView,
+    "object-shown",
+    "obj_id names the object that the mask shows.",
+    "correct obj_id in scene_gt.json",
+)
+def check_object(rendered: DiagnosedView) -> _Finding:
+    """Masks that another object of the view fits at the same pose."""
+    yield from _found(rendered, Kind.OBJECT)
 
 
 @rule(
