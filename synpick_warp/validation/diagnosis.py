@@ -211,6 +211,10 @@ def _pose_agrees(item: Instance, mask: np.ndarray, tolerance: float) -> bool:
     if item.depth is None:
         return False
     part &= item.depth > 0.0
+    errors = (item.depth - item.rendered)[item.seen]
+    if errors.size >= 20 and abs(float(np.median(errors))) > tolerance > _spread(errors):
+        # The object is there, and as a whole nearer or farther.
+        return False
     agreeing = part & (np.abs(item.depth - item.rendered) <= tolerance)
     beside = np.count_nonzero(part & ~mask)
     if beside >= MIN_BESIDE:
@@ -230,13 +234,18 @@ def _describe_offset(item: Instance, rendered: RenderedView, shift: tuple[int, i
         model = item.rendered if shift is None else _moved_depth(item.rendered, *shift)
         errors = (item.depth - model)[known & np.isfinite(model)]
         away = float(np.median(errors)) if errors.size else 0.0
-        spread = float(np.percentile(np.abs(errors - away), 75)) if errors.size else 0.0
+        spread = _spread(errors) if errors.size else 0.0
     if shift is None and abs(away) > rendered.tolerance > spread:
         return f"the pose is off by about {abs(away):.2g} mm along the optical axis"
     if shift is None:
         return f"the pose does not fit the image: IoU of mask and silhouette {iou:.2f}, depth differs by a median of {away:+.3g} mm"
     x, y = shift[0] * distance / rendered.matrix[0, 0], shift[1] * distance / rendered.matrix[1, 1]
     return f"the pose is off by about {np.sqrt(x * x + y * y + away * away):.2g} mm (x {x:+.1f}, y {y:+.1f}, z {away:+.1f} mm)"
+
+
+def _spread(errors: np.ndarray) -> float:
+    """Upper quartile of the distance from the median."""
+    return float(np.percentile(np.abs(errors - np.median(errors)), 75))
 
 
 def _moved_depth(depth: np.ndarray, columns: int, rows: int) -> np.ndarray:
