@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import UNSET
 from scipy.signal import fftconvolve
 
 from synpick_warp.validation.pictures import Mask, crop_mask
-from synpick_warp.validation.rendering import ObjectRenderer, Patch
 from synpick_warp.validation.subjects import ViewSubject
+
+if TYPE_CHECKING:
+    from synpick_warp.validation.rendering import ObjectRenderer, Patch
 
 EXACT_DEPTH, MEASURED_DEPTH = 1.0, 15.0
 """Largest difference of depth from the model [mm]: of rendered depth, and of a sensor's (BOP's tolerance of visibility)."""
