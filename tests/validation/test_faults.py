@@ -19,7 +19,8 @@ def test_a_correct_set_has_no_violation(good, check):
 @pytest.mark.parametrize("planted", FAULTS, ids=lambda planted: planted.name)
 def test_a_planted_fault_is_found(copy, check, planted):
     planted.plant(copy)
-    found = [violation for violation in check(copy, sample=None) if violation.rule == planted.rule]
+    rendered = load_rules()[planted.rule].check.__module__.endswith("poses")
+    found = [violation for violation in check(copy, sample=None if rendered else 0) if violation.rule == planted.rule]
     assert found, planted.rule
     assert any(planted.words in violation.text for violation in found), [violation.text for violation in found]
     assert all(violation.file for violation in found)
