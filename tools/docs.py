@@ -1,6 +1,6 @@
-"""Generate the documentation that follows from code: configs/README.md, the settings reference.
+"""Generate the documentation that follows from code: configs/README.md, the settings reference; the rules in validation/README.md.
 
-python -m tools.docs          # writes it
+python -m tools.docs          # writes them
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ from synpick_warp.configs.load import ROWS, sections, settings_of
 from synpick_warp.configs.schema import ObjectRow, Split
 from synpick_warp.configs.split_tables import SPLITS, split_settings
 from synpick_warp.configs.write import format_toml
+from synpick_warp.validation.registry import load_rules
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS_REFERENCE = ROOT / "configs" / "README.md"
+VALIDATION = ROOT / "synpick_warp" / "validation" / "README.md"
+_RULES_BEGIN, _RULES_END = "from the rules' declarations. -->\n", "<!-- End. -->"
 
 _INTRODUCTION = """\
 # Settings
@@ -214,11 +217,20 @@ def _section(title: str, kind: type[Any], prefix: str) -> str:
     return "\n".join([*lines, ""])
 
 
+def validation_reference() -> str:
+    """The README of the validation with its table of rules; the rest is as committed."""
+    head, rest = VALIDATION.read_text(encoding="utf-8").split(_RULES_BEGIN)
+    rows = [f"| `{item.name}` | {item.level} | {item.sentence} |" for item in load_rules().values()]
+    table = "\n".join(["| rule | level | what holds |", "|---|---|---|", *rows])
+    return f"{head}{_RULES_BEGIN}\n{table}\n\n{_RULES_END}{rest.split(_RULES_END)[1]}"
+
+
 def main() -> None:
     """Write the generated files."""
     argparse.ArgumentParser(description="Generate the documentation that follows from code.").parse_args()
     SETTINGS_REFERENCE.write_text(settings_reference(), encoding="utf-8")
-    print(f"wrote {SETTINGS_REFERENCE.relative_to(ROOT)}")
+    VALIDATION.write_text(validation_reference(), encoding="utf-8")
+    print(f"wrote {SETTINGS_REFERENCE.relative_to(ROOT)}, {VALIDATION.relative_to(ROOT)}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Command line: bake, verify, merge, preview, explain, eval, estimate, stats, doctor, config. User errors: one line, exit code 2."""
+"""Command line of synpick-warp: its subcommands and their options. User errors: one line, exit code 2."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from synpick_warp.cli.evaluate import evaluate
 from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard, parse_splits
 from synpick_warp.cli.statistics import show_statistics
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
+from synpick_warp.cli.validate import validate
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
@@ -240,6 +241,7 @@ def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
 app.command(evaluate, name="eval")
 app.command(estimate)
 app.command(show_statistics, name="stats")
+app.command(validate)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
