@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 from synpick_warp.configs.check import format_value
 from synpick_warp.configs.fields import INT32_MAX
+from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import FORMATS, MIXED, Config
 
 DEPTH_COUNTS = 65535
@@ -37,7 +38,7 @@ def find_conflicts(config: Config) -> Iterator[Conflict]:
 
 
 def _mix(config: Config) -> Iterator[Conflict]:
-    if config.bake.mode == MIXED and not any(config.bake.mix):
+    if MIXED in bake_modes(config) and not any(config.bake.mix):
         yield "bake.mix", "at least one weight above 0, with the mode mixed"
     if not config.bake.formats:
         yield "bake.formats", f"at least one of {', '.join(FORMATS)}"
@@ -129,12 +130,14 @@ def _sensors(config: Config) -> Iterator[Conflict]:
 
 def _bop(config: Config) -> Iterator[Conflict]:
     bop = config.bop
-    if not _SPLIT.fullmatch(bop.split):
-        yield "bop.split", "train, val or test, and after an underscore letters and digits, as in train_pbr"
-    elif (bop.color_format == "jpg") != bop.split.endswith("_pbr"):
-        fitting = "png" if bop.color_format == "jpg" else "jpg"
-        rule = "BOP's toolkit reads jpg from splits that end in _pbr, and png from all others"
-        yield "bop.color_format", f"{fitting} with the split {bop.split}: {rule}"
+    folders = [(f"splits.{split.name}.folder", split.folder) for split in config.splits] or [("bop.split", bop.split)]
+    for key, folder in folders:
+        if not _SPLIT.fullmatch(folder):
+            yield key, "train, val or test, and after an underscore letters and digits, as in train_pbr"
+        elif (bop.color_format == "jpg") != folder.endswith("_pbr"):
+            fitting = "png" if bop.color_format == "jpg" else "jpg"
+            rule = "BOP's toolkit reads jpg from splits that end in _pbr, and png from all others"
+            yield "bop.color_format", f"{fitting} with the split {folder}: {rule}"
     far = max((math.dist(position, (0.0, 0.0, 0.0)) for position in config.cameras.positions), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
         yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote from {far:.3g} m [mm]"

@@ -12,7 +12,8 @@ from typing import Any
 
 from synpick_warp.configs.check import check_value, format_value, shorten, suggest
 from synpick_warp.configs.consistency import find_conflicts
-from synpick_warp.configs.schema import Config, ObjectRow
+from synpick_warp.configs.schema import Bake, Bop, Config, ObjectRow
+from synpick_warp.configs.split_tables import SPLITS, override_table, read_tables, resolve_splits, split_settings
 from synpick_warp.errors import ConfigError
 from synpick_warp.inputs.toml import decode_toml, read_toml
 
@@ -20,6 +21,8 @@ DEFAULT_PRESET = "synpick"
 COMMAND_LINE = "on the command line"
 """Source of settings that come as options, in error messages."""
 ROWS = "object_rows"
+_OFFERED = "offered splits"
+"""Key of the splits of a preset, which hold only if they are asked for."""
 _BASE = "preset"
 _ROW_NEEDS = ("id", "diameter")
 _ROW_IDENTITY = ("id", "name", "diameter")
@@ -30,7 +33,11 @@ Values = dict[str, tuple[Any, str]]
 
 
 def load_config(
-    preset_or_file: Path | str | None = None, settings: Mapping[str, object] | None = None, *, source: str = "in the settings passed"
+    preset_or_file: Path | str | None = None,
+    settings: Mapping[str, object] | None = None,
+    *,
+    source: str = "in the settings passed",
+    splits: bool = False,
 ) -> Config:
     """Load a preset or a TOML file, override single settings, and validate the result.
 
@@ -46,6 +53,8 @@ def load_config(
             "synpick". None: the preset "synpick".
         settings: Full key, such as "physics.step", -> value, with lists for TOML's arrays.
         source: Where `settings` come from, for error messages.
+        splits: Whether the splits of a preset hold, such as train and test of "synpick", unless a file sets mode or episodes otherwise;
+            the [splits] of a file always hold.
 
     Returns:
         The complete configuration: frozen dataclasses, see `synpick_warp.configs.schema`.
@@ -55,12 +64,19 @@ def load_config(
             values contradict each other. The message names key, value and source, and what is allowed.
     """
     values = _read(str(preset_or_file or DEFAULT_PRESET))
+    offered = values.pop(_OFFERED, None)
+    if splits and offered and SPLITS not in values:
+        values[SPLITS] = offered
     for key, value in (settings or {}).items():
         section, _, name = key.partition(".")
-        values |= _section_values(section, {name: value}, source)
-    config = _build(values)
+        if section == SPLITS:
+            values[SPLITS] = (override_table(values.get(SPLITS, ({}, ""))[0], name, value, source), source)
+        else:
+            values |= _section_values(section, {name: value}, source)
+    config = _build(values, source if settings else "")
     for key, rule in find_conflicts(config):
-        value, origin = values.get(key, (_value_of(config, key), "by default"))
+        owner = values.get(SPLITS if key.startswith(f"{SPLITS}.") else key, (None, "by default"))
+        value, origin = _value_of(config, key), owner[1]
         has = f"has {len(value)} rows" if key == ROWS else f"is {format_value(value)}"
         raise ConfigError(f"{key} {has} {origin}; allowed: {rule}")
     return config
@@ -82,7 +98,10 @@ def parse_assignment(text: str) -> tuple[str, object]:
     if not equals:
         raise ConfigError(f"--set {shorten(text)} has no value; write --set section.key=value, as in --set physics.friction=0.4")
     section, _, name = key.partition(".")
-    _, annotation = _setting(section, name, COMMAND_LINE)
+    if section == SPLITS:
+        annotation = split_settings().get(name.rpartition(".")[2], (None, str))[1]
+    else:
+        _, annotation = _setting(section, name, COMMAND_LINE)
     try:
         document = decode_toml(f"value = {written}")
     except ValueError:  # TOML's errors are ValueErrors.
@@ -98,7 +117,7 @@ def parse_assignment(text: str) -> tuple[str, object]:
 def sections() -> dict[str, type[Any]]:
     """Name -> dataclass of every section, in order."""
     hints = typing.get_type_hints(Config)
-    return {item.name: hints[item.name] for item in dataclasses.fields(Config) if item.name != ROWS}
+    return {item.name: hints[item.name] for item in dataclasses.fields(Config) if item.name not in (ROWS, SPLITS)}
 
 
 @functools.cache
@@ -118,8 +137,13 @@ def _read(preset_or_file: str) -> Values:
         base = document.pop(_BASE, DEFAULT_PRESET)
         if not isinstance(base, str):
             raise ConfigError(f"{_BASE} is {format_value(base)} in {preset_or_file}; allowed: {', '.join(preset_names())}")
-        return _override(_read_preset(base, f" in {preset_or_file}"), document, f"in {preset_or_file}")
-    return _read_preset(preset_or_file, "")
+        return _override(_offer_splits(_read_preset(base, f" in {preset_or_file}")), document, f"in {preset_or_file}")
+    return _offer_splits(_read_preset(preset_or_file, ""))
+
+
+def _offer_splits(values: Values) -> Values:
+    """Values of a preset whose splits hold only if they are asked for."""
+    return {_OFFERED if key == SPLITS else key: value for key, value in values.items()}
 
 
 def _read_preset(name: str, source: str) -> Values:
@@ -139,13 +163,18 @@ def _parse(path: Path) -> dict[str, Any]:
 
 
 def _override(base: Values, document: Mapping[str, Any], source: str) -> Values:
-    """Override the values of a preset by those of a document that builds on it."""
+    """Override the values of a preset by those of a document that builds on it; its mode or number of episodes undo the preset's splits."""
     values = dict(base)
+    bake = document.get("bake")
+    if isinstance(bake, dict) and ("mode" in bake or "episodes" in bake):
+        values = {key: value for key, value in values.items() if key not in (SPLITS, _OFFERED)}
     for name, content in document.items():
         if name == ROWS and isinstance(content, dict):
             values[ROWS] = (_changed_rows(base[ROWS][0] if ROWS in base else (), content, source), source)
         elif name == ROWS:
             values[ROWS] = (_rows(content, source), source)
+        elif name == SPLITS:
+            values[SPLITS] = (read_tables(content, source), source)
         elif name in sections() and not isinstance(content, dict):
             raise ConfigError(f"{name} is {format_value(content)} {source}; allowed: a section, [{name}]")
         else:
@@ -171,7 +200,7 @@ def _check_section(section: str, source: str) -> None:
         # A setting without its section is likelier than a misspelt section.
         keys = [f"{name}.{section}" for name, kind in known.items() if section in settings_of(kind)]
         hint = f"; did you mean {' or '.join(keys)}?" if keys else suggest(section, list(known))
-        raise ConfigError(f"there is no section {shorten(section)}, set {source}; sections: {', '.join(known)}, {ROWS}{hint}")
+        raise ConfigError(f"there is no section {shorten(section)}, set {source}; sections: {', '.join(known)}, {ROWS}, {SPLITS}{hint}")
 
 
 def _setting(section: str, name: str, source: str) -> tuple[dataclasses.Field[Any], Any]:
@@ -214,15 +243,33 @@ def _row(key: str, content: Mapping[str, Any], source: str) -> ObjectRow:
     return ObjectRow(**{name: check_value(f"{key}.{name}", value, *known[name], source) for name, value in content.items()})
 
 
-def _build(values: Values) -> Config:
+def _build(values: Values, override: str) -> Config:
+    """Configuration of checked values; `override` is the source of single settings."""
+    splits = ()
+    if SPLITS in values:
+        tables, source = values[SPLITS]
+        mode, written = values.get("bake.mode", (Bake().mode, ""))
+        splits = resolve_splits(tables, mode, values.get("bop.color_format", (Bop().color_format, ""))[0], source)
+        total = sum(split.episodes for split in splits)
+        asked, origin = values.get("bake.episodes", (total, ""))
+        if asked != total and origin in (source, override):
+            raise ConfigError(
+                f"bake.episodes is {asked} {origin}; allowed: {total} or none, as each split sets its own: splits.NAME.episodes"
+            )
+        if written and written == override and all("mode" in table for table in tables.values()):
+            raise ConfigError(f"bake.mode is {format_value(mode)} {written}; allowed: none, as each split sets its own: splits.NAME.mode")
+        values = values | {"bake.episodes": (total, source)}
     parts: dict[str, Any] = {
         section: kind(**{name: values[f"{section}.{name}"][0] for name in settings_of(kind) if f"{section}.{name}" in values})
         for section, kind in sections().items()
     }
     if ROWS in values:
         parts[ROWS] = values[ROWS][0]
-    return Config(**parts)
+    return Config(**parts, splits=splits)
 
 
 def _value_of(config: Config, key: str) -> Any:
+    if key.startswith(f"{SPLITS}."):
+        _, name, item = key.split(".")
+        return next(getattr(split, item) for split in config.splits if split.name == name)
     return functools.reduce(getattr, key.split("."), config)

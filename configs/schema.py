@@ -300,6 +300,31 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
+class Split:
+    """A split, such as [splits.train]: a range of the data set's episodes with a mode and a BOP folder of its own.
+
+    Splits share seed and settings, never an episode index, and so no random number.
+    """
+
+    name: str = ""
+    """Key of its table; no setting of its own."""
+    episodes: int = setting(1, "", "Episodes of the split; a finished data set can grow where indices are free.", low=1, high=INT32_MAX)
+    first: int = setting(
+        -1,
+        "",
+        "Index of its first episode; -1: the next index after the split before it. A gap leaves room to grow.",
+        low=-1,
+        high=INT32_MAX,
+    )
+    mode: str = setting(
+        "", "", "Task of the gripper, as bake.mode, which is the default if this is empty.", choices=("", *MODES, MIXED, CYCLE)
+    )
+    folder: str = setting(
+        "", "", "BOP name of the split and of its folder; empty: the split's name, with _pbr if bop.color_format is jpg, as in test_pbr."
+    )
+
+
+@dataclass(frozen=True)
 class Config:
     """All settings of a bake, by section."""
 
@@ -322,3 +347,5 @@ class Config:
     bop: Bop = field(default_factory=Bop)
     trajectory: Trajectory = field(default_factory=Trajectory)
     object_rows: tuple[ObjectRow, ...] = ()
+    splits: tuple[Split, ...] = ()
+    """Resolved splits, by first episode; empty: one split, bop.split, of bake.episodes episodes."""

@@ -7,7 +7,8 @@ from typing import Any
 
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import ROWS, sections, settings_of
-from synpick_warp.configs.schema import Config, ObjectRow
+from synpick_warp.configs.schema import Config, ObjectRow, Split
+from synpick_warp.configs.split_tables import SPLITS, split_settings
 
 _DELETE = "\x7f"
 """The only control character that JSON does not escape and TOML forbids."""
@@ -27,12 +28,14 @@ def config_to_toml(config: Config, *, comments: bool = False) -> str:
         lines += [f"[{section}]", *_table(getattr(config, section), kind, comments), ""]
     for index, row in enumerate(config.object_rows):
         lines += [f"[[{ROWS}]]", *_table(row, ObjectRow, comments and index == 0), ""]
+    for index, split in enumerate(config.splits):
+        lines += [f"[{SPLITS}.{split.name}]", *_table(split, Split, comments and index == 0), ""]
     return "\n".join(lines)
 
 
 def _table(values: Any, kind: type[Any], comments: bool) -> list[str]:
     lines = []
-    for name, (item, annotation) in settings_of(kind).items():
+    for name, (item, annotation) in (split_settings() if kind is Split else settings_of(kind)).items():
         if comments:
             unit = f"[{item.metadata['unit']}] " if item.metadata["unit"] else ""
             lines.append(f"# {item.metadata['doc']} {unit}Allowed: {describe_allowed(item, annotation)}.")

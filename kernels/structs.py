@@ -123,8 +123,10 @@ class SettleData:
 
 @wp.struct
 class ModeData:
-    """Distribution of the modes of episodes."""
+    """Distribution of the modes of a split's episodes."""
 
+    first: int
+    """Index of the split's first episode."""
     pick_share: float
     """Probability of PICK."""
     pick_or_target_share: float

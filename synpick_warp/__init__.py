@@ -10,7 +10,7 @@ Importing this package loads neither simulator, NumPy nor OpenCV; the functions 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -44,6 +44,7 @@ def bake(
     settings: Mapping[str, object] | None = None,
     *,
     shard: tuple[int, int] = (0, 1),
+    splits: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> BakeSummary:
     """Generate a data set: simulate, render and write it; or resume one that was interrupted. `synpick-warp bake` does the same.
@@ -53,6 +54,7 @@ def bake(
         out: Folder of the data set: new, empty, or of an earlier bake with the same settings.
         settings: Full key, such as "bake.mode", -> value; they override a preset or file.
         shard: (i, n): only episodes with index % n == i.
+        splits: Only episodes of these splits of the settings, such as ("train",) of the preset "synpick"; empty: all.
         progress: Receives stages, counts and notes; None: silent. See `synpick_warp.progress`.
 
     Returns:
@@ -67,25 +69,26 @@ def bake(
     from synpick_warp.progress import SilentProgress
 
     if not isinstance(config, Config):
-        config = load_config(config, settings)
+        config = load_config(config, settings, splits=bool(splits))
     elif settings:
         raise TypeError("settings override a preset or a file; pass them to load_config, or use dataclasses.replace on the Config")
-    return run_bake(config, Path(out), progress if progress is not None else SilentProgress(), shard)
+    return run_bake(config, Path(out), progress if progress is not None else SilentProgress(), shard, splits)
 
 
-def load_config(preset_or_file: Path | str | None = None, settings: Mapping[str, object] | None = None) -> Config:
+def load_config(preset_or_file: Path | str | None = None, settings: Mapping[str, object] | None = None, *, splits: bool = False) -> Config:
     """Read a preset or a .toml file, override single settings, and validate the result.
 
     Args:
         preset_or_file: Name of a preset, such as "smoke", or path of a file that ends in .toml; None: the preset "synpick".
         settings: Full key, such as "physics.step", -> value.
+        splits: Whether the splits that a preset offers hold; those of a file always do.
 
     Raises:
         ConfigError: There is no such preset, file or key, or a value is not allowed.
     """
     from synpick_warp.configs.load import load_config as load
 
-    return load(None if preset_or_file is None else str(preset_or_file), settings or {})
+    return load(None if preset_or_file is None else str(preset_or_file), settings or {}, splits=splits)
 
 
 def open(folder: Path | str) -> DataSet:

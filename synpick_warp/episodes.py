@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 from synpick_warp.attempts import EpisodeRecord
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import split_of
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.stages.stream import TickReport
 
@@ -37,16 +38,20 @@ class EpisodeRow(NamedTuple):
     """Objects that left the scene otherwise."""
     left: int
     """Objects at the last frame."""
+    split: str = ""
+    """Name of the episode's split; empty, and no key: the settings have no splits."""
 
     def as_json(self) -> dict[str, Any]:
         """Convert to a line of episodes.jsonl."""
         row = {**self._asdict(), "ending": self.ending.name.lower()}
+        if not self.split:
+            del row["split"]
         return {**row, "sentence": self.ending.sentence}
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> EpisodeRow:
         """Convert from a line of episodes.jsonl."""
-        values: dict[str, Any] = {name: row[name] for name in cls._fields}
+        values: dict[str, Any] = {name: row[name] for name in cls._fields if name != "split" or name in row}
         values["ending"] = Ending[row["ending"].upper()]
         return cls(**values)
 
@@ -97,6 +102,7 @@ def episode_row(config: Config, report: TickReport, world: int, record: EpisodeR
     """Build the row of the episode that ended in a world."""
     episode, arrangement, frame, ending = (int(report.column(name)[world]) for name in ("episode", "arrangement", "frame", "ending"))
     tick = config.physics.step * config.physics.steps_per_tick
+    split = split_of(config, episode)
     return EpisodeRow(
         episode,
         arrangement,
@@ -109,6 +115,7 @@ def episode_row(config: Config, report: TickReport, world: int, record: EpisodeR
         record.picked,
         record.lost,
         record.left,
+        "" if split is None else split.name,
     )
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
@@ -62,7 +63,7 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
     Args:
         config: All settings.
         progress: Observer.
-        episodes: Indices of the episodes to simulate; None: all of `bake.episodes`.
+        episodes: Indices of the episodes to simulate; None: all.
         records_physics: Whether ticks are recorded with their physics.
 
     Raises:
@@ -107,7 +108,7 @@ def make_renderer(config: Config, scene: RenderScene, instances: int, views: int
     )
 
 
-def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, int] = (0, 1)) -> BakeSummary:
+def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, int] = (0, 1), splits: Sequence[str] = ()) -> BakeSummary:
     """Simulate, render and write a data set, or the remaining episodes of one.
 
     Args:
@@ -115,14 +116,15 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
         out: Folder of the data set: new, empty, or of an earlier bake with the same settings.
         progress: Observer.
         shard: (i, n): only episodes with index % n == i.
+        splits: Only episodes of these splits; empty: all.
 
     Raises:
         SynpickError: An error that the user can correct; committed episodes stay, and the same bake resumes.
     """
     kinds = load_exporter_classes(config.bake.formats)
-    episodes = range(shard[0], config.bake.episodes, shard[1])
-    check_episodes(len(episodes), config)
-    with OutputFolder(out, config, episodes) as output:
+    planned = plan_episodes(config, splits, shard)
+    check_episodes(sum(map(len, planned)), config)
+    with OutputFolder(out, config, [episode for each in planned for episode in each]) as output:
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
             summary.take_record(read_entry(out, episode_entry(episode)) or {})

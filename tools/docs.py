@@ -1,6 +1,6 @@
-"""Generate the documentation that follows from code: configs/README.md, the settings reference.
+"""Generate the documentation that follows from code: configs/README.md, the settings reference; the rules in validation/README.md.
 
-python -m tools.docs          # writes it
+python -m tools.docs          # writes them
 """
 
 from __future__ import annotations
@@ -11,11 +11,15 @@ from typing import Any
 
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import ROWS, sections, settings_of
-from synpick_warp.configs.schema import ObjectRow
+from synpick_warp.configs.schema import ObjectRow, Split
+from synpick_warp.configs.split_tables import SPLITS, split_settings
 from synpick_warp.configs.write import format_toml
+from synpick_warp.validation.registry import load_rules
 
 ROOT = Path(__file__).resolve().parents[1]
 SETTINGS_REFERENCE = ROOT / "configs" / "README.md"
+VALIDATION = ROOT / "synpick_warp" / "validation" / "README.md"
+_RULES_BEGIN, _RULES_END = "from the rules' declarations. -->\n", "<!-- End. -->"
 
 _INTRODUCTION = """\
 # Settings
@@ -64,7 +68,7 @@ resolved configuration is stored in each data set as `config.toml`.
 
 | preset | for |
 |---|---|
-| `synpick` | default: the values of the paper, and the object table of the 21 YCB-Video objects |
+| `synpick` | default: the values of the paper, the object table of the 21 YCB-Video objects, and the [splits](#splits) of the paper |
 | `synpick-released` | the released generator, where it differs from the paper |
 | `smoke` | small and fast: two sequences of stirring in small images, in a minute or two on two CPU cores; not for training |
 | `synpick-test` | data set to evaluate on, of the shape of the paper's test sets |
@@ -125,6 +129,46 @@ synpick-warp bake --config PRESET --models MODELS --lights LIGHTS --out DIR --de
 python -m tools.reports.difficulty TEST HARD
 ```
 
+## Splits
+
+```bash
+synpick-warp bake --config synpick --split train --out DATA          # 80 sequences each of pick, target and move
+synpick-warp bake --config synpick --split test --out DATA           # 20 of each, into the same data set
+```
+
+A data set can have several splits: in one folder, with one manifest, resumed by the same command. The preset `synpick` offers `train` and
+`test` of the paper's size to `--split` (`--split train,test` bakes both); without `--split` it is a bake of `bake.episodes` episodes, as
+are configurations that set `bake.mode` or `bake.episodes` themselves. The splits of a file always hold, and `bake` without `--split` bakes
+them all:
+
+```toml
+# my.toml
+preset = "synpick"
+
+[splits.train]
+episodes = 3000
+mode = "cycle"              # default: bake.mode
+
+[splits.val]
+episodes = 30
+first = 10_000              # default: after the split before it; a gap leaves train room to grow
+
+[splits.test]
+episodes = 60
+folder = "test_hard_pbr"    # default: test_pbr, or test if bop.color_format is png
+```
+
+- **Seeds cannot meet.** Splits number their episodes through, train 0 to 2,999, val 10,000 to 10,029 and so on, and every random stream is
+  keyed by seed and episode index. A test shows that the streams of the paper's splits lie apart on the generator's orbit.
+- **Scene ids are unique over splits**: camera c of C sees episode k in scene C·k + c of its split's folder, so a line of a result file, a
+  target or a track names one scene without its split.
+- BOP scenes and shards have a folder per split (`train_pbr/`, `train_pbr_web/`), target lists one per kind of split
+  (`test_targets_bop19.json`, `train_targets_bop19.json`). USD stages and trajectories stay in one place, by episode, and carry the
+  split's name, as does `episodes.jsonl`.
+- `--split` can be combined with `--shard`; `merge`, `verify` and `preview` take the whole folder, `eval` and `estimate` have `--split`,
+  and `synpick_warp.open(DIR).splits["test"]` is a data set of the split's episodes.
+- A finished split can grow where the indices after it are free; name, first episode, mode and folder are fixed by the first bake.
+
 ## Object table
 
 Model files do not contain mass, concavity or material. `[[object_rows]]` tables in a file add them, and replace those of the preset. A
@@ -160,23 +204,33 @@ def settings_reference() -> str:
     parts = [_INTRODUCTION]
     parts += [_section(f"[{name}]", kind, f"{name}.") for name, kind in sections().items()]
     parts.append(_section(f"[[{ROWS}]]", ObjectRow, ""))
+    parts.append(_section(f"[{SPLITS}.NAME]", Split, ""))
     return "\n".join(parts)
 
 
 def _section(title: str, kind: type[Any], prefix: str) -> str:
     meaning = "\n\n".join(" ".join(paragraph.split()) for paragraph in (kind.__doc__ or "").strip().split("\n\n"))
     lines = [f"### `{title}`", "", meaning, "", "| key | default | unit | allowed | meaning |", "|---|---|---|---|---|"]
-    for name, (item, annotation) in settings_of(kind).items():
+    for name, (item, annotation) in (split_settings() if kind is Split else settings_of(kind)).items():
         unit, rule = item.metadata["unit"], describe_allowed(item, annotation)
         lines.append(f"| `{prefix}{name}` | `{format_toml(item.default)}` | {unit} | {rule} | {item.metadata['doc']} |")
     return "\n".join([*lines, ""])
+
+
+def validation_reference() -> str:
+    """The README of the validation with its table of rules; the rest is as committed."""
+    head, rest = VALIDATION.read_text(encoding="utf-8").split(_RULES_BEGIN)
+    rows = [f"| `{item.name}` | {item.level} | {item.sentence} |" for item in load_rules().values()]
+    table = "\n".join(["| rule | level | what holds |", "|---|---|---|", *rows])
+    return f"{head}{_RULES_BEGIN}\n{table}\n\n{_RULES_END}{rest.split(_RULES_END)[1]}"
 
 
 def main() -> None:
     """Write the generated files."""
     argparse.ArgumentParser(description="Generate the documentation that follows from code.").parse_args()
     SETTINGS_REFERENCE.write_text(settings_reference(), encoding="utf-8")
-    print(f"wrote {SETTINGS_REFERENCE.relative_to(ROOT)}")
+    VALIDATION.write_text(validation_reference(), encoding="utf-8")
+    print(f"wrote {SETTINGS_REFERENCE.relative_to(ROOT)}, {VALIDATION.relative_to(ROOT)}")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ import warp as wp
 
 from synpick_warp.kernels.pose.lighting import CHANNELS, Lighting, harmonics
 from synpick_warp.kernels.pose.observation import CROP, Images, Observation, Targets
-from synpick_warp.kernels.pose.residuals import LANES, Cost, Models, Sums, jacobian, tukey_weight
+from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Models, Sums, jacobian, tukey_weight
 from synpick_warp.kernels.pose.samples import PROTRUDING, VISIBLE, SampleView, has_color, interpolate_color, view_sample
 
 wp.set_module_options({"enable_backward": False})
@@ -54,7 +54,7 @@ def intensity_gradient(across: float, down: float, intrinsics: wp.vec4, pitch: f
 def accumulate_samples_kernel(
     # Scene:
     models: Models,
-    cost: Cost,
+    cost: LossParameters,
     # In:
     images: Images,
     targets: Targets,

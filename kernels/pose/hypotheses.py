@@ -1,9 +1,9 @@
-"""Pose hypotheses of a tracker: motion models, turns that depth cannot tell apart, their colour correlation, and the choice of the best."""
+"""Pose hypotheses of a tracker: motion models, near-symmetries, their colour correlation, and the choice of the best."""
 
 import warp as wp
 
 from synpick_warp.kernels.pose.observation import Images, Observation, Targets
-from synpick_warp.kernels.pose.residuals import Cost, Models
+from synpick_warp.kernels.pose.residuals import LossParameters, Models
 from synpick_warp.kernels.pose.samples import VISIBLE, has_color, interpolate_color, view_sample
 
 wp.set_module_options({"enable_backward": False})
@@ -11,14 +11,14 @@ wp.set_module_options({"enable_backward": False})
 MOTIONS = wp.constant(3)
 """Motion hypotheses per instance: at rest, constant velocity, shift with the observed centroid."""
 CORRELATION_LANES = wp.constant(8)
-"""Threads that share the correlation of one turn."""
+"""Threads that share the correlation of one near-symmetry."""
 MIN_SAMPLES = wp.constant(24)
 """Smallest number of coloured samples for a correlation."""
 NO_CORRELATION = wp.constant(-2.0)
 """Below any correlation: there are too few samples."""
 FAST_MEAN = wp.constant(0.1)
 SLOW_MEAN = wp.constant(0.02)
-"""Weights of a new correlation in its running mean: usually, and while it is so low that turns are considered."""
+"""Weights of a new correlation in its running mean: usually, and while it is so low that symmetries are considered."""
 COST_MEAN = wp.constant(0.2)
 """Weight of a new cost in its running mean."""
 
@@ -40,7 +40,7 @@ class Track:
     held: wp.array[int]
     """(instance): number of frames since the last one whose estimate was taken."""
     correlation: wp.array[float]
-    """(instance): running mean of the correlation between image and base colours, before turns; `NO_CORRELATION`: none yet."""
+    """(instance): running mean of the correlation between image and base colours, before symmetries; `NO_CORRELATION`: none yet."""
 
 
 @wp.struct
@@ -58,15 +58,15 @@ class TrackPolicy:
 
 
 @wp.struct
-class Turns:
-    """Rotations about an object's centre that change its shape little, by model. Constant."""
+class Symmetries:
+    """Near-symmetries: rotations about an object's centre that change its shape little, by model. Constant."""
 
     rotation: wp.array2d[wp.quat]
-    """(model, turn): in the model's axes; the first is the identity."""
+    """(model, symmetry): in the model's axes; the first is the identity."""
     count: wp.array[int]
-    """(model): number of turns."""
+    """(model): number of symmetries."""
     center: wp.array[wp.vec3]
-    """(model): fixed point of the turns, in the model's frame [m]."""
+    """(model): fixed point of the rotations, in the model's frame [m]."""
 
 
 @wp.struct
@@ -110,18 +110,18 @@ def propose_motions_kernel(
     pose_out[first + 2] = pose
     if track_inout.frames[instance] > 1:
         before = track_inout.before[instance]
-        turn = rotation * wp.quat_inverse(wp.transform_get_rotation(before))
+        rotated = rotation * wp.quat_inverse(wp.transform_get_rotation(before))
         shift = position - wp.transform_get_translation(before)
-        pose_out[first + 1] = wp.transform(position + shift, wp.normalize(turn * rotation))
+        pose_out[first + 1] = wp.transform(position + shift, wp.normalize(rotated * rotation))
     if track_inout.frames[instance] > 0 and observation.points[instance] > 0 and track_inout.centroid[instance][2] > 0.0:
         shift = observation.centroid[instance] - track_inout.centroid[instance]
         pose_out[first + 2] = wp.transform(position + shift, rotation)
 
 
 @wp.kernel
-def turn_poses_kernel(
+def symmetric_poses_kernel(
     # Scene:
-    turns: Turns,
+    symmetries: Symmetries,
     # In:
     targets: Targets,
     pose: wp.array[wp.transform],  # (instance) [m]
@@ -129,25 +129,25 @@ def turn_poses_kernel(
     # Out:
     pose_out: wp.array[wp.transform],  # (candidate) [m]
 ):
-    """Turn poses about the object's centre, candidate = instance x capacity + turn."""
+    """Poses rotated by each near-symmetry of their object, candidate = instance x capacity + symmetry."""
     index = wp.tid()
     instance = index // capacity
-    turn = index % capacity
+    symmetry = index % capacity
     model = targets.model[instance]
     result = pose[instance]
-    if turn < turns.count[model]:
-        rotation = turns.rotation[model, turn]
-        center = turns.center[model]
+    if symmetry < symmetries.count[model]:
+        rotation = symmetries.rotation[model, symmetry]
+        center = symmetries.center[model]
         result = result * wp.transform(center - wp.quat_rotate(rotation, center), rotation)
     pose_out[index] = result
 
 
 @wp.kernel
-def correlate_turns_kernel(
+def correlate_symmetries_kernel(
     # Scene:
     models: Models,
-    turns: Turns,
-    cost: Cost,
+    symmetries: Symmetries,
+    cost: LossParameters,
     # In:
     images: Images,
     targets: Targets,
@@ -157,14 +157,14 @@ def correlate_turns_kernel(
     # Out:
     correlation_out: Correlation,
 ):
-    """Sums of intensity and base colour over the visible samples of each turned pose."""
+    """Sums of intensity and base colour over the visible samples of each candidate pose."""
     index, lane = wp.tid()
     instance = index // capacity
     model = targets.model[instance]
     intensities = wp.vec3()
     bases = wp.vec3()
     squares = wp.vec4()
-    if observation.points[instance] > 0 and index % capacity < turns.count[model]:
+    if observation.points[instance] > 0 and index % capacity < symmetries.count[model]:
         for k in range(lane, models.position.shape[1], CORRELATION_LANES):
             sample = view_sample(models, images, targets, observation, cost, instance, pose[index], k)
             if sample.state == VISIBLE and has_color(observation, instance, sample.crop):
@@ -198,9 +198,9 @@ def correlation_of(correlation: Correlation, index: int) -> float:
 
 
 @wp.kernel
-def choose_turns_kernel(
+def choose_symmetry_kernel(
     # Scene:
-    turns: Turns,
+    symmetries: Symmetries,
     # State:
     mean_inout: wp.array[float],  # (instance)
     # In:
@@ -212,10 +212,10 @@ def choose_turns_kernel(
     # Out:
     pose_out: wp.array[wp.transform],  # (pose) [m]
 ):
-    """Two hypotheses per instance: the pose as it is, and the turn that correlates best.
+    """Two hypotheses per instance: the pose as it is, and its near-symmetry that correlates best.
 
-    A turn is considered only where colours fit by `gain` worse than they used to, and the turn by `gain` better than the pose: light and
-    gloss alone make some turns of a still object fit better than the truth.
+    One is considered only where colours fit by `gain` worse than they used to, and there by `gain` better than at the pose: light and
+    gloss alone make some symmetries of a still object fit better than the truth.
     """
     instance = wp.tid()
     first = instance * capacity
@@ -229,11 +229,11 @@ def choose_turns_kernel(
         if start < mean - gain:
             weight = float(SLOW_MEAN)
             most = start + gain
-            for turn in range(1, turns.count[targets.model[instance]]):
-                value = correlation_of(correlation, first + turn)
+            for symmetry in range(1, symmetries.count[targets.model[instance]]):
+                value = correlation_of(correlation, first + symmetry)
                 if value > most:
                     most = value
-                    best = first + turn
+                    best = first + symmetry
         mean_inout[instance] = mean + weight * (start - mean)
     pose_out[2 * instance] = pose[first]
     pose_out[2 * instance + 1] = pose[best]

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.pose.observation import Images, Observation, Targets
-from synpick_warp.kernels.pose.residuals import LANES, Cost, Models
+from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Models
 from synpick_warp.kernels.pose.samples import VISIBLE, has_color, interpolate_color, view_sample
 
 wp.set_module_options({"enable_backward": False})
@@ -35,7 +35,7 @@ def harmonics(normal: wp.vec3) -> wp.vec4:
 def accumulate_lighting_kernel(
     # Scene:
     models: Models,
-    cost: Cost,
+    cost: LossParameters,
     # In:
     images: Images,
     targets: Targets,

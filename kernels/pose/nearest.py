@@ -120,11 +120,11 @@ def sum_distances_kernel(
     if pose >= sum_out.shape[0]:
         return
     block = task % blocks
-    turn = rotation[pose]
+    orientation = rotation[pose]
     shift = translation[pose]
     total = wp.float64(0.0)
     for index in range(block * BLOCK, wp.min((block + 1) * BLOCK, query.shape[0])):
-        point = turn * query[index] + shift
+        point = orientation * query[index] + shift
         place = point * cells_per_meter
         x = wp.int32(place[0])
         y = wp.int32(place[1])

@@ -31,7 +31,7 @@ class Models:
 
 
 @wp.struct
-class Cost:
+class LossParameters:
     """Parameters of the robust losses: cutoffs, weights, and the stride with which points and samples are taken."""
 
     cutoff: float

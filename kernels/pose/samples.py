@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.pose.observation import CROP, Images, Observation, Targets, read_depth
-from synpick_warp.kernels.pose.residuals import Cost, Models
+from synpick_warp.kernels.pose.residuals import LossParameters, Models
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,7 +39,7 @@ def view_sample(
     images: Images,
     targets: Targets,
     observation: Observation,
-    cost: Cost,
+    cost: LossParameters,
     instance: int,
     pose: wp.transform,
     sample: int,

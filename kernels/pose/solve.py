@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.pose.observation import Observation, Targets
-from synpick_warp.kernels.pose.residuals import LANES, Cost, Models, Sums
+from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Models, Sums
 
 wp.set_module_options({"enable_backward": False})
 
@@ -77,18 +77,20 @@ def rotation_vector(rotation: wp.quat) -> wp.vec3:
 @wp.func
 def pose_difference(target: wp.transform, start: wp.transform, radius: float) -> wp.spatial_vector:
     """Step (w, v) [m] that moves the pose `start` to `target`."""
-    turn = wp.transform_get_rotation(target) * wp.quat_inverse(wp.transform_get_rotation(start))
-    return wp.spatial_vector(radius * rotation_vector(turn), wp.transform_get_translation(target) - wp.transform_get_translation(start))
+    rotation_step = wp.transform_get_rotation(target) * wp.quat_inverse(wp.transform_get_rotation(start))
+    return wp.spatial_vector(
+        radius * rotation_vector(rotation_step), wp.transform_get_translation(target) - wp.transform_get_translation(start)
+    )
 
 
 @wp.func
 def apply_step(pose: wp.transform, step: wp.spatial_vector, radius: float) -> wp.transform:
     """Retraction on SO(3) x R³: exp(w / ρ) times the rotation, v plus the translation; the object's origin is the pivot."""
-    turn = wp.spatial_top(step) / radius
-    angle = wp.length(turn)
+    rotation_step = wp.spatial_top(step) / radius
+    angle = wp.length(rotation_step)
     rotation = wp.transform_get_rotation(pose)
     if angle > 1.0e-9:
-        rotation = wp.normalize(wp.quat_from_axis_angle(turn / angle, angle) * rotation)
+        rotation = wp.normalize(wp.quat_from_axis_angle(rotation_step / angle, angle) * rotation)
     return wp.transform(wp.transform_get_translation(pose) + wp.spatial_bottom(step), rotation)
 
 
@@ -132,7 +134,7 @@ def step_poses_kernel(
 @wp.kernel
 def score_poses_kernel(
     # Scene:
-    cost: Cost,
+    cost: LossParameters,
     # In:
     observation: Observation,
     sums: Sums,

@@ -3,7 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.pose.observation import Observation, Targets
-from synpick_warp.kernels.pose.residuals import LANES, Cost, Models, Sums, jacobian, tukey_weight
+from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Models, Sums, jacobian, tukey_weight
 
 wp.set_module_options({"enable_backward": False})
 
@@ -67,7 +67,7 @@ def match_point(mesh: wp.uint64, local: wp.vec3, seen: wp.vec3, eye: wp.vec3, re
 def accumulate_points_kernel(
     # Scene:
     models: Models,
-    cost: Cost,
+    cost: LossParameters,
     # In:
     targets: Targets,
     observation: Observation,

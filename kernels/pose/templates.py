@@ -1,8 +1,8 @@
-"""Template search: the observed points of an instance are compared with depth templates of its object from all directions and in all turns.
+"""Template search: observed points of an instance against depth templates of its object, all directions, all in-plane rotations.
 
 A template is a depth image of the object alone, `TEMPLATE` px across, relative to the depth of the object's centre. Directions are spread
-over the sphere; turns about the optical axis are not stored: the observed points are turned instead (Hinterstoisser et al., 2012; Vidal et
-al., 2018, for the truncated cost that knows occlusion).
+over the sphere; in-plane rotations (about the optical axis) are not stored: the observed points are rotated instead (Hinterstoisser et
+al., 2012; Vidal et al., 2018, for the truncated cost that knows occlusion).
 """
 
 import warp as wp
@@ -62,8 +62,8 @@ class Probes:
 class Search:
     """Search grid and loss."""
 
-    turns: int
-    """Turns about the optical axis."""
+    rotations: int
+    """Number of in-plane rotations, about the optical axis."""
     shifts: int
     """Shifts to each side of the centred placement, along either axis."""
     shift: float
@@ -131,13 +131,13 @@ def sample_probes_kernel(
 
 @wp.struct
 class Placement:
-    """Alignment of a template: direction, turn about the optical axis, and offset of the object's origin from the centroid."""
+    """Alignment of a template: direction, in-plane rotation, and offset of the object's origin from the centroid."""
 
     model: int
     direction: int
     cosine: float
     sine: float
-    """Of the turn."""
+    """Of the in-plane rotation."""
     x: float
     y: float
     """Offset across the viewing direction [m]."""
@@ -209,21 +209,21 @@ def search_templates_kernel(
     targets: Targets,
     probes: Probes,
     # Out:
-    cost_out: wp.array3d[float],  # (instance, direction, turn)
-    offset_out: wp.array3d[wp.vec3],  # (instance, direction, turn) [m]
+    cost_out: wp.array3d[float],  # (instance, direction, rotation)
+    offset_out: wp.array3d[wp.vec3],  # (instance, direction, rotation) [m]
 ):
-    """Cost of a direction and turn at its best shift, and the object's centre there, relative to the centroid.
+    """Cost of a direction and in-plane rotation at its best shift, and the object's centre there, relative to the centroid.
 
     The centre's depth is a trimmed mean. At least half of the observed points must lie on the template.
     """
-    instance, direction, turn = wp.tid()
+    instance, direction, inplane = wp.tid()
     count = probes.insides[instance]
     best = float(NO_COST)
     offset = wp.vec3(0.0, 0.0, 0.0)
     place = Placement()
     place.model = targets.model[instance]
     place.direction = direction
-    angle = TAU * float(turn) / float(search.turns)
+    angle = TAU * float(inplane) / float(search.rotations)
     place.cosine = wp.cos(angle)
     place.sine = wp.sin(angle)
     step = search.shift * templates.width[place.model] * float(TEMPLATE) / TEMPLATE_MARGIN
@@ -245,8 +245,8 @@ def search_templates_kernel(
             if price < best:
                 best = price
                 offset = wp.vec3(place.x, place.y, depth)
-    cost_out[instance, direction, turn] = best
-    offset_out[instance, direction, turn] = offset
+    cost_out[instance, direction, inplane] = best
+    offset_out[instance, direction, inplane] = offset
 
 
 @wp.kernel
@@ -257,15 +257,15 @@ def choose_directions_kernel(
     # In:
     observation: Observation,
     probes: Probes,
-    offset: wp.array3d[wp.vec3],  # (instance, direction, turn) [m]
+    offset: wp.array3d[wp.vec3],  # (instance, direction, rotation) [m]
     hypotheses: int,
     # Out:
-    cost_inout: wp.array3d[float],  # (instance, direction, turn)
+    cost_inout: wp.array3d[float],  # (instance, direction, rotation)
     pose_out: wp.array[wp.transform],  # (pose) [m]
 ):
-    """The best placements of an instance as poses, by greedy non-maximum suppression over turns; used costs are overwritten.
+    """The best placements of an instance as poses, by greedy non-maximum suppression over in-plane rotations; used costs are overwritten.
 
-    A placement suppresses turns of its direction within 60°. Where there are fewer, the best is repeated; without any, the pose is the
+    A placement suppresses rotations of its direction within 60°. Where there are fewer, the best is repeated; without any, the pose is the
     centroid without rotation.
     """
     instance = wp.tid()
@@ -273,25 +273,25 @@ def choose_directions_kernel(
     for k in range(hypotheses):
         best = float(NO_COST)
         direction = int(-1)
-        turn = int(0)
+        inplane = int(0)
         for i in range(cost_inout.shape[1]):
-            for j in range(search.turns):
+            for j in range(search.rotations):
                 if cost_inout[instance, i, j] < best:
                     best = cost_inout[instance, i, j]
                     direction = i
-                    turn = j
+                    inplane = j
         index = instance * hypotheses + k
         if direction < 0:
             pose_out[index] = wp.transform(observation.centroid[instance], wp.quat_identity())
             if k > 0:
                 pose_out[index] = pose_out[instance * hypotheses]
         else:
-            angle = TAU * float(turn) / float(search.turns)
+            angle = TAU * float(inplane) / float(search.rotations)
             around = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle)
-            place = observation.centroid[instance] + wp.quat_rotate(ray, offset[instance, direction, turn])
+            place = observation.centroid[instance] + wp.quat_rotate(ray, offset[instance, direction, inplane])
             pose_out[index] = wp.transform(place, wp.normalize(ray * around * templates.rotation[direction]))
-            for j in range(search.turns):
-                # One turn and its neighbours lead to the same pose; the opposite turns of a direction are another.
-                apart = wp.abs(j - turn)
-                if wp.min(apart, search.turns - apart) <= search.turns / SUPPRESSED:
+            for j in range(search.rotations):
+                # One rotation and its neighbours lead to the same pose; the opposite ones of a direction are another.
+                apart = wp.abs(j - inplane)
+                if wp.min(apart, search.rotations - apart) <= search.rotations / SUPPRESSED:
                     cost_inout[instance, direction, j] = NO_COST

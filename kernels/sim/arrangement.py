@@ -62,7 +62,7 @@ def assign_episodes_kernel(
 def sample_modes_kernel(
     # Scene:
     seed: wp.uint64,
-    mode: ModeData,
+    modes: wp.array[ModeData],  # (split)
     # State:
     arrangement_id: wp.array[wp.vec2i],  # (world)
     phase: wp.array[int],  # (world)
@@ -71,16 +71,22 @@ def sample_modes_kernel(
 ):
     """Sample the mode of starting episodes: PICK if u < p, else TARGET if u < p + t, else MOVE, with fractions p and t of the modes.
 
-    u is the first sample of the stream (seed, episode, 0, Stream.MODE): a resampled arrangement of the episode has the same mode. In a
-    round robin of n episodes, episode i has the midpoint of stratum i mod n instead: u = (i mod n + 1/2) / n.
+    The fractions are those of the episode's split; splits are sorted by first episode. u is the first sample of the stream (seed,
+    episode, 0, Stream.MODE): a resampled arrangement of the episode has the same mode. In a round robin of n episodes, episode i of the
+    split has the midpoint of stratum i mod n instead: u = (i mod n + 1/2) / n.
     """
     world = wp.tid()
     if phase[world] != Phase.START:
         return
     episode = arrangement_id[world][0]
+    split = int(0)
+    for index in range(1, modes.shape[0]):
+        if episode >= modes[index].first:
+            split = index
+    mode = modes[split]
     u = uniform(stream_key(seed, episode, 0, Stream.MODE), 0)
     if mode.cycle > 0:
-        u = (float(episode % mode.cycle) + 0.5) / float(mode.cycle)
+        u = (float((episode - mode.first) % mode.cycle) + 0.5) / float(mode.cycle)
     if u < mode.pick_share:
         mode_out[world] = Mode.PICK
     elif u < mode.pick_or_target_share:

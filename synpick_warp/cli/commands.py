@@ -1,4 +1,4 @@
-"""Command line: bake, verify, merge, preview, explain, eval, estimate, convert, doctor, config. A user error is one line; exit code 2."""
+"""Command line of synpick-warp: its subcommands and their options. User errors: one line, exit code 2."""
 
 from __future__ import annotations
 
@@ -15,11 +15,14 @@ from synpick_warp import __version__
 from synpick_warp.cli.convert import convert
 from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
-from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard
+from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard, parse_splits
+from synpick_warp.cli.statistics import show_statistics
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
+from synpick_warp.cli.validate import validate
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 
@@ -88,6 +91,12 @@ def bake(
     shard: Annotated[
         str | None, Parameter(help="i/n: only episodes with index % n == i, such as 0/4; combine the data sets with merge.")
     ] = None,
+    split: Annotated[
+        str | None,
+        Parameter(
+            help="Only these splits of the settings, such as train or train,test (default: all of a file's; a preset's must be named)."
+        ),
+    ] = None,
     set_: SetOption = None,
     profile: Annotated[
         bool, Parameter(negative=(), help="Print the time of each stage at the end, and write a Chrome trace (see --profile-out).")
@@ -114,13 +123,15 @@ def bake(
         "bake.writers": writers,
         "bake.formats": None if formats is None else [name.strip() for name in formats.split(",")],
     }
-    resolved = _resolve(config, given, resolution, set_)
-    part = parse_shard(shard, resolved.bake.episodes) if shard is not None else (0, 1)
+    names = parse_splits(split)
+    resolved = _resolve(config, given, resolution, set_, splits=split is not None)
+    planned = plan_episodes(resolved, names)
+    part = parse_shard(shard, planned) if shard is not None else (0, 1)
     if not profile and profile_out is None:
-        return _bake(resolved, out, part)
+        return _bake(resolved, out, part, names)
     trace = profile_out or out.with_name(f"{out.name}-profile.json")
     check_trace_file(trace, out)
-    return _bake_profiled(resolved, out, part, trace)
+    return _bake_profiled(resolved, out, part, names, trace)
 
 
 @app.command
@@ -231,6 +242,8 @@ def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
 app.command(evaluate, name="eval")
 app.command(estimate)
 app.command(convert)
+app.command(show_statistics, name="stats")
+app.command(validate)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -264,13 +277,15 @@ def _run(arguments: list[str]) -> int:
         return EXIT_INTERRUPTED
 
 
-def _resolve(config: str | None, given: dict[str, object], resolution: str | None, assignments: list[str] | None) -> Config:
+def _resolve(
+    config: str | None, given: dict[str, object], resolution: str | None, assignments: list[str] | None, *, splits: bool = False
+) -> Config:
     """Resolve settings from file and options; named options override --set."""
     overrides = dict(parse_assignment(text) for text in assignments or [])
     overrides |= {key: value for key, value in given.items() if value is not None}
     if resolution is not None:
         overrides["cameras.resolution"] = parse_resolution(resolution)
-    return load_config(config, overrides, source=COMMAND_LINE)
+    return load_config(config, overrides, source=COMMAND_LINE, splits=splits)
 
 
 def check_trace_file(trace: Path, out: Path) -> None:
@@ -285,14 +300,14 @@ def check_trace_file(trace: Path, out: Path) -> None:
         raise ConfigError(f"--profile-out is {trace}; allowed: a file in an existing folder")
 
 
-def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], trace: Path) -> int:
+def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], trace: Path) -> int:
     """Bake with the profiler on; print the table and write the trace."""
     from synpick_warp.cli.display import make_console, print_profile
     from synpick_warp.exporters.writing.files import output_error
     from synpick_warp.stages.timing import record
 
     with record() as recorder:
-        code = _bake(config, out, shard)
+        code = _bake(config, out, shard, splits)
     print_profile(make_console(), recorder)
     try:
         recorder.write_trace(trace)
@@ -302,7 +317,7 @@ def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], trace: Pat
     return code
 
 
-def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:
+def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str]) -> int:
     """Check device and folders, which is cheap, then bake."""
     from synpick_warp.cli.display import make_console, make_progress, print_summary
     from synpick_warp.exporters.writing.files import check_output_folder
@@ -319,7 +334,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int]) -> int:
 
     console = make_console()
     with make_progress(console) as progress:
-        summary = run_bake(config, out, progress, shard)
+        summary = run_bake(config, out, progress, shard, splits)
     print_summary(console, summary, out)
     if summary.stopped:
         done = f"{len(summary.episodes)} of {summary.total} episodes are complete"

@@ -50,6 +50,7 @@ def estimate(
     modes: Annotated[str | None, Parameter(help="Only episodes of these modes: pick, target, move; joined by commas.")] = None,
     cameras: Annotated[str | None, Parameter(help="Only these cameras, such as 0,2.")] = None,
     episodes: Annotated[str | None, Parameter(help="Only these episodes, such as 0-9,12.")] = None,
+    split: Annotated[str | None, Parameter(help="Only the episodes of this split (default: all splits).")] = None,
     visib_min: Annotated[float, Parameter(help="Smallest visible fraction of an instance that is estimated, from 0 to 1.")] = (
         DEFAULT_VISIBILITY
     ),
@@ -69,7 +70,7 @@ def estimate(
         from synpick_warp.estimation.gicp import load_small_gicp
 
         load_small_gicp()
-    run, listed = run_method(data, selection, options, device, out, color=color)
+    run, listed = run_method(data, selection, options, device, out, color=color, split=split)
     print(describe_run(run))
     print(f"results: {escape(str(out))}")
     if listed is not None:
@@ -77,11 +78,13 @@ def estimate(
     return 0
 
 
-def run_method(data: Path, selection: Selection, options: Options, device: str, out: Path, *, color: bool) -> tuple[Run, Path | None]:
+def run_method(
+    data: Path, selection: Selection, options: Options, device: str, out: Path, *, color: bool, split: str | None = None
+) -> tuple[Run, Path | None]:
     """Estimate, and write the files; returns the run, and the file of targets if it was written."""
     from synpick_warp.cli.display import ViewCounter, make_console
     from synpick_warp.dataset.reading import open_data_set
-    from synpick_warp.estimation import device as factories
+    from synpick_warp.estimation import factories
     from synpick_warp.estimation.decoder_pool import open_pool
     from synpick_warp.estimation.models import read_object_models
     from synpick_warp.estimation.run import list_targets, read_scenes, run_estimation
@@ -91,6 +94,8 @@ def run_method(data: Path, selection: Selection, options: Options, device: str, 
     from synpick_warp.exporters.writing.files import output_error, write_atomically
 
     data_set = open_data_set(data)
+    if split is not None:
+        data_set = data_set.split(split)
     plans, complete = plan_scenes(data_set, selection)
     processes = open_pool(options.threads, sum(len(plan.frames) for plan in plans))
     with processes or nullcontext() as pool, ViewCounter(make_console()) as counter:
@@ -100,7 +105,7 @@ def run_method(data: Path, selection: Selection, options: Options, device: str, 
         noise = factories.sensor_noise(data_set.config.depth_sensor, scenes) if options.depth == "sensor" else 0.0
         factory = factories.make_factory(options.method, models, device, options.threads, color=color, depth_noise=noise)
         run = run_estimation(scenes, [model.object_id for model in models], factory, options, counter.report, pool)
-    listed = None if complete else targets_file(out)
+    listed = None if complete and split is None else targets_file(out)
     if listed is not None:
         try:
             write_atomically(listed, encode_targets(list_targets(scenes)))

@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from synpick_warp.cli.options import WholeNumber
 from synpick_warp.configs.check import escape, format_value
+from synpick_warp.configs.splits import bop_folders, split_kind
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def evaluate(
     targets: Annotated[
         Path | None, Parameter(help="Score only images and objects of this list, such as estimate writes or BOP's test_targets_bop19.json.")
     ] = None,
+    split: Annotated[str | None, Parameter(help="Only the episodes of this split (default: all splits).")] = None,
     filter_: Annotated[
         str | None,
         Parameter(name="--filter", help="ema: score each method a second time, through the tracking filter of the SynPick paper."),
@@ -77,6 +79,8 @@ def evaluate(
     from synpick_warp.dataset.reading import open_data_set
 
     data_set = open_data_set(data)
+    if split is not None:
+        data_set = data_set.split(split)
     given = {"visib_min": visib_min, "convention": convention, "top": top, "vertices": vertices, "alpha": weight, "targets": targets}
     table, pictures = make_table(data_set, results, format_, **given, plots=plots, track=chosen)
     if out is not None:
@@ -294,7 +298,8 @@ def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
     """Command that computes BOP's scores (VSD, MSSD, MSPD), with comments about names that the toolkit needs otherwise."""
     folder = data_set.folder.absolute()
     name = re.sub("[^A-Za-z0-9]", "", folder.name).lower() or "synpick"
-    split, _, kind = data_set.config.bop.split.partition("_")
+    folders = bop_folders(data_set.config)
+    split, _, kind = next((name for name in folders if split_kind(name) == "test"), folders[0]).partition("_")
     ending = f"{name}-{split}{f'-{kind}' if kind else ''}"
     lines = [f"# BOP scores by the BOP toolkit, once `{name}` is in its dataset_params.py:"]
     if name != folder.name:

@@ -55,8 +55,13 @@ def parse_resolution(text: str) -> list[int]:
     return [int(match[1]), int(match[2])]
 
 
-def parse_shard(text: str, episodes: int) -> tuple[int, int]:
-    """Parse "0/4" into shard index and number of shards.
+def parse_splits(text: str | None) -> tuple[str, ...]:
+    """Parse "train,test" into names; None: no names."""
+    return () if text is None else tuple(name.strip() for name in text.split(","))
+
+
+def parse_shard(text: str, episodes: Sequence[range]) -> tuple[int, int]:
+    """Parse "0/4" into shard index and number of shards of these episodes.
 
     Raises:
         ConfigError: The text has another form, or the shard would have no episode.
@@ -64,6 +69,7 @@ def parse_shard(text: str, episodes: int) -> tuple[int, int]:
     match = _SHARD.fullmatch(text)
     if match is None or not int(match[1]) < int(match[2]):
         raise ConfigError(f"--shard is {format_value(text)}; allowed: i/n with i from 0 to n - 1, such as 0/4")
-    if int(match[1]) >= episodes:
-        raise ConfigError(f"--shard {text} has none of {episodes} episodes; use fewer shards")
-    return int(match[1]), int(match[2])
+    index, count = int(match[1]), int(match[2])
+    if not any((index - each.start) % count < len(each) for each in episodes):
+        raise ConfigError(f"--shard {text} has none of {sum(map(len, episodes))} episodes; use fewer shards")
+    return index, count

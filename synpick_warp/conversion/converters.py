@@ -10,16 +10,21 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
+from typing import ClassVar
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import bop_folder
 from synpick_warp.conversion.scenes import SceneContent, SceneSource, place_shards, write_coco, write_scene, write_shards, write_video_group
 from synpick_warp.conversion.source import Source, SourceEpisode
+from synpick_warp.dataset.object_names import object_names
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import ExportContext
 from synpick_warp.exporters.bop import coco
+from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes
-from synpick_warp.exporters.bop.scene_exporter import CONSTANTS
+from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
 from synpick_warp.exporters.bop.shard_parts import find_shards
+from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.exporters.registry import Exporters
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -93,15 +98,18 @@ class _SceneConverter(Converter):
         bop = config.bop
         self.content = SceneContent(bop.masks, bop.coco, config.render.layers)
 
-    @property
-    @abstractmethod
-    def split(self) -> Path:
-        """Folder of all scenes."""
+    exporter: ClassVar[type[SceneExporter]]
+    """The format's exporter, which names the folders of scenes."""
+
+    def folder(self, episode: int) -> Path:
+        """Folder of the scenes of an episode's split."""
+        return self.out / self.exporter.folder_name(bop_folder(self.config, episode))
 
     def write_constants(self) -> list[Path]:
         """See `Exporter`: copies of models, camera and notes."""
         try:
-            self.split.mkdir(exist_ok=True)
+            for folder in self.exporter.folders(self.config):
+                (self.out / folder).mkdir(exist_ok=True)
             self.source.copy_constants(CONSTANTS, self.out)
         except OSError as error:
             raise output_error(self.out, error) from error
@@ -116,31 +124,31 @@ class _SceneConverter(Converter):
 class ShardsConverter(_SceneConverter):
     """To webdataset shards: images are copied."""
 
-    @property
-    def split(self) -> Path:
-        """See base class."""
-        return self.out / f"{self.config.bop.split}_web"
+    exporter = ShardsExporter
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
-        return sorted(path.relative_to(self.out) for scene in self.scene_ids(episode) for path in find_shards(scene, self.split))
+        split = self.folder(episode)
+        return sorted(path.relative_to(self.out) for scene in self.scene_ids(episode) for path in find_shards(scene, split))
 
     def convert(self, episode: SourceEpisode, on_committed: Done) -> None:
         """See base class."""
-        folder = self.stage("shards", episode)
+        folder, split = self.stage("shards", episode), self.folder(episode.end.episode)
         staged: list[tuple[Path, int]] = []
         tasks: list[tuple[Callable[..., None], tuple[object, ...], Path]] = []
         for scene in episode.scenes():
             place = folder / f"{scene.scene:06d}"
             place.mkdir()
             staged.append((place, scene.scene))
-            tasks.append((write_shards, (scene, self.content, place), self.split))
-        arguments = (tuple(staged), self.split, episode.frames)
-        self.submit_all(tasks, lambda: self.pool.submit(place_shards, (), arguments, path=self.split, on_done=on_committed))
+            tasks.append((write_shards, (scene, self.content, place), split))
+        arguments = (tuple(staged), split, episode.frames)
+        self.submit_all(tasks, lambda: self.pool.submit(place_shards, (), arguments, path=split, on_done=on_committed))
 
 
 class BopConverter(_SceneConverter):
     """To scene folders: images are copied, masks drawn from run lengths."""
+
+    exporter = BopExporter
 
     def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
         super().__init__(source, out, config, pool)
@@ -148,40 +156,32 @@ class BopConverter(_SceneConverter):
             raise DatasetError(f"{source.folder} has no masks, which bop.coco needs; bake it with bop.masks = true")
         self._object_ids = tuple(sorted(source.data.models_info))
 
-    @property
-    def split(self) -> Path:
-        """See base class."""
-        return self.out / self.config.bop.split
-
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
-        places = (self.split / f"{scene:06d}" for scene in self.scene_ids(episode))
+        places = (self.folder(episode) / f"{scene:06d}" for scene in self.scene_ids(episode))
         return [place.relative_to(self.out) for place in places if os.path.lexists(place)]
 
     def convert(self, episode: SourceEpisode, on_committed: Done) -> None:
         """See base class."""
-        folder = self.stage("bop", episode)
+        folder, split = self.stage("bop", episode), self.folder(episode.end.episode)
         width, height = self.config.cameras.resolution
         suffix = f".{self.config.bop.color_format}"
-        settings = SceneSettings(self.config.bop.split, episode.frames, width, height, suffix, self.config.bop.coco, self._object_ids)
+        settings = SceneSettings(split.name, episode.frames, width, height, suffix, self.config.bop.coco, self._object_ids)
         scenes = episode.scenes()
-        moves = tuple((folder / f"{scene.scene:06d}", self.split / f"{scene.scene:06d}") for scene in scenes)
+        moves = tuple((folder / f"{scene.scene:06d}", split / f"{scene.scene:06d}") for scene in scenes)
         tasks = [(write_scene, (scene, self.content, move[0]), move[1]) for scene, move in zip(scenes, moves, strict=True)]
-        self.submit_all(tasks, lambda: self.pool.submit(commit_scenes, (), (moves, settings), path=self.split, on_done=on_committed))
+        self.submit_all(tasks, lambda: self.pool.submit(commit_scenes, (), (moves, settings), path=split, on_done=on_committed))
 
 
 class CocoConverter(_SceneConverter):
     """To COCO: images are copied."""
 
+    exporter = coco.CocoExporter
+
     def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
         super().__init__(source, out, config, pool)
         if not config.bop.masks:
             raise DatasetError(f"{source.folder} has no masks, which COCO needs; bake it with bop.masks = true")
-
-    @property
-    def split(self) -> Path:
-        """See base class."""
-        return self.out / coco.FOLDER
 
     def write_constants(self) -> list[Path]:
         """See base class."""
@@ -189,7 +189,8 @@ class CocoConverter(_SceneConverter):
         if data.has_store:
             names = {item.object_id: item.name for item in data.objects}
         else:
-            names = {entry.obj_id: entry.name for entry in load_assets(self.source)[0].entries}
+            known = object_names(self.source.folder, self.source.config, set(data.models_info))
+            names = {index: known.get(index, f"obj_{index:06d}") for index in data.models_info}
         coco.write_categories(self.out, names)
         return [coco.CATEGORIES]
 
@@ -204,7 +205,7 @@ class CocoConverter(_SceneConverter):
         staged = tuple((folder / f"{scene.scene:06d}", scene.scene) for scene in scenes)
         tasks = [(write_coco, (scene, place), place) for scene, (place, _) in zip(scenes, staged, strict=True)]
         arguments = (staged, self.out)
-        self.submit_all(tasks, lambda: self.pool.submit(coco.commit_scenes, (), arguments, path=self.split, on_done=on_committed))
+        self.submit_all(tasks, lambda: self.pool.submit(coco.commit_scenes, (), arguments, path=folder, on_done=on_committed))
 
 
 class UsdConverter(Converter):

@@ -16,7 +16,7 @@ import numpy as np
 
 from synpick_warp.conversion.masks import read_masks
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, SceneShards, ViewRecords, check_planes
-from synpick_warp.errors import DatasetError
+from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.coco import make_annotations, write_image
 from synpick_warp.exporters.bop.scene import create_scene_folders
 from synpick_warp.exporters.bop.shard_parts import END_OF_ARCHIVE, MAX_SHARD_VIEWS, mask_json, shard_name, tar_entry, view_key
@@ -156,7 +156,7 @@ def place_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int)
     for staging, scene in scenes:
         names = [shard_name(scene, part) for part in range(-(-frames // MAX_SHARD_VIEWS))]
         if sorted(path.name for path in staging.iterdir()) != sorted(names):
-            raise DatasetError(f"{staging} does not hold the shards of {frames} frames; this is an error of synpick-warp, please report it")
+            raise OutputError(f"{staging} does not hold the shards of {frames} frames; this is an error of synpick-warp, please report it")
         for name in names:
             (staging / name).rename(split / name)
         staging.rmdir()

@@ -93,12 +93,16 @@ def make_manifest(config: Config) -> dict[str, Any]:
 
 
 def fixed_settings(config: Config) -> dict[str, Any]:
-    """Settings that determine the output: all but FREE_SETTINGS, nested as in the file; formats sorted by name."""
+    """Settings that determine the output: all but FREE_SETTINGS and the splits' numbers of episodes, nested; formats sorted by name."""
     settings = dataclasses.asdict(config)
     for key in FREE_SETTINGS:
         section, name = key.split(".")
         del settings[section][name]
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
+    for split in settings["splits"]:
+        del split["episodes"]
+    if not config.splits:
+        del settings["splits"]
     return settings
 
 

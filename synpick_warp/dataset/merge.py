@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 import os
 import stat
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.manifest import (
     CONFIG_FILE,
@@ -84,7 +86,8 @@ def merge(parts: Sequence[Path], out: Path) -> Merged:
         for lock in locks:
             os.close(lock)
     there = committed_episodes(out)
-    return Merged(len(there), sorted(set(range(config.bake.episodes)) - set(there)))
+    planned = {index for each in plan_episodes(config) for index in each}
+    return Merged(len(there), sorted(planned - set(there)))
 
 
 def _check_folders(parts: Sequence[Path], out: Path) -> None:
@@ -130,12 +133,17 @@ def _sources(parts: Sequence[Path]) -> dict[Path, Path]:
 
 
 def _config(parts: Sequence[Path], manifest: Mapping[str, Any]) -> Config:
-    """Settings of the first part, with the largest `bake.episodes` of all."""
+    """Settings of the first part, with the largest number of episodes of all, in each split."""
     configs = [read_settings(part, manifest) for part in parts]
-    episodes = max(config.bake.episodes for config in configs)
+    longest = [max(each, key=lambda split: split.episodes) for each in zip(*(config.splits for config in configs), strict=True)]
+    episodes = sum(split.episodes for split in longest) or max(config.bake.episodes for config in configs)
     if episodes > MAX_EPISODES:
         raise DatasetError(f"bake.episodes is {episodes} in the {CONFIG_FILE} of a part; allowed: up to {MAX_EPISODES}; correct it there")
-    return dataclasses.replace(configs[0], bake=dataclasses.replace(configs[0].bake, episodes=episodes))
+    config = dataclasses.replace(configs[0], bake=dataclasses.replace(configs[0].bake, episodes=episodes), splits=tuple(longest))
+    for before, after in itertools.pairwise(config.splits):
+        if after.first < before.first + before.episodes:
+            raise DatasetError(f"the split {before.name} of one part has episodes that the split {after.name} of another one has")
+    return config
 
 
 def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes) -> None:

@@ -15,6 +15,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from synpick_warp.configs.check import format_value
+from synpick_warp.configs.splits import bop_folder, bop_folders, episode_range, plan_episodes
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
 from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
 from synpick_warp.dataset.trajectory import (
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
 
 USD = Path("usd")
 """Folder of USD episodes in a data set."""
+LEROBOT_PARTS, COCO_PARTS = Path("lerobot/parts"), Path("coco/parts")
+"""Folders with a file per episode and per scene; these formats alone give rows and attempts, but no views."""
 
 
 class Episode:
@@ -179,13 +183,15 @@ class Episode:
 class DataSet(Mapping[int, Episode]):
     """Episodes of a data set by index, and what they share. Episodes that another bake commits meanwhile appear on the next access."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, episodes: range | None = None) -> None:
         """
         Args:
             folder: Folder of the data set.
+            episodes: Indices of the episodes to show; None: all.
         """
         self.folder = folder
         self._store = folder / STORE
+        self._only = episodes
 
     @cached_property
     def config(self) -> Config:
@@ -282,12 +288,36 @@ class DataSet(Mapping[int, Episode]):
             raise DatasetError(f"{self.folder} has no {STORE}; bake with --formats zarr, which can be combined with others, as in bop,zarr")
 
     @cached_property
-    def _splits(self) -> tuple[Path, ...]:
-        """Folders of BOP scenes and of webdataset shards, which need not exist; none if there are no settings."""
+    def splits(self) -> dict[str, DataSet]:
+        """Splits by name, each a data set of its episodes. Without [splits] in the settings, the one of the name `bop.split`; none
+        without settings, as in a lone trajectory store."""
         if not (self.folder / CONFIG_FILE).exists():
-            return ()
-        split = path_inside(self.folder, self.config.bop.split, self.folder / CONFIG_FILE, DatasetError)
-        return split, split.with_name(f"{split.name}_web")
+            return {}
+        named = {split.name: DataSet(self.folder, episode_range(split)) for split in self.config.splits}
+        return named or {self.config.bop.split: self}
+
+    def split(self, name: str) -> DataSet:
+        """The episodes of one split.
+
+        Raises:
+            DatasetError: There is no such split.
+        """
+        if name not in self.splits:
+            raise DatasetError(f"{self.folder} has no split {format_value(name)}; splits: {', '.join(self.splits) or 'none'}")
+        return self.splits[name]
+
+    @cached_property
+    def planned(self) -> int:
+        """Number of episodes that the settings plan."""
+        return sum(len(each) for each in plan_episodes(self.config) if self._only in (None, each))
+
+    @cached_property
+    def _folders(self) -> dict[str, tuple[Path, Path]]:
+        """BOP name of each split -> folders of its scenes and of its webdataset shards, which need not exist; none without settings."""
+        if not (self.folder / CONFIG_FILE).exists():
+            return {}
+        places = {name: path_inside(self.folder, name, self.folder / CONFIG_FILE, DatasetError) for name in bop_folders(self.config)}
+        return {name: (place, place.with_name(f"{place.name}_web")) for name, place in places.items()}
 
     def scene_files(self, episode: int, camera: int) -> SceneFiles:
         """Files of the scene that a camera recorded in an episode: its folder, or else its shards.
@@ -300,7 +330,7 @@ class DataSet(Mapping[int, Episode]):
 
         scene = self.camera_count * episode + camera
         size = self.config.cameras.resolution
-        folder, web = self._splits
+        folder, web = self._folders[bop_folder(self.config, episode)]
         if (folder / f"{scene:06d}").is_dir():
             return SceneFolder(folder / f"{scene:06d}", size)
         if shards := list(find_shards(scene, web)):
@@ -309,21 +339,27 @@ class DataSet(Mapping[int, Episode]):
 
     def _has_files(self, index: int) -> bool:
         """Whether an episode has files in some format."""
-        paths = [self._store / EPISODES / f"{index:06d}" / GROUP_FILE, self.folder / USD / f"{index:06d}.usdc"]
-        if self._splits:
+        name, folder = f"{index:06d}", self.folder
+        paths = [self._store / EPISODES / name / GROUP_FILE, folder / USD / f"{name}.usdc", folder / LEROBOT_PARTS / f"{name}.json"]
+        if self._folders:
             scene = self.camera_count * index
-            paths += [self._splits[0] / f"{scene:06d}", self._splits[1] / f"shard-{scene:06d}.tar"]
+            split, web = self._folders[bop_folder(self.config, index)]
+            paths += [split / f"{scene:06d}", web / f"shard-{scene:06d}.tar", folder / COCO_PARTS / f"{scene:06d}.jsonl"]
         return any(path.exists() for path in paths)
 
     def _names(self) -> Iterator[int]:
         """Indices of the episodes that have files in some format; an index can occur several times."""
-        yield from _indices((self._store / EPISODES).glob("[0-9]*"))
-        yield from _indices((self.folder / USD).glob("[0-9]*.usdc"))
-        for split, pattern in zip(self._splits, ("[0-9]*", "shard-??????.tar"), strict=False):
-            yield from (scene // self.camera_count for scene in _indices(split.glob(pattern)))
+        episodes = ((self._store / EPISODES, "[0-9]*"), (self.folder / USD, "[0-9]*.usdc"), (self.folder / LEROBOT_PARTS, "[0-9]*.json"))
+        yield from (index for folder, pattern in episodes for index in _indices(folder.glob(pattern)))
+        scenes = [(self.folder / COCO_PARTS, "[0-9]*.jsonl")]
+        for folder, web in self._folders.values():
+            scenes += [(folder, "[0-9]*"), (web, "shard-??????.tar")]
+        yield from (scene // self.camera_count for folder, pattern in scenes for scene in _indices(folder.glob(pattern)))
 
     def _is_committed(self, index: int) -> bool:
-        """Whether an episode has its manifest entry; a data set without manifest, such as a lone store, has none to check."""
+        """Whether an episode is one of these and has its manifest entry; without manifest, as in a lone store, there is none to check."""
+        if self._only is not None and index not in self._only:
+            return False
         return not (self.folder / ENTRIES).is_dir() or (self.folder / f"{episode_entry(index)}.json").is_file()
 
     def __getitem__(self, index: int) -> Episode:

@@ -78,6 +78,7 @@ class Row(msgspec.Struct):
     lost: Number
     left: Index
     sentence: str
+    split: str = ""
 
     def __post_init__(self) -> None:
         _check_name("ending", self.ending, names(Ending)[1:])

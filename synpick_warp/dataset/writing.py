@@ -21,6 +21,7 @@ from pathlib import Path
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import episodes_end, is_planned, split_of
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.dataset.manifest import (
     ATTEMPTS_FILE,
@@ -108,7 +109,7 @@ class OutputFolder:
 
     def _scan(self) -> None:
         """Compare settings, and sort episodes into committed, remaining and partial ones."""
-        out, episodes = self.out, self.config.bake.episodes
+        out, config = self.out, self.config
         self._known = read_manifest(out) if os.path.lexists(out / MANIFEST_FILE) else None
         self._is_ours = self._known is not None
         if self._known:
@@ -117,8 +118,11 @@ class OutputFolder:
                 raise ConfigError(f"{out} was started with other settings: {said}; {_ADVICE}")
             _check_links(out, self._shared)
         entries = committed_episodes(out)
-        if entries and entries[-1] >= episodes:
-            raise ConfigError(f"bake.episodes is {episodes}, but {out} has episode {entries[-1]}; a data set can only grow")
+        foreign = next((index for index in reversed(entries) if not is_planned(config, index)), None)
+        if foreign is not None:
+            split = split_of(config, foreign)
+            key, episodes = (f"splits.{split.name}.episodes", split.episodes) if split else ("bake.episodes", config.bake.episodes)
+            raise ConfigError(f"{key} is {episodes}, but {out} has episode {foreign}; a data set can only grow")
         self._complete = {index for index in entries if is_complete(self.out, episode_entry(index))}
         self.committed = sorted(self._complete.intersection(self.episodes))
         self.remaining = sorted(set(self.episodes) - self._complete)
@@ -153,7 +157,7 @@ class OutputFolder:
             (self.out / ENTRIES).mkdir(exist_ok=True)
             self._remove_indices()
             if self._known:
-                self._remove_partial(max(self.config.bake.episodes, _planned_episodes(self.out)))
+                self._remove_partial(max(episodes_end(self.config), _planned_end(self.out)))
             write_atomically(self.out / CONFIG_FILE, config_to_toml(self.config).encode())
             (self.out / PARTIAL).mkdir()
             if not is_complete(self.out, CONSTANTS):
@@ -234,7 +238,7 @@ class OutputFolder:
         """Remove a data set without episodes. While anything of it stays, the manifest does, so that a bake can resume it."""
         self._complete = set()
         if self._exporters is not None:
-            self._remove_partial(self.config.bake.episodes)
+            self._remove_partial(episodes_end(self.config))
         self._remove_indices()
         self._remove_constants()
         if any(os.path.lexists(self.out / folder) for folder in self._shared.folders):
@@ -281,11 +285,11 @@ def build_lists(out: Path, config: Config) -> list[Path]:
     return paths
 
 
-def _planned_episodes(out: Path) -> int:
-    """`bake.episodes` of the last bake of the folder; 0 if its settings cannot be read."""
+def _planned_end(out: Path) -> int:
+    """One more than the largest episode index of the last bake of the folder; 0 if its settings cannot be read."""
     with contextlib.suppress(ConfigError, DatasetError):
         check_regular_file(out / CONFIG_FILE, MAX_TOML, DatasetError)
-        return load_config(str(out / CONFIG_FILE), {}).bake.episodes
+        return episodes_end(load_config(str(out / CONFIG_FILE), {}))
     return 0
 
 

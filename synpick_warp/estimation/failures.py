@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
+from synpick_warp.evaluation.auc import LIMIT
 from synpick_warp.evaluation.charts import INK, SOFT, Color, Image, printable
 from synpick_warp.evaluation.poses import PoseTable
 from synpick_warp.evaluation.scoring import Scores
@@ -51,6 +52,9 @@ class Failure:
     """Row of the estimates of its object in its image that is nearest; -1: there is none."""
     error: float
     """[m]; infinity: missed."""
+    distance: float = np.inf
+    """Of the estimate's position from the true one [m]. BOP's matching takes as many estimates as there are targets, the best scored, so
+    that an instance may be missed though an estimate is near."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +104,9 @@ def find_failures(truth: Truth, scores: Scores, estimates: PoseTable, count: int
         order = np.lexsort((np.array(found) < 0, -np.where(np.isfinite(errors), errors, 1e9)))
         row = rows[order[0]]
         target = int(scores.target[row])
-        result.append(Failure(target, nearest_estimate(truth.poses, target, estimates), float(scores.errors[METRIC][row])))
+        nearest = nearest_estimate(truth.poses, target, estimates)
+        offset = np.inf if nearest < 0 else np.linalg.norm(estimates.translation[nearest] - truth.poses.translation[target])
+        result.append(Failure(target, nearest, float(scores.errors[METRIC][row]), float(offset)))
     return sorted(result, key=lambda failure: -failure.error)[:count]
 
 
@@ -158,9 +164,14 @@ def describe_failure(truth: Truth, failure: Failure, view: View, names: Mapping[
     object_id = int(truth.poses.object_id[failure.truth])
     name = printable(names.get(object_id, f"object {object_id}"))
     place = f"{truth.mode[failure.truth]}, episode {view.episode}, camera {view.camera}, frame {view.frame}"
-    error = f"{METRIC} {1e3 * failure.error:.1f} mm" if np.isfinite(failure.error) else "missed (above 100 mm)"
-    if failure.estimate < 0:
+    if np.isfinite(failure.error):
+        error = f"{METRIC} {1e3 * failure.error:.1f} mm"
+    elif failure.estimate < 0:
         error = "no estimate"
+    elif failure.distance < LIMIT:
+        error = "missed: other estimates of the object have higher scores (shown: the nearest)"
+    else:
+        error = f"missed (above {1e3 * LIMIT:.0f} mm)"
     speed = truth.speed[failure.truth]
     moving = f", {speed:.2f} m/s" if np.isfinite(speed) else ""
     return f"{name}: {error}", f"{place}; {100 * truth.visibility[failure.truth]:.0f} % visible{moving}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,13 +23,14 @@ GRIPPER_HOME = (3.0, 0.0, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class SceneData:
-    """Constants for the kernels, one struct a subject; `guide_shapes` are the indices of a world's guide walls among its shapes."""
+    """Constants for the kernels, one struct a subject; `modes` has one `ModeData` per split, `guide_shapes` the indices of a world's guide
+    walls among its shapes."""
 
     layout: structs.LayoutData
     catalog: structs.CatalogData
     drop: structs.DropData
     settle: structs.SettleData
-    mode: structs.ModeData
+    modes: wp.array
     move: structs.MoveData
     pick: structs.PickData
     perception: structs.PerceptionData
@@ -72,7 +74,7 @@ def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, l
         _catalog_data(catalog, built, device),
         _drop_data(config, lights),
         _settle_data(config.settle, physics.step * physics.steps_per_tick),
-        _mode_data(config),
+        mode_data(_mode_rows(config), device),
         _move_data(config.move, config.tote, gripper, physics),
         fill(
             structs.PickData,
@@ -127,12 +129,22 @@ def _extents(entry: CatalogEntry) -> np.ndarray:
     return np.sort(np.ptp(entry.mesh.vertices.astype(np.float64), axis=0))
 
 
-def _mode_data(config: Config) -> structs.ModeData:
-    weights = mode_weights(config)
-    pick, target, move = weights["pick"], weights["target"], weights["move"]
-    total = pick + target + move
-    cycle = len(MODES) if config.bake.mode == CYCLE else 0
-    return fill(structs.ModeData, pick_share=pick / total, pick_or_target_share=(pick + target) / total, cycle=cycle)
+def mode_data(rows: Sequence[tuple[int, float, float, int]], device: wp.Device) -> wp.array:
+    """Array of `ModeData` from the values of its members, in order."""
+    names = structs.ModeData.vars
+    return wp.array([fill(structs.ModeData, **dict(zip(names, row, strict=True))) for row in rows], dtype=structs.ModeData, device=device)
+
+
+def _mode_rows(config: Config) -> list[tuple[int, float, float, int]]:
+    """Members of `ModeData` of each split, or of the one range without splits."""
+    splits = [(split.first, split.mode) for split in config.splits] or [(0, config.bake.mode)]
+    rows = []
+    for first, mode in splits:
+        weights = mode_weights(config, mode)
+        pick, target, move = weights["pick"], weights["target"], weights["move"]
+        total = pick + target + move
+        rows.append((first, pick / total, (pick + target) / total, len(MODES) if mode == CYCLE else 0))
+    return rows
 
 
 def _drop_data(config: Config, lights: int) -> structs.DropData:

@@ -5,7 +5,6 @@ The layout follows the figure of the paper (Periyasamy et al., SynPick, 2021).
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,11 @@ import numpy as np
 
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.dataset.annotations import SCENE_SCHEMAS, Key, ModelDiameter, read_checked
+from synpick_warp.configs.splits import bop_folder
+from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
+from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.view_files import read_image
 from synpick_warp.errors import DatasetError
-from synpick_warp.inputs.files import check_regular_file
 from synpick_warp.inputs.paths import path_inside
 from synpick_warp.viz.explain_graph import (
     CYCLIC,
@@ -54,12 +54,6 @@ _LABEL = 0.5
 """Font scale of an object's label on the image; the target's is larger."""
 _HALO = 3
 """Width of the dark outline around bright lines on the image [px]."""
-_MODEL_NAME = re.compile(rb"^comment (.+), millimetres\r?$", re.MULTILINE)
-"""Comment in a PLY file that the BOP exporter wrote: the object's name."""
-_PLY_HEAD = 2048
-"""Size of the part of a PLY file that is searched for comments [B]."""
-_MAX_MODEL = 2**40
-"""Largest PLY file [B]; only its head is read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,32 +93,8 @@ def write_explanation(dataset: Path, out: Path, episode: int, attempt: int | Non
     return write_picture(out, np.concatenate(rows))
 
 
-def object_names(dataset: Path, config: Config, object_ids: set[int]) -> dict[int, str]:
-    """Names of objects (obj_id -> name): from the exported model's comment, else from the settings' object table; some have none."""
-    infos = read_checked(dataset / "models" / "models_info.json", dict[Key, ModelDiameter])
-    names = {}
-    for object_id in object_ids:
-        path = dataset / "models" / f"obj_{object_id:06d}.ply"
-        comment = None
-        if path.exists():
-            check_regular_file(path, _MAX_MODEL, DatasetError)
-            with path.open("rb") as file:
-                comment = _MODEL_NAME.search(file.read(_PLY_HEAD))
-        size = float(infos.get(object_id, {}).get("diameter", 0.0)) / 1000.0
-        fits = (row.name for row in config.object_rows if row.id == object_id and _fits(row.diameter, size, config))
-        name = comment[1].decode(errors="replace") if comment else next(fits, "")
-        if name:
-            names[object_id] = name
-    return names
-
-
-def _fits(expected: float, size: float, config: Config) -> bool:
-    """Whether a model's diameter matches that of a row in the object table [m]."""
-    return abs(size - expected) <= config.objects.diameter_tolerance * expected
-
-
 def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
-    split = path_inside(dataset, config.bop.split, dataset / "config.toml", DatasetError)
+    split = path_inside(dataset, bop_folder(config, attempt.episode), dataset / "config.toml", DatasetError)
     scene = split / f"{len(config.cameras.positions) * attempt.episode:06d}"
     stem = f"{attempt.frame:06d}"
     truth = read_checked(scene / "scene_gt.json", SCENE_SCHEMAS["gt"]).get(attempt.frame)

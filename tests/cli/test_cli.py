@@ -34,8 +34,8 @@ def bakes(monkeypatch):
     module = types.ModuleType("synpick_warp.pipeline")
     calls = []
 
-    def run_bake(config, out, progress, shard):
-        calls.append((config, out, shard))
+    def run_bake(config, out, progress, shard, splits):
+        calls.append((config, out, shard, splits))
         progress.stage("building worlds")
         progress.update(episodes_done=0, episodes=2, worlds_active=2, views=0, views_per_s=0.0, seconds_left=None)
         progress.note("a note")
@@ -67,8 +67,8 @@ def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
     given = {"config": "smoke", "worlds": 3, "episodes": 4, "seed": 7, "device": "cpu", "resolution": "64x48", "writers": 1, "mode": "move"}
     arguments = [f"--{name}={value}" for name, value in given.items()]
     assert main(["bake", "--out", str(out), *arguments, "--set", "move.speed=0.2", "--set", "bake.seed=1"]) == 0
-    [(config, folder, shard)] = bakes.calls
-    assert (folder, shard) == (out, (0, 1))
+    [(config, folder, shard, splits)] = bakes.calls
+    assert (folder, shard, splits) == (out, (0, 1), ())
     expected = {"bake.worlds": 3, "bake.episodes": 4, "bake.seed": 7, "bake.device": "cpu", "bake.writers": 1}
     assert config == load_config("smoke", expected | {"cameras.resolution": [64, 48], "move.speed": 0.2})
     printed = capsys.readouterr().out
@@ -142,9 +142,15 @@ def test_incomplete_command_lines(capsys, arguments):
 
 def test_formats_and_share_are_passed_on(tmp_path, bakes):
     assert main(["bake", "--device=cpu", f"--out={tmp_path}", "--formats=zarr, bop", "--shard=1/3"]) == 0
-    [(config, _, shard)] = bakes.calls
+    [(config, _, shard, _)] = bakes.calls
     assert config.bake.formats == ("zarr", "bop")
     assert shard == (1, 3)
+
+
+def test_splits_are_passed_on(bakes, tmp_path):
+    assert main(["bake", "--device=cpu", f"--out={tmp_path}", "--split=train, test", "--shard=1/300"]) == 0
+    [(config, _, shard, splits)] = bakes.calls
+    assert (shard, splits, config.bake.episodes) == ((1, 300), ("train", "test"), 300)
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def other(value: object) -> object:
 def keys() -> Iterator[str]:
     config = settings()
     for section in dataclasses.fields(config):
-        if section.name != "object_rows":
+        if section.name not in ("object_rows", "splits"):
             yield from (f"{section.name}.{name}" for name in settings_of(type(getattr(config, section.name))))
 
 

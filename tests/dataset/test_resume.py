@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 import random
 import shutil
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+import synpick_warp
 from synpick_warp.cli.commands import EXIT_MISTAKE, main
 from synpick_warp.dataset import writing
 from synpick_warp.dataset.manifest import CONSTANTS, committed_episodes, episode_entry, read_checksums
@@ -107,6 +109,64 @@ def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected
     server.bake(out, alone=True, kill_at=round((1.0 - share) * changes / 2))
     assert server.bake(out, alone=True) == 0
     assert digests(out) == expected
+
+
+@pytest.fixture
+def splits(tmp_path) -> str:
+    """Settings with the episodes of `whole` in two splits."""
+    path = tmp_path / "splits.toml"
+    path.write_text('preset = "smoke"\n[splits.train]\nepisodes = 3\n[splits.test]\nepisodes = 1\n')
+    return str(path)
+
+
+def test_splits_fill_one_folder_in_any_order(server, splits, expected, tmp_path):
+    """Split by split and shard by shard or all at once: the same files, and the episodes are those of the same indices without splits."""
+    once, parts = tmp_path / "once", tmp_path / "parts"
+    assert server.bake(once, config=splits) == 0
+    for arguments in (["--split", "test"], ["--split=train", "--shard=0/2"], ["--split", "train,test"]):
+        assert server.bake(parts, config=splits, arguments=arguments) == 0
+        assert verify(parts).finished
+    files = digests(once)
+    assert digests(parts) == files
+    moved = {name.replace("test_web/", "train_web/").replace("test/", "train/"): digest for name, digest in files.items()}
+    images = [name for name in expected if name.endswith((".png", ".tar")) or name.startswith("train/")]
+    assert images
+    for name in images:
+        # COCO files name their split.
+        assert name in moved
+        assert moved[name] == expected[name] or name.endswith("scene_gt_coco.json")
+    data = synpick_warp.open(once)
+    cameras = data.camera_count
+    assert {name: list(part) for name, part in data.splits.items()} == {"train": [0, 1, 2], "test": [3]}
+    assert [episode.row["split"] for episode in data.values()] == [episode.attributes["split"] for episode in data.values()]
+    assert sorted(path.name for path in (once / "test").iterdir()) == [f"{3 * cameras + camera:06d}" for camera in range(cameras)]
+    assert data.split("test")[3].view(0).rgb.shape == data[0].view(0).rgb.shape
+    assert 0 not in data.split("test")
+    for name, scenes in (("train", range(3 * cameras)), ("test", range(3 * cameras, 4 * cameras))):
+        for kind in ("bop19", "bop24"):
+            targets = json.loads((once / f"{name}_targets_{kind}.json").read_text())
+            assert {target["scene_id"] for target in targets} == set(scenes)
+        assert {int(key[:6]) for key in json.loads((once / f"{name}_web" / "key_to_shard.json").read_text())} == set(scenes)
+
+
+def test_a_data_set_of_splits_grows_at_its_end_only(server, splits, tmp_path):
+    out, log = tmp_path / "set", tmp_path / "log"
+    settings = {"bake.episodes": 3, "splits.train.episodes": 2, "splits.test.first": 3, "bake.formats": ["zarr"]}
+    assert server.bake(out, config=splits, settings=settings) == 0
+    assert committed_episodes(out) == [0, 1, 3]
+    assert server.bake(out, config=splits, settings=settings | {"bake.episodes": 4, "splits.train.episodes": 3}) == 0
+    assert committed_episodes(out) == [0, 1, 2, 3]
+    assert server.bake(out, config=splits, settings=settings, log=str(log)) == EXIT_MISTAKE
+    assert "splits.train.episodes is 2, but" in log.read_text()
+
+
+def test_parts_of_splits_are_merged(server, splits, tmp_path):
+    parts = [tmp_path / name for name in ("train", "test")]
+    for part in parts:
+        assert server.bake(part, config=splits, arguments=["--split", part.name], settings={"bake.formats": ["bop"]}) == 0
+    assert server.bake(tmp_path / "once", config=splits, settings={"bake.formats": ["bop"]}) == 0
+    assert merge(parts, tmp_path / "merged").missing == []
+    assert digests(tmp_path / "merged") == digests(tmp_path / "once")
 
 
 def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expected, tmp_path):

@@ -13,8 +13,7 @@ import pytest
 from synpick_warp.cli.commands import main
 from synpick_warp.cli.estimate import parse_indices
 from synpick_warp.errors import ConfigError
-from synpick_warp.estimation import decoder_pool
-from synpick_warp.estimation import device as factories
+from synpick_warp.estimation import decoder_pool, factories
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards import ShardsExporter
 from synpick_warp.exporters.writing.png import encode_png

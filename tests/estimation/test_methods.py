@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 import synpick_warp
 from synpick_warp.configs.sensors import DepthSensor
 from synpick_warp.errors import DatasetError
-from synpick_warp.estimation.device import sensor_noise
 from synpick_warp.estimation.disturbance import disturb_poses
+from synpick_warp.estimation.factories import sensor_noise
 from synpick_warp.estimation.methods import GICP, REFINE, SINGLE, TRACK, ask, make_group, to_rotations, to_transforms
 from synpick_warp.estimation.run import AHEAD, BYTES_PER_PIXEL, MAX_VIEWS, Options, count_views, list_targets, read_scenes, run_estimation
 from synpick_warp.estimation.scenes import ABSENT, ScenePlan, read_scene

@@ -95,7 +95,7 @@ def arguments(request: dict) -> list[str]:
     """Command-line arguments of a request."""
     overrides = QUICK | TINY | request.get("settings", {})
     settings = [part for key, value in overrides.items() for part in ("--set", f"{key}={json.dumps(value)}")]
-    return ["bake", "--out", request["out"], "--config", "smoke", *settings, *request.get("arguments", [])]
+    return ["bake", "--out", request["out"], "--config", request.get("config", "smoke"), *settings, *request.get("arguments", [])]
 
 
 def _serve() -> None:

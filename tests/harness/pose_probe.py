@@ -9,7 +9,7 @@ from synpick_warp.arrays import allocate_struct
 from synpick_warp.kernels.pose.appearance import accumulate_samples_kernel, intensity_gradient, way_to_mask
 from synpick_warp.kernels.pose.lighting import CHANNELS
 from synpick_warp.kernels.pose.observation import Images, Observation, Targets
-from synpick_warp.kernels.pose.residuals import LANES, Cost, Models, jacobian, tukey_weight
+from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Models, jacobian, tukey_weight
 from synpick_warp.kernels.pose.samples import VISIBLE, has_color, interpolate_color, view_sample
 from synpick_warp.kernels.pose.solve import StepLimits, apply_step, pose_difference, rotation_vector, solve_cholesky, step_poses_kernel
 from synpick_warp.kernels.pose.surface import accumulate_points_kernel
@@ -67,7 +67,7 @@ def residual_kernel(
 @wp.kernel
 def view_samples_kernel(
     models: Models,
-    cost: Cost,
+    cost: LossParameters,
     images: Images,
     targets: Targets,
     observation: Observation,

@@ -1,4 +1,4 @@
-"""Hypotheses of the tracker: motions, turns, correlation of colours, choices, state of the tracks."""
+"""Hypotheses of the tracker: motions, symmetries, correlation of colours, choices, state of the tracks."""
 
 import numpy as np
 import pytest
@@ -14,16 +14,16 @@ from synpick_warp.kernels.pose.hypotheses import (
     SLOW_MEAN,
     TrackPolicy,
     choose_poses_kernel,
-    choose_turns_kernel,
-    correlate_turns_kernel,
+    choose_symmetry_kernel,
+    correlate_symmetries_kernel,
     propose_motions_kernel,
-    turn_poses_kernel,
+    symmetric_poses_kernel,
     update_tracks_kernel,
 )
-from synpick_warp.stages.pose.models import TURNS, build_models
+from synpick_warp.stages.pose.models import SYMMETRIES, build_models
 from synpick_warp.stages.pose.refine import CostScales, make_cost
+from synpick_warp.stages.pose.symmetries import CORRELATION
 from synpick_warp.stages.pose.track import TRACK
-from synpick_warp.stages.pose.turns import CORRELATION
 from tests.harness.pose_probe import view_samples
 from tests.twins import pose as twin
 from tests.worlds.pose_views import (
@@ -97,18 +97,18 @@ def test_a_track_that_starts_forgets_what_was(device):
 
 def test_turns_keep_the_centre(device):
     observer = two_discs(device)
-    turns = allocate_struct(TURNS, {"model": 1, "turn": 3}, device)
+    symmetries = allocate_struct(SYMMETRIES, {"model": 1, "symmetry": 3}, device)
     quarter = Rotation.from_euler("z", 90, degrees=True)
-    turns.rotation.assign(np.array([[(0, 0, 0, 1), quarter.as_quat(), (1, 0, 0, 0)]], np.float32))
-    turns.count.assign(np.array([2], np.int32))
+    symmetries.rotation.assign(np.array([[(0, 0, 0, 1), quarter.as_quat(), (1, 0, 0, 0)]], np.float32))
+    symmetries.count.assign(np.array([2], np.int32))
     center = np.array([0.01, 0.02, 0.03])
-    turns.center.assign(center[None].astype(np.float32))
+    symmetries.center.assign(center[None].astype(np.float32))
     out = wp.zeros(6, dtype=wp.transform, device=device)
     poses = as_poses(np.stack([NOW, BEFORE]), device)
-    wp.launch(turn_poses_kernel, dim=6, inputs=[turns, observer.targets, poses, 3], outputs=[out], device=device)
+    wp.launch(symmetric_poses_kernel, dim=6, inputs=[symmetries, observer.targets, poses, 3], outputs=[out], device=device)
     found = out.numpy().reshape(2, 3, 7)
     for row, pose in enumerate((NOW, BEFORE)):
-        # Beyond the model's turns the pose is repeated.
+        # Beyond the model's symmetries the pose is repeated.
         assert found[row, [0, 2]] == pytest.approx(np.stack([pose, pose]), abs=1e-6)
         rotation, place = Rotation.from_quat(pose[3:]), pose[:3]
         turned = Rotation.from_quat(found[row, 1, 3:])
@@ -120,19 +120,19 @@ def correlate(device, observer, models, pose: np.ndarray):
     """Sums of one candidate per instance."""
     sums = allocate_struct(CORRELATION, {"candidate": len(pose), "lane": int(CORRELATION_LANES)}, device)
     cost = make_cost(CostScales(), 0.01, 1, 1.0)
-    inputs = [models.models, models.turns, cost, observer.images, observer.targets, observer.observation, as_poses(pose, device), 1]
-    wp.launch(correlate_turns_kernel, dim=(len(pose), int(CORRELATION_LANES)), inputs=inputs, outputs=[sums], device=device)
+    inputs = [models.models, models.symmetries, cost, observer.images, observer.targets, observer.observation, as_poses(pose, device), 1]
+    wp.launch(correlate_symmetries_kernel, dim=(len(pose), int(CORRELATION_LANES)), inputs=inputs, outputs=[sums], device=device)
     return sums
 
 
 def choose_turn(device, sums, poses: np.ndarray, mean: float, gain: float, capacity: int, count: int | None = None):
     """The two hypotheses of one instance, and the new running mean."""
-    turns = allocate_struct(TURNS, {"model": 1, "turn": capacity}, device)
-    turns.count.assign(np.array([capacity if count is None else count], np.int32))
+    symmetries = allocate_struct(SYMMETRIES, {"model": 1, "symmetry": capacity}, device)
+    symmetries.count.assign(np.array([capacity if count is None else count], np.int32))
     observer = two_discs(device)
     means, out = wp.array([mean, mean], dtype=float, device=device), wp.zeros(2, dtype=wp.transform, device=device)
-    inputs = [turns, means, observer.targets, sums, as_poses(poses, device), capacity, gain]
-    wp.launch(choose_turns_kernel, dim=1, inputs=inputs, outputs=[out], device=device)
+    inputs = [symmetries, means, observer.targets, sums, as_poses(poses, device), capacity, gain]
+    wp.launch(choose_symmetry_kernel, dim=1, inputs=inputs, outputs=[out], device=device)
     return out.numpy(), float(means.numpy()[0])
 
 
@@ -167,7 +167,7 @@ def turned_poses(count: int) -> np.ndarray:
 @pytest.mark.parametrize(
     ("correlations", "mean", "gain", "chosen", "after"),
     [
-        # As well as ever: turns are not considered, however well they fit.
+        # As well as ever: symmetries are not considered, however well they fit.
         ((0.5, 0.9), 0.5, 0.1, 0, 0.5),
         ((0.45, 0.9), 0.5, 0.1, 0, 0.5 - 0.05 * float(FAST_MEAN)),
         # Worse than ever: the best that is better by the gain.
@@ -295,7 +295,7 @@ def test_an_ordinary_cost_ends_the_wait(device):
 
 def test_a_box_has_its_turns_in_the_table(device):
     models = build_models([model_of(box(0.12, 0.08, 0.05)), model_of(box(0.08, 0.08, 0.08))], device, samples=1024)
-    counts, rotation = models.turns.count.numpy(), models.turns.rotation.numpy()
+    counts, rotation = models.symmetries.count.numpy(), models.symmetries.rotation.numpy()
     assert rotation.shape[1] == counts.max()
     assert (counts >= 4).all()
     assert rotation[:, 0].tolist() == [[0.0, 0.0, 0.0, 1.0]] * 2

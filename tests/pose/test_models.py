@@ -1,4 +1,4 @@
-"""Object models on the device: samples of surfaces and their colours, turns that keep a shape."""
+"""Object models on the device: samples of surfaces and their colours, symmetries that keep a shape."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import Material
-from synpick_warp.stages.pose.models import MAX_TURNS, SAMPLES, TURN_STEP, TURN_TOLERANCE, build_models, sample_surface, shape_turns
+from synpick_warp.stages.pose.models import (
+    MAX_SYMMETRIES,
+    SAMPLES,
+    SYMMETRY_STEP,
+    SYMMETRY_TOLERANCE,
+    build_models,
+    near_symmetries,
+    sample_surface,
+)
 from tests.worlds.pose_views import as_material, embedded, model_of
 from tests.worlds.toy_scene import GREY, ball, box, flat_shaded, sheet
 
@@ -18,8 +26,8 @@ def cylinder(radius: float, height: float):
     return flat_shaded(mesh.vertices, mesh.faces)
 
 
-def has_turn(turns: np.ndarray, rotation: Rotation, tolerance: float = 1.0) -> bool:
-    return bool(np.degrees((Rotation.from_quat(turns) * rotation.inv()).magnitude()).min() < tolerance)
+def has_symmetry(symmetries: np.ndarray, rotation: Rotation, tolerance: float = 1.0) -> bool:
+    return bool(np.degrees((Rotation.from_quat(symmetries) * rotation.inv()).magnitude()).min() < tolerance)
 
 
 @pytest.mark.parametrize("count", [64, 500, SAMPLES])
@@ -66,37 +74,37 @@ def test_without_a_texture_the_factor_is_the_colour():
 
 def test_turns_of_a_cylinder():
     """All steps about its axis, and the can upside down in all of them; beside these only slight tilts, and no quarter turn."""
-    turns = shape_turns(sample_surface(cylinder(0.034, 0.1), GREY, SAMPLES).position)
-    assert turns[0].tolist() == [0.0, 0.0, 0.0, 1.0]
-    upright = Rotation.from_quat(turns).as_matrix()[:, 2, 2]
-    assert (np.abs(upright) > np.cos(np.deg2rad(TURN_STEP + 5.0))).all()
-    for angle in np.arange(0.0, 360.0, TURN_STEP):
+    symmetries = near_symmetries(sample_surface(cylinder(0.034, 0.1), GREY, SAMPLES).position)
+    assert symmetries[0].tolist() == [0.0, 0.0, 0.0, 1.0]
+    upright = Rotation.from_quat(symmetries).as_matrix()[:, 2, 2]
+    assert (np.abs(upright) > np.cos(np.deg2rad(SYMMETRY_STEP + 5.0))).all()
+    for angle in np.arange(0.0, 360.0, SYMMETRY_STEP):
         # The samples' principal axes are not exactly the can's.
         about = Rotation.from_euler("z", angle, degrees=True)
-        assert has_turn(turns, about, 5.0)
-        assert has_turn(turns, about * Rotation.from_euler("x", 180.0, degrees=True), 0.5 * TURN_STEP + 1.0)
+        assert has_symmetry(symmetries, about, 5.0)
+        assert has_symmetry(symmetries, about * Rotation.from_euler("x", 180.0, degrees=True), 0.5 * SYMMETRY_STEP + 1.0)
 
 
 @pytest.mark.parametrize(("size", "quarter"), [((0.16, 0.09, 0.05), None), ((0.2, 0.05, 0.05), "x"), ((0.16, 0.16, 0.05), "z")])
 def test_turns_of_a_box(size, quarter):
-    """The three half turns; of a square one also the quarter turns about its axis. Quarter turns about other axes are none."""
-    turns = shape_turns(sample_surface(box(*size), GREY, SAMPLES).position)
-    assert has_turn(turns, Rotation.identity())
+    """The three half-turns; of a square one also the quarter turns about its axis. Quarter turns about other axes are none."""
+    symmetries = near_symmetries(sample_surface(box(*size), GREY, SAMPLES).position)
+    assert has_symmetry(symmetries, Rotation.identity())
     for axis in "xyz":
-        assert has_turn(turns, Rotation.from_euler(axis, 180.0, degrees=True), 0.5 * TURN_STEP)
-        assert has_turn(turns, Rotation.from_euler(axis, 90.0, degrees=True), 0.5 * TURN_STEP) == (axis == quarter)
+        assert has_symmetry(symmetries, Rotation.from_euler(axis, 180.0, degrees=True), 0.5 * SYMMETRY_STEP)
+        assert has_symmetry(symmetries, Rotation.from_euler(axis, 90.0, degrees=True), 0.5 * SYMMETRY_STEP) == (axis == quarter)
 
 
 def test_turns_of_a_shape_without_symmetry():
-    """A long L: slight tilts about its axes may keep it near, half turns do not."""
+    """A long L: slight tilts about its axes may keep it near, half-turns do not."""
     arms = trimesh.util.concatenate(
         [trimesh.creation.box((0.2, 0.04, 0.03)), _moved(trimesh.creation.box((0.04, 0.1, 0.05)), (0.08, 0.07, 0.0))]
     )
     mesh = flat_shaded(arms.vertices, arms.faces)
-    turns = shape_turns(sample_surface(mesh, GREY, SAMPLES).position)
-    magnitude = np.degrees(Rotation.from_quat(turns).magnitude())
-    half_about_z = np.abs(Rotation.from_quat(turns).apply((0.0, 0.0, 1.0))[:, 2]) > 0.9
-    assert magnitude[half_about_z].max() < 3.0 * TURN_STEP
+    symmetries = near_symmetries(sample_surface(mesh, GREY, SAMPLES).position)
+    magnitude = np.degrees(Rotation.from_quat(symmetries).magnitude())
+    half_about_z = np.abs(Rotation.from_quat(symmetries).apply((0.0, 0.0, 1.0))[:, 2]) > 0.9
+    assert magnitude[half_about_z].max() < 3.0 * SYMMETRY_STEP
 
 
 def _moved(mesh: trimesh.Trimesh, offset: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -105,19 +113,21 @@ def _moved(mesh: trimesh.Trimesh, offset: tuple[float, float, float]) -> trimesh
 
 
 def test_turns_keep_the_surface_near():
-    """To the tolerance, and the spacing of the samples, for the turns about one axis; twice that for those that flip, too."""
+    """To the tolerance, and the spacing of the samples, for the symmetries about one axis; twice that for those that flip, too."""
     (can,) = embedded(4)
     points = sample_surface(can.mesh, can.material, SAMPLES).position.astype(np.float64)
     points -= points.mean(axis=0)
-    tree, turns = KDTree(points), shape_turns(points)
+    tree, symmetries = KDTree(points), near_symmetries(points)
     size = 2.0 * np.linalg.norm(points, axis=1).max()
     spacing = tree.query(points, k=2)[0][:, 1].mean()
-    moved = [tree.query(Rotation.from_quat(turn).apply(points))[0].mean() for turn in turns]
-    assert max(moved) < 2.0 * (spacing + TURN_TOLERANCE * size)
-    assert 1 < len(turns) <= MAX_TURNS
-    # Different turns are apart.
-    apart = [(Rotation.from_quat(turn) * Rotation.from_quat(turns[:k]).inv()).magnitude().min() for k, turn in enumerate(turns) if k]
-    assert np.degrees(min(apart)) > 0.5 * TURN_STEP - 1e-3
+    moved = [tree.query(Rotation.from_quat(turn).apply(points))[0].mean() for turn in symmetries]
+    assert max(moved) < 2.0 * (spacing + SYMMETRY_TOLERANCE * size)
+    assert 1 < len(symmetries) <= MAX_SYMMETRIES
+    # Different symmetries are apart.
+    apart = [
+        (Rotation.from_quat(turn) * Rotation.from_quat(symmetries[:k]).inv()).magnitude().min() for k, turn in enumerate(symmetries) if k
+    ]
+    assert np.degrees(min(apart)) > 0.5 * SYMMETRY_STEP - 1e-3
 
 
 def test_device_arrays_hold_the_models(device):
@@ -132,5 +142,5 @@ def test_device_arrays_hold_the_models(device):
         assert np.array_equal(models.models.normal.numpy()[row], samples.normal)
         assert np.array_equal(models.models.color.numpy()[row], samples.color)
         assert models.models.sample_area.numpy()[row] == pytest.approx(samples.area / 256)
-        assert models.turns.center.numpy()[row] == pytest.approx(samples.position.mean(axis=0), abs=1e-6)
+        assert models.symmetries.center.numpy()[row] == pytest.approx(samples.position.mean(axis=0), abs=1e-6)
     assert models.models.mesh.numpy().tolist() == [mesh.id for mesh in models.meshes]

@@ -70,13 +70,15 @@ def test_crops_sample_mask_and_colour(device, cell):
     batch = random_batch(cell, cell)
     seen = observe(batch, TABLE, device).observation
     corner, pitch = seen.corner.numpy(), seen.pitch.numpy()
+    # Where samples lie on the border of two pixels, a GPU's rounding decides; random pixels differ there.
     for row, mask in enumerate(masks(batch)):
         if mask.any():
-            # One sample in a thousand may lie on the border of two pixels, where a GPU's rounding decides.
+            firm = np.ones((twin.CROP, twin.CROP), bool) if device.is_cpu else ~twin.on_borders(corner[row], pitch[row])
+            assert firm.mean() > 0.8
             inside = seen.inside.numpy()[row] != twin.sample_mask(mask, corner[row], pitch[row])
-            assert inside.mean() <= (0.0 if device.is_cpu else 1e-3)
+            assert not inside[firm].any()
             color = twin.sample_color(linear(batch)[TABLE.view[row]], mask, corner[row], pitch[row])
-            assert (np.abs(seen.color.numpy()[row] - color).max(axis=-1) > 1e-5).mean() <= (0.0 if device.is_cpu else 1e-3)
+            assert np.abs(seen.color.numpy()[row] - color).max(axis=-1)[firm].max() <= 1e-5
 
 
 @pytest.mark.parametrize("size", [1, 17, 40, 57, 58, 90, 300])

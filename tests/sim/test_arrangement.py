@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from synpick_warp.codes import Ending, Mode, Phase
+from synpick_warp.configs.schema import Split
 from synpick_warp.kernels.sim import arrangement as kernels
 from synpick_warp.scenes import build
 from synpick_warp.stages.constants import make_scene_data
@@ -103,7 +104,7 @@ def modes(built, device, mode: str, mix: tuple[float, float, float], episodes: n
     config = small_worlds.settings(bake__mode=mode, bake__mix=list(mix))
     worlds = arrangement_worlds(device, worlds=len(episodes))
     scene = make_scene_data(config, small_worlds.catalog(), built, 1, device)
-    worlds.scene = dataclasses.replace(worlds.scene, mode=scene.mode)
+    worlds.scene = dataclasses.replace(worlds.scene, modes=scene.modes)
     worlds.begin(Phase.START, episodes, arrangement)
     worlds.set(worlds.state.mode, 99)
     arrange.sample_objects(worlds.scene, worlds.state, SEED)
@@ -136,6 +137,20 @@ def test_a_cycle_has_each_mode_once_in_three_episodes(mix, first, built, device)
     episodes = first + np.arange(WORLDS)
     found = modes(built, device, "cycle", mix, episodes)
     np.testing.assert_array_equal(found, np.array((Mode.PICK, Mode.TARGET, Mode.MOVE))[episodes % 3])
+
+
+def test_each_split_has_its_own_mode(built, device):
+    """Splits in one range of indices, with a gap; a cycle begins with the split."""
+    config = small_worlds.settings()
+    splits = (Split("train", 4, 0, "move", "train"), Split("val", 5, 4, "cycle", "val"), Split("test", 3, 20, "target", "test"))
+    episodes = np.array([0, 3, 4, 5, 6, 7, 8, 20, 22])
+    worlds = arrangement_worlds(device, worlds=len(episodes))
+    scene = make_scene_data(dataclasses.replace(config, splits=splits), small_worlds.catalog(), built, 1, device)
+    worlds.scene = dataclasses.replace(worlds.scene, modes=scene.modes)
+    worlds.begin(Phase.START, episodes, 0)
+    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    cycle = [Mode.PICK, Mode.TARGET, Mode.MOVE, Mode.PICK, Mode.TARGET]
+    assert worlds.state.mode.numpy().tolist() == [Mode.MOVE, Mode.MOVE, *cycle, Mode.TARGET, Mode.TARGET]
 
 
 def test_an_episode_keeps_its_mode_in_any_world_and_arrangement(built, device):

@@ -31,6 +31,17 @@ def sample_mask(mask: np.ndarray, corner: np.ndarray, pitch: float) -> np.ndarra
     return padded[np.clip(y + CROP, 0, padded.shape[0] - 1)][:, np.clip(x + CROP, 0, padded.shape[1] - 1)]
 
 
+def on_borders(corner: np.ndarray, pitch: float, tolerance: float = 1e-4) -> np.ndarray:
+    """Crop pixels (CROP, CROP) bool with a tap within `tolerance` [px] of the border of two image pixels."""
+    taps = int(np.clip(np.rint(pitch), 1, MAX_TAPS))
+    near = []
+    for begin in corner:
+        steps = np.concatenate((np.arange(CROP)[:, None] + (np.arange(taps) + 0.5) / taps, np.arange(CROP)[:, None] + 0.5), axis=1)
+        place = begin + steps * pitch
+        near.append((np.abs(place - np.rint(place)) < tolerance).any(axis=1))
+    return near[1][:, None] | near[0][None, :]
+
+
 def sample_color(linear: np.ndarray, mask: np.ndarray, corner: np.ndarray, pitch: float) -> np.ndarray:
     """Mean of the linear image (H, W, 3) at regular taps in each crop pixel's footprint that the mask shows; the edge is repeated."""
     height, width = linear.shape[:2]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,7 +11,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.kernels import structs
-from synpick_warp.stages.constants import SceneData, fill
+from synpick_warp.stages.constants import SceneData, fill, mode_data
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState
 
@@ -93,7 +93,7 @@ class KernelWorlds:
             self._catalog(),
             fill(structs.DropData, **(DROP | self.drop)),
             fill(structs.SettleData, **(SETTLE | self.settle)),
-            fill(structs.ModeData, pick_share=0.0, pick_or_target_share=0.0, cycle=0),
+            mode_data([(0, 0.0, 0.0, 0)], self.device),
             fill(structs.MoveData, **(MOVE | self.move)),
             filled(structs.PickData(), self.pick),
             structs.PerceptionData(),
@@ -208,5 +208,6 @@ def arrangement_worlds(device: Any, worlds: int, mix: tuple[float, float, float]
         "compound_slots": 8,
     }
     result = KernelWorlds(device, worlds, **(default | sizes))
-    result.scene.mode.pick_share, result.scene.mode.pick_or_target_share = np.cumsum(mix)[:2] / np.sum(mix)
+    shares = (np.cumsum(mix)[:2] / np.sum(mix)).tolist()
+    result.scene = replace(result.scene, modes=mode_data([(0, *shares, 0)], device))
     return result

@@ -1,6 +1,6 @@
 """Dataset card of shards: README.md with the YAML header that the Hugging Face hub, its viewer and the package `datasets` read.
 
-The header declares the split's files, because key_to_shard.json lies beside them, and the columns' types: inferred ones come from the first
+The header declares each split's files, as key_to_shard.json lies beside them, and the columns' types: inferred ones come from the first
 views, and miss masks of scenes with more objects, or find nothing but null where a later scene has a light's direction.
 """
 
@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import split_kind
+
 CARD_FILE = "README.md"
 """Name that the hub gives the card."""
-_SPLITS = {"train": "train", "val": "validation", "test": "test"}
-"""First part of a BOP split's name -> the split's name on the hub."""
 _SIZES = ("K", "M", "B", "T")
 """Units of the hub's size categories: powers of 1000."""
 _NUMBERS, _INTEGERS = {"list": "float64"}, {"list": "int64"}
@@ -22,19 +23,29 @@ _COUNTS = dict.fromkeys(("px_count_all", "px_count_valid", "px_count_visib"), "i
 _INFO = {"bbox_obj": _INTEGERS, "bbox_visib": _INTEGERS, **_COUNTS, "visib_fract": "float64"}
 _MASK = {"counts": _INTEGERS, "size": _INTEGERS}
 
-_FOREIGN = "Objects or light maps are not synpick-warp's own: set `license` to theirs in the copy that you upload.\n"
+_FOREIGN = "\nObjects or light maps are not synpick-warp's own: set `license` to theirs in the copy that you upload.\n"
+
+
+@dataclass(frozen=True)
+class SplitContent:
+    """What a card says of a split."""
+
+    name: str
+    """Name on the hub."""
+    folder: str
+    """Folder of its shards."""
+    views: int
+    shards: int
+    bytes: int
+    """Size of all shards [B]."""
 
 
 @dataclass(frozen=True)
 class CardContent:
     """What a card says of a data set."""
 
-    split: str
-    """Name of the BOP split; its shards lie in the folder of this name with "_web"."""
-    views: int
-    shards: int
-    bytes: int
-    """Size of all shards [B]."""
+    splits: tuple[SplitContent, ...]
+    """At least one."""
     embedded: bool
     """Whether objects and light maps are those of synpick-warp; others have licences of their own."""
     color_suffix: str
@@ -48,31 +59,44 @@ class CardContent:
     """Names of the active camera effects."""
 
 
+def hub_splits(config: Config) -> tuple[str, ...]:
+    """Names of the splits on the hub, for each of `bop_folders`: val is called validation there, unless another split is."""
+    names = [split.name for split in config.splits] or [split_kind(config.bop.split)]
+    return tuple("validation" if name == "val" and "validation" not in names else name for name in names)
+
+
 def make_card(content: CardContent) -> str:
-    """Text of README.md."""
-    folder = f"{content.split}_web"
-    split = _SPLITS[content.split.partition("_")[0]]
+    """Text of README.md. Splits without shards, which may be baked later, have no files: a pattern that matches none is an error."""
+    splits = [split for split in content.splits if split.shards] or content.splits
+    views, shards, size = (sum(getattr(split, name) for split in splits) for name in ("views", "shards", "bytes"))
+    split, folder = splits[0].name, splits[0].folder
+    files = (f"\n  - split: {each.name}\n    path: {each.folder}/shard-*.tar" for each in splits)
     header = "\n".join(
         (
             f"license: {'mit' if content.embedded else 'unknown'}",
             "pretty_name: Synthetic bin picking by synpick-warp",
             "task_categories: [object-detection, image-segmentation, depth-estimation, robotics]",
             "tags: [6d-pose-estimation, bin-picking, synthetic, webdataset, bop]",
-            f"size_categories: [{size_category(content.views)}]",
-            f"configs:\n- config_name: default\n  data_files:\n  - split: {split}\n    path: {folder}/shard-*.tar",
+            f"size_categories: [{size_category(views)}]",
+            f"configs:\n- config_name: default\n  data_files:{''.join(files)}",
             "dataset_info:\n  config_name: default\n  features:",
             *_list_features(_features(content), "  "),
         )
     )
+    rows = "\n".join(f"| {each.name} | {each.folder} | {each.views:,} | {each.shards:,} | {each.bytes:,} |" for each in splits)
     licence = "" if content.embedded else _FOREIGN
     return f"""---
 {header}
 ---
 # Synthetic bin picking
 
-{content.views:,} views in {content.shards:,} webdataset shards of {content.bytes:,} bytes in all, made by synpick-warp:
+{views:,} views in {shards:,} webdataset shards of {size:,} bytes in all, made by synpick-warp:
 colour, 16-bit depth, 6D poses, boxes and masks as in the BOP challenge. One shard is one camera's scene; `dataset_info.md` has
 the conventions and the objects.
+
+| split | folder | views | shards | bytes |
+|---|---|---|---|---|
+{rows}
 {licence}
     datasets.load_dataset("DIR", split="{split}")
     datasets.load_dataset("webdataset", data_dir="DIR/{folder}", data_files="*.tar", split="train")

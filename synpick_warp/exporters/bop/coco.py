@@ -1,4 +1,4 @@
-"""Exporter of COCO instance segmentation: one annotation file for the whole split, with visible boxes, for detectors' training code.
+"""Exporter of COCO instance segmentation: one annotation file for each split, with visible boxes, for detectors' training code.
 
 Beside BOP's scene_gt_coco.json, which is a file a scene with amodal boxes: here boxes enclose the visible mask, as COCO's readers expect.
 """
@@ -15,7 +15,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from synpick_warp.configs.schema import Bop, Config
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import bop_folder, bop_folders
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
@@ -42,7 +43,7 @@ from synpick_warp.inputs.paths import path_inside
 FOLDER = Path("coco")
 """Folder in the data set."""
 IMAGES, PARTS, CATEGORIES = FOLDER / "images", FOLDER / "parts", FOLDER / "categories.json"
-"""Images in a folder a scene, annotations of each scene, names of the objects."""
+"""Images in a folder a scene, annotations of each scene, names of the objects. Splits share them, as scene ids are unique over all."""
 _ADVICE = "remove it and its episode's two files in manifest/, and resume the bake"
 
 
@@ -52,12 +53,12 @@ class _Category(msgspec.Struct):
 
 
 def annotation_file(split: str) -> Path:
-    """The annotations of all images, relative to the data set."""
+    """The annotations of a split's images, relative to the data set; `split`: its name in BOP, such as test_pbr."""
     return FOLDER / "annotations" / f"instances_{split}.json"
 
 
 class CocoExporter(SceneExporter):
-    """`Exporter` of COCO. A scene is a folder of images, and a part of the annotations, from which one file is made at the end."""
+    """`Exporter` of COCO. A scene is a folder of images, and a part of the annotations, from which a file a split is made at the end."""
 
     staging = "coco"
 
@@ -83,21 +84,21 @@ class CocoExporter(SceneExporter):
         write_image(scene, truth.frame, settings.color_suffix, encode_color(color, settings, truth.jpeg_quality), annotations)
 
     @staticmethod
-    def split(bop: Bop) -> str:
-        """See `SceneExporter`."""
+    def folder_name(split: str) -> str:
+        """See `SceneExporter`: one for all splits."""
         return FOLDER.name
 
     @staticmethod
     def shared_files(config: Config) -> SharedFiles:
         """See `Exporter`."""
-        place = annotation_file(config.bop.split)
-        return SharedFiles((CATEGORIES,), (place,), (IMAGES, PARTS, place.parent, FOLDER))
+        places = tuple(map(annotation_file, bop_folders(config)))
+        return SharedFiles((CATEGORIES,), places, (IMAGES, PARTS, places[0].parent, FOLDER))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
-        """See `Exporter`: the annotations of all images."""
+        """See `Exporter`: the annotations of each split."""
         try:
-            return [write_annotation_file(out, config)]
+            return write_annotation_files(out, config)
         except OSError as error:
             raise output_error(out / FOLDER, error) from error
 
@@ -180,20 +181,29 @@ def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path) -> None:
         sync_folder(out / folder)
 
 
-def write_annotation_file(out: Path, config: Config) -> Path:
-    """Join the parts to the annotation file; images and annotations are numbered from 1. Returns its name.
+def write_annotation_files(out: Path, config: Config) -> list[Path]:
+    """Join the parts to an annotation file a split; images and annotations are numbered from 1 in each. Returns their names.
 
     Raises:
         DatasetError: A part is damaged.
-        OSError: The file cannot be written.
+        OSError: A file cannot be written.
     """
-    place = annotation_file(config.bop.split)
+    parts: dict[str, list[Path]] = {split: [] for split in bop_folders(config)}
+    for part in sorted((out / PARTS).glob("[0-9]*.jsonl"), key=lambda path: int(path.stem)):
+        parts[bop_folder(config, int(part.stem) // len(config.cameras.positions))].append(part)
+    categories = read_json(path_inside(out, str(CATEGORIES), out, DatasetError), list[_Category], DatasetError, _ADVICE)
+    return [_write_annotations(out, config, split, found, categories) for split, found in parts.items()]
+
+
+def _write_annotations(out: Path, config: Config, split: str, parts: list[Path], categories: list[_Category]) -> Path:
+    """Join parts to the annotation file of a split; returns its name."""
+    place = annotation_file(split)
     folder = out / PARTIAL / "coco-index"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     images, annotations = 0, 0
     with (folder / "images").open("w", encoding="ascii") as image_file, (folder / "annotations").open("w", encoding="ascii") as file:
-        for part in sorted((out / PARTS).glob("[0-9]*.jsonl"), key=lambda path: int(path.stem)):
+        for part in parts:
             for frame, found in enumerate(_read_part(part, out)):
                 images += 1
                 row = {"id": images, **_describe_image(config, int(part.stem), frame)}
@@ -202,8 +212,7 @@ def write_annotation_file(out: Path, config: Config) -> Path:
                     annotations += 1
                     text = to_json({"id": annotations, "image_id": images, **annotation}).decode()
                     file.write((",\n" if annotations > 1 else "") + text)
-    categories = read_json(path_inside(out, str(CATEGORIES), out, DatasetError), list[_Category], DatasetError, _ADVICE)
-    head = {"info": {"description": f"synpick-warp, {config.bop.split}"}, "licenses": [], "categories": msgspec.to_builtins(categories)}
+    head = {"info": {"description": f"synpick-warp, {split}"}, "licenses": [], "categories": msgspec.to_builtins(categories)}
     (out / place).parent.mkdir(exist_ok=True)
     with (folder / "joined").open("wb") as joined:
         joined.write((json.dumps(head)[:-1] + ', "images": [\n').encode())

@@ -8,11 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Bop, Config
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import bop_folder, bop_folders
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
-from synpick_warp.exporters.bop.targets import BOP19, BOP24, concatenate_targets, find_scenes, write_scene_targets
+from synpick_warp.exporters.bop.targets import concatenate_targets, find_scenes, scene_target_files, target_files, write_scene_targets
 from synpick_warp.exporters.bop.view import write_layer, write_view
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -30,31 +31,33 @@ class BopExporter(SceneExporter):
         self._object_ids = tuple(entry.obj_id for entry in context.catalog.entries)
 
     @staticmethod
-    def split(bop: Bop) -> str:
+    def folder_name(split: str) -> str:
         """See `SceneExporter`."""
-        return bop.split
+        return split
 
     @staticmethod
     def shared_files(config: Config) -> SharedFiles:
         """See `Exporter`."""
-        return SharedFiles(CONSTANTS, (Path(BOP19), Path(BOP24)), (Path(config.bop.split),))
+        return SharedFiles(CONSTANTS, tuple(map(Path, target_files(config))), BopExporter.folders(config))
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
         """See `Exporter`: the lists of evaluation targets."""
-        parts = out / PARTIAL / BopExporter.staging / "targets"
+        parts, names = out / PARTIAL / BopExporter.staging / "targets", target_files(config)
         try:
             parts.parent.mkdir(exist_ok=True)
             shutil.rmtree(parts, ignore_errors=True)
-            for name in (parts, parts / BOP19, parts / BOP24):
+            for name in (parts, *(parts / name for name in names)):
                 name.mkdir()
-            for scene in find_scenes(out / config.bop.split):
-                pool.submit(write_scene_targets, (), (scene, parts, config.bop.target_visibility), path=scene)
+            for folder in bop_folders(config):
+                places = tuple(str(parts / name) for name in scene_target_files(config, folder))
+                for scene in find_scenes(out / folder):
+                    pool.submit(write_scene_targets, (), (scene, places, config.bop.target_visibility), path=scene)
             pool.wait()
-            concatenate_targets(parts, out)
+            concatenate_targets(parts, out, names)
         except OSError as error:
             raise output_error(out, error) from error
-        return [Path(BOP19), Path(BOP24)]
+        return [Path(name) for name in names]
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the scene folders."""
@@ -69,7 +72,7 @@ class BopExporter(SceneExporter):
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
         settings = SceneSettings(
-            split=self._bop.split,
+            split=bop_folder(self._context.config, scenes[0][1] // len(self._cameras)),
             frames=frames,
             width=self._cameras[0].width,
             height=self._cameras[0].height,
@@ -80,4 +83,4 @@ class BopExporter(SceneExporter):
         return commit_scenes, (tuple((scene, self._place(scene_id)) for scene, scene_id in scenes), settings)
 
     def _place(self, scene_id: int) -> Path:
-        return self._split / f"{scene_id:06d}"
+        return self._folder(scene_id) / f"{scene_id:06d}"

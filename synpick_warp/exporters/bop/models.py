@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import CatalogError
 from synpick_warp.exporters.bop.view import MILLIMETERS
@@ -167,6 +168,13 @@ def _write_json(path: Path, content: object) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="ascii")
 
 
+def _describe_folders(config: Config) -> str:
+    """Folders of the scenes, and where each split begins."""
+    if not config.splits:
+        return f"`{config.bop.split}/`"
+    return ", ".join(f"`{split.folder}/` (k from {split.first} on)" for split in config.splits)
+
+
 def describe_dataset(config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
     """Text of dataset_info.md: conventions of the ground truth, and the objects."""
     camera, count = cameras[0], len(cameras)
@@ -174,8 +182,8 @@ def describe_dataset(config: Config, catalog: Catalog, cameras: tuple[Camera, ..
     objects = "\n".join(f"| {entry.obj_id} | {entry.name} | {entry.mass:g} |" for entry in catalog.entries)
     return f"""# A SynPick data set
 
-Made by synpick-warp (mode {config.bake.mode}, seed {config.bake.seed}, {count} cameras), in the format of the
-BOP challenge (scenewise). Camera c of episode k is scene {count} · k + c of `{config.bop.split}/`. Frames are {period:g} s apart.
+Made by synpick-warp (mode {", ".join(bake_modes(config))}, seed {config.bake.seed}, {count} cameras), in the format of the
+BOP challenge (scenewise). Camera c of episode k is scene {count} · k + c of {_describe_folders(config)}. Frames are {period:g} s apart.
 
 - Lengths are in millimetres. A depth image's count times `depth_scale` ({config.bop.depth_scale:g}) is the planar depth, along the
   optical axis; 0: no surface.

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from synpick_warp.codes import Ending
-from synpick_warp.configs.schema import Bop, Config
+from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import effect_ranges
+from synpick_warp.configs.splits import bop_folder, bop_folders
 from synpick_warp.exporters.base import ExportContext, view_bytes
 from synpick_warp.exporters.bop.models import CAMERA_FILE, MODEL_FOLDERS, NOTES_FILE, describe_dataset, write_constants
 from synpick_warp.exporters.bop.scene import discard_scenes
@@ -58,7 +59,6 @@ class SceneExporter(ABC):
         self._bop = bop
         self._cameras = context.cameras
         self._pool = context.pool
-        self._split = self._out / self.split(bop)
         self._suffix = f".{bop.color_format}"
         self._layers = config.render.layers
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
@@ -69,10 +69,19 @@ class SceneExporter(ABC):
         self._episodes: dict[int, _Episode] = {}
         self._arrangements = 0
 
+    @classmethod
+    def folders(cls, config: Config) -> tuple[Path, ...]:
+        """Folders of the splits' scenes, relative to the data set."""
+        return tuple(Path(cls.folder_name(split)) for split in bop_folders(config))
+
     @staticmethod
     @abstractmethod
-    def split(bop: Bop) -> str:
-        """Name of the folder that holds all scenes of the data set."""
+    def folder_name(split: str) -> str:
+        """Name of the folder that holds the scenes of a split, from its name in BOP."""
+
+    def _folder(self, scene_id: int) -> Path:
+        """Folder of a scene's split."""
+        return self._out / self.folder_name(bop_folder(self._context.config, scene_id // len(self._cameras)))
 
     @abstractmethod
     def _stage_scene(self, scene: Path) -> None:
@@ -99,7 +108,8 @@ class SceneExporter(ABC):
         """See `Exporter`: models, camera and notes."""
         context = self._context
         try:
-            self._split.mkdir(exist_ok=True)
+            for folder in self.folders(context.config):
+                (self._out / folder).mkdir(exist_ok=True)
             notes = describe_dataset(context.config, context.catalog, self._cameras)
             return write_constants(self._out, context.catalog, self._cameras[0], self._bop.depth_scale, notes)
         except OSError as error:
@@ -121,8 +131,9 @@ class SceneExporter(ABC):
                 function, arguments = self._layer_task(scene, truth.scene, name, truth.frame)
                 tasks.append((function, (batch.layers[name][view],), arguments))
             episode.pending += len(tasks)
+            place = self._folder(truth.scene) / scene.name
             for function, arrays, arguments in tasks:
-                yield WriteTask(function, arrays, arguments, self._split / scene.name, partial(self._task_done, index, episode))
+                yield WriteTask(function, arrays, arguments, place, partial(self._task_done, index, episode))
 
     def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`. BOP takes everything from the views."""
@@ -177,4 +188,5 @@ class SceneExporter(ABC):
             function, arguments = self._commit_task(scenes, episode.end.frames)
         else:
             function, arguments = discard_scenes, (episode.scenes,)
-        self._pool.submit(function, (), arguments, path=self._split / f"{self.scene_id(index, 0):06d}", on_done=episode.on_committed)
+        place = self._folder(self.scene_id(index, 0)) / f"{self.scene_id(index, 0):06d}"
+        self._pool.submit(function, (), arguments, path=place, on_done=episode.on_committed)

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Bop, Config
+from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.exporters.base import SharedFiles
-from synpick_warp.exporters.bop.card import CARD_FILE, CardContent, make_card
+from synpick_warp.exporters.bop.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
 from synpick_warp.exporters.bop.shard_parts import (
     commit_shards,
@@ -38,39 +38,32 @@ class ShardsExporter(SceneExporter):
     write_view = staticmethod(write_shard_view)
 
     @staticmethod
-    def split(bop: Bop) -> str:
+    def folder_name(split: str) -> str:
         """See `SceneExporter`: the toolkit's name."""
-        return f"{bop.split}_web"
+        return f"{split}_web"
 
     @staticmethod
     def shared_files(config: Config) -> SharedFiles:
         """See `Exporter`."""
-        split = Path(ShardsExporter.split(config.bop))
-        return SharedFiles(CONSTANTS, (split / KEYS_FILE, Path(CARD_FILE)), (split,))
+        splits = ShardsExporter.folders(config)
+        return SharedFiles(CONSTANTS, (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
-        """See `Exporter`: the index of views and shards, and the dataset card."""
-        split, parts = out / ShardsExporter.split(config.bop), out / PARTIAL / ShardsExporter.staging / "keys"
+        """See `Exporter`: the index of views and shards of each split, and the dataset card."""
+        contents = [
+            _write_keys(out, name, split, pool) for name, split in zip(hub_splits(config), ShardsExporter.folders(config), strict=True)
+        ]
         try:
-            parts.parent.mkdir(exist_ok=True)
-            shutil.rmtree(parts, ignore_errors=True)
-            parts.mkdir()
-            shards = list_shards(split)
-            for shard in shards:
-                pool.submit(list_keys, (), (shard, parts), path=shard)
-            pool.wait()
-            lines = [line for part in sorted(parts.iterdir(), key=shard_index) for line in part.read_bytes().splitlines()]
-            write_atomically(split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
-            write_atomically(out / CARD_FILE, make_card(_describe(config, shards, len(lines))).encode())
+            write_atomically(out / CARD_FILE, make_card(_describe(config, contents)).encode())
         except OSError as error:
-            raise output_error(split, error) from error
-        return [(split / KEYS_FILE).relative_to(out), Path(CARD_FILE)]
+            raise output_error(out / CARD_FILE, error) from error
+        return [*(Path(split.folder) / KEYS_FILE for split in contents), Path(CARD_FILE)]
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the shards of its scenes."""
         scenes = (self.scene_id(episode, camera) for camera in range(len(self._cameras)))
-        return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._split))
+        return sorted(path.relative_to(self._out) for scene in scenes for path in find_shards(scene, self._folder(scene)))
 
     def _stage_scene(self, scene: Path) -> None:
         scene.mkdir()
@@ -79,17 +72,14 @@ class ShardsExporter(SceneExporter):
         return write_shard_layer, (scene, scene_id, name, frame)
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return commit_shards, (scenes, self._split, frames, self._layers)
+        return commit_shards, (scenes, self._folder(scenes[0][1]), frames, self._layers)
 
 
-def _describe(config: Config, shards: list[Path], views: int) -> CardContent:
+def _describe(config: Config, splits: list[SplitContent]) -> CardContent:
     """What the card of a data set says."""
     bake, bop = config.bake, config.bop
     return CardContent(
-        split=bop.split,
-        views=views,
-        shards=len(shards),
-        bytes=sum(shard.stat().st_size for shard in shards),
+        splits=tuple(splits),
         embedded=not (bake.models or bake.lights),
         color_suffix=f".{bop.color_format}",
         masks=bop.masks,
@@ -97,3 +87,21 @@ def _describe(config: Config, shards: list[Path], views: int) -> CardContent:
         layers=config.render.layers,
         effects=tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits)),
     )
+
+
+def _write_keys(out: Path, name: str, split: Path, pool: WriterPool) -> SplitContent:
+    """Write the index of a split's views and shards; returns how many there are."""
+    parts = out / PARTIAL / ShardsExporter.staging / "keys"
+    try:
+        parts.parent.mkdir(exist_ok=True)
+        shutil.rmtree(parts, ignore_errors=True)
+        parts.mkdir()
+        shards = list_shards(out / split)
+        for shard in shards:
+            pool.submit(list_keys, (), (shard, parts), path=shard)
+        pool.wait()
+        lines = [line for part in sorted(parts.iterdir(), key=shard_index) for line in part.read_bytes().splitlines()]
+        write_atomically(out / split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
+        return SplitContent(name, split.name, len(lines), len(shards), sum(shard.stat().st_size for shard in shards))
+    except OSError as error:
+        raise output_error(out / split, error) from error

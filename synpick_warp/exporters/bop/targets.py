@@ -1,4 +1,4 @@
-"""Evaluation target lists of BOP (test_targets_bop19.json, test_targets_bop24.json), from the committed scenes of a split."""
+"""Evaluation target lists of BOP (test_targets_bop19.json, test_targets_bop24.json), from the committed scenes of the splits."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from typing import Annotated, TypeVar
 
 import msgspec
 
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import bop_folders, split_kind
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import write_atomically
 from synpick_warp.inputs.json import read_json
@@ -17,6 +19,7 @@ from synpick_warp.inputs.paths import path_inside
 
 BOP19, BOP24 = "test_targets_bop19.json", "test_targets_bop24.json"
 
+KINDS = (BOP19, BOP24)
 _SCENE = re.compile(r"[0-9]{6,12}")
 """Name of a scene's folder."""
 _Frame = Annotated[str, msgspec.Meta(pattern=r"\A(0|[1-9][0-9]{0,8})\Z")]
@@ -33,13 +36,27 @@ class _Info(msgspec.Struct):
     visib_fract: float
 
 
+def scene_target_files(config: Config, folder: str) -> tuple[str, str]:
+    """Files that list a split's targets, BOP19 and BOP24: those of its kind. Without splits, all scenes are in the lists named test.
+
+    Lists begin with the kind of their splits, as in val_targets_bop19.json; splits of one kind share them, as scene ids are unique.
+    """
+    kind = split_kind(folder) if config.splits else "test"
+    return BOP19.replace("test", kind, 1), BOP24.replace("test", kind, 1)
+
+
+def target_files(config: Config) -> tuple[str, ...]:
+    """All files that list targets. Those named test always exist, as BOP's toolkit opens them for any split."""
+    return tuple(dict.fromkeys((*KINDS, *(name for folder in bop_folders(config) for name in scene_target_files(config, folder)))))
+
+
 def find_scenes(split: Path) -> list[Path]:
     """Find the scene folders of a split, sorted; other names, and links, are not ours."""
     return sorted(path for path in split.iterdir() if _SCENE.fullmatch(path.name) and path.is_dir() and not path.is_symlink())
 
 
-def write_scene_targets(scene: Path, folder: Path, visibility: float) -> None:
-    """Task: write a scene's targets, one per line, to `folder/<file name>/<scene name>`; the folders must exist.
+def write_scene_targets(scene: Path, folders: tuple[str, str], visibility: float) -> None:
+    """Task: write a scene's targets, one per line, into the two folders, BOP19 and BOP24, under the scene's name.
 
     BOP19: for each image and object, the number of instances whose visible fraction is at least `visibility`. BOP24: every image.
     """
@@ -54,17 +71,17 @@ def write_scene_targets(scene: Path, folder: Path, visibility: float) -> None:
         image = {"im_id": int(frame)}
         localize += [{**image, "inst_count": count, "obj_id": obj_id, "scene_id": scene_id} for obj_id, count in sorted(visible.items())]
         detect.append({**image, "scene_id": scene_id})
-    for name, targets in ((BOP19, localize), (BOP24, detect)):
-        (folder / name / scene.name).write_text("".join(json.dumps(target) + "\n" for target in targets), encoding="ascii")
+    for folder, targets in zip(folders, (localize, detect), strict=True):
+        Path(folder, scene.name).write_text("".join(json.dumps(target) + "\n" for target in targets), encoding="ascii")
 
 
 def _read(scene: Path, name: str, schema: type[_Content]) -> _Content:
     return read_json(path_inside(scene, name, scene, DatasetError), schema, DatasetError, _ADVICE)
 
 
-def concatenate_targets(folder: Path, out: Path) -> None:
-    """Concatenate the parts that `write_scene_targets` wrote into the data set's two files, in order of scenes."""
-    for name in (BOP19, BOP24):
+def concatenate_targets(folder: Path, out: Path, names: tuple[str, ...]) -> None:
+    """Concatenate the parts that `write_scene_targets` wrote to `folder/name` into the data set's files, in order of scenes."""
+    for name in names:
         parts = sorted((folder / name).iterdir(), key=lambda path: int(path.name))
         lines = [line for part in parts for line in part.read_bytes().splitlines()]
         write_atomically(out / name, b"[\n" + b",\n".join(lines) + b"\n]\n")

@@ -14,6 +14,7 @@ import numpy as np
 
 from synpick_warp.codes import Ending, Task
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import episodes_end
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.lerobot.episode import (
     EpisodeContent,
@@ -98,7 +99,7 @@ class LerobotExporter:
     @staticmethod
     def shared_files(config: Config) -> SharedFiles:
         """See `Exporter`."""
-        videos = video_folders(len(config.cameras.positions), config.bake.episodes)
+        videos = video_folders(len(config.cameras.positions), episodes_end(config))
         between = (EPISODES.parent, EPISODES.parent.parent, META, DATA.parent, DATA.parent.parent)
         return SharedFiles((), (INFO, STATS, TASKS, EPISODES, DATA, CARD), (PARTS, *videos, *between, FOLDER))
 

@@ -35,6 +35,7 @@ from synpick_warp.exporters.lerobot.layout import (
     frame_rate,
     make_info,
     part_path,
+    split_name,
 )
 from synpick_warp.exporters.lerobot.part import Part, outcome_names
 from synpick_warp.exporters.lerobot.statistics import Statistics, describe_levels, describe_numbers, merge_numbers, to_json
@@ -71,7 +72,7 @@ def write_indices(out: Path, config: Config) -> list[Path]:
     cameras, totals = len(config.cameras.positions), _Totals()
     totals.levels = [np.zeros((3, 256), np.int64) for _ in range(cameras)]
     with pq.ParquetWriter(out / PARTIAL / "data.parquet", _data_schema(), compression="zstd") as writer:
-        for batch in _batch_tables(_read_tables(out, totals, 1.0 / frame_rate(config))):
+        for batch in _batch_tables(_read_tables(out, totals, config)):
             writer.write_table(batch)
     _place(out, DATA, lambda path: (out / PARTIAL / "data.parquet").replace(path))
     _place(
@@ -80,7 +81,7 @@ def write_indices(out: Path, config: Config) -> list[Path]:
     _place(out, TASKS, lambda path: pq.write_table(_task_table(totals.tasks), path))
     videos = {camera_key(index): describe_levels(levels, totals.frames) for index, levels in enumerate(totals.levels) if levels.any()}
     statistics = {name: to_json(values) for name, values in (totals.statistics | videos).items()}
-    info = make_info(config, len(totals.rows), totals.frames, len(totals.tasks))
+    info = make_info(config, [row["source/split"] for row in totals.rows], totals.frames, len(totals.tasks))
     info["features"]["attempt.outcome"]["info"] = {"codes": list(outcome_names())}
     for place, content in ((STATS, statistics), (INFO, info)):
         text = json.dumps(content, indent=2) + "\n"
@@ -101,9 +102,9 @@ def _place(out: Path, name: Path, write: Callable[[Path], object]) -> None:
     sync_folder(place.parent)
 
 
-def _read_tables(out: Path, totals: _Totals, period: float) -> Iterator[pa.Table]:
+def _read_tables(out: Path, totals: _Totals, config: Config) -> Iterator[pa.Table]:
     """Tables of the episodes, in order; adds them to the totals."""
-    folder = out / PARTS
+    folder, period = out / PARTS, 1.0 / frame_rate(config)
     indices = sorted(int(path.stem) for path in folder.iterdir() if path.name.removesuffix(".json").isdecimal()) if folder.is_dir() else []
     for source in indices:
         name = part_path(source)
@@ -112,6 +113,7 @@ def _read_tables(out: Path, totals: _Totals, period: float) -> Iterator[pa.Table
             raise DatasetError(f"{out / name} has {len(part.levels)} cameras, the settings {len(totals.levels)}; {_ADVICE}")
         columns = _make_columns(part, totals, period)
         _add_episode(source, part, columns, totals, period)
+        totals.rows[-1]["source/split"] = split_name(config, source)
         yield pa.table({name: _to_array(columns[name], feature) for name, feature in FRAME_FEATURES.items()}, _data_schema())
 
 
@@ -201,7 +203,7 @@ def _episode_schema(cameras: int) -> pa.Schema:
     fields: dict[str, pa.DataType] = dict.fromkeys(integers, pa.int64()) | {"tasks": pa.list_(pa.string())}
     fields |= dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), pa.int64())
     fields |= dict.fromkeys(("source/episode", "source/attempts", "source/picked"), pa.int64())
-    fields |= dict.fromkeys(("source/mode", "source/ending"), pa.string())
+    fields |= dict.fromkeys(("source/mode", "source/ending", "source/split"), pa.string())
     numbers = pa.list_(pa.float64())
     kinds = dict.fromkeys(FRAME_FEATURES, numbers)
     for camera in range(cameras):
@@ -235,20 +237,21 @@ def _task_table(tasks: dict[str, int]) -> pa.Table:
 def _make_card(config: Config, totals: _Totals) -> str:
     """Dataset card for the Hugging Face hub, whose visualizer of LeRobot data sets goes by the tag."""
     licence = "unknown" if config.bake.models or config.bake.lights else "mit"
-    split = config.bop.split.partition("_")[0]
+    names = list(dict.fromkeys(row["source/split"] for row in totals.rows))
+    only = "validation" if names == ["val"] else names[0] if names else "train"
+    files = " data/*/*.parquet" if config.splits else f"\n  - split: {only}\n    path: data/*/*.parquet"
+    splits = f"\nSplits (ranges of episodes in `meta/info.json`): {', '.join(names)}.\n" if config.splits else ""
     return f"""---
 license: {licence}
 task_categories: [robotics]
 tags: [LeRobot, bin-picking, suction, synthetic]
 configs:
 - config_name: default
-  data_files:
-  - split: {"validation" if split == "val" else split}
-    path: data/*/*.parquet
+  data_files:{files}
 ---
 # Bin picking with a suction gripper
 
 {len(totals.rows):,} episodes of {totals.frames:,} frames, simulated by synpick-warp, in LeRobot's format {VERSION}.
 State: cup pose in the tote's frame (x, y, z [m], quaternion x, y, z, w), whether the suction is on, whether an object hangs on the cup.
 Action: setpoint of the cup [m] and suction command. Tasks name the object that each attempt picks.
-"""
+{splits}"""

@@ -6,12 +6,16 @@ by the episode's index in the bake, which may have gaps, and meta/episodes says 
 
 from __future__ import annotations
 
+import itertools
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import split_kind, split_of
 
 FOLDER = Path("lerobot")
 """Folder of the LeRobot data set, in ours."""
@@ -100,8 +104,21 @@ def frame_rate(config: Config) -> float | int:
     return round(rate) if abs(rate - round(rate)) < 1e-9 else rate
 
 
-def make_info(config: Config, episodes: int, frames: int, tasks: int) -> dict[str, Any]:
-    """Content of meta/info.json."""
+def split_name(config: Config, episode: int) -> str:
+    """Name of the split of an episode of the bake; without splits, BOP's kind of the one: train, val or test."""
+    split = split_of(config, episode)
+    return split_kind(config.bop.split) if split is None else split.name
+
+
+def split_ranges(names: Sequence[str]) -> dict[str, str]:
+    """Ranges of episodes, as "0:240", from the split of each; the episodes of a split follow each other."""
+    counts = Counter(names)
+    ends = itertools.accumulate(counts.values())
+    return {name: f"{end - count}:{end}" for (name, count), end in zip(counts.items(), ends, strict=True)}
+
+
+def make_info(config: Config, splits: Sequence[str], frames: int, tasks: int) -> dict[str, Any]:
+    """Content of meta/info.json; `splits`: name of the split of each episode."""
     width, height = config.cameras.resolution
     rate = frame_rate(config)
     video = {
@@ -126,13 +143,13 @@ def make_info(config: Config, episodes: int, frames: int, tasks: int) -> dict[st
     return {
         "codebase_version": VERSION,
         "robot_type": ROBOT,
-        "total_episodes": episodes,
+        "total_episodes": len(splits),
         "total_frames": frames,
         "total_tasks": tasks,
         "chunks_size": CHUNK,
         **_SIZES,
         "fps": rate,
-        "splits": {config.bop.split.partition("_")[0]: f"0:{episodes}"},
+        "splits": split_ranges(splits),
         "data_path": f"data/{_CHUNKED}.parquet",
         "video_path": f"videos/{{video_key}}/{_CHUNKED}.mp4",
         "features": {**{camera_key(camera): video for camera in range(len(config.cameras.positions))}, **columns},

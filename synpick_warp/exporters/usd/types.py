@@ -51,8 +51,10 @@ class EpisodeMetadata:
     """Number of arrangements that were discarded before this one."""
     frames: int
     ending: str
+    split: str = ""
+    """Name of the episode's split; empty: the data set has none."""
 
     @staticmethod
     def from_end(end: EpisodeEnd) -> EpisodeMetadata:
         """Take the metadata from the episode's end."""
-        return EpisodeMetadata(end.episode, end.arrangement, end.frames, Ending(end.ending).name.lower())
+        return EpisodeMetadata(end.episode, end.arrangement, end.frames, Ending(end.ending).name.lower(), end.row.get("split", ""))

@@ -1,4 +1,4 @@
-"""Single-frame pose estimation: template search, refinement of many hypotheses, turns told apart by colour, refinement of the best."""
+"""Single-frame pose estimation: template search, refinement of hypotheses, near-symmetries told apart by colour, last refinement."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import warp as wp
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
 from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule, choose_poses
+from synpick_warp.stages.pose.symmetries import SymmetrySearch
 from synpick_warp.stages.pose.templates import SearchSettings, TemplateSearch
-from synpick_warp.stages.pose.turns import TurnSearch
 
 COARSE = Schedule(iterations=12, cutoffs=(0.03, 0.01), step=2, color=0.0)
 """Refinement of the many hypotheses of the template search."""
 FINE = Schedule(iterations=10, cutoffs=(0.012, 0.005), step=1, color=0.005)
-"""Refinement of the best one and its best turn."""
+"""Refinement of the best one and its best near-symmetry."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +29,10 @@ class DetectSettings:
     coarse: Schedule = COARSE
     fine: Schedule = FINE
     color: bool = True
-    turn_gain: float = 0.05
-    """Correlation by which a turn must be better to become a hypothesis."""
-    turn_loyalty: float = 0.0
-    """Relative cost by which a turn must be better after refinement."""
+    symmetry_gain: float = 0.05
+    """Correlation by which a symmetry must be better to become a hypothesis."""
+    symmetry_loyalty: float = 0.0
+    """Relative cost by which a symmetry must be better after refinement."""
 
 
 class Detector:
@@ -50,13 +50,13 @@ class Detector:
         self.observer, self.settings, self.device, n = observer, settings, observer.device, observer.instances
         self.search = TemplateSearch(templates, observer, settings.hypotheses, settings.search)
         self.many = Refiner(models, observer, settings.hypotheses, scales)
-        self.turns = TurnSearch(models, observer, scales)
-        self.pair = Refiner(models, observer, self.turns.hypotheses, scales)
+        self.symmetries = SymmetrySearch(models, observer, scales)
+        self.pair = Refiner(models, observer, self.symmetries.hypotheses, scales)
         self.many_pose = wp.zeros(n * settings.hypotheses, dtype=wp.transform, device=self.device)
-        self.pair_pose = wp.zeros(n * self.turns.hypotheses, dtype=wp.transform, device=self.device)
+        self.pair_pose = wp.zeros(n * self.symmetries.hypotheses, dtype=wp.transform, device=self.device)
         self.best = wp.zeros(n, dtype=wp.transform, device=self.device)
         self.cost = wp.zeros(n, dtype=float, device=self.device)
-        # Any correlation is below this mean, so that turns are always considered.
+        # Any correlation is below this mean, so that symmetries are always considered.
         self.no_memory = wp.zeros(n, dtype=float, device=self.device)
 
     def detect(self) -> None:
@@ -67,7 +67,7 @@ class Detector:
         cost = self.many.score(self.many_pose, color=settings.color)
         choose_poses(self.many_pose, cost, settings.hypotheses, 0.0, [self.best, self.cost], self.device)
         self.no_memory.fill_(1.0e3)
-        self.turns.propose(self.best, self.no_memory, settings.turn_gain, self.pair_pose, color=settings.color)
+        self.symmetries.propose(self.best, self.no_memory, settings.symmetry_gain, self.pair_pose, color=settings.color)
         self.pair.refine(self.pair_pose, settings.fine)
         cost = self.pair.score(self.pair_pose, color=settings.color)
-        choose_poses(self.pair_pose, cost, self.turns.hypotheses, settings.turn_loyalty, [self.best, self.cost], self.device)
+        choose_poses(self.pair_pose, cost, self.symmetries.hypotheses, settings.symmetry_loyalty, [self.best, self.cost], self.device)

@@ -1,4 +1,4 @@
-"""Object models on the device: meshes for closest points, surface samples with normals and colours, and turns that keep the shape."""
+"""Object models on the device: meshes for closest points, surface samples with normals and colours, and near-symmetries."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.arrays import allocate_struct, struct_arrays
-from synpick_warp.kernels.pose.hypotheses import Turns
+from synpick_warp.kernels.pose.hypotheses import Symmetries
 from synpick_warp.kernels.pose.residuals import Models
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import Material, TriangleMesh
@@ -23,11 +23,11 @@ SAMPLES = 2048
 """Surface samples of a model: 3 mm apart on a can, 6 mm on a large box."""
 TEXELS = 96
 """Resolution of sample colours: a texel of the mip level is at most a diameter over this, about a crop pixel."""
-TURN_STEP = 15.0
-"""Step of the angles about an object's principal axes that are tried as turns [°]."""
-TURN_TOLERANCE = 0.025
-"""Largest mean distance of the turned surface from the surface for a turn, relative to the diameter."""
-MAX_TURNS = 72
+SYMMETRY_STEP = 15.0
+"""Step of the angles about an object's principal axes that are tried as near-symmetries [°]."""
+SYMMETRY_TOLERANCE = 0.025
+"""Largest mean distance of the rotated surface from the surface for a near-symmetry, relative to the diameter."""
+MAX_SYMMETRIES = 72
 
 MODELS = struct_arrays(
     Models,
@@ -37,7 +37,7 @@ MODELS = struct_arrays(
     color=("model", "sample"),
     units={"radius": "m", "sample_area": "m²", "position": "m"},
 )
-TURNS = struct_arrays(Turns, "model", rotation=("model", "turn"), units={"center": "m"})
+SYMMETRIES = struct_arrays(Symmetries, "model", rotation=("model", "symmetry"), units={"center": "m"})
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +60,8 @@ class PoseModels:
 
     models: Any
     """The struct `Models`."""
-    turns: Any
-    """The struct `Turns`."""
+    symmetries: Any
+    """The struct `Symmetries`."""
     objects: tuple[ObjectModel, ...]
     diameters: np.ndarray
     """Diameter of each model's bounding sphere about its origin (model) float64 [m]."""
@@ -70,10 +70,10 @@ class PoseModels:
 
 
 def build_models(objects: Sequence[ObjectModel], device: wp.Device, samples: int = SAMPLES) -> PoseModels:
-    """Sample the surfaces of objects, find their turns and upload both."""
+    """Sample the surfaces of objects, find their near-symmetries and upload both."""
     surfaces = [sample_surface(item.mesh, item.material, samples) for item in objects]
     centers = [surface.position.mean(axis=0) for surface in surfaces]
-    turns = [shape_turns(surface.position) for surface in surfaces]
+    symmetries = [near_symmetries(surface.position) for surface in surfaces]
     radii = np.array([np.linalg.norm(item.mesh.vertices, axis=1).max() for item in objects])
     meshes = tuple(
         wp.Mesh(
@@ -90,13 +90,13 @@ def build_models(objects: Sequence[ObjectModel], device: wp.Device, samples: int
     models.sample_area.assign(np.array([surface.area / samples for surface in surfaces], np.float32))
     for name in ("position", "normal", "color"):
         getattr(models, name).assign(np.stack([getattr(surface, name) for surface in surfaces]))
-    table = allocate_struct(TURNS, {"model": len(objects), "turn": max(len(turn) for turn in turns)}, device)
+    table = allocate_struct(SYMMETRIES, {"model": len(objects), "symmetry": max(len(symmetry) for symmetry in symmetries)}, device)
     rotation = np.zeros((*table.rotation.shape, 4), np.float32)
     rotation[..., 3] = 1.0
-    for row, turn in enumerate(turns):
-        rotation[row, : len(turn)] = turn
+    for row, symmetry in enumerate(symmetries):
+        rotation[row, : len(symmetry)] = symmetry
     table.rotation.assign(rotation)
-    table.count.assign(np.array([len(turn) for turn in turns], np.int32))
+    table.count.assign(np.array([len(symmetry) for symmetry in symmetries], np.int32))
     table.center.assign(np.array(centers, np.float32))
     return PoseModels(models, table, tuple(objects), 2.0 * radii, meshes)
 
@@ -142,8 +142,8 @@ def sample_color(mesh: TriangleMesh, material: Material, uv: np.ndarray) -> np.n
     return (srgb_to_linear(level[row, column] / 255.0) * factor).astype(np.float32)
 
 
-def shape_turns(points: np.ndarray) -> np.ndarray:
-    """Near-symmetries: rotations about the centroid that keep a surface nearly in place, about principal axes in steps, and half turns.
+def near_symmetries(points: np.ndarray) -> np.ndarray:
+    """Near-symmetries: rotations about the centroid that keep a surface nearly in place, about principal axes in steps, and half-turns.
 
     Args:
         points: Samples of the surface (S, 3).
@@ -158,19 +158,33 @@ def shape_turns(points: np.ndarray) -> np.ndarray:
     # Distances between samples alone are not zero: what the identity would have if its own sample did not count.
     spacing = tree.query(probes, k=2)[0][:, 1].mean()
     axes = np.linalg.svd(centered, full_matrices=False)[2]
-    angles = np.deg2rad(np.arange(TURN_STEP, 360.0, TURN_STEP))
-    candidates = [Rotation.from_rotvec(angle * axis) for axis in axes for angle in angles]
-    # Half turns about all axes across a principal one: where two principal moments are equal, their axes are arbitrary.
+    angles = np.deg2rad(np.arange(SYMMETRY_STEP, 360.0, SYMMETRY_STEP))
+    vectors = [angle * axis for axis in axes for angle in angles]
+    # Half-turns about all axes across a principal one: where two principal moments are equal, their axes are arbitrary.
     for first, second in ((0, 1), (1, 2), (2, 0)):
-        half = [np.pi * (np.cos(angle) * axes[first] + np.sin(angle) * axes[second]) for angle in angles[angles < np.pi]]
-        candidates += [Rotation.from_rotvec(vector) for vector in half]
-    kept = [turn for turn in candidates if tree.query(turn.apply(probes))[0].mean() < spacing + TURN_TOLERANCE * size]
-    flips = [turn for turn in kept if np.isclose(turn.magnitude(), np.pi)]
-    rotations = [Rotation.identity(), *kept]
-    for turn in kept:
-        rotations += [flip * turn for flip in flips]
-    unique: list[Rotation] = []
-    for turn in rotations:
-        if all((turn * other.inv()).magnitude() > np.deg2rad(TURN_STEP) / 2.0 for other in unique):
-            unique.append(turn)
-    return np.array([turn.as_quat() for turn in unique[:MAX_TURNS]], np.float32)
+        vectors += [np.pi * (np.cos(angle) * axes[first] + np.sin(angle) * axes[second]) for angle in angles[angles < np.pi]]
+    candidates = Rotation.from_rotvec(vectors)
+    distances = tree.query(np.einsum("tij,pj->tpi", candidates.as_matrix(), probes))[0]
+    kept = candidates[distances.mean(axis=1) < spacing + SYMMETRY_TOLERANCE * size]
+    flips = kept[np.isclose(kept.magnitude(), np.pi)]
+    rotations = [Rotation.identity().as_quat()[None], kept.as_quat()]
+    rotations += [(flips * symmetry).as_quat() for symmetry in kept if len(flips)]
+    return distinct_rotations(np.concatenate(rotations), np.deg2rad(SYMMETRY_STEP) / 2.0, MAX_SYMMETRIES).astype(np.float32)
+
+
+def distinct_rotations(quaternions: np.ndarray, angle: float, limit: int) -> np.ndarray:
+    """Non-maximum suppression of rotations in their order: each one kept is farther than `angle` [rad] from those kept before it.
+
+    Args:
+        quaternions: Unit quaternions (N, 4), the best first.
+        angle: Smallest angle between two that are kept [rad].
+        limit: Maximum number that is kept.
+    """
+    kept = np.empty((0, 4))
+    for quaternion in quaternions:
+        # Opposite quaternions are one rotation.
+        if (np.abs(kept @ quaternion) < np.cos(angle / 2.0)).all():
+            kept = np.concatenate((kept, quaternion[None]))
+            if len(kept) == limit:
+                break
+    return kept

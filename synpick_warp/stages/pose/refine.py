@@ -11,7 +11,7 @@ from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.appearance import accumulate_samples_kernel
 from synpick_warp.kernels.pose.hypotheses import choose_poses_kernel
 from synpick_warp.kernels.pose.lighting import CHANNELS, Lighting, accumulate_lighting_kernel, fit_lighting_kernel
-from synpick_warp.kernels.pose.residuals import LANES, Cost, Sums
+from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Sums
 from synpick_warp.kernels.pose.solve import StepLimits, score_poses_kernel, step_poses_kernel
 from synpick_warp.kernels.pose.surface import accumulate_points_kernel
 from synpick_warp.stages.pose.models import PoseModels
@@ -113,8 +113,8 @@ class Refiner:
 
 
 def make_cost(scales: CostScales, cutoff: float, step: int, color: float) -> Any:
-    """The struct `Cost`; see `Schedule` for the parameters that change in the course of a refinement."""
-    cost = Cost()
+    """The struct `LossParameters`; see `Schedule` for the parameters that change in the course of a refinement."""
+    cost = LossParameters()
     cost.cutoff, cost.step, cost.color = cutoff, step, color
     for name in ("truncation", "margin", "silhouette", "color_cutoff", "color_cost"):
         setattr(cost, name, getattr(scales, name))

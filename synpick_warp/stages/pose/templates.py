@@ -44,8 +44,8 @@ class SearchSettings:
 
     directions: int = 96
     """Viewing directions, spread over the sphere: 20° apart."""
-    turns: int = 18
-    """Turns about the optical axis: 20° apart."""
+    rotations: int = 18
+    """Number of in-plane rotations, about the optical axis: 20° apart."""
     shifts: int = 3
     """Shifts to each side along either axis."""
     shift: float = 0.09
@@ -75,11 +75,11 @@ class TemplateSearch:
         self.templates = templates
         n = observer.instances
         self.probes = allocate_struct(PROBES, {"instance": n, "inside": settings.inside, "outside": settings.outside}, self.device)
-        shape = (n, settings.directions, settings.turns)
+        shape = (n, settings.directions, settings.rotations)
         self.cost = wp.zeros(shape, dtype=float, device=self.device)
         self.offset = wp.zeros(shape, dtype=wp.vec3, device=self.device)
         self.parameters = Search()
-        for name in ("turns", "shifts", "shift", "truncation", "margin"):
+        for name in ("rotations", "shifts", "shift", "truncation", "margin"):
             setattr(self.parameters, name, getattr(settings, name))
 
     def search(self, pose: wp.array) -> None:

@@ -1,4 +1,4 @@
-"""Tracking of object poses from frame to frame: motion hypotheses, refinement, turns told apart by colour, no restart."""
+"""Tracking of object poses from frame to frame: motion hypotheses, refinement, near-symmetries told apart by colour, no restart."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from synpick_warp.kernels.pose.hypotheses import (
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
 from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule, choose_poses
-from synpick_warp.stages.pose.turns import TurnSearch
+from synpick_warp.stages.pose.symmetries import SymmetrySearch
 
 TRACK = struct_arrays(Track, "instance", units={"pose": "m", "before": "m", "centroid": "m"})
 
 COARSE = Schedule(iterations=6, cutoffs=(0.03, 0.01), step=2, color=0.005, prior=1e-3)
 """Refinement of the motion hypotheses."""
 FINE = Schedule(iterations=8, cutoffs=(0.012, 0.005), step=1, color=0.005, prior=1e-3)
-"""Refinement of the best one and its best turn."""
+"""Refinement of the best one and its best near-symmetry."""
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,13 @@ class TrackSettings:
     coarse: Schedule = COARSE
     fine: Schedule = FINE
     color: bool = True
-    """Use colours to choose turns, and in costs; in refinements the schedules say so."""
+    """Use colours to choose among near-symmetries, and in costs; in refinements the schedules say so."""
     loyalty: float = 0.05
     """Relative cost by which a motion must be better than rest."""
-    turn_gain: float = 0.1
-    """Correlation by which colours must fit worse than before for turns to be considered, and a turn better than the pose."""
-    turn_loyalty: float = 0.15
-    """Relative cost by which a turn must be better after refinement."""
+    symmetry_gain: float = 0.1
+    """Correlation by which colours must fit worse than before for symmetries to be considered, and a symmetry better than the pose."""
+    symmetry_loyalty: float = 0.15
+    """Relative cost by which a symmetry must be better after refinement."""
     min_points: int = 16
     """See `TrackPolicy`, as for the next three."""
     surprise: float = 0.4
@@ -63,12 +63,12 @@ class Tracker:
         self.models, self.observer, self.settings = models, observer, settings
         self.device, n = observer.device, observer.instances
         self.motions = Refiner(models, observer, int(MOTIONS), scales)
-        self.turns = TurnSearch(models, observer, scales)
-        self.pair = Refiner(models, observer, self.turns.hypotheses, scales)
+        self.symmetries = SymmetrySearch(models, observer, scales)
+        self.pair = Refiner(models, observer, self.symmetries.hypotheses, scales)
         self.track_state = allocate_struct(TRACK, {"instance": n}, self.device)
         self.track_state.pose.fill_(wp.transform_identity())
         self.motion_pose = wp.zeros(n * int(MOTIONS), dtype=wp.transform, device=self.device)
-        self.pair_pose = wp.zeros(n * self.turns.hypotheses, dtype=wp.transform, device=self.device)
+        self.pair_pose = wp.zeros(n * self.symmetries.hypotheses, dtype=wp.transform, device=self.device)
         self.best = wp.zeros(n, dtype=wp.transform, device=self.device)
         self.cost = wp.zeros(n, dtype=float, device=self.device)
         self.start_pose = wp.zeros(n, dtype=wp.transform, device=self.device)
@@ -91,10 +91,10 @@ class Tracker:
         self.motions.refine(self.motion_pose, settings.coarse)
         cost = self.motions.score(self.motion_pose, color=settings.color)
         choose_poses(self.motion_pose, cost, int(MOTIONS), settings.loyalty, [self.best, self.cost], self.device)
-        self.turns.propose(self.best, state.correlation, settings.turn_gain, self.pair_pose, color=settings.color)
+        self.symmetries.propose(self.best, state.correlation, settings.symmetry_gain, self.pair_pose, color=settings.color)
         self.pair.refine(self.pair_pose, settings.fine)
         cost = self.pair.score(self.pair_pose, color=settings.color)
-        choose_poses(self.pair_pose, cost, self.turns.hypotheses, settings.turn_loyalty, [self.best, self.cost], self.device)
+        choose_poses(self.pair_pose, cost, self.symmetries.hypotheses, settings.symmetry_loyalty, [self.best, self.cost], self.device)
         inputs = [self.policy, observation, self.best, self.cost, self.start_pose, self.starting]
         wp.launch(update_tracks_kernel, dim=n, inputs=inputs, outputs=[state], device=device)
         self.starting.zero_()

@@ -27,7 +27,7 @@ def sample_objects(scene: SceneData, state: WorldState, seed: int) -> None:
     wp.launch(
         arrangement.sample_modes_kernel,
         dim=worlds,
-        inputs=[wp.uint64(seed), scene.mode, state.arrangement_id, state.phase],
+        inputs=[wp.uint64(seed), scene.modes, state.arrangement_id, state.phase],
         outputs=[state.mode],
         device=device,
     )

@@ -13,6 +13,7 @@ import warp as wp
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.kernels.sim import snapshot as pack
 from synpick_warp.scenes.build import build_model
 from synpick_warp.scenes.types import Catalog
@@ -65,7 +66,7 @@ class Simulation:
             lights: Count of environment maps to sample from.
             device: Device of all arrays.
             render_scene: Scene that perception renders; not needed if all episodes have mode MOVE.
-            episodes: Indices of the episodes to simulate, in order; None: 0 to `bake.episodes` - 1.
+            episodes: Indices of the episodes to simulate, in order; None: all.
             records_physics: True if records contain `physics`.
 
         Raises:
@@ -77,7 +78,8 @@ class Simulation:
         self.layout = built.layout
         self.physics = Physics(config.physics, built)
         self.scene: SceneData = make_scene_data(config, catalog, built, lights, device)
-        indices = np.asarray(range(config.bake.episodes) if episodes is None else episodes, np.int32)
+        planned = [index for each in plan_episodes(config) for index in each] if episodes is None else episodes
+        indices = np.asarray(planned, np.int32)
         self.episodes = wp.array(indices, dtype=wp.int32, device=device)
         sizes = world_sizes(config, built.layout.bodies_per_world)
         self.state = allocate(WorldState, sizes, device)

@@ -21,7 +21,7 @@ from synpick_warp.cli.commands import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import SynpickError
-from synpick_warp.estimation import device as factories
+from synpick_warp.estimation import factories
 from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
 from synpick_warp.pipeline import run_bake
@@ -222,11 +222,22 @@ def estimate(sandbox: Sandbox) -> int:
     return code
 
 
+def count(sandbox: Sandbox) -> int:
+    """Run `stats`; tables are written if and only if the code is 0."""
+    tables = sandbox.scratch / "tables"
+    code = run_command("stats", sandbox.folder, "--csv", tables)
+    assert (code == 0) == tables.exists()
+    shutil.rmtree(tables, ignore_errors=True)
+    run_command("stats", sandbox.folder)
+    return code
+
+
 READERS = {
     "open": lambda sandbox: use_set(sandbox.folder),
     "draw": draw,
     "evaluate": evaluate,
     "estimate": estimate,
+    "count": count,
     "check and merge": check_and_merge,
     "config": show_settings,
 }
@@ -240,6 +251,7 @@ def test_the_set_itself_is_read_by_every_command(sandbox):
     draw(sandbox)
     evaluate(sandbox)
     assert estimate(sandbox) == 0
+    assert count(sandbox) == 0
     assert run_command("verify", sandbox.folder) == 0
     show_settings(sandbox)
 

@@ -73,14 +73,15 @@ def test_a_checksum_list_is_refused_or_its_names_are_inside(tmp_path_factory, li
 def test_damaged_scenes_are_one_line_or_targets(ready, tmp_path_factory, data):
     scene = tmp_path_factory.mktemp("scene") / "000000"
     scene.mkdir()
-    for name in (targets.BOP19, targets.BOP24):
-        (scene.parent / name).mkdir()
+    places = str(scene.parent / targets.BOP19), str(scene.parent / targets.BOP24)
+    for place in places:
+        Path(place).mkdir()
     for name in ("scene_gt.json", "scene_gt_info.json"):
         shutil.copy(ready / "train" / "000000" / name, scene)
     path = scene / data.draw(st.sampled_from(["scene_gt.json", "scene_gt_info.json"]))
     path.write_bytes(draw_hostile(data, path.read_bytes()))
     try:
-        targets.write_scene_targets(scene, scene.parent, 0.1)
+        targets.write_scene_targets(scene, places, 0.1)
     except DatasetError as error:
         check_line(error)
 

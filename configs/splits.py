@@ -1,0 +1,84 @@
+"""Splits of a data set: which episodes each one has, and where its BOP scenes are.
+
+A data set numbers its episodes through: each split is a range of indices. Random streams are keyed by seed and episode index, so splits
+share none; scene ids follow from episode indices, so a scene id names one scene of the whole data set. Without splits there is one range,
+from 0 to `bake.episodes`, in the folder `bop.split`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from synpick_warp.configs.check import format_value, suggest
+from synpick_warp.configs.schema import Config, Split
+from synpick_warp.errors import ConfigError
+
+
+def episode_range(split: Split) -> range:
+    """Episode indices of a split."""
+    return range(split.first, split.first + split.episodes)
+
+
+def choose_splits(config: Config, names: Sequence[str]) -> tuple[Split, ...]:
+    """Splits of these names; no names: all splits, which may be none.
+
+    Raises:
+        ConfigError: There is no split of a name.
+    """
+    if not names:
+        return config.splits
+    known = [split.name for split in config.splits]
+    if not known:
+        raise ConfigError(f"there is no split {format_value(names[0])}: the settings have no splits; add tables such as [splits.train]")
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"there is no split {format_value(name)}; splits: {', '.join(known)}{suggest(name, known)}")
+    return tuple(split for split in config.splits if split.name in names)
+
+
+def plan_episodes(config: Config, names: Sequence[str] = (), shard: tuple[int, int] = (0, 1)) -> list[range]:
+    """Episode indices of a bake, ascending, one range per split.
+
+    Args:
+        config: All settings.
+        names: Splits; empty: all.
+        shard: (i, n): only indices with index % n == i.
+
+    Raises:
+        ConfigError: There is no split of a name.
+    """
+    index, count = shard
+    splits = choose_splits(config, names)
+    ranges = [episode_range(split) for split in splits] if splits else [range(config.bake.episodes)]
+    return [range(each.start + (index - each.start) % count, each.stop, count) for each in ranges]
+
+
+def is_planned(config: Config, episode: int) -> bool:
+    """Whether the settings plan an episode of this index."""
+    return any(episode in each for each in plan_episodes(config))
+
+
+def episodes_end(config: Config) -> int:
+    """One more than the largest episode index."""
+    return max(each.stop for each in plan_episodes(config))
+
+
+def split_of(config: Config, episode: int) -> Split | None:
+    """Split of an episode, or for an index in a gap the split before it; None: there are no splits."""
+    return next((split for split in reversed(config.splits) if split.first <= episode), config.splits[0] if config.splits else None)
+
+
+def bop_folder(config: Config, episode: int) -> str:
+    """Name of the folder of an episode's BOP scenes."""
+    split = split_of(config, episode)
+    return config.bop.split if split is None else split.folder
+
+
+def bop_folders(config: Config) -> tuple[str, ...]:
+    """Names of the folders of all BOP scenes."""
+    return tuple(split.folder for split in config.splits) or (config.bop.split,)
+
+
+def split_kind(folder: str) -> str:
+    """What BOP calls a split's name: train, val or test; the rest of the folder's name is its type."""
+    return folder.partition("_")[0]

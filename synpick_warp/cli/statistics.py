@@ -1,0 +1,72 @@
+"""Command `stats`: statistics of a data set beside those of the paper."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from rich.console import Console
+
+from synpick_warp.cli.options import WholeNumber
+from synpick_warp.configs.check import escape
+from synpick_warp.errors import ConfigError, DatasetError
+
+MAX_DEPTH_VIEWS = 100_000
+MAX_THREADS = 1024
+MEBIBYTE = 2**20
+"""Bytes."""
+
+
+def show_statistics(
+    folder: Annotated[Path, Parameter(name="DIR", help="A data set.")],
+    /,
+    *,
+    json: Annotated[bool, Parameter(negative=(), help="Print all statistics as JSON instead of tables.")] = False,
+    csv: Annotated[Path | None, Parameter(help="New or empty folder for all tables as CSV files.")] = None,
+    split: Annotated[str | None, Parameter(help="Only the episodes of this split (default: all splits).")] = None,
+    depth_views: Annotated[WholeNumber, Parameter(help="Views whose depth image is read, spread over the data set; 0: none.")] = 64,
+    threads: Annotated[WholeNumber, Parameter(help="Processes that read; 0: one per core.")] = 0,
+) -> int:
+    """Count views, instances, visibility, attempts, seal forces, viewing directions, depth and lights, beside the paper's numbers.
+
+    Reads each annotation file once and holds only counts. Exit codes: 0; 2, the folder is not a data set, or a file of it is damaged.
+    """
+    for option, number, most in (("--depth-views", depth_views, MAX_DEPTH_VIEWS), ("--threads", threads, MAX_THREADS)):
+        if not 0 <= number <= most:
+            raise ConfigError(f"{option} is {number}; allowed: 0 to {most}")
+    from synpick_warp.statistics.output import check_csv_folder, print_statistics, to_json, write_csv
+
+    if csv is not None:
+        check_csv_folder(csv)
+        if csv.resolve().is_relative_to(folder.resolve()):
+            raise ConfigError(f"--csv is {csv}, inside the data set {folder}; name a folder outside of it")
+    from synpick_warp.cli.display import ViewCounter, make_console
+    from synpick_warp.dataset.reading import open_data_set
+    from synpick_warp.statistics.collect import collect, count_cores
+    from synpick_warp.statistics.compute import assemble
+
+    data_set = open_data_set(folder)
+    if not (folder / "config.toml").exists():
+        raise DatasetError(f"{folder} has no config.toml; name the folder of a data set that synpick-warp baked")
+    if split is not None:
+        data_set = data_set.split(split)
+    started = time.perf_counter()
+    notes = Console(stderr=True, highlight=False, soft_wrap=True)
+    with ViewCounter(notes) as counter:
+        collected = collect(data_set, depth_views, threads or count_cores(), counter.report)
+    wall = max(time.perf_counter() - started, 1e-9)
+    statistics = assemble(data_set, collected)
+    if csv is not None:
+        for path in write_csv(statistics, csv):
+            print(f"table: {escape(str(path))}", file=sys.stderr if json else sys.stdout)
+    if json:
+        print(to_json(statistics))
+    elif csv is None:
+        print_statistics(make_console(), statistics)
+    rate = f"{collected.views / wall:,.0f} views/s"
+    summary = f"{collected.views:,} views in {wall:.1f} s ({rate}); peak memory {collected.memory / MEBIBYTE:,.0f} MiB"
+    print(summary, file=sys.stderr if json else sys.stdout)
+    return 0

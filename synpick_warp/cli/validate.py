@@ -1,0 +1,127 @@
+"""Command `validate`: check a BOP data set by all rules, and poses against re-rendered views."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from synpick_warp.cli.options import WholeNumber, one_line
+from synpick_warp.errors import ConfigError
+
+if TYPE_CHECKING:
+    from synpick_warp.validation.registry import Violation
+    from synpick_warp.validation.run import Options, Summary
+
+EXIT_VIOLATIONS = 1
+_MAX_SAMPLE = 10**9
+_MAX_THREADS = 1024
+
+
+def validate(
+    folder: Annotated[Path | None, Parameter(name="DIR", help="A BOP data set: the folder that contains train_pbr, models, ...")] = None,
+    /,
+    *,
+    sample: Annotated[
+        WholeNumber | None, Parameter(help="Views that are rendered again to check poses, spread evenly; 0: none (default 200).")
+    ] = None,
+    poses: Annotated[bool, Parameter(negative=(), help="Render every view again.")] = False,
+    fast: Annotated[bool, Parameter(negative=(), help="Only files, annotations, models and target lists; no image is read.")] = False,
+    json: Annotated[bool, Parameter(negative=(), help="Print JSON Lines: one object per violation, and one with the totals.")] = False,
+    limit: Annotated[WholeNumber, Parameter(help="Violations that are printed of each rule; 0: all. --json prints all.")] = 20,
+    threads: Annotated[WholeNumber, Parameter(help="Number of processes; 0: one per core.")] = 0,
+    rules: Annotated[bool, Parameter(negative=(), help="List all rules instead.")] = False,
+) -> int:
+    """Check a BOP data set, ours or not: files, annotations, masks, models, target lists, and poses against re-rendered views.
+
+    A line per violation: level, file, rule, what is wrong and how to mend it. Nothing is written.
+
+    Exit codes: 0, no errors (there may be warnings); 1, errors were found; 2, the folder is not a BOP data set.
+    """
+    if rules:
+        _print_rules(as_json=json)
+        return 0
+    if folder is None:
+        raise ConfigError("validate needs the folder of a data set; --rules lists the rules")
+    options = _make_options(sample, threads, poses=poses, fast=fast)
+    if limit < 0:
+        raise ConfigError(f"--limit is {limit}; allowed: 0 for all, or more")
+    from rich.console import Console
+
+    from synpick_warp.cli.display import ViewCounter
+    from synpick_warp.validation.run import Summary
+    from synpick_warp.validation.run import validate as check
+
+    summary, counts = Summary(), Counter()
+    with ViewCounter(Console(stderr=True, highlight=False)) as counter:
+        for violation in check(folder, options, summary, counter.report):
+            counts[violation.rule] += 1
+            if json or not limit or counts[violation.rule] <= limit:
+                print(_encode(violation) if json else _describe(violation))
+    _print_summary(summary, counts, 0 if json else limit, as_json=json)
+    return EXIT_VIOLATIONS if summary.errors else 0
+
+
+def _make_options(sample: int | None, threads: int, *, poses: bool, fast: bool) -> Options:
+    """Check the options.
+
+    Raises:
+        ConfigError: A value is not allowed, or two options exclude each other.
+    """
+    from synpick_warp.validation.run import DEFAULT_SAMPLE, Options
+
+    if fast and (poses or sample):
+        raise ConfigError("--fast reads no images, so it renders none; drop it, or --sample and --poses")
+    if poses and sample is not None:
+        raise ConfigError("--poses renders every view; drop it, or --sample")
+    if sample is not None and not 0 <= sample <= _MAX_SAMPLE:
+        raise ConfigError(f"--sample is {sample}; allowed: 0 to {_MAX_SAMPLE}")
+    if not 0 <= threads <= _MAX_THREADS:
+        raise ConfigError(f"--threads is {threads}; allowed: 0 to {_MAX_THREADS}")
+    given = {"threads": threads} if threads else {}
+    return Options(None if poses else DEFAULT_SAMPLE if sample is None else sample, not fast, **given)
+
+
+def _describe(violation: Violation) -> str:
+    """A violation in one line."""
+    from synpick_warp.validation.registry import load_rules
+
+    cure = load_rules()[violation.rule].cure
+    return one_line(f"{violation.level} {violation.file}: {violation.rule}: {violation.text}. To mend it: {cure}.")
+
+
+def _encode(violation: Violation) -> str:
+    """A violation as a JSON object."""
+    from synpick_warp.validation.registry import load_rules
+
+    return _dump({**violation._asdict(), "cure": load_rules()[violation.rule].cure})
+
+
+def _dump(record: object) -> str:
+    """JSON in ASCII; file names that are not UTF-8 have their bytes as lone surrogates."""
+    from json import dumps
+
+    return dumps(record)
+
+
+def _print_rules(*, as_json: bool) -> None:
+    from synpick_warp.validation.registry import load_rules
+
+    for item in load_rules().values():
+        record = {"rule": item.name, "level": item.level, "sentence": item.sentence, "cure": item.cure}
+        print(_dump(record) if as_json else f"{item.name} ({item.level}): {item.sentence}")
+
+
+def _print_summary(summary: Summary, counts: Counter, limit: int, *, as_json: bool) -> None:
+    if as_json:
+        print(_dump({"totals": vars(summary)}))
+        return
+    for name, count in counts.items():
+        if limit and count > limit:
+            print(f"{name}: {count - limit:,} more; --limit 0 prints all")
+    checked = f"{summary.scenes:,} scenes, {summary.models:,} models, {summary.views:,} views, {summary.rendered:,} of them rendered again"
+    print(f"{checked}: {summary.errors:,} errors, {summary.warnings:,} warnings")
+    sys.stdout.flush()

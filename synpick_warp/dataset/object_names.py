@@ -1,0 +1,42 @@
+"""Names of a data set's objects, from its models and its settings."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.annotations import Key, ModelDiameter, read_checked
+from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.files import check_regular_file
+
+_MODEL_NAME = re.compile(rb"^comment (.+), millimetres\r?$", re.MULTILINE)
+"""Comment in a PLY file that the BOP exporter wrote: the object's name."""
+_PLY_HEAD = 2048
+"""Size of the part of a PLY file that is searched for comments [B]."""
+_MAX_MODEL = 2**40
+"""Largest PLY file [B]; only its head is read."""
+
+
+def object_names(dataset: Path, config: Config, object_ids: set[int]) -> dict[int, str]:
+    """Names of objects (obj_id -> name): from the exported model's comment, else from the settings' object table; some have none."""
+    infos = read_checked(dataset / "models" / "models_info.json", dict[Key, ModelDiameter])
+    names = {}
+    for object_id in object_ids:
+        path = dataset / "models" / f"obj_{object_id:06d}.ply"
+        comment = None
+        if path.exists():
+            check_regular_file(path, _MAX_MODEL, DatasetError)
+            with path.open("rb") as file:
+                comment = _MODEL_NAME.search(file.read(_PLY_HEAD))
+        size = float(infos.get(object_id, {}).get("diameter", 0.0)) / 1000.0
+        fits = (row.name for row in config.object_rows if row.id == object_id and _fits(row.diameter, size, config))
+        name = comment[1].decode(errors="replace") if comment else next(fits, "")
+        if name:
+            names[object_id] = name
+    return names
+
+
+def _fits(expected: float, size: float, config: Config) -> bool:
+    """Whether a model's diameter matches that of a row in the object table [m]; a row without one matches any."""
+    return expected == 0.0 or abs(size - expected) <= config.objects.diameter_tolerance * expected

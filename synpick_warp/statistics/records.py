@@ -1,0 +1,49 @@
+"""Schemas of what statistics read: episodes, attempts, light. Other keys are passed over."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import UNSET, Meta, UnsetType
+
+from synpick_warp.dataset.annotations import CameraEntry, Index, Length
+
+MAX_NAME = 256
+"""Longest name of a mode, an ending, an outcome, a split or a light map."""
+Name = Annotated[str, Meta(max_length=MAX_NAME)]
+
+
+class EpisodeFacts(msgspec.Struct):
+    """Row of an episode."""
+
+    mode: Name
+    frames: Index
+    ending: Name
+    objects: Index = 0
+    picked: Index = 0
+    lost: Annotated[int, Meta(ge=-(2**31), lt=2**31)] = 0
+
+
+class AttemptFacts(msgspec.Struct):
+    """An attempt to pick."""
+
+    outcome: Name
+    good_seal: bool = False
+    engaged: Annotated[list[Index], Meta(max_length=255)] = []
+    peak_force: Annotated[list[Annotated[float, Meta(ge=0.0, le=1e9)]], Meta(max_length=100_000)] = []
+    """Largest force on any seal in each tick of the lift [N]."""
+
+
+class Light(msgspec.Struct, gc=False):
+    """An episode's environment map, its yaw [rad] and exposure compensation [EV]."""
+
+    map: Name
+    yaw: Length
+    exposure: Length
+
+
+class LitCameraEntry(CameraEntry, gc=False):
+    """A view's entry in scene_camera.json, with the light that data sets of others lack."""
+
+    light: Light | UnsetType = UNSET

@@ -1,0 +1,70 @@
+"""Folders of keyed views as subjects of rules: webdataset shards with key_to_shard.json, and the imagewise layout."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+
+from synpick_warp.dataset.view_files import list_members
+from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.json import MAX_JSON, decode_json
+from synpick_warp.validation.folders import Listing
+from synpick_warp.validation.layout import KEYED, KEYS, SHARD, SceneRef
+
+KEY = re.compile(r"([0-9]{6,9})_([0-9]{6,9})")
+
+
+@dataclass(frozen=True, eq=False)
+class KeyedFolder:
+    """A folder of shards or of the imagewise layout."""
+
+    listing: Listing
+
+    @property
+    def place(self) -> str:
+        """Path relative to the data set."""
+        return self.listing.place
+
+    @cached_property
+    def shards(self) -> list[str]:
+        """Names of the tar files."""
+        return sorted(filter(SHARD.fullmatch, self.listing.files))
+
+    @cached_property
+    def keys(self) -> tuple[dict[str, int] | None, str]:
+        """Index of the shard by key, and what is wrong with key_to_shard.json; None: there is no such file, or it is damaged."""
+        if KEYS not in self.listing.files:
+            return None, f"there is no {KEYS}" if self.shards else ""
+        try:
+            return decode_json(self.listing.read(KEYS, MAX_JSON), dict[str, int], self.listing.name(KEYS), DatasetError), ""
+        except DatasetError as error:
+            return None, str(error)
+
+    @cached_property
+    def members(self) -> dict[str, set[str] | str]:
+        """Keys in each shard, or why it cannot be read."""
+        found: dict[str, set[str] | str] = {}
+        for shard in self.shards:
+            try:
+                matches = (KEYED.fullmatch(name) for name, _, _ in list_members(self.listing.path(shard)))
+                found[shard] = {f"{match[1]}_{match[2]}" for match in matches if match}
+            except DatasetError as error:
+                found[shard] = str(error)
+        return found
+
+    def scenes(self) -> list[tuple[SceneRef, list[int]]]:
+        """Scenes with their images, by index; those in shards that cannot be read are left out."""
+        images: dict[int, set[int]] = {}
+        shards: dict[int, set[str]] = {}
+        for shard, keys in self.members.items():
+            for key in keys if isinstance(keys, set) else ():
+                scene, image = map(int, key.split("_"))
+                images.setdefault(scene, set()).add(image)
+                shards.setdefault(scene, set()).add(shard)
+        for name in self.listing.files if not self.shards else ():
+            if match := KEYED.fullmatch(name):
+                images.setdefault(int(match[1]), set()).add(int(match[2]))
+        return [
+            (SceneRef(self.place, scene, "", "", tuple(sorted(shards.get(scene, ())))), sorted(images[scene])) for scene in sorted(images)
+        ]

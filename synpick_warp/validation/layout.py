@@ -1,0 +1,129 @@
+"""Layout of a BOP data set: splits, scenes, sensors, shards and models folders, as the files have them and not as a name promises."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+from synpick_warp.errors import DatasetError
+from synpick_warp.validation.folders import Listing, list_folder
+
+SPLIT = re.compile(r"(train|val|test)(_.*)?")
+MODELS = re.compile(r"models(_.*)?")
+MODEL_FILE = re.compile(r"obj_([0-9]{6,9})\.ply")
+TARGETS = re.compile(r".*targets.*\.json")
+KEYS = "key_to_shard.json"
+SHARD = re.compile(r"shard-[0-9]+\.tar")
+KEYED = re.compile(r"([0-9]{6,9})_([0-9]{6,9})\.(.+)")
+"""File of the imagewise layout, and member of a shard: scene, image, content."""
+_ANNOTATION = re.compile(r"scene_(?:camera|gt)(?:_(?!info(?:_|\.)|coco(?:_|\.)|world(?:_|\.))(\w+))?\.json")
+_RENDERING_MODELS = ("models", "models_cad", "models_eval", "models_reconst")
+"""Models folders in the order in which poses are checked with them: the first is what ground truth is rendered with."""
+
+
+@dataclass(frozen=True)
+class SceneRef:
+    """A scene as one sensor sees it: a folder of files, members of shards, or files of the imagewise layout."""
+
+    split: str
+    scene: int
+    name: str
+    """Folder in the split; empty: keyed files (shards, imagewise)."""
+    sensor: str = ""
+    """Suffix of the sensor's files, such as "_cam1" of scene_gt_cam1.json; empty: the classic layout."""
+    shards: tuple[str, ...] = ()
+    """Tar files in the split's folder; empty, with no name: imagewise."""
+
+    @property
+    def place(self) -> str:
+        """Path relative to the data set."""
+        return f"{self.split}/{self.name}" if self.name else self.split
+
+
+class Layout:
+    """Folders of a data set."""
+
+    def __init__(self, folder: Path) -> None:
+        """
+        Raises:
+            DatasetError: The folder does not exist, cannot be listed, or has nothing of a BOP data set.
+        """
+        if not folder.is_dir():
+            raise DatasetError(f"there is no folder {folder}; name the folder of a BOP data set")
+        self.root = folder.resolve()
+        self.listing = list_folder(self.root)
+        self._refuse_parts(folder)
+        self.models = {name: self.listing.enter(name) for name in sorted(filter(MODELS.fullmatch, self.listing.folders))}
+        others = sorted(name for name in self.listing.folders if not name.startswith(".") and name not in self.models)
+        listings = {name: self.listing.enter(name) for name in others}
+        self.splits = {name: listing for name, listing in listings.items() if SPLIT.fullmatch(name) and not _is_keyed(listing)}
+        self.splits |= {name: listing for name, listing in listings.items() if name not in self.splits and _has_scenes(listing)}
+        self.keyed = {name: listing for name, listing in listings.items() if _is_keyed(listing)}
+        self.splits = {name: self.splits[name] for name in sorted(self.splits)}
+        if not self.splits and not self.keyed:
+            raise DatasetError(
+                f"{folder} is not a BOP data set: it has no split (train_pbr, test, ...) of scenes; name the folder that contains them"
+            )
+
+    def _refuse_parts(self, folder: Path) -> None:
+        """Refuse a scene or a split instead of a data set."""
+        if any(_ANNOTATION.fullmatch(name) for name in self.listing.files):
+            raise DatasetError(f"{folder} is a scene; name the data set, two folders above")
+        if _has_scenes(self.listing):
+            raise DatasetError(f"{folder} is a split; name the data set, the folder above")
+
+    @property
+    def ours(self) -> bool:
+        """Whether `bake` made it: masks are exact, and do not overlap."""
+        return "manifest.json" in self.listing.files and "manifest" in self.listing.folders
+
+    def is_rendered(self, split: str) -> bool:
+        """Whether a split's images are rendered, so that depth is exact."""
+        return self.ours or split.endswith(("_pbr", "_pbr_web"))
+
+    @cached_property
+    def model_files(self) -> dict[int, tuple[str, str]]:
+        """Model by obj_id, as (models folder, file name): those that ground truth is rendered with."""
+        order = [name for name in _RENDERING_MODELS if name in self.models] + [
+            name for name in self.models if name not in _RENDERING_MODELS
+        ]
+        for folder in order:
+            found = {int(match[1]): (folder, match[0]) for name in self.models[folder].files if (match := MODEL_FILE.fullmatch(name))}
+            if found:
+                return found
+        return {}
+
+    def scenes(self) -> list[SceneRef]:
+        """All scenes: those of splits by index and sensor, then keyed ones."""
+        found = []
+        for split, listing in self.splits.items():
+            for name in sorted((name for name in listing.folders if is_index(name)), key=int):
+                found += [SceneRef(split, int(name), name, sensor) for sensor in sensors(listing.enter(name))]
+        return found
+
+
+def is_index(name: str) -> bool:
+    """Whether a name is a number in ASCII digits that fits into 32 bits."""
+    return name.isascii() and name.isdecimal() and len(name) <= 9
+
+
+def sensors(scene: Listing) -> list[str]:
+    """Suffixes of a scene's annotation files, one per sensor; the classic layout has the suffix ""."""
+    found = {f"_{match[1]}" if match[1] else "" for name in scene.files if (match := _ANNOTATION.fullmatch(name))}
+    return sorted(found) or [""]
+
+
+def _has_scenes(listing: Listing) -> bool:
+    """Whether a folder contains a scene: a numbered folder with annotations."""
+    return any(
+        any(_ANNOTATION.fullmatch(file) for file in listing.enter(name).files) for name in sorted(filter(is_index, listing.folders))[:3]
+    )
+
+
+def _is_keyed(listing: Listing) -> bool:
+    """Whether a folder contains shards or files of the imagewise layout."""
+    if KEYS in listing.files or any(SHARD.fullmatch(name) for name in listing.files):
+        return True
+    return any((match := KEYED.fullmatch(name)) and match[3] in ("camera.json", "gt.json") for name in listing.files)

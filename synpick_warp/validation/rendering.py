@@ -1,0 +1,109 @@
+"""Depth of single objects, re-rendered by the bake's rasterizer from a data set's models, poses and intrinsics, cropped to the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.errors import CatalogError, DatasetError, SynpickError
+from synpick_warp.scenes.assets.meshes import read_mesh
+from synpick_warp.scenes.types import Camera, TriangleMesh
+from synpick_warp.stages.pose.render import object_scene, render_object
+from synpick_warp.stages.render.scene import build_meshes
+from synpick_warp.system.device import pick_device, start_warp
+from synpick_warp.validation.layout import Layout
+
+_MILLIMETRE = 1e-3
+_FAR = 1e20
+"""Larger depths are misses [m]: the rasterizer's are `FAR`."""
+_NEAR = 1e-3
+"""Depth from which points are projected [m]."""
+MAX_MODELS = 64
+"""Models that are kept in memory; the least recently used one is dropped."""
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """Depth of one object in a crop of the image."""
+
+    left: int
+    top: int
+    depth: np.ndarray
+    """Planar depth (h, w) float32 [mm]; inf: the object is not there."""
+
+
+class ObjectRenderer:
+    """Renders objects of a data set one by one, on the CPU."""
+
+    def __init__(self, layout: Layout) -> None:
+        start_warp()
+        self.layout = layout
+        self.device = pick_device("cpu")
+        self._models: dict[int, tuple[TriangleMesh, Any, tuple[wp.Mesh, ...]]] = {}
+        self._damaged: set[int] = set()
+
+    def render(self, obj_id: int, rotation: np.ndarray, translation: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> Patch:
+        """Render an object.
+
+        Args:
+            obj_id: The object.
+            rotation: Object to camera (3, 3).
+            translation: Object to camera (3) [mm].
+            matrix: Intrinsics (3, 3) [px]; the centre of pixel (row, column) is (column + 0.5, row + 0.5).
+            size: Width and height of the image [px].
+
+        Raises:
+            CatalogError: The model cannot be read, or has too many triangles.
+            DatasetError: The object has no model.
+        """
+        mesh, meshes, keep = self._load(obj_id)
+        points = mesh.vertices.astype(np.float64) @ rotation.T + translation * _MILLIMETRE
+        left, top, right, bottom = _crop(points, matrix, size)
+        if left >= right or top >= bottom:
+            return Patch(0, 0, np.full((0, 0), np.inf, np.float32))
+        shifted = matrix - np.array([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+        camera = Camera(right - left, bottom - top, shifted, rotation, translation * _MILLIMETRE)
+        depth = render_object(object_scene(meshes, keep, (camera,), self.device), 0).depth.numpy()[0]
+        depth = depth[: bottom - top, : right - left].astype(np.float32)
+        return Patch(left, top, np.where(depth < _FAR, depth / np.float32(_MILLIMETRE), np.float32(np.inf)))
+
+    def has(self, obj_id: int) -> bool:
+        """Whether an object has a model that can be rendered; others are left to the rules about models."""
+        if obj_id not in self._damaged:
+            try:
+                self._load(obj_id)
+            except SynpickError:
+                self._damaged.add(obj_id)
+        return obj_id not in self._damaged
+
+    def _load(self, obj_id: int) -> tuple[TriangleMesh, Any, tuple[wp.Mesh, ...]]:
+        found = self._models.pop(obj_id, None)
+        if found is None:
+            if obj_id not in self.layout.model_files:
+                raise DatasetError(f"there is no model of obj_id {obj_id}")
+            folder, name = self.layout.model_files[obj_id]
+            mesh = read_mesh(self.layout.models[folder].path(name), _MILLIMETRE)[0]
+            if not len(mesh.faces):
+                raise CatalogError(f"{folder}/{name}: no triangles")
+            found = (mesh, *build_meshes([mesh], 1, self.device))
+        while len(self._models) >= MAX_MODELS:
+            self._models.pop(next(iter(self._models)))
+        self._models[obj_id] = found
+        return found
+
+
+def _crop(points: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Part of the image that shows points (V, 3) [m], with a pixel around it: left, top, right, bottom; the last two exclusive."""
+    width, height = size
+    if points[:, 2].max() <= _NEAR:
+        return 0, 0, 0, 0
+    if points[:, 2].min() <= _NEAR:
+        return 0, 0, width, height
+    x = matrix[0, 0] * points[:, 0] / points[:, 2] + matrix[0, 2]
+    y = matrix[1, 1] * points[:, 1] / points[:, 2] + matrix[1, 2]
+    low = np.clip(np.floor([x.min(), y.min()]) - 1.0, 0, size)
+    high = np.clip(np.ceil([x.max(), y.max()]) + 1.0, 0, size)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])

@@ -1,0 +1,114 @@
+"""Schemas of foreign BOP annotations (msgspec types): as loose as the toolkit is, so that rules, not the parser, name what is wrong."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import UNSET, Struct, UnsetType
+
+from synpick_warp.dataset.annotations import Box, Index, Length, Matrix3, Vector3
+
+PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
+"""An index as a key: decimal digits without leading zeros."""
+
+
+class Camera(Struct, gc=False):
+    """A view's entry in scene_camera.json [mm]."""
+
+    cam_K: Matrix3 | UnsetType = UNSET  # noqa: N815
+    cam_model: dict[str, Any] | UnsetType = UNSET
+    depth_scale: Length | UnsetType = UNSET
+    cam_R_w2c: Matrix3 | UnsetType = UNSET  # noqa: N815
+    cam_t_w2c: Vector3 | UnsetType = UNSET
+
+
+class Truth(Struct, gc=False):
+    """An instance's entry in scene_gt.json [mm]."""
+
+    cam_R_m2c: Matrix3  # noqa: N815
+    cam_t_m2c: Vector3
+    obj_id: Index
+    instance_id: Index | UnsetType = UNSET
+
+
+class Info(Struct, gc=False):
+    """An instance's entry in scene_gt_info.json [px]."""
+
+    bbox_obj: Box
+    bbox_visib: Box
+    px_count_all: Index
+    px_count_valid: Index
+    px_count_visib: Index
+    visib_fract: Length
+
+
+class Segmentation(Struct, gc=False):
+    """Run-length encoding of a mask; pycocotools compresses `counts` into a string."""
+
+    counts: list[Index] | str
+    size: tuple[Index, Index]
+    """Height and width [px]."""
+
+
+class Annotation(Struct, gc=False):
+    """An instance's entry in scene_gt_coco.json [px]."""
+
+    id: Index
+    image_id: Index
+    category_id: Index
+    bbox: Annotated[list[Length], msgspec.Meta(min_length=4, max_length=4)]
+    segmentation: Segmentation
+    area: Length | UnsetType = UNSET
+    ignore: bool | UnsetType = UNSET
+
+
+class CocoImage(Struct, gc=False):
+    """An image's entry in scene_gt_coco.json."""
+
+    id: Index
+    file_name: str
+    width: Index
+    height: Index
+
+
+class Category(Struct, gc=False):
+    """An object's entry in scene_gt_coco.json."""
+
+    id: Index
+
+
+class Coco(Struct, gc=False):
+    """scene_gt_coco.json."""
+
+    images: list[CocoImage]
+    annotations: list[Annotation]
+    categories: list[Category]
+
+
+class Target(Struct, gc=False):
+    """A record of a target list; those of 2024 have neither object nor count."""
+
+    scene_id: Index
+    im_id: Index | list[Any]
+    obj_id: Index | UnsetType = UNSET
+    inst_count: Index | UnsetType = UNSET
+
+
+RECORDS: dict[str, Any] = {"camera": Camera, "gt": list[Truth], "gt_info": list[Info]}
+"""Schema of an image's entry by file."""
+
+
+def convert(content: Any, schema: Any) -> Any:
+    """Check decoded JSON against a schema.
+
+    Raises:
+        ValueError: In few words, with the place in `content`.
+    """
+    try:
+        return msgspec.convert(content, schema)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    except msgspec.ValidationError as fault:
+        raise ValueError(str(fault).replace("`", "")) from None

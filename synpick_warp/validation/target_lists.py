@@ -1,0 +1,67 @@
+"""Target lists of a data set, as subjects of rules, and their records by scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.json import MAX_JSON, decode_json
+from synpick_warp.validation.layout import TARGETS, Layout
+from synpick_warp.validation.schemas import Target
+
+
+@dataclass(frozen=True)
+class TargetList:
+    """A target list."""
+
+    scenes: dict[int, dict[int, list[Target]]] = field(default_factory=dict)
+    """Records by scene and image. Records of several views, as in multi-view lists, are under no image."""
+    fault: str = ""
+    """What is wrong with the file."""
+
+
+@dataclass(frozen=True, eq=False)
+class TargetLists:
+    """All target lists of a data set."""
+
+    layout: Layout
+    place: str = "."
+
+    @cached_property
+    def lists(self) -> dict[str, TargetList]:
+        """Lists by name."""
+        return {name: self._read(name) for name in sorted(filter(TARGETS.fullmatch, self.layout.listing.files))}
+
+    def _read(self, name: str) -> TargetList:
+        try:
+            records = decode_json(self.layout.listing.read(name, MAX_JSON), list[Target], name, DatasetError)
+        except DatasetError as error:
+            return TargetList(fault=str(error))
+        scenes: dict[int, dict[int, list[Target]]] = {}
+        for record in records:
+            images = scenes.setdefault(record.scene_id, {})
+            if isinstance(record.im_id, int):
+                images.setdefault(record.im_id, []).append(record)
+        return TargetList(scenes)
+
+    def splits(self, name: str) -> list[str]:
+        """Splits that a list is about: those with its prefix, else, since BOP's lists are of test splits only, val or all splits."""
+        prefix = name.split("_targets")[0]
+        names = list(self.layout.splits) or list(self.layout.keyed)
+        for start in (prefix, "val"):
+            found = [split for split in names if split == start or split.startswith(f"{start}_")]
+            if found:
+                return found
+        return names
+
+    def scene_ids(self, name: str) -> set[int]:
+        """Indices of the scenes in the splits that a list is about."""
+        splits = self.splits(name)
+        if not self.layout.splits:
+            return set(self.lists[name].scenes)
+        return {int(folder) for split in splits for folder in self.layout.splits[split].folders if folder.isdecimal()}
+
+    def of_scene(self, split: str, scene: int) -> dict[str, dict[int, list[Target]]]:
+        """Records about a scene: by list and image."""
+        return {name: found.scenes[scene] for name, found in self.lists.items() if scene in found.scenes and split in self.splits(name)}

@@ -1,0 +1,172 @@
+"""Command `stats`: text, JSON and CSV say the same, sets of every shape give what they have, and bad input is one line."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+import synpick_warp
+from synpick_warp.cli.commands import main
+from synpick_warp.configs.schema import Split
+from synpick_warp.statistics import compute_statistics
+from synpick_warp.statistics.output import to_csv
+from synpick_warp.statistics.tables import Column, Table, make_tables
+from tests.harness.scripted_bake import bake, settings
+from tests.worlds.evaluation_set import CAMERAS, FRAMES, write_evaluation_set
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A data set of all formats with two splits, three episodes of mode pick."""
+    out = tmp_path_factory.mktemp("scripted") / "set"
+    splits = (Split("train", 2, 0, "pick", "train"), Split("test", 1, 2, "pick", "test"))
+    config = settings(3, ("bop", "shards", "zarr"))
+    bop = dataclasses.replace(config.bop, color_format="png")
+    bake(out, dataclasses.replace(config, splits=splits, bop=bop))
+    return out
+
+
+@pytest.fixture
+def copy(folder, tmp_path) -> Path:
+    shutil.copytree(folder, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def run(capsys, *arguments: object) -> tuple[str, str]:
+    """Standard output and error of a command that succeeds."""
+    assert main(["stats", *map(str, arguments)]) == 0
+    captured = capsys.readouterr()
+    return captured.out, captured.err
+
+
+def refused(capsys, *arguments: object) -> str:
+    """Message of a command that is refused."""
+    assert main(["stats", *map(str, arguments)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.splitlines()
+    return line.removeprefix("synpick-warp: error: ")
+
+
+def test_text_json_and_csv_are_the_same_numbers(folder, tmp_path, capsys):
+    statistics = compute_statistics(synpick_warp.open(folder))
+    text, error = run(capsys, folder)
+    assert error == ""
+    assert text.startswith("Views and mean visibility, by split and mode\n")
+    assert text.splitlines()[-1].endswith("MiB")
+    assert f"{statistics.total.annotations.visibility:.3f}" in text
+    out, error = run(capsys, folder, "--json")
+    assert " views/s); peak memory " in error
+    content = json.loads(out)
+    assert content.keys() == {field.name for field in dataclasses.fields(statistics)}
+    assert [(row["split"], row["mode"], row["annotations"]["views"]) for row in content["groups"]] == [
+        (row.split, row.mode, row.annotations.views) for row in statistics.groups
+    ]
+    run(capsys, folder, "--csv", tmp_path / "tables")
+    tables = make_tables(statistics)
+    assert {path.stem for path in (tmp_path / "tables").iterdir()} == {table.name for table in tables}
+    for table in tables:
+        with open(tmp_path / "tables" / f"{table.name}.csv", newline="", encoding="utf-8") as file:
+            header, *rows = csv.reader(file)
+        assert header == [column.name for column in table.columns]
+        assert rows == [["" if value is None else str(value) for value in row] for row in table.rows]
+        assert all(len(row) == len(header) for row in rows)
+
+
+def test_splits_are_counted_apart_and_alone(folder, capsys):
+    statistics = compute_statistics(synpick_warp.open(folder))
+    assert [(row.split, row.episodes.episodes) for row in statistics.groups] == [("train", 2), ("test", 1)]
+    assert statistics.total.episodes.episodes == 3
+    assert [row.split for row in statistics.paper] == ["train", "test"]
+    alone = json.loads(run(capsys, folder, "--split", "test", "--json")[0])
+    assert [row["split"] for row in alone["groups"]] == ["test"]
+    assert alone["missing"] == ["the objects are not those of the paper, so their distributions are not compared"]
+    assert refused(capsys, folder, "--split", "val") == f'{folder} has no split "val"; splits: train, test'
+
+
+def test_shards_count_as_scenes_do(folder, copy):
+    for split in ("train", "test"):
+        shutil.rmtree(copy / split)
+    assert compute_statistics(synpick_warp.open(copy)) == compute_statistics(synpick_warp.open(folder))
+
+
+def test_a_set_without_images_gives_episodes_and_attempts(copy, capsys):
+    for split in ("train", "test"):
+        shutil.rmtree(copy / split)
+        shutil.rmtree(copy / f"{split}_web")
+    text, _ = run(capsys, copy)
+    assert "missing: 3 episodes have no images" in text
+    assert "missing: no images: no views, visibility" in text
+    statistics = compute_statistics(synpick_warp.open(copy))
+    assert (statistics.total.episodes.episodes, statistics.total.episodes.attempts) == (3, 3)
+    assert statistics.total.annotations.visibility is None
+    assert (statistics.depth, statistics.lights, statistics.paper) == (None, None, ())
+
+
+def test_a_set_without_trajectories_attempts_lights_and_depth_gives_the_rest(tmp_path, capsys):
+    text, _ = run(capsys, write_evaluation_set(tmp_path / "set"))
+    assert f"{2 * FRAMES * CAMERAS} views in " in text
+    for said in ("no depth images", "names no light maps", "no attempts", "are not those of the paper"):
+        assert said in text
+
+
+def test_an_unfinished_set_says_how_much_is_there(copy, capsys):
+    for name in ("000002.json", "000002.sha256"):
+        (copy / "manifest" / name).unlink()
+    assert "missing: 1 of 3 planned episodes are not baked" in run(capsys, copy)[0]
+    assert "not baked" not in run(capsys, copy, "--split", "train")[0]
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "said"),
+    [
+        ("train/000000/scene_gt_info.json", None, "there is no file {path}"),
+        ("train/000000/scene_gt.json", "{}", "{path} does not have the images 0 to 1 of its episode; "),
+        ("train/000000/scene_gt.json", "[" * 100_000, "{path} is damaged: "),
+        ("train/000000/scene_gt_info.json", '{"0": [], "1": []}', "{folder}/train/000000: image 0 has other instances in scene_gt than "),
+        ("train/000000/scene_camera.json", '{"0": 1e999}', "{path} is damaged: "),
+        ("manifest/000000.json", '{"row": {"frames": 2, "ending": "x", "mode": 3}, "attempts": []}', "{path} is damaged: "),
+        ("manifest/000000.json", '{"row": {"frames": 2, "ending": "x", "mode": "pick"}, "attempts": [{}]}', "{path} is damaged: "),
+        ("config.toml", None, "{folder} has no config.toml; "),
+        ("config.toml", "splits = 3", "splits is 3 in {path}; "),
+        ("train/000000/depth/000000.png", "nothing", "{path} is not an image"),
+    ],
+)
+def test_a_damaged_file_is_named_in_one_line(copy, tmp_path, capsys, file, content, said):
+    path = copy / file
+    path.unlink()
+    if content is not None:
+        path.write_text(content)
+    assert refused(capsys, copy, "--csv", tmp_path / "tables").startswith(said.format(path=path, folder=copy))
+    assert not (tmp_path / "tables").exists()
+
+
+def test_folders_that_are_no_data_set_are_named_in_one_line(copy, tmp_path, capsys):
+    assert refused(capsys, tmp_path / "gone").startswith(f"{tmp_path / 'gone'} is not a data set")
+    (copy / "manifest.json").unlink()
+    shutil.rmtree(copy / "trajectory.zarr")
+    assert refused(capsys, copy).startswith(f"{copy} is not a data set: it has neither manifest.json nor")
+
+
+def test_wrong_options_are_named_in_one_line(folder, tmp_path, capsys):
+    assert refused(capsys, folder, "--depth-views", "-1").startswith("--depth-views is -1; allowed: 0 to ")
+    assert refused(capsys, folder, "--threads", "9999").startswith("--threads is 9999; allowed: 0 to ")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").touch()
+    assert refused(capsys, folder, "--csv", tmp_path / "full") == f"--csv is {tmp_path / 'full'}; allowed: a new or an empty folder"
+    assert refused(capsys, folder, "--csv", folder / "tables").startswith(f"--csv is {folder / 'tables'}, inside the data set")
+
+
+def test_names_are_neither_formulas_nor_markup(copy, capsys):
+    table = Table("names", "Names", (Column("name"),), [("=1+1",), ("[red]x",), ("\x1b[2J",)])
+    assert to_csv(table) == "name\n'=1+1\n[red]x\n\\x1b[2J\n"
+    path = copy / "manifest" / "000000.json"
+    entry = json.loads(path.read_text())
+    entry["row"]["ending"] = "[red]\x1b[2J"
+    path.write_text(json.dumps(entry))
+    assert "[red]\\x1b[2J" in run(capsys, copy)[0]

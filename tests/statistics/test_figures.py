@@ -1,0 +1,279 @@
+"""Figures: known answers on a hand-made data set, twins in NumPy, and merges that equal the whole."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import synpick_warp
+from synpick_warp.dataset.reading import DataSet
+from synpick_warp.errors import DatasetError
+from synpick_warp.statistics import collect as collecting
+from synpick_warp.statistics import partial as partials
+from synpick_warp.statistics.annotations import VISIBILITY_BINS, AnnotationCounts
+from synpick_warp.statistics.attempts import FORCE_BIN
+from synpick_warp.statistics.collect import SceneTask, collect
+from synpick_warp.statistics.compute import assemble, compute_statistics
+from synpick_warp.statistics.counting import Group
+from synpick_warp.statistics.coverage import BANDS, BINS, MIN_VISIBILITY, SECTORS, CoverageCounts, direction_bins
+from synpick_warp.statistics.depth import DEPTH_BIN, QUANTILES, DepthCounts
+from synpick_warp.statistics.lights import LightCounts
+from synpick_warp.statistics.partial import Partial
+from synpick_warp.statistics.records import Light
+from synpick_warp.statistics.scenes import SceneTruth
+from synpick_warp.statistics.timeline import TIME_BIN, TimelineCounts
+from tests.worlds.evaluation_set import BOX, BRICK, CAMERAS, FRAMES, MODES, PERIOD, PRISM, VISIBILITY, write_evaluation_set
+
+ATTEMPTS = [
+    {"outcome": "target_picked", "good_seal": True, "engaged": [1], "peak_force": [0.0, 3.0, 5.5]},
+    {"outcome": "target_picked", "good_seal": False, "engaged": [0, 1], "peak_force": [0.0, 500.0]},
+    {"outcome": "missed", "good_seal": False, "engaged": [], "peak_force": []},
+]
+HEIGHT, WIDTH = 4, 6
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Two episodes, move and pick, with attempts, lights and depth images of the second one only."""
+    out = write_evaluation_set(tmp_path_factory.mktemp("statistics") / "set")
+    text = (out / "config.toml").read_text().replace("resolution = [320, 180]", f"resolution = [{WIDTH}, {HEIGHT}]", 1)
+    (out / "config.toml").write_text(text)
+    entry = out / "manifest" / "000001.json"
+    row = json.loads(entry.read_text())["row"] | {"objects": 4, "picked": 2, "lost": 1}
+    entry.write_text(json.dumps({"row": row, "attempts": ATTEMPTS}))
+    random = np.random.default_rng(3)
+    for scene in range(CAMERAS, 2 * CAMERAS):
+        place = out / "train_pbr" / f"{scene:06d}"
+        cameras = json.loads((place / "scene_camera.json").read_text())
+        for camera in cameras.values():
+            camera["light"] = {"map": "sky", "yaw": 3.2, "exposure": -0.05, "direction": None}
+        (place / "scene_camera.json").write_text(json.dumps(cameras))
+        (place / "depth").mkdir()
+        for frame in range(FRAMES):
+            image = random.integers(0, 3, (HEIGHT, WIDTH)) * random.integers(15_000, 22_000, (HEIGHT, WIDTH))
+            cv2.imwrite(str(place / "depth" / f"{frame:06d}.png"), image.astype(np.uint16))
+    return out
+
+
+@pytest.fixture(scope="module")
+def data_set(folder) -> DataSet:
+    return synpick_warp.open(folder)
+
+
+@pytest.fixture(scope="module")
+def statistics(data_set):
+    return compute_statistics(data_set, depth_views=1000)
+
+
+def test_the_table_has_the_known_answers(statistics):
+    assert [(row.split, row.mode) for row in statistics.groups] == [("train_pbr", mode) for mode in MODES]
+    for row in statistics.groups:
+        views = FRAMES * CAMERAS
+        assert (row.episodes.episodes, row.episodes.frames, row.annotations.views) == (1, FRAMES, views)
+        assert row.annotations.instances == views * len(VISIBILITY)
+        assert row.annotations.visibility == pytest.approx(np.mean(VISIBILITY), abs=1e-9)
+        assert row.annotations.objects == {BRICK: 2 * views, BOX: views, PRISM: views}
+        assert row.annotations.invisible == 0
+        expected = dict.fromkeys(range(VISIBILITY_BINS), 0) | {1: views, 6: views, 12: views, VISIBILITY_BINS - 1: views}
+        assert dict(enumerate(row.annotations.histogram)) == expected
+        assert [point.objects for point in row.objects_over_time] == [len(VISIBILITY)]
+    total = statistics.total.annotations
+    assert (total.views, total.instances_per_view) == (2 * FRAMES * CAMERAS, len(VISIBILITY))
+    assert [(each.object_id, each.instances) for each in statistics.objects] == sorted(total.objects.items())
+
+
+def test_attempts_and_seal_forces_have_the_known_answers(statistics):
+    move, pick = (row.episodes for row in statistics.groups)
+    assert (move.attempts, move.outcomes, move.force) == (0, {}, None)
+    assert (pick.objects, pick.picked, pick.lost, pick.attempts) == (4, 2, 1, 3)
+    assert pick.outcomes == {"target_picked": 2, "missed": 1}
+    assert pick.endings == {"finished": 1}
+    assert (pick.seals, pick.good_seals, pick.force) == (2, 1, pytest.approx((5.5 + 500.0) / 2))
+    assert {index: count for index, count in enumerate(pick.force_histogram) if count} == {int(5.5 / FORCE_BIN): 1, 29: 1}
+    assert statistics.total.episodes.attempts == 3
+
+
+def test_lights_have_the_known_answers_and_what_is_missing_is_told(statistics, data_set):
+    assert statistics.lights.maps == {"sky": 1}
+    assert statistics.lights.exposure == {-0.1: 1}
+    assert [index for index, count in enumerate(statistics.lights.yaw) if count] == [6]
+    assert statistics.missing == ("the objects are not those of the paper, so their distributions are not compared",)
+    move = assemble(data_set, collect(data_set, 0, 1))
+    assert move.depth is None
+    assert "no depth images: no depth range" in move.missing
+
+
+def test_depth_is_that_of_all_pixels(statistics, folder):
+    images = [cv2.imread(str(path), -1) for path in sorted(folder.glob("train_pbr/*/depth/*.png"))]
+    pixels = np.sort(np.concatenate([image[image > 0] for image in images])) * 0.1
+    assert statistics.depth.views == len(images) == FRAMES * CAMERAS
+    assert statistics.depth.missing == pytest.approx(np.mean(np.stack(images) == 0))
+    for quantile in QUANTILES:
+        expected = np.quantile(pixels, quantile, method="inverted_cdf")
+        assert statistics.depth.quantiles[quantile] == pytest.approx(expected, abs=DEPTH_BIN / 2 + 1e-6)
+
+
+def test_all_figures_are_those_of_a_twin_that_reads_view_by_view(statistics, data_set):
+    """The twin uses the public reader, one view at a time, and other formulas for directions."""
+    for row, (_, episode) in zip(statistics.groups, data_set.items(), strict=True):
+        views = list(episode.views())
+        visibility = np.concatenate([view.visibility for view in views])
+        assert row.annotations.visibility == pytest.approx(visibility.mean(), abs=1e-9)
+        bins = [min(int(Fraction(str(value)) * VISIBILITY_BINS), VISIBILITY_BINS - 1) for value in visibility.tolist()]
+        np.testing.assert_array_equal(np.bincount(bins, minlength=VISIBILITY_BINS), row.annotations.histogram)
+        by_frame = [len(view.instance_ids) for view in views if view.camera == 0]
+        assert row.objects_over_time[0].objects == pytest.approx(np.mean(by_frame))
+    counts = {each.object_id: np.zeros((BANDS, SECTORS), int) for each in statistics.objects}
+    for view in data_set.views():
+        for entry, info, pose in zip(view.records.gt, view.records.gt_info, view.object_to_camera, strict=True):
+            if info["visib_fract"] >= MIN_VISIBILITY:
+                x, y, z = np.linalg.inv(pose)[:3, 3]  # The camera in the object's frame.
+                height, longitude = z / np.sqrt(x * x + y * y + z * z), np.degrees(np.arctan2(y, x))
+                band = int(np.digitize(height, np.linspace(-1, 1, BANDS + 1))) - 1
+                counts[entry["obj_id"]][band, int(np.digitize(longitude, np.linspace(-180, 180, SECTORS + 1))) - 1] += 1
+    for each in statistics.objects:
+        np.testing.assert_array_equal(np.reshape(each.coverage.bins, (BANDS, SECTORS)), counts[each.object_id])
+        assert each.coverage.occupied == pytest.approx((counts[each.object_id] > 0).mean())
+
+
+# ---- merges ----
+
+
+@given(
+    order=st.permutations(list(itertools.product(range(len(MODES)), range(CAMERAS)))),
+    parts=st.lists(st.integers(0, 3), min_size=6, max_size=6),
+)
+def test_parts_merge_to_the_whole_in_any_order(data_set, whole, order, parts):
+    pieces = [Partial() for _ in range(4)]
+    for (episode, camera), part in zip(order, parts, strict=True):
+        pieces[part].add_scene(data_set, episode, camera, range(FRAMES))
+        if camera == 0:
+            pieces[part].add_episode(data_set, episode)
+    left, right = pieces[:2], pieces[2:]
+    for side in (left, right):
+        side[0].merge(side[1])
+    right[0].merge(left[0])
+    assert right[0] == whole
+
+
+@pytest.fixture(scope="module")
+def whole(data_set) -> Partial:
+    result = Partial()
+    for episode in range(len(MODES)):
+        result.add_episode(data_set, episode)
+        for camera in range(CAMERAS):
+            result.add_scene(data_set, episode, camera, range(FRAMES))
+    return result
+
+
+@given(
+    visibility=st.lists(st.floats(0.0, 1.0), min_size=1, max_size=60),
+    cut=st.integers(0, 60),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_a_scene_counts_as_its_halves(visibility, cut, seed):
+    random = np.random.default_rng(seed)
+    ids = random.integers(1, 5, len(visibility))
+    group = Group("train", "move")
+    whole, halves = AnnotationCounts(), AnnotationCounts()
+    whole.add_scene(group, scene(np.array(visibility), ids))
+    for part in (slice(0, cut), slice(cut, None)):
+        other = AnnotationCounts()
+        other.add_scene(group, scene(np.array(visibility[part]), ids[part]))
+        halves.merge(other)
+    halves.views[group] = whole.views[group]
+    assert halves == whole
+    result = whole.result([group])
+    assert result.visibility == pytest.approx(np.mean(visibility), abs=1e-9)
+    assert sum(result.histogram) == result.instances == len(visibility)
+
+
+def scene(visibility: np.ndarray, ids: np.ndarray, counts: np.ndarray | None = None) -> SceneTruth:
+    counts = np.array([len(ids)]) if counts is None else counts
+    return SceneTruth(len(counts), counts, ids, visibility, np.tile((0.0, 0.0, 1.0), (len(ids), 1)), None, np.ones(len(counts)), None)  # type: ignore[arg-type]
+
+
+def test_processes_count_what_one_counts(data_set, statistics, monkeypatch):
+    monkeypatch.setattr(collecting, "VIEWS_PER_PROCESS", 1)
+    seen = []
+    found = compute_statistics(data_set, depth_views=1000, threads=3, report=lambda *progress: seen.append(progress))
+    assert found == statistics
+    assert seen[-1] == ("views", 24, 24)
+    assert [done for _, done, _ in seen] == sorted(done for _, done, _ in seen)
+
+
+@given(frames=st.lists(st.integers(1, 40), min_size=1, max_size=8), count=st.integers(0, 50))
+def test_depth_is_sampled_evenly(frames, count):
+    tasks = collecting._sample_depth([SceneTask(index, 0, length) for index, length in enumerate(frames)], count)
+    places = [sum(frames[: task.episode]) + frame for task in tasks for frame in task.depth_frames]
+    assert len(places) == len(set(places)) == min(count, sum(frames))
+    assert all(frame < task.frames for task in tasks for frame in task.depth_frames)
+    if len(places) > 1 and count <= sum(frames):
+        assert np.ptp(np.diff(places)) <= 1
+
+
+# ---- single accumulators ----
+
+
+def test_bins_of_directions_have_equal_areas():
+    """Even directions fill them evenly; the axes have known bins."""
+    random = np.random.default_rng(0).normal(size=(BINS * 500, 3))
+    counts = np.bincount(direction_bins(random / np.linalg.norm(random, axis=1, keepdims=True)), minlength=BINS)
+    assert abs(((counts - 500.0) ** 2 / 500.0).sum() - (BINS - 1)) < 4.5 * np.sqrt(2.0 * BINS)
+    bands = direction_bins(np.array([[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0]])) // SECTORS
+    assert bands.tolist() == [BANDS - 1, 0, BANDS // 2, BANDS // 2, BANDS // 2]
+    assert (direction_bins(np.array([[1.0, 0, 0], [0, 1, 0]])) % SECTORS).tolist() == [SECTORS // 2, 3 * SECTORS // 4]
+
+
+def test_evenness_is_0_for_one_direction_and_1_for_all():
+    one, even = CoverageCounts(), CoverageCounts()
+    one.add_scene(scene(np.ones(5), np.full(5, 7)))
+    assert (one.result(7).views, one.result(7).evenness, one.result(7).occupied) == (5, 0.0, 1 / BINS)
+    even.bins.update({(7, index): 2 for index in range(BINS)})
+    assert even.result(7).evenness == pytest.approx(1.0)
+    assert even.result(8) == dataclasses.replace(one.result(8), views=0)
+    hidden = CoverageCounts()
+    hidden.add_scene(scene(np.full(5, MIN_VISIBILITY - 1e-6), np.full(5, 7)))
+    assert hidden.result(7).views == 0
+
+
+def test_objects_over_time_are_a_mean_over_those_that_last():
+    group, counts = Group("train", "pick"), TimelineCounts()
+    frames = round(2 * TIME_BIN / PERIOD)
+    counts.add_scene(group, scene(np.ones(0), np.ones(0, int), np.repeat((5, 3), frames // 2)), PERIOD)
+    counts.add_scene(group, scene(np.ones(0), np.ones(0, int), np.full(frames // 2, 1)), PERIOD)
+    assert counts.result([group]) == ((0.0, frames, 3.0), (TIME_BIN, frames // 2, 3.0))
+
+
+def test_depth_without_pixels():
+    counts = DepthCounts()
+    assert counts.result() is None
+    counts.add_image(np.zeros((2, 3), np.uint16), 0.1)
+    assert counts.result().quantiles == {}
+    assert counts.result().missing == 1.0
+
+
+@given(yaw=st.floats(-100.0, 100.0), exposure=st.floats(-5.0, 5.0))
+def test_any_light_has_a_bin(yaw, exposure):
+    counts = LightCounts()
+    counts.add_episode(Light("sky", yaw, exposure))
+    assert sum(counts.result().yaw) == 1
+    ((low, _),) = counts.result().exposure.items()
+    assert low - 1e-6 <= exposure < low + 0.1 + 1e-6
+
+
+def test_endlessly_many_objects_are_refused(monkeypatch):
+    monkeypatch.setattr(partials, "MAX_OBJECTS", 3)
+    part = Partial()
+    part.annotations.add_scene(Group("train", "move"), scene(np.ones(4), np.arange(4)))
+    with pytest.raises(DatasetError, match="more than 3 different obj_id"):
+        Partial().merge(part)
