@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from synpick_warp.cli.commands import EXIT_MISTAKE, main
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Config, Split
 from synpick_warp.conversion.run import convert
 from synpick_warp.dataset.verify import verify
-from synpick_warp.errors import ConfigError, DatasetError, OutputError
+from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.scenes.embedded.skies import skies
 from tests.harness import scripted_bake
 from tests.harness.scripted_bake import INPUTS, snapshot
@@ -23,10 +23,12 @@ from tests.worlds import box_views
 
 
 def settings(*formats: str, jpg: bool = False) -> Config:
-    """Settings of two episodes with two layers, as PNG or JPEG."""
+    """Settings of two episodes with two layers: two splits as PNG, or one as JPEG."""
     config = scripted_bake.settings(2, formats)
     bop = dataclasses.replace(config.bop, split="train_pbr" if jpg else "train", color_format="jpg" if jpg else "png")
-    return dataclasses.replace(config, bop=bop, render=dataclasses.replace(config.render, layers=("flow", "classes")))
+    splits = () if jpg else (Split("train", 1, 0, "pick", "train"), Split("test", 1, 1, "pick", "test"))
+    render = dataclasses.replace(config.render, layers=("flow", "classes"))
+    return dataclasses.replace(config, bop=bop, splits=splits, render=render)
 
 
 @pytest.fixture(scope="module")
@@ -86,9 +88,25 @@ def test_converted_sets_equal_baked_ones_byte_for_byte(sets, tmp_path, assets, s
 
 def test_several_formats_are_converted_at_once(sets, tmp_path):
     run(sets["source"], tmp_path / "out", "shards", "lerobot")
-    for name in ("train_web/shard-000003.tar", "lerobot/meta/stats.json", "lerobot/parts/000001.json"):
-        baked = sets["shards" if name.startswith("train") else "lerobot"]
+    for name in ("test_web/shard-000003.tar", "lerobot/meta/stats.json", "lerobot/parts/000001.json"):
+        baked = sets["lerobot" if name.startswith("lerobot") else "shards"]
         assert (tmp_path / "out" / name).read_bytes() == (baked / name).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["lerobot", "coco"])
+def test_sets_without_views_have_episodes_and_attempts(sets, name, capsys):
+    import synpick_warp
+
+    data = synpick_warp.open(sets[name])
+    assert {split: list(part) for split, part in data.splits.items()} == {"train": [0], "test": [1]}
+    assert (data[1].row["split"], len(data[1].attempts)) == ("test", 1)
+    with pytest.raises(DatasetError, match="has no images of episode 1; bake with --formats bop or shards"):
+        data[1].view(0)
+    assert main(["stats", str(sets[name])]) == 0
+    assert "2 episodes have no images" in capsys.readouterr().out
+    for command in (["validate", str(sets[name])], ["preview", str(sets[name]), "--out", str(sets[name].parent / "sheet.png")]):
+        assert main(command) == EXIT_MISTAKE
+        assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_interrupted_conversion_resumes_to_the_same_bytes(sets, tmp_path):
@@ -97,7 +115,7 @@ def test_interrupted_conversion_resumes_to_the_same_bytes(sets, tmp_path):
     shutil.copytree(sets["shards"], out)
     for name in ("000001.json", "000001.sha256", "joined.json", "joined.sha256"):
         (out / "manifest" / name).unlink()
-    (out / "train_web" / "shard-000004.tar").write_bytes(b"half")
+    (out / "test_web" / "shard-000004.tar").write_bytes(b"half")
     (out / ".partial" / "shards" / "000001").mkdir(parents=True)
     assert run(sets["source"], out, "shards", report=lambda *step: seen.append(step)) == (2, 1)
     assert seen == [("episodes", 2, 2)]
@@ -123,7 +141,7 @@ def test_episodes_that_delivered_nothing_stay_in_the_lists(sets, tmp_path):
     content["row"] |= {"ending": "unsettled", "sentence": "the objects did not come to rest"}
     entry.write_text(json.dumps(content))
     assert run(source, tmp_path / "out", "shards").episodes == 2
-    assert {path.name for path in (tmp_path / "out" / "train_web").glob("*.tar")} == {f"shard-{scene:06d}.tar" for scene in range(3)}
+    assert {path.name for path in (tmp_path / "out").glob("*_web/*.tar")} == {f"shard-{scene:06d}.tar" for scene in range(3)}
     assert len((tmp_path / "out" / "episodes.jsonl").read_text().splitlines()) == 2
 
 
@@ -161,7 +179,7 @@ def test_changed_objects_are_refused_for_usd(sets, tmp_path, assets, monkeypatch
 def test_damaged_sources_are_one_error(sets, tmp_path, fault):
     source = tmp_path / "source"
     shutil.copytree(sets["source"], source)
-    image = source / "train" / "000004" / "depth" / "000001.png"
+    image = source / "test" / "000004" / "depth" / "000001.png"
     if fault == "missing image":
         image.unlink()
     elif fault == "no image":
@@ -169,19 +187,20 @@ def test_damaged_sources_are_one_error(sets, tmp_path, fault):
     elif fault == "other size":
         image.write_bytes(cv2.imencode(".png", np.zeros((4, 4), np.uint16))[1].tobytes())
     elif fault == "damaged json":
-        (source / "train" / "000004" / "scene_gt.json").write_text("{")
+        (source / "test" / "000004" / "scene_gt.json").write_text("{")
     else:
         (source / "models" / "obj_000003.ply").unlink()
-    with pytest.raises((DatasetError, OutputError), match="obj_000003" if fault == "missing model" else "000004") as caught:
+    with pytest.raises(DatasetError, match="obj_000003" if fault == "missing model" else "000004") as caught:
         run(source, tmp_path / "out", "shards")
     assert "\n" not in str(caught.value)
+    assert "cannot write" not in str(caught.value)
 
 
 def test_masks_beyond_their_boxes_are_read_whole(sets, tmp_path):
     """An edited source whose boxes are wrong: masks are what counts."""
     source = tmp_path / "source"
     shutil.copytree(sets["source"], source)
-    for scene in (source / "train").iterdir():
+    for scene in source.glob("t*/00000?"):
         infos = json.loads((scene / "scene_gt_info.json").read_text())
         for rows in infos.values():
             for row in rows:

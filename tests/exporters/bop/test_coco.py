@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
+from synpick_warp.configs.schema import Split
+from synpick_warp.dataset.reading import COCO_PARTS
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.coco import CATEGORIES, PARTS, CocoExporter
+from synpick_warp.exporters.bop.coco import CATEGORIES, IMAGES, PARTS, CocoExporter
 from tests.harness.exporter_contract import ExporterContract, export, exporting, finish
 from tests.worlds.box_views import batches, cameras, config, ends
 
@@ -24,10 +26,17 @@ class TestCocoContract(ExporterContract):
     exporter_class = CocoExporter
 
 
-def read(out: Path) -> COCO:
-    """The annotation file, by pycocotools, which prints."""
+SPLITS = (
+    Split("train", 2, 0, "pick", "train_pbr"),
+    Split("test", 2, 2, "pick", "test_pbr"),
+    Split("val", 5, 9, "pick", "val_pbr"),
+)
+
+
+def read(out: Path, split: str = "train_pbr") -> COCO:
+    """The annotation file of a split, by pycocotools, which prints."""
     with contextlib.redirect_stdout(io.StringIO()):
-        return COCO(out / "coco" / "annotations" / "instances_train_pbr.json")
+        return COCO(out / "coco" / "annotations" / f"instances_{split}.json")
 
 
 @pytest.mark.filterwarnings("ignore:__array__:DeprecationWarning")
@@ -48,6 +57,23 @@ def test_pycocotools_reads_back_masks_boxes_and_images(tmp_path):
             rows, columns = np.flatnonzero(visible.any(axis=1)), np.flatnonzero(visible.any(axis=0))
             assert row["bbox"] == [columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1]
             assert (row["area"], row["category_id"]) == (visible.sum(), batch.object_id[0, row["instance_id"]])
+
+
+def test_every_split_has_an_annotation_file(tmp_path):
+    """Two splits of one episode each, and one that has not been baked."""
+    settings = dataclasses.replace(config(), splits=SPLITS)
+    out = export(CocoExporter, tmp_path / "set", settings, (0, 2), processes=0)
+    assert sorted(path.name for path in (out / IMAGES).iterdir()) == [f"{scene:06d}" for scene in (0, 1, 2, 6, 7, 8)]
+    assert {out / name for name in CocoExporter.shared_files(settings).indices} == set((out / "coco" / "annotations").iterdir())
+    for split, episode in (("train_pbr", 0), ("test_pbr", 2)):
+        found = read(out, split)
+        assert sorted(found.imgs) == list(range(1, 10))
+        assert sorted(found.anns) == list(range(1, len(found.anns) + 1))
+        assert {image["episode"] for image in found.imgs.values()} == {episode}
+        assert all((out / IMAGES / image["file_name"]).is_file() for image in found.imgs.values())
+        assert found.dataset["info"]["description"] == f"synpick-warp, {split}"
+    assert (len(read(out, "val_pbr").imgs), len(read(out, "val_pbr").cats)) == (0, 2)
+    assert PARTS == COCO_PARTS
 
 
 def test_views_without_objects_have_no_annotations(tmp_path):

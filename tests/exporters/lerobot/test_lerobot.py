@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import sys
 from fractions import Fraction
 from pathlib import Path
@@ -15,7 +16,8 @@ import pytest
 
 from synpick_warp.codes import Outcome, Task
 from synpick_warp.configs.load import load_config
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import Config, Split
+from synpick_warp.dataset.reading import LEROBOT_PARTS
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.lerobot import layout
 from synpick_warp.exporters.lerobot.exporter import LerobotExporter, video_rate
@@ -142,6 +144,23 @@ def test_info_describes_every_column_and_video(dataset, data, episodes):
     assert Fraction(info["fps"]).limit_denominator(1000) == 1 / Fraction(trajectories.config().physics.step * 4).limit_denominator(1000)
     assert (dataset / info["data_path"].format(chunk_index=0, file_index=0)).is_file()
     assert all(feature["info"]["video.codec"] == "h264" for name, feature in info["features"].items() if name in videos)
+
+
+def test_splits_are_ranges_of_episodes(tmp_path, dataset, episodes):
+    assert json.loads((dataset / "meta" / "info.json").read_text())["splits"] == {"train": "0:2"}
+    assert [row["source/split"] for row in episodes] == ["train", "train"]
+    assert "  - split: train\n    path: data/" in (dataset / "README.md").read_text()
+    splits = (Split("train", 2, 0, "pick", "train_pbr"), Split("test", 3, 2, "pick", "test_pbr"), Split("val", 1, 1500, "pick", "val_pbr"))
+    settings = dataclasses.replace(trajectories.config(), splits=splits)
+    shutil.copytree(dataset, out := tmp_path / "set" / "lerobot")
+    (out.parent / ".partial").mkdir()
+    LerobotExporter.finalize(out.parent, settings, None)  # type: ignore[arg-type]
+    assert json.loads((out / "meta" / "info.json").read_text())["splits"] == {"train": "0:1", "test": "1:2"}
+    assert [row["source/split"] for row in pq.read_table(out.parent / layout.EPISODES).to_pylist()] == ["train", "test"]
+    assert "  data_files: data/*/*.parquet\n" in (out / "README.md").read_text()
+    assert "in `meta/info.json`): train, test.\n" in (out / "README.md").read_text()
+    assert layout.video_path(0, 1500).parent in LerobotExporter.shared_files(settings).folders
+    assert layout.PARTS == LEROBOT_PARTS
 
 
 def test_statistics_are_those_of_all_frames(dataset, data, episodes):
