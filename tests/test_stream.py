@@ -348,7 +348,12 @@ def test_files_and_lists_stand_for_images(device):
     [
         (False, False, {}, stream.HostImages()),
         (True, True, {}, stream.HostImages()),
-        (True, False, {"bop__color_format": "jpg", "bop__jpeg_quality": 90}, stream.HostImages(("color", "instance", "amodal"), 90)),
+        (
+            True,
+            False,
+            {"bop__split": "train_pbr", "bop__color_format": "jpg", "bop__jpeg_quality": 90},
+            stream.HostImages(("color", "instance", "amodal"), 90),
+        ),
         (True, False, {"bop__color_format": "png"}, stream.HostImages(("instance", "amodal"))),
         (True, False, {"cameras__resolution": [300, 287]}, stream.HostImages()),
     ],
