@@ -19,6 +19,7 @@ class Fake:
 
     needs_physics = False
     needs_views = False
+    needs_images = False
     paths: tuple[str, ...] = ()
 
     def __init__(self, _: ExportContext | None) -> None:
@@ -51,6 +52,7 @@ class Fake:
 class Other(Fake):
     needs_physics = True
     needs_views = True
+    needs_images = False
     paths = ("b", "a")
 
     @staticmethod
