@@ -80,6 +80,7 @@ class LerobotExporter:
 
     needs_physics = True
     needs_views = True
+    needs_images = True
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
