@@ -7,7 +7,7 @@ from functools import cached_property
 
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.json import MAX_JSON, decode_json
-from synpick_warp.validation.layout import TARGETS, Layout
+from synpick_warp.validation.layout import TARGETS, Layout, is_index
 from synpick_warp.validation.schemas import Target
 
 
@@ -48,7 +48,8 @@ class TargetLists:
     def splits(self, name: str) -> list[str]:
         """Splits that a list is about: those with its prefix, else, since BOP's lists are of test splits only, val or all splits."""
         prefix = name.split("_targets")[0]
-        names = list(self.layout.splits) or list(self.layout.keyed)
+        with_scenes = [split for split, listing in self.layout.splits.items() if any(map(is_index, listing.folders))]
+        names = with_scenes or list(self.layout.splits) or list(self.layout.keyed)
         for start in (prefix, "val"):
             found = [split for split in names if split == start or split.startswith(f"{start}_")]
             if found:

@@ -42,6 +42,13 @@ def test_warnings_alone_are_no_failure(copy, capsys):
     assert lines[0].startswith("warning test_targets_bop19.json: set-files: missing")
 
 
+def test_a_split_that_is_still_to_be_baked_is_no_error(copy, capsys):
+    (copy / "val_pbr").mkdir()
+    code, lines, _ = run(capsys, copy, "--fast")
+    assert code == 0
+    assert not [line for line in lines if line.startswith("error")]
+
+
 def test_json_lines(copy, capsys):
     edit_entry(copy, "gt_info", 0, visib_fract=0.5)
     code, lines, _ = run(capsys, copy, "--json", "--fast")
