@@ -42,6 +42,8 @@ def _mix(config: Config) -> Iterator[Conflict]:
         yield "bake.mix", "at least one weight above 0, with the mode mixed"
     if not config.bake.formats:
         yield "bake.formats", f"at least one of {', '.join(FORMATS)}"
+    if "lerobot" in config.bake.formats and any(side % 2 for side in config.cameras.resolution):
+        yield "cameras.resolution", "even width and height with the format lerobot, whose videos have a colour for 2 x 2 pixels"
 
 
 def _tote(config: Config) -> Iterator[Conflict]:

@@ -26,7 +26,7 @@ RENDER_MODES = (FAST, REFERENCE)
 """Colour renderers."""
 LAYERS = tuple(LAYER_TABLE)
 """Annotation layers (AOVs) that a view can have besides colour, depth and masks; see `synpick_warp.layers`."""
-FORMATS = ("bop", "shards", "usd", "zarr")
+FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco")
 """Output formats."""
 
 
@@ -53,7 +53,7 @@ class Bake:
     formats: tuple[str, ...] = setting(
         ("bop",),
         "",
-        "Output formats: bop (scene folders), shards (BOP as webdataset), usd (a stage per episode), zarr (trajectories).",
+        "Output formats: bop (scene folders), shards (webdataset), usd (a stage per episode), zarr (trajectories), lerobot (v3), coco.",
         choices=FORMATS,
     )
     writers: int = setting(0, "", "Processes that write files; 0: one per CPU core.", low=0, high=1024)

@@ -7,9 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+
+
+class Images(Protocol):
+    """Images of a batch on the device, of which single ones can be copied to the host."""
+
+    def __getitem__(self, view: int) -> np.ndarray:
+        """Copy an image to the host; waits for the device."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,13 +36,13 @@ class FrameBatch:
     """Frame index within the episode, from 0, (B) int32."""
     time: np.ndarray
     """Simulated time since the episode's first frame [s] (B) float64."""
-    color: np.ndarray
+    color: np.ndarray | Images
     """Colour image, sRGB, RGB order (B, H, W, 3) uint8."""
     depth: np.ndarray
     """Planar depth (along the optical axis) in units of `bop.depth_scale` mm; 0: no surface (B, H, W) uint16."""
-    instance: np.ndarray
+    instance: np.ndarray | Images
     """Segmentation id of the nearest surface: 0 none, 1 + instance_id, or a `Segment` (B, H, W) uint8."""
-    amodal: np.ndarray
+    amodal: np.ndarray | Images
     """Amodal masks as a bit field: bit i is set where the pixel's ray hits instance i, hidden or not (B, H, W) uint32."""
     object_id: np.ndarray
     """obj_id of each instance; -1: the instance is not in the scene (B, I) int32."""
@@ -61,8 +69,19 @@ class FrameBatch:
     boundaries: np.ndarray | None = None
     """Per run boundary column · (H + 1) + row of the pixel below, value above, value below; sorted by the first (B, 2, 3, R) uint32."""
 
+    jpeg_size: np.ndarray | None = None
+    """Size of each JPEG file [B] (B) int32; above F: `jpeg` is cut."""
+    jpeg: np.ndarray | None = None
+    """JPEG files of `color` that the device has made (B, F) uint8."""
+
     def __len__(self) -> int:
         return len(self.episode)
+
+    def color_source(self, view: int) -> np.ndarray:
+        """JPEG file (bytes) uint8 of a view if the device has made it, else its colour image (H, W, 3) uint8."""
+        if self.jpeg is None or self.jpeg_size is None or self.jpeg_size[view] > self.jpeg.shape[1]:
+            return self.color[view]
+        return self.jpeg[view, : self.jpeg_size[view]]
 
 
 @dataclass(frozen=True, eq=False)

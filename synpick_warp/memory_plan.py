@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import warp as wp
@@ -22,6 +22,7 @@ from synpick_warp.errors import ConfigError
 from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
 from synpick_warp.scenes import build
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch, jpeg_sizes
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.images import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
@@ -36,7 +37,7 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import RECORDS
 from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
-from synpick_warp.stages.stream import RING, view_sizes
+from synpick_warp.stages.stream import RING, HostImages, host_images, view_sizes
 from synpick_warp.system.device import pick_device
 from synpick_warp.system.free_memory import free_device_memory, free_host_memory
 
@@ -201,6 +202,9 @@ def _images(config: Config, device: wp.Device) -> Iterator[Term]:
         groups += [(LensArrays, views, 1)]
     if config.render.mode == FAST:
         groups += [(kind, views | scratch_sizes(config.render, width, height), copies) for kind, copies in DENOISED_SCRATCH]
+    if _host_images(config, device).jpeg_quality:
+        files = jpeg_sizes(views["view"], width, height)
+        groups += [(JpegBuffers, files, ring), (JpegScratch, files, 1)]
     term = _term(name, _VIEWS, groups)
     layers = memory_table(LayerBuffers, views, config.render.layers)
     yield Term(term.name, (*term.rows, *(ring * layers)), term.settings)
@@ -237,13 +241,22 @@ def _host(config: Config, device: wp.Device, writers: int) -> Iterator[Term]:
     A writer is counted with one slot of shared memory: those of its queue get memory only once they are used.
     """
     if device.is_cuda:
-        views = view_sizes(config, device)
-        groups = [*memory_table(ViewBuffers, views), *memory_table(LayerBuffers, views, config.render.layers)]
+        views, host = view_sizes(config, device), _host_images(config, device)
+        copied = [item.name for item in fields(ViewBuffers) if item.name not in host.on_demand]
+        groups = memory_table(ViewBuffers, views, copied)
+        groups += memory_table(LayerBuffers, views, config.render.layers)
+        if host.jpeg_quality:
+            groups += memory_table(JpegBuffers, jpeg_sizes(views["view"], *config.cameras.resolution))
         rows = tuple((f"pinned {name}", shape, unit, size) for name, shape, unit, size in RING * groups)
         yield Term(f"pinned copies of {views['view']:,} views", rows, _VIEWS, False)
     size = slot_bytes(load_exporter_classes(config.bake.formats), config)
     row = ("shared memory of writers", (writers, size), "", writers * size)
     yield Term(f"images in {writers:,} writers", (row,), ("cameras.resolution", "bake.writers"), False, False)
+
+
+def _host_images(config: Config, device: wp.Device) -> HostImages:
+    """What a bake copies to the host."""
+    return host_images(config, device, any(kind.needs_images for kind in load_exporter_classes(config.bake.formats)))
 
 
 def _advice(term: Term, config: Config) -> str:

@@ -39,7 +39,7 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import RECORDS, Simulation
-from synpick_warp.stages.stream import FrameStream, TickReader, TickReport, name_lights, tick_batch, view_sizes
+from synpick_warp.stages.stream import FrameStream, TickReader, TickReport, host_images, name_lights, tick_batch, view_sizes
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device
 from synpick_warp.system.interrupt import StopRequest
@@ -57,7 +57,13 @@ class Factory:
     log: AttemptLog
 
 
-def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | None = None, records_physics: bool = False) -> Factory:
+def build_factory(
+    config: Config,
+    progress: Progress,
+    episodes: Sequence[int] | None = None,
+    records_physics: bool = False,
+    needs_images: bool = True,
+) -> Factory:
     """Load assets and build the stages on the device.
 
     Args:
@@ -65,6 +71,7 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
         progress: Observer.
         episodes: Indices of the episodes to simulate; None: all.
         records_physics: Whether ticks are recorded with their physics.
+        needs_images: Whether all images are copied to the host; see `Exporter`.
 
     Raises:
         SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
@@ -85,7 +92,8 @@ def build_factory(config: Config, progress: Progress, episodes: Sequence[int] | 
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
     tick_time = config.physics.step * config.physics.steps_per_tick
-    stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device)
+    host = host_images(config, device, needs_images)
+    stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device, host)
     return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.perception.resolution, object_ids))
 
 
@@ -150,9 +158,9 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
 
 def _fill(config: Config, output: OutputFolder, kinds: tuple[type[Exporter], ...], summary: BakeSummary, progress: Progress) -> None:
     """Generate the remaining episodes, then the indices over all."""
-    needs_physics = any(kind.needs_physics for kind in kinds)
+    needs = [any(getattr(kind, name) for kind in kinds) for name in ("needs_physics", "needs_images")]
     with scope("build"):
-        factory = build_factory(config, progress, output.remaining, needs_physics) if output.remaining else None
+        factory = build_factory(config, progress, output.remaining, *needs) if output.remaining else None
     with WriterPool(count_writers(config), slot_bytes(kinds, config), output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:

@@ -16,9 +16,11 @@ from synpick_warp.codes import Effect, Measure, Phase, Status
 from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.frames import FrameBatch
+from synpick_warp.jpeg import encode_jpeg
 from synpick_warp.stages import stream
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.perception.arrays import Observation, Plan
+from synpick_warp.stages.render.mask_runs import BOUNDARIES_PER_COLUMN, FIELDS
 from synpick_warp.stages.render.scene import build_lights
 from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.sim.simulate import TickRecord
@@ -319,3 +321,48 @@ def test_run_boundaries_are_those_of_the_batchs_own_images(device):
                 assert len(boundaries.column) == 2 * image.shape[1]
                 for name, values in vars(find_run_boundaries(image)).items():
                     np.testing.assert_array_equal(getattr(boundaries, name), values)
+
+
+def test_files_and_lists_stand_for_images(device):
+    """Files are those of the color images; images that are not copied can be fetched one by one."""
+    renderer, config = FakeRenderer([]), config_of(render__views_per_batch=4)
+    sizes, tick_time = view_sizes(config, device), config.physics.step * config.physics.steps_per_tick
+    host = stream.HostImages(("color", "instance", "amodal"), 90)
+    frames = FrameStream(sizes, (), 3, tick_time, renderer, OBJECT_IDS, LIGHTS, device, host)  # type: ignore[arg-type]
+    code = iter([11, 12, 13, 41, 42, 43])
+    for batch in frames.render("snapshot", report_of([0, 1, 0, 0, 1])):  # type: ignore[arg-type]
+        for view in range(len(batch)):
+            value = next(code)
+            for name, shape in (("color", (6, 8, 3)), ("instance", (6, 8)), ("amodal", (6, 8))):
+                image = getattr(batch, name)[view]
+                assert image.shape == shape
+                assert (image == value).all()
+            # The quality is that of the effects, which this renderer sets to the view's code.
+            assert batch.color_source(view).tobytes() == encode_jpeg(batch.color[view], value).tobytes()
+            assert (batch.depth[view] == value).all()
+    assert next(code, None) is None
+
+
+@pytest.mark.parametrize(
+    ("cuda", "needs_images", "settings_", "expected"),
+    [
+        (False, False, {}, stream.HostImages()),
+        (True, True, {}, stream.HostImages()),
+        (
+            True,
+            False,
+            {"bop__split": "train_pbr", "bop__color_format": "jpg", "bop__jpeg_quality": 90},
+            stream.HostImages(("color", "instance", "amodal"), 90),
+        ),
+        (True, False, {"bop__color_format": "png"}, stream.HostImages(("instance", "amodal"))),
+        (True, False, {"cameras__resolution": [300, 287]}, stream.HostImages()),
+    ],
+)
+def test_what_is_copied_to_the_host(cuda, needs_images, settings_, expected):
+    config = settings(**({"cameras__resolution": [640, 360]} | settings_))
+    assert stream.host_images(config, SimpleNamespace(is_cuda=cuda), needs_images) == expected  # type: ignore[arg-type]
+
+
+def test_the_largest_lists_are_no_larger_than_images():
+    one, columns = np.dtype(np.uint32).itemsize * FIELDS, 7
+    assert one * BOUNDARIES_PER_COLUMN * columns <= stream.MIN_LISTED_ROWS * columns

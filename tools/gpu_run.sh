@@ -21,7 +21,7 @@
 #     WORLDS             512: worlds of the step bench
 #     BENCH_PARTS        physics,perception,render,write; also sensor
 #     BENCH_RESOLUTION   1920x1080
-#     BENCH_SETTINGS     none, such as "bake.mode=move bake.formats=[bop,shards,usd,zarr]"; writers write to TMPDIR
+#     BENCH_SETTINGS     none, such as "bake.mode=move bake.formats=[bop,shards,usd,zarr,lerobot,coco]"; writers write to TMPDIR
 #     RENDER_SCENES      10: piles whose denoised image is compared with the reference; RENDER_SAMPLES 1024, RENDER_SIZE 960x540
 #     SAME_WORLDS        8,1,512: world counts with which the same episodes are simulated; the first and the last also bake
 #     SAME_EPISODES      8

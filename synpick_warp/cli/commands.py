@@ -12,6 +12,7 @@ import cyclopts
 from cyclopts import App, Parameter
 
 from synpick_warp import __version__
+from synpick_warp.cli.convert import convert
 from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
 from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard, parse_splits
@@ -240,6 +241,7 @@ def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
 
 app.command(evaluate, name="eval")
 app.command(estimate)
+app.command(convert)
 app.command(show_statistics, name="stats")
 app.command(validate)
 

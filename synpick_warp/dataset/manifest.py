@@ -63,6 +63,8 @@ FREE_SETTINGS = (
 of their folder. A device of another type computes the same episodes up to rounding."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
 """Packages whose versions the output depends on."""
+FORMAT_PACKAGES = {"lerobot": ("av", "pyarrow")}
+"""Further ones, of a format."""
 MAX_DIFFERENCES, MAX_SHOWN = 8, 80
 """Differences, and characters of a value, that an error message shows."""
 _EPISODE = re.compile(r"[0-9]{6,12}")
@@ -79,10 +81,11 @@ class _Format(msgspec.Struct):
 def make_manifest(config: Config) -> dict[str, Any]:
     """Build the manifest of a data set with these settings, in types of JSON."""
     settings = fixed_settings(config)
+    packages = (*PACKAGES, *(name for form in sorted(set(config.bake.formats)) for name in FORMAT_PACKAGES.get(form, ())))
     content = {
         "format": FORMAT,
         "seed": config.bake.seed,
-        "versions": {"synpick-warp": __version__, **{name: _version(name) for name in PACKAGES}},
+        "versions": {"synpick-warp": __version__, **{name: _version(name) for name in packages}},
         "settings_checksum": _digest(settings),
         "settings": settings,
     }

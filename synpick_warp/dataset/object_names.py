@@ -38,5 +38,5 @@ def object_names(dataset: Path, config: Config, object_ids: set[int]) -> dict[in
 
 
 def _fits(expected: float, size: float, config: Config) -> bool:
-    """Whether a model's diameter matches that of a row in the object table [m]."""
-    return abs(size - expected) <= config.objects.diameter_tolerance * expected
+    """Whether a model's diameter matches that of a row in the object table [m]; a row without one matches any."""
+    return expected == 0.0 or abs(size - expected) <= config.objects.diameter_tolerance * expected

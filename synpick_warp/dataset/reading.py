@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 USD = Path("usd")
 """Folder of USD episodes in a data set."""
+LEROBOT_PARTS, COCO_PARTS = Path("lerobot/parts"), Path("coco/parts")
+"""Folders with a file per episode and per scene; these formats alone give rows and attempts, but no views."""
 
 
 class Episode:
@@ -337,20 +339,22 @@ class DataSet(Mapping[int, Episode]):
 
     def _has_files(self, index: int) -> bool:
         """Whether an episode has files in some format."""
-        paths = [self._store / EPISODES / f"{index:06d}" / GROUP_FILE, self.folder / USD / f"{index:06d}.usdc"]
+        name, folder = f"{index:06d}", self.folder
+        paths = [self._store / EPISODES / name / GROUP_FILE, folder / USD / f"{name}.usdc", folder / LEROBOT_PARTS / f"{name}.json"]
         if self._folders:
             scene = self.camera_count * index
-            folder, web = self._folders[bop_folder(self.config, index)]
-            paths += [folder / f"{scene:06d}", web / f"shard-{scene:06d}.tar"]
+            split, web = self._folders[bop_folder(self.config, index)]
+            paths += [split / f"{scene:06d}", web / f"shard-{scene:06d}.tar", folder / COCO_PARTS / f"{scene:06d}.jsonl"]
         return any(path.exists() for path in paths)
 
     def _names(self) -> Iterator[int]:
         """Indices of the episodes that have files in some format; an index can occur several times."""
-        yield from _indices((self._store / EPISODES).glob("[0-9]*"))
-        yield from _indices((self.folder / USD).glob("[0-9]*.usdc"))
-        for folders in self._folders.values():
-            for folder, pattern in zip(folders, ("[0-9]*", "shard-??????.tar"), strict=True):
-                yield from (scene // self.camera_count for scene in _indices(folder.glob(pattern)))
+        episodes = ((self._store / EPISODES, "[0-9]*"), (self.folder / USD, "[0-9]*.usdc"), (self.folder / LEROBOT_PARTS, "[0-9]*.json"))
+        yield from (index for folder, pattern in episodes for index in _indices(folder.glob(pattern)))
+        scenes = [(self.folder / COCO_PARTS, "[0-9]*.jsonl")]
+        for folder, web in self._folders.values():
+            scenes += [(folder, "[0-9]*"), (web, "shard-??????.tar")]
+        yield from (scene // self.camera_count for folder, pattern in scenes for scene in _indices(folder.glob(pattern)))
 
     def _is_committed(self, index: int) -> bool:
         """Whether an episode is one of these and has its manifest entry; without manifest, as in a lone store, there is none to check."""

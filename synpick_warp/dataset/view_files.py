@@ -17,7 +17,7 @@ import numpy as np
 from synpick_warp.dataset.annotations import ADVICE, MASK_SCHEMA, SCENE_SCHEMAS, VIEW_SCHEMAS, check_json, read_checked
 from synpick_warp.errors import DatasetError
 from synpick_warp.inputs.files import check_regular_file, describe_bytes, read_file_if_present
-from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image
+from synpick_warp.inputs.image_files import MAX_IMAGE_FILE, decode_image, image_size
 
 SUFFIXES = (".png", ".jpg")
 """File formats of images; colour may be either."""
@@ -50,6 +50,10 @@ class SceneFiles(Protocol):
 
     def image(self, name: str, frame: int) -> np.ndarray:
         """An image, decoded by OpenCV without conversion (H, W[, 3]), blue first; `name` is "rgb", "depth" or a layer."""
+        ...
+
+    def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
+        """Suffix and content of an image's file, which states the scene's size; `name` as for `image`."""
         ...
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
@@ -88,6 +92,15 @@ class SceneFolder:
     def image(self, name: str, frame: int) -> np.ndarray:
         """See `SceneFiles`."""
         return read_image(self.folder / name, f"{frame:06d}", size=self.size)
+
+    def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
+        """See `SceneFiles`."""
+        for suffix in SUFFIXES:
+            path = self.folder / name / f"{frame:06d}{suffix}"
+            data = read_file_if_present(path, MAX_IMAGE_FILE, DatasetError)
+            if data is not None:
+                return suffix, _check_stated_size(data, self.size, path)
+        raise DatasetError(f"there is no {self.folder / name / f'{frame:06d}'}.png or .jpg; the data set is not complete")
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
         """See `SceneFiles`."""
@@ -140,6 +153,14 @@ class SceneShards:
                 return decode_image(data, self._source(frame, f"{name}{suffix}"), DatasetError, size=self.size)
         raise DatasetError(f"{self.shards[0].parent} has no {self._key(frame)}.{name}{SUFFIXES[0]}; the data set is not complete")
 
+    def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
+        """See `SceneFiles`."""
+        for suffix in SUFFIXES:
+            data = self._read(frame, f"{name}{suffix}")
+            if data is not None:
+                return suffix, _check_stated_size(data, self.size, self._source(frame, f"{name}{suffix}"))
+        raise DatasetError(f"{self.shards[0].parent} has no {self._key(frame)}.{name}{SUFFIXES[0]}; the data set is not complete")
+
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
         """See `SceneFiles`."""
         records = self._json(frame, name, MASK_SCHEMA)
@@ -149,7 +170,7 @@ class SceneShards:
         if missing := set(range(count)) - set(records):
             raise DatasetError(f"{source} has no mask {min(missing)}, but there are {count} instances; {ADVICE}")
         for index in range(count):
-            _check_run_lengths(records[index], self.size, f"{source}, mask {index},")
+            check_run_lengths(records[index], self.size, f"{source}, mask {index},")
         return [decode_run_lengths(records[index]["counts"], records[index]["size"]) for index in range(count)]
 
     def layers(self) -> set[str]:
@@ -214,6 +235,15 @@ def list_members(shard: Path) -> list[tuple[str, int, int]]:
     return members
 
 
+def _check_stated_size(data: bytes, size: tuple[int, int] | None, source: object) -> bytes:
+    """Check the size that an image file states; returns its content."""
+    stated = image_size(data)
+    if stated is None or (size is not None and stated != size):
+        there = "is not an image" if stated is None else f"has {stated[0]} x {stated[1]} pixels, not the camera's; {ADVICE}"
+        raise DatasetError(f"{source} {there}")
+    return data
+
+
 def _check_records(parts: list[Any], place: Path, frame: int) -> ViewRecords:
     camera, gt, info = parts
     if camera is None or gt is None or info is None or len(gt) != len(info):
@@ -221,7 +251,7 @@ def _check_records(parts: list[Any], place: Path, frame: int) -> ViewRecords:
     return ViewRecords(camera, gt, info)
 
 
-def _check_run_lengths(record: Mapping[str, Any], size: tuple[int, int], source: str) -> None:
+def check_run_lengths(record: Mapping[str, Any], size: tuple[int, int], source: str) -> None:
     """Check that run lengths cover an image of that width and height exactly."""
     height, width = record["size"]
     if (width, height) != size:

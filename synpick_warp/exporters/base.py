@@ -66,6 +66,9 @@ class Exporter(Protocol):
     needs_views: ClassVar[bool]
     """Whether views must be rendered; if no exporter needs them, none are."""
 
+    needs_images: ClassVar[bool]
+    """Whether it reads all images of a batch; else only depth, and those for which neither a file nor run boundaries stand."""
+
     def __init__(self, context: ExportContext) -> None:
         """Writes nothing yet."""
         ...

@@ -29,8 +29,13 @@ EXPORTERS = {
     "shards": ("bop.shards", "ShardsExporter"),
     "usd": ("usd.exporter", "UsdExporter"),
     "zarr": ("trajectory.exporter", "TrajectoryExporter"),
+    "lerobot": ("lerobot.exporter", "LerobotExporter"),
+    "coco": ("bop.coco", "CocoExporter"),
 }
 """Format -> (module in this package, class in it). Modules are imported when their format is used."""
+
+_EXTRAS = {"lerobot": "install it by pip install 'synpick-warp[lerobot]'"}
+"""Formats that need packages which a plain installation lacks, and how to get them."""
 
 
 def load_exporter_classes(names: Iterable[str]) -> tuple[type[Exporter], ...]:
@@ -48,7 +53,9 @@ def _load(name: str) -> type[Exporter]:
     try:
         return getattr(importlib.import_module(f"{__package__}.{module}"), class_name)
     except ImportError as error:
-        raise ConfigError(f"bake.formats names {name}, but its writer cannot be loaded: {error}; name other formats") from None
+        raise ConfigError(
+            f"bake.formats names {name}, but its writer cannot be loaded: {error}; {_EXTRAS.get(name, 'name other formats')}"
+        ) from None
 
 
 class Exporters:

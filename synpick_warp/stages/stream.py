@@ -15,6 +15,7 @@ from synpick_warp.codes import Measure, Status, column_names
 from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
+from synpick_warp.stages.encoding.jpeg import Compressor
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
@@ -30,6 +31,8 @@ PIXEL_BYTES = 3 + 2 + 1 + 4
 _SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
 # Ring size of view batches: one is rendered while another is copied and a third is read.
 RING = 3
+# Rows from which the largest lists of run boundaries are no larger than the images.
+MIN_LISTED_ROWS = 288
 
 
 def views_per_batch(config: Config, device: wp.Device) -> int:
@@ -102,6 +105,45 @@ def name_lights(names: list[str], lights: Any) -> LightTable:
     """Build the table of environment maps from their names and the struct `Lights`."""
     shines = lights.sun_irradiance.numpy().max(axis=1, keepdims=True) > 0.0
     return LightTable(np.array(names), np.where(shines, lights.sun_direction.numpy(), 0.0).astype(np.float32))
+
+
+class DeviceImages:
+    """Images of a batch that stay on the device: `Images` of `frames`."""
+
+    def __init__(self, array: wp.array) -> None:
+        self.array = array
+
+    def __getitem__(self, view: int) -> np.ndarray:
+        """Copy an image to the host; waits for the device."""
+        return self.array[view].numpy()
+
+
+@dataclass(frozen=True)
+class HostImages:
+    """Which images of a batch are copied to the host, and in which form."""
+
+    on_demand: tuple[str, ...] = ()
+    """Arrays of `ViewBuffers` of which exporters copy single images, where something else stands for most: files, run boundaries."""
+    jpeg_quality: int = 0
+    """JPEG quality of the files that stand for colour images; 0: there are none."""
+
+
+def host_images(config: Config, device: wp.Device, needs_images: bool) -> HostImages:
+    """Choose what is copied to the host.
+
+    On a GPU, files and run boundaries stand for all images but depth, unless exporters need these or the images are small: copying
+    single images waits for the device.
+
+    Args:
+        config: All settings.
+        device: Device of the rendering.
+        needs_images: Whether an exporter reads all images.
+    """
+    if not device.is_cuda or needs_images or config.cameras.resolution[1] < MIN_LISTED_ROWS:
+        return HostImages()
+    if config.bop.color_format != "jpg":
+        return HostImages(("instance", "amodal"))
+    return HostImages(("color", "instance", "amodal"), config.bop.jpeg_quality)
 
 
 class HostCopy:
@@ -196,6 +238,7 @@ class FrameStream:
         object_ids: np.ndarray,
         lights: LightTable,
         device: wp.Device,
+        host: HostImages | None = None,
     ) -> None:
         """Allocate the ring of batches.
 
@@ -208,8 +251,10 @@ class FrameStream:
             object_ids: obj_id of each catalog entry (entry) int32.
             lights: Table of the environment maps.
             device: Device of rendering.
+            host: Which images are copied to the host; None: all.
         """
         self.renderer = renderer
+        self.host = host or HostImages()
         self.object_ids = np.append(object_ids, -1).astype(np.int32)
         self.lights = lights
         self.cameras = cameras
@@ -217,20 +262,20 @@ class FrameStream:
         self.batch, self.instances = sizes["view"], sizes["instance"]
         self.device = device
         self.copy_stream = wp.Stream(device) if device.is_cuda else None
-        self.images = [item.name for kind in (ViewBuffers, BoundaryBuffers) for item in fields(kind)]
         self.layers = [item.name for item in fields(LayerBuffers) if item.name in layers]
         ring = range(RING if device.is_cuda else 1)
         self.buffers = [allocate(ViewBuffers, sizes, device) for _ in ring]
         self.boundaries = [allocate(BoundaryBuffers, boundary_sizes(sizes), device) for _ in ring]
         self.boundary_scratch = allocate(BoundaryScratch, boundary_sizes(sizes), device)
         self.layer_buffers = [allocate(LayerBuffers, sizes, device, self.layers) for _ in ring]
-        self.copies = [
-            HostCopy(
-                [getattr(part, item.name) for part in (images, boundaries) for item in fields(part)]
-                + [getattr(layers, name) for name in self.layers]
-            )
-            for images, boundaries, layers in zip(self.buffers, self.boundaries, self.layer_buffers, strict=True)
-        ]
+        self.compressor = Compressor(sizes, self.host.jpeg_quality, len(ring), device) if self.host.jpeg_quality else None
+        self.copies = []
+        for slot in ring:
+            parts = [self.buffers[slot], self.boundaries[slot], *([self.compressor.out[slot]] if self.compressor else [])]
+            arrays = {item.name: getattr(part, item.name) for part in parts for item in fields(part)}
+            copied = {name: array for name, array in arrays.items() if name not in self.host.on_demand}
+            self.images = list(copied)
+            self.copies.append(HostCopy([*copied.values(), *(getattr(self.layer_buffers[slot], name) for name in self.layers)]))
         self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.buffers]
 
     def render(self, snapshot: Snapshot, report: TickReport) -> Iterator[FrameBatch]:
@@ -261,6 +306,8 @@ class FrameStream:
         with scope("render", self.device):
             self.renderer.render(snapshot, views, self.buffers[slot], self.layer_buffers[slot])
             list_boundaries(self.boundary_scratch, len(world), self.buffers[slot], self.boundaries[slot])
+            if self.compressor is not None:
+                self.compressor.compress(slot, len(world), self.buffers[slot])
         self.copies[slot].start(self.copy_stream)
 
     def _collect(self, waiting: tuple[int, slice], world: np.ndarray, camera: np.ndarray, report: TickReport) -> FrameBatch:
@@ -284,5 +331,6 @@ class FrameStream:
             light_exposure=report.snapshot.light_exposure[worlds],
             light_direction=self.lights.directions(light, turn),
             **{name: arrays[name] for name in self.images},
+            **{name: DeviceImages(getattr(self.buffers[slot], name)) for name in self.host.on_demand},
             layers={name: arrays[name] for name in self.layers},
         )

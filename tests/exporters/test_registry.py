@@ -19,6 +19,7 @@ class Fake:
 
     needs_physics = False
     needs_views = False
+    needs_images = False
     paths: tuple[str, ...] = ()
 
     def __init__(self, _: ExportContext | None) -> None:
@@ -51,6 +52,7 @@ class Fake:
 class Other(Fake):
     needs_physics = True
     needs_views = True
+    needs_images = False
     paths = ("b", "a")
 
     @staticmethod
@@ -103,4 +105,6 @@ def test_views_and_physics_are_needed_if_one_exporter_needs_them():
         (False, False),
         (True, True),
     ]
-    assert [one.needs_views for one in load_exporter_classes(FORMATS)] == [name in ("bop", "shards") for name in registry.EXPORTERS]
+    assert [one.needs_views for one in load_exporter_classes(FORMATS)] == [
+        name in ("bop", "shards", "lerobot", "coco") for name in registry.EXPORTERS
+    ]

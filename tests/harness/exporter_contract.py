@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import ClassVar
@@ -20,6 +20,7 @@ from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
+from synpick_warp.jpeg import encode_jpeg
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import Camera
 from tests.worlds import box_views
@@ -67,13 +68,18 @@ def export(
 
 
 def feed(
-    exporter: Exporter, episodes: tuple[int, ...], frames: int = FRAMES, ending: Ending = Ending.FINISHED, views: int = 4
+    exporter: Exporter,
+    episodes: tuple[int, ...],
+    frames: int = FRAMES,
+    ending: Ending = Ending.FINISHED,
+    views: int = 4,
+    prepare: Callable[[FrameBatch], FrameBatch] = lambda batch: batch,
 ) -> list[int]:
     """Feed interleaved episodes in batches whose buffers are overwritten; returns a list to which committed episodes are appended."""
     committed: list[int] = []
     lenses = export_context(exporter).cameras
     views_per_tick = len(lenses) * len(episodes)
-    view_batches = list(batches(views, episodes, frames, lenses))
+    view_batches = [prepare(batch) for batch in batches(views, episodes, frames, lenses)]
     for index, tick in enumerate(ticks(len(episodes), episodes, frames)):
         exporter.write_ticks(tick)
         overwrite(tick)
@@ -84,6 +90,15 @@ def feed(
     for end in ends(episodes, frames, ending):
         exporter.end_episode(end, lambda index=end.episode: committed.append(index))
     return committed
+
+
+def with_files(batch: FrameBatch) -> FrameBatch:
+    """The batch with JPEG files as a GPU makes them; those of camera 1 exceed the capacity."""
+    files = [bytes(encode_jpeg(image, 95)) for image in batch.color]
+    capacity = max(map(len, files))
+    jpeg = np.stack([np.frombuffer(file.ljust(capacity, b"x"), np.uint8) for file in files])
+    size = np.array([capacity + 1 if camera == 1 else len(file) for file, camera in zip(files, batch.camera, strict=True)], np.int32)
+    return dataclasses.replace(batch, jpeg=jpeg, jpeg_size=size)
 
 
 def overwrite(batch: FrameBatch | TickBatch) -> None:

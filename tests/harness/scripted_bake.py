@@ -9,6 +9,7 @@ from pathlib import Path
 
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import FORMATS, Config
+from synpick_warp.configs.splits import plan_episodes, split_of
 from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
 from synpick_warp.episodes import BakeSummary, EpisodeRow
@@ -63,7 +64,7 @@ def small_settings() -> Config:
 def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after: int | None = None) -> BakeSummary:
     """Write a data set, or the remaining episodes of one, as `pipeline.run_bake` does; `stop_after` episodes it is stopped."""
     classes = load_exporter_classes(config.bake.formats)
-    with OutputFolder(out, config, range(shard[0], config.bake.episodes, shard[1])) as output:
+    with OutputFolder(out, config, [index for part in plan_episodes(config, (), shard) for index in part]) as output:
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
             summary.take_record(read_entry(out, episode_entry(episode)) or {})
@@ -90,7 +91,8 @@ def _write_episode(output: OutputFolder, exporters: Exporters, pool: WriterPool,
         exporters.write_ticks(batch)
     for batch in box_views.batches(len(_LENSES), (episode,), FRAMES, _LENSES):
         exporters.write_views(batch)
-    row = EpisodeRow(episode, 0, Ending.FINISHED, FRAMES, 0.5, "pick", 3, 1, 1, 0, 2)
+    split = split_of(output.config, episode)
+    row = EpisodeRow(episode, 0, Ending.FINISHED, FRAMES, 0.5, "pick", 3, 1, 1, 0, 2, split.name if split else "")
     end = EpisodeEnd(episode, 0, FRAMES, int(Ending.FINISHED), row.as_json(), (json.dumps(ATTEMPT | {"episode": episode}) + "\n",))
     exporters.end_episode(end, lambda: output.commit(exporters, pool, end))
 

@@ -54,6 +54,20 @@ def sample_effects_kernel(
     effects_out[view] = parameters
 
 
+@wp.kernel
+def jpeg_quality_kernel(
+    # In:
+    effects: wp.array[EffectParameters],  # (view)
+    fixed_quality: int,
+    # Out:
+    quality_out: wp.array[int],  # (view)
+):
+    """JPEG quality of each view: the sampled one, or `fixed_quality` where there is none."""
+    view = wp.tid()
+    sampled = int(effects[view][Effect.JPEG_QUALITY])
+    quality_out[view] = wp.where(sampled > 0, sampled, fixed_quality)
+
+
 @wp.func
 def corner_slope(intrinsics: wp.vec4, width: int, height: int) -> wp.vec2:
     """Largest |x| and |y| of the rays (x, y, 1) through an image's corners."""

@@ -67,7 +67,7 @@ def discard_scenes(scenes: tuple[Path, ...]) -> None:
 
 def _complete_scene(scene: Path, settings: SceneSettings) -> None:
     with (scene / ANNOTATIONS).open("rb") as file:
-        blocks = _AnnotationBlocks(file)
+        blocks = AnnotationBlocks(file)
         if blocks.frames != list(range(settings.frames)):
             raise OutputError(
                 f"{scene} has {len(blocks.frames)} of {settings.frames} frames; this is an error of synpick-warp, please report it"
@@ -82,7 +82,7 @@ def _complete_scene(scene: Path, settings: SceneSettings) -> None:
         sync_folder(folder)
 
 
-class _AnnotationBlocks:
+class AnnotationBlocks:
     """Random access by frame to a file of `annotation_block`s, which may be too large for the memory."""
 
     def __init__(self, file: BinaryIO) -> None:
@@ -106,7 +106,7 @@ class _AnnotationBlocks:
             yield self._file.read(size).decode("ascii")
 
 
-def _format_keyed(blocks: _AnnotationBlocks, index: int) -> Iterator[str]:
+def _format_keyed(blocks: AnnotationBlocks, index: int) -> Iterator[str]:
     """Format entry `index` of all views as a JSON object with a key for each frame."""
     yield "{\n"
     for position, frame in enumerate(blocks.frames):
@@ -115,7 +115,7 @@ def _format_keyed(blocks: _AnnotationBlocks, index: int) -> Iterator[str]:
     yield "\n}\n"
 
 
-def _format_coco(blocks: _AnnotationBlocks, first: int, settings: SceneSettings) -> Iterator[str]:
+def _format_coco(blocks: AnnotationBlocks, first: int, settings: SceneSettings) -> Iterator[str]:
     """Format scene_gt_coco.json; the views' annotations are their entries from `first` on, and get their ids here, from 1."""
     head = {
         "info": {

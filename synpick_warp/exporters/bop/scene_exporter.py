@@ -46,6 +46,7 @@ class SceneExporter(ABC):
 
     needs_physics = False
     needs_views = True
+    needs_images = False
     staging: ClassVar[str]
     """Name of the format's folder in `PARTIAL`."""
     write_view: ClassVar[Callable[..., None]]

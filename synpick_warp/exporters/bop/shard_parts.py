@@ -38,7 +38,7 @@ MAX_SHARD_VIEWS = 1000
 """Maximum number of views in a shard, as in the toolkit (convert_imagewise_to_webdataset.py)."""
 SHARD_STRIDE = 1_000_000
 """Index of a scene's shard p: scene_id + p · stride; a scene_id has six digits."""
-_END_OF_ARCHIVE = bytes(2 * tarfile.BLOCKSIZE)
+END_OF_ARCHIVE = bytes(2 * tarfile.BLOCKSIZE)
 """End-of-archive marker of a tar file (POSIX.1-1988, section 10.1.1)."""
 _SHARD = re.compile(r"shard-[0-9]{6,18}\.tar")
 """Name of a shard."""
@@ -72,21 +72,22 @@ def write_shard_view(
     ]
     if settings.masks:
         masks = extract_masks(visible_source, amodal_source, truth, height)
-        entries.append(("mask.json", _mask_json((mask.amodal for mask in masks), height, width)))
-        entries.append(("mask_visib.json", _mask_json((mask.visible for mask in masks), height, width)))
-    key = _key(truth.scene, truth.frame)
+        entries.append(("mask.json", mask_json((mask.amodal for mask in masks), height, width)))
+        entries.append(("mask_visib.json", mask_json((mask.visible for mask in masks), height, width)))
+    key = view_key(truth.scene, truth.frame)
     with open_folder(scene) as folder:
-        folder.write(str(truth.frame), b"".join(part for name, data in entries for part in _tar_entry(f"{key}.{name}", data)))
+        folder.write(str(truth.frame), b"".join(part for name, data in entries for part in tar_entry(f"{key}.{name}", data)))
 
 
 def write_shard_layer(values: np.ndarray, scene: Path, scene_id: int, name: str, frame: int) -> None:
     """Task: write a view's layer as a tar entry, without end-of-archive marker, to a file in the scene's staging folder."""
-    entry = _tar_entry(f"{_key(scene_id, frame)}.{name}.png", encode_png(encode_layer(name, values)))
+    entry = tar_entry(f"{view_key(scene_id, frame)}.{name}.png", encode_png(encode_layer(name, values)))
     with open_folder(scene) as folder:
         folder.write(_layer_file(frame, name), b"".join(entry))
 
 
-def _key(scene: int, frame: int) -> str:
+def view_key(scene: int, frame: int) -> str:
+    """Key of a view."""
     return f"{scene:06d}_{frame:06d}"
 
 
@@ -94,11 +95,12 @@ def _layer_file(frame: int, name: str) -> str:
     return f"{frame}.{name}"
 
 
-def _mask_json(masks: Iterable[Runs], height: int, width: int) -> bytes:
+def mask_json(masks: Iterable[Runs], height: int, width: int) -> bytes:
+    """Masks by ground-truth index, as run lengths."""
     return to_json({str(index): make_rle(runs, height, width) for index, runs in enumerate(masks)})
 
 
-def _tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
+def tar_entry(name: str, data: Buffer) -> tuple[Buffer, ...]:
     """Reproducible tar entry: no owner, modification time 0."""
     info = tarfile.TarInfo(name)
     info.size = len(data)
@@ -140,7 +142,7 @@ def _concatenate(shard: Path, pieces: list[Path]) -> None:
             with piece.open("rb", buffering=0) as source:
                 shutil.copyfileobj(source, target, _COPY_BYTES)
             piece.unlink()
-        target.write(_END_OF_ARCHIVE)
+        target.write(END_OF_ARCHIVE)
         os.fsync(target.fileno())
 
 

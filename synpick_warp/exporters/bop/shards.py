@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.exporters.base import SharedFiles
+from synpick_warp.exporters.bop.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
 from synpick_warp.exporters.bop.shard_parts import (
     commit_shards,
@@ -44,12 +46,19 @@ class ShardsExporter(SceneExporter):
     def shared_files(config: Config) -> SharedFiles:
         """See `Exporter`."""
         splits = ShardsExporter.folders(config)
-        return SharedFiles(CONSTANTS, tuple(split / KEYS_FILE for split in splits), splits)
+        return SharedFiles(CONSTANTS, (*(split / KEYS_FILE for split in splits), Path(CARD_FILE)), splits)
 
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
-        """See `Exporter`: the index of views and shards of each split."""
-        return [_write_keys(out, split, pool) for split in ShardsExporter.folders(config)]
+        """See `Exporter`: the index of views and shards of each split, and the dataset card."""
+        contents = [
+            _write_keys(out, name, split, pool) for name, split in zip(hub_splits(config), ShardsExporter.folders(config), strict=True)
+        ]
+        try:
+            write_atomically(out / CARD_FILE, make_card(_describe(config, contents)).encode())
+        except OSError as error:
+            raise output_error(out / CARD_FILE, error) from error
+        return [*(Path(split.folder) / KEYS_FILE for split in contents), Path(CARD_FILE)]
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the shards of its scenes."""
@@ -66,18 +75,33 @@ class ShardsExporter(SceneExporter):
         return commit_shards, (scenes, self._folder(scenes[0][1]), frames, self._layers)
 
 
-def _write_keys(out: Path, split: Path, pool: WriterPool) -> Path:
-    """Write the index of a split's views and shards; returns the file, relative to the data set."""
+def _describe(config: Config, splits: list[SplitContent]) -> CardContent:
+    """What the card of a data set says."""
+    bake, bop = config.bake, config.bop
+    return CardContent(
+        splits=tuple(splits),
+        embedded=not (bake.models or bake.lights),
+        color_suffix=f".{bop.color_format}",
+        masks=bop.masks,
+        instances=config.arrangement.max_objects,
+        layers=config.render.layers,
+        effects=tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits)),
+    )
+
+
+def _write_keys(out: Path, name: str, split: Path, pool: WriterPool) -> SplitContent:
+    """Write the index of a split's views and shards; returns how many there are."""
     parts = out / PARTIAL / ShardsExporter.staging / "keys"
     try:
         parts.parent.mkdir(exist_ok=True)
         shutil.rmtree(parts, ignore_errors=True)
         parts.mkdir()
-        for shard in list_shards(out / split):
+        shards = list_shards(out / split)
+        for shard in shards:
             pool.submit(list_keys, (), (shard, parts), path=shard)
         pool.wait()
         lines = [line for part in sorted(parts.iterdir(), key=shard_index) for line in part.read_bytes().splitlines()]
         write_atomically(out / split / KEYS_FILE, b"{\n" + b",\n".join(lines) + b"\n}\n")
+        return SplitContent(name, split.name, len(lines), len(shards), sum(shard.stat().st_size for shard in shards))
     except OSError as error:
         raise output_error(out / split, error) from error
-    return split / KEYS_FILE

@@ -10,15 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import orjson
 
 from synpick_warp.codes import Effect, names
+from synpick_warp.exporters.base import PIXEL_BYTES
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
 from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
 from synpick_warp.exporters.writing.rle import Runs, find_run_boundaries, unpack_run_boundaries
 from synpick_warp.frames import FrameBatch
+from synpick_warp.jpeg import encode_jpeg
 from synpick_warp.layer_codec import encode_layer, layer_path
 from synpick_warp.scenes.types import Camera
 
@@ -114,8 +115,9 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
     """Collect the inputs of the task that writes a view.
 
     Returns:
-        Images color, depth, and two mask sources, of visible and of amodal masks: the device's run boundaries of the images `instance`
-        and `amodal`, or, if these lists are incomplete or larger, the images themselves, cropped to the objects. And the ground truth.
+        Colour (image or file), depth, and two mask sources, of visible and of amodal masks: the device's run boundaries of the images
+        `instance` and `amodal`, or, if these lists are incomplete or larger, the images themselves, cropped to the objects. And the
+        ground truth.
     """
     present = np.flatnonzero(batch.object_id[view] >= 0)
     boxes = batch.boxes[view][present]
@@ -136,8 +138,8 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
         top=rows.start,
         left=columns.start,
     )
-    sources = boundaries or tuple(image[view, rows, columns] for image in (batch.instance, batch.amodal))
-    return (batch.color[view], batch.depth[view], *sources), truth
+    sources = boundaries or tuple(images[view][rows, columns] for images in (batch.instance, batch.amodal))
+    return (batch.color_source(view), batch.depth[view], *sources), truth
 
 
 def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dict[str, Any]:
@@ -158,8 +160,9 @@ def _select_boundaries(batch: FrameBatch, view: int) -> tuple[np.ndarray, ...]:
         return ()
     counts = batch.boundary_count[view].tolist()
     lists = tuple(packed[:, :count] for packed, count in zip(batch.boundaries[view], counts, strict=True))
-    images = batch.instance[view], batch.amodal[view]
-    return lists if all(packed.nbytes <= image.nbytes for packed, image in zip(lists, images, strict=True)) else ()
+    pixels = batch.depth[view].size
+    sizes = [pixels * size for size in PIXEL_BYTES[-2:]]
+    return lists if all(packed.nbytes <= size for packed, size in zip(lists, sizes, strict=True)) else ()
 
 
 def _crop_to_boxes(boxes: np.ndarray, height: int, width: int) -> tuple[slice, slice]:
@@ -222,13 +225,10 @@ def write_layer(values: np.ndarray, scene: Path, name: str, frame: int) -> None:
 
 
 def encode_color(color: np.ndarray, settings: ViewSettings, jpeg_quality: int) -> Buffer:
-    """Encode an RGB image (H, W, 3) uint8 in the format that the settings name."""
-    if settings.color_suffix == ".png":
-        return encode_png(color)
-    encoded, data = cv2.imencode(".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), (cv2.IMWRITE_JPEG_QUALITY, jpeg_quality))
-    if not encoded:
-        raise ValueError(f"OpenCV cannot encode an image of shape {color.shape} as JPEG")
-    return data.data
+    """Encode an RGB image (H, W, 3) uint8 in the format that the settings name. A file (bytes) uint8 of the device stays as it is."""
+    if color.ndim == 1:
+        return color.data
+    return encode_png(color) if settings.color_suffix == ".png" else encode_jpeg(color, jpeg_quality)
 
 
 def encode_masks(masks: Masks, height: int, width: int) -> tuple[bytes, bytes]:

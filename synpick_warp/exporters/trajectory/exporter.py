@@ -56,6 +56,7 @@ class TrajectoryExporter:
 
     needs_physics = True
     needs_views = False
+    needs_images = False
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""

@@ -31,6 +31,7 @@ class UsdExporter:
 
     needs_physics = False
     needs_views = False
+    needs_images = False
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from synpick_warp.errors import OutputError
+from synpick_warp.errors import DatasetError, OutputError, SynpickError
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.worker import Failure, TaskMessage, run_task
 from synpick_warp.system.descriptors import open_standard_descriptors
@@ -83,7 +83,7 @@ class WriterPool:
         self._waiting: deque[_QueuedTask] = deque()
         self._workers: list[WorkerProcess] = []
         self._links = selectors.DefaultSelector()
-        self._failure: OutputError | None = None
+        self._failure: SynpickError | None = None
         self._ended = False
         self._receiving = False
         self._copy_threads = ThreadPoolExecutor(max(1, processes // PROCESSES_PER_COPY_THREAD))
@@ -121,6 +121,7 @@ class WriterPool:
         Threads copy the images of earlier tasks while the next one is prepared, so pass tasks that are costly to prepare as a generator.
 
         Raises:
+            DatasetError: A task read a damaged file.
             OutputError: One of these or an earlier task failed, or a process died.
         """
         self._check()
@@ -150,6 +151,12 @@ class WriterPool:
         self._check()
         self._progress(0.0)
         while self._waiting or any(worker.tasks for worker in self._workers):
+            self._progress(None)
+
+    def wait_until(self, condition: Callable[[], bool]) -> None:
+        """Block until a condition holds that callbacks make true, or no task is left. Raises like `submit`."""
+        self._check()
+        while not condition() and (self._waiting or any(worker.tasks for worker in self._workers)):
             self._progress(None)
 
     def close(self) -> None:
@@ -257,7 +264,7 @@ class WriterPool:
 
     def _finish(self, queued: _QueuedTask, failure: Failure | None) -> None:
         if failure is not None:
-            self._fail(_to_output_error(failure, queued.path), failure.trace)
+            self._fail(_to_error(failure, queued.path), failure.trace)
         if queued.slot is not None:
             self._free.append(queued.slot)
         if queued.on_done is not None:
@@ -268,7 +275,7 @@ class WriterPool:
         activity = f"while it wrote {worker.tasks[0].path}" if worker.tasks else "while it had nothing to do"
         self._fail(OutputError(f"a writer process {how} {activity}; {remedy}"), "")
 
-    def _fail(self, error: OutputError, trace: str) -> NoReturn:
+    def _fail(self, error: SynpickError, trace: str) -> NoReturn:
         if trace:
             error.add_note(trace)
         self._failure = error
@@ -281,7 +288,9 @@ class WriterPool:
             raise OutputError("the writer processes have ended; make a new pool")
 
 
-def _to_output_error(failure: Failure, path: Path) -> OutputError:
+def _to_error(failure: Failure, path: Path) -> SynpickError:
+    if failure.is_input:
+        return DatasetError(failure.error)
     if failure.system is None:
         return OutputError(f"cannot write {path}: {failure.error}")
     code, reason, name = failure.system

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from synpick_warp.errors import SynpickError
+from synpick_warp.errors import DatasetError, SynpickError
 from synpick_warp.system.processes import serve
 from synpick_warp.system.shared_memory import SharedArray
 
@@ -38,6 +38,8 @@ class Failure:
     """errno, reason and path of an `OSError`."""
     trace: str
     """Traceback, for developers."""
+    is_input: bool = False
+    """Whether a file that the task reads is at fault, which the message names."""
 
 
 def run_task(task: TaskMessage, memory: mmap.mmap) -> Failure | None:
@@ -49,7 +51,7 @@ def run_task(task: TaskMessage, memory: mmap.mmap) -> Failure | None:
         return Failure("", system, traceback.format_exc())
     except Exception as error:
         line = str(error) if isinstance(error, SynpickError) else f"{type(error).__name__}: {' '.join(str(error).split())}"
-        return Failure(line, None, traceback.format_exc())
+        return Failure(line, None, traceback.format_exc(), isinstance(error, DatasetError))
     return None
 
 

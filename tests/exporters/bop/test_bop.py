@@ -27,9 +27,10 @@ from synpick_warp.exporters.bop.view import ANNOTATIONS, annotation_block
 from synpick_warp.exporters.writing.files import check_output_folder
 from synpick_warp.exporters.writing.folder import open_folder
 from synpick_warp.exporters.writing.png import encode_png
+from synpick_warp.jpeg import encode_jpeg
 from synpick_warp.scenes.types import Catalog
 from tests.exporters.writing.test_rle import decode
-from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, feed, finish
+from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, feed, finish, with_files
 from tests.worlds.box_views import OBJECT_IDS, SIZES, batches, cameras, catalog, config, ends, poses
 
 EPISODES = (0, 2)
@@ -225,6 +226,14 @@ def test_bytes_do_not_depend_on_the_number_of_processes(dataset, tmp_path):
         assert digests(make(tmp_path / str(processes), processes)) == digests(dataset)
 
 
+def test_files_of_the_device_stand_for_colour_images(dataset, tmp_path):
+    with exporting(BopExporter, tmp_path, config(), 2) as exporter:
+        exporter.write_constants()
+        feed(exporter, EPISODES, FRAMES, prepare=with_files)
+        finish(exporter)
+    assert digests(tmp_path) == digests(dataset)
+
+
 def test_active_effects_are_recorded_and_jpeg_quality_is_per_view(tmp_path):
     effects = Effects(exposure_jitter=1.0, blur=(0.0, 2.0), jpeg_quality=(5, 40))
     export(BopExporter, tmp_path / "set", replace(config(), effects=effects), (0,), 0)
@@ -236,9 +245,7 @@ def test_active_effects_are_recorded_and_jpeg_quality_is_per_view(tmp_path):
             assert record["effects"] == {"exposure": first, "blur": first + 5, "jpeg_quality": first + 8}
             assert record["light"] == light_of(0)
             picture = next(batch.color[0] for batch, name, index in rows() if name == f"{scene:06d}" and index == frame)
-            quality = (cv2.IMWRITE_JPEG_QUALITY, int(first) + 8)
-            expected = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), quality)[1].tobytes()
-            assert (folder / "rgb" / f"{frame:06d}.jpg").read_bytes() == expected
+            assert (folder / "rgb" / f"{frame:06d}.jpg").read_bytes() == encode_jpeg(picture, int(first) + 8).tobytes()
 
 
 def test_png_colour_without_masks_and_coco(tmp_path):

@@ -65,7 +65,8 @@ def decode(data: bytes) -> np.ndarray:
 
 def test_one_shard_per_scene_and_bops_common_files(dataset, split):
     assert {path.name for path in split.iterdir()} == {"key_to_shard.json", *(f"shard-{scene:06d}.tar" for scene in SCENES)}
-    assert {path.name for path in dataset.iterdir()} == {"camera.json", "dataset_info.md", "models", "models_eval", "train_pbr_web"}
+    names = {"README.md", "camera.json", "dataset_info.md", "models", "models_eval", "train_pbr_web"}
+    assert {path.name for path in dataset.iterdir()} == names
 
 
 def test_webdataset_reads_back_the_views(split):
@@ -202,7 +203,7 @@ def test_a_long_scene_has_several_shards(tmp_path, dataset, monkeypatch):
 def test_an_empty_data_set_has_an_empty_key_index(tmp_path):
     with exporting(ShardsExporter, tmp_path, config()) as exporter:
         exporter.write_constants()
-        assert finish(exporter) == [Path("train_pbr_web/key_to_shard.json")]
+        assert finish(exporter) == [Path("train_pbr_web/key_to_shard.json"), Path("README.md")]
     assert json.loads((tmp_path / "train_pbr_web/key_to_shard.json").read_text()) == {}
     assert set(digests(tmp_path / "train_pbr_web")) == {"key_to_shard.json"}
 

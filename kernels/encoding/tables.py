@@ -1,0 +1,14 @@
+"""Dimensions of baseline JPEG with 4:2:0 chroma, shared by its kernels."""
+
+import warp as wp
+
+BLOCK = wp.constant(8)
+"""Rows and columns of a block."""
+BLOCK_SIZE = wp.constant(64)
+"""Coefficients of a block."""
+MCU = wp.constant(16)
+"""Rows and columns of pixels in a minimum coded unit (MCU)."""
+MCU_BLOCKS_ACROSS = wp.constant(2)
+"""Blocks of Y across an MCU."""
+BLOCKS_PER_MCU = wp.constant(6)
+"""Four blocks of Y, one each of Cb and Cr."""

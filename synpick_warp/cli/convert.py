@@ -1,0 +1,38 @@
+"""Command `convert`: write a baked data set in other formats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from synpick_warp.cli.options import WholeNumber
+from synpick_warp.errors import ConfigError
+
+
+def convert(
+    folder: Annotated[Path, Parameter(name="DIR", help="A data set; its committed episodes are converted.")],
+    /,
+    *,
+    to: Annotated[str, Parameter(help="Formats to write, joined by commas: bop, shards, usd, lerobot, coco.")],
+    out: Annotated[Path, Parameter(help="Folder of the converted data set: new, empty, or of an interrupted conversion.")],
+    processes: Annotated[WholeNumber, Parameter(help="Processes that convert; 0: one per core.")] = 0,
+) -> int:
+    """Convert a data set to other formats. After an interruption, the same command resumes with the remaining episodes.
+
+    Sources: shards and bop need the other of the two; usd needs zarr; coco needs bop or shards; lerobot needs zarr, and bop or shards.
+    Files are those that a bake would have written, but for LeRobot's videos from JPEG images. Exit codes: 0, converted; 2, an error.
+    """
+    if not 0 <= processes <= 1024:
+        raise ConfigError(f"--processes is {processes}; allowed: 0 to 1024")
+    from synpick_warp.cli.display import ViewCounter, make_console
+    from synpick_warp.conversion.run import convert as run_conversion
+
+    names = [name.strip() for name in to.split(",")]
+    with ViewCounter(make_console()) as counter:
+        converted = run_conversion(folder, out, names, processes, counter.report)
+    before = f" ({converted.resumed:,} of them before)" if converted.resumed else ""
+    print(f"{converted.episodes:,} episodes converted to {', '.join(names)}{before}")
+    print(f"data set: {out}")
+    return 0

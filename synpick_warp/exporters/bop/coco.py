@@ -1,0 +1,242 @@
+"""Exporter of COCO instance segmentation: one annotation file for each split, with visible boxes, for detectors' training code.
+
+Beside BOP's scene_gt_coco.json, which is a file a scene with amodal boxes: here boxes enclose the visible mask, as COCO's readers expect.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import bop_folder, bop_folders
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.base import ExportContext, SharedFiles
+from synpick_warp.exporters.bop.scene import AnnotationBlocks
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter
+from synpick_warp.exporters.bop.view import (
+    ANNOTATIONS,
+    Masks,
+    ViewSettings,
+    ViewTruth,
+    annotation_block,
+    encode_color,
+    extract_masks,
+    make_gt_info_entries,
+    make_rle,
+    to_json,
+)
+from synpick_warp.exporters.writing.files import PARTIAL, output_error, sync_folder, write_synced
+from synpick_warp.exporters.writing.folder import open_folder
+from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.inputs.files import read_file
+from synpick_warp.inputs.json import MAX_JSON, decode_json, read_json
+from synpick_warp.inputs.paths import path_inside
+
+FOLDER = Path("coco")
+"""Folder in the data set."""
+IMAGES, PARTS, CATEGORIES = FOLDER / "images", FOLDER / "parts", FOLDER / "categories.json"
+"""Images in a folder a scene, annotations of each scene, names of the objects. Splits share them, as scene ids are unique over all."""
+_ADVICE = "remove it and its episode's two files in manifest/, and resume the bake"
+
+
+class _Category(msgspec.Struct):
+    id: int
+    name: str
+
+
+def annotation_file(split: str) -> Path:
+    """The annotations of a split's images, relative to the data set; `split`: its name in BOP, such as test_pbr."""
+    return FOLDER / "annotations" / f"instances_{split}.json"
+
+
+class CocoExporter(SceneExporter):
+    """`Exporter` of COCO. A scene is a folder of images, and a part of the annotations, from which a file a split is made at the end."""
+
+    staging = "coco"
+
+    def __init__(self, context: ExportContext) -> None:
+        """See `Exporter`."""
+        super().__init__(context)
+        self._layers = ()
+
+    @staticmethod
+    def write_view(
+        color: np.ndarray,
+        depth: np.ndarray,
+        visible_source: np.ndarray,
+        amodal_source: np.ndarray,
+        scene: Path,
+        settings: ViewSettings,
+        truth: ViewTruth,
+    ) -> None:
+        """See `SceneExporter`."""
+        masks = extract_masks(visible_source, amodal_source, truth, depth.shape[0])
+        infos = make_gt_info_entries(truth)
+        annotations = make_annotations(truth.object_id.tolist(), truth.instance_id.tolist(), infos, masks, *depth.shape)
+        write_image(scene, truth.frame, settings.color_suffix, encode_color(color, settings, truth.jpeg_quality), annotations)
+
+    @staticmethod
+    def folder_name(split: str) -> str:
+        """See `SceneExporter`: one for all splits."""
+        return FOLDER.name
+
+    @staticmethod
+    def shared_files(config: Config) -> SharedFiles:
+        """See `Exporter`."""
+        places = tuple(map(annotation_file, bop_folders(config)))
+        return SharedFiles((CATEGORIES,), places, (IMAGES, PARTS, places[0].parent, FOLDER))
+
+    @staticmethod
+    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+        """See `Exporter`: the annotations of each split."""
+        try:
+            return write_annotation_files(out, config)
+        except OSError as error:
+            raise output_error(out / FOLDER, error) from error
+
+    def write_constants(self) -> list[Path]:
+        """See `Exporter`: the names of the objects."""
+        write_categories(self._out, {entry.obj_id: entry.name for entry in self._context.catalog.entries})
+        return [CATEGORIES]
+
+    def files(self, episode: int) -> list[Path]:
+        """See `Exporter`: folders of images, and parts."""
+        return scene_files(self._out, [self.scene_id(episode, camera) for camera in range(len(self._cameras))])
+
+    def _stage_scene(self, scene: Path) -> None:
+        scene.mkdir()
+
+    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        raise NotImplementedError("COCO has no layers")
+
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        return commit_scenes, (scenes, self._out)
+
+
+def write_categories(out: Path, names: dict[int, str]) -> None:
+    """Write the names of the objects, and the folders of the format."""
+    try:
+        for folder in (FOLDER, IMAGES, PARTS):
+            (out / folder).mkdir(exist_ok=True)
+        categories = [{"id": index, "name": name, "supercategory": "object"} for index, name in sorted(names.items())]
+        (out / CATEGORIES).write_text(json.dumps(categories, indent=2) + "\n", encoding="ascii")
+    except OSError as error:
+        raise output_error(out / CATEGORIES, error) from error
+
+
+def scene_files(out: Path, scenes: Iterable[int]) -> list[Path]:
+    """Committed files and folders of scenes, relative to the data set, sorted."""
+    places = [place for scene in scenes for place in (IMAGES / f"{scene:06d}", PARTS / f"{scene:06d}.jsonl")]
+    return sorted(place for place in places if os.path.lexists(out / place))
+
+
+def make_annotations(
+    object_ids: Sequence[int], instance_ids: Sequence[int], infos: Sequence[dict[str, Any]], masks: Sequence[Masks], height: int, width: int
+) -> Iterator[dict[str, Any]]:
+    """Annotations of a view's visible instances, without ids: box of the visible mask, its run lengths, and extras of ours."""
+    for object_id, instance_id, info, mask in zip(object_ids, instance_ids, infos, masks, strict=True):
+        box = mask.visible.box()
+        if box is not None:
+            left, top, right, bottom = box
+            yield {
+                "category_id": object_id,
+                "bbox": [left, top, right - left + 1, bottom - top + 1],
+                "area": mask.visible.count,
+                "iscrowd": 0,
+                "segmentation": make_rle(mask.visible, height, width),
+                "bbox_amodal": info["bbox_obj"],
+                "visib_fract": info["visib_fract"],
+                "instance_id": instance_id,
+            }
+
+
+def write_image(scene: Path, frame: int, suffix: str, data: Any, annotations: Iterable[dict[str, Any]]) -> None:
+    """Write a view's image to the staging folder of its scene, and append its annotations there."""
+    with open_folder(scene) as folder:
+        folder.write(f"{frame:06d}{suffix}", data)
+        folder.append(ANNOTATIONS, annotation_block(frame, (to_json(list(annotations)),)))
+
+
+def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path) -> None:
+    """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations a frame, and rename all to their places."""
+    for scene, scene_id in scenes:
+        with (scene / ANNOTATIONS).open("rb") as file:
+            blocks = AnnotationBlocks(file)
+            lines = [next(blocks.read(frame, 0, 1)) for frame in blocks.frames]
+        part = scene.with_name(f"{scene.name}.part")
+        write_synced(part, "".join(f"{line}\n" for line in lines).encode())
+        (scene / ANNOTATIONS).unlink()
+        sync_folder(scene)
+        part.rename(out / PARTS / f"{scene_id:06d}.jsonl")
+        scene.rename(out / IMAGES / f"{scene_id:06d}")
+    for folder in (PARTS, IMAGES):
+        sync_folder(out / folder)
+
+
+def write_annotation_files(out: Path, config: Config) -> list[Path]:
+    """Join the parts to an annotation file a split; images and annotations are numbered from 1 in each. Returns their names.
+
+    Raises:
+        DatasetError: A part is damaged.
+        OSError: A file cannot be written.
+    """
+    parts: dict[str, list[Path]] = {split: [] for split in bop_folders(config)}
+    for part in sorted((out / PARTS).glob("[0-9]*.jsonl"), key=lambda path: int(path.stem)):
+        parts[bop_folder(config, int(part.stem) // len(config.cameras.positions))].append(part)
+    categories = read_json(path_inside(out, str(CATEGORIES), out, DatasetError), list[_Category], DatasetError, _ADVICE)
+    return [_write_annotations(out, config, split, found, categories) for split, found in parts.items()]
+
+
+def _write_annotations(out: Path, config: Config, split: str, parts: list[Path], categories: list[_Category]) -> Path:
+    """Join parts to the annotation file of a split; returns its name."""
+    place = annotation_file(split)
+    folder = out / PARTIAL / "coco-index"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    images, annotations = 0, 0
+    with (folder / "images").open("w", encoding="ascii") as image_file, (folder / "annotations").open("w", encoding="ascii") as file:
+        for part in parts:
+            for frame, found in enumerate(_read_part(part, out)):
+                images += 1
+                row = {"id": images, **_describe_image(config, int(part.stem), frame)}
+                image_file.write((",\n" if images > 1 else "") + json.dumps(row))
+                for annotation in found:
+                    annotations += 1
+                    text = to_json({"id": annotations, "image_id": images, **annotation}).decode()
+                    file.write((",\n" if annotations > 1 else "") + text)
+    head = {"info": {"description": f"synpick-warp, {split}"}, "licenses": [], "categories": msgspec.to_builtins(categories)}
+    (out / place).parent.mkdir(exist_ok=True)
+    with (folder / "joined").open("wb") as joined:
+        joined.write((json.dumps(head)[:-1] + ', "images": [\n').encode())
+        for name, end in (("images", b'\n], "annotations": [\n'), ("annotations", b"\n]}\n")):
+            with (folder / name).open("rb") as source:
+                shutil.copyfileobj(source, joined)
+            joined.write(end)
+        joined.flush()
+        os.fsync(joined.fileno())
+    (folder / "joined").replace(out / place)
+    sync_folder((out / place).parent)
+    shutil.rmtree(folder)
+    return place
+
+
+def _read_part(part: Path, out: Path) -> Iterator[list[dict[str, Any]]]:
+    """Annotations of each frame of a scene."""
+    data = read_file(path_inside(out, str(part.relative_to(out)), out / PARTS, DatasetError), MAX_JSON, DatasetError)
+    for number, line in enumerate(data.splitlines(), start=1):
+        yield decode_json(line, list[dict[str, Any]], f"{part}, line {number},", DatasetError, _ADVICE)
+
+
+def _describe_image(config: Config, scene: int, frame: int) -> dict[str, Any]:
+    width, height = config.cameras.resolution
+    episode, camera = divmod(scene, len(config.cameras.positions))
+    name = f"{scene:06d}/{frame:06d}.{config.bop.color_format}"
+    return {"file_name": name, "width": width, "height": height, "episode": episode, "camera": camera, "frame": frame}

@@ -1,0 +1,90 @@
+"""Tasks that commit or discard an episode: its videos and its part. They run in writer processes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from synpick_warp.exporters.lerobot.layout import part_path, video_path
+from synpick_warp.exporters.lerobot.part import TICK, Part, describe_tasks, make_rows
+from synpick_warp.exporters.lerobot.video import GROUP, join_groups
+from synpick_warp.exporters.writing.files import sync_file, sync_folder, write_synced
+
+
+@dataclass(frozen=True)
+class EpisodeSettings:
+    """Settings common to all episodes."""
+
+    out: Path
+    """The data set."""
+    cameras: int
+    size: tuple[int, int]
+    """Width and height of the images [px]."""
+    rate: Fraction
+    """Frames per second."""
+    objects: Mapping[int, str]
+    """obj_id -> name."""
+
+
+@dataclass(frozen=True)
+class EpisodeContent:
+    """Content of an episode besides its videos."""
+
+    episode: int
+    mode: str
+    ending: str
+    picked: int
+    ticks: bytes
+    """Rows of `TICK`."""
+    attempts: tuple[str, ...]
+    """Lines of attempts.jsonl."""
+
+
+def group_path(folder: Path, camera: int, group: int) -> Path:
+    """Encoded group of a camera's frames, in the episode's staging folder."""
+    return folder / f"{camera}-{group:06d}"
+
+
+def frame_path(folder: Path, camera: int, frame: int) -> Path:
+    """Spooled frame, in the episode's staging folder."""
+    return folder / f"{camera}-{frame:06d}.frame"
+
+
+def commit_episode(folder: Path, content: EpisodeContent, settings: EpisodeSettings) -> None:
+    """Task: join the videos of an episode and rename them and the part to their places, the part first: by it a resumed bake knows them."""
+    ticks = np.frombuffer(content.ticks, TICK)
+    groups = range(-(-len(ticks) // GROUP))
+    videos, levels = [], []
+    for camera in range(settings.cameras):
+        video = folder / f"{camera}.mp4"
+        levels.append(join_groups([group_path(folder, camera, group) for group in groups], settings.size, settings.rate, video).tolist())
+        sync_file(video)
+        videos.append((video, settings.out / video_path(camera, content.episode)))
+    attempts = [json.loads(line) for line in content.attempts]
+    sentences, tasks = describe_tasks(content.mode, len(ticks), attempts, settings.objects)
+    rows = make_rows(ticks, attempts, sentences, tasks)
+    part = Part(len(ticks), content.mode, content.ending, len(attempts), content.picked, sentences, rows.tobytes(), levels)
+    write_synced(folder / "part", msgspec.json.encode(part))
+    for source, place in ((folder / "part", settings.out / part_path(content.episode)), *videos):
+        make_folders(settings.out, place.parent)
+        source.rename(place)
+        sync_folder(place.parent)
+    shutil.rmtree(folder)
+
+
+def make_folders(out: Path, folder: Path) -> None:
+    """Create a folder below the data set, which must exist, and those between."""
+    for parent in reversed([folder, *folder.parents][: len(folder.relative_to(out).parts)]):
+        parent.mkdir(exist_ok=True)
+
+
+def discard_episode(folder: Path) -> None:
+    """Task: remove the staging folder of a discarded arrangement."""
+    shutil.rmtree(folder)

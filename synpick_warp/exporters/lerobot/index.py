@@ -1,0 +1,257 @@
+"""Tables over all episodes of a LeRobot data set: data, episodes, tasks, statistics, info.json and dataset card, from the parts.
+
+Parts are read one after the other, so memory does not grow with the number of frames; only the list of episodes is held.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.lerobot.episode import make_folders
+from synpick_warp.exporters.lerobot.layout import (
+    CARD,
+    CHUNK,
+    DATA,
+    EPISODES,
+    FRAME_FEATURES,
+    INFO,
+    PARTS,
+    ROW,
+    STATS,
+    TASKS,
+    VERSION,
+    Feature,
+    camera_key,
+    frame_rate,
+    make_info,
+    part_path,
+    split_name,
+)
+from synpick_warp.exporters.lerobot.part import Part, outcome_names
+from synpick_warp.exporters.lerobot.statistics import Statistics, describe_levels, describe_numbers, merge_numbers, to_json
+from synpick_warp.exporters.writing.files import PARTIAL, sync_file, sync_folder
+from synpick_warp.inputs.json import read_json
+from synpick_warp.inputs.paths import path_inside
+
+ROW_GROUP = 20_000
+"""Frames of a row group of the data: about 2 MB."""
+_ADVICE = "remove it, its episode's videos and two files in manifest/, and resume the bake"
+
+
+@dataclass(eq=False)
+class _Totals:
+    """What is known of all episodes read so far."""
+
+    tasks: dict[str, int] = field(default_factory=dict)
+    """Sentence -> index, in order of appearance."""
+    statistics: dict[str, Statistics] = field(default_factory=dict)
+    levels: list[np.ndarray] = field(default_factory=list)
+    """Histogram of each camera's channels."""
+    frames: int = 0
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    """Rows of the table of episodes."""
+
+
+def write_indices(out: Path, config: Config) -> list[Path]:
+    """Write the tables over all committed episodes; returns them, relative to the data set.
+
+    Raises:
+        DatasetError: A part is damaged.
+        OSError: A file cannot be written.
+    """
+    cameras, totals = len(config.cameras.positions), _Totals()
+    totals.levels = [np.zeros((3, 256), np.int64) for _ in range(cameras)]
+    with pq.ParquetWriter(out / PARTIAL / "data.parquet", _data_schema(), compression="zstd") as writer:
+        for batch in _batch_tables(_read_tables(out, totals, config)):
+            writer.write_table(batch)
+    _place(out, DATA, lambda path: (out / PARTIAL / "data.parquet").replace(path))
+    _place(
+        out, EPISODES, lambda path: pq.write_table(pa.Table.from_pylist(totals.rows, _episode_schema(cameras)), path, compression="zstd")
+    )
+    _place(out, TASKS, lambda path: pq.write_table(_task_table(totals.tasks), path))
+    videos = {camera_key(index): describe_levels(levels, totals.frames) for index, levels in enumerate(totals.levels) if levels.any()}
+    statistics = {name: to_json(values) for name, values in (totals.statistics | videos).items()}
+    info = make_info(config, [row["source/split"] for row in totals.rows], totals.frames, len(totals.tasks))
+    info["features"]["attempt.outcome"]["info"] = {"codes": list(outcome_names())}
+    for place, content in ((STATS, statistics), (INFO, info)):
+        text = json.dumps(content, indent=2) + "\n"
+        _place(out, place, lambda path, text=text: path.write_text(text, encoding="ascii"))
+    _place(out, CARD, lambda path: path.write_text(_make_card(config, totals), encoding="utf-8"))
+    return [INFO, STATS, TASKS, EPISODES, DATA, CARD]
+
+
+def _place(out: Path, name: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside its place, sync it, and rename it."""
+    place = out / name
+    make_folders(out, place.parent)
+    temporary = out / PARTIAL / "lerobot-index"
+    temporary.unlink(missing_ok=True)
+    write(temporary)
+    sync_file(temporary)
+    temporary.replace(place)
+    sync_folder(place.parent)
+
+
+def _read_tables(out: Path, totals: _Totals, config: Config) -> Iterator[pa.Table]:
+    """Tables of the episodes, in order; adds them to the totals."""
+    folder, period = out / PARTS, 1.0 / frame_rate(config)
+    indices = sorted(int(path.stem) for path in folder.iterdir() if path.name.removesuffix(".json").isdecimal()) if folder.is_dir() else []
+    for source in indices:
+        name = part_path(source)
+        part = read_json(path_inside(out, str(name), out / PARTS, DatasetError), Part, DatasetError, _ADVICE)
+        if len(part.levels) != len(totals.levels):
+            raise DatasetError(f"{out / name} has {len(part.levels)} cameras, the settings {len(totals.levels)}; {_ADVICE}")
+        columns = _make_columns(part, totals, period)
+        _add_episode(source, part, columns, totals, period)
+        totals.rows[-1]["source/split"] = split_name(config, source)
+        yield pa.table({name: _to_array(columns[name], feature) for name, feature in FRAME_FEATURES.items()}, _data_schema())
+
+
+def _make_columns(part: Part, totals: _Totals, period: float) -> dict[str, np.ndarray]:
+    """Columns of an episode's frames, with their indices in the whole data set."""
+    rows = np.frombuffer(part.rows, ROW)
+    frames = np.arange(part.frames)
+    tasks = np.array([totals.tasks.setdefault(sentence, len(totals.tasks)) for sentence in part.sentences])
+    columns = {
+        "observation.state": rows["state"],
+        "action": rows["action"],
+        "next.reward": rows["reward"],
+        "next.success": rows["success"],
+        "next.done": frames == part.frames - 1,
+        "attempt.index": rows["attempt"],
+        "attempt.outcome": rows["outcome"],
+        "timestamp": frames * period,
+        "frame_index": frames,
+        "episode_index": np.full(part.frames, len(totals.rows)),
+        "index": totals.frames + frames,
+        "task_index": tasks[rows["task"]],
+    }
+    return {name: columns[name].astype(feature.dtype) for name, feature in FRAME_FEATURES.items()}
+
+
+def _add_episode(source: int, part: Part, columns: dict[str, np.ndarray], totals: _Totals, period: float) -> None:
+    """Add a row of the table of episodes, and the episode's statistics."""
+    cameras = range(len(totals.levels))
+    numbers = {name: describe_numbers(values.reshape(part.frames, -1)) for name, values in columns.items()}
+    levels = [np.array(part.levels[camera]) for camera in cameras]
+    statistics = numbers | {camera_key(camera): describe_levels(levels[camera], part.frames) for camera in cameras}
+    row: dict[str, Any] = {
+        "episode_index": len(totals.rows),
+        "tasks": part.sentences,
+        "length": part.frames,
+        "dataset_from_index": totals.frames,
+        "dataset_to_index": totals.frames + part.frames,
+        **dict.fromkeys(("data/chunk_index", "data/file_index", "meta/episodes/chunk_index", "meta/episodes/file_index"), 0),
+        "source/episode": source,
+        "source/mode": part.mode,
+        "source/ending": part.ending,
+        "source/attempts": part.attempts,
+        "source/picked": part.picked,
+    }
+    for camera in cameras:
+        place = f"videos/{camera_key(camera)}"
+        row |= {f"{place}/chunk_index": source // CHUNK, f"{place}/file_index": source % CHUNK}
+        row |= {f"{place}/from_timestamp": 0.0, f"{place}/to_timestamp": part.frames * period}
+        totals.levels[camera] += levels[camera]
+    for name, values in statistics.items():
+        row |= {f"stats/{name}/{key}": value for key, value in to_json(values).items()}
+    for name, values in numbers.items():
+        totals.statistics[name] = merge_numbers(totals.statistics[name], values) if name in totals.statistics else values
+    totals.rows.append(row)
+    totals.frames += part.frames
+
+
+def _batch_tables(tables: Iterator[pa.Table]) -> Iterator[pa.Table]:
+    """Join tables to row groups of at least ROW_GROUP rows, but the last."""
+    waiting: list[pa.Table] = []
+    for table in tables:
+        waiting.append(table)
+        if sum(map(len, waiting)) >= ROW_GROUP:
+            yield pa.concat_tables(waiting).combine_chunks()
+            waiting = []
+    if waiting:
+        yield pa.concat_tables(waiting).combine_chunks()
+
+
+def _to_array(values: np.ndarray, feature: Feature) -> pa.Array:
+    """A column as an Arrow array: numbers, or lists of fixed size."""
+    flat = pa.array(np.ascontiguousarray(values).ravel())
+    return pa.FixedSizeListArray.from_arrays(flat, len(feature.names)) if feature.names else flat
+
+
+def _data_schema() -> pa.Schema:
+    fields = []
+    for name, feature in FRAME_FEATURES.items():
+        kind = pa.from_numpy_dtype(np.dtype(feature.dtype))
+        fields.append((name, pa.list_(kind, len(feature.names)) if feature.names else kind))
+    return pa.schema(fields)
+
+
+def _episode_schema(cameras: int) -> pa.Schema:
+    """Columns of the table of episodes."""
+    integers = ("episode_index", "length", "dataset_from_index", "dataset_to_index", "data/chunk_index", "data/file_index")
+    fields: dict[str, pa.DataType] = dict.fromkeys(integers, pa.int64()) | {"tasks": pa.list_(pa.string())}
+    fields |= dict.fromkeys(("meta/episodes/chunk_index", "meta/episodes/file_index"), pa.int64())
+    fields |= dict.fromkeys(("source/episode", "source/attempts", "source/picked"), pa.int64())
+    fields |= dict.fromkeys(("source/mode", "source/ending", "source/split"), pa.string())
+    numbers = pa.list_(pa.float64())
+    kinds = dict.fromkeys(FRAME_FEATURES, numbers)
+    for camera in range(cameras):
+        place = f"videos/{camera_key(camera)}"
+        fields |= dict.fromkeys((f"{place}/chunk_index", f"{place}/file_index"), pa.int64())
+        fields |= dict.fromkeys((f"{place}/from_timestamp", f"{place}/to_timestamp"), pa.float64())
+        kinds[camera_key(camera)] = pa.list_(pa.list_(numbers))
+    keys = tuple(describe_numbers(np.zeros((1, 1))))
+    fields |= {f"stats/{name}/{key}": pa.list_(pa.int64()) if key == "count" else kind for name, kind in kinds.items() for key in keys}
+    return pa.schema(list(fields.items()))
+
+
+def _task_table(tasks: dict[str, int]) -> pa.Table:
+    """Table of sentences, which pandas reads with the sentence as index, as LeRobot expects."""
+    strings = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
+    numbers = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
+    notes = {
+        "index_columns": ["task"],
+        "column_indexes": [{"name": None, "field_name": None, **strings, "metadata": {"encoding": "UTF-8"}}],
+        "columns": [
+            {"name": "task_index", "field_name": "task_index", **numbers},
+            {"name": "task", "field_name": "task", **strings},
+        ],
+        "creator": {"library": "synpick-warp", "version": ""},
+        "pandas_version": "2.0.0",
+    }
+    table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": pa.array(list(tasks), pa.string())})
+    return table.replace_schema_metadata({"pandas": json.dumps(notes)})
+
+
+def _make_card(config: Config, totals: _Totals) -> str:
+    """Dataset card for the Hugging Face hub, whose visualizer of LeRobot data sets goes by the tag."""
+    licence = "unknown" if config.bake.models or config.bake.lights else "mit"
+    names = list(dict.fromkeys(row["source/split"] for row in totals.rows))
+    only = "validation" if names == ["val"] else names[0] if names else "train"
+    files = " data/*/*.parquet" if config.splits else f"\n  - split: {only}\n    path: data/*/*.parquet"
+    splits = f"\nSplits (ranges of episodes in `meta/info.json`): {', '.join(names)}.\n" if config.splits else ""
+    return f"""---
+license: {licence}
+task_categories: [robotics]
+tags: [LeRobot, bin-picking, suction, synthetic]
+configs:
+- config_name: default
+  data_files:{files}
+---
+# Bin picking with a suction gripper
+
+{len(totals.rows):,} episodes of {totals.frames:,} frames, simulated by synpick-warp, in LeRobot's format {VERSION}.
+State: cup pose in the tote's frame (x, y, z [m], quaternion x, y, z, w), whether the suction is on, whether an object hangs on the cup.
+Action: setpoint of the cup [m] and suction command. Tasks name the object that each attempt picks.
+{splits}"""

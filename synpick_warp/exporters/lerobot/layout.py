@@ -1,0 +1,156 @@
+"""Layout of a LeRobot v3 data set: names of files, features of a frame, and info.json. Imports neither PyAV nor pyarrow.
+
+Checked against `lerobot` 0.4.4 (codebase_version v3.0). LeRobot numbers the episodes of a data set without gaps; videos and parts are named
+by the episode's index in the bake, which may have gaps, and meta/episodes says which file is whose.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import split_kind, split_of
+
+FOLDER = Path("lerobot")
+"""Folder of the LeRobot data set, in ours."""
+PARTS, VIDEOS, META = FOLDER / "parts", FOLDER / "videos", FOLDER / "meta"
+CARD, INFO, STATS, TASKS = FOLDER / "README.md", META / "info.json", META / "stats.json", META / "tasks.parquet"
+EPISODES, DATA = META / "episodes" / "chunk-000" / "file-000.parquet", FOLDER / "data" / "chunk-000" / "file-000.parquet"
+CHUNK = 1000
+"""Maximum number of files in a chunk's folder (LeRobot's default)."""
+VERSION = "v3.0"
+ROBOT = "suction_gripper"
+CODEC, PIXEL_FORMAT = "h264", "yuv420p"
+_CHUNKED = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+_SIZES = {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
+"""LeRobot's defaults, for recorders that append to the data set [MB]."""
+
+STATE = ("x", "y", "z", "qx", "qy", "qz", "qw", "suction", "attached")
+"""Cup to world [m] and quaternion; 1 if the suction is on; 1 if an object hangs on the cup."""
+ACTION = ("x", "y", "z", "suction")
+"""Setpoint of the cup's tilt axis [m] and suction command of the tick that leads to the next frame."""
+
+
+class Feature(NamedTuple):
+    """A column of the data: its NumPy type, and the names of its components."""
+
+    dtype: str
+    names: tuple[str, ...] = ()
+    """Empty: a single number."""
+
+
+FRAME_FEATURES = {
+    "observation.state": Feature("float32", STATE),
+    "action": Feature("float32", ACTION),
+    "next.reward": Feature("float32"),
+    "next.success": Feature("bool"),
+    "next.done": Feature("bool"),
+    "attempt.index": Feature("int64"),
+    "attempt.outcome": Feature("int64"),
+    "timestamp": Feature("float32"),
+    "frame_index": Feature("int64"),
+    "episode_index": Feature("int64"),
+    "index": Feature("int64"),
+    "task_index": Feature("int64"),
+}
+"""Columns of data/*.parquet. Reward is 1 and success true if the next frame is the one at which an attempt was judged, and an object was
+picked; `attempt.index` is -1 outside of attempts, `attempt.outcome` the code of the attempt's `Outcome`, 0 outside."""
+
+ROW = np.dtype(
+    [
+        ("state", "<f4", len(STATE)),
+        ("action", "<f4", len(ACTION)),
+        ("reward", "<f4"),
+        ("success", "?"),
+        ("attempt", "<i4"),
+        ("outcome", "<i4"),
+        ("task", "<i4"),
+    ]
+)
+"""A frame in a part: what its episode alone determines. `task` is an index into the part's sentences."""
+
+
+def camera_key(camera: int) -> str:
+    """Feature name of a camera's video."""
+    return f"observation.images.camera_{camera}"
+
+
+def part_path(episode: int) -> Path:
+    """File with the rows of an episode, relative to the data set."""
+    return PARTS / f"{episode:06d}.json"
+
+
+def video_path(camera: int, episode: int) -> Path:
+    """Video of an episode, relative to the data set."""
+    place = _CHUNKED.format(chunk_index=episode // CHUNK, file_index=episode % CHUNK)
+    return VIDEOS / camera_key(camera) / f"{place}.mp4"
+
+
+def video_folders(cameras: int, episodes: int) -> list[Path]:
+    """Folders that hold the videos of episodes 0 to `episodes` - 1, each after the folders within it."""
+    keys = [VIDEOS / camera_key(camera) for camera in range(cameras)]
+    return [*(key / f"chunk-{chunk:03d}" for key in keys for chunk in range(-(-episodes // CHUNK))), *keys, VIDEOS]
+
+
+def frame_rate(config: Config) -> float | int:
+    """Frames per second of simulated time [Hz]; whole numbers as integers."""
+    rate = 1.0 / (config.physics.step * config.physics.steps_per_tick)
+    return round(rate) if abs(rate - round(rate)) < 1e-9 else rate
+
+
+def split_name(config: Config, episode: int) -> str:
+    """Name of the split of an episode of the bake; without splits, BOP's kind of the one: train, val or test."""
+    split = split_of(config, episode)
+    return split_kind(config.bop.split) if split is None else split.name
+
+
+def split_ranges(names: Sequence[str]) -> dict[str, str]:
+    """Ranges of episodes, as "0:240", from the split of each; the episodes of a split follow each other."""
+    counts = Counter(names)
+    ends = itertools.accumulate(counts.values())
+    return {name: f"{end - count}:{end}" for (name, count), end in zip(counts.items(), ends, strict=True)}
+
+
+def make_info(config: Config, splits: Sequence[str], frames: int, tasks: int) -> dict[str, Any]:
+    """Content of meta/info.json; `splits`: name of the split of each episode."""
+    width, height = config.cameras.resolution
+    rate = frame_rate(config)
+    video = {
+        "dtype": "video",
+        "shape": [height, width, 3],
+        "names": ["height", "width", "channels"],
+        "info": {
+            "video.height": height,
+            "video.width": width,
+            "video.codec": CODEC,
+            "video.pix_fmt": PIXEL_FORMAT,
+            "video.is_depth_map": False,
+            "video.fps": rate,
+            "video.channels": 3,
+            "has_audio": False,
+        },
+    }
+    columns = {
+        name: {"dtype": feature.dtype, "shape": [len(feature.names) or 1], "names": list(feature.names) or None}
+        for name, feature in FRAME_FEATURES.items()
+    }
+    return {
+        "codebase_version": VERSION,
+        "robot_type": ROBOT,
+        "total_episodes": len(splits),
+        "total_frames": frames,
+        "total_tasks": tasks,
+        "chunks_size": CHUNK,
+        **_SIZES,
+        "fps": rate,
+        "splits": split_ranges(splits),
+        "data_path": f"data/{_CHUNKED}.parquet",
+        "video_path": f"videos/{{video_key}}/{_CHUNKED}.mp4",
+        "features": {**{camera_key(camera): video for camera in range(len(config.cameras.positions))}, **columns},
+    }

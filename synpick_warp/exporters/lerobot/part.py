@@ -1,0 +1,114 @@
+"""Parts: what an episode alone determines of its table (states, actions, task sentences, outcomes), as a JSON file.
+
+LeRobot numbers frames and episodes over the whole data set, so the tables are written when the bake ends, from the parts of all episodes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+
+from synpick_warp.codes import Mode, Outcome, names
+from synpick_warp.exporters.lerobot.layout import ROW
+from synpick_warp.exporters.lerobot.video import LEVELS
+
+_Count = Annotated[int, msgspec.Meta(ge=0, lt=2**62)]
+_Levels = Annotated[list[_Count], msgspec.Meta(min_length=LEVELS, max_length=LEVELS)]
+_CATALOG_NUMBER = re.compile(r"^[0-9]+[_ -]+")
+"""Number before an object's name, as in YCB's 003_cracker_box."""
+
+TICK = np.dtype(
+    [("pose", "<f4", 7), ("setpoint", "<f4", 3), ("suction", "?"), ("attached", "?")],
+)
+"""A frame as it comes from the simulation: cup to world, setpoint of the steps that led to it (NaN: none), suction, load."""
+
+
+class Part(msgspec.Struct):
+    """Content of a part."""
+
+    frames: Annotated[int, msgspec.Meta(ge=1, lt=2**31)]
+    mode: str
+    ending: str
+    attempts: _Count
+    picked: _Count
+    sentences: Annotated[list[str], msgspec.Meta(min_length=1)]
+    """Tasks of the episode's frames."""
+    rows: bytes
+    """Rows of `ROW`."""
+    levels: list[Annotated[list[_Levels], msgspec.Meta(min_length=3, max_length=3)]]
+    """Histogram of each camera's colour channels."""
+
+    def __post_init__(self) -> None:
+        if len(self.rows) != self.frames * ROW.itemsize:
+            raise ValueError(f"its rows have {len(self.rows)} bytes, but {self.frames} frames have {self.frames * ROW.itemsize}")
+        tasks = np.frombuffer(self.rows, ROW)["task"]
+        if tasks.min() < 0 or tasks.max() >= len(self.sentences):
+            raise ValueError("a frame has a task without sentence")
+
+
+def make_rows(ticks: np.ndarray, attempts: Sequence[Mapping[str, Any]], sentences: Sequence[str], tasks: np.ndarray) -> np.ndarray:
+    """Build the rows (frame) of `ROW` of an episode.
+
+    The action of a frame is the command of the tick that leads to the next one; the last frame repeats its own.
+
+    Args:
+        ticks: Frames of `TICK`.
+        attempts: The episode's lines of attempts.jsonl.
+        sentences: The episode's sentences.
+        tasks: Index of each frame's sentence.
+    """
+    count = len(ticks)
+    rows = np.zeros(count, ROW)
+    rows["state"] = np.column_stack((ticks["pose"], ticks["suction"], ticks["attached"]))
+    following = np.minimum(np.arange(count) + 1, count - 1)
+    setpoint = np.where(np.isnan(ticks["setpoint"]), ticks["pose"][:, :3], ticks["setpoint"])[following]
+    rows["action"] = np.column_stack((setpoint, ticks["suction"][following]))
+    rows["attempt"], rows["task"] = -1, tasks
+    for index, attempt in enumerate(attempts):
+        outcome = Outcome[attempt["outcome"].upper()]
+        first, last = attempt["frame"], attempt["end_frame"]
+        rows["attempt"][first:last], rows["outcome"][first:last] = index, outcome
+        if outcome.succeeded and 0 < last <= count:
+            rows["reward"][last - 1], rows["success"][last - 1] = 1.0, True
+    return rows
+
+
+def describe_tasks(
+    mode: str, frames: int, attempts: Iterable[Mapping[str, Any]], objects: Mapping[int, str]
+) -> tuple[list[str], np.ndarray]:
+    """The task of each frame in words: that of the running attempt, or else of the next one, or else the episode's.
+
+    Args:
+        mode: Mode of the episode.
+        frames: Number of frames.
+        attempts: The episode's lines of attempts.jsonl, in order.
+        objects: obj_id -> name.
+
+    Returns:
+        Sentences in order of appearance, and the index of each frame's (frame) int32.
+    """
+    general = "stir the objects in the tote" if mode == Mode.MOVE.name.lower() else "pick all objects out of the tote"
+    verb = "dig" if mode == Mode.TARGET.name.lower() else "pick"
+    of_frame = np.full(frames, general, object)
+    begin = 0
+    for attempt in attempts:
+        if attempt["object_id"] is not None:
+            name = objects.get(attempt["object_id"], f"object {attempt['object_id']}")
+            of_frame[begin : attempt["end_frame"]] = f"{verb} the {speak(name)} out of the tote"
+        begin = attempt["end_frame"]
+    sentences = list(dict.fromkeys(of_frame.tolist()))
+    return sentences, np.array([sentences.index(sentence) for sentence in of_frame], np.int32)
+
+
+def speak(name: str) -> str:
+    """An object's name in words: 003_cracker_box is a cracker box."""
+    return " ".join(_CATALOG_NUMBER.sub("", name).replace("_", " ").split()) or name
+
+
+def outcome_names() -> tuple[str, ...]:
+    """Names of the codes of `attempt.outcome`."""
+    return names(Outcome)

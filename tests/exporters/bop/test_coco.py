@@ -1,0 +1,96 @@
+"""COCO annotations of a whole split: the exporter contract, and pycocotools against the views."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pycocotools.coco import COCO
+
+from synpick_warp.configs.schema import Split
+from synpick_warp.dataset.reading import COCO_PARTS
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.bop.coco import CATEGORIES, IMAGES, PARTS, CocoExporter
+from tests.harness.exporter_contract import ExporterContract, export, exporting, finish
+from tests.worlds.box_views import batches, cameras, config, ends
+
+LENSES = cameras()
+
+
+class TestCocoContract(ExporterContract):
+    exporter_class = CocoExporter
+
+
+SPLITS = (
+    Split("train", 2, 0, "pick", "train_pbr"),
+    Split("test", 2, 2, "pick", "test_pbr"),
+    Split("val", 5, 9, "pick", "val_pbr"),
+)
+
+
+def read(out: Path, split: str = "train_pbr") -> COCO:
+    """The annotation file of a split, by pycocotools, which prints."""
+    with contextlib.redirect_stdout(io.StringIO()):
+        return COCO(out / "coco" / "annotations" / f"instances_{split}.json")
+
+
+@pytest.mark.filterwarnings("ignore:__array__:DeprecationWarning")
+def test_pycocotools_reads_back_masks_boxes_and_images(tmp_path):
+    read_back = read(out := export(CocoExporter, tmp_path / "set", config(), (0, 2), processes=0))
+    assert {category["id"]: category["name"] for category in read_back.loadCats(read_back.getCatIds())} == {3: "box 3", 7: "box 7"}
+    views = {(row["episode"], row["camera"], row["frame"]): row for row in read_back.loadImgs(read_back.getImgIds())}
+    assert len(views) == 18
+    for batch in batches(1, (0, 2), 3, LENSES):
+        image = views[int(batch.episode[0]), int(batch.camera[0]), int(batch.frame[0])]
+        color = cv2.imread(str(out / "coco" / "images" / image["file_name"]))[..., ::-1]
+        assert np.median(np.abs(color.astype(int) - batch.color[0])) <= 3
+        found = read_back.loadAnns(read_back.getAnnIds(imgIds=image["id"]))
+        assert [row["instance_id"] for row in found] == [index for index in (0, 2, 3) if (batch.instance[0] == 1 + index).any()]
+        for row in found:
+            visible = batch.instance[0] == 1 + row["instance_id"]
+            np.testing.assert_array_equal(read_back.annToMask(row), visible)
+            rows, columns = np.flatnonzero(visible.any(axis=1)), np.flatnonzero(visible.any(axis=0))
+            assert row["bbox"] == [columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1]
+            assert (row["area"], row["category_id"]) == (visible.sum(), batch.object_id[0, row["instance_id"]])
+
+
+def test_every_split_has_an_annotation_file(tmp_path):
+    """Two splits of one episode each, and one that has not been baked."""
+    settings = dataclasses.replace(config(), splits=SPLITS)
+    out = export(CocoExporter, tmp_path / "set", settings, (0, 2), processes=0)
+    assert sorted(path.name for path in (out / IMAGES).iterdir()) == [f"{scene:06d}" for scene in (0, 1, 2, 6, 7, 8)]
+    assert {out / name for name in CocoExporter.shared_files(settings).indices} == set((out / "coco" / "annotations").iterdir())
+    for split, episode in (("train_pbr", 0), ("test_pbr", 2)):
+        found = read(out, split)
+        assert sorted(found.imgs) == list(range(1, 10))
+        assert sorted(found.anns) == list(range(1, len(found.anns) + 1))
+        assert {image["episode"] for image in found.imgs.values()} == {episode}
+        assert all((out / IMAGES / image["file_name"]).is_file() for image in found.imgs.values())
+        assert found.dataset["info"]["description"] == f"synpick-warp, {split}"
+    assert (len(read(out, "val_pbr").imgs), len(read(out, "val_pbr").cats)) == (0, 2)
+    assert PARTS == COCO_PARTS
+
+
+def test_views_without_objects_have_no_annotations(tmp_path):
+    with exporting(CocoExporter, tmp_path, config(), 0) as exporter:
+        exporter.write_constants()
+        for batch in batches(5, (0,), 1, LENSES):
+            nothing = {"object_id": np.full_like(batch.object_id, -1), "instance": np.zeros_like(batch.instance)}
+            exporter.write_views(dataclasses.replace(batch, **nothing))
+        exporter.end_episode(ends((0,), 1)[0], lambda: None)
+        finish(exporter)
+    assert (len(read(tmp_path).imgs), len(read(tmp_path).anns)) == (3, 0)
+
+
+@pytest.mark.parametrize("name", [str(PARTS / "000001.jsonl"), str(CATEGORIES)])
+def test_damaged_parts_are_one_error(tmp_path, name):
+    out = export(CocoExporter, tmp_path / "set", config(), (0,), processes=0)
+    (out / name).write_text("[}\n")
+    (out / ".partial").mkdir()
+    with pytest.raises(DatasetError, match=Path(name).name):
+        CocoExporter.finalize(out, config(), None)  # type: ignore[arg-type]

@@ -1,0 +1,227 @@
+"""LeRobot data sets written by the real pool: contract, tables by pyarrow against the simulation, videos by PyAV against the views."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import sys
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from synpick_warp.codes import Outcome, Task
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.schema import Config, Split
+from synpick_warp.dataset.reading import LEROBOT_PARTS
+from synpick_warp.errors import ConfigError, DatasetError
+from synpick_warp.exporters.lerobot import layout
+from synpick_warp.exporters.lerobot.exporter import LerobotExporter, video_rate
+from synpick_warp.exporters.lerobot.video import GROUP
+from synpick_warp.exporters.registry import load_exporter_classes
+from tests.harness.exporter_contract import ExporterContract, digests, exporting, finish
+from tests.worlds import box_views, trajectories
+
+EPISODES = (0, 2)
+FRAMES = 11
+"""More than a group of pictures."""
+LENSES = box_views.cameras()
+
+
+class TestLerobotContract(ExporterContract):
+    exporter_class = LerobotExporter
+
+
+def write(out: Path, settings: Config, episodes: tuple[int, ...] = EPISODES, processes: int = 2) -> Path:
+    """Write a data set with physics, views and attempts."""
+    with exporting(LerobotExporter, out, settings, processes) as exporter:
+        exporter.write_constants()
+        for tick in trajectories.ticks(episodes, FRAMES):
+            exporter.write_ticks(tick)
+        for batch in box_views.batches(4, episodes, FRAMES, LENSES):
+            exporter.write_views(batch)
+        for end in trajectories.ends(episodes, FRAMES):
+            exporter.end_episode(end, lambda: None)
+        finish(exporter)
+    return out
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    return write(tmp_path_factory.mktemp("lerobot") / "set", trajectories.config()) / "lerobot"
+
+
+@pytest.fixture(scope="module")
+def data(dataset) -> dict[str, np.ndarray]:
+    table = pq.read_table(dataset / "data" / "chunk-000" / "file-000.parquet").to_pydict()
+    return {name: np.array(values) for name, values in table.items()}
+
+
+@pytest.fixture(scope="module")
+def episodes(dataset) -> list[dict]:
+    return pq.read_table(dataset / "meta" / "episodes" / "chunk-000" / "file-000.parquet").to_pylist()
+
+
+def test_frames_hold_states_and_commands_of_the_simulation(data):
+    for place, episode in enumerate(EPISODES):
+        ticks = list(trajectories.ticks((episode,), FRAMES))
+        mine = data["episode_index"] == place
+        for frame, tick in enumerate(ticks):
+            following = ticks[min(frame + 1, FRAMES - 1)]
+            suction = [float(one.tick["task"][0] == Task.LIFT) for one in (tick, following)]
+            state = [*tick.fixture_pose[0, 2], suction[0], float(tick.tick["attached"][0].any())]
+            np.testing.assert_array_equal(data["observation.state"][mine][frame], np.array(state, np.float32))
+            np.testing.assert_array_equal(
+                data["action"][mine][frame], np.array([*following.steps["setpoint"][0, -1], suction[1]], np.float32)
+            )
+    assert data["index"].tolist() == list(range(2 * FRAMES))
+    assert data["frame_index"].tolist() == 2 * list(range(FRAMES))
+    period = trajectories.config().physics.step * trajectories.STEP_COUNT
+    np.testing.assert_array_equal(data["timestamp"].astype(np.float32), np.tile(np.arange(FRAMES) * period, 2).astype(np.float32))
+
+
+def test_frames_without_setpoint_are_commanded_to_stay(tmp_path):
+    with exporting(LerobotExporter, tmp_path, trajectories.config(), 0) as exporter:
+        for tick in box_views.ticks(1, (0,), 2):
+            exporter.write_ticks(tick)
+        for batch in box_views.batches(4, (0,), 2, LENSES):
+            exporter.write_views(batch)
+        exporter.end_episode(box_views.ends((0,), 2)[0], lambda: None)
+        finish(exporter)
+    table = pq.read_table(tmp_path / layout.DATA).to_pydict()
+    assert table["action"][0][:3] == table["observation.state"][1][:3]
+
+
+def test_attempts_become_tasks_rewards_and_outcomes(data, dataset):
+    first = slice(0, FRAMES)
+    sentences = pq.read_table(dataset / "meta" / "tasks.parquet").to_pydict()["task"]
+    spoken = [sentences[index] for index in data["task_index"][first]]
+    # The first attempt, frames 1 to 4, aims at a box 7 and picks; the second, frame 6, sees nothing.
+    assert spoken == 5 * ["pick the box 7 out of the tote"] + 6 * ["pick all objects out of the tote"]
+    assert data["attempt.index"][first].tolist() == [-1, 0, 0, 0, 0, -1, 1, -1, -1, -1, -1]
+    assert data["attempt.outcome"][2] == Outcome.TARGET_PICKED
+    assert data["next.reward"][first].tolist() == [0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0]
+    assert data["next.success"][first].sum() == 1
+    assert np.flatnonzero(data["next.done"]).tolist() == [FRAMES - 1, 2 * FRAMES - 1]
+
+
+def test_videos_show_the_views_at_exact_times(dataset, episodes):
+    for place, episode in enumerate(EPISODES):
+        row = episodes[place]
+        assert (row["episode_index"], row["source/episode"], row["length"]) == (place, episode, FRAMES)
+        assert (row["dataset_from_index"], row["dataset_to_index"]) == (place * FRAMES, (place + 1) * FRAMES)
+        assert (row["source/mode"], row["source/ending"], row["source/attempts"], row["source/picked"]) == ("pick", "emptied", 2, 2)
+        for camera in range(3):
+            key = f"observation.images.camera_{camera}"
+            assert (row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"]) == (0, episode)
+            truth = [one.color[0] for one in box_views.batches(1, (episode,), FRAMES, LENSES) if int(one.camera[0]) == camera]
+            with av.open(str(dataset / "videos" / key / "chunk-000" / f"file-{episode:03d}.mp4")) as container:
+                stream = container.streams.video[0]
+                assert (stream.codec_context.name, stream.average_rate) == ("h264", video_rate(trajectories.config()))
+                shown = list(container.decode(stream))
+            assert [frame.pts * frame.time_base for frame in shown] == [
+                frame / video_rate(trajectories.config()) for frame in range(FRAMES)
+            ]
+            assert [frame.key_frame for frame in shown] == [index % GROUP == 0 for index in range(FRAMES)]
+            errors = [
+                np.abs(frame.to_ndarray(format="rgb24").astype(int) - color).mean() for frame, color in zip(shown, truth, strict=True)
+            ]
+            assert max(errors) < 6
+
+
+def test_info_describes_every_column_and_video(dataset, data, episodes):
+    info = json.loads((dataset / "meta" / "info.json").read_text())
+    assert (info["codebase_version"], info["total_episodes"], info["total_frames"]) == ("v3.0", 2, 2 * FRAMES)
+    videos = {name for name, feature in info["features"].items() if feature["dtype"] == "video"}
+    assert videos == {f"observation.images.camera_{camera}" for camera in range(3)}
+    assert set(info["features"]) - videos == set(data)
+    for name in set(data):
+        assert info["features"][name]["shape"] == list(data[name].shape[1:] or (1,))
+    assert Fraction(info["fps"]).limit_denominator(1000) == 1 / Fraction(trajectories.config().physics.step * 4).limit_denominator(1000)
+    assert (dataset / info["data_path"].format(chunk_index=0, file_index=0)).is_file()
+    assert all(feature["info"]["video.codec"] == "h264" for name, feature in info["features"].items() if name in videos)
+
+
+def test_splits_are_ranges_of_episodes(tmp_path, dataset, episodes):
+    assert json.loads((dataset / "meta" / "info.json").read_text())["splits"] == {"train": "0:2"}
+    assert [row["source/split"] for row in episodes] == ["train", "train"]
+    assert "  - split: train\n    path: data/" in (dataset / "README.md").read_text()
+    splits = (Split("train", 2, 0, "pick", "train_pbr"), Split("test", 3, 2, "pick", "test_pbr"), Split("val", 1, 1500, "pick", "val_pbr"))
+    settings = dataclasses.replace(trajectories.config(), splits=splits)
+    shutil.copytree(dataset, out := tmp_path / "set" / "lerobot")
+    (out.parent / ".partial").mkdir()
+    LerobotExporter.finalize(out.parent, settings, None)  # type: ignore[arg-type]
+    assert json.loads((out / "meta" / "info.json").read_text())["splits"] == {"train": "0:1", "test": "1:2"}
+    assert [row["source/split"] for row in pq.read_table(out.parent / layout.EPISODES).to_pylist()] == ["train", "test"]
+    assert "  data_files: data/*/*.parquet\n" in (out / "README.md").read_text()
+    assert "in `meta/info.json`): train, test.\n" in (out / "README.md").read_text()
+    assert layout.video_path(0, 1500).parent in LerobotExporter.shared_files(settings).folders
+    assert layout.PARTS == LEROBOT_PARTS
+
+
+def test_statistics_are_those_of_all_frames(dataset, data, episodes):
+    stats = json.loads((dataset / "meta" / "stats.json").read_text())
+    for name, values in data.items():
+        numbers = values.reshape(2 * FRAMES, -1).astype(float)
+        expected = {"min": numbers.min(0), "max": numbers.max(0), "mean": numbers.mean(0), "std": numbers.std(0), "count": [2 * FRAMES]}
+        for key, value in expected.items():
+            np.testing.assert_allclose(stats[name][key], value, rtol=1e-6, atol=1e-9, err_msg=f"{name} {key}")
+    halves = data["observation.state"].reshape(2, FRAMES, -1)
+    np.testing.assert_allclose(stats["observation.state"]["q90"], np.quantile(halves.astype(float), 0.9, axis=1).mean(axis=0), rtol=1e-6)
+    color = np.concatenate(
+        [one.color[0, ::4, ::4].reshape(-1, 3) for one in box_views.batches(1, EPISODES, FRAMES, LENSES) if one.camera[0] == 1]
+    )
+    seen = stats["observation.images.camera_1"]
+    for key, value in {"min": color.min(0), "max": color.max(0), "mean": color.mean(0), "std": color.std(0)}.items():
+        np.testing.assert_allclose(np.ravel(seen[key]), value / 255, rtol=1e-6)
+    median = np.quantile(color, 0.5, axis=0, method="inverted_cdf")
+    np.testing.assert_allclose(np.ravel(seen["q50"]), median / 255)
+    assert np.shape(seen["q50"]) == (3, 1, 1)
+    assert episodes[1]["stats/index/min"] == [FRAMES]
+
+
+def test_bytes_do_not_depend_on_processes(dataset, tmp_path):
+    assert digests(write(tmp_path / "set", trajectories.config(), processes=0) / "lerobot") == digests(dataset)
+
+
+@pytest.mark.parametrize("fault", ["text", "rows", "cameras", "link"])
+def test_damaged_parts_are_one_error(tmp_path, fault):
+    out = write(tmp_path / "set", trajectories.config(), (0,), processes=0)
+    part = out / layout.part_path(0)
+    content = json.loads(part.read_text())
+    if fault == "text":
+        part.write_text("{")
+    elif fault == "rows":
+        part.write_text(json.dumps(content | {"rows": content["rows"][:-8]}))
+    elif fault == "cameras":
+        part.write_text(json.dumps(content | {"levels": content["levels"][:1]}))
+    else:
+        part.rename(tmp_path / "elsewhere")
+        part.symlink_to(tmp_path / "elsewhere")
+    (out / ".partial").mkdir()
+    with pytest.raises(DatasetError, match=r"000000\.json"):
+        LerobotExporter.finalize(out, trajectories.config(), None)  # type: ignore[arg-type]
+
+
+def test_missing_packages_are_one_line_that_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "av", None)
+    for name in [name for name in sys.modules if name.startswith("synpick_warp.exporters.lerobot")]:
+        monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(ConfigError, match=r"bake\.formats names lerobot, .*av.*; install it by pip install 'synpick-warp\[lerobot\]'"):
+        load_exporter_classes(("lerobot",))
+
+
+def test_odd_image_sizes_are_refused_at_the_start():
+    with pytest.raises(ConfigError, match=r"cameras\.resolution .* even width and height with the format lerobot"):
+        load_config("smoke", {"bake.formats": ["lerobot"], "cameras.resolution": [161, 90]})
+
+
+def test_chunks_hold_a_thousand_videos():
+    assert str(layout.video_path(1, 2345)).endswith("camera_1/chunk-002/file-345.mp4")
+    folders = layout.video_folders(2, 2001)
+    assert len(folders) == 2 * 3 + 2 + 1
+    assert dataclasses.replace(Config()).bake.formats == ("bop",)
