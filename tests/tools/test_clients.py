@@ -23,7 +23,9 @@ SOURCES = base.Sources()
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory) -> Path:
-    return export(BopExporter, tmp_path_factory.mktemp("clients") / "set", config(), (0,), 0, FRAMES, CAMERAS)
+    folder = export(BopExporter, tmp_path_factory.mktemp("clients") / "set", config(), (0,), 0, FRAMES, CAMERAS)
+    (folder / "episodes.jsonl").write_text(f'{{"episode": 0, "frames": {FRAMES}}}\n')
+    return folder
 
 
 def visible_masks(data: Path) -> dict[str, np.ndarray]:
@@ -63,12 +65,11 @@ def test_a_client_that_disagrees(data, opened, capsys):
     assert "DIFFERS" in capsys.readouterr().out
 
 
-def test_a_client_that_fails(data, opened, tmp_path):
-    scene = base.first_scene(data)
-    assert scene is not None
+def test_a_client_that_fails(tmp_path):
     broken = tmp_path / "train_pbr" / "000000"
     broken.mkdir(parents=True)
     (broken / "scene_camera.json").write_text("{}")
+    (tmp_path / "episodes.jsonl").write_text('{"episode": 0, "frames": 1}\n')
     (broken / "scene_gt_coco.json").write_text("{")
     result = tool.run_client("coco", sys.executable, tmp_path, {}, SOURCES)
     assert (result.agreement, result.holds) == ("FAILED", False)

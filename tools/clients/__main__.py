@@ -65,7 +65,7 @@ def run_client(name: str, python: str, data: Path, data_set: Any, sources: Sourc
             return Result(name, "", place.name, f"no answer in {TIMEOUT:.0f} s", "", holds=False)
         last = (done.stderr.strip().splitlines() or [""])[-1]
         if done.returncode == MISSING:
-            return Result(name, "", "", NOT_INSTALLED, f"no module {last}")
+            return Result(name, "", "", NOT_INSTALLED, f"missing: {last}")
         if done.returncode:
             return Result(name, "", place.name, "FAILED", last or f"exit code {done.returncode}", holds=False)
         report = json.loads((Path(folder) / "report.json").read_text())

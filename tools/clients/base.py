@@ -39,6 +39,8 @@ class Reading:
     """For the table."""
     values: dict[str, np.ndarray]
     remarks: list[str] = field(default_factory=list)
+    versions: dict[str, str] = field(default_factory=dict)
+    """Of packages that are not installed, but imported from a folder."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 
 from tools.clients.base import MILLIMETERS, Reading, Sources, first_scene, make_matrix, sample_frames, sampled_views
 
-PACKAGES = ("numpy", "imageio", "pypng")
+PACKAGES = ("bop_toolkit_lib", "numpy")
 BOUNDS = {"depth": 1e-5, "world_to_camera": 1e-12, "object_to_camera": 1e-12, "model": 1e-4}
 """Depth and poses: metres here, millimetres there. Vertices are 32-bit millimetres."""
 
@@ -53,7 +54,8 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
     infos = json.loads((data / "models" / "models_info.json").read_text())
     values["symmetries"] = np.array([len(misc.get_symmetry_transformations(info, 0.01)) > 0 for info in infos.values()])
     shards = any(name.startswith("shard") for name in values)
-    return Reading(f"{place.parent.name}/{place.name}{', its shard' if shards else ''}, a model", values)
+    what = f"{place.parent.name}/{place.name}{', its shard' if shards else ''}, a model"
+    return Reading(what, values, versions=_read_version(Path(inout.__file__).parents[1]))
 
 
 def _read_shard(scene: Path) -> dict[str, np.ndarray]:
@@ -66,6 +68,13 @@ def _read_shard(scene: Path) -> dict[str, np.ndarray]:
     suffix = next((scene / "rgb").iterdir()).suffix
     view = bop_webdataset.load_image_data(shard, f"{scene.name}_000000", load_mask=True, load_gt=True, load_gt_info=True, rgb_suffix=suffix)
     return {"shard rgb": view["im_rgb"], "shard mask": np.asarray(view["mask"]) > 0}
+
+
+def _read_version(folder: Path) -> dict[str, str]:
+    """Version of a copy of the toolkit, from its pyproject.toml."""
+    project = folder / "pyproject.toml"
+    found = re.search(r'^version = "(.*)"', project.read_text() if project.is_file() else "", re.MULTILINE)
+    return {"bop_toolkit_lib": found[1]} if found else {}
 
 
 def _first_model(data: Path) -> int:

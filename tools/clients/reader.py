@@ -27,12 +27,12 @@ def main() -> int:
     try:
         module = importlib.import_module(f"tools.clients.{name}")
         reading = module.read(Path(place), Path(data), Sources(**json.loads(sources)))
-    except ModuleNotFoundError as error:
-        print(error.name, file=sys.stderr)
+    except ImportError as error:
+        print(error.name or error, file=sys.stderr)
         return MISSING
     folder = Path(out)
     np.savez(folder / "values.npz", **reading.values)
-    versions = {package: version_of(package) for package in module.PACKAGES}
+    versions = {package: version_of(package) for package in module.PACKAGES} | reading.versions
     (folder / "report.json").write_text(json.dumps({"what": reading.what, "remarks": reading.remarks, "versions": versions}))
     return 0
 

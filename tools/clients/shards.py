@@ -41,6 +41,8 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
         scale = np.float32(view["camera.json"]["depth_scale"] / MILLIMETERS)
         values |= {f"rgb {frame}": color, f"depth {frame}": view["depth.png"] * scale, f"mask_visib {frame}": view["mask_visib.json"]}
         values[f"obj_id {frame}"] = np.array([row["obj_id"] for row in view["gt.json"]])
+        if not view["gt.json"]:  # An entry without masks does not tell the image's size.
+            values[f"mask_visib {frame}"] = np.zeros((0, *color.shape[:2]), bool)
     stock = next(iter(webdataset.WebDataset(str(place), shardshuffle=False).decode("l8")))["depth.png"]
     remarks = ["its own decoders clip depth to 0 and 255: use decode_view"] if set(np.unique(stock)) <= {0, 255} else []
     if importlib.util.find_spec("torch") is None:
