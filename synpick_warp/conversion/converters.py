@@ -145,6 +145,15 @@ class ShardsConverter(_SceneConverter):
         self.submit_all(tasks, lambda: self.pool.submit(place_shards, (), arguments, path=split, on_done=on_committed))
 
 
+def _read_names(source: Source) -> dict[int, str]:
+    """Names of the objects (obj_id -> name) from the store; without one from models and settings, where some may have none."""
+    data = source.data
+    if data.has_store:
+        return {item.object_id: item.name for item in data.objects}
+    known = object_names(source.folder, source.config, set(data.models_info))
+    return {index: known.get(index, f"obj_{index:06d}") for index in data.models_info}
+
+
 class BopConverter(_SceneConverter):
     """To scene folders: images are copied, masks drawn from run lengths."""
 
@@ -154,7 +163,7 @@ class BopConverter(_SceneConverter):
         super().__init__(source, out, config, pool)
         if config.bop.coco and not config.bop.masks:
             raise DatasetError(f"{source.folder} has no masks, which bop.coco needs; bake it with bop.masks = true")
-        self._object_ids = tuple(sorted(source.data.models_info))
+        self._object_names = tuple(sorted(_read_names(source).items()))
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
@@ -166,7 +175,7 @@ class BopConverter(_SceneConverter):
         folder, split = self.stage("bop", episode), self.folder(episode.end.episode)
         width, height = self.config.cameras.resolution
         suffix = f".{self.config.bop.color_format}"
-        settings = SceneSettings(split.name, episode.frames, width, height, suffix, self.config.bop.coco, self._object_ids)
+        settings = SceneSettings(split.name, episode.frames, width, height, suffix, self.config.bop.coco, self._object_names)
         scenes = episode.scenes()
         moves = tuple((folder / f"{scene.scene:06d}", split / f"{scene.scene:06d}") for scene in scenes)
         tasks = [(write_scene, (scene, self.content, move[0]), move[1]) for scene, move in zip(scenes, moves, strict=True)]
@@ -185,13 +194,7 @@ class CocoConverter(_SceneConverter):
 
     def write_constants(self) -> list[Path]:
         """See base class."""
-        data = self.source.data
-        if data.has_store:
-            names = {item.object_id: item.name for item in data.objects}
-        else:
-            known = object_names(self.source.folder, self.source.config, set(data.models_info))
-            names = {index: known.get(index, f"obj_{index:06d}") for index in data.models_info}
-        coco.write_categories(self.out, names)
+        coco.write_categories(self.out, _read_names(self.source))
         return [coco.CATEGORIES]
 
     def files(self, episode: int) -> list[Path]:

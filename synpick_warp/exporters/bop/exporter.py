@@ -28,7 +28,7 @@ class BopExporter(SceneExporter):
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         super().__init__(context)
-        self._object_ids = tuple(entry.obj_id for entry in context.catalog.entries)
+        self._object_names = tuple((entry.obj_id, entry.name) for entry in context.catalog.entries)
 
     @staticmethod
     def folder_name(split: str) -> str:
@@ -78,7 +78,7 @@ class BopExporter(SceneExporter):
             height=self._cameras[0].height,
             color_suffix=self._suffix,
             coco=self._bop.coco,
-            object_ids=self._object_ids,
+            object_names=self._object_names,
         )
         return commit_scenes, (tuple((scene, self._place(scene_id)) for scene, scene_id in scenes), settings)
 

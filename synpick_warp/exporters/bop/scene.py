@@ -34,8 +34,8 @@ class SceneSettings:
     height: int
     color_suffix: str
     coco: bool
-    object_ids: tuple[int, ...]
-    """obj_id of every object of the catalog."""
+    object_names: tuple[tuple[int, str], ...]
+    """obj_id and name of every object of the catalog."""
 
 
 def create_scene_folders(scene: Path, masks: bool, layers: tuple[str, ...]) -> None:
@@ -127,7 +127,7 @@ def _format_coco(blocks: AnnotationBlocks, first: int, settings: SceneSettings) 
             "date_created": DATE,
         },
         "licenses": [{"id": 1, "name": "as of the models", "url": ""}],
-        "categories": [{"id": obj_id, "name": str(obj_id), "supercategory": "synpick"} for obj_id in settings.object_ids],
+        "categories": [{"id": obj_id, "name": name, "supercategory": "synpick"} for obj_id, name in settings.object_names],
         "images": [_coco_image(frame, settings) for frame in blocks.frames],
     }
     yield json.dumps(head)[:-1] + ', "annotations": [\n'

@@ -18,6 +18,7 @@ from synpick_warp.exporters.usd.parts import (
     add_collider,
     add_friction,
     add_mesh,
+    add_property,
     add_surface,
     make_collider,
     new_asset,
@@ -64,7 +65,7 @@ def _write_object(library: Path, physics: Physics, entry: CatalogEntry) -> None:
     stage = new_asset(name, entry.name)
     root = stage.GetDefaultPrim()
     root.SetDisplayName(entry.name)
-    root.SetCustomDataByKey("obj_id", entry.obj_id)
+    add_property(root, "obj_id", entry.obj_id)
     _add_shapes(stage, physics, entry.mesh, entry.material, write_texture(library, name, entry.material), entry.pieces)
     add_body(root, entry.mass, entry.center_of_mass, entry.inertia, kinematic=False)
     _save(library, name, stage)

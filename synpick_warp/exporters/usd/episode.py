@@ -20,7 +20,7 @@ def write_episode(spool: Path, instances: int, place: Path, metadata: EpisodeMet
         spool: File of a `TickSpool`.
         instances: Instance capacity of its rows.
         place: Final path of the episode's file; its folder also holds `assets/`.
-        metadata: Custom data of the episode.
+        metadata: Properties of the episode.
         settings: Settings common to all episodes.
     """
     from pxr import Work

@@ -26,6 +26,9 @@ TEXTURES = "textures"
 """Folder of textures in the asset library."""
 CLASS = "class"
 """Taxonomy of semantic class labels."""
+USER = "userProperties:"
+"""Namespace of custom attributes: the one that Blender imports, as custom properties."""
+_PROPERTY_TYPES = {int: Sdf.ValueTypeNames.Int, float: Sdf.ValueTypeNames.Float, str: Sdf.ValueTypeNames.String}
 _SYSTEM_REASON = re.compile(r"writing file: ([^']+)'")
 
 
@@ -74,6 +77,11 @@ def save_layer(layer: Sdf.Layer, path: Path) -> None:
 def add_label(prim: Usd.Prim, taxonomy: str, label: str) -> None:
     """Add a semantic label in one taxonomy."""
     UsdSemantics.LabelsAPI.Apply(prim, taxonomy).CreateLabelsAttr([label])
+
+
+def add_property(prim: Usd.Prim, name: str, value: int | float | str) -> None:
+    """Add a fact of ours as a custom attribute in the namespace USER."""
+    prim.CreateAttribute(f"{USER}{name}", _PROPERTY_TYPES[type(value)]).Set(value)
 
 
 def add_mesh(stage: Usd.Stage, path: str, mesh: TriangleMesh, surface: UsdShade.Material) -> UsdGeom.Mesh:

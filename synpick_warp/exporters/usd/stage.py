@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from pxr import Gf, Kind, Sdf, Usd, UsdGeom, UsdLux, UsdPhysics, UsdRender
 
-from synpick_warp.exporters.usd.parts import add_label, object_asset, set_units
+from synpick_warp.exporters.usd.parts import add_label, add_property, object_asset, set_units
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings, StageLight
 from synpick_warp.scenes.types import Camera
 
@@ -19,6 +19,10 @@ APERTURE = 0.36
 """Horizontal aperture (film width) in tenths of a metre, USD's unit for lenses: 36 mm. Only its ratio to the focal length matters."""
 CLIPPING = (0.01, 100.0)
 """Near and far clipping distance of viewers [m]."""
+AWAY = Gf.Vec3d(0.0, 0.0, -1000.0)
+"""Position of what is not in the scene [m]: beyond CLIPPING and below the table, for readers that ignore animated visibility (Blender)."""
+HOLD = 1.0 / 1024.0
+"""Time codes before a frame at which a prim leaves for AWAY or comes back, so that it is not seen on its way between two frames."""
 INSTANCE = "instance"
 """Taxonomy of instance labels, and prefix of the objects' prim names."""
 ROOT = "/Episode"
@@ -31,7 +35,7 @@ def make_episode_layer(ticks: np.ndarray, metadata: EpisodeMetadata, settings: E
 
     Args:
         ticks: One row per frame, of `spool.tick_type`.
-        metadata: Custom data of the root prim.
+        metadata: Properties of the root prim.
         settings: Settings common to all episodes.
     """
     layer = Sdf.Layer.CreateAnonymous()
@@ -70,7 +74,7 @@ def _add_root(stage: Usd.Stage, metadata: EpisodeMetadata, settings: EpisodeSett
     stage.SetTimeCodesPerSecond(settings.tick_rate)
     stage.SetFramesPerSecond(settings.tick_rate)
     for name in ("episode", "arrangement", "frames", "ending", *(("split",) if metadata.split else ())):
-        root.SetCustomDataByKey(name, getattr(metadata, name))
+        add_property(root, name, getattr(metadata, name))
     scene = UsdPhysics.Scene.Define(stage, f"{ROOT}/Physics")
     scene.CreateGravityDirectionAttr(Gf.Vec3f(0.0, 0.0, -1.0))
     scene.CreateGravityMagnitudeAttr(settings.gravity)
@@ -87,7 +91,7 @@ def _add_object(stage: Usd.Stage, ticks: np.ndarray, instance: int, settings: Ep
     shown = np.flatnonzero(visible)
     prim = _add_moving(stage, path, ticks["pose"][:, instance], visible, np.arange(shown[0], shown[-1] + 1))
     prim.SetDisplayName(settings.names[obj_id])
-    prim.SetCustomDataByKey("instance_id", instance)
+    add_property(prim, "instance_id", instance)
     add_label(prim, INSTANCE, str(instance))
     primvars = UsdGeom.PrimvarsAPI(prim)
     for name, value in (("instance_id", instance), ("obj_id", obj_id)):
@@ -98,30 +102,42 @@ def _add_object(stage: Usd.Stage, ticks: np.ndarray, instance: int, settings: Ep
 def _add_moving(stage: Usd.Stage, path: str, poses: np.ndarray, visible: np.ndarray, frames: np.ndarray) -> Usd.Prim:
     """Add a prim with time-sampled pose and visibility; one that never moves gets default values only.
 
+    While it is not in the scene it is invisible, and its samples are at AWAY.
+
     Args:
         poses: Pose at every frame of the episode (frame, 7).
         visible: Visibility at every frame (frame).
         frames: Frames at which its pose is known.
     """
     prim = UsdGeom.Xform.Define(stage, path)
-    positions, rotations = poses[frames, :3].astype(np.float64), _make_continuous(poses[frames, 3:])
-    moves = len(frames) > 1 and bool((poses[frames] != poses[frames[0]]).any())
+    rotations = _make_continuous(poses[frames, 3:])
+    leaves = not visible.all()
+    moves = leaves or bool((poses[frames] != poses[frames[0]]).any())
     translate, orient = prim.AddTranslateOp(), prim.AddOrientOp()
-    values = zip(frames.tolist(), positions.tolist(), rotations.tolist(), strict=True)
-    for frame, xyz, (x, y, z, w) in values:
-        position, rotation = Gf.Vec3d(*xyz), Gf.Quatf(w, x, y, z)
+    values = zip(frames.tolist(), rotations.tolist(), strict=True)
+    for frame, (x, y, z, w) in values:
+        rotation = Gf.Quatf(w, x, y, z)
         if frame == frames[0]:
-            translate.Set(position)
+            translate.Set(_position(poses[frame]))
             orient.Set(rotation)
         if not moves:
             break
-        translate.Set(position, frame)
+        if visible[frame]:
+            translate.Set(_position(poses[frame]), frame)
         orient.Set(rotation, frame)
     visibility = prim.CreateVisibilityAttr(_visibility(visible[0]))
     changes = np.flatnonzero(np.diff(visible.astype(int))) + 1
-    for frame in [0, *changes.tolist()] if len(changes) else []:
+    for frame in [0, *changes.tolist()] if leaves else []:
         visibility.Set(_visibility(visible[frame]), frame)
+        if frame:
+            translate.Set(_position(poses[frame - 1]) if visible[frame - 1] else AWAY, frame - HOLD)
+        if not visible[frame]:
+            translate.Set(AWAY, frame)
     return prim.GetPrim()
+
+
+def _position(pose: np.ndarray) -> Gf.Vec3d:
+    return Gf.Vec3d(*pose[:3].astype(np.float64).tolist())
 
 
 def _visibility(visible: bool) -> str:
@@ -164,15 +180,18 @@ def _add_camera(stage: Usd.Stage, index: int, camera: Camera) -> None:
 def _add_light(stage: Usd.Stage, light: StageLight, yaw: float, exposure: float) -> None:
     """Add the episode's environment map as a dome light, and its sun, if it has one, as a distant light.
 
+    The exposure compensation is part of the intensities, since Blender ignores `inputs:exposure`; the dome keeps its value as a property.
+
     Args:
         yaw: Rotation of the map about +z, counter-clockwise [rad].
         exposure: Exposure compensation relative to the automatic exposure [EV].
     """
+    intensity = light.intensity * 2.0**exposure
     dome = UsdLux.DomeLight.Define(stage, f"{ROOT}/Lights/Dome")
     dome.CreateTextureFileAttr(Sdf.AssetPath(f"./assets/{light.file}"))
     dome.CreateTextureFormatAttr(UsdLux.Tokens.latlong)
-    dome.CreateIntensityAttr(light.intensity)
-    dome.CreateExposureAttr(exposure)
+    dome.CreateIntensityAttr(intensity)
+    add_property(dome.GetPrim(), "exposure", exposure)
     dome.GetPrim().SetDisplayName(light.name)
     # A dome light has its zenith along +y and longitude 0 along +z. Rotated by 90° about x, its zenith is up and longitude 0 is -y;
     # a rotation by 90° about z brings it to +x, our azimuth 0.
@@ -185,9 +204,8 @@ def _add_light(stage: Usd.Stage, light: StageLight, yaw: float, exposure: float)
     sun.CreateAngleAttr(light.sun_angle)
     # With `normalize`, the intensity is the irradiance of a surface that faces the sun, independent of its angular diameter.
     sun.CreateNormalizeAttr(True)
-    sun.CreateIntensityAttr(light.intensity * peak)
+    sun.CreateIntensityAttr(intensity * peak)
     sun.CreateColorAttr(Gf.Vec3f(*(value / peak for value in light.sun_irradiance)))
-    sun.CreateExposureAttr(exposure)
     # A distant light shines along its -z.
     sun.AddRotateZOp().Set(float(np.degrees(yaw)) + light.sun_azimuth)
     sun.AddRotateYOp().Set(light.sun_polar)

@@ -44,7 +44,7 @@ class EpisodeSettings:
 
 @dataclass(frozen=True)
 class EpisodeMetadata:
-    """Custom data of an episode's root prim."""
+    """Properties of an episode's root prim."""
 
     episode: int
     arrangement: int

@@ -94,7 +94,7 @@ def visible_objects(stage: Usd.Stage, frame: int) -> dict[int, Usd.Prim]:
     """Prims of the visible objects, by instance_id."""
     prims = stage.GetPrimAtPath("/Episode/Objects").GetChildren()
     visible = [prim for prim in prims if UsdGeom.Imageable(prim).ComputeVisibility(frame) != UsdGeom.Tokens.invisible]
-    return {prim.GetCustomDataByKey("instance_id"): prim for prim in visible}
+    return {prim.GetAttribute("userProperties:instance_id").Get(): prim for prim in visible}
 
 
 def inside(prim: Usd.Prim, frame: int, view: np.ndarray, shape: tuple[int, int]) -> np.ndarray:

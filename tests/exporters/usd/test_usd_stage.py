@@ -13,7 +13,7 @@ from pxr import Gf, Usd, UsdGeom, UsdLux, UsdRender, UsdSemantics
 
 from synpick_warp.exporters.usd.lights import make_stage_light, separate_sun, write_light_maps
 from synpick_warp.exporters.usd.spool import TickSpool, read_ticks
-from synpick_warp.exporters.usd.stage import FIXTURES, make_episode_layer
+from synpick_warp.exporters.usd.stage import CLIPPING, FIXTURES, make_episode_layer
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.embedded.skies import skies
@@ -93,7 +93,9 @@ def test_fixture_poses_and_visibility_at_every_tick(stage, index):
     for frame, batch in enumerate(TICKS):
         visible = UsdGeom.Imageable(prim).ComputeVisibility(frame) == UsdGeom.Tokens.inherited
         assert visible == bool(batch.fixture_visible[0, index])
-        np.testing.assert_allclose(world_matrix(prim, frame), matrix(batch.fixture_pose[0, index]), atol=5e-7)
+        if visible:
+            np.testing.assert_allclose(world_matrix(prim, frame), matrix(batch.fixture_pose[0, index]), atol=5e-7)
+    np.testing.assert_allclose(world_matrix(prim, Usd.TimeCode.Default()), matrix(TICKS[0].fixture_pose[0, index]), atol=5e-7)
 
 
 def test_visibility_changes_at_the_tick_and_not_before(stage):
@@ -101,6 +103,30 @@ def test_visibility_changes_at_the_tick_and_not_before(stage):
     assert prim.ComputeVisibility(usd_sets.PICKED_FRAME - 0.01) == UsdGeom.Tokens.inherited
     assert prim.ComputeVisibility(usd_sets.PICKED_FRAME) == UsdGeom.Tokens.invisible
     assert prim.GetVisibilityAttr().GetTimeSamples() == [0.0, usd_sets.PICKED_FRAME]
+
+
+GONE = {
+    f"/Episode/Objects/instance_{usd_sets.PICKED:02d}": (0, usd_sets.PICKED_FRAME),
+    **dict.fromkeys((FIXTURES["finger"], FIXTURES["cup"]), usd_sets.GRIPPER),
+}
+"""Prims that are not always in the scene: their first frame, and the first one without them."""
+
+
+@pytest.mark.parametrize(("path", "span"), GONE.items())
+def test_what_is_not_in_the_scene_is_beyond_the_far_plane_for_readers_without_visibility(stage, path, span):
+    prim = stage.GetPrimAtPath(path)
+    for frame in range(usd_sets.FRAMES):
+        distance = np.linalg.norm(world_matrix(prim, frame)[:3, 3])
+        assert distance > 2 * CLIPPING[1] if not span[0] <= frame < span[1] else distance < CLIPPING[1]
+
+
+@pytest.mark.parametrize(("path", "span"), GONE.items())
+def test_it_leaves_and_returns_within_a_moment_before_the_frame(stage, path, span):
+    """Between two frames it stays where it was, so that nobody sees it fly past."""
+    prim = stage.GetPrimAtPath(path)
+    for frame in span:
+        if frame:
+            np.testing.assert_array_equal(world_matrix(prim, frame - 0.01)[:3, 3], world_matrix(prim, frame - 1)[:3, 3])
 
 
 def test_default_values_are_the_first_frame(stage):
@@ -122,7 +148,7 @@ def test_instances_have_all_ids_and_labels(stage):
     prims = stage.GetPrimAtPath("/Episode/Objects").GetChildren()
     assert [prim.GetName() for prim in prims] == ["instance_00", "instance_02", "instance_03"]
     for prim, instance, obj_id in zip(prims, (0, 2, 3), (3, 1, 2), strict=True):
-        assert prim.GetCustomDataByKey("instance_id") == instance
+        assert prim.GetAttribute("userProperties:instance_id").Get() == instance
         assert list(UsdSemantics.LabelsAPI(prim, "instance").GetLabelsAttr().Get()) == [str(instance)]
         primvars = UsdGeom.PrimvarsAPI(prim)
         assert [primvars.GetPrimvar(name).Get() for name in ("instance_id", "obj_id")] == [instance, obj_id]
@@ -225,7 +251,17 @@ def test_distant_lights_have_direction_angle_and_irradiance_of_the_sun(rows, azi
     assert np.radians(sun.GetAngleAttr().Get() / 2) == pytest.approx(np.arctan(separate_sun(light)[2]), rel=1e-5)
     irradiance = np.array(sun.GetColorAttr().Get()) * sun.GetIntensityAttr().Get()
     described = make_stage_light(0, light, 1.0)
-    np.testing.assert_allclose(irradiance, described.intensity * np.array(described.sun_irradiance), rtol=1e-5)
+    factor = described.intensity * 2.0**usd_sets.EXPOSURE
+    np.testing.assert_allclose(irradiance, factor * np.array(described.sun_irradiance), rtol=1e-5)
+
+
+def test_exposure_is_folded_into_the_intensity(stage):
+    """Blender ignores inputs:exposure."""
+    dome = UsdLux.DomeLight.Get(stage, "/Episode/Lights/Dome")
+    light = make_stage_light(usd_sets.LIGHT, skies()[usd_sets.LIGHT], 1.0)
+    assert dome.GetIntensityAttr().Get() == pytest.approx(light.intensity * 2.0**usd_sets.EXPOSURE)
+    assert dome.GetExposureAttr().Get() == 0.0
+    assert dome.GetPrim().GetAttribute("userProperties:exposure").Get() == usd_sets.EXPOSURE
 
 
 def test_maps_without_a_sun_have_none(stage):

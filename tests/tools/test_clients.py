@@ -1,0 +1,111 @@
+"""Table of clients: readers that agree, that disagree, that fail, that are not there. Here pycocotools alone, as everyone has it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from synpick_warp.exporters.bop.exporter import BopExporter
+from tests.harness.exporter_contract import export
+from tests.worlds.box_views import cameras, config
+from tools.clients import __main__ as tool
+from tools.clients import base, blender, coco
+
+CAMERAS = cameras(160, 120)
+FRAMES = 2
+SOURCES = base.Sources()
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    folder = export(BopExporter, tmp_path_factory.mktemp("clients") / "set", config(), (0,), 0, FRAMES, CAMERAS)
+    (folder / "episodes.jsonl").write_text(f'{{"episode": 0, "frames": {FRAMES}}}\n')
+    return folder
+
+
+def visible_masks(data: Path) -> dict[str, np.ndarray]:
+    """Masks with visible pixels of the first scene, from its files."""
+    scene = base.first_scene(data)
+    assert scene is not None
+    values = {}
+    for frame in range(FRAMES):
+        masks = np.array(
+            [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) > 0 for path in sorted((scene / "mask_visib").glob(f"{frame:06d}_*"))]
+        )
+        values[f"mask_visib {frame}"] = masks[masks.any(axis=(1, 2))]
+    return values
+
+
+@pytest.fixture
+def opened(data, monkeypatch) -> dict[str, np.ndarray]:
+    """The clients' data set, opened; what is in memory can be changed."""
+    memory = visible_masks(data)
+    monkeypatch.setattr(tool.synpick_warp, "open", lambda folder: {0: None})
+    monkeypatch.setattr(coco, "expect", lambda data_set: memory)
+    return memory
+
+
+def test_a_client_that_agrees(data, opened, tmp_path, capsys):
+    assert tool.main([str(data), "--clients", "coco,xarray_store", "--json", str(tmp_path / "table.json")]) == 0
+    first, second = json.loads((tmp_path / "table.json").read_text())
+    assert first["version"].startswith("pycocotools 2")
+    assert first["agreement"] == f"{FRAMES} values equal"
+    assert second["agreement"] == tool.NO_FORMAT
+    assert "pycocotools" in capsys.readouterr().out
+
+
+def test_a_client_that_disagrees(data, opened, capsys):
+    opened["mask_visib 1"] = ~opened["mask_visib 1"]
+    assert tool.main([str(data), "--clients", "coco"]) == 1
+    assert "DIFFERS" in capsys.readouterr().out
+
+
+def test_a_client_that_fails(tmp_path):
+    broken = tmp_path / "train_pbr" / "000000"
+    broken.mkdir(parents=True)
+    (broken / "scene_camera.json").write_text("{}")
+    (tmp_path / "episodes.jsonl").write_text('{"episode": 0, "frames": 1}\n')
+    (broken / "scene_gt_coco.json").write_text("{")
+    result = tool.run_client("coco", sys.executable, tmp_path, {}, SOURCES)
+    assert (result.agreement, result.holds) == ("FAILED", False)
+    assert result.remarks.startswith("json.decoder.JSONDecodeError")
+
+
+@pytest.mark.parametrize("name", ["bop_toolkit", "coco"])
+def test_a_client_that_is_not_installed_is_no_error(data, opened, name):
+    python = sys.executable if name == "bop_toolkit" else str(data / "no-python")
+    result = tool.run_client(name, python, data, {}, SOURCES)
+    assert (result.agreement, result.holds) == (tool.NOT_INSTALLED, True)
+
+
+@pytest.mark.parametrize("arguments", [(), ("--python", "coco"), ("--python", "word=python3")])
+def test_bad_input_is_one_line(tmp_path, capsys, arguments):
+    assert tool.main([str(tmp_path), *arguments]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_values_are_compared_by_difference_and_pictures_by_psnr():
+    ramp = np.linspace(0.0, 1.0, 300).reshape(10, 10, 3)
+    assert tool.difference(np.array([1.0, np.nan]), np.array([1.5, np.nan])) == 0.5
+    assert tool.difference(np.array([1.0, np.nan]), np.array([1.0, 2.0])) == np.inf
+    assert tool.difference(ramp, ramp[1:]) == np.inf
+    assert tool.psnr(ramp, ramp + 0.1) == pytest.approx(20.0)
+    assert tool.compare(base, {"picture 0": ramp + 0.1}, {"picture 0": ramp}) == ("DIFFERS: picture 0", False)
+    assert tool.compare(base, {"a": ramp}, {"b": ramp})[1] is False
+
+
+def test_blenders_light_goes_through_our_tone_curve():
+    """Linear to sRGB up to 0.6; continuous there; below 1 for any light."""
+    developed = blender.develop("picture", np.array([0.0, 0.18, 0.6, 0.6001, 100.0]))
+    np.testing.assert_allclose(developed[:4], [0.0, 0.4614, 0.7977, 0.7978], atol=1e-4)
+    assert 0.99 < developed[4] <= 1.0
+
+
+@pytest.mark.parametrize(("count", "frames"), [(1, [0]), (2, [0, 1]), (221, [0, 110, 220])])
+def test_sampled_frames_are_spread_evenly(count, frames):
+    assert base.sample_frames(count) == frames

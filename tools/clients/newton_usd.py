@@ -1,0 +1,43 @@
+"""Newton: an episode's USD file as bodies of a model, by `ModelBuilder.add_usd`."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tools.clients.base import Reading, Sources, first_episode, pose_matrix
+
+PACKAGES = ("newton", "newton-usd-schemas", "usd-core")
+BOUNDS = {"object_to_world": 1e-6}
+"""Rounding of poses to 32 bits there, of matrices in millimetres here [m]."""
+
+
+def find(data: Path, sources: Sources) -> Path | None:
+    """USD file of the first episode."""
+    file = data / "usd" / f"{first_episode(data)['episode']:06d}.usdc"
+    return file if file.is_file() else None
+
+
+def read(place: Path, data: Path, sources: Sources) -> Reading:
+    """Poses of the objects that are in the first frame, by instance_id."""
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")
+        import newton
+
+        builder = newton.ModelBuilder()
+        builder.add_usd(str(place))
+    poses = {label: pose for label, pose in zip(builder.body_label, builder.body_q, strict=True) if "/Objects/" in label}
+    values = {"instance_id": np.array(sorted(int(label.rpartition("_")[2]) for label in poses))}
+    values["object_to_world"] = np.array([pose_matrix(np.array(poses[label])) for label in sorted(poses)])
+    return Reading(f"{place.parent.name}/{place.name}: {builder.body_count} bodies, {builder.shape_count} shapes", values)
+
+
+def expect(data_set: Any) -> dict[str, np.ndarray]:
+    """Objects of the first frame; all are in the scene at first."""
+    view = data_set[min(data_set)].view(0)
+    return {"instance_id": view.instance_ids, "object_to_world": view.object_to_world}
