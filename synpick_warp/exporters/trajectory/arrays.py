@@ -19,12 +19,12 @@ FORMAT = 1
 """Version of the store's layout."""
 
 LABELS = {
-    "pose": ("x", "y", "z", "qx", "qy", "qz", "qw"),
+    "component": ("x", "y", "z", "qx", "qy", "qz", "qw"),
     "axis": ("x", "y", "z"),
     "fixture": ("tote", "finger", "cup"),
     "link": ("finger", "cup"),
 }
-"""Dimensions with named indices."""
+"""Dimensions with named indices. No dimension has the name of an array: xarray takes such an array for the dimension's coordinate."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ TICKS = GroupSpec(
     {
         "time": ArraySpec(("tick",), "<f8", "s", "Simulated time since the episode's first frame."),
         "object_id": ArraySpec(("tick", "instance"), "<i4", "1", "obj_id of the instance; -1: it is not in the scene."),
-        "pose": ArraySpec(("tick", "instance", "pose"), "<f4", "m", f"Object to world: {_POSE}{_GONE}"),
-        "fixture_pose": ArraySpec(("tick", "fixture", "pose"), "<f4", "m", f"Tote, finger and cup to world: {_POSE}"),
+        "pose": ArraySpec(("tick", "instance", "component"), "<f4", "m", f"Object to world: {_POSE}{_GONE}"),
+        "fixture_pose": ArraySpec(("tick", "fixture", "component"), "<f4", "m", f"Tote, finger and cup to world: {_POSE}"),
         "fixture_visible": ArraySpec(("tick", "fixture"), "|b1", "1", "Whether it is in the pictures."),
         "phase": ArraySpec(("tick",), "<i4", "1", "What the episode is at.", names(Phase)),
         "task": ArraySpec(("tick",), "<i4", "1", "What the gripper is at when the frame is taken.", names(Task)),
@@ -84,7 +84,7 @@ STEPS = GroupSpec(
     "state that the frame shows, but for what is put elsewhere after it: a gripper that appears or goes home, objects that leave.",
     {
         "time": ArraySpec(("step",), "<f8", "s", "Simulated time at the step's end since the episode's first frame."),
-        "pose": ArraySpec(("step", "instance", "pose"), "<f4", "m", f"Object to world at the step's end: {_POSE}{_GONE}"),
+        "pose": ArraySpec(("step", "instance", "component"), "<f4", "m", f"Object to world at the step's end: {_POSE}{_GONE}"),
         "velocity": ArraySpec(("step", "instance", "axis"), "<f4", "m/s", f"{_COM}{_GONE}"),
         "angular_velocity": ArraySpec(("step", "instance", "axis"), "<f4", "rad/s", f"{_SPIN}{_GONE}"),
         "contact_force": ArraySpec(("step", "instance", "axis"), "<f4", "N", f"{_CONTACT}{_GONE}"),
@@ -93,7 +93,7 @@ STEPS = GroupSpec(
             ("step", "instance"), "<f4", "N", f"Tension and shear that the instance's seal bore; 0: none holds it.{_GONE}"
         ),
         "attached": ArraySpec(("step", "instance"), "|b1", "1", "Whether a seal holds the instance at the step's end."),
-        "gripper_pose": ArraySpec(("step", "link", "pose"), "<f4", "m", f"Finger and cup to world at the step's end: {_POSE}"),
+        "gripper_pose": ArraySpec(("step", "link", "component"), "<f4", "m", f"Finger and cup to world at the step's end: {_POSE}"),
         "gripper_velocity": ArraySpec(("step", "link", "axis"), "<f4", "m/s", _COM),
         "gripper_angular_velocity": ArraySpec(("step", "link", "axis"), "<f4", "rad/s", _SPIN),
         "gripper_contact_force": ArraySpec(("step", "link", "axis"), "<f4", "N", _CONTACT),
@@ -112,7 +112,7 @@ ARRANGEMENT = GroupSpec(
     {
         "object_id": ArraySpec(("instance",), "<i4", "1", "obj_id of the instance; -1: there is none with this index."),
         "mass": ArraySpec(("instance",), "<f8", "kg", "Its mass."),
-        "drop_pose": ArraySpec(("instance", "pose"), "<f4", "m", f"Object to world where it began to fall: {_POSE}"),
+        "drop_pose": ArraySpec(("instance", "component"), "<f4", "m", f"Object to world where it began to fall: {_POSE}"),
     },
 )
 _UNSEEN = "nothing was seen"

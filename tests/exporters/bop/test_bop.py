@@ -69,6 +69,7 @@ def split(dataset) -> Path:
 
 def test_folder_tree_is_exactly_bops(dataset, split):
     assert {path.name for path in dataset.iterdir()} == {
+        "bop_dataset_params.py",
         "camera.json",
         "dataset_info.md",
         "models",
@@ -163,7 +164,7 @@ def test_views_cover_clipped_and_occluded_objects(split):
 def test_coco_masks_and_boxes(split):
     for scene in split.iterdir():
         coco = load(scene / "scene_gt_coco.json")
-        assert coco["categories"] == [{"id": obj_id, "name": str(obj_id), "supercategory": "synpick"} for obj_id in SIZES]
+        assert coco["categories"] == [{"id": obj_id, "name": f"box {obj_id}", "supercategory": "synpick"} for obj_id in SIZES]
         assert [image["file_name"] for image in coco["images"]] == [f"rgb/{frame:06d}.jpg" for frame in range(FRAMES)]
         assert [annotation["id"] for annotation in coco["annotations"]] == list(range(1, len(coco["annotations"]) + 1))
         expected = []
@@ -287,7 +288,7 @@ def omit_a_frame(out: Path) -> None:
 
 
 def test_annotation_blocks_are_sorted_and_checked_for_completeness(tmp_path):
-    settings = SceneSettings("train_pbr", 3, 4, 3, ".jpg", True, (5,))
+    settings = SceneSettings("train_pbr", 3, 4, 3, ".jpg", True, categories=())
     for frames in ((2, 0, 1), (2, 0, 1, 0), (2, 0)):
         scene, place = tmp_path / "hidden", tmp_path / "-".join(map(str, frames))
         create_scene_folders(scene, True, ())
