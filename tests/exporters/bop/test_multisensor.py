@@ -69,5 +69,5 @@ def test_it_opens_by_episode(folders):
 
 
 def test_validation_finds_the_same_in_both_layouts(folders):
-    multi, classic = ({found.rule for found in validate(folder, Options(images=False, poses=0), Summary())} for folder in folders)
+    multi, classic = ({found.rule for found in validate(folder, Options(sample=0, images=False), Summary())} for folder in folders)
     assert multi <= classic
