@@ -151,7 +151,8 @@ cp -r /path/to/this/folder $BOP_PATH/synpick
 cd bop_toolkit
 echo "import runpy; runpy.run_path('$BOP_PATH/synpick/{PARAMS_FILE}')" >> bop_toolkit_lib/dataset_params.py
 sed -i 's/"vsd_deltas": {{/&"synpick": 15, /' scripts/eval_bop19_pose.py scripts/eval_calc_errors.py
-export PYOPENGL_PLATFORM=egl VISPY_GL_LIB=libGLESv2.so.2     # without a display; PYOPENGL_PLATFORM=osmesa also without a GPU's EGL
+unset DISPLAY; export PYOPENGL_PLATFORM=egl                 # without a display
+export EGL_PLATFORM=surfaceless                             # and without a GPU: Mesa's EGL on the CPU
 python scripts/calc_gt_coco.py {options}
 python scripts/eval_bop24_pose.py --renderer_type=vispy --result_filenames=METHOD_synpick-{ending}.csv
 ```

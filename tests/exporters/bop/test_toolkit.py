@@ -67,7 +67,7 @@ def test_models_cameras_and_other_data_sets(toolkit, tmp_path):
     with pytest.raises(ValueError, match="synpick has no split test; splits: train_pbr"):
         toolkit.get_split_params(str(tmp_path), "synpick", "test")
     notes = (folder / "dataset_info.md").read_text()
-    for text in ("run_path('$BOP_PATH/synpick/bop_dataset_params.py')", "METHOD_synpick-train-pbr.csv", "on a copy", "PYOPENGL_PLATFORM"):
+    for text in ("run_path('$BOP_PATH/synpick/bop_dataset_params.py')", "METHOD_synpick-train-pbr.csv", "on a copy", "EGL_PLATFORM"):
         assert text in notes
     shutil.move(folder, tmp_path / "my-set")
     with pytest.raises(ValueError, match="rename"):
