@@ -26,6 +26,10 @@ RENDER_MODES = (FAST, REFERENCE)
 """Colour renderers."""
 LAYERS = tuple(LAYER_TABLE)
 """Annotation layers (AOVs) that a view can have besides colour, depth and masks; see `synpick_warp.layers`."""
+CLASSIC = "classic"
+MULTISENSOR = "multisensor"
+LAYOUTS = (CLASSIC, MULTISENSOR)
+"""Layouts of scene folders: BOP's classic one, and that of BOP-Industrial 2025."""
 FORMATS = ("bop", "shards", "usd", "zarr", "lerobot", "coco")
 """Output formats."""
 
@@ -284,6 +288,20 @@ class Bop:
     depth_scale: float = setting(0.1, "mm", "Depth of one count in 16-bit depth images; 0.1 mm reaches 6.5 m.", above=0.0)
     masks: bool = setting(True, "", "Write mask/ (amodal) and mask_visib/ (visible): one file per instance and view.")
     coco: bool = setting(True, "", "Write COCO annotations (scene_gt_coco.json).")
+    layout: str = setting(
+        CLASSIC,
+        "",
+        "Scene folders: classic (a scene per episode and camera) or multisensor (a scene per episode, with rgb_cam0/, scene_gt_cam0.json "
+        "and so on for each camera, as BOP-Industrial 2025); shards are always classic.",
+        choices=LAYOUTS,
+    )
+    keypoints: int = setting(
+        0,
+        "",
+        "Keypoints of each object in COCO annotations: points of its surface far from each other (8: as PVNet); 0: none.",
+        low=0,
+        high=64,
+    )
     target_visibility: float = setting(
         0.1, "", "Minimum visible fraction of an instance listed in test_targets_bop19.json.", low=0.0, high=1.0
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from synpick_warp.configs.check import format_value, suggest
-from synpick_warp.configs.schema import Config, Split
+from synpick_warp.configs.schema import MULTISENSOR, Config, Split
 from synpick_warp.errors import ConfigError
 
 
@@ -72,6 +72,23 @@ def bop_folder(config: Config, episode: int) -> str:
     """Name of the folder of an episode's BOP scenes."""
     split = split_of(config, episode)
     return config.bop.split if split is None else split.folder
+
+
+def bop_scene(config: Config, episode: int, camera: int) -> tuple[int, str]:
+    """Scene id of a camera's images of an episode, and the suffix of their files: empty, or that of the sensor, such as "_cam1"."""
+    if config.bop.layout == MULTISENSOR:
+        return episode, f"_{sensor_name(camera)}"
+    return len(config.cameras.positions) * episode + camera, ""
+
+
+def scene_episode(config: Config, scene: int) -> int:
+    """Episode of a BOP scene."""
+    return scene if config.bop.layout == MULTISENSOR else scene // len(config.cameras.positions)
+
+
+def sensor_name(camera: int) -> str:
+    """Name of a camera among the sensors of a scene."""
+    return f"cam{camera}"
 
 
 def bop_folders(config: Config) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import subprocess
@@ -37,12 +38,14 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def environment(folder) -> dict[str, str]:
-    """The package importable from anywhere, and a command `synpick-warp` that runs it."""
+    """The package importable from anywhere, a stand-in for PyTorch where it is missing, and a command `synpick-warp`."""
     command = folder / "bin" / "synpick-warp"
     command.parent.mkdir()
     command.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m synpick_warp "$@"\n')
     command.chmod(0o755)
-    return checkout_environment(PATH=f"{command.parent}:{os.environ['PATH']}")
+    stubs = [] if importlib.util.find_spec("torch") else [str(ROOT / "tests" / "stubs")]
+    paths = os.pathsep.join([*stubs, *filter(None, [os.environ.get("PYTHONPATH")])])
+    return checkout_environment(PYTHONPATH=os.pathsep.join([str(ROOT), paths]), PATH=f"{command.parent}:{os.environ['PATH']}")
 
 
 def test_the_lines_of_the_readme_run_as_written(folder, environment):

@@ -12,7 +12,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import ClassVar
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import CLASSIC, MULTISENSOR, Config
 from synpick_warp.configs.splits import bop_folder
 from synpick_warp.conversion.scenes import SceneContent, SceneSource, place_shards, write_coco, write_scene, write_shards, write_video_group
 from synpick_warp.conversion.source import Source, SourceEpisode
@@ -163,7 +163,10 @@ class BopConverter(_SceneConverter):
         super().__init__(source, out, config, pool)
         if config.bop.coco and not config.bop.masks:
             raise DatasetError(f"{source.folder} has no masks, which bop.coco needs; bake it with bop.masks = true")
-        self._object_names = tuple(sorted(_read_names(source).items()))
+        if config.bop.layout != CLASSIC or config.bop.keypoints:
+            raise DatasetError(f'{source.folder} has bop.layout = "{MULTISENSOR}" or bop.keypoints, which only a bake can write')
+        names = sorted(_read_names(source).items())
+        self._categories = tuple({"id": obj_id, "name": name, "supercategory": "synpick"} for obj_id, name in names)
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
@@ -175,7 +178,7 @@ class BopConverter(_SceneConverter):
         folder, split = self.stage("bop", episode), self.folder(episode.end.episode)
         width, height = self.config.cameras.resolution
         suffix = f".{self.config.bop.color_format}"
-        settings = SceneSettings(split.name, episode.frames, width, height, suffix, self.config.bop.coco, self._object_names)
+        settings = SceneSettings(split.name, episode.frames, width, height, suffix, self.config.bop.coco, categories=self._categories)
         scenes = episode.scenes()
         moves = tuple((folder / f"{scene.scene:06d}", split / f"{scene.scene:06d}") for scene in scenes)
         tasks = [(write_scene, (scene, self.content, move[0]), move[1]) for scene, move in zip(scenes, moves, strict=True)]

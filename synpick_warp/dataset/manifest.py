@@ -61,6 +61,8 @@ FREE_SETTINGS = (
 )
 """Settings that may differ when a bake is resumed: no episode depends on them. Objects and lights are compared by content, not by the name
 of their folder. A device of another type computes the same episodes up to rounding."""
+YOUNGER_SETTINGS = ("bop.layout", "bop.keypoints")
+"""Settings that older manifests lack: left out where they have their defaults, so that older data sets can still be resumed."""
 PACKAGES = ("warp-lang", "newton", "numpy", "scipy", "coacd", "opencv-python-headless", "isal", "orjson", "usd-core", "zarr")
 """Packages whose versions the output depends on."""
 FORMAT_PACKAGES = {"lerobot": ("av", "pyarrow")}
@@ -93,11 +95,19 @@ def make_manifest(config: Config) -> dict[str, Any]:
 
 
 def fixed_settings(config: Config) -> dict[str, Any]:
-    """Settings that determine the output: all but FREE_SETTINGS and the splits' numbers of episodes, nested; formats sorted by name."""
+    """Settings that determine the output: all but FREE_SETTINGS, defaults of YOUNGER_SETTINGS and the splits' numbers of episodes.
+
+    Nested; formats sorted by name.
+    """
     settings = dataclasses.asdict(config)
     for key in FREE_SETTINGS:
         section, name = key.split(".")
         del settings[section][name]
+    defaults = dataclasses.asdict(Config())
+    for key in YOUNGER_SETTINGS:
+        section, name = key.split(".")
+        if settings[section][name] == defaults[section][name]:
+            del settings[section][name]
     settings["bake"]["formats"] = sorted(set(config.bake.formats))
     for split in settings["splits"]:
         del split["episodes"]

@@ -3,6 +3,8 @@
     data = synpick_warp.open("DATA")
     view = data[0].view(frame=12, camera=1)
     view.rgb, view.depth, view.masks, view.object_to_camera
+    track = data[0].tracks[view.instance_ids[0]]
+    track.object_to_world, track.visibility, track.boxes
 
 Views come from BOP folders (format bop) or webdataset shards (format shards), arrays by name from the zarr store (format zarr). Reading
 needs no simulator; zarr, NumPy and OpenCV are imported when arrays or images are read.
@@ -10,15 +12,16 @@ needs no simulator; zarr, NumPy and OpenCV are imported when arrays or images ar
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from synpick_warp.configs.check import format_value
-from synpick_warp.configs.splits import bop_folder, bop_folders, episode_range, plan_episodes
+from synpick_warp.configs.splits import episode_range, plan_episodes
 from synpick_warp.dataset.annotations import ADVICE, EpisodeEntry, EpisodeRow, Key, ModelInfo, check_content, read_checked
 from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIFEST_FILE, episode_entry, read_checksums
+from synpick_warp.dataset.scene_index import SceneIndex, numbered
 from synpick_warp.dataset.trajectory import (
     GROUP_FILE,
     Arrays,
@@ -38,6 +41,7 @@ from synpick_warp.inputs.paths import path_inside
 
 if TYPE_CHECKING:
     from synpick_warp.configs.schema import Config
+    from synpick_warp.dataset.tracks import Track, Tracks
     from synpick_warp.dataset.view import View
     from synpick_warp.dataset.view_files import SceneFiles
 
@@ -137,6 +141,17 @@ class Episode:
         lines = read_array(self.attempt_arrays["record"]).tobytes().splitlines()
         source = self._group / "attempts" / "record"
         return tuple(decode_json(line, dict[str, Any], f"{source}, line {row},", DatasetError, ADVICE) for row, line in enumerate(lines, 1))
+
+    @cached_property
+    def tracks(self) -> Tracks:
+        """Every instance over cameras and time: poses, visibility and boxes as arrays, by instance id.
+
+        Raises:
+            DatasetError: The data set has no images.
+        """
+        from synpick_warp.dataset.tracks import Tracks
+
+        return Tracks(self.views(), self._data_set.camera_count, len(self))
 
     @property
     def usd(self) -> Path:
@@ -272,6 +287,11 @@ class DataSet(Mapping[int, Episode]):
         """Pick attempts of all episodes, in order."""
         return (attempt for episode in self.values() for attempt in episode.attempts)
 
+    @property
+    def tracks(self) -> Iterator[tuple[Episode, Track]]:
+        """Tracks of all instances of all episodes, in order; one episode at a time is in memory."""
+        return ((episode, track) for episode in self.values() for track in episode.tracks.values())
+
     def views(self, camera: int | None = None) -> Iterator[View]:
         """Iterate over the views of all episodes, of one camera or of all."""
         for episode in self.values():
@@ -312,12 +332,9 @@ class DataSet(Mapping[int, Episode]):
         return sum(len(each) for each in plan_episodes(self.config) if self._only in (None, each))
 
     @cached_property
-    def _folders(self) -> dict[str, tuple[Path, Path]]:
-        """BOP name of each split -> folders of its scenes and of its webdataset shards, which need not exist; none without settings."""
-        if not (self.folder / CONFIG_FILE).exists():
-            return {}
-        places = {name: path_inside(self.folder, name, self.folder / CONFIG_FILE, DatasetError) for name in bop_folders(self.config)}
-        return {name: (place, place.with_name(f"{place.name}_web")) for name, place in places.items()}
+    def _scenes(self) -> SceneIndex | None:
+        """Where scenes are; None without settings."""
+        return SceneIndex(self.folder, self.config) if (self.folder / CONFIG_FILE).exists() else None
 
     def scene_files(self, episode: int, camera: int) -> SceneFiles:
         """Files of the scene that a camera recorded in an episode: its folder, or else its shards.
@@ -325,36 +342,23 @@ class DataSet(Mapping[int, Episode]):
         Raises:
             DatasetError: The data set has no images.
         """
-        from synpick_warp.dataset.view_files import SceneFolder, SceneShards
-        from synpick_warp.exporters.bop.shard_parts import find_shards
-
-        scene = self.camera_count * episode + camera
-        size = self.config.cameras.resolution
-        folder, web = self._folders[bop_folder(self.config, episode)]
-        if (folder / f"{scene:06d}").is_dir():
-            return SceneFolder(folder / f"{scene:06d}", size)
-        if shards := list(find_shards(scene, web)):
-            return SceneShards(shards, scene, size)
-        raise DatasetError(f"{self.folder} has no images of episode {episode}; bake with --formats bop or shards")
+        return SceneIndex(self.folder, self.config).files(episode, camera) if self._scenes is None else self._scenes.files(episode, camera)
 
     def _has_files(self, index: int) -> bool:
         """Whether an episode has files in some format."""
         name, folder = f"{index:06d}", self.folder
         paths = [self._store / EPISODES / name / GROUP_FILE, folder / USD / f"{name}.usdc", folder / LEROBOT_PARTS / f"{name}.json"]
-        if self._folders:
-            scene = self.camera_count * index
-            split, web = self._folders[bop_folder(self.config, index)]
-            paths += [split / f"{scene:06d}", web / f"shard-{scene:06d}.tar", folder / COCO_PARTS / f"{scene:06d}.jsonl"]
-        return any(path.exists() for path in paths)
+        if self._scenes is not None:
+            paths.append(folder / COCO_PARTS / f"{self.camera_count * index:06d}.jsonl")
+        return any(path.exists() for path in paths) or (self._scenes is not None and self._scenes.has(index))
 
     def _names(self) -> Iterator[int]:
         """Indices of the episodes that have files in some format; an index can occur several times."""
         episodes = ((self._store / EPISODES, "[0-9]*"), (self.folder / USD, "[0-9]*.usdc"), (self.folder / LEROBOT_PARTS, "[0-9]*.json"))
-        yield from (index for folder, pattern in episodes for index in _indices(folder.glob(pattern)))
-        scenes = [(self.folder / COCO_PARTS, "[0-9]*.jsonl")]
-        for folder, web in self._folders.values():
-            scenes += [(folder, "[0-9]*"), (web, "shard-??????.tar")]
-        yield from (scene // self.camera_count for folder, pattern in scenes for scene in _indices(folder.glob(pattern)))
+        yield from (index for folder, pattern in episodes for index in numbered(folder.glob(pattern)))
+        if self._scenes is not None:
+            yield from self._scenes.episodes()
+            yield from (scene // self.camera_count for scene in numbered((self.folder / COCO_PARTS).glob("[0-9]*.jsonl")))
 
     def _is_committed(self, index: int) -> bool:
         """Whether an episode is one of these and has its manifest entry; without manifest, as in a lone store, there is none to check."""
@@ -375,14 +379,6 @@ class DataSet(Mapping[int, Episode]):
 
     def __repr__(self) -> str:
         return f"DataSet({str(self.folder)!r}, {len(self)} episodes)"
-
-
-def _indices(paths: Iterable[Path]) -> Iterator[int]:
-    """Indices in file names such as 000012 and shard-000012.tar; other names, such as those of notes, are passed over."""
-    for path in paths:
-        name = path.stem.removeprefix("shard-")
-        if name.isascii() and name.isdecimal() and f"{int(name):06d}" == name:
-            yield int(name)
 
 
 def open_data_set(folder: Path | str) -> DataSet:

@@ -68,22 +68,31 @@ class SceneFiles(Protocol):
 class SceneFolder:
     """`SceneFiles` of a BOP "scenewise" folder: one file per image and mask."""
 
-    def __init__(self, folder: Path, size: tuple[int, int] | None = None) -> None:
+    def __init__(self, folder: Path, size: tuple[int, int] | None = None, suffix: str = "") -> None:
         """
         Args:
             folder: Scene folder, such as DATA/train_pbr/000000.
             size: Width and height of the camera's images [px]; None: not checked.
+            suffix: Suffix of the files of one sensor, such as "_cam1"; empty: the classic layout.
         """
-        self.folder, self.size = folder, size
+        self.folder, self.size, self.suffix = folder, size, suffix
 
     @property
     def place(self) -> Path:
         """See `SceneFiles`."""
         return self.folder
 
+    def images(self, name: str) -> Path:
+        """Folder of one kind of images, such as "rgb"."""
+        return self.folder / f"{name}{self.suffix}"
+
+    def annotations(self, name: str) -> Path:
+        """Annotation file: "camera", "gt" or "gt_info"."""
+        return self.folder / f"scene_{name}{self.suffix}.json"
+
     @cached_property
     def _records(self) -> list[dict[int, Any]]:
-        return [read_checked(self.folder / f"scene_{name}.json", SCENE_SCHEMAS[name]) for name in RECORD_NAMES]
+        return [read_checked(self.annotations(name), SCENE_SCHEMAS[name]) for name in RECORD_NAMES]
 
     def records(self, frame: int) -> ViewRecords:
         """See `SceneFiles`."""
@@ -91,7 +100,7 @@ class SceneFolder:
 
     def image(self, name: str, frame: int) -> np.ndarray:
         """See `SceneFiles`."""
-        return read_image(self.folder / name, f"{frame:06d}", size=self.size)
+        return read_image(self.images(name), f"{frame:06d}", size=self.size)
 
     def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
         """See `SceneFiles`."""
@@ -104,18 +113,19 @@ class SceneFolder:
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
         """See `SceneFiles`."""
-        if not (self.folder / name).is_dir():
-            raise DatasetError(f"{self.folder} has no {name}; bake with bop.masks = true")
+        if not self.images(name).is_dir():
+            raise DatasetError(f"{self.folder} has no {name}{self.suffix}; bake with bop.masks = true")
         return [self.mask(name, frame, index) for index in range(count)]
 
     def mask(self, name: str, frame: int, index: int) -> np.ndarray:
         """One of `masks`."""
         stem = f"{frame:06d}_{index:06d}"
-        return check_planes(read_image(self.folder / name, stem, size=self.size), None, f"{self.folder / name / stem}.png") > 0
+        return check_planes(read_image(self.images(name), stem, size=self.size), None, f"{self.images(name) / stem}.png") > 0
 
     def layers(self) -> set[str]:
         """See `SceneFiles`."""
-        return {path.name for path in self.folder.iterdir() if path.is_dir()} - {"rgb", "depth", "mask", "mask_visib"}
+        names = {path.name for path in self.folder.iterdir() if path.is_dir() and path.name.endswith(self.suffix)}
+        return {name.removesuffix(self.suffix) for name in names} - {"rgb", "depth", "mask", "mask_visib"}
 
 
 class SceneShards:

@@ -117,9 +117,9 @@ def paint_label(scene: Scene, step: int, label: np.ndarray) -> None:
     shown = np.flatnonzero((scene.index[step] != ABSENT) & (scene.boxes[step, :, 2] >= 0))
     frame = scene.plan.frames[step]
     if isinstance(scene.files, SceneFolder):
-        folder = f"{scene.files.folder}{os.sep}mask_visib"
+        folder = str(scene.files.images("mask_visib"))
         if not os.path.isdir(folder):
-            raise DatasetError(f"{scene.files.folder} has no mask_visib; bake with bop.masks = true")
+            raise DatasetError(f"{scene.files.folder} has no {os.path.basename(folder)}; bake with bop.masks = true")
         for slot in shown.tolist():
             rows, columns = _crop(scene.boxes[step, slot], scene.size)
             index = int(scene.index[step, slot])

@@ -88,7 +88,7 @@ class Partial:
 
     def _add_depth(self, scene: SceneTruth, frame: int) -> None:
         """Count a depth image; a scene folder without depth has none."""
-        if isinstance(scene.files, SceneFolder) and not (scene.files.folder / "depth").is_dir():
+        if isinstance(scene.files, SceneFolder) and not scene.files.images("depth").is_dir():
             return
         image = check_planes(scene.files.image("depth", frame), None, f"{scene.files.place}, depth of image {frame},", np.uint16.__name__)
         self.depth.add_image(image, float(scene.depth_scale[frame]))

@@ -80,7 +80,7 @@ def _read_folder(files: SceneFolder, frames: int) -> _Parts:
     schemas = {"camera": LitCameraEntry, "gt": list[TruthEntry], "gt_info": list[InfoEntry]}
     parts = []
     for name, schema in schemas.items():
-        path = files.folder / f"scene_{name}.json"
+        path = files.annotations(name)
         content = read_json(path, dict[Key, schema], DatasetError, ADVICE)  # type: ignore[valid-type]
         if content.keys() != set(range(frames)):
             raise DatasetError(f"{path} does not have the images 0 to {frames - 1} of its episode; {ADVICE}")

@@ -14,7 +14,7 @@ import numpy as np
 
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import bop_folder
+from synpick_warp.configs.splits import bop_folder, bop_scene
 from synpick_warp.dataset.annotations import SCENE_SCHEMAS, read_checked
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.dataset.view_files import read_image
@@ -95,14 +95,15 @@ def write_explanation(dataset: Path, out: Path, episode: int, attempt: int | Non
 
 def _read_scene(dataset: Path, config: Config, attempt: Attempt) -> _Scene:
     split = path_inside(dataset, bop_folder(config, attempt.episode), dataset / "config.toml", DatasetError)
-    scene = split / f"{len(config.cameras.positions) * attempt.episode:06d}"
+    index, suffix = bop_scene(config, attempt.episode, 0)
+    scene = split / f"{index:06d}"
     stem = f"{attempt.frame:06d}"
-    truth = read_checked(scene / "scene_gt.json", SCENE_SCHEMAS["gt"]).get(attempt.frame)
+    truth = read_checked(scene / f"scene_gt{suffix}.json", SCENE_SCHEMAS["gt"]).get(attempt.frame)
     if truth is None:
-        raise DatasetError(f"{scene}/scene_gt.json has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
-    color = read_image(scene / "rgb", stem, cv2.IMREAD_COLOR, config.cameras.resolution)
+        raise DatasetError(f"{scene}/scene_gt{suffix}.json has no image {attempt.frame}, which {dataset}/attempts.jsonl names")
+    color = read_image(scene / f"rgb{suffix}", stem, cv2.IMREAD_COLOR, config.cameras.resolution)
     masks = None
-    folder = scene / "mask_visib"
+    folder = scene / f"mask_visib{suffix}"
     if folder.is_dir():
         seen = attempt.objects
         masks = {

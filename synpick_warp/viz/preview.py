@@ -118,6 +118,8 @@ def find_scenes(dataset: Path) -> list[Path]:
     if not dataset.is_dir():
         raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
     scenes = sorted(path.parent for path in dataset.glob("*/*/scene_camera.json") if path.parent.name.isdecimal())
+    if not scenes and any(dataset.glob("*/*/scene_camera_*.json")):
+        raise DatasetError(f"{dataset} has scenes of several sensors, which are not drawn; synpick_warp.open reads them")
     if not scenes:
         raise DatasetError(f"{dataset} has no complete scene; a BOP data set has folders such as train_pbr/000000 with a scene_camera.json")
     return scenes

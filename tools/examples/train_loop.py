@@ -9,16 +9,15 @@ a `DataLoader` with `batch_size=None`.
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-import cv2
 import numpy as np
 import webdataset
 
 import synpick_warp
-from synpick_warp.dataset.view_files import decode_run_lengths
+from synpick_warp.webdataset import decode_view
 
 SETTINGS = {"bake.episodes": 1, "bake.worlds": 1, "bake.formats": ["shards"]}
 BATCH_SIZE = 8
@@ -26,21 +25,19 @@ EPOCHS = 3
 LEARNING_RATE = 0.5
 
 
-def decode(sample: dict[str, bytes]) -> dict[str, np.ndarray]:
+def prepare(sample: dict[str, Any]) -> dict[str, np.ndarray]:
     """One view: image (H, W, 3) float32 from 0 to 1, depth (H, W) float32 [m], foreground (H, W) bool."""
-    color = sample.get("rgb.png") or sample["rgb.jpg"]
-    image = cv2.imdecode(np.frombuffer(color, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
-    counts = cv2.imdecode(np.frombuffer(sample["depth.png"], np.uint8), cv2.IMREAD_UNCHANGED)
-    scale = json.loads(sample["camera.json"])["depth_scale"] / 1000.0
-    masks = [decode_run_lengths(**mask) for mask in json.loads(sample["mask_visib.json"]).values()]
-    foreground = np.any([np.zeros(counts.shape, bool), *masks], axis=0)
-    return {"image": image / np.float32(255), "depth": np.float32(scale) * counts, "foreground": foreground}
+    image = sample["rgb.png"] if "rgb.png" in sample else sample["rgb.jpg"]
+    depth = sample["depth.png"] * np.float32(sample["camera.json"]["depth_scale"] / 1000.0)
+    masks = sample["mask_visib.json"]
+    foreground = masks.any(axis=0) if len(masks) else np.zeros(depth.shape, bool)
+    return {"image": image / np.float32(255), "depth": depth, "foreground": foreground}
 
 
 def batches(folder: Path, seed: int) -> Iterator[dict[str, np.ndarray]]:
     """Shuffled batches of views: the same keys, with a first dimension of at most BATCH_SIZE."""
     shards = sorted(str(path) for path in folder.glob("*_web/shard-*.tar"))
-    views = webdataset.WebDataset(shards, shardshuffle=len(shards), seed=seed).shuffle(100, seed=seed).map(decode)
+    views = webdataset.WebDataset(shards, shardshuffle=len(shards), seed=seed).shuffle(100, seed=seed).decode(decode_view).map(prepare)
     for batch in views.batched(BATCH_SIZE, collation_fn=None):
         yield {name: np.stack([view[name] for view in batch]) for name in batch[0]}
 

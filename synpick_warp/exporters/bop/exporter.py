@@ -8,12 +8,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import bop_folder, bop_folders
+from synpick_warp.configs.schema import MULTISENSOR, Config
+from synpick_warp.configs.splits import bop_folder, bop_folders, bop_scene
 from synpick_warp.exporters.base import ExportContext, SharedFiles
+from synpick_warp.exporters.bop.keypoints import make_category_keys
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
-from synpick_warp.exporters.bop.targets import concatenate_targets, find_scenes, scene_target_files, target_files, write_scene_targets
+from synpick_warp.exporters.bop.sensors import commit_sensor_scene
+from synpick_warp.exporters.bop.targets import (
+    concatenate_targets,
+    find_scenes,
+    scene_target_files,
+    sensor_suffixes,
+    target_files,
+    write_scene_targets,
+)
 from synpick_warp.exporters.bop.view import write_layer, write_view
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -28,7 +37,9 @@ class BopExporter(SceneExporter):
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""
         super().__init__(context)
-        self._object_names = tuple((entry.obj_id, entry.name) for entry in context.catalog.entries)
+        names = {entry.obj_id: {"id": entry.obj_id, "name": entry.name, "supercategory": "synpick"} for entry in context.catalog.entries}
+        points = {obj_id: make_category_keys(keypoints) for obj_id, keypoints in self._keypoints.items()}
+        self._categories = tuple(category | points.get(obj_id, {}) for obj_id, category in names.items())
 
     @staticmethod
     def folder_name(split: str) -> str:
@@ -43,7 +54,7 @@ class BopExporter(SceneExporter):
     @staticmethod
     def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
         """See `Exporter`: the lists of evaluation targets."""
-        parts, names = out / PARTIAL / BopExporter.staging / "targets", target_files(config)
+        parts, names, sensors = out / PARTIAL / BopExporter.staging / "targets", target_files(config), sensor_suffixes(config)
         try:
             parts.parent.mkdir(exist_ok=True)
             shutil.rmtree(parts, ignore_errors=True)
@@ -52,7 +63,7 @@ class BopExporter(SceneExporter):
             for folder in bop_folders(config):
                 places = tuple(str(parts / name) for name in scene_target_files(config, folder))
                 for scene in find_scenes(out / folder):
-                    pool.submit(write_scene_targets, (), (scene, places, config.bop.target_visibility), path=scene)
+                    pool.submit(write_scene_targets, (), (scene, places, config.bop.target_visibility, sensors), path=scene)
             pool.wait()
             concatenate_targets(parts, out, names)
         except OSError as error:
@@ -61,7 +72,7 @@ class BopExporter(SceneExporter):
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`: the scene folders."""
-        places = (self._place(self.scene_id(episode, camera)) for camera in range(len(self._cameras)))
+        places = dict.fromkeys(self._place(self.scene_id(episode, camera)) for camera in range(len(self._cameras)))
         return [place.relative_to(self._out) for place in places if os.path.lexists(place)]
 
     def _stage_scene(self, scene: Path) -> None:
@@ -78,9 +89,13 @@ class BopExporter(SceneExporter):
             height=self._cameras[0].height,
             color_suffix=self._suffix,
             coco=self._bop.coco,
-            object_names=self._object_names,
+            categories=self._categories,
         )
+        if self._bop.layout == MULTISENSOR:
+            return commit_sensor_scene, (tuple(scene for scene, _ in scenes), self._place(scenes[0][1]), settings)
         return commit_scenes, (tuple((scene, self._place(scene_id)) for scene, scene_id in scenes), settings)
 
     def _place(self, scene_id: int) -> Path:
-        return self._folder(scene_id) / f"{scene_id:06d}"
+        """Folder of the scene that holds what the staged one of this id does."""
+        episode, camera = divmod(scene_id, len(self._cameras))
+        return self._folder(scene_id) / f"{bop_scene(self._context.config, episode, camera)[0]:06d}"

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from synpick_warp.configs.modes import bake_modes
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import MULTISENSOR, Config
 from synpick_warp.errors import CatalogError
+from synpick_warp.exporters.bop.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.inputs.paths import path_inside
@@ -26,8 +27,8 @@ MODEL_FOLDERS = ("models", "models_eval")
 """The toolkit renders the first and evaluates with the second; ours are equal."""
 
 
-def write_constants(out: Path, catalog: Catalog, camera: Camera, depth_scale: float, notes: str) -> list[Path]:
-    """Write models/, models_eval/, camera.json and dataset_info.md, replacing existing ones; returns their paths.
+def write_constants(out: Path, catalog: Catalog, camera: Camera, depth_scale: float, texts: dict[str, str]) -> list[Path]:
+    """Write models/, models_eval/, camera.json and the texts by name, replacing existing ones; returns their paths.
 
     Raises:
         CatalogError: A model file or its texture is not what was read for the catalog.
@@ -38,8 +39,9 @@ def write_constants(out: Path, catalog: Catalog, camera: Camera, depth_scale: fl
             shutil.rmtree(out / name)
         write_models(out / name, catalog)
     _write_json(out / CAMERA_FILE, _make_camera_file(camera, depth_scale))
-    (out / NOTES_FILE).write_text(notes, encoding="utf-8", newline="\n")
-    return [Path(name) for name in (*MODEL_FOLDERS, CAMERA_FILE, NOTES_FILE)]
+    for name, text in texts.items():
+        (out / name).write_text(text, encoding="utf-8", newline="\n")
+    return [Path(name) for name in (*MODEL_FOLDERS, CAMERA_FILE, *texts)]
 
 
 def write_models(folder: Path, catalog: Catalog) -> None:
@@ -175,6 +177,13 @@ def _describe_folders(config: Config) -> str:
     return ", ".join(f"`{split.folder}/` (k from {split.first} on)" for split in config.splits)
 
 
+def _describe_scenes(config: Config, count: int) -> str:
+    """Which scene has what."""
+    if config.bop.layout == MULTISENSOR:
+        return f"Episode k is scene k, with files of the sensors cam0 to cam{count - 1},"
+    return f"Camera c of episode k is scene {count} · k + c"
+
+
 def describe_dataset(config: Config, catalog: Catalog, cameras: tuple[Camera, ...]) -> str:
     """Text of dataset_info.md: conventions of the ground truth, and the objects."""
     camera, count = cameras[0], len(cameras)
@@ -183,7 +192,7 @@ def describe_dataset(config: Config, catalog: Catalog, cameras: tuple[Camera, ..
     return f"""# A SynPick data set
 
 Made by synpick-warp (mode {", ".join(bake_modes(config))}, seed {config.bake.seed}, {count} cameras), in the format of the
-BOP challenge (scenewise). Camera c of episode k is scene {count} · k + c of {_describe_folders(config)}. Frames are {period:g} s apart.
+BOP challenge (scenewise). {_describe_scenes(config, count)} of {_describe_folders(config)}. Frames are {period:g} s apart.
 
 - Lengths are in millimetres. A depth image's count times `depth_scale` ({config.bop.depth_scale:g}) is the planar depth, along the
   optical axis; 0: no surface.
@@ -198,9 +207,8 @@ BOP challenge (scenewise). Camera c of episode k is scene {count} · k + c of {_
 - `mask_visib` is exact: what the ray through the pixel's centre meets first. The masks of an image do not overlap.
 - `px_count_all` and `bbox_obj` count what lies outside of the picture too, up to one picture's size beyond each border.
 {layer_notes(config.render.layers)}- `models_eval/` equals `models/`.
-- The toolkit has no place for new data sets: add this one's name to `dataset_params.py` (im_size {(camera.width, camera.height)}).
 
 | obj_id | name | mass [kg] |
 |---|---|---|
 {objects}
-"""
+{describe_toolkit(config)}"""

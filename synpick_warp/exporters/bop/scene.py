@@ -10,9 +10,9 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.view import ANNOTATIONS
@@ -34,8 +34,10 @@ class SceneSettings:
     height: int
     color_suffix: str
     coco: bool
-    object_names: tuple[tuple[int, str], ...]
-    """obj_id and name of every object of the catalog."""
+    categories: tuple[dict[str, Any], ...] = field(kw_only=True)
+    """COCO's category of every object of the catalog."""
+    sensor: str = ""
+    """Suffix of the image folders, such as "_cam1"; empty: classic."""
 
 
 def create_scene_folders(scene: Path, masks: bool, layers: tuple[str, ...]) -> None:
@@ -52,7 +54,7 @@ def commit_scenes(scenes: tuple[tuple[Path, Path], ...], settings: SceneSettings
     of this process, but not necessarily a power cut.
     """
     for scene, _ in scenes:
-        _complete_scene(scene, settings)
+        complete_scene(scene, settings)
     for scene, place in scenes:
         scene.rename(place)
     for folder in {place.parent for _, place in scenes}:
@@ -65,7 +67,8 @@ def discard_scenes(scenes: tuple[Path, ...]) -> None:
         shutil.rmtree(scene)
 
 
-def _complete_scene(scene: Path, settings: SceneSettings) -> None:
+def complete_scene(scene: Path, settings: SceneSettings) -> None:
+    """Write the JSON files of a staged scene from its annotation blocks, and sync its folders to disk."""
     with (scene / ANNOTATIONS).open("rb") as file:
         blocks = AnnotationBlocks(file)
         if blocks.frames != list(range(settings.frames)):
@@ -127,7 +130,7 @@ def _format_coco(blocks: AnnotationBlocks, first: int, settings: SceneSettings) 
             "date_created": DATE,
         },
         "licenses": [{"id": 1, "name": "as of the models", "url": ""}],
-        "categories": [{"id": obj_id, "name": name, "supercategory": "synpick"} for obj_id, name in settings.object_names],
+        "categories": settings.categories,
         "images": [_coco_image(frame, settings) for frame in blocks.frames],
     }
     yield json.dumps(head)[:-1] + ', "annotations": [\n'
@@ -142,7 +145,7 @@ def _format_coco(blocks: AnnotationBlocks, first: int, settings: SceneSettings) 
 def _coco_image(frame: int, settings: SceneSettings) -> dict[str, object]:
     return {
         "id": frame,
-        "file_name": f"rgb/{frame:06d}{settings.color_suffix}",
+        "file_name": f"rgb{settings.sensor}/{frame:06d}{settings.color_suffix}",
         "width": settings.width,
         "height": settings.height,
         "date_captured": DATE,

@@ -14,14 +14,16 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.configs.splits import bop_folder, bop_folders
 from synpick_warp.exporters.base import ExportContext, view_bytes
+from synpick_warp.exporters.bop.keypoints import sample_keypoints
 from synpick_warp.exporters.bop.models import CAMERA_FILE, MODEL_FOLDERS, NOTES_FILE, describe_dataset, write_constants
 from synpick_warp.exporters.bop.scene import discard_scenes
+from synpick_warp.exporters.bop.toolkit import PARAMS_FILE, format_dataset_params
 from synpick_warp.exporters.bop.view import ViewSettings, make_camera_constants, make_view_task
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriteTask
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 
-CONSTANTS = tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, NOTES_FILE)))
+CONSTANTS = tuple(map(Path, (*MODEL_FOLDERS, CAMERA_FILE, NOTES_FILE, PARAMS_FILE)))
 """Names of the files that all scenes share."""
 
 
@@ -63,8 +65,11 @@ class SceneExporter(ABC):
         self._suffix = f".{bop.color_format}"
         self._layers = config.render.layers
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
+        entries = context.catalog.entries if bop.keypoints else ()
+        self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
+        quality, points = bop.jpeg_quality, self._keypoints
         self._views = tuple(
-            ViewSettings(self._suffix, bop.jpeg_quality, effects, bop.masks, bop.coco, make_camera_constants(camera, bop.depth_scale))
+            ViewSettings(self._suffix, quality, effects, bop.masks, bop.coco, make_camera_constants(camera, bop.depth_scale), points)
             for camera in context.cameras
         )
         self._episodes: dict[int, _Episode] = {}
@@ -111,8 +116,9 @@ class SceneExporter(ABC):
         try:
             for folder in self.folders(context.config):
                 (self._out / folder).mkdir(exist_ok=True)
-            notes = describe_dataset(context.config, context.catalog, self._cameras)
-            return write_constants(self._out, context.catalog, self._cameras[0], self._bop.depth_scale, notes)
+            scene = context.config, context.catalog, self._cameras
+            texts = {NOTES_FILE: describe_dataset(*scene), PARAMS_FILE: format_dataset_params(*scene)}
+            return write_constants(self._out, context.catalog, self._cameras[0], self._bop.depth_scale, texts)
         except OSError as error:
             raise output_error(self._out, error) from error
 

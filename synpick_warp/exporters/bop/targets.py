@@ -10,8 +10,8 @@ from typing import Annotated, TypeVar
 
 import msgspec
 
-from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import bop_folders, split_kind
+from synpick_warp.configs.schema import MULTISENSOR, Config
+from synpick_warp.configs.splits import bop_folders, bop_scene, split_kind
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.files import write_atomically
 from synpick_warp.inputs.json import read_json
@@ -19,6 +19,7 @@ from synpick_warp.inputs.paths import path_inside
 
 BOP19, BOP24 = "test_targets_bop19.json", "test_targets_bop24.json"
 
+MULTIVIEW = "test_targets_multiview_bop25.json"
 KINDS = (BOP19, BOP24)
 _SCENE = re.compile(r"[0-9]{6,12}")
 """Name of a scene's folder."""
@@ -36,18 +37,33 @@ class _Info(msgspec.Struct):
     visib_fract: float
 
 
-def scene_target_files(config: Config, folder: str) -> tuple[str, str]:
-    """Files that list a split's targets, BOP19 and BOP24: those of its kind. Without splits, all scenes are in the lists named test.
+def sensor_suffixes(config: Config) -> tuple[str, ...]:
+    """Suffixes of the sensors' files in a scene; one empty string in the classic layout."""
+    return tuple(bop_scene(config, 0, camera)[1] for camera in range(len(config.cameras.positions))) if _is_multisensor(config) else ("",)
+
+
+def _is_multisensor(config: Config) -> bool:
+    return config.bop.layout == MULTISENSOR
+
+
+def _kinds(config: Config) -> tuple[str, ...]:
+    return (*KINDS, *((MULTIVIEW,) if _is_multisensor(config) else ()))
+
+
+def scene_target_files(config: Config, folder: str) -> tuple[str, ...]:
+    """Files that list a split's targets, BOP19, BOP24, and MULTIVIEW with several sensors: those of its kind.
+
+    Without splits, all scenes are in the lists named test.
 
     Lists begin with the kind of their splits, as in val_targets_bop19.json; splits of one kind share them, as scene ids are unique.
     """
     kind = split_kind(folder) if config.splits else "test"
-    return BOP19.replace("test", kind, 1), BOP24.replace("test", kind, 1)
+    return tuple(name.replace("test", kind, 1) for name in _kinds(config))
 
 
 def target_files(config: Config) -> tuple[str, ...]:
     """All files that list targets. Those named test always exist, as BOP's toolkit opens them for any split."""
-    return tuple(dict.fromkeys((*KINDS, *(name for folder in bop_folders(config) for name in scene_target_files(config, folder)))))
+    return tuple(dict.fromkeys((*_kinds(config), *(name for folder in bop_folders(config) for name in scene_target_files(config, folder)))))
 
 
 def find_scenes(split: Path) -> list[Path]:
@@ -55,23 +71,25 @@ def find_scenes(split: Path) -> list[Path]:
     return sorted(path for path in split.iterdir() if _SCENE.fullmatch(path.name) and path.is_dir() and not path.is_symlink())
 
 
-def write_scene_targets(scene: Path, folders: tuple[str, str], visibility: float) -> None:
-    """Task: write a scene's targets, one per line, into the two folders, BOP19 and BOP24, under the scene's name.
+def write_scene_targets(scene: Path, folders: tuple[str, ...], visibility: float, sensors: tuple[str, ...] = ("",)) -> None:
+    """Task: write a scene's targets, one per line, into the folders, BOP19, BOP24 and MULTIVIEW, under the scene's name.
 
-    BOP19: for each image and object, the number of instances whose visible fraction is at least `visibility`. BOP24: every image.
+    BOP19: for each image and object, the number of instances whose visible fraction is at least `visibility`. BOP24: every image. Of
+    several sensors, both list the images of the first, by which the toolkit evaluates. MULTIVIEW: the images of all sensors at a time.
     """
-    truth = _read(scene, "scene_gt.json", dict[_Frame, list[_Truth]])
-    infos = _read(scene, "scene_gt_info.json", dict[_Frame, list[_Info]])
+    truth = _read(scene, f"scene_gt{sensors[0]}.json", dict[_Frame, list[_Truth]])
+    infos = _read(scene, f"scene_gt_info{sensors[0]}.json", dict[_Frame, list[_Info]])
     if {frame: len(entries) for frame, entries in truth.items()} != {frame: len(entries) for frame, entries in infos.items()}:
         raise DatasetError(f"{scene} has other objects in scene_gt.json than in scene_gt_info.json; {_ADVICE}")
     scene_id = int(scene.name)
-    localize, detect = [], []
+    localize, detect, together = [], [], []
     for frame in sorted(truth, key=int):
         visible = Counter(entry.obj_id for entry, info in zip(truth[frame], infos[frame], strict=True) if info.visib_fract >= visibility)
         image = {"im_id": int(frame)}
         localize += [{**image, "inst_count": count, "obj_id": obj_id, "scene_id": scene_id} for obj_id, count in sorted(visible.items())]
         detect.append({**image, "scene_id": scene_id})
-    for folder, targets in zip(folders, (localize, detect), strict=True):
+        together.append({"im_id": [[sensor.removeprefix("_"), int(frame)] for sensor in sensors], "scene_id": scene_id})
+    for folder, targets in zip(folders, (localize, detect, together), strict=False):
         Path(folder, scene.name).write_text("".join(json.dumps(target) + "\n" for target in targets), encoding="ascii")
 
 

@@ -6,7 +6,7 @@ Runs in writer processes, so it imports neither Warp nor Newton. Only the BOP ex
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import orjson
 
 from synpick_warp.codes import Effect, names
 from synpick_warp.exporters.base import PIXEL_BYTES
+from synpick_warp.exporters.bop.keypoints import MILLIMETERS, Keypoints, project_keypoints
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
 from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
 from synpick_warp.exporters.writing.rle import Runs, find_run_boundaries, unpack_run_boundaries
@@ -28,8 +29,6 @@ ANNOTATIONS = "annotations"
 
 One file instead of one per view, because ext4 without a journal scans the inodes freed in the last minutes whenever it creates a file.
 """
-MILLIMETERS = 1000.0
-"""Millimetres per metre."""
 IGNORE_VISIBILITY = 0.1
 """COCO annotations with a lower visible fraction are marked `ignore` (the toolkit's calc_gt_coco.py)."""
 NO_BOX = [-1, -1, -1, -1]
@@ -60,6 +59,8 @@ class ViewSettings:
     """Whether COCO annotations are written."""
     camera: dict[str, Any]
     """Constant part of the views' entries in scene_camera.json."""
+    keypoints: dict[int, Keypoints] = field(default_factory=dict)
+    """Keypoints in COCO annotations, by obj_id; empty: none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,9 +208,11 @@ def write_view(
                 folder.write(f"mask/{name}_{index:06d}.png", amodal)
                 folder.write(f"mask_visib/{name}_{index:06d}.png", visible)
         infos = make_gt_info_entries(truth)
-        entries = [make_camera_entry(truth, settings), make_gt_entries(truth, settings.camera), infos]
+        poses = make_gt_entries(truth, settings.camera)
+        entries = [make_camera_entry(truth, settings), poses, infos]
         if settings.coco:
-            entries += make_coco_annotations(truth, infos, masks, height, width)
+            points = project_keypoints(poses, settings.camera, depth, settings.keypoints) if settings.keypoints else None
+            entries += make_coco_annotations(truth, infos, masks, height, width, points)
         folder.append(ANNOTATIONS, annotation_block(truth.frame, map(to_json, entries)))
 
 
@@ -293,10 +296,16 @@ def _bop_box(box: list[int]) -> list[int]:
 
 
 def make_coco_annotations(
-    truth: ViewTruth, infos: list[dict[str, Any]], masks: list[Masks], height: int, width: int
+    truth: ViewTruth,
+    infos: list[dict[str, Any]],
+    masks: list[Masks],
+    height: int,
+    width: int,
+    points: list[dict[str, Any]] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """COCO annotations of the visible instances, without ids: amodal box clipped to the image, visible mask."""
-    for object_id, info, mask in zip(truth.object_id.tolist(), infos, masks, strict=True):
+    """COCO annotations of the visible instances, without ids: amodal box clipped to the image, visible mask, keys of keypoints."""
+    keys = points or [{} for _ in infos]
+    for object_id, info, mask, extra in zip(truth.object_id.tolist(), infos, masks, keys, strict=True):
         box = mask.amodal.box()
         area = mask.visible.count
         if box is not None and area:
@@ -311,7 +320,7 @@ def make_coco_annotations(
                 "width": width,
                 "height": height,
                 "ignore": info["visib_fract"] < IGNORE_VISIBILITY,
-            }
+            } | extra
 
 
 def make_rle(runs: Runs, height: int, width: int) -> dict[str, Any]:

@@ -24,7 +24,7 @@ LABELS = {
     "fixture": ("tote", "finger", "cup"),
     "link": ("finger", "cup"),
 }
-"""Dimensions with named indices."""
+"""Dimensions with named indices. No dimension has the name of an array: xarray takes such an array for the dimension's coordinate."""
 
 
 @dataclass(frozen=True)

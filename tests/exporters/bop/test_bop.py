@@ -70,6 +70,7 @@ def split(dataset) -> Path:
 
 def test_folder_tree_is_exactly_bops(dataset, split):
     assert {path.name for path in dataset.iterdir()} == {
+        "bop_dataset_params.py",
         "camera.json",
         "dataset_info.md",
         "models",
@@ -294,7 +295,7 @@ def omit_a_frame(out: Path) -> None:
 
 
 def test_annotation_blocks_are_sorted_and_checked_for_completeness(tmp_path):
-    settings = SceneSettings("train_pbr", 3, 4, 3, ".jpg", True, ((5, "five"),))
+    settings = SceneSettings("train_pbr", 3, 4, 3, ".jpg", True, categories=())
     for frames in ((2, 0, 1), (2, 0, 1, 0), (2, 0)):
         scene, place = tmp_path / "hidden", tmp_path / "-".join(map(str, frames))
         create_scene_folders(scene, True, ())

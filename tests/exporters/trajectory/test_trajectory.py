@@ -45,6 +45,18 @@ def arrays(group: zarr.Group) -> dict[str, zarr.Array]:
     return {path: member for path, member in group.members(max_depth=None) if isinstance(member, zarr.Array)}
 
 
+def test_no_dimension_has_the_name_of_an_array(store):
+    # xarray takes such an array for the dimension's coordinate, and then neither opens the group nor selects in it.
+    dimensions = {name for array in arrays(store).values() for name in array.metadata.dimension_names}
+    assert {"tick", "step", "instance", "component", "axis"} <= dimensions
+    groups: dict[str, set[str]] = {}
+    for path, array in arrays(store).items():
+        groups.setdefault(path.rpartition("/")[0], set()).update(array.metadata.dimension_names)
+    for group, dims in groups.items():
+        assert dims & {path.rpartition("/")[2] for path in arrays(store) if path.rpartition("/")[0] == group} == set(), group
+    assert store[f"{tables.EPISODES}/000000/ticks/pose"].attrs["labels"]["component"] == ["x", "y", "z", "qx", "qy", "qz", "qw"]
+
+
 def written_batches(episode: int) -> list:
     """Tick batches of an episode."""
     return list(ticks((episode,), FRAMES))

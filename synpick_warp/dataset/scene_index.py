@@ -1,0 +1,75 @@
+"""Where the scenes of a data set's episodes are: BOP scene folders in either layout, and webdataset shards."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from synpick_warp.configs.splits import bop_folder, bop_folders, bop_scene, scene_episode
+from synpick_warp.dataset.manifest import CONFIG_FILE
+from synpick_warp.errors import DatasetError
+from synpick_warp.inputs.paths import path_inside
+
+if TYPE_CHECKING:
+    from synpick_warp.configs.schema import Config
+    from synpick_warp.dataset.view_files import SceneFiles
+
+
+class SceneIndex:
+    """Scene folders and shards of a data set by episode and camera."""
+
+    def __init__(self, folder: Path, config: Config) -> None:
+        """
+        Args:
+            folder: Folder of the data set.
+            config: Its settings.
+        """
+        self._folder, self._config = folder, config
+        self._cameras = len(config.cameras.positions)
+
+    @cached_property
+    def _folders(self) -> dict[str, tuple[Path, Path]]:
+        """BOP name of each split -> folders of its scenes and of its webdataset shards, which need not exist."""
+        places = {name: path_inside(self._folder, name, self._folder / CONFIG_FILE, DatasetError) for name in bop_folders(self._config)}
+        return {name: (place, place.with_name(f"{place.name}_web")) for name, place in places.items()}
+
+    def files(self, episode: int, camera: int) -> SceneFiles:
+        """Files of the scene that a camera recorded in an episode: its folder, or else its shards.
+
+        Raises:
+            DatasetError: The data set has no images of it.
+        """
+        from synpick_warp.dataset.view_files import SceneFolder, SceneShards
+        from synpick_warp.exporters.bop.shard_parts import find_shards
+
+        size = self._config.cameras.resolution
+        folder, web = self._folders[bop_folder(self._config, episode)]
+        index, suffix = bop_scene(self._config, episode, camera)
+        if (folder / f"{index:06d}").is_dir():
+            return SceneFolder(folder / f"{index:06d}", size, suffix)
+        scene = self._cameras * episode + camera
+        if shards := list(find_shards(scene, web)):
+            return SceneShards(shards, scene, size)
+        raise DatasetError(f"{self._folder} has no images of episode {episode}; bake with --formats bop or shards")
+
+    def has(self, episode: int) -> bool:
+        """Whether an episode has a scene folder or a shard."""
+        folder, web = self._folders[bop_folder(self._config, episode)]
+        scene = folder / f"{bop_scene(self._config, episode, 0)[0]:06d}"
+        return scene.exists() or (web / f"shard-{self._cameras * episode:06d}.tar").exists()
+
+    def episodes(self) -> Iterator[int]:
+        """Indices of the episodes that have scenes; an index can occur several times."""
+        for folder, web in self._folders.values():
+            yield from (scene_episode(self._config, scene) for scene in numbered(folder.glob("[0-9]*")))
+            yield from (scene // self._cameras for scene in numbered(web.glob("shard-??????.tar")))
+
+
+def numbered(paths: Iterable[Path]) -> Iterator[int]:
+    """Indices in file names such as 000012 and shard-000012.tar; other names, such as those of notes, are passed over."""
+    for path in paths:
+        name = path.stem.removeprefix("shard-")
+        if name.isascii() and name.isdecimal() and f"{int(name):06d}" == name:
+            yield int(name)

@@ -1,0 +1,37 @@
+"""Multisensor layout of BOP-Industrial 2025: one scene per episode, with folders and annotation files for each camera.
+
+The cameras' scenes are staged in the classic layout, and brought together by renaming when the episode is complete. Runs in writer
+processes, so it imports neither Warp nor Newton.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+from synpick_warp.configs.splits import sensor_name
+from synpick_warp.exporters.bop.scene import SceneSettings, complete_scene
+from synpick_warp.exporters.writing.files import sync_folder
+
+
+def commit_sensor_scene(scenes: tuple[Path, ...], place: Path, settings: SceneSettings) -> None:
+    """Task: complete the scenes of an episode's cameras, bring them together in one folder, and rename it to its place.
+
+    The rename of the folder is the commit: a killed bake leaves nothing at `place`.
+
+    Args:
+        scenes: Staging folder of each camera.
+        place: Folder of the scene.
+        settings: Settings of the scenes, without sensor.
+    """
+    whole = scenes[0].with_name(f"{scenes[0].name}-sensors")
+    whole.mkdir()
+    for camera, scene in enumerate(scenes):
+        suffix = f"_{sensor_name(camera)}"
+        complete_scene(scene, dataclasses.replace(settings, sensor=suffix))
+        for path in sorted(scene.iterdir()):
+            path.rename(whole / f"{path.stem}{suffix}{path.suffix}")
+        scene.rmdir()
+    sync_folder(whole)
+    whole.rename(place)
+    sync_folder(place.parent)
