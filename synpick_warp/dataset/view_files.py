@@ -105,11 +105,11 @@ class SceneFolder:
     def image_file(self, name: str, frame: int) -> tuple[str, bytes]:
         """See `SceneFiles`."""
         for suffix in SUFFIXES:
-            path = self.folder / name / f"{frame:06d}{suffix}"
+            path = self.images(name) / f"{frame:06d}{suffix}"
             data = read_file_if_present(path, MAX_IMAGE_FILE, DatasetError)
             if data is not None:
                 return suffix, _check_stated_size(data, self.size, path)
-        raise DatasetError(f"there is no {self.folder / name / f'{frame:06d}'}.png or .jpg; the data set is not complete")
+        raise DatasetError(f"there is no {self.images(name) / f'{frame:06d}'}.png or .jpg; the data set is not complete")
 
     def masks(self, name: str, frame: int, count: int) -> list[np.ndarray]:
         """See `SceneFiles`."""

@@ -65,7 +65,7 @@ def decode(data: bytes) -> np.ndarray:
 
 def test_one_shard_per_scene_and_bops_common_files(dataset, split):
     assert {path.name for path in split.iterdir()} == {"key_to_shard.json", *(f"shard-{scene:06d}.tar" for scene in SCENES)}
-    names = {"README.md", "camera.json", "dataset_info.md", "models", "models_eval", "train_pbr_web"}
+    names = {"README.md", "bop_dataset_params.py", "camera.json", "dataset_info.md", "models", "models_eval", "train_pbr_web"}
     assert {path.name for path in dataset.iterdir()} == names
 
 
@@ -211,4 +211,4 @@ def test_an_empty_data_set_has_an_empty_key_index(tmp_path):
 def test_files_shared_with_the_bop_format_are_listed_once(tmp_path):
     with exporting(ShardsExporter, tmp_path, config()) as exporter:
         constants = Exporters((BopExporter, ShardsExporter), export_context(exporter)).write_constants()
-    assert sorted(map(str, constants)) == ["camera.json", "dataset_info.md", "models", "models_eval"]
+    assert sorted(map(str, constants)) == ["bop_dataset_params.py", "camera.json", "dataset_info.md", "models", "models_eval"]
