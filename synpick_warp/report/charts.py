@@ -89,7 +89,7 @@ def _stack(rows: Rows, category: str, value: str, order: Sequence[str], titles: 
         "mark": {"type": "bar", "cornerRadiusEnd": 2},
         "encoding": {
             "y": _field(category, "nominal", None, sort=list(order), axis={"labelLimit": 190, "ticks": False, "domain": False}),
-            "x": _field(value, "quantitative", titles[1], stack="zero"),
+            "x": _field(value, "quantitative", titles[1], stack="zero", axis=_COUNT_AXIS),
             "color": _mode_color(rows),
             "opacity": _FADED,
             "order": {"field": "rank", "type": "quantitative"},
@@ -102,6 +102,8 @@ def _stack(rows: Rows, category: str, value: str, order: Sequence[str], titles: 
     }
 
 
+_COUNT_AXIS: Spec = {"tickCount": 6, "labelExpr": "datum.value == floor(datum.value) ? datum.label : ''"}
+"""Axis of counts: fractions between them have no label."""
 _LEGEND: Spec = {"name": "chosen", "select": {"type": "point", "fields": ["mode"]}, "bind": "legend"}
 """A click on a mode in the legend chooses it."""
 _FADED: Spec = {"condition": {"param": "chosen", "value": 1}, "value": 0.15}
@@ -147,7 +149,8 @@ def _ranked(counts: Mapping[str, Mapping[Any, int]]) -> list[Any]:
 def _objects(source: Source) -> Chart | None:
     names = object_labels(source.statistics.objects)
     groups = [
-        (group.mode, {names.get(key, str(key)): count for key, count in group.annotations.objects.items()}) for group in source.statistics.groups
+        (group.mode, {names.get(key, str(key)): count for key, count in group.annotations.objects.items()})
+        for group in source.statistics.groups
     ]
     counts = _sum_modes(groups)
     order = [*_ranked(counts), *(names[each.object_id] for each in source.statistics.objects if not each.instances)]
@@ -155,18 +158,26 @@ def _objects(source: Source) -> Chart | None:
         return None
     rows = [row for row in _by_mode(counts, "object", "instances") if row["object"] in order[:MAX_LINES]]
     more = len(order) - MAX_LINES
-    caption = "Annotated instances in all views, by object and mode of the episode" + (f"; {more} rarer objects are left out." if more > 0 else ".")
+    caption = "Annotated instances in all views, by object and mode of the episode" + (
+        f"; {more} rarer objects are left out." if more > 0 else "."
+    )
     spec = _stack(rows, "object", "instances", order[:MAX_LINES], ("object", "instances"))
     spec["encoding"]["y"]["scale"] = {"domain": order[:MAX_LINES]}
     return Chart("objects", "Annotations per object", caption, spec, wide=True)
 
 
-def _histogram(rows: Rows, titles: tuple[str, str], labels: str, colored: bool = True) -> Spec:
-    """Bars from `low` to `high` with a count, stacked by mode if there are modes."""
+def _histogram(rows: Rows, width: float, titles: tuple[str, str], labels: str, colored: bool = True) -> Spec:
+    """Bars of a width from `low` to `high` with a count, stacked by mode if there are modes."""
     encoding = {
-        "x": _field("low", "quantitative", titles[0], bin={"binned": True}, axis={"format": labels}),
+        "x": _field(
+            "low",
+            "quantitative",
+            titles[0],
+            bin={"binned": True, "step": width},
+            axis={"format": labels, "labelOverlap": "greedy", "labelSeparation": 8},
+        ),
         "x2": {"field": "high"},
-        "y": _field("count", "quantitative", titles[1], stack="zero", axis={"tickCount": 5}),
+        "y": _field("count", "quantitative", titles[1], stack="zero", axis=_COUNT_AXIS),
         "tooltip": [
             *([_field("mode", "nominal", "mode")] if colored else []),
             _field("low", "quantitative", "from", format=labels),
@@ -196,7 +207,7 @@ def _visibility(source: Source) -> Chart | None:
         return None
     mean = source.statistics.total.annotations.visibility
     caption = f"Visible fraction of each instance's silhouette; the mean is {mean:.3f}. Invisible instances are in the first bar."
-    return Chart("visibility", "Visibility", caption, _histogram(rows, ("visible fraction", "instances"), ".0%"))
+    return Chart("visibility", "Visibility", caption, _histogram(rows, 1 / VISIBILITY_BINS, ("visible fraction", "instances"), ".0%"))
 
 
 def _named(source: Source, counts: dict[str, dict[Any, int]], value: str) -> tuple[Rows, list[str]]:
@@ -217,7 +228,9 @@ def _outcomes(source: Source) -> Chart | None:
 def _endings(source: Source) -> Chart | None:
     rows, order = _named(source, _sum_modes([(group.mode, group.episodes.endings) for group in source.statistics.groups]), "episodes")
     caption = "Why the episodes ended: tote empty, corners visited, or too many failures."
-    return Chart("endings", "Episodes by ending", caption, _stack(rows, "what", "episodes", order, ("ending", "episodes"))) if rows else None
+    return (
+        Chart("endings", "Episodes by ending", caption, _stack(rows, "what", "episodes", order, ("ending", "episodes"))) if rows else None
+    )
 
 
 def _forces(source: Source) -> Chart | None:
@@ -226,19 +239,26 @@ def _forces(source: Source) -> Chart | None:
     if not rows:
         return None
     suction = source.config.suction
-    limits = [{"limit": suction.good_force, "what": "good seal breaks"}, {"limit": suction.poor_force, "what": "poor seal breaks"}]
-    rule: Spec = {
-        "data": {"values": limits},
+    rules = [_limit(suction.poor_force, "poor seal breaks", "left"), _limit(suction.good_force, "good seal breaks", "right")]
+    bars = _histogram(rows, FORCE_BIN, ("largest seal force [N]", "attempts"), "g")
+    spec = {"height": bars.pop("height"), "layer": [bars, *rules]}
+    caption = f"Largest force on a seal during each of {source.statistics.total.episodes.seals:,} lifts that engaged an object."
+    return Chart("forces", "Seal forces", caption, spec)
+
+
+def _limit(force: float, text: str, side: str) -> Spec:
+    """A dashed line at a force, with its text on the other side."""
+    return {
+        "data": {"values": [{"limit": force, "what": text}]},
         "encoding": {"x": _field("limit", "quantitative", None)},
         "layer": [
             {"mark": {"type": "rule", "strokeDash": [4, 3], "color": "gray"}},
-            {"mark": {"type": "text", "align": "right", "dx": -4, "dy": -4, "baseline": "top", "y": 4}, "encoding": {"text": {"field": "what"}}},
+            {
+                "mark": {"type": "text", "align": side, "dx": 5 if side == "left" else -5, "baseline": "bottom", "y": -4},
+                "encoding": {"text": {"field": "what"}},
+            },
         ],
     }
-    bars = _histogram(rows, ("largest seal force [N]", "attempts"), "g")
-    spec = {"height": bars.pop("height"), "layer": [bars, rule]}
-    caption = f"Largest force on a seal during each of {source.statistics.total.episodes.seals:,} lifts that engaged an object."
-    return Chart("forces", "Seal forces", caption, spec)
 
 
 def _timeline(source: Source) -> Chart | None:
@@ -250,7 +270,8 @@ def _timeline(source: Source) -> Chart | None:
     if not sums:
         return None
     rows = [
-        {"mode": mode, "time": time, "objects": round(total / frames, 3), "frames": frames} for (mode, time), (frames, total) in sorted(sums.items())
+        {"mode": mode, "time": time, "objects": round(total / frames, 3), "frames": frames}
+        for (mode, time), (frames, total) in sorted(sums.items())
     ]
     spec: Spec = {
         "data": {"values": rows},
@@ -279,7 +300,10 @@ def _coverage(source: Source) -> Chart | None:
         return None
     names = object_labels(source.statistics.objects)
     rows = [
-        {"object": names[each.object_id], "bin": index, "views": count} for each in seen for index, count in enumerate(each.coverage.bins) if count
+        {"object": names[each.object_id], "bin": index, "views": count}
+        for each in seen
+        for index, count in enumerate(each.coverage.bins)
+        if count
     ]
     options = [names[each.object_id] for each in seen]
     band, sector = 2.0 / BANDS, TURN / SECTORS
@@ -297,7 +321,13 @@ def _coverage(source: Source) -> Chart | None:
         ],
         "mark": {"type": "rect"},
         "encoding": {
-            "x": _field("longitude", "quantitative", "longitude [°]", scale={"domain": [-HALF_TURN, HALF_TURN]}, axis={"values": [-180, -90, 0, 90, 180]}),
+            "x": _field(
+                "longitude",
+                "quantitative",
+                "longitude [°]",
+                scale={"domain": [-HALF_TURN, HALF_TURN]},
+                axis={"values": [-180, -90, 0, 90, 180]},
+            ),
             "x2": {"field": "longitude2"},
             "y": _field("z", "quantitative", "z of the direction", scale={"domain": [-1, 1]}, axis={"values": [-1, -0.5, 0, 0.5, 1]}),
             "y2": {"field": "z2"},
@@ -309,7 +339,10 @@ def _coverage(source: Source) -> Chart | None:
             ],
         },
     }
-    caption = f"Directions from the object, in its frame, to the camera, where at least {MIN_VISIBILITY:.0%} is visible. All cells have the same area on the sphere."
+    caption = (
+        f"Directions from the object, in its frame, to the camera, where at least {MIN_VISIBILITY:.0%} is visible. "
+        "All cells have the same area on the sphere."
+    )
     return Chart("coverage", "Pose coverage", caption, spec)
 
 
@@ -321,7 +354,7 @@ def _bars(rows: Rows, order: Sequence[str], titles: tuple[str, str]) -> Spec:
         "mark": {"type": "bar", "cornerRadiusEnd": 2},
         "encoding": {
             "y": _field("what", "nominal", None, sort=list(order), axis={"labelLimit": 190, "ticks": False, "domain": False}),
-            "x": _field("count", "quantitative", titles[1], axis={"tickMinStep": 1}),
+            "x": _field("count", "quantitative", titles[1], axis=_COUNT_AXIS),
             "tooltip": [_field("what", "nominal", titles[0]), _field("count", "quantitative", titles[1], format=",")],
         },
     }
@@ -341,7 +374,7 @@ def _exposure(source: Source) -> Chart | None:
     if lights is None or len(lights.exposure) < 2:
         return None
     rows = [{"low": low, "high": round(low + EXPOSURE_BIN, 6), "count": count} for low, count in lights.exposure.items()]
-    spec = _histogram(rows, ("exposure compensation [EV]", "episodes"), ".1f", colored=False)
+    spec = _histogram(rows, EXPOSURE_BIN, ("exposure compensation [EV]", "episodes"), ".1f", colored=False)
     return Chart("exposure", "Exposure", "Exposure compensation of the episodes' light.", spec)
 
 
@@ -351,5 +384,5 @@ def _luma(source: Source) -> Chart | None:
         counts[min(int(view.mean * BRIGHTNESS_BINS), BRIGHTNESS_BINS - 1)] += 1
     if not any(counts):
         return None
-    spec = _histogram(_bins(counts, 1 / BRIGHTNESS_BINS), ("mean brightness (sRGB)", "views"), ".0%", colored=False)
+    spec = _histogram(_bins(counts, 1 / BRIGHTNESS_BINS), 1 / BRIGHTNESS_BINS, ("mean brightness (sRGB)", "views"), ".0%", colored=False)
     return Chart("brightness", "Brightness", f"Mean luma of {len(source.brightness)} views, spread over the data set.", spec)

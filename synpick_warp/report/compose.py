@@ -99,9 +99,7 @@ def write_report(data_set: DataSet, out: Path, *, frames: int = FRAMES, threads:
     return out
 
 
-def take_samples(
-    data_set: DataSet, statistics: Statistics, episodes: Episodes, album: Album, frames: int, report: Report
-) -> Samples:
+def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, album: Album, frames: int, report: Report) -> Samples:
     """Read all pictures of a report; none if the data set has no images.
 
     Raises:
@@ -121,7 +119,9 @@ def take_samples(
     chosen = choose_episodes(episodes)
     asked["strips"] = len(chosen)
     for place, index in enumerate(chosen):
-        strip = make_strip(data_set, index, len(chosen) - place, album, lambda done: report("film strips", done, 0))
+        strip = make_strip(
+            data_set, index, len(chosen) - place, album, lambda done, most, place=place: report(f"film strip {place + 1}", done, most)
+        )
         data["strips"] += _present(strip)
     attempts = choose_attempts(data_set, episodes)
     asked["attempts"] = len(attempts)
@@ -160,9 +160,7 @@ def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) ->
     return join([said, element("a", f"Findings: {summary(findings)}", href="#findings"), "."])
 
 
-def _parts(
-    data_set: DataSet, statistics: Statistics, samples: Samples, findings: list[Finding], versions: Mapping[str, str]
-) -> list[Part]:
+def _parts(data_set: DataSet, statistics: Statistics, samples: Samples, findings: list[Finding], versions: Mapping[str, str]) -> list[Part]:
     views, shown = statistics.total.annotations.views, {name: len(made) for name, made in samples.data.items()}
     leads = {
         "frames": ("Frames", f"{shown['frames']} of {views:,} views, evenly spread over episodes, cameras and time."),
@@ -178,9 +176,21 @@ def _parts(
     figures = join([element("div", id="charts-host"), statistics_tables(statistics)])
     return [
         *parts,
-        Part("figures", "Figures", "Counts of all episodes and annotations; point at a mark for its numbers, click a mode to single it out.", figures),
-        Part("findings", "Findings", "What a person who looks through the figures would raise. A note may be meant.", findings_list(findings)),
-        Part("settings", "Configuration", "Settings that differ from the preset synpick, which has the paper's values.", settings_tables(data_set.config, versions)),
+        Part(
+            "figures",
+            "Figures",
+            "Counts of all episodes and annotations; point at a mark for its numbers, click a mode to single it out.",
+            figures,
+        ),
+        Part(
+            "findings", "Findings", "What a person who looks through the figures would raise. A note may be meant.", findings_list(findings)
+        ),
+        Part(
+            "settings",
+            "Configuration",
+            "Settings that differ from the preset synpick, which has the paper's values.",
+            settings_tables(data_set.config, versions),
+        ),
     ]
 
 

@@ -48,7 +48,9 @@ def choose_attempts(data_set: DataSet, episodes: Episodes) -> list[Found]:
     groups = sorted(found.values(), key=lambda group: (-len(group), group[0].outcome))
     share = -(-MAX_ATTEMPTS // max(1, len(groups)))
     spreads = [spread(range(len(group)), share) for group in groups]
-    chosen = [groups[number][spreads[number][turn]] for turn in range(share) for number in range(len(groups)) if turn < len(spreads[number])]
+    chosen = [
+        groups[number][spreads[number][turn]] for turn in range(share) for number in range(len(groups)) if turn < len(spreads[number])
+    ]
     return sorted(chosen[:MAX_ATTEMPTS], key=lambda one: (one.episode, one.place))
 
 

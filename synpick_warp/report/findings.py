@@ -112,7 +112,9 @@ def _rare(figures: Figures) -> Iterator[Finding]:
     rare = [each for each in figures.statistics.objects if 0 < each.instances < RARE * median]
     if rare:
         listed = _listed(f"{each.name or f'object {each.object_id}'} ({each.instances:,})" for each in rare)
-        yield Finding(NOTE, f"{len(rare)} object{'' if len(rare) == 1 else 's'} with few annotations", f"{listed}; the median is {median:,.0f}.")
+        yield Finding(
+            NOTE, f"{len(rare)} object{'' if len(rare) == 1 else 's'} with few annotations", f"{listed}; the median is {median:,.0f}."
+        )
 
 
 def _failures(figures: Figures) -> Iterator[Finding]:
@@ -137,7 +139,9 @@ def _without_attempt(figures: Figures) -> Iterator[Finding]:
     idle = [index for index, row in rows.items() if row.mode in ("pick", "target") and not figures.episodes.attempts[index]]
     if idle:
         listed = _listed(map(str, idle))
-        yield Finding(WARNING, f"{_number(len(idle), 'picking episode')} without an attempt", f"Episodes {listed} have images but no attempt.")
+        yield Finding(
+            WARNING, f"{_number(len(idle), 'picking episode')} without an attempt", f"Episodes {listed} have images but no attempt."
+        )
 
 
 def _endings(figures: Figures) -> Iterator[Finding]:
@@ -169,14 +173,22 @@ def _brightness(figures: Figures) -> Iterator[Finding]:
         if views and len(found) / len(views) >= EXTREME_SHARE:
             listed = _listed(f"episode {each.episode}, camera {each.camera}, frame {each.frame}" for each in found)
             title = f"{len(found)} of {len(views)} measured views are too {word}"
-            yield Finding(WARNING, title, f"Mean brightness {'below' if word == 'dark' else 'above'} {DARK if word == 'dark' else BRIGHT:.0%}: {listed}.")
+            yield Finding(
+                WARNING,
+                title,
+                f"Mean brightness {'below' if word == 'dark' else 'above'} {DARK if word == 'dark' else BRIGHT:.0%}: {listed}.",
+            )
 
 
 def _invisible(figures: Figures) -> Iterator[Finding]:
     counted = figures.statistics.total.annotations
     if counted.instances and counted.invisible / counted.instances >= INVISIBLE_SHARE:
         share = counted.invisible / counted.instances
-        yield Finding(NOTE, f"{share:.0%} of the instances have no visible pixel", "They lie below others or outside of the image; targets leave them out.")
+        yield Finding(
+            NOTE,
+            f"{share:.0%} of the instances have no visible pixel",
+            "They lie below others or outside of the image; targets leave them out.",
+        )
 
 
 def _depth(figures: Figures) -> Iterator[Finding]:
@@ -197,11 +209,7 @@ def _lights(figures: Figures) -> Iterator[Finding]:
 
 
 def _coverage(figures: Figures) -> Iterator[Finding]:
-    poor = [
-        each
-        for each in figures.statistics.objects
-        if each.coverage.views >= MIN_COVERED_VIEWS and each.coverage.occupied < COVERED
-    ]
+    poor = [each for each in figures.statistics.objects if each.coverage.views >= MIN_COVERED_VIEWS and each.coverage.occupied < COVERED]
     if poor:
         listed = _listed(f"{each.name or f'object {each.object_id}'} ({each.coverage.occupied:.0%})" for each in poor)
         yield Finding(NOTE, f"{_number(len(poor), 'object')} seen from few directions", f"{listed} of the sphere of viewing directions.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -52,6 +53,7 @@ class Page:
     footer: str
 
 
+@functools.cache
 def read_vega() -> str:
     """Vega, Vega-Lite and Vega-Embed as one script, which sets `vegaEmbed`.
 
@@ -73,7 +75,8 @@ def render(page: Page) -> Iterator[str]:
     """The page's text in pieces; each picture is a piece, so that all of them are never in memory twice."""
     vega = read_vega()
     style, boot = _read("style.css"), _read("boot.js")
-    script = "\n".join(_read(name) for name in SCRIPTS)
+    # Vega's script has global functions; those of the page must not replace them.
+    script = "\n".join(["(() => {", *map(_read, SCRIPTS), "})();"])
     policy = (
         f"default-src 'none'; img-src data:; style-src {content_hash(style)}; "
         f"script-src {' '.join(map(content_hash, (boot, vega, script)))}; base-uri 'none'; form-action 'none'"

@@ -88,13 +88,16 @@ def read_episodes(data_set: DataSet) -> Episodes:
 
 
 def sample_views(data_set: DataSet, episodes: Episodes, count: int) -> list[View]:
-    """Sample views: cameras in turn, episodes evenly, frames of a low-discrepancy sequence; sorted and distinct."""
+    """Sample views: episodes evenly, cameras in turn, frames of a low-discrepancy sequence; sorted and distinct, `count` if there are
+    so many in the chosen episodes."""
     indices = [index for index, row in episodes.rows.items() if row.frames]
-    keys = set()
+    cameras, keys = data_set.camera_count, set()
     for number in range(count if indices else 0):
         index = indices[number * len(indices) // count]
-        frame = int((0.5 + number * _GOLDEN) % 1.0 * episodes.rows[index].frames)
-        keys.add((index, frame, number % data_set.camera_count))
+        frames = episodes.rows[index].frames
+        first = int((0.5 + number * _GOLDEN) % 1.0 * frames) * cameras + number % cameras
+        views = (divmod((first + step) % (frames * cameras), cameras) for step in range(min(count, frames * cameras)))
+        keys.update(next(([(index, *view)] for view in views if (index, *view) not in keys), []))
     return [data_set[index].view(frame, camera) for index, frame, camera in sorted(keys)]
 
 

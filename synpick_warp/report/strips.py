@@ -35,7 +35,7 @@ def choose_episodes(episodes: Episodes) -> list[int]:
     return chosen[:MAX_STRIPS]
 
 
-def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report: Callable[[int], None]) -> dict[str, Any] | None:
+def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report: Callable[[int, int], None]) -> dict[str, Any] | None:
     """JSON of an episode's film strip, whose pictures are added to the album; None: not even two frames fit the budget.
 
     Args:
@@ -43,7 +43,7 @@ def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report:
         index: Index of the episode.
         strips: Number of strips that are still to share the budget, this one included.
         album: Receives the pictures.
-        report: Receives the number of pictures that were read.
+        report: Receives the number of pictures that were read, and the largest number.
 
     Raises:
         DatasetError: A file is missing or damaged.
@@ -51,11 +51,12 @@ def make_strip(data_set: DataSet, index: int, strips: int, album: Album, report:
     episode = data_set[index]
     cameras = range(min(MAX_CAMERAS, data_set.camera_count))
     cache: dict[tuple[int, int], Picture] = {}
+    most = min(MAX_FRAMES, len(episode)) * len(cameras)
 
     def encode(frame: int, camera: int) -> Picture:
         if (frame, camera) not in cache:
             cache[frame, camera] = encode_photo(shrink(episode.view(frame, camera).rgb[..., ::-1], WIDTH), QUALITY)
-            report(len(cache))
+            report(len(cache), most)
         return cache[frame, camera]
 
     every = range(len(episode))

@@ -49,7 +49,10 @@ def _table(table: Table) -> Html:
     classes = ["num" if column.style else "" for column in table.columns]
     names = [column.name.replace("_", " ") if column.label is None else column.label for column in table.columns]
     rows = [
-        [UNKNOWN if value is None else value if isinstance(value, str) else format(value, column.style) for value, column in zip(row, table.columns, strict=True)]
+        [
+            UNKNOWN if value is None else value if isinstance(value, str) else format(value, column.style)
+            for value, column in zip(row, table.columns, strict=True)
+        ]
         for row in table.rows
     ]
     return element("div", element("h3", table.title), plain_table(names, rows, classes), class_="scroll")
@@ -81,7 +84,7 @@ def settings_tables(config: Config, versions: Mapping[str, str]) -> Html:
     """Settings that differ from the default preset with their meaning, versions, and all settings as TOML."""
     rows = changed_settings(config)
     if rows:
-        changed = plain_table(("setting", "here", "default", "meaning"), rows, ("", "", "", ""))
+        changed = plain_table(("setting", "here", "default", "meaning"), rows, ("", "wide", "wide", ""))
     else:
         changed = element("p", "All settings are those of the preset synpick.", class_="empty")
     parts = [element("div", changed, class_="scroll")]

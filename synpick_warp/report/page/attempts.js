@@ -45,14 +45,14 @@ function objectTable(objects) {
 }
 
 function forceSpec(force) {
-  const x = { field: "time", type: "quantitative", title: "time since the suction was switched on [s]" };
-  const y = { field: "force", type: "quantitative", title: "seal force [N]" };
+  const x = { field: "time", type: "quantitative", title: "time since the suction was switched on [s]", axis: { tickCount: 8 } };
+  const y = { field: "force", type: "quantitative", title: "seal force [N]", axis: { tickCount: 5 } };
   return {
     height: 190,
     layer: [
       { data: { values: [{ limit: force.limit }] }, mark: { type: "rule", strokeDash: [4, 3], color: "gray" },
         encoding: { y: { field: "limit", type: "quantitative" }, tooltip: [{ field: "limit", type: "quantitative", title: "breaks at [N]" }] } },
-      { data: { values: force.values }, mark: { type: "line", point: { size: 22 } }, encoding: { x, y, tooltip: [{ ...x, title: "time [s]" }, y] } },
+      { data: { values: force.values }, mark: { type: "line", point: { size: 22 } }, encoding: { x, y, tooltip: [{ field: "time", type: "quantitative", title: "time [s]" }, { field: "force", type: "quantitative", title: "seal force [N]" }] } },
     ],
   };
 }

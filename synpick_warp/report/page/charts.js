@@ -28,7 +28,7 @@ function plotConfig() {
 async function drawPlot(plot) {
   if (plot.view) plot.view.finalize();
   plot.view = null;
-  const spec = { width: "container", autosize: { type: "fit", contains: "padding" }, ...plot.spec };
+  const spec = { width: "container", autosize: { type: "fit-x", contains: "padding" }, ...plot.spec };
   const options = {
     mode: "vega-lite", ast: true, actions: false, renderer: "svg", defaultStyle: false, config: plotConfig(), tooltip: { disableDefaultStyle: true },
     loader: { http: { credentials: "omit" } },
@@ -56,7 +56,7 @@ function showCharts(host) {
   if (!host) return;
   const figures = content.charts.map((chart) => {
     const plot = el("div", { class: "plot" });
-    plot.style.minHeight = `${(chart.spec.height || 200) + 40}px`;
+    plot.style.minHeight = `${chart.spec.height > 0 ? chart.spec.height + 40 : 90}px`;
     addPlot(plot, chart.spec, "charts");
     return el("figure", { class: chart.wide ? "wide" : "", id: `chart-${chart.name}` }, el("h3", {}, chart.title), el("p", { class: "caption" }, chart.caption), plot);
   });
