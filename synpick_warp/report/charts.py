@@ -55,14 +55,14 @@ def make_charts(source: Source) -> list[Chart]:
     makers: tuple[Callable[[Source], Chart | None], ...] = (
         _objects,
         _visibility,
-        _outcomes,
-        _forces,
         _timeline,
-        _endings,
+        _forces,
         _coverage,
-        _lights,
+        _outcomes,
+        _endings,
         _exposure,
         _luma,
+        _lights,
     )
     return [chart for make in makers if (chart := make(source)) is not None]
 
@@ -113,7 +113,7 @@ def _mode_color(rows: Rows) -> Spec:
     """Colour by mode, in a fixed order, so that a mode has one colour in all plots; the page sets the range `category`."""
     present = {row["mode"] for row in rows}
     domain = [*MODES, *sorted(present - set(MODES))]
-    legend = None if len(present) < 2 else {"orient": "top", "values": [mode for mode in domain if mode in present]}
+    legend = None if len(present) < 2 else {"orient": "top", "offset": 16, "values": [mode for mode in domain if mode in present]}
     return _field("mode", "nominal", None, scale={"domain": domain}, legend=legend)
 
 
@@ -240,17 +240,21 @@ def _forces(source: Source) -> Chart | None:
         return None
     suction = source.config.suction
     rules = [_limit(suction.poor_force, "poor seal breaks", "left"), _limit(suction.good_force, "good seal breaks", "right")]
-    bars = _histogram(rows, FORCE_BIN, ("largest seal force [N]", "attempts"), "g")
+    bars = _histogram(rows, FORCE_BIN, (_FORCE, "attempts"), "~g")
     spec = {"height": bars.pop("height"), "layer": [bars, *rules]}
     caption = f"Largest force on a seal during each of {source.statistics.total.episodes.seals:,} lifts that engaged an object."
     return Chart("forces", "Seal forces", caption, spec)
+
+
+_FORCE = "largest seal force [N]"
+"""Title of the forces' axis."""
 
 
 def _limit(force: float, text: str, side: str) -> Spec:
     """A dashed line at a force, with its text on the other side."""
     return {
         "data": {"values": [{"limit": force, "what": text}]},
-        "encoding": {"x": _field("limit", "quantitative", None)},
+        "encoding": {"x": _field("limit", "quantitative", _FORCE)},
         "layer": [
             {"mark": {"type": "rule", "strokeDash": [4, 3], "color": "gray"}},
             {

@@ -212,7 +212,9 @@ def _coverage(figures: Figures) -> Iterator[Finding]:
     poor = [each for each in figures.statistics.objects if each.coverage.views >= MIN_COVERED_VIEWS and each.coverage.occupied < COVERED]
     if poor:
         listed = _listed(f"{each.name or f'object {each.object_id}'} ({each.coverage.occupied:.0%})" for each in poor)
-        yield Finding(NOTE, f"{_number(len(poor), 'object')} seen from few directions", f"{listed} of the sphere of viewing directions.")
+        yield Finding(
+            NOTE, f"{_number(len(poor), 'object')} seen from few directions", f"Seen part of the sphere of viewing directions: {listed}."
+        )
 
 
 def _missing(figures: Figures) -> Iterator[Finding]:

@@ -64,7 +64,7 @@ def read_vega() -> str:
         import vl_convert
     except ImportError:
         raise MissingVegaError("report needs the package vl-convert-python for its plots; pip install 'synpick-warp[report]'") from None
-    script = vl_convert.javascript_bundle(vl_version=VEGA_LITE)
+    script = vl_convert.javascript_bundle(vl_version=VEGA_LITE)  # type: ignore[call-arg]  # Its stub demands a snippet.
     # Neither an end of the element nor the states of HTML's parser that hide one can stand in the script, as its hash would not match.
     if any(text in script.lower() for text in ("</script", "<script", "<!--")):
         raise MissingVegaError("the installed vl-convert-python has a script that cannot be inlined; install another version")

@@ -18,8 +18,9 @@ MAX_EPISODES = 2000
 """Most episodes whose manifest entry is read; of more, evenly spread ones."""
 SURVEY_VIEWS = 48
 """Views whose brightness is measured."""
-_GOLDEN = 0.6180339887498949
-"""Golden ratio conjugate (√5 - 1) / 2: multiples modulo 1 are a low-discrepancy sequence for any count."""
+_STEPS = (0.7548776662466927, 0.5698402909980532)
+"""Steps of frame and camera: 1 / p and 1 / p² of the plastic number p, whose multiples modulo 1 fill the unit square evenly for any
+count (Roberts, The unreasonable effectiveness of quasirandom sequences, 2018)."""
 _WEIGHTS = np.array((0.2126, 0.7152, 0.0722), np.float32)
 """Luma of red, green and blue (Rec. 709)."""
 
@@ -88,14 +89,15 @@ def read_episodes(data_set: DataSet) -> Episodes:
 
 
 def sample_views(data_set: DataSet, episodes: Episodes, count: int) -> list[View]:
-    """Sample views: episodes evenly, cameras in turn, frames of a low-discrepancy sequence; sorted and distinct, `count` if there are
+    """Sample views: episodes evenly, frames and cameras of a low-discrepancy sequence; sorted and distinct, `count` if there are
     so many in the chosen episodes."""
     indices = [index for index, row in episodes.rows.items() if row.frames]
     cameras, keys = data_set.camera_count, set()
     for number in range(count if indices else 0):
         index = indices[number * len(indices) // count]
         frames = episodes.rows[index].frames
-        first = int((0.5 + number * _GOLDEN) % 1.0 * frames) * cameras + number % cameras
+        time, place = ((0.5 + number * step) % 1.0 for step in _STEPS)
+        first = int(time * frames) * cameras + int(place * cameras)
         views = (divmod((first + step) % (frames * cameras), cameras) for step in range(min(count, frames * cameras)))
         keys.update(next(([(index, *view)] for view in views if (index, *view) not in keys), []))
     return [data_set[index].view(frame, camera) for index, frame, camera in sorted(keys)]
