@@ -16,6 +16,7 @@ from synpick_warp.cli.convert import convert
 from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
 from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard, parse_splits
+from synpick_warp.cli.report import write_page
 from synpick_warp.cli.statistics import show_statistics
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
 from synpick_warp.cli.validate import validate
@@ -244,6 +245,7 @@ app.command(estimate)
 app.command(convert)
 app.command(show_statistics, name="stats")
 app.command(validate)
+app.command(write_page, name="report")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

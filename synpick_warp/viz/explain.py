@@ -136,7 +136,7 @@ def image_scale(size: tuple[int, int]) -> float:
 
 def _row(attempt: Attempt, scene: _Scene, names: Mapping[int, str], config: Config) -> Image:
     """Draw one attempt: image and force plot, clutter graph, text and table."""
-    image = _draw_image(attempt, scene)
+    image = draw_observation(attempt, scene.color, scene.masks)
     words = draw_words(attempt, names, config)
     left = image.shape[0] + 2 * LINE + MARGIN + PLOT_HEIGHT
     height = max(left, words.shape[0], _MIN_ROW_HEIGHT)
@@ -168,16 +168,23 @@ def _paste(sheet: Image, picture: Image, column: int, row: int) -> None:
     sheet[row : row + picture.shape[0], column : column + picture.shape[1]] = picture
 
 
-def _draw_image(attempt: Attempt, scene: _Scene) -> Image:
-    """Draw contours and suction points on the colour image, which is darkened except for the target."""
-    height, width = scene.color.shape[:2]
+def draw_observation(attempt: Attempt, color: Image, masks: Mapping[int, np.ndarray] | None) -> Image:
+    """Draw contours and suction points on the colour image, which is darkened except for the target.
+
+    Args:
+        attempt: The attempt.
+        color: Image of camera 0 at the observation (H, W, 3) uint8, blue first.
+        masks: Instance id -> modal mask (H, W) uint8, of visible instances; None: the data set has no masks.
+    """
+    masks = masks or {}
+    height, width = color.shape[:2]
     scale = image_scale((width, height))
     size = (max(1, round(scale * width)), max(1, round(scale * height)))
-    color = cv2.resize(scene.color, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    color = cv2.resize(color, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
     drawn = (0.62 * color).astype(np.uint8)
-    order = sorted(scene.masks or {}, key=lambda instance: instance == attempt.target)
+    order = sorted(masks, key=lambda instance: instance == attempt.target)
     for instance in order:
-        mask = cv2.resize(np.minimum((scene.masks or {})[instance], 1) * 255, size, interpolation=cv2.INTER_LINEAR) > 127
+        mask = cv2.resize(np.minimum(masks[instance], 1) * 255, size, interpolation=cv2.INTER_LINEAR) > 127
         _draw_contours(drawn, color, mask, instance, instance == attempt.target)
     short = labels(attempt)
     for one in attempt.seen:

@@ -6,10 +6,11 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset import records
-from synpick_warp.dataset.annotations import ADVICE
+from synpick_warp.dataset.annotations import ADVICE, check_content
 from synpick_warp.dataset.manifest import ATTEMPTS_FILE
 from synpick_warp.dataset.records import Pixel
 from synpick_warp.errors import DatasetError
@@ -115,6 +116,15 @@ def read_attempts(dataset: Path, episode: int, number: int | None) -> list[Attem
         for count, row in rows
         if number in (None, count)
     ]
+
+
+def parse_attempt(content: Mapping[str, Any], source: str) -> Attempt:
+    """Parse a record of `synpick_warp.dataset.reading.Episode.attempts`.
+
+    Raises:
+        DatasetError: It is damaged.
+    """
+    return _attempt(check_content(content, records.Attempt, source), source)
 
 
 def _line(path: Path, row: int) -> str:

@@ -176,7 +176,7 @@ def _row(view: _View) -> Image:
     depth = check_planes(counts, None, f"{view.scene / 'depth' / stem}.png") * view.depth_scale
     panels: list[tuple[str, Callable[[float], Image]]] = [
         (f"{view.scene.parent.name}/{view.scene.name} image {view.frame}", lambda scale: _fit(color, scale)),
-        (_depth_caption(depth), lambda scale: _fit(color_depth(depth), scale, smooth=False)),
+        (describe_depth(depth), lambda scale: _fit(color_depth(depth), scale, smooth=False)),
         (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
         ("boxes: amodal thin, visible thick; obj_id and visible fraction", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
     ]
@@ -215,7 +215,8 @@ def _depth_limits(depth: np.ndarray) -> tuple[float, float] | None:
     return float(low), float(high)
 
 
-def _depth_caption(depth: np.ndarray) -> str:
+def describe_depth(depth: np.ndarray) -> str:
+    """Caption of `color_depth`: the depths of the first and the last colour; depth [mm]."""
     limits = _depth_limits(depth)
     return "depth: none" if limits is None else f"depth {limits[0] / 1000:.3f} (red) to {limits[1] / 1000:.3f} m (blue); black: none"
 

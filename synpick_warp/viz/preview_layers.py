@@ -25,7 +25,12 @@ Image = np.ndarray
 
 def color_layer(name: str, values: np.ndarray) -> Image:
     """One layer as colours, from its values as `synpick_warp.layer_codec.read_layer` returns them."""
-    return _DRAW[name](values)[1]
+    return draw_layer(name, values)[1]
+
+
+def draw_layer(name: str, values: np.ndarray) -> tuple[str, Image]:
+    """Caption and colours of one layer, from its values as `synpick_warp.layer_codec.read_layer` returns them."""
+    return _DRAW[name](values)
 
 
 def layer_pictures(scene: Path, frame: int, size: tuple[int, int]) -> list[tuple[str, Image]]:

@@ -1,0 +1,52 @@
+"""Command `report`: one HTML page about a data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+from rich.console import Console
+
+from synpick_warp.cli.options import WholeNumber
+from synpick_warp.configs.check import escape
+from synpick_warp.errors import ConfigError, DatasetError
+
+MAX_THREADS = 1024
+MEGABYTE = 1e6
+"""Bytes."""
+
+
+def write_page(
+    folder: Annotated[Path, Parameter(name="DIR", help="A data set.")],
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="HTML file to write (default report.html in the data set).")] = None,
+    split: Annotated[str | None, Parameter(help="Only the episodes of this split (default: all splits).")] = None,
+    views: Annotated[WholeNumber, Parameter(help="Frames that are shown, spread over the data set.")] = 12,
+    threads: Annotated[WholeNumber, Parameter(help="Processes that count; 0: one per core.")] = 0,
+) -> int:
+    """Write a report: one HTML page with frames, film strips, explained attempts, plots, findings and settings.
+
+    The page needs no network and no other file; its pictures have at most 25 MB. Exit codes: 0; 2, the folder is not a data set, a file
+    of it is damaged, or the page cannot be written.
+    """
+    from synpick_warp.report.compose import DEFAULT_NAME, MAX_FRAMES, check_out, write_report
+
+    for option, number, least, most in (("--views", views, 1, MAX_FRAMES), ("--threads", threads, 0, MAX_THREADS)):
+        if not least <= number <= most:
+            raise ConfigError(f"{option} is {number}; allowed: {least} to {most}")
+    page = out or folder / DEFAULT_NAME
+    check_out(page)
+    from synpick_warp.cli.display import ViewCounter
+    from synpick_warp.dataset.reading import open_data_set
+
+    data_set = open_data_set(folder)
+    if not (folder / "config.toml").exists():
+        raise DatasetError(f"{folder} has no config.toml; name the folder of a data set that synpick-warp baked")
+    if split is not None:
+        data_set = data_set.split(split)
+    with ViewCounter(Console(stderr=True, highlight=False, soft_wrap=True)) as counter:
+        write_report(data_set, page, frames=views, threads=threads, report=counter.report)
+    print(f"report: {escape(str(page))} ({page.stat().st_size / MEGABYTE:.1f} MB)")
+    return 0

@@ -1,0 +1,242 @@
+"""Report of a data set: reads figures and samples, and writes one HTML file."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from synpick_warp import __version__
+from synpick_warp.dataset.manifest import read_manifest
+from synpick_warp.dataset.reading import DataSet
+from synpick_warp.dataset.view import View
+from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.report.album import Album
+from synpick_warp.report.charts import Source, make_charts
+from synpick_warp.report.explained import choose_attempts, make_attempt
+from synpick_warp.report.findings import WARNING, Figures, Finding, find
+from synpick_warp.report.frames import make_frame
+from synpick_warp.report.markup import Html, element, join
+from synpick_warp.report.page import Page, Part, read_vega, render, summary
+from synpick_warp.report.sampling import (
+    SURVEY_VIEWS,
+    Brightness,
+    Content,
+    Episodes,
+    find_content,
+    measure_brightness,
+    read_episodes,
+    sample_views,
+)
+from synpick_warp.report.strips import choose_episodes, make_strip
+from synpick_warp.report.tables import findings_list, settings_tables, statistics_tables, tiles
+from synpick_warp.statistics import Statistics, compute_statistics
+
+SUFFIXES = (".html", ".htm")
+DEFAULT_NAME = "report.html"
+FRAMES = 12
+"""Sampled frames on the page."""
+MAX_FRAMES = 200
+Report = Callable[[str, int, int], None]
+"""Progress: unit, done, total."""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Pictures and measurements of a data set."""
+
+    data: dict[str, list[dict[str, Any]]]
+    """Frames, strips and attempts, as the page's scripts expect them."""
+    brightness: list[Brightness]
+    asked: dict[str, int]
+    """Number of frames, strips and attempts that were to be shown; fewer are if the pictures' budget is spent."""
+
+
+def write_report(data_set: DataSet, out: Path, *, frames: int = FRAMES, threads: int = 0, report: Report | None = None) -> Path:
+    """Write the report of a data set, or of one of its splits.
+
+        write_report(synpick_warp.open("DATA"), Path("report.html"))
+
+    Args:
+        data_set: The data set; with settings.
+        out: HTML file to write; its folder is created. A file is replaced, a link never followed.
+        frames: Number of sampled frames.
+        threads: Maximum number of processes that count; 0: one per core.
+        report: Receives the progress.
+
+    Raises:
+        ConfigError: The settings are damaged.
+        DatasetError: There is no episode, or a file is missing or damaged.
+        MissingVegaError: The plots' library is not installed.
+        OutputError: The file cannot be written.
+    """
+    check_out(out)
+    read_vega()
+    progress = report or (lambda _unit, _done, _total: None)
+    statistics = compute_statistics(data_set, threads=threads, report=report)
+    episodes = read_episodes(data_set)
+    album = Album()
+    samples = take_samples(data_set, statistics, episodes, album, frames, progress)
+    versions, remarks = _versions(data_set)
+    findings = [*remarks, *find(Figures(statistics, episodes, samples.brightness, data_set.planned))]
+    findings.sort(key=lambda finding: finding.level != WARNING)
+    page = Page(
+        title=data_set.folder.resolve().name or "data set",
+        lead=_lead(data_set, statistics, findings),
+        tiles=tiles(statistics),
+        parts=_parts(data_set, statistics, samples, findings, versions),
+        findings=findings,
+        data=samples.data,
+        charts=make_charts(Source(statistics, samples.brightness, data_set.config)),
+        album=album,
+        footer=f"synpick-warp {__version__}, report of {data_set.folder.resolve().name}. The page loads nothing from anywhere.",
+    )
+    write_text(out, render(page))
+    return out
+
+
+def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, album: Album, frames: int, report: Report) -> Samples:
+    """Read all pictures of a report; none if the data set has no images.
+
+    Raises:
+        DatasetError: A file is missing or damaged.
+    """
+    data: dict[str, list[dict[str, Any]]] = {"frames": [], "strips": [], "attempts": []}
+    asked = dict.fromkeys(data, 0)
+    if not statistics.total.annotations.views:
+        return Samples(data, [], asked)
+    names = {each.object_id: each.name for each in statistics.objects}
+    views = sample_views(data_set, episodes, frames)
+    content = find_content(data_set, views[0]) if views else Content(False, False)
+    asked["frames"] = len(views)
+    for done, view in enumerate(views):
+        report("frames", done, len(views))
+        data["frames"] += _present(make_frame(view, content, names, episodes.rows[view.episode].mode, album))
+    chosen = choose_episodes(episodes)
+    asked["strips"] = len(chosen)
+    for place, index in enumerate(chosen):
+        strip = make_strip(
+            data_set, index, len(chosen) - place, album, lambda done, most, place=place: report(f"film strip {place + 1}", done, most)
+        )
+        data["strips"] += _present(strip)
+    attempts = choose_attempts(data_set, episodes)
+    asked["attempts"] = len(attempts)
+    for done, found in enumerate(attempts):
+        report("attempts", done, len(attempts))
+        data["attempts"] += _present(make_attempt(data_set, found, content, names, album))
+    return Samples(data, _measure(sample_views(data_set, episodes, SURVEY_VIEWS), report), asked)
+
+
+def _present(made: dict[str, Any] | None) -> list[dict[str, Any]]:
+    return [] if made is None else [made]
+
+
+def _measure(views: list[View], report: Report) -> list[Brightness]:
+    measured = []
+    for done, view in enumerate(views):
+        report("brightness", done, len(views))
+        measured.append(measure_brightness(view))
+    return measured
+
+
+def _versions(data_set: DataSet) -> tuple[Mapping[str, str], list[Finding]]:
+    """Versions of the packages that baked the set; a damaged manifest is a finding, as everything else can still be shown."""
+    try:
+        return read_manifest(data_set.folder)["versions"], []
+    except DatasetError as error:
+        return {}, [Finding(WARNING, "The manifest cannot be read", f"{error}.")]
+
+
+def _lead(data_set: DataSet, statistics: Statistics, findings: list[Finding]) -> Html:
+    config = data_set.config
+    modes = ", ".join(dict.fromkeys(group.mode for group in statistics.groups))
+    splits = ", ".join(dict.fromkeys(group.split for group in statistics.groups))
+    width, height = config.cameras.resolution
+    said = f"Modes {modes}; splits {splits}; images of {width} x {height} pixels; seed {config.bake.seed}. "
+    return join([said, element("a", f"Findings: {summary(findings)}", href="#findings"), "."])
+
+
+def _parts(data_set: DataSet, statistics: Statistics, samples: Samples, findings: list[Finding], versions: Mapping[str, str]) -> list[Part]:
+    views, shown = statistics.total.annotations.views, {name: len(made) for name, made in samples.data.items()}
+    leads = {
+        "frames": ("Frames", f"{shown['frames']} of {views:,} views, evenly spread over episodes, cameras and time."),
+        "strips": ("Episodes", "One episode of each mode, of median length, from its first frame to its last."),
+        "attempts": ("Attempts", "What was perceived, chosen and engaged, and why: attempts of every outcome."),
+    }
+    parts = []
+    for name, (title, lead) in leads.items():
+        cut = samples.asked[name] - shown[name]
+        lead += f" {cut} more did not fit the {samples_budget()} of pictures." if cut else ""
+        empty = element("p", _EMPTY[name], class_="empty") if not shown[name] else element("div", id=f"{name}-host")
+        parts.append(Part(name, title, lead, empty))
+    figures = join([element("div", id="charts-host"), statistics_tables(statistics)])
+    return [
+        *parts,
+        Part(
+            "figures",
+            "Figures",
+            "Counts of all episodes and annotations; point at a mark for its numbers, click a mode to single it out.",
+            figures,
+        ),
+        Part(
+            "findings", "Findings", "What a person who looks through the figures would raise. A note may be meant.", findings_list(findings)
+        ),
+        Part(
+            "settings",
+            "Configuration",
+            "Settings that differ from the preset synpick, which has the paper's values.",
+            settings_tables(data_set.config, versions),
+        ),
+    ]
+
+
+_EMPTY = {
+    "frames": "This data set has no images.",
+    "strips": "This data set has no images.",
+    "attempts": "No attempts can be shown: no episode picks, or there are no images.",
+}
+
+
+def samples_budget() -> str:
+    """The budget of the pictures in words."""
+    return f"{Album().budget / 1e6:.0f} MB"
+
+
+def check_out(out: Path) -> None:
+    """Check the name of the file.
+
+    Raises:
+        OutputError: It is not that of an HTML file, or it is a folder.
+    """
+    if out.suffix.lower() not in SUFFIXES:
+        raise OutputError(f"{out} is not an HTML file; its name must end in {', '.join(SUFFIXES)}")
+    if out.is_dir() and not out.is_symlink():
+        raise OutputError(f"cannot write {out}: it is a folder")
+
+
+def write_text(out: Path, pieces: Iterable[str]) -> None:
+    """Write a file that appears with all of its content or not at all.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    partial = out.with_name(f".{out.name}.{os.getpid()}")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            # A link of the name is replaced, never followed.
+            with open(partial, "x", encoding="utf-8", newline="\n") as file:
+                file.writelines(pieces)
+            partial.replace(out)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise output_error(out, error) from error
+    except ValueError as error:
+        raise OutputError(f"cannot write {out}: {error}") from error

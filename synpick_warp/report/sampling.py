@@ -1,0 +1,109 @@
+"""Samples that stand for a data set: episodes, views and frames, spread evenly, the same on every call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from synpick_warp.dataset.annotations import check_content
+from synpick_warp.dataset.manifest import episode_entry
+from synpick_warp.dataset.reading import DataSet
+from synpick_warp.dataset.view import View
+from synpick_warp.dataset.view_files import SceneFolder
+from synpick_warp.statistics.records import EpisodeFacts
+
+MAX_EPISODES = 2000
+"""Most episodes whose manifest entry is read; of more, evenly spread ones."""
+SURVEY_VIEWS = 48
+"""Views whose brightness is measured."""
+_STEPS = (0.7548776662466927, 0.5698402909980532)
+"""Steps of frame and camera: 1 / p and 1 / p² of the plastic number p, whose multiples modulo 1 fill the unit square evenly for any
+count (Roberts, The unreasonable effectiveness of quasirandom sequences, 2018)."""
+_WEIGHTS = np.array((0.2126, 0.7152, 0.0722), np.float32)
+"""Luma of red, green and blue (Rec. 709)."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Episodes that are looked at."""
+
+    rows: dict[int, EpisodeFacts]
+    """Row of each episode by its index."""
+    attempts: dict[int, int]
+    """Number of attempts by index of the episode."""
+    total: int
+    """Episodes of the data set."""
+
+
+@dataclass(frozen=True)
+class Brightness:
+    """Mean luma of one view."""
+
+    episode: int
+    camera: int
+    frame: int
+    mean: float
+    """From 0 to 1, of the sRGB values."""
+
+
+@dataclass(frozen=True)
+class Content:
+    """Images that the data set has beside colour."""
+
+    masks: bool
+    depth: bool
+
+
+def find_content(data_set: DataSet, view: View) -> Content:
+    """Look whether a view has masks and depth: folders of its scene; shards always have depth."""
+    files = data_set.scene_files(view.episode, view.camera)
+    if isinstance(files, SceneFolder):
+        return Content((files.folder / "mask_visib").is_dir(), (files.folder / "depth").is_dir())
+    return Content(data_set.config.bop.masks, True)
+
+
+def spread(items: Sequence[int], count: int) -> list[int]:
+    """At most `count` of the items, evenly spread, the first and the last among them if there are two or more."""
+    if len(items) <= count:
+        return list(items)
+    if count == 1:
+        return [items[len(items) // 2]]
+    return [items[index * (len(items) - 1) // (count - 1)] for index in range(count)]
+
+
+def read_episodes(data_set: DataSet) -> Episodes:
+    """Read the rows of at most MAX_EPISODES episodes.
+
+    Raises:
+        DatasetError: A manifest entry is damaged.
+    """
+    indices = list(data_set)
+    rows, attempts = {}, {}
+    for index in spread(indices, MAX_EPISODES):
+        episode = data_set[index]
+        rows[index] = check_content(episode.row, EpisodeFacts, data_set.folder / f"{episode_entry(index)}.json")
+        attempts[index] = len(episode.attempts)
+    return Episodes(rows, attempts, len(indices))
+
+
+def sample_views(data_set: DataSet, episodes: Episodes, count: int) -> list[View]:
+    """Sample views: episodes evenly, frames and cameras of a low-discrepancy sequence; sorted and distinct, `count` if there are
+    so many in the chosen episodes."""
+    indices = [index for index, row in episodes.rows.items() if row.frames]
+    cameras, keys = data_set.camera_count, set()
+    for number in range(count if indices else 0):
+        index = indices[number * len(indices) // count]
+        frames = episodes.rows[index].frames
+        time, place = ((0.5 + number * step) % 1.0 for step in _STEPS)
+        first = int(time * frames) * cameras + int(place * cameras)
+        views = (divmod((first + step) % (frames * cameras), cameras) for step in range(min(count, frames * cameras)))
+        keys.update(next(([(index, *view)] for view in views if (index, *view) not in keys), []))
+    return [data_set[index].view(frame, camera) for index, frame, camera in sorted(keys)]
+
+
+def measure_brightness(view: View) -> Brightness:
+    """Mean luma of a view; every fourth row and column is read."""
+    mean = float((view.rgb[::4, ::4] @ _WEIGHTS).mean()) / 255.0
+    return Brightness(view.episode, view.camera, view.frame, mean)

@@ -1,0 +1,80 @@
+"""Plots: their values are those of the statistics, Vega-Lite compiles them, and names are values only."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+pytest.importorskip("vl_convert")
+
+import synpick_warp
+from synpick_warp.configs.load import load_config
+from synpick_warp.report.charts import Source, make_charts, object_labels
+from synpick_warp.report.page import VEGA_LITE
+from synpick_warp.report.sampling import Brightness, find_content, measure_brightness, read_episodes, sample_views
+from synpick_warp.statistics import compute_statistics
+from synpick_warp.statistics.timeline import TimePoint
+
+
+@pytest.fixture(scope="module")
+def statistics(data):
+    return compute_statistics(synpick_warp.open(data))
+
+
+@pytest.fixture(scope="module")
+def charts(statistics):
+    """Plots of the set as if it had two modes."""
+    group = statistics.groups[0]
+    other = replace(group, mode="move", objects_over_time=(TimePoint(0.0, 2, 5.0),))
+    source = Source(replace(statistics, groups=(group, other)), [Brightness(0, 0, 0, 0.31), Brightness(0, 0, 1, 1.0)], load_config())
+    return {chart.name: chart for chart in make_charts(source)}
+
+
+def total(chart, key: str) -> int:
+    return sum(row[key] for row in chart.spec["data"]["values"])
+
+
+def test_the_values_are_those_of_the_statistics(charts, statistics):
+    counted, episodes = statistics.total.annotations, statistics.total.episodes
+    assert total(charts["objects"], "instances") == total(charts["visibility"], "count") == 2 * counted.instances
+    assert total(charts["outcomes"], "attempts") == 2 * episodes.attempts
+    assert total(charts["endings"], "episodes") == 2 * episodes.episodes
+    assert sum(row["count"] for row in charts["forces"].spec["layer"][0]["data"]["values"]) == 2 * episodes.seals
+    assert total(charts["coverage"], "views") == sum(each.coverage.views for each in statistics.objects)
+    assert total(charts["lights"], "count") == statistics.lights.episodes
+    assert [(row["low"], row["count"]) for row in charts["brightness"].spec["data"]["values"]] == [(0.3, 1), (0.95, 1)]
+
+
+def test_every_plot_compiles(charts):
+    import vl_convert
+
+    for chart in charts.values():
+        compiled = vl_convert.vegalite_to_vega({"width": 400, **chart.spec}, vl_version=VEGA_LITE)
+        assert compiled["marks"], chart.name
+
+
+def test_names_stand_in_values_only(statistics):
+    evil = "datum['x'] + signal"
+    objects = tuple(replace(each, name=evil) for each in statistics.objects)
+    charts = make_charts(Source(replace(statistics, objects=objects), [], load_config()))
+    for chart in charts:
+        rest = {key: value for key, value in chart.spec.items() if key not in ("data", "params")}
+        rest.get("encoding", {}).get("y", {}).pop("sort", None)
+        rest.get("encoding", {}).get("y", {}).pop("scale", None)
+        assert evil not in str(rest)
+    labels = object_labels(objects)
+    assert len(set(labels.values())) == len(objects)
+
+
+def test_views_are_sampled_evenly_and_distinct(data):
+    opened = synpick_warp.open(data)
+    episodes = read_episodes(opened)
+    assert (episodes.total, episodes.attempts) == (3, {0: 1, 1: 1, 2: 1})
+    for count in (1, 3, 12, 18, 40):
+        keys = [(view.episode, view.frame, view.camera) for view in sample_views(opened, episodes, count)]
+        assert len(set(keys)) == len(keys) == min(count, 18)
+        assert len({key[0] for key in keys}) == min(count, 3)
+    view = opened[0].view(0)
+    assert find_content(opened, view).masks
+    assert measure_brightness(view).mean == pytest.approx(float((view.rgb[::4, ::4] @ [0.2126, 0.7152, 0.0722]).mean()) / 255, abs=1e-4)

@@ -1,0 +1,185 @@
+"""The page as text: what it has, what it may run, sets of every shape, and bad input in one line."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("vl_convert")
+
+import synpick_warp
+from synpick_warp.cli.commands import main
+from synpick_warp.errors import OutputError
+from synpick_warp.report import album, compose, write_report
+from synpick_warp.report import page as page_module
+from synpick_warp.report.markup import content_hash
+from tests.report.conftest import EVIL
+
+SECTIONS = ["frames", "strips", "attempts", "figures", "findings", "settings"]
+ADDRESSES = ("src", "href", "action", "data", "srcset", "formaction", "poster")
+VOID = {"meta", "link"}
+
+
+class Parsed(HTMLParser):
+    """Elements of a page, and the texts of its scripts."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.texts: list[str] = []
+        self.open: list[str] = []
+        self.feed(path.read_text(encoding="utf-8"))
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attrs)))
+        self.texts.append("")
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == self.elements[-1][0]:
+            self.texts[-1] += data
+
+    def policy(self) -> str:
+        return next(attributes["content"] or "" for tag, attributes in self.elements if attributes.get("http-equiv"))
+
+    def content(self) -> dict:
+        return json.loads(next(text for (_, each), text in zip(self.elements, self.texts, strict=True) if each.get("id") == "content"))
+
+
+def refused(capsys, *arguments: object) -> str:
+    """Message of a command that is refused."""
+    assert main(["report", *map(str, arguments)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    (line,) = captured.err.splitlines()
+    return line.removeprefix("synpick-warp: error: ")
+
+
+def test_the_page_has_all_sections_and_their_content(page):
+    parsed = Parsed(page)
+    assert parsed.open == []
+    assert [attributes["id"] for tag, attributes in parsed.elements if tag == "section"] == SECTIONS
+    content = parsed.content()
+    assert [len(content[name]) for name in ("frames", "strips", "attempts")] == [12, 1, 3]
+    frame = content["frames"][0]
+    assert {"rgb", "ids", "depth"} <= frame["pictures"].keys()
+    assert [one["object"] for one in frame["instances"]] == [3, 7, 3]
+    stored = {attributes["id"] for _, attributes in parsed.elements if str(attributes.get("id")).startswith("picture-")}
+    named = {each["picture"] for one in content["frames"] for each in one["pictures"].values()}
+    named |= {picture for strip in content["strips"] for camera in strip["cameras"] for picture in camera}
+    named |= {attempt["picture"] for attempt in content["attempts"]}
+    assert stored == {f"picture-{index}" for index in named}
+    assert {"objects", "visibility", "outcomes", "forces"} <= {chart["name"] for chart in content["charts"]}
+
+
+@pytest.mark.parametrize("kind", ["page", "hostile_page"])
+def test_only_the_pages_own_scripts_may_run_and_nothing_is_loaded(kind, request):
+    parsed = Parsed(request.getfixturevalue(kind))
+    policy = parsed.policy()
+    assert policy.startswith("default-src 'none'; img-src data:; style-src 'sha256-")
+    assert "unsafe" not in policy
+    assert "http" not in policy
+    allowed = set(re.findall(r"'sha256-[^']+'", policy))
+    for (tag, attributes), text in zip(parsed.elements, parsed.texts, strict=True):
+        assert not [name for name in attributes if name.startswith("on") or name == "style"]
+        assert all((attributes.get(name) or "#").startswith(("#", "data:,")) for name in ADDRESSES)
+        if tag == "style" or (tag == "script" and "type" not in attributes):
+            assert content_hash(text) in allowed
+        elif tag == "script":
+            assert attributes["type"] in ("application/json", "text/plain")
+        assert tag not in ("iframe", "object", "embed", "base", "form", "img")
+    assert len([tag for tag, attributes in parsed.elements if tag == "script" and "type" not in attributes]) == 3
+
+
+def test_hostile_names_are_texts(hostile_page):
+    content = Parsed(hostile_page).content()
+    assert content["strips"][0]["sentence"] == content["attempts"][0]["sentence"] == EVIL
+    assert content["frames"][0]["light"] == EVIL
+    assert {one["name"] for frame in content["frames"] for one in frame["instances"]} == {EVIL}
+    assert "<img" not in hostile_page.read_text().split('id="content"')[0]
+
+
+def test_the_same_set_gives_the_same_bytes(data, page, tmp_path):
+    assert write_report(synpick_warp.open(data), tmp_path / "again.html").read_bytes() == page.read_bytes()
+
+
+def test_the_budget_of_pictures_holds(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(compose, "Album", lambda: album.Album(budget=4000))
+    path = write_report(synpick_warp.open(data), tmp_path / "small.html")
+    parsed = Parsed(path)
+    sizes = [len(text) for (_, each), text in zip(parsed.elements, parsed.texts, strict=True) if str(each.get("id")).startswith("picture-")]
+    assert sum(sizes) <= 4000
+    assert "did not fit" in path.read_text()
+
+
+def test_sets_of_every_shape(data, tmp_path, capsys):
+    folder = tmp_path / "set"
+    shutil.copytree(data, folder)
+    shutil.rmtree(folder / "train")
+    assert main(["report", str(folder)]) == 0
+    assert capsys.readouterr().out.startswith(f"report: {folder / 'report.html'} (")
+    assert len(Parsed(folder / "report.html").content()["frames"]) == 12
+    shutil.rmtree(folder / "train_web")
+    assert main(["report", str(folder), "--views", "2"]) == 0
+    assert Parsed(folder / "report.html").content()["frames"] == []
+    assert "This data set has no images." in (folder / "report.html").read_text()
+
+
+def test_a_damaged_manifest_is_a_finding(data, tmp_path):
+    shutil.copytree(data, tmp_path / "set")
+    (tmp_path / "set" / "manifest.json").write_text("{}")
+    path = write_report(synpick_warp.open(tmp_path / "set"), tmp_path / "report.html")
+    assert "The manifest cannot be read" in path.read_text()
+
+
+def test_bad_input_is_one_line_and_nothing_is_written(data, tmp_path, capsys):
+    (tmp_path / "folder.html").mkdir()
+    assert refused(capsys, data, "--out", tmp_path / "page.pdf").endswith("its name must end in .html, .htm")
+    assert refused(capsys, data, "--out", tmp_path / "folder.html").endswith("it is a folder")
+    assert refused(capsys, data, "--views", 0) == "--views is 0; allowed: 1 to 200"
+    assert refused(capsys, data, "--split", "west", "--out", tmp_path / "x.html").endswith("splits: train")
+    assert "is not a data set" in refused(capsys, tmp_path, "--out", tmp_path / "x.html")
+    broken = tmp_path / "broken"
+    shutil.copytree(data, broken)
+    for image in broken.glob("train/000000/rgb/*"):
+        image.write_bytes(b"no image")
+    assert str(broken / "train" / "000000" / "rgb") in refused(capsys, broken)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken", "folder.html"]
+    assert not (broken / "report.html").exists()
+
+
+def test_a_link_is_replaced_and_never_followed(data, tmp_path):
+    (tmp_path / "thesis.html").write_text("ten years")
+    (tmp_path / "report.html").symlink_to(tmp_path / "thesis.html")
+    write_report(synpick_warp.open(data), tmp_path / "report.html", frames=1)
+    assert (tmp_path / "thesis.html").read_text() == "ten years"
+    assert not (tmp_path / "report.html").is_symlink()
+
+
+def test_without_the_plots_library_one_line_says_so(data, tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "vl_convert", None)
+    monkeypatch.setattr(compose, "read_vega", page_module.read_vega.__wrapped__)
+    assert refused(capsys, data, "--out", tmp_path / "x.html") == (
+        "report needs the package vl-convert-python for its plots; pip install 'synpick-warp[report]'"
+    )
+
+
+def test_a_full_disk_leaves_nothing(data, tmp_path):
+    def pieces():
+        yield "<!doctype html>"
+        raise OSError(28, "No space left on device")
+
+    with pytest.raises(OutputError, match="No space left"):
+        compose.write_text(tmp_path / "report.html", pieces())
+    assert list(tmp_path.iterdir()) == []
