@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import pickle
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -27,12 +28,16 @@ def folder(request, tmp_path_factory):
 
 @pytest.fixture
 def torch(monkeypatch):
-    """PyTorch, or its stand-in where it is not installed."""
-    if importlib.util.find_spec("torch") is None:
+    """PyTorch, or its stand-in where it is not installed, which is gone after the test: other libraries would take it for PyTorch."""
+    missing = importlib.util.find_spec("torch") is None
+    if missing:
         monkeypatch.syspath_prepend(str(STUBS))
     import torch
 
-    return torch
+    yield torch
+    if missing:
+        for name in [name for name in sys.modules if name.partition(".")[0] == "torch"]:
+            del sys.modules[name]
 
 
 def test_samples_are_views_in_order_with_what_is_visible_enough(folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 import synpick_warp
 from synpick_warp import pipeline
 from synpick_warp.configs.load import load_config
+from synpick_warp.webdataset import decode_view
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import catalog, settings
 from tools.examples import bake_and_show, read_trajectory, train_loop
@@ -70,7 +72,9 @@ def test_samples_of_the_train_loop_are_views(folder):
     names = ("rgb.png", "depth.png", "camera.json", "mask_visib.json")
     web = shutil.copytree(folder, folder.parent / "web", ignore=shutil.ignore_patterns("train"))
     files = synpick_warp.open(web)[0].view(1)._files
-    sample = train_loop.decode({name: files._read(1, name) for name in names})
+    entries = {name: files._read(1, name) for name in names}
+    decoded = {name: decode_view(f".{name}", data) for name, data in entries.items()}
+    sample = train_loop.prepare(decoded | {"camera.json": json.loads(entries["camera.json"])})
     np.testing.assert_allclose(sample["image"], view.rgb / np.float32(255))
     np.testing.assert_allclose(sample["depth"], view.depth, rtol=1e-6)
     np.testing.assert_array_equal(sample["foreground"], view.masks.any(axis=0))
