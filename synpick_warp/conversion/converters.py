@@ -12,7 +12,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import ClassVar
 
-from synpick_warp.configs.schema import CLASSIC, MULTISENSOR, Config
+from synpick_warp.configs.schema import CLASSIC, Config
 from synpick_warp.configs.splits import bop_folder
 from synpick_warp.conversion.scenes import SceneContent, SceneSource, place_shards, write_coco, write_scene, write_shards, write_video_group
 from synpick_warp.conversion.source import Source, SourceEpisode
@@ -163,8 +163,6 @@ class BopConverter(_SceneConverter):
         super().__init__(source, out, config, pool)
         if config.bop.coco and not config.bop.masks:
             raise DatasetError(f"{source.folder} has no masks, which bop.coco needs; bake it with bop.masks = true")
-        if config.bop.layout != CLASSIC or config.bop.keypoints:
-            raise DatasetError(f'{source.folder} has bop.layout = "{MULTISENSOR}" or bop.keypoints, which only a bake can write')
         names = sorted(_read_names(source).items())
         self._categories = tuple({"id": obj_id, "name": name, "supercategory": "synpick"} for obj_id, name in names)
 
@@ -331,15 +329,24 @@ class Converters(Exporters):
             converter.convert(episode, count_down)
 
 
-def check_formats(names: Sequence[str], present: Sequence[str], folder: Path) -> None:
+def check_formats(names: Sequence[str], config: Config, folder: Path) -> None:
     """Check that a data set can be converted to these formats.
 
+    Args:
+        names: Names of formats.
+        config: Settings of the data set.
+        folder: Its folder.
+
     Raises:
-        ConfigError: One is unknown, cannot be converted to, or is there already.
+        ConfigError: A format is unknown, cannot be converted to, or is there already; or the settings are those of a bake only.
     """
+    if config.bop.layout != CLASSIC:
+        raise ConfigError(f'{folder} has bop.layout = "{config.bop.layout}", which convert does not read; bake the other formats')
+    if config.bop.keypoints and "bop" in names:
+        raise ConfigError(f"{folder} has bop.keypoints = {config.bop.keypoints}, which convert does not write; bake the format bop")
     for name in names:
         if name not in CONVERTERS:
             why = "; no other format has the physics of zarr" if name == "zarr" else ""
             raise ConfigError(f"--to names {name}; allowed: {', '.join(CONVERTERS)}{why}")
-        if name in present:
+        if name in config.bake.formats:
             raise ConfigError(f"--to names {name}, which {folder} has already; copy the folder")

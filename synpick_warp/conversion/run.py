@@ -46,7 +46,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         OutputError: A file cannot be written.
     """
     source = Source(folder)
-    check_formats(formats, source.config.bake.formats, folder)
+    check_formats(formats, source.config, folder)
     _check_apart(folder, out)
     config = dataclasses.replace(source.config, bake=dataclasses.replace(source.config.bake, formats=tuple(formats)))
     classes = load_exporter_classes(formats)

@@ -13,6 +13,7 @@ import pytest
 
 from synpick_warp.cli.commands import EXIT_MISTAKE, main
 from synpick_warp.configs.schema import Config, Split
+from synpick_warp.conversion.converters import check_formats
 from synpick_warp.conversion.run import convert
 from synpick_warp.dataset.verify import verify
 from synpick_warp.errors import ConfigError, DatasetError
@@ -160,6 +161,13 @@ def test_what_cannot_be_converted_is_one_error_and_leaves_nothing(sets, tmp_path
     with pytest.raises(error, match=message):
         run(sets[source], tmp_path / "out", *formats)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("formats", "bop"), [(("shards",), {"layout": "multisensor"}), (("bop",), {"keypoints": 8})])
+def test_what_only_a_bake_has_is_refused(formats, bop):
+    config = settings("bop" if "bop" not in formats else "shards", "zarr")
+    with pytest.raises(ConfigError, match=f"has bop.{next(iter(bop))} = .*, which convert does not"):
+        check_formats(formats, dataclasses.replace(config, bop=dataclasses.replace(config.bop, **bop)), Path("DATA"))
 
 
 @pytest.mark.parametrize("place", [".", "inside", ".."])
