@@ -1,4 +1,4 @@
-"""Reading of [splits.NAME] tables: validation, defaults, resolution to `Split`s."""
+"""Parser of the configuration tables [splits.NAME]: validation, defaults, and episode ranges as `Split`s."""
 
 from __future__ import annotations
 

@@ -324,7 +324,7 @@ def test_run_boundaries_are_those_of_the_batchs_own_images(device):
 
 
 def test_files_and_lists_stand_for_images(device):
-    """Files are those of the color images; images that are not copied can be fetched one by one."""
+    """JPEG files equal the encoded colour images; images that stay on the device are copied on demand, one at a time."""
     renderer, config = FakeRenderer([]), config_of(render__views_per_batch=4)
     sizes, tick_time = view_sizes(config, device), config.physics.step * config.physics.steps_per_tick
     host = stream.HostImages(("color", "instance", "amodal"), 90)

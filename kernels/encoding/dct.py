@@ -14,7 +14,7 @@ vec8i = wp.types.vector(length=8, dtype=wp.int32)
 block_vec = wp.types.vector(length=64, dtype=wp.int32)
 
 COLOR_BITS = wp.constant(16)
-"""Fractional bits of the colour transform."""
+"""Fractional bits of the colour transform; its factors are those of JFIF times 2^16, and 32768 is the half that rounds."""
 DCT_BITS = wp.constant(13)
 """Fractional bits of the DCT's factors."""
 PASS_BITS = wp.constant(2)

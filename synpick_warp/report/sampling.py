@@ -1,4 +1,4 @@
-"""Samples that stand for a data set: episodes, views and frames, spread evenly, the same on every call."""
+"""Deterministic, stratified sampling of a data set's episodes, views and frames."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from synpick_warp.dataset.view_files import SceneFolder
 from synpick_warp.statistics.records import EpisodeFacts
 
 MAX_EPISODES = 2000
-"""Most episodes whose manifest entry is read; of more, evenly spread ones."""
+"""Maximum number of episodes whose manifest entry is read; larger data sets are sampled at equal steps."""
 SURVEY_VIEWS = 48
-"""Views whose brightness is measured."""
+"""Number of views whose brightness is measured."""
 _STEPS = (0.7548776662466927, 0.5698402909980532)
 """Steps of frame and camera: 1 / p and 1 / p² of the plastic number p, whose multiples modulo 1 fill the unit square evenly for any
 count (Roberts, The unreasonable effectiveness of quasirandom sequences, 2018)."""
@@ -27,7 +27,7 @@ _WEIGHTS = np.array((0.2126, 0.7152, 0.0722), np.float32)
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes that are looked at."""
+    """Sampled episodes."""
 
     rows: dict[int, EpisodeFacts]
     """Row of each episode by its index."""
@@ -89,8 +89,10 @@ def read_episodes(data_set: DataSet) -> Episodes:
 
 
 def sample_views(data_set: DataSet, episodes: Episodes, count: int) -> list[View]:
-    """Sample views: episodes evenly, frames and cameras of a low-discrepancy sequence; sorted and distinct, `count` if there are
-    so many in the chosen episodes."""
+    """Sample distinct views, sorted: episodes at equal steps, frames and cameras by a low-discrepancy (R2) sequence.
+
+    Fewer than `count` views are returned if the chosen episodes have fewer.
+    """
     indices = [index for index, row in episodes.rows.items() if row.frames]
     cameras, keys = data_set.camera_count, set()
     for number in range(count if indices else 0):

@@ -13,7 +13,7 @@ DEPTH_BIN = 5.0
 """Width of a bin of depth [mm]."""
 QUANTILES = (0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0)
 _LEVELS = 2**16
-"""Values of a depth image."""
+"""Number of possible counts in a 16-bit depth image."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class DepthCounts(Counts):
     """Pixels by bin of depth."""
 
     def add_image(self, image: np.ndarray, scale: float) -> None:
-        """Count a depth image (H, W) uint16 with `scale` mm per count; 0 is no measurement."""
+        """Accumulate a depth image (H, W) uint16 with `scale` mm per count; 0 is no measurement."""
         levels = np.bincount(image.ravel(), minlength=_LEVELS)
         self.totals.update(views=1, pixels=image.size, missing=int(levels[0]))
         present = np.flatnonzero(levels[1:]) + 1

@@ -87,7 +87,7 @@ class Partial:
             self._add_depth(scene, frame)
 
     def _add_depth(self, scene: SceneTruth, frame: int) -> None:
-        """Count a depth image; a scene folder without depth has none."""
+        """Accumulate the histogram of a depth image; scenes without depth images are skipped."""
         if isinstance(scene.files, SceneFolder) and not scene.files.images("depth").is_dir():
             return
         image = check_planes(scene.files.image("depth", frame), None, f"{scene.files.place}, depth of image {frame},", np.uint16.__name__)

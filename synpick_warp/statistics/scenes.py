@@ -33,9 +33,9 @@ class SceneTruth:
     light: Light | None
     """Light of the first frame; None: it is not told."""
     depth_scale: np.ndarray
-    """Depth of one count in each frame (F,) float64 [mm]."""
+    """Depth scale of each frame (F,) float64 [mm per count]."""
     files: SceneFiles
-    """Where the images are."""
+    """Reader of the scene's images."""
 
 
 def read_scene(data_set: DataSet, episode: int, camera: int) -> SceneTruth:

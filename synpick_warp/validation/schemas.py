@@ -45,7 +45,7 @@ class Info(Struct, gc=False):
 
 
 class Segmentation(Struct, gc=False):
-    """Run-length encoding of a mask; pycocotools compresses `counts` into a string."""
+    """Run-length encoding (RLE) of a mask; `counts` is a list, or a string in pycocotools' compressed form."""
 
     counts: list[Index] | str
     size: tuple[Index, Index]

@@ -1,4 +1,4 @@
-"""The paper's numbers, and distances of distributions."""
+"""Comparison with the SynPick paper: consistency of its published numbers, and the total variation distance."""
 
 from __future__ import annotations
 

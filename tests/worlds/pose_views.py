@@ -41,7 +41,7 @@ def rays(width: int, height: int, focal: float) -> tuple[np.ndarray, np.ndarray]
 
 
 def drawn(label: np.ndarray, depth: np.ndarray, focal: float, color: np.ndarray | None = None) -> ViewBatch:
-    """A view: labels (H, W), depth (H, W) [m], 0: none, and linear RGB (H, W, 3) or mid-grey."""
+    """Batch of one view from labels (H, W), depth (H, W) [m] (0: none) and linear RGB (H, W, 3), by default mid-grey."""
     height, width = label.shape
     linear = np.full((height, width, 3), 0.2) if color is None else color
     return ViewBatch(

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 CLIENTS = ("bop_toolkit", "shards", "hugging_face", "coco", "xarray_store", "newton_usd", "blender", "lerobot")
-"""Modules of the clients, in the order of the table."""
+"""Client modules, in the order of the table's rows."""
 SAMPLES = 3
-"""Frames that are read of an episode."""
+"""Number of frames read from an episode."""
 MISSING = 3
 """Exit code of a client's process that lacks a package."""
 PICTURE = "picture"

@@ -25,7 +25,7 @@ WIDTH = 320
 PATHS = 48
 """Cycles' samples a pixel."""
 SHOULDER_START = 0.6
-"""Where our tone curve bends (kernels/render/images/postprocess.py)."""
+"""Knee of the tone curve (kernels/render/images/postprocess.py)."""
 
 
 def find(data: Path, sources: Sources) -> Path | None:
@@ -91,7 +91,7 @@ def _render(frame: int) -> np.ndarray:
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """Send standard output to nowhere, also that of Blender's C code."""
+    """Redirect standard output to the null device, that of Blender's C code included."""
     sys.stdout.flush()
     saved, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:

@@ -22,7 +22,7 @@ def version_of(package: str) -> str:
 
 
 def main() -> int:
-    """Read as the client NAME does: NAME PLACE DATA OUT SOURCES; returns MISSING if a package is not there."""
+    """Run one client in this process; arguments: NAME PLACE DATA OUT SOURCES. Returns MISSING if its package is not installed."""
     name, place, data, out, sources = sys.argv[1:]
     try:
         module = importlib.import_module(f"tools.clients.{name}")

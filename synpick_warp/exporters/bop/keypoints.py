@@ -34,7 +34,7 @@ class Keypoints:
     positions: np.ndarray
     """In the model's frame (K, 3) float64 [mm]."""
     edges: tuple[tuple[int, int], ...]
-    """Skeleton: each keypoint but the first is joined to the nearest one before it, so it is a tree."""
+    """Skeleton edges, a tree: each keypoint is connected to its nearest predecessor in sampling order."""
 
 
 def sample_keypoints(vertices: np.ndarray, count: int) -> Keypoints:

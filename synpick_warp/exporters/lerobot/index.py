@@ -184,7 +184,7 @@ def _batch_tables(tables: Iterator[pa.Table]) -> Iterator[pa.Table]:
 
 
 def _to_array(values: np.ndarray, feature: Feature) -> pa.Array:
-    """A column as an Arrow array: numbers, or lists of fixed size."""
+    """Arrow array of a feature's column: scalars, or fixed-size lists for vectors."""
     flat = pa.array(np.ascontiguousarray(values).ravel())
     return pa.FixedSizeListArray.from_arrays(flat, len(feature.names)) if feature.names else flat
 

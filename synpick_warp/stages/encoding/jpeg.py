@@ -32,9 +32,9 @@ from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kerne
 from synpick_warp.stages.buffers import ViewBuffers
 
 SLOT_BYTES_PER_PIXEL = 1.0
-"""Capacity of a restart interval: four times the mean of totes at quality 95."""
+"""Capacity of a restart interval: nearly four times the mean at quality 95 (568 kB for a full-HD view of a tote)."""
 FILE_BYTES_PER_PIXEL = 0.75
-"""Capacity of a file: three times what a tote takes at quality 95."""
+"""Capacity of a file: nearly three times its size at quality 95."""
 MIN_FILE_BYTES = 1024
 """Capacity for header and markers [B]."""
 LANES = 32
