@@ -17,7 +17,7 @@ from tools.clients.base import MILLIMETERS, Reading, Sources, first_scene, make_
 
 PACKAGES = ("bop_toolkit_lib", "numpy")
 BOUNDS = {"depth": 1e-5, "world_to_camera": 1e-12, "object_to_camera": 1e-12, "model": 1e-4}
-"""Bounds of the largest absolute difference: depth [m] and poses (translations in metres, millimetres in the toolkit); models are float32 [mm]."""
+"""Bounds of the largest absolute difference: depth and poses, in the toolkit in millimetres, [m]; models in float32 [mm]."""
 
 
 def find(data: Path, sources: Sources) -> Path | None:
