@@ -29,6 +29,10 @@ BLOCK_THREADS = 16384
 COUNT_THREADS = 1024
 """Threads that share the pixels of one instance in counts and boxes: enough to hide the latency of reads, few enough that their atomics do
 not contend."""
+BORDER_GROUPS, BORDER_THREADS = 2112, 128
+"""Groups and threads of one that share the pixels of boxes beyond the image: as many as an H200's 132 multiprocessors hold at once."""
+BORDER_CHUNK = 8192
+"""Pixels that a group takes at a time: 64 rays a thread, few enough that groups end together, many enough that their atomics are rare."""
 FOOTPRINT_THREADS = 128
 """Threads that share the list of anti-aliasing footprints of a chunk: it has some hundred samples."""
 CPU_PIECES = 8

@@ -26,6 +26,7 @@ from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch, jpeg_siz
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.images import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
+from synpick_warp.stages.render.annotate import BORDER_BOXES, border_sizes
 from synpick_warp.stages.render.denoised import DENOISED_SCRATCH, scratch_sizes
 from synpick_warp.stages.render.layers import BODY_MOTIONS, MOTION_LAYERS
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
@@ -195,7 +196,7 @@ def _images(config: Config, device: wp.Device) -> Iterator[Term]:
     boundaries = boundary_sizes(views)
     groups: list[tuple[Any, dict[str, int], int]] = [(ViewBuffers, views, ring), (BoundaryBuffers, boundaries, ring)]
     groups += [(BoundaryScratch, boundaries, 1)] + [(kind, views, 1) for kind in (VIEW_BODIES, GBUFFER, SHADED_IMAGE)]
-    groups += [(VISIBILITY_BUFFER, visibility_sizes(views["view"], width, height), 1)]
+    groups += [(VISIBILITY_BUFFER, visibility_sizes(views["view"], width, height), 1), (BORDER_BOXES, border_sizes(views["view"], room), 1)]
     if MOTION_LAYERS.intersection(config.render.layers):
         groups += [(BODY_MOTIONS, views, 1)]
     if has_lens_filter(config.effects):

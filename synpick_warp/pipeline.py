@@ -5,14 +5,16 @@ This is the one module that passes the whole `Config` on; stages take what they 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import warp as wp
 
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.codes import Phase
@@ -43,6 +45,9 @@ from synpick_warp.stages.stream import FrameStream, TickReader, TickReport, host
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device
 from synpick_warp.system.interrupt import StopRequest
+
+HIGH_PRIORITY = -1
+"""CUDA stream priority of physics: its 25,000 short kernels a tick wait for each other, and should not also wait for the renderer's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,16 +202,18 @@ class _Run:
         self.config, self.factory, self.exporters = config, factory, exporters
         self.commit, self.summary, self.progress = commit, summary, progress
         self.meter = _Meter(config, summary, progress)
+        device = factory.simulation.device
+        self.physics_stream = wp.Stream(device, priority=HIGH_PRIORITY) if device.is_cuda else None
 
     def run(self) -> None:
         """Tick until no episode remains or a signal requests a stop.
 
-        Double-buffered: the device simulates the next tick while the host reads this one.
+        Double-buffered: the device simulates the next tick on a stream of its own while this one is rendered, copied and read.
         """
         simulation = self.factory.simulation
         readers = [TickReader(record) for record in simulation.records]
         self.progress.stage("compiling kernels, dropping objects")
-        with StopRequest() as stop:
+        with StopRequest() as stop, self._simulation_ended():
             self._simulate(readers, 0)
             current = 0
             while not stop.number:
@@ -225,9 +232,20 @@ class _Run:
     def _simulate(self, readers: list[TickReader], record: int) -> None:
         """Enqueue a tick and its copy to the host."""
         simulation = self.factory.simulation
-        with scope("simulate", simulation.device):
-            simulation.tick(simulation.records[record])
-        readers[record].start()
+        with wp.ScopedStream(self.physics_stream):
+            with scope("simulate", simulation.device):
+                simulation.tick(simulation.records[record])
+            readers[record].start()
+
+    @contextlib.contextmanager
+    def _simulation_ended(self) -> Iterator[None]:
+        """Wait at the end for the tick that was simulated ahead: its arrays are freed by another stream."""
+        try:
+            yield
+        finally:
+            if self.physics_stream is not None:
+                with contextlib.suppress(RuntimeError):  # A failed device; the error that ends the loop tells it.
+                    wp.synchronize_stream(self.physics_stream)
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot) -> None:
         """Hand a tick's frames, views and episode ends to the exporters."""

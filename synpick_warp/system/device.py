@@ -15,6 +15,9 @@ from synpick_warp.errors import DeviceError
 from synpick_warp.system.caches import usable_kernel_cache
 from synpick_warp.system.descriptors import STANDARD_ERROR
 
+_CONNECTIONS = ("CUDA_DEVICE_MAX_CONNECTIONS", "32")
+"""Hardware queues that CUDA maps streams to; its default is 8. A tick's captured physics graph spreads over some 60 streams. Where it
+shares queues with the renderer's stream, neither runs beside the other: a tick takes 1.34 instead of 1.17 s on an H200."""
 _CUDA = re.compile(r"cuda:([0-9]{1,9})")
 _NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 """Warp's native code prints this regardless of the log level; a machine without a GPU is not a fault."""
@@ -52,6 +55,7 @@ def start_warp() -> None:
     Raises:
         CacheError: There is no room for a temporary one.
     """
+    os.environ.setdefault(*_CONNECTIONS)  # CUDA reads it when it starts.
     wp.config.log_level = wp.LOG_WARNING
     if wp.config.kernel_cache_dir is None:  # Else the caller has chosen, or Warp runs already.
         temporary = usable_kernel_cache(wp.config.version)

@@ -1,4 +1,4 @@
-"""Benchmark of a bake's parts: physics, perception and planning, rendering, writing, and a whole small bake.
+"""Benchmark of a bake's parts: physics, perception and planning, rendering, writing, a small bake, a large one in steady state.
 
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
 mode pick; with `--set bake.mode=move`, piles are stirred instead. Writers get the same views repeatedly. Files are written to the
@@ -40,10 +40,13 @@ from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.system.device import pick_device
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
 from tools.bench.sensor import measure_sensor
+from tools.bench.steady import measure_steady
 from tools.bench.write import measure_writing
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
 
-PARTS = ("physics", "perception", "render", "sensor", "write", "bake")
+PARTS = ("physics", "perception", "render", "sensor", "write", "bake", "steady")
+WHOLE_BAKES = {"bake", "steady"}
+"""Parts that run bakes of their own."""
 STREAM_BATCHES = 12
 """Batches rendered and copied in a row."""
 WRITE_VIEWS = 12
@@ -103,7 +106,7 @@ def _config(options: argparse.Namespace) -> Config:
 
 def measure(config: Config, parts: tuple[str, ...], min_seconds: float) -> Iterator[Row]:
     """Measure the parts; yields rows as they arrive. Each measurement is repeated for at least `min_seconds` [s]."""
-    if set(parts) - {"bake"}:
+    if set(parts) - WHOLE_BAKES:
         started = time.perf_counter()
         records = "write" in parts and any(exporter.needs_physics for exporter in load_exporter_classes(config.bake.formats))
         factory = build_factory(config, SilentProgress(), records_physics=records)
@@ -120,6 +123,8 @@ def measure(config: Config, parts: tuple[str, ...], min_seconds: float) -> Itera
         yield _memory_in_use(factory.simulation.device)
     if "bake" in parts:
         yield from _measure_bake(config)
+    if "steady" in parts:
+        yield from measure_steady(config, min_seconds)
 
 
 def _measure_worlds(config: Config, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:

@@ -28,7 +28,6 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.pipeline import Factory, build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.render.annotate import annotate
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.simulate import RECORDS
 from synpick_warp.stages.stream import HostCopy, TickReader, TickReport
@@ -142,7 +141,7 @@ class VisibilityCounter:
             world, camera = (_slice(values, first, count) for values in self.lists)
             views = make_views(world, camera, count, self.renderer.instances)
             self.renderer.render_gbuffer(snapshot, views, self.out)
-            annotate(self.renderer.scene, self.renderer.bodies, views, self.out)
+            self.renderer.annotator.annotate(self.renderer.bodies, views, self.out)
             wp.copy(_slice(self.pixels, first, count), _slice(self.out.pixels, 0, count))
         self.copy.start(None)
 

@@ -17,6 +17,9 @@ VISIBLE_BOX = wp.constant(1)
 """Index of a box: of the amodal mask and of the visible mask."""
 UNSET = wp.constant(2147483647)
 """Side of a box without pixels: the largest int32, negative for the maxima, so that the first pixel replaces it."""
+HALF = wp.constant(wp.uint64(32))
+LOWER_HALF = wp.constant(wp.uint64(0xFFFFFFFF))
+"""Bits of one of the two counts in `BorderBoxes.length`, and the mask of the lower one."""
 
 
 @wp.kernel
@@ -113,6 +116,67 @@ def count_image_pixels_kernel(
         merge_box(boxes_inout, view, instance, VISIBLE_BOX, visible_box)
 
 
+@wp.struct
+class BorderBoxes:
+    """List of the projected boxes that reach beyond the image, cut into chunks of pixels that threads share. Scratch."""
+
+    owner: wp.array[int]
+    """(listed): view * instances + instance."""
+    first_chunk: wp.array[int]
+    """(listed): chunks of the boxes before; ascending."""
+    length: wp.array[wp.uint64]
+    """(1): boxes in the upper 32 bits and chunks in the lower, so that one atomic addition reserves both in the same order."""
+
+
+@wp.func
+def is_inside(grid: ImageGrid, box: wp.vec4i) -> bool:
+    """True if a projected box is empty or lies within the image."""
+    return box[2] < box[0] or (box[0] >= 0 and box[1] >= 0 and box[2] < grid.width and box[3] < grid.height)
+
+
+@wp.func
+def box_pixels(box: wp.vec4i) -> int:
+    """Pixels of a box with inclusive sides."""
+    return (box[2] - box[0] + 1) * (box[3] - box[1] + 1)
+
+
+@wp.kernel
+def list_border_boxes_kernel(
+    # Scene:
+    grid: ImageGrid,
+    # In:
+    bodies: ViewBodies,
+    instances: int,
+    chunk: int,
+    # Out:
+    boxes_inout: BorderBoxes,
+):
+    """List the instances whose boxes reach beyond the image, in any order, with `chunk` pixels to a chunk. `length` starts at 0."""
+    view, instance = wp.tid()
+    box = bodies.box[view, instance]
+    if is_inside(grid, box):
+        return
+    chunks = (box_pixels(box) + chunk - 1) // chunk
+    reserved = wp.atomic_add(boxes_inout.length, 0, (wp.uint64(1) << HALF) + wp.uint64(chunks))
+    listed = int(reserved >> HALF)
+    boxes_inout.owner[listed] = view * instances + instance
+    boxes_inout.first_chunk[listed] = int(reserved & LOWER_HALF)
+
+
+@wp.func
+def find_box(first_chunk: wp.array[int], listed: int, chunk: int) -> int:
+    """Index of the listed box that a chunk belongs to: binary search for the last one that starts at it or before."""
+    low = int(0)
+    high = int(listed)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if first_chunk[middle] <= chunk:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
 @wp.kernel
 def count_border_pixels_kernel(
     # Scene:
@@ -122,34 +186,41 @@ def count_border_pixels_kernel(
     # In:
     bodies: ViewBodies,
     views: Views,
+    border_boxes: BorderBoxes,
+    groups: int,
     threads: int,
+    chunk: int,
     # Out:
     pixels_inout: wp.array3d[int],  # (view, instance, count)
     boxes_inout: wp.array4d[int],  # (view, instance, box, side)
 ):
-    """Count an instance's amodal pixels outside the image, up to one image size beyond each border, by a ray per pixel of its box.
+    """Count amodal pixels outside the image, up to one image size beyond each border, by a ray per pixel of the listed boxes.
 
+    Groups of `threads` threads stride over the chunks: one object near the camera has more pixels than all others of a batch.
     `pixels_inout` is increased by the amodal count, `boxes_inout` is extended in its amodal box.
     """
-    view, instance, thread = wp.tid()
-    box = bodies.box[view, instance]
-    if box[2] < box[0] or (box[0] >= 0 and box[1] >= 0 and box[2] < grid.width and box[3] < grid.height):
-        return
-    intrinsics = cameras.intrinsics[views.camera[view]]
-    columns = box[2] - box[0] + 1
-    rows = box[3] - box[1] + 1
-    amodal = int(0)
-    amodal_box = wp.vec4i(UNSET, UNSET, -UNSET, -UNSET)
-    for i in range(thread, rows * columns, threads):
-        row = box[1] + i // columns
-        column = box[0] + i % columns
-        if not in_image(grid, row, column):
-            if hits_body(meshes, bodies, view, instance, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))):
-                amodal += 1
-                amodal_box = extend_box(amodal_box, row, column)
-    if amodal > 0:
-        wp.atomic_add(pixels_inout, view, instance, ALL, amodal)
-        merge_box(boxes_inout, view, instance, AMODAL_BOX, amodal_box)
+    group, thread = wp.tid()
+    length = border_boxes.length[0]
+    for index in range(group, int(length & LOWER_HALF), groups):
+        listed = find_box(border_boxes.first_chunk, int(length >> HALF), index)
+        view = border_boxes.owner[listed] // views.instances
+        instance = border_boxes.owner[listed] % views.instances
+        box = bodies.box[view, instance]
+        intrinsics = cameras.intrinsics[views.camera[view]]
+        columns = box[2] - box[0] + 1
+        begin = (index - border_boxes.first_chunk[listed]) * chunk
+        amodal = int(0)
+        amodal_box = wp.vec4i(UNSET, UNSET, -UNSET, -UNSET)
+        for i in range(begin + thread, wp.min(begin + chunk, box_pixels(box)), threads):
+            row = box[1] + i // columns
+            column = box[0] + i % columns
+            if not in_image(grid, row, column):
+                if hits_body(meshes, bodies, view, instance, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))):
+                    amodal += 1
+                    amodal_box = extend_box(amodal_box, row, column)
+        if amodal > 0:
+            wp.atomic_add(pixels_inout, view, instance, ALL, amodal)
+            merge_box(boxes_inout, view, instance, AMODAL_BOX, amodal_box)
 
 
 @wp.kernel

@@ -6,41 +6,78 @@ from typing import Any
 
 import warp as wp
 
+from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.render.images.boxes_counts import (
+    BorderBoxes,
     clear_boxes_counts_kernel,
     count_border_pixels_kernel,
     count_image_pixels_kernel,
+    list_border_boxes_kernel,
     reset_empty_boxes_kernel,
 )
-from synpick_warp.kernels.tuning import COUNT_THREADS
+from synpick_warp.kernels.tuning import BORDER_CHUNK, BORDER_GROUPS, BORDER_THREADS, COUNT_THREADS
 from synpick_warp.stages.buffers import ViewBuffers
 from synpick_warp.stages.render.scene import RenderScene
 
+BORDER_BOXES = struct_arrays(BorderBoxes, "view_instance", length=("one",))
 
-def annotate(scene: RenderScene, bodies: Any, views: Any, out: ViewBuffers) -> None:
-    """Compute `out.pixels` and `out.boxes` of the views from their images and, beyond the image border, by rays.
 
-    Args:
-        scene: Constant data.
-        bodies: The struct `ViewBodies` that `set_up_views` filled for these views.
-        views: The struct `Views`.
-        out: Its images are read, its counts and boxes written.
-    """
-    instances = out.pixels.shape[1]
-    threads = COUNT_THREADS if scene.device.is_cuda else 1
-    wp.launch(clear_boxes_counts_kernel, dim=(views.count, instances), outputs=[out.pixels, out.boxes], device=scene.device)
-    wp.launch(
-        count_image_pixels_kernel,
-        dim=(views.count, instances, threads),
-        inputs=[scene.grid, bodies, out.instance, out.depth, out.amodal, threads],
-        outputs=[out.pixels, out.boxes],
-        device=scene.device,
-    )
-    wp.launch(
-        count_border_pixels_kernel,
-        dim=(views.count, instances, threads),
-        inputs=[scene.meshes, scene.cameras, scene.grid, bodies, views, threads],
-        outputs=[out.pixels, out.boxes],
-        device=scene.device,
-    )
-    wp.launch(reset_empty_boxes_kernel, dim=(views.count, instances, 2), outputs=[out.boxes], device=scene.device)
+def border_sizes(views: int, instances: int) -> dict[str, int]:
+    """Extents of the dimensions of `BORDER_BOXES`."""
+    return {"view_instance": views * instances, "one": 1}
+
+
+class Annotator:
+    """Counts the instances' pixels and bounds them by boxes. Owns its scratch; `annotate` only launches."""
+
+    def __init__(self, scene: RenderScene, instances: int, views: int) -> None:
+        """Allocate scratch.
+
+        Args:
+            scene: Constant data.
+            instances: Instance capacity of a world.
+            views: Maximum number of views of a batch.
+        """
+        self.scene = scene
+        self.border_boxes: Any = allocate_struct(BORDER_BOXES, border_sizes(views, instances), scene.device)
+
+    def annotate(self, bodies: Any, views: Any, out: ViewBuffers) -> None:
+        """Compute `out.pixels` and `out.boxes` of the views from their images and, beyond the image border, by rays.
+
+        Args:
+            bodies: The struct `ViewBodies` that `set_up_views` filled for these views.
+            views: The struct `Views`.
+            out: Its images are read, its counts and boxes written.
+        """
+        scene, device, instances = self.scene, self.scene.device, out.pixels.shape[1]
+        threads = COUNT_THREADS if device.is_cuda else 1
+        wp.launch(clear_boxes_counts_kernel, dim=(views.count, instances), outputs=[out.pixels, out.boxes], device=device)
+        wp.launch(
+            count_image_pixels_kernel,
+            dim=(views.count, instances, threads),
+            inputs=[scene.grid, bodies, out.instance, out.depth, out.amodal, threads],
+            outputs=[out.pixels, out.boxes],
+            device=device,
+        )
+        self._count_border_pixels(bodies, views, out)
+        wp.launch(reset_empty_boxes_kernel, dim=(views.count, instances, 2), outputs=[out.boxes], device=device)
+
+    def _count_border_pixels(self, bodies: Any, views: Any, out: ViewBuffers) -> None:
+        scene, device, instances = self.scene, self.scene.device, out.pixels.shape[1]
+        groups, threads = (BORDER_GROUPS, BORDER_THREADS) if device.is_cuda else (1, 1)
+        self.border_boxes.length.zero_()
+        wp.launch(
+            list_border_boxes_kernel,
+            dim=(views.count, instances),
+            inputs=[scene.grid, bodies, instances, BORDER_CHUNK],
+            outputs=[self.border_boxes],
+            device=device,
+        )
+        wp.launch(
+            count_border_pixels_kernel,
+            dim=(groups, threads),
+            inputs=[scene.meshes, scene.cameras, scene.grid, bodies, views, self.border_boxes, groups, threads, BORDER_CHUNK],
+            outputs=[out.pixels, out.boxes],
+            device=device,
+            block_dim=BORDER_THREADS,
+        )

@@ -9,7 +9,7 @@ from synpick_warp.configs import schema
 from synpick_warp.configs.sensors import DepthSensor, Effects
 from synpick_warp.kernels.render.images.antialias import ShadedImage
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
-from synpick_warp.stages.render.annotate import annotate
+from synpick_warp.stages.render.annotate import Annotator
 from synpick_warp.stages.render.denoised import DenoisedRenderer
 from synpick_warp.stages.render.layers import LayerRenderer, sensor_parameters
 from synpick_warp.stages.render.postprocess import PostProcessor
@@ -74,6 +74,7 @@ class Renderer:
         self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)
         self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, instances, views)
+        self.annotator = Annotator(scene, instances, views)
         self.postprocessor = PostProcessor(effects, settings.tone, seed, scene, views)
 
     def render(self, snapshot: Snapshot, views: Any, out: ViewBuffers, layers: LayerBuffers | None = None) -> None:
@@ -102,7 +103,7 @@ class Renderer:
         with scope("post-process", device):
             self.postprocessor.process(snapshot, views, self.image, out)
         with scope("annotate", device):
-            annotate(self.scene, self.bodies, views, out)
+            self.annotator.annotate(self.bodies, views, out)
 
     def render_gbuffer(self, snapshot: Snapshot, views: Any, out: ViewBuffers) -> None:
         """First part of `render`: the G-buffer, and the images of depth, instances and amodal bits."""
