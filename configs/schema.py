@@ -261,6 +261,13 @@ class Render:
         low=0,
         high=1024,
     )
+    history: int = setting(
+        16,
+        "",
+        "Mode fast: paths per coarse pixel that are averaged over the frames of an episode where nothing moves; 0: each frame by itself.",
+        low=0,
+        high=255,
+    )
     antialias: bool = setting(True, "", "Mode fast: anti-alias the edges of surfaces; mode reference always does.")
     tone: str = setting(
         "shoulder",

@@ -27,7 +27,7 @@ from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.images import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
 from synpick_warp.stages.render.annotate import BORDER_BOXES, border_sizes
-from synpick_warp.stages.render.denoised import DENOISED_SCRATCH, scratch_sizes
+from synpick_warp.stages.render.denoised import DENOISED_SCRATCH, LIGHT_HISTORY, MOVING_BODIES, history_sizes, scratch_sizes
 from synpick_warp.stages.render.layers import BODY_MOTIONS, MOTION_LAYERS
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes
 from synpick_warp.stages.render.postprocess import LensArrays, has_lens_filter
@@ -58,6 +58,7 @@ _NEWTON = (
 )
 _VIEWS = ("cameras.resolution", "render.views_per_batch", "cameras.positions")
 _CAMERAS = ("cameras.resolution", "cameras.positions")
+_HISTORY = ("bake.worlds", "cameras.resolution", "render.history", "cameras.positions")
 _WORLDS = ("bake.worlds", "arrangement.max_objects", "move.rounds")
 _STEPS = ("bake.worlds", "physics.steps_per_tick", "arrangement.max_objects")
 _PERCEPTION = ("perception.resolution", "perception.contour_points", "perception.views", "bake.worlds")
@@ -203,6 +204,9 @@ def _images(config: Config, device: wp.Device) -> Iterator[Term]:
         groups += [(LensArrays, views, 1)]
     if config.render.mode == FAST:
         groups += [(kind, views | scratch_sizes(config.render, width, height), copies) for kind, copies in DENOISED_SCRATCH]
+        groups += [(MOVING_BODIES, views, 1)]
+        histories = history_sizes(config.render, width, height, config.bake.worlds * len(config.cameras.positions))
+        yield _term("light averaged over frames", _HISTORY, [(LIGHT_HISTORY, histories, 1)])
     if _host_images(config, device).jpeg_quality:
         files = jpeg_sizes(views["view"], width, height)
         groups += [(JpegBuffers, files, ring), (JpegScratch, files, 1)]

@@ -93,7 +93,8 @@ def build_factory(
     scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
     sizes = view_sizes(config, device)
-    renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"])
+    histories = simulation.layout.worlds * len(cameras)
+    renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
     tick_time = config.physics.step * config.physics.steps_per_tick
@@ -107,8 +108,11 @@ def count_writers(config: Config) -> int:
     return config.bake.writers or len(os.sched_getaffinity(0))
 
 
-def make_renderer(config: Config, scene: RenderScene, instances: int, views: int) -> Renderer:
-    """The renderer of a bake: its sections of the settings, for `instances` instances of a world and at most `views` views of a batch."""
+def make_renderer(config: Config, scene: RenderScene, instances: int, views: int, histories: int = 0) -> Renderer:
+    """The renderer of a bake: its sections of the settings, for `instances` instances of a world and at most `views` views of a batch.
+
+    `histories` as in `Renderer`.
+    """
     return Renderer(
         scene,
         config.render,
@@ -118,6 +122,7 @@ def make_renderer(config: Config, scene: RenderScene, instances: int, views: int
         depth_scale=config.bop.depth_scale,
         instances=instances,
         views=views,
+        histories=histories,
     )
 
 

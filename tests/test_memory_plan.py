@@ -75,7 +75,7 @@ CAMERAS = {"cameras__positions": [[0.0, 0.0, 2.0]] * 1000, "cameras__ups": [[0.0
             "perception of 1 worlds at 640x360 px",
             "lower perception.contour_points (100000000)",
         ),
-        ({"bake__worlds": 65536}, "Newton's contacts", "lower bake.worlds (65536)"),
+        ({"bake__worlds": 65536}, "light averaged over frames", "lower bake.worlds (65536)"),
     ],
 )
 def test_settings_that_exceed_the_memory_are_refused_in_one_line(overrides, largest, advice, tmp_path, monkeypatch):

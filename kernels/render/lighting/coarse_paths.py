@@ -11,6 +11,14 @@ from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.lighting.brdf import SplitRadiance, specular_albedo
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide, interleaved_pixel, middle_pixel, morton_index
 from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE
+from synpick_warp.kernels.render.lighting.history import (
+    LightHistory,
+    MovingBodies,
+    blend_light,
+    read_history,
+    usable_paths,
+    write_history,
+)
 from synpick_warp.kernels.render.lighting.path_tracing import (
     TERMINATED,
     PathContext,
@@ -34,6 +42,8 @@ SEQUENCE_PERIOD = wp.constant(16)
 INDIRECT_CLAMP = wp.constant(4.0)
 """Firefly clamp of indirect light: at most this many times the radiance of a white surface that faces the sun, on top of the clamp for
 unoccluded light. Few paths find sunlit surfaces, so each of them has a large weight."""
+SEQUENCE_FRAMES = wp.constant(64)
+"""Frames until accumulated paths repeat their random numbers: four times as many as an average remembers by default."""
 SHIFT_RANGE = wp.constant(1.0)
 """Cranley-Patterson rotation of the first dimension over an image's height and width: slow enough that the points of a filter kernel
 stay stratified, and large enough that the image's mean is unbiased."""
@@ -79,7 +89,7 @@ def make_context(
     light: int,
     yaw: float,
 ) -> PathContext:
-    """Context of a coarse pixel's paths. All images of an episode use one stream of random numbers: noise on resting objects stays still.
+    """Context of a coarse pixel's paths. All images of an episode use one stream of random numbers; see `path_indices`.
 
     The sun is left out of the light on the first surface: row `light` + maps of `Lights.radiance`.
     """
@@ -101,12 +111,13 @@ def average_paths(
     rules: PathRules,
     context: PathContext,
     index: int,
+    samples: int,
     first: Vertex,
     width: float,
     unoccluded: SplitRadiance,
     firefly_clamp: float,
 ) -> SplitRadiance:
-    """Mean reflected light over the paths from `index` on that start at `first`, each with a firefly clamp.
+    """Mean reflected light over `samples` paths from `index` on that start at `first`, each with a firefly clamp.
 
     The clamp is `firefly_clamp` times the unoccluded light; for light from other surfaces INDIRECT_CLAMP is added, because the unoccluded
     light lacks the sun.
@@ -116,7 +127,7 @@ def average_paths(
     # One loop over all bounces of all paths: a thread whose path ends early starts the next while others of its warp go on.
     sample = int(0)
     path = init_path(first, width)
-    while sample < rules.samples:
+    while sample < samples:
         path = extend_path(scene, bodies, rules, context, index + sample, first.brdf.diffuse, path)
         if path.bounce == TERMINATED:
             sum.diffuse += clamp_light(path.radiance.diffuse, firefly_clamp * unoccluded.diffuse)
@@ -125,11 +136,33 @@ def average_paths(
             sum.specular += clamp_light(path.radiance.specular, limit)
             path = init_path(first, width)
             sample += 1
-    scale = 1.0 / float(rules.samples)
+    scale = 1.0 / float(samples)
     sum.diffuse = scale * sum.diffuse
     sum.indirect = scale * sum.indirect
     sum.specular = scale * sum.specular
     return sum
+
+
+@wp.func
+def first_path_index(samples: int, row: int, column: int, frame: int, accumulates: bool) -> int:
+    """Index of a coarse pixel's first path in the sequence that SEQUENCE_PERIOD² coarse pixels share.
+
+    The paths of a frame by itself start with the sequence; one that is added to a history takes the next point of its coarse pixel.
+    """
+    index = morton_index(SEQUENCE_PERIOD, row, column)
+    if accumulates:
+        return index + SEQUENCE_PERIOD * SEQUENCE_PERIOD * (samples + frame % SEQUENCE_FRAMES)
+    return index * samples
+
+
+@wp.func
+def store_light(out: CoarseLight, view: int, row: int, column: int, light: SplitRadiance, unoccluded: SplitRadiance):
+    """Write a coarse pixel."""
+    out.diffuse[view, row, column] = light.diffuse
+    out.indirect[view, row, column] = light.indirect
+    out.specular[view, row, column] = light.specular
+    out.unoccluded_diffuse[view, row, column] = unoccluded.diffuse
+    out.unoccluded_specular[view, row, column] = unoccluded.specular
 
 
 @wp.kernel(cuda_max_registers=COARSE_PATH_REGISTERS)
@@ -140,22 +173,26 @@ def trace_coarse_paths_kernel(
     coarse: CoarseGrid,
     # State: worlds
     episode: wp.array[int],  # (world)
+    frame: wp.array[int],  # (world)
     light: wp.array[int],  # (world)
     light_yaw: wp.array[float],  # (world) [rad]
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: Views,
+    moving: MovingBodies,
     rules: PathRules,
     firefly_clamp: float,
     first: int,
     # Out:
+    history_inout: LightHistory,
     guide_out: Guide,
     coarse_light_out: CoarseLight,
 ):
-    """Trace N paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
+    """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
-    The sun's direct light is left out: it casts sharp shadows, and `shadows` samples it at more pixels. `variance` is not written.
+    With a usable history one path is added to it, in every other frame once it is full; else N paths are traced. The sun's direct light is
+    left out: it casts sharp shadows, and `shadows` samples it at more pixels. `variance` is not written.
     """
     view, row, column = interleaved_pixel(coarse, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
@@ -175,12 +212,19 @@ def trace_coarse_paths_kernel(
 
     context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
     unoccluded = unoccluded_light(scene.lights, context.light, context.yaw, vertex.brdf)
-    index = morton_index(SEQUENCE_PERIOD, row, column) * rules.samples
-    mean = average_paths(scene, bodies, rules, context, index, vertex, width, unoccluded, firefly_clamp)
-    coarse_light_out.diffuse[view, row, column] = mean.diffuse
-    coarse_light_out.indirect[view, row, column] = mean.indirect
-    coarse_light_out.specular[view, row, column] = mean.specular
-    coarse_light_out.unoccluded_diffuse[view, row, column] = unoccluded.diffuse
-    coarse_light_out.unoccluded_specular[view, row, column] = unoccluded.specular
+    known = usable_paths(scene.meshes, history_inout, moving, views, view, row, column, hit.segment, position)
+    slot = world * history_inout.cameras + camera
+    # Neighbours of a full history take turns; the coarse pixels of a warp, LANE_STRIDE apart, trace or rest together.
+    if known > 0 and known == history_inout.max_paths and (row + column + frame[world]) % 2 == 0:
+        store_light(coarse_light_out, view, row, column, read_history(history_inout, slot, row, column), unoccluded)
+    else:
+        samples = wp.where(known > 0, 1, rules.samples)
+        index = first_path_index(rules.samples, row, column, frame[world], known > 0)
+        mean = average_paths(scene, bodies, rules, context, index, samples, vertex, width, unoccluded, firefly_clamp)
+        if known > 0:
+            mean = blend_light(read_history(history_inout, slot, row, column), mean, 1.0 / float(known + 1))
+        if history_inout.max_paths > 0:
+            write_history(history_inout, slot, row, column, hit.segment, mean, known + samples)
+        store_light(coarse_light_out, view, row, column, mean, unoccluded)
     guide_out.normal[view, row, column] = wp.transpose(cameras.to_world[camera]) * vertex.brdf.normal
     guide_out.depth[view, row, column] = hit.depth

@@ -13,11 +13,12 @@ from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, f
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, trace_coarse_paths_kernel
 from synpick_warp.kernels.render.lighting.denoise import RatioImages, choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
+from synpick_warp.kernels.render.lighting.history import NEVER, LightHistory, MovingBodies, find_moving_bodies_kernel
 from synpick_warp.kernels.render.lighting.shading import shade_kernel
 from synpick_warp.kernels.render.lighting.shadows import filter_shadows_kernel, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
-from synpick_warp.kernels.tuning import FOOTPRINT_THREADS, LANE_COLUMNS, LANE_STRIDE, PIXEL_BLOCK
-from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.kernels.tuning import FOOTPRINT_THREADS, LANE_COLUMNS, LANE_STRIDE, PIXEL_BLOCK, VIEW_BLOCK
+from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.launch import launch_pixels
 from synpick_warp.stages.render.reference import make_path_rules
 from synpick_warp.stages.render.scene import RenderScene, build_grid
@@ -44,6 +45,8 @@ ROULETTE = 1
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column", units={"depth": "m"})
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
+LIGHT_HISTORY = struct_arrays(LightHistory, "world_camera", "cell_row", "cell_column", episode=("world_camera",), frame=("world_camera",))
+MOVING_BODIES = struct_arrays(MovingBodies, "view", "body", holds=("view",), count=("view",), units={"to_body": "m"})
 RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 
 
@@ -96,6 +99,11 @@ def scratch_sizes(render: Render, width: int, height: int) -> dict[str, int]:
     }
 
 
+def history_sizes(render: Render, width: int, height: int, histories: int) -> dict[str, int]:
+    """Extents of the dimensions of `LIGHT_HISTORY`, for `histories` worlds times cameras with images of `width` x `height` px."""
+    return scratch_sizes(render, width, height) | {"world_camera": histories if render.history else 0}
+
+
 def build_coarse_grid(image: Any, size: int, window: int) -> Any:
     """The struct `CoarseGrid` over an `ImageGrid`: coarse pixels of `size` x `size` px, shadow filter of `window` x `window` of them."""
     coarse = CoarseGrid()
@@ -120,14 +128,16 @@ def interleaved_threads(coarse: Any) -> int:
 class DenoisedRenderer:
     """Renders linear radiance from few paths per coarse pixel and a denoiser. Owns its scratch; `shade` only launches."""
 
-    def __init__(self, render: Render, seed: int, scene: RenderScene, views: int) -> None:
+    def __init__(self, render: Render, seed: int, scene: RenderScene, instances: int, views: int, histories: int = 0) -> None:
         """Allocate scratch.
 
         Args:
-            render: Render settings: `coarse_pixel`, `coarse_paths`, `bounces` and `antialias`.
+            render: Render settings: `coarse_pixel`, `coarse_paths`, `bounces`, `history` and `antialias`.
             seed: Seed of the data set.
             scene: Constant data.
+            instances: Instance capacity of a world.
             views: Capacity of a batch.
+            histories: Worlds times cameras whose light is averaged over frames; 0: each frame by itself.
         """
         size = coarse_size(render, scene.width)
         sizes = {"view": views} | scratch_sizes(render, scene.width, scene.height)
@@ -138,6 +148,10 @@ class DenoisedRenderer:
         self.rules.min_roughness = MIN_ROUGHNESS
         self.firefly_clamp = FIREFLY_CLAMP
         self.variance_scale = SINGLE_PATH_VARIANCE_SCALE if self.rules.samples == 1 else 1.0
+        self.history = allocate_struct(LIGHT_HISTORY, history_sizes(render, scene.width, scene.height, histories), scene.device)
+        self.history.cameras, self.history.max_paths = scene.camera_count, render.history if histories else 0
+        self.history.frame.fill_(int(NEVER))
+        self.moving = allocate_struct(MOVING_BODIES, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
         self.guide = allocate_struct(GUIDE, sizes, scene.device)
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, scene.device) for _ in range(2))
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, scene.device) for _ in range(2))
@@ -158,6 +172,7 @@ class DenoisedRenderer:
         """
         device = self.scene.device
         with scope("trace coarse paths", device):
+            self.find_moving_bodies(snapshot, views)
             self.trace_coarse_paths(snapshot, bodies, gbuffer, views)
         with scope("denoise", device):
             self.denoise(views)
@@ -169,12 +184,24 @@ class DenoisedRenderer:
             with scope("anti-alias", device):
                 self.resolve_footprints(bodies, gbuffer, views, image)
 
+    def find_moving_bodies(self, snapshot: Snapshot, views: Any) -> None:
+        """Compare the worlds with the previous frame, where a history holds it."""
+        if self.history.max_paths == 0:
+            return
+        inputs = [self.scene.meshes, snapshot.episode, snapshot.frame, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose]
+        inputs += [snapshot.fixture_visible, snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose]
+        inputs += [snapshot.last_fixture_visible, views, self.moving.rests.shape[1]]
+        outputs = [self.history, self.moving]
+        wp.launch(
+            find_moving_bodies_kernel, dim=views.count, inputs=inputs, outputs=outputs, device=self.scene.device, block_dim=VIEW_BLOCK
+        )
+
     def trace_coarse_paths(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
         """Coarse path pass: guide image and light of coarse pixels."""
         scene = self.scene
-        inputs = [scene.paths, scene.cameras, self.coarse, snapshot.episode, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
-        inputs += [views, self.rules, self.firefly_clamp]
-        outputs = [self.guide, self.coarse_light]
+        inputs = [scene.paths, scene.cameras, self.coarse, snapshot.episode, snapshot.frame, snapshot.light, snapshot.light_yaw]
+        inputs += [bodies, gbuffer, views, self.moving, self.rules, self.firefly_clamp]
+        outputs = [self.history, self.guide, self.coarse_light]
         launch_pixels(trace_coarse_paths_kernel, views.count * interleaved_threads(self.coarse), inputs, outputs, scene.device)
 
     def denoise(self, views: Any) -> None:

@@ -47,6 +47,7 @@ class Renderer:
         depth_scale: float,
         instances: int,
         views: int,
+        histories: int = 0,
     ) -> None:
         """Allocate scratch.
 
@@ -59,6 +60,7 @@ class Renderer:
             depth_scale: Millimetres per count of the depth image.
             instances: Instance capacity of a world, at most 32: one bit each in the amodal image.
             views: Maximum number of views of a batch.
+            histories: Worlds times cameras whose light is averaged over the frames of an episode; 0: each frame is rendered by itself.
         """
         sizes = {"view": views, "row": scene.height, "column": scene.width} | body_sizes(instances, scene.width, scene.height)
         self.scene = scene
@@ -70,7 +72,7 @@ class Renderer:
         if settings.mode == schema.REFERENCE:
             self.shading: DenoisedRenderer | ReferenceRenderer = ReferenceRenderer(settings, seed, scene)
         else:
-            self.shading = DenoisedRenderer(settings, seed, scene, views)
+            self.shading = DenoisedRenderer(settings, seed, scene, instances, views, histories)
         self.rasterizer = Rasterizer(scene, 1000.0 / depth_scale, views)
         sensor = sensor_parameters(depth_sensor, seed, depth_scale)
         self.layer_renderer = LayerRenderer(settings.layers, sensor, scene, instances, views)

@@ -1,0 +1,231 @@
+"""Temporal accumulation of coarse light: an exponential moving average over the frames of an episode (after Schied et al., 2017, SVGF).
+
+Cameras do not move, so a resting surface stays at its pixel and nothing is reprojected. A coarse pixel forgets its history when its body
+moves, and keeps less of it the more the bodies that move near it can change its light.
+"""
+
+import warp as wp
+
+from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.lighting.brdf import SplitRadiance
+from synpick_warp.kernels.render.visibility.camera import Views
+from synpick_warp.kernels.render.visibility.gbuffer import Meshes, body_of
+
+wp.set_module_options({"enable_backward": False})
+
+REST_DISPLACEMENT = wp.constant(2.5e-4)
+"""A body rests if none of its points is displaced by more in a frame [m]: in the 16 frames that an average remembers, by two coarse pixels
+of a full-HD image at most."""
+LIGHT_CHANGE = wp.constant(0.05)
+"""Change of a coarse pixel's light that its history may miss, as a fraction: the number of remembered paths times the change in a frame."""
+NEVER = wp.constant(-2)
+"""Frame index of a history without a frame: no frame follows it."""
+MAX_HALF = wp.constant(60000.0)
+"""Largest stored radiance; half precision ends at 65,504."""
+
+
+@wp.struct
+class LightHistory:
+    """Average light of the coarse pixels of each world and camera, over the frames of an episode; members as in `CoarseLight`."""
+
+    diffuse: wp.array3d[wp.vec3h]
+    specular: wp.array3d[wp.vec3h]
+    indirect: wp.array3d[wp.vec3h]
+    """(world_camera, cell_row, cell_column)"""
+    segment: wp.array3d[wp.uint8]
+    """(world_camera, cell_row, cell_column): segmentation id of the surface."""
+    paths: wp.array3d[wp.uint8]
+    """(world_camera, cell_row, cell_column): paths that the average counts, at most `max_paths`."""
+    episode: wp.array[int]
+    """(world_camera): episode of the last frame."""
+    frame: wp.array[int]
+    """(world_camera): index of the last frame; NEVER: none."""
+    cameras: int
+    """Cameras of a world."""
+    max_paths: int
+    """Paths that an average counts at most; 0: no history is kept."""
+
+
+@wp.struct
+class MovingBodies:
+    """Motion of the bodies of each view since the previous frame. Scratch."""
+
+    holds: wp.array[int]
+    """(view): 1: the history holds the previous frame of the same episode."""
+    rests: wp.array2d[int]
+    """(view, body): 1: the body is where it was in the previous frame."""
+    count: wp.array[int]
+    """(view): bodies that moved, came or went."""
+    mesh: wp.array2d[int]
+    """(view, rank): row of `Meshes` of each of them."""
+    to_body: wp.array2d[wp.transformf]
+    """(view, rank): world to body [m]; of a body that went, at its last pose."""
+    change: wp.array2d[float]
+    """(view, rank): displacement as a fraction of the body's size, at most 1."""
+
+
+@wp.func
+def mean_projected_area(size: wp.vec3) -> float:
+    """Mean area of the projections of a box along all directions: a quarter of its surface (Cauchy) [m²]."""
+    return 0.5 * (size[0] * size[1] + size[1] * size[2] + size[2] * size[0])
+
+
+@wp.func
+def max_displacement(now: wp.transformf, then: wp.transformf, center: wp.vec3, radius: float) -> float:
+    """Upper bound of the displacement of the points of a body: that of its bounding sphere's centre and the turn about it [m]."""
+    turn = wp.transform_get_rotation(now) * wp.quat_inverse(wp.transform_get_rotation(then))
+    sine = wp.length(wp.vec3(turn[0], turn[1], turn[2]))
+    return wp.length(wp.transform_point(now, center) - wp.transform_point(then, center)) + 2.0 * radius * wp.min(sine, 1.0)
+
+
+@wp.kernel
+def find_moving_bodies_kernel(
+    # Scene:
+    meshes: Meshes,
+    # State: worlds
+    episode: wp.array[int],  # (world)
+    frame: wp.array[int],  # (world)
+    catalog_index: wp.array2d[int],  # (world, instance)
+    pose: wp.array2d[wp.transformf],  # (world, instance) [m]
+    fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
+    fixture_visible: wp.array2d[int],  # (world, fixture)
+    last_catalog_index: wp.array2d[int],  # (world, instance)
+    last_pose: wp.array2d[wp.transformf],  # (world, instance) [m]
+    last_fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
+    last_fixture_visible: wp.array2d[int],  # (world, fixture)
+    # In:
+    views: Views,
+    bodies: int,
+    # Out:
+    history_inout: LightHistory,
+    moving_out: MovingBodies,
+):
+    """List the bodies of each view that moved since the previous frame, and advance the history's frame index to this one.
+
+    Without the previous frame of the same episode in the history, `holds` is 0 and the rest of `moving_out` is not written.
+    """
+    view = wp.tid()
+    world = views.world[view]
+    slot = world * history_inout.cameras + views.camera[view]
+    holds = int(history_inout.episode[slot] == episode[world] and history_inout.frame[slot] + 1 == frame[world])
+    history_inout.episode[slot] = episode[world]
+    history_inout.frame[slot] = frame[world]
+    moving_out.holds[view] = holds
+    if holds == 0:
+        return
+    count = int(0)
+    for body in range(bodies):
+        now = wp.transform_identity(dtype=float)
+        then = wp.transform_identity(dtype=float)
+        mesh = int(-1)
+        last_mesh = int(-1)
+        if body < views.instances:
+            now = pose[world, body]
+            then = last_pose[world, body]
+            mesh = catalog_index[world, body]
+            last_mesh = last_catalog_index[world, body]
+        else:
+            fixture = body - views.instances
+            now = fixture_pose[world, fixture]
+            then = last_fixture_pose[world, fixture]
+            if fixture_visible[world, fixture] != 0:
+                mesh = meshes.entries + fixture
+            if last_fixture_visible[world, fixture] != 0:
+                last_mesh = meshes.entries + fixture
+        moving_out.rests[view, body] = 1
+        if mesh >= 0 or last_mesh >= 0:
+            which = mesh
+            where = now
+            if mesh < 0:
+                which = last_mesh
+                where = then
+            size = wp.sqrt(mean_projected_area(meshes.upper[which] - meshes.lower[which]))
+            displacement = size
+            if mesh == last_mesh:
+                displacement = max_displacement(now, then, meshes.center[which], meshes.radius[which])
+            if displacement > REST_DISPLACEMENT:
+                moving_out.rests[view, body] = 0
+                moving_out.mesh[view, count] = which
+                moving_out.to_body[view, count] = wp.transform_inverse(where)
+                moving_out.change[view, count] = wp.min(displacement / size, 1.0)
+                count += 1
+    moving_out.count[view] = count
+
+
+@wp.func
+def light_change(meshes: Meshes, moving: MovingBodies, view: int, point: wp.vec3) -> float:
+    """Estimate of the fraction of a point's light that the moving bodies change in a frame.
+
+    Each counts with the fraction of all directions that its projected area covers at its distance, times that by which it moved.
+    """
+    total = float(0.0)
+    for rank in range(moving.count[view]):
+        mesh = moving.mesh[view, rank]
+        local = wp.transform_point(moving.to_body[view, rank], point)
+        lower = meshes.lower[mesh]
+        upper = meshes.upper[mesh]
+        away = local - wp.max(lower, wp.min(local, upper))
+        area = mean_projected_area(upper - lower)
+        total += moving.change[view, rank] * area / (4.0 * wp.PI * wp.dot(away, away) + area)
+    return total
+
+
+@wp.func
+def usable_paths(
+    meshes: Meshes,
+    history: LightHistory,
+    moving: MovingBodies,
+    views: Views,
+    view: int,
+    row: int,
+    column: int,
+    segment: int,
+    point: wp.vec3,
+) -> int:
+    """Paths of a coarse pixel's history that still count; 0: none, because another surface shows, or its light changed."""
+    if history.max_paths == 0 or moving.holds[view] == 0:
+        return 0
+    slot = views.world[view] * history.cameras + views.camera[view]
+    if int(history.segment[slot, row, column]) != segment:
+        return 0
+    if segment != Segment.TABLE:
+        if moving.rests[view, body_of(segment, views.instances)] == 0:
+            return 0
+    paths = int(history.paths[slot, row, column])
+    return wp.min(paths, int(LIGHT_CHANGE / wp.max(light_change(meshes, moving, view, point), 1.0e-6)))
+
+
+@wp.func
+def read_history(history: LightHistory, slot: int, row: int, column: int) -> SplitRadiance:
+    """Average light of a coarse pixel."""
+    result = SplitRadiance()
+    result.diffuse = wp.vec3(history.diffuse[slot, row, column])
+    result.specular = wp.vec3(history.specular[slot, row, column])
+    result.indirect = wp.vec3(history.indirect[slot, row, column])
+    return result
+
+
+@wp.func
+def to_half(light: wp.vec3) -> wp.vec3h:
+    """Radiance in half precision, clamped to its range."""
+    return wp.vec3h(wp.min(light, wp.vec3(MAX_HALF, MAX_HALF, MAX_HALF)))
+
+
+@wp.func
+def write_history(history: LightHistory, slot: int, row: int, column: int, segment: int, light: SplitRadiance, paths: int):
+    """Store the average light of a coarse pixel and the paths that it counts."""
+    history.diffuse[slot, row, column] = to_half(light.diffuse)
+    history.specular[slot, row, column] = to_half(light.specular)
+    history.indirect[slot, row, column] = to_half(light.indirect)
+    history.segment[slot, row, column] = wp.uint8(segment)
+    history.paths[slot, row, column] = wp.uint8(wp.min(paths, history.max_paths))
+
+
+@wp.func
+def blend_light(history: SplitRadiance, light: SplitRadiance, weight: float) -> SplitRadiance:
+    """Exponential moving average: `light` counts with `weight`."""
+    result = SplitRadiance()
+    result.diffuse = wp.lerp(history.diffuse, light.diffuse, weight)
+    result.specular = wp.lerp(history.specular, light.specular, weight)
+    result.indirect = wp.lerp(history.indirect, light.indirect, weight)
+    return result

@@ -1,0 +1,135 @@
+"""Temporal accumulation: what is remembered, what is forgotten, and that pictures get nearer to the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.pipeline import make_renderer
+from synpick_warp.scenes.types import EnvironmentMap
+from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
+from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.render.view_setup import make_views
+from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot
+
+PATHS = 16
+VIEW = camera(64, 48, 300.0, (0.0, 0.0, 1.5))
+LIGHT = EnvironmentMap("gradient", even_light(1.0, 32).radiance * np.linspace(3.0, 0.1, 64, dtype=np.float32)[None, :, None])
+
+
+def settings() -> Config:
+    return Config(render=replace(Config().render, mode=FAST, coarse_pixel=2, coarse_paths=1, history=PATHS))
+
+
+def toy(ball_height: float | None = 0.08, config: Config | None = None) -> ToyScene:
+    """A sheet with a box, and a ball above it; None: the ball is not there."""
+    placed = [(0, (0.0, 0.0, 0.0, *UPRIGHT)), (1, (0.06, 0.0, 0.03, *UPRIGHT))]
+    if ball_height is not None:
+        placed.append((2, (-0.05, 0.0, ball_height, *UPRIGHT)))
+    entries = [entry(sheet(0.4, 0.4)), entry(box(0.04, 0.04, 0.06)), entry(ball(0.03, 3))]
+    return ToyScene(entries, [placed], (VIEW,), lights=(LIGHT,), config=config or settings())
+
+
+def show(renderer: Renderer, frames: list[tuple[int, ToyScene]], device: wp.Device, episode: int = 0) -> Iterator[np.ndarray]:
+    """Render (frame index, scene) one after the other, each with the one before as its last frame; yields radiance."""
+    scene, before = renderer.scene, None
+    out = allocate_view_buffers(1, scene.width, scene.height, 4, device)
+    zero = wp.zeros(1, dtype=wp.int32, device=device)
+    for frame, each in frames:
+        state = snapshot(each, device)
+        state.frame.fill_(frame)
+        state.episode.fill_(episode)
+        link(state, before or state)
+        renderer.render(state, make_views(zero, zero, 1, 4), out)
+        before = state
+        yield renderer.image.radiance.numpy()[0].copy()
+
+
+def link(state: Snapshot, before: Snapshot) -> None:
+    for name in ("catalog_index", "pose", "fixture_pose", "fixture_visible"):
+        wp.copy(getattr(state, f"last_{name}"), getattr(before, name))
+
+
+@pytest.fixture
+def renderer(device) -> Renderer:
+    each = toy()
+    return make_renderer(each.settings(), build_scene(each, device), each.instances, 1, 1)
+
+
+def remembered(renderer: Renderer) -> np.ndarray:
+    """Paths that the history counts (row, column)."""
+    return renderer.shading.history.paths.numpy()[0]  # type: ignore[union-attr]
+
+
+def test_a_still_scene_is_remembered_up_to_the_limit(renderer, device):
+    counts = [np.unique(remembered(renderer)).tolist() for _ in show(renderer, [(frame, toy()) for frame in range(PATHS + 4)], device)]
+    assert counts[:3] == [[1], [2], [3]]
+    assert counts[PATHS - 1 :] == [[PATHS]] * 5
+
+
+def test_the_first_frame_is_that_of_a_renderer_without_history(renderer, device):
+    each = toy()
+    alone = make_renderer(each.settings(), renderer.scene, each.instances, 1)
+    (first,) = show(renderer, [(0, each)], device)
+    (single,) = show(alone, [(0, each)], device)
+    assert first.tobytes() == single.tobytes()
+
+
+@pytest.mark.parametrize(("frame", "episode"), [(5, 0), (2, 0), (4, 1), (3, 0)])
+def test_without_the_frame_before_nothing_is_remembered(renderer, device, frame, episode):
+    list(show(renderer, [(index, toy()) for index in range(4)], device))
+    list(show(renderer, [(frame, toy())], device, episode))
+    assert (remembered(renderer) == 1).all()
+
+
+def test_a_body_that_moves_is_forgotten_and_dims_the_memory_around_it(renderer, device):
+    frames = [(index, toy()) for index in range(PATHS)] + [(PATHS, toy(0.1))]
+    list(show(renderer, frames, device))
+    count, segment = remembered(renderer), renderer.shading.guide.segment.numpy()[0]  # type: ignore[union-attr]
+    assert set(np.unique(count[segment == 3])) == {1}
+    distance = np.hypot(*(np.argwhere(segment == 1) - np.argwhere(segment == 3).mean(axis=0)).T)
+    near, far = (count[segment == 1][part].mean() for part in (distance < 8, distance > 16))
+    assert near < far <= PATHS
+    moving = renderer.shading.moving  # type: ignore[union-attr]
+    assert moving.count.numpy()[0] == 1
+    # 2 cm of a ball whose box has a mean projected area of 1.5 x 6 cm x 6 cm.
+    np.testing.assert_allclose(moving.change.numpy()[0, 0], 0.02 / np.sqrt(1.5 * 0.06**2), rtol=1e-3)
+
+
+@pytest.mark.parametrize(("before", "after"), [(None, 0.08), (0.08, None)])
+def test_bodies_that_come_or_go_change_the_light(renderer, device, before, after):
+    list(show(renderer, [*((index, toy(before)) for index in range(4)), (4, toy(after))], device))
+    assert renderer.shading.moving.count.numpy()[0] == 1  # type: ignore[union-attr]
+    assert renderer.shading.moving.change.numpy()[0, 0] == 1.0  # type: ignore[union-attr]
+    assert remembered(renderer).min() == 1
+
+
+def test_a_displacement_below_the_threshold_is_rest(renderer, device):
+    list(show(renderer, [(0, toy(0.08)), (1, toy(0.0802))], device))
+    assert renderer.shading.moving.count.numpy()[0] == 0  # type: ignore[union-attr]
+    assert (remembered(renderer) == 2).all()
+
+
+def test_pictures_approach_the_reference_over_the_frames(renderer, device):
+    each = toy()
+    config = Config(render=replace(each.settings().render, mode=REFERENCE, samples=1024))
+    (reference,) = show(make_renderer(config, renderer.scene, each.instances, 1), [(0, each)], device)
+    errors = [np.sqrt(np.mean((picture - reference) ** 2)) for picture in show(renderer, [(index, each) for index in range(24)], device)]
+    assert errors[-1] < 0.6 * errors[0]
+    assert np.mean(errors[-4:]) < np.mean(errors[4:8]) < errors[0]
+
+
+def test_a_moved_body_leaves_no_ghost(renderer, device):
+    """A ball that has left its place: what was beneath it has the light of a renderer without history."""
+    frames = [*((index, toy(0.04)) for index in range(PATHS)), *((PATHS + index, toy(None)) for index in range(6))]
+    *_, last = show(renderer, frames, device)
+    each = toy(None)
+    many = Config(render=replace(each.settings().render, coarse_paths=64))
+    (expected,) = show(make_renderer(many, renderer.scene, each.instances, 1), [(0, each)], device)
+    blur = np.abs(last - expected).mean(axis=-1) / expected.mean()
+    assert blur[12:36, 8:32].mean() < 0.02
