@@ -99,6 +99,11 @@ def measure_steady(config: Config, min_seconds: float) -> Iterator[Row]:
     with tempfile.TemporaryDirectory() as folder:
         meter = _Meter(min_seconds, Path(folder), live_views)
         run_bake(config, Path(folder) / "out", meter)
+    yield from _summarize(meter)
+
+
+def _summarize(meter: _Meter) -> Iterator[Row]:
+    """Rows of a measurement; none if it was too short."""
     if len(meter.readings) < 2:
         return
     first, last = meter.readings[0], meter.readings[-1]
