@@ -23,7 +23,7 @@ from synpick_warp.stages.stream import views_per_batch
 HEADROOM = 1.5
 """Room for what a bake takes beyond its plan, which is a lower bound, as a multiple of it. tools/README.md has both measured."""
 RUNTIME_BYTES = 1 << 30
-"""Room for what no plan counts: CUDA's context and kernels; a process's libraries, 460 MB, and objects, 200 MB [bytes]."""
+"""Room for what no plan counts: CUDA's context and kernels; a process's libraries and objects, 0.7 GiB [bytes]."""
 WRITER_BYTES = 100 << 20
 """Memory of a writer process besides its images [bytes]: 50 MB, its part of shared libraries included, at full HD with bop and shards, and
 headroom for formats with larger libraries."""
