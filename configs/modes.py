@@ -18,7 +18,11 @@ def bake_modes(config: Config) -> tuple[str, ...]:
     return tuple(dict.fromkeys(split.mode for split in config.splits)) or (config.bake.mode,)
 
 
+def possible_modes(config: Config) -> set[str]:
+    """Those of MODES that episodes of a bake can have."""
+    return {name for mode in bake_modes(config) for name, weight in mode_weights(config, mode).items() if weight > 0.0}
+
+
 def may_pick(config: Config) -> bool:
     """Whether a bake can have episodes in mode pick or target."""
-    weights = [mode_weights(config, mode) for mode in bake_modes(config)]
-    return any(each["pick"] > 0.0 or each["target"] > 0.0 for each in weights)
+    return not possible_modes(config).isdisjoint({"pick", "target"})

@@ -48,7 +48,13 @@ class Bake:
     mix: tuple[float, float, float] = setting(
         (1.0, 1.0, 1.0), "", "Weights with which mode mixed draws pick, target and move for an episode.", low=0.0, high=1000
     )
-    worlds: int = setting(4, "", "Totes simulated in parallel; a GPU simulates at least 8.", low=1, high=65536)
+    worlds: int = setting(
+        0,
+        "",
+        "Totes simulated in parallel, on each device; 0: chosen by episodes, device and memory. A GPU simulates at least 8.",
+        low=0,
+        high=65536,
+    )
     episodes: int = setting(4, "", "Episodes (sequences) to generate; each becomes one BOP scene per camera.", low=1, high=INT32_MAX)
     seed: int = setting(0, "", "Random seed, from which every random number of the bake follows.", low=0, high=2**63 - 1)
     device: str = setting("auto", "", "Device: cpu, cuda:N, or auto (the first GPU if there is one).")
@@ -60,7 +66,7 @@ class Bake:
         "Output formats: bop (scene folders), shards (webdataset), usd (a stage per episode), zarr (trajectories), lerobot (v3), coco.",
         choices=FORMATS,
     )
-    writers: int = setting(0, "", "Processes that write files; 0: one per CPU core.", low=0, high=1024)
+    writers: int = setting(0, "", "Processes that write files, for all devices; 0: one per CPU core, if memory suffices.", low=0, high=1024)
 
 
 @dataclass(frozen=True)

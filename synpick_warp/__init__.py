@@ -45,6 +45,7 @@ def bake(
     *,
     shard: tuple[int, int] = (0, 1),
     splits: Sequence[str] = (),
+    devices: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> BakeSummary:
     """Generate a data set: simulate, render and write it; or resume one that was interrupted. `synpick-warp bake` does the same.
@@ -55,6 +56,8 @@ def bake(
         settings: Full key, such as "bake.mode", -> value; they override a preset or file.
         shard: (i, n): only episodes with index % n == i.
         splits: Only episodes of these splits of the settings, such as ("train",) of the preset "synpick"; empty: all.
+        devices: Devices with a process each: GPUs such as ("cuda:0", "cuda:1"), or ("all",), or "cpu" once per process. The bytes are those
+            of one device. Empty: `bake.device` alone.
         progress: Receives stages, counts and notes; None: silent. See `synpick_warp.progress`.
 
     Returns:
@@ -72,7 +75,7 @@ def bake(
         config = load_config(config, settings, splits=bool(splits))
     elif settings:
         raise TypeError("settings override a preset or a file; pass them to load_config, or use dataclasses.replace on the Config")
-    return run_bake(config, Path(out), progress if progress is not None else SilentProgress(), shard, splits)
+    return run_bake(config, Path(out), progress if progress is not None else SilentProgress(), shard, splits, devices)
 
 
 def load_config(preset_or_file: Path | str | None = None, settings: Mapping[str, object] | None = None, *, splits: bool = False) -> Config:

@@ -86,6 +86,19 @@ class BakeSummary:
         self.outcomes.update(Outcome[attempt["outcome"].upper()] for attempt in record["attempts"])
         self.resumed += 1
 
+    def take_summary(self, other: BakeSummary) -> None:
+        """Add the episodes of another process of this bake; the total stays."""
+        self.episodes += other.episodes
+        self.episodes.sort()
+        self.views += other.views
+        self.redraws += other.redraws
+        for ending, count in other.redrawn.items():
+            self.redrawn[ending] = self.redrawn.get(ending, 0) + count
+        self.remedies |= other.remedies
+        self.outcomes.update(other.outcomes)
+        self.stopped = self.stopped or other.stopped
+        self.wall_seconds = max(self.wall_seconds, other.wall_seconds)
+
     def take_resample(self, ending: Ending) -> None:
         """Add an arrangement that ended without delivery and will be resampled."""
         self.redraws += 1

@@ -99,17 +99,30 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
     return [*terms, *_newton(config, device), *_host(config, device, writers)]
 
 
-def check_memory(config: Config, device: wp.Device, writers: int = 1) -> None:
+def free_memory(device: wp.Device | None) -> int:
+    """Free memory of a GPU, or of the host for None and the CPU [bytes]."""
+    return free_device_memory(device) if device is not None and device.is_cuda else free_host_memory()
+
+
+def check_memory(config: Config, device: wp.Device, writers: int = 1, processes: int = 1) -> None:
     """Refuse a bake that certainly exceeds the memory of this machine, or the 32-bit indices of kernels.
+
+    Args:
+        config: All settings.
+        device: Device of the simulation.
+        writers: Writer processes of the device.
+        processes: Processes, such as one per device, that share the host's memory.
 
     Raises:
         ConfigError: One line with the largest term, its size, what is available, and the setting to lower.
     """
+    config = with_enough_worlds(config, device)
     terms = plan_memory(config, device, writers)
-    for on_device, place in ((True, device.alias), (False, "this machine")):
+    shared = "this machine" if processes == 1 else f"each of {processes} processes"
+    for on_device, place in ((True, device.alias), (False, shared)):
         part = [term for term in terms if term.on_device == on_device]
         needed = sum(term.size for term in part)
-        free = free_device_memory(device) if on_device and device.is_cuda else free_host_memory()
+        free = free_memory(device) if on_device else free_memory(None) // processes
         if needed > free:
             largest = max(part, key=lambda term: term.size)
             raise ConfigError(
@@ -151,6 +164,7 @@ def is_shortage(error: BaseException) -> bool:
 
 def shortage_error(config: Config, device: wp.Device) -> ConfigError:
     """Error for memory that ran out although the plan, a lower bound, had accepted the settings."""
+    config = with_enough_worlds(config, device)
     largest = max(plan_memory(config, device), key=lambda term: term.size)
     return ConfigError(f"the bake ran out of memory; its largest part are {largest.name}, {_gib(largest.size)}; {_advice(largest, config)}")
 

@@ -6,10 +6,9 @@ This is the one module that passes the whole `Config` on; stages take what they 
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -22,11 +21,11 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.manifest import episode_entry, read_entry
-from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
+from synpick_warp.dataset.writing import OutputFolder, commit_episode, finalize_data_set
 from synpick_warp.episodes import BakeSummary, episode_end, episode_row, is_resampled, remedy
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext, Exporter
-from synpick_warp.exporters.registry import Exporters, load_exporter_classes, slot_bytes
+from synpick_warp.exporters.registry import Exporters, aborting, load_exporter_classes, slot_bytes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.memory_plan import check_episodes, check_memory, is_shortage, shortage_error
@@ -36,18 +35,23 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
+from synpick_warp.scheduling.devices import Share, bake_on_devices
+from synpick_warp.scheduling.order import order_longest_first
+from synpick_warp.scheduling.sizes import count_writers, fit_to_device
+from synpick_warp.scheduling.worker import BakeLink
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
-from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import RECORDS, Simulation
 from synpick_warp.stages.stream import FrameStream, TickReader, TickReport, host_images, name_lights, tick_batch, view_sizes
 from synpick_warp.stages.timing import scope
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.device import pick_device, pick_devices
 from synpick_warp.system.interrupt import StopRequest
 
 HIGH_PRIORITY = -1
 """CUDA stream priority of physics: its 25,000 short kernels a tick wait for each other, and should not also wait for the renderer's."""
+_DEVICE_PROGRAM = "from synpick_warp.pipeline import generate_share; from synpick_warp.scheduling.worker import main; main(generate_share)"
+"""Program of a device's process, where a bake uses several."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +72,7 @@ def build_factory(
     episodes: Sequence[int] | None = None,
     records_physics: bool = False,
     needs_images: bool = True,
+    processes: int = 1,
 ) -> Factory:
     """Load assets and build the stages on the device.
 
@@ -77,13 +82,16 @@ def build_factory(
         episodes: Indices of the episodes to simulate; None: all.
         records_physics: Whether ticks are recorded with their physics.
         needs_images: Whether all images are copied to the host; see `Exporter`.
+        processes: Processes of the bake, which share the host's memory.
 
     Raises:
         SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
     """
     device = pick_device(config.bake.device)
-    config = with_enough_worlds(config, device)
-    check_memory(config, device, count_writers(config))
+    planned = sum(map(len, plan_episodes(config))) if episodes is None else len(episodes)
+    writers = count_writers(config)
+    config = fit_to_device(config, device, planned, writers, processes)
+    check_memory(config, device, writers, processes)
     progress.stage("loading objects and lights")
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
@@ -101,11 +109,6 @@ def build_factory(
     host = host_images(config, device, needs_images)
     stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device, host)
     return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.perception.resolution, object_ids))
-
-
-def count_writers(config: Config) -> int:
-    """Writer processes of a bake: `bake.writers`, or one per usable CPU core."""
-    return config.bake.writers or len(os.sched_getaffinity(0))
 
 
 def make_renderer(config: Config, scene: RenderScene, instances: int, views: int, histories: int = 0) -> Renderer:
@@ -126,7 +129,14 @@ def make_renderer(config: Config, scene: RenderScene, instances: int, views: int
     )
 
 
-def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, int] = (0, 1), splits: Sequence[str] = ()) -> BakeSummary:
+def run_bake(
+    config: Config,
+    out: Path,
+    progress: Progress,
+    shard: tuple[int, int] = (0, 1),
+    splits: Sequence[str] = (),
+    devices: Sequence[str] = (),
+) -> BakeSummary:
     """Simulate, render and write a data set, or the remaining episodes of one.
 
     Args:
@@ -135,10 +145,13 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
         progress: Observer.
         shard: (i, n): only episodes with index % n == i.
         splits: Only episodes of these splits; empty: all.
+        devices: Devices with a process each, see `pick_devices`; empty: `bake.device` alone.
 
     Raises:
         SynpickError: An error that the user can correct; committed episodes stay, and the same bake resumes.
     """
+    names = pick_devices(devices) if devices else (config.bake.device,)
+    config = replace(config, bake=replace(config.bake, device=names[0]))
     kinds = load_exporter_classes(config.bake.formats)
     planned = plan_episodes(config, splits, shard)
     check_episodes(sum(map(len, planned)), config)
@@ -152,44 +165,83 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
         if output.committed:
             progress.note(f"{len(output.committed)} of {len(output.episodes)} episodes are complete; resuming with the others")
         try:
-            _fill(config, output, kinds, summary, progress)
+            with _naming_shortage(config):
+                _fill(config, output, kinds, names[: max(1, len(output.remaining))], summary, progress)
         except OutputError as error:
             if out.exists():
                 raise
             raise OutputError(f"{out} was removed while the bake wrote to it") from error
-        except (MemoryError, RuntimeError) as error:
-            if not is_shortage(error):
-                raise
-            raise shortage_error(config, pick_device(config.bake.device)) from error
         finally:
             output.clean_up()
     return summary
 
 
-def _fill(config: Config, output: OutputFolder, kinds: tuple[type[Exporter], ...], summary: BakeSummary, progress: Progress) -> None:
+@contextlib.contextmanager
+def _naming_shortage(config: Config) -> Iterator[None]:
+    """Turn an error that says that memory ran out into one that names the setting to lower."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not is_shortage(error):
+            raise
+        raise shortage_error(config, pick_device(config.bake.device)) from error
+
+
+def _fill(
+    config: Config, output: OutputFolder, kinds: tuple[type[Exporter], ...], names: Sequence[str], summary: BakeSummary, progress: Progress
+) -> None:
     """Generate the remaining episodes, then the indices over all."""
-    needs = [any(getattr(kind, name) for kind in kinds) for name in ("needs_physics", "needs_images")]
-    with scope("build"):
-        factory = build_factory(config, progress, output.remaining, *needs) if output.remaining else None
+    factory = None
+    if len(names) > 1:
+        bake_on_devices(config, output, kinds, names, _DEVICE_PROGRAM, summary, progress)
+    elif output.remaining:
+        with scope("build"):
+            episodes = order_longest_first(config, output.remaining, pick_device(config.bake.device))
+            factory = build_factory(config, progress, episodes, *_needs(kinds))
     with WriterPool(count_writers(config), slot_bytes(kinds, config), output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:
             exporters = Exporters(kinds, ExportContext(output.out, config, factory.catalog, factory.cameras, factory.lights, pool))
-            try:
+            with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(factory.catalog, factory.lights), pool)
-                _Run(config, factory, exporters, partial(output.commit, exporters, pool), summary, progress).run()
+                _Run(config, factory, exporters, partial(output.commit, exporters, pool), summary, progress, StopRequest()).run()
                 with scope("wait for writers"):
                     pool.wait()
                 exporters.close()
-            except BaseException:
-                pool.abort()
-                exporters.abort()
-                raise
         if not summary.stopped:
             progress.stage("finishing files")
             with scope("finalize"):
                 finalize_data_set(output.out, config, kinds, pool)
-        summary.wall_seconds = time.perf_counter() - started
+        summary.wall_seconds += time.perf_counter() - started
+
+
+def _needs(kinds: Sequence[type[Exporter]]) -> tuple[bool, bool]:
+    """Whether any format needs physics, and images."""
+    return any(kind.needs_physics for kind in kinds), any(kind.needs_images for kind in kinds)
+
+
+def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> BakeSummary:
+    """Generate and commit the episodes of one device, in its process; the folder is prepared already.
+
+    Args:
+        share: Part of the bake.
+        handles: Handles that the writers keep open.
+        link: Receives reports, and requests to stop.
+    """
+    config, summary = share.config, BakeSummary(len(share.episodes))
+    kinds = load_exporter_classes(config.bake.formats)
+    with _naming_shortage(config):
+        factory = build_factory(config, link, share.episodes, *_needs(kinds), processes=share.processes)
+        with WriterPool(config.bake.writers, slot_bytes(kinds, config), *handles) as pool:
+            link.writers = pool.pids()
+            started = time.perf_counter()
+            exporters = Exporters(kinds, ExportContext(share.out, config, factory.catalog, factory.cameras, factory.lights, pool))
+            with aborting(pool, exporters):
+                _Run(config, factory, exporters, partial(commit_episode, share.out, exporters, pool), summary, link, link).run()
+                pool.wait()
+                exporters.close()
+            summary.wall_seconds = time.perf_counter() - started
+    return summary
 
 
 class _Run:
@@ -203,7 +255,9 @@ class _Run:
         commit: Callable[[EpisodeEnd], None],
         summary: BakeSummary,
         progress: Progress,
+        stop: StopRequest | BakeLink,
     ) -> None:
+        self.stop = stop
         self.config, self.factory, self.exporters = config, factory, exporters
         self.commit, self.summary, self.progress = commit, summary, progress
         self.meter = _Meter(config, summary, progress)
@@ -218,7 +272,7 @@ class _Run:
         simulation = self.factory.simulation
         readers = [TickReader(record) for record in simulation.records]
         self.progress.stage("compiling kernels, dropping objects")
-        with StopRequest() as stop, self._simulation_ended():
+        with self.stop as stop, self._simulation_ended():
             self._simulate(readers, 0)
             current = 0
             while not stop.number:

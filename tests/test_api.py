@@ -62,7 +62,7 @@ def test_the_type_marker_is_packaged():
 
 def test_settings_of_a_preset_are_overridden(tmp_path, calls):
     synpick_warp.bake("smoke", str(tmp_path / "set"), {"bake.mode": "move"}, shard=(1, 2))
-    [(config, out, progress, shard, _)] = calls
+    [(config, out, progress, shard, *_)] = calls
     assert config == load_config("smoke", {"bake.mode": "move"}) == synpick_warp.load_config("smoke", {"bake.mode": "move"})
     assert (out, shard) == (tmp_path / "set", (1, 2))
     assert isinstance(progress, SilentProgress)
@@ -71,7 +71,8 @@ def test_settings_of_a_preset_are_overridden(tmp_path, calls):
 def test_a_config_is_taken_as_it_is(tmp_path, calls):
     config, progress = synpick_warp.load_config("smoke"), SilentProgress()
     synpick_warp.bake(config, tmp_path, progress=progress)
-    assert calls == [(config, tmp_path, progress, (0, 1), ())]
+    synpick_warp.bake(config, tmp_path, devices=("cpu", "cpu"), progress=progress)
+    assert calls == [(config, tmp_path, progress, (0, 1), (), devices) for devices in ((), ("cpu", "cpu"))]
     with pytest.raises(TypeError, match="pass them to load_config"):
         synpick_warp.bake(config, tmp_path, {"bake.mode": "move"})
 

@@ -57,7 +57,11 @@ CAMERAS = {"cameras__positions": [[0.0, 0.0, 2.0]] * 1000, "cameras__ups": [[0.0
 @pytest.mark.parametrize(
     ("overrides", "largest", "advice"),
     [
-        ({"cameras__resolution": [8192, 8192]}, "images of 3 views of 8,192x8,192 px", "lower cameras.resolution ([8192, 8192])"),
+        (
+            {"cameras__resolution": [8192, 8192], "render__views_per_batch": 3},
+            "images of 3 views of 8,192x8,192 px",
+            "lower cameras.resolution ([8192, 8192])",
+        ),
         (
             {"cameras__resolution": [8192, 8192], "bake__worlds": 65536, "bake__mode": "pick"},
             "Newton's contacts",
@@ -65,7 +69,7 @@ CAMERAS = {"cameras__positions": [[0.0, 0.0, 2.0]] * 1000, "cameras__ups": [[0.0
         ),
         (
             CAMERAS | {"cameras__resolution": [1280, 720]},
-            "images of 1,000 views of 1,280x720 px",
+            "backgrounds of 1,000 cameras of 1,280x720 px",
             "lower cameras.positions (1,000 cameras)",
         ),
         ({"render__views_per_batch": 10_000}, "images of 10,000 views of 320x180 px", "lower render.views_per_batch (10000)"),

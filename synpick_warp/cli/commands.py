@@ -15,7 +15,7 @@ from synpick_warp import __version__
 from synpick_warp.cli.convert import convert
 from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
-from synpick_warp.cli.options import WholeNumber, one_line, parse_resolution, parse_shard, parse_splits
+from synpick_warp.cli.options import Count, WholeNumber, one_line, parse_devices, parse_resolution, parse_shard, parse_splits
 from synpick_warp.cli.report import write_page
 from synpick_warp.cli.statistics import show_statistics
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
@@ -69,8 +69,15 @@ SetOption = Annotated[
         help=f"Any other setting, as section.key=value; may be repeated. `{NAME} config` prints all, with units, ranges and values.",
     ),
 ]
-WorldsOption = Annotated[WholeNumber | None, Parameter(help=_help("bake.worlds"))]
+WorldsOption = Annotated[Count | None, Parameter(help=_help("bake.worlds", " auto is 0."))]
 ResolutionOption = Annotated[str | None, Parameter(help=_help("cameras.resolution", " As WIDTHxHEIGHT."))]
+DevicesOption = Annotated[
+    str | None,
+    Parameter(
+        help="Several devices with a process each, joined by commas: GPUs such as cuda:0,cuda:1, or all, or cpu once per process. They "
+        "fill one data set, with the bytes of one device; it can be resumed on other devices."
+    ),
+]
 DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
 
 
@@ -84,10 +91,11 @@ def bake(
     mode: Annotated[str | None, Parameter(help=_help("bake.mode", " Weights of mixed: --set bake.mix=[pick, target, move]."))] = None,
     seed: Annotated[WholeNumber | None, Parameter(help=_help("bake.seed"))] = None,
     device: DeviceOption = None,
+    devices: DevicesOption = None,
     models: Annotated[str | None, Parameter(help=_help("bake.models"))] = None,
     lights: Annotated[str | None, Parameter(help=_help("bake.lights"))] = None,
     resolution: ResolutionOption = None,
-    writers: Annotated[WholeNumber | None, Parameter(help=_help("bake.writers"))] = None,
+    writers: Annotated[Count | None, Parameter(help=_help("bake.writers", " auto is 0."))] = None,
     formats: Annotated[str | None, Parameter(help=_help("bake.formats", " Joined by commas."))] = None,
     shard: Annotated[
         str | None, Parameter(help="i/n: only episodes with index % n == i, such as 0/4; combine the data sets with merge.")
@@ -124,12 +132,13 @@ def bake(
         "bake.writers": writers,
         "bake.formats": None if formats is None else [name.strip() for name in formats.split(",")],
     }
+    several = parse_devices(devices, device, profile or profile_out is not None)
     names = parse_splits(split)
     resolved = _resolve(config, given, resolution, set_, splits=split is not None)
     planned = plan_episodes(resolved, names)
     part = parse_shard(shard, planned) if shard is not None else (0, 1)
     if not profile and profile_out is None:
-        return _bake(resolved, out, part, names)
+        return _bake(resolved, out, part, names, several)
     trace = profile_out or out.with_name(f"{out.name}-profile.json")
     check_trace_file(trace, out)
     return _bake_profiled(resolved, out, part, names, trace)
@@ -319,13 +328,16 @@ def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], splits: Se
     return code
 
 
-def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str]) -> int:
+def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], devices: Sequence[str] = ()) -> int:
     """Check device and folders, which is cheap, then bake."""
     from synpick_warp.cli.display import make_console, make_progress, print_summary
     from synpick_warp.exporters.writing.files import check_output_folder
-    from synpick_warp.system.device import pick_device
+    from synpick_warp.system.device import pick_device, pick_devices
 
-    pick_device(config.bake.device)
+    if devices:
+        devices = pick_devices(devices)
+    else:
+        pick_device(config.bake.device)
     models, lights = config.bake.models, config.bake.lights
     if models and not os.path.isdir(models):
         raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes")
@@ -336,7 +348,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
 
     console = make_console()
     with make_progress(console) as progress:
-        summary = run_bake(config, out, progress, shard, splits)
+        summary = run_bake(config, out, progress, shard, splits, devices)
     print_summary(console, summary, out)
     if summary.stopped:
         done = f"{len(summary.episodes)} of {summary.total} episodes are complete"

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from synpick_warp import __version__
 from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.system.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
 from synpick_warp.system.device import pick_device
@@ -45,9 +46,10 @@ def describe_machine(device: wp.Device) -> list[tuple[str, str]]:
 def memory_report(config: Config) -> Table:
     """Table of shape, unit and size of every array in the memory plan of a bake with these settings, and their sum."""
     from synpick_warp.memory_plan import describe_memory
-    from synpick_warp.stages.sim.physics import with_enough_worlds
+    from synpick_warp.scheduling.sizes import count_writers, fit_to_device
 
-    config = with_enough_worlds(config, pick_device(config.bake.device))
+    episodes = sum(map(len, plan_episodes(config)))
+    config = fit_to_device(config, pick_device(config.bake.device), episodes, count_writers(config))
     rows = describe_memory(config)
     width, height = config.cameras.resolution
     table = Table("array", "shape", "unit", "MiB", title=f"{config.bake.worlds} worlds, {width}x{height}", show_footer=True)

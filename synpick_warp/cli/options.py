@@ -33,8 +33,15 @@ def parse_whole_number(_: Any, tokens: Sequence[Token]) -> int:
     return int(text)
 
 
+def parse_count(kind: Any, tokens: Sequence[Token]) -> int:
+    """Parse the value of an option that counts something: `auto`, which is 0, or a whole number. Raises as `parse_whole_number`."""
+    return 0 if tokens[0].value == "auto" else parse_whole_number(kind, tokens)
+
+
 WholeNumber = Annotated[int, Parameter(converter=parse_whole_number)]
 """Type of all integer options."""
+Count = Annotated[int, Parameter(converter=parse_count)]
+"""Type of options whose number the program can choose."""
 
 
 def one_line(text: str) -> str:
@@ -58,6 +65,21 @@ def parse_resolution(text: str) -> list[int]:
 def parse_splits(text: str | None) -> tuple[str, ...]:
     """Parse "train,test" into names; None: no names."""
     return () if text is None else tuple(name.strip() for name in text.split(","))
+
+
+def parse_devices(devices: str | None, device: str | None, profile: bool) -> tuple[str, ...]:
+    """Parse "cuda:0,cuda:1" into names; None: no names.
+
+    Raises:
+        ConfigError: Another option cannot be beside it.
+    """
+    if devices is None:
+        return ()
+    if device is not None:
+        raise ConfigError("--device and --devices are both given; name one device by --device, or several by --devices")
+    if profile:
+        raise ConfigError("--profile records the process of one device; name it by --device, not by --devices")
+    return tuple(name.strip() for name in devices.split(","))
 
 
 def parse_shard(text: str, episodes: Sequence[range]) -> tuple[int, int]:

@@ -214,10 +214,8 @@ class OutputFolder:
             (self.out / f"{entry}{suffix}").unlink(missing_ok=True)
 
     def commit(self, exporters: Exporters, pool: WriterPool, end: EpisodeEnd) -> None:
-        """Commit an episode whose files are all in place: a writer computes their checksums and writes the manifest entry."""
-        content = {"episode": end.episode, "row": dict(end.row), "attempts": [json.loads(line) for line in end.attempts]}
-        entry = episode_entry(end.episode)
-        pool.submit(write_manifest_entry, (), (self.out, entry, exporters.files(end.episode), content), path=self.out / entry)
+        """See `commit_episode`."""
+        commit_episode(self.out, exporters, pool, end)
 
     def clean_up(self) -> None:
         """Remove partial files, after success or an error; a data set without committed episodes is removed entirely.
@@ -249,6 +247,13 @@ class OutputFolder:
             (self.out / ENTRIES).rmdir()
         for name in (CONFIG_FILE, MANIFEST_FILE):
             (self.out / name).unlink(missing_ok=True)
+
+
+def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: EpisodeEnd) -> None:
+    """Commit an episode whose files are all in place: a writer computes their checksums and writes the manifest entry."""
+    content = {"episode": end.episode, "row": dict(end.row), "attempts": [json.loads(line) for line in end.attempts]}
+    entry = episode_entry(end.episode)
+    pool.submit(write_manifest_entry, (), (out, entry, exporters.files(end.episode), content), path=out / entry)
 
 
 def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:

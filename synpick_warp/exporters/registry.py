@@ -14,8 +14,9 @@ A new subpackage also goes into `packages` in pyproject.toml. Nothing else lists
 
 from __future__ import annotations
 
+import contextlib
 import importlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 from synpick_warp.configs.schema import Config
@@ -109,6 +110,17 @@ class Exporters:
         """See `Exporter`."""
         for exporter in self._all:
             exporter.abort()
+
+
+@contextlib.contextmanager
+def aborting(pool: WriterPool, exporters: Exporters) -> Iterator[None]:
+    """End writers and exporters after an error."""
+    try:
+        yield
+    except BaseException:
+        pool.abort()
+        exporters.abort()
+        raise
 
 
 def slot_bytes(classes: Iterable[type[Exporter]], config: Config) -> int:

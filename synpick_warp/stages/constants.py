@@ -74,7 +74,7 @@ def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, l
         _catalog_data(catalog, built, device),
         _drop_data(config, lights),
         _settle_data(config.settle, physics.step * physics.steps_per_tick),
-        mode_data(_mode_rows(config), device),
+        mode_data(mode_rows(config), device),
         _move_data(config.move, config.tote, gripper, physics),
         fill(
             structs.PickData,
@@ -135,7 +135,7 @@ def mode_data(rows: Sequence[tuple[int, float, float, int]], device: wp.Device) 
     return wp.array([fill(structs.ModeData, **dict(zip(names, row, strict=True))) for row in rows], dtype=structs.ModeData, device=device)
 
 
-def _mode_rows(config: Config) -> list[tuple[int, float, float, int]]:
+def mode_rows(config: Config) -> list[tuple[int, float, float, int]]:
     """Members of `ModeData` of each split, or of the one range without splits."""
     splits = [(split.first, split.mode) for split in config.splits] or [(0, config.bake.mode)]
     rows = []

@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import warp as wp
 
@@ -19,6 +19,7 @@ _CONNECTIONS = ("CUDA_DEVICE_MAX_CONNECTIONS", "32")
 """Hardware queues that CUDA maps streams to; its default is 8. A tick's captured physics graph spreads over some 60 streams. Where it
 shares queues with the renderer's stream, neither runs beside the other: a tick takes 1.34 instead of 1.17 s on an H200."""
 _CUDA = re.compile(r"cuda:([0-9]{1,9})")
+_DEVICES = "allowed: all, or GPUs such as cuda:0,cuda:1, or cpu once per process"
 _NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 """Warp's native code prints this regardless of the log level; a machine without a GPU is not a fault."""
 
@@ -45,6 +46,42 @@ def pick_device(name: str) -> wp.Device:
         present = "no CUDA device" if count == 0 else f"only cuda:0 to cuda:{count - 1}" if count > 1 else "only cuda:0"
         raise DeviceError(f"{name} was requested, but Warp finds {present} here; use --device {'cuda:0' if count else 'cpu'}")
     return wp.get_device(f"cuda:{int(match[1])}")
+
+
+def pick_devices(names: Sequence[str]) -> tuple[str, ...]:
+    """Select the devices of a bake with one process each; returns their names. Starts Warp, but touches no device.
+
+    Args:
+        names: Different GPUs, or "cpu" once per process, since Warp runs a CPU's kernels on one core. "all" alone: every GPU, or the CPU if
+            there is none.
+
+    Raises:
+        DeviceError: There is no such device, a GPU is named twice, or the CPU beside a GPU.
+    """
+    if not names:
+        raise DeviceError(f"--devices names none; {_DEVICES}")
+    if list(names) == ["all"]:
+        start_warp()
+        return tuple(f"cuda:{index}" for index in range(wp.get_cuda_device_count())) or ("cpu",)
+    for name in names:
+        if name in ("all", "auto"):
+            raise DeviceError(f"--devices names {name} beside others; {_DEVICES}" if len(names) > 1 else f"--devices is {name}; {_DEVICES}")
+    picked = [pick_device(name) for name in names]
+    gpus = [device.alias for device in picked if device.is_cuda]
+    if gpus and len(gpus) < len(picked):
+        raise DeviceError(f"--devices names cpu beside {gpus[0]}, which computes other last bits; name either GPUs or cpu")
+    twice = next((name for name in gpus if gpus.count(name) > 1), None)
+    if twice:
+        raise DeviceError(f"--devices names {twice} twice; name each GPU once: its one process simulates bake.worlds totes")
+    return tuple(device.alias for device in picked)
+
+
+def describe_kinds(names: Sequence[str]) -> str:
+    """Say that devices are of different kinds, if they are: "cuda:0 is NVIDIA H100, cuda:1 NVIDIA H200"; empty: all are of one kind."""
+    kinds = [wp.get_device(name).name for name in names]
+    if len(set(kinds)) == 1:
+        return ""
+    return f"{names[0]} is {kinds[0]}, " + ", ".join(f"{name} {kind}" for name, kind in zip(names[1:], kinds[1:], strict=True))
 
 
 def start_warp() -> None:

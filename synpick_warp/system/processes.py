@@ -64,7 +64,12 @@ class WorkerProcess:
 
 
 def start_process(
-    program: str, handles: Sequence[int] = (), inherited: Sequence[int] = (), environment: Mapping[str, str] = {}
+    program: str,
+    handles: Sequence[int] = (),
+    inherited: Sequence[int] = (),
+    environment: Mapping[str, str] = {},
+    *,
+    has_threads: bool = False,
 ) -> WorkerProcess:
     """Start a process. Its standard output is the null device, since the inherited one may be full or closed.
 
@@ -74,6 +79,7 @@ def start_process(
         handles: File handles that it uses; sys.argv[1] is the number of its link's handle, the following those of these.
         inherited: File handles that it keeps open until it exits, such as one that holds a lock.
         environment: Environment variables that it has besides those of this process.
+        has_threads: Whether its libraries start as many threads as those of this process.
 
     Raises:
         OSError: Processes, memory or descriptors are used up.
@@ -90,7 +96,7 @@ def start_process(
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=None if sys.__stderr__ is not None else subprocess.DEVNULL,
-            env={**os.environ, **_ENVIRONMENT, **environment, "PYTHONPATH": paths},
+            env={**os.environ, **({} if has_threads else _ENVIRONMENT), **environment, "PYTHONPATH": paths},
             pass_fds=(theirs.fileno(), *handles, *passed),
             process_group=0,  # Ctrl-C in a terminal reaches the parent alone, even before the process ignores it.
         )

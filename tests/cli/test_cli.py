@@ -34,7 +34,8 @@ def bakes(monkeypatch):
     module = types.ModuleType("synpick_warp.pipeline")
     calls = []
 
-    def run_bake(config, out, progress, shard, splits):
+    def run_bake(config, out, progress, shard, splits, devices):
+        module.devices = devices
         calls.append((config, out, shard, splits))
         progress.stage("building worlds")
         progress.update(episodes_done=0, episodes=2, worlds_active=2, views=0, views_per_s=0.0, seconds_left=None)
@@ -50,6 +51,9 @@ def bakes(monkeypatch):
     plan = types.ModuleType("synpick_warp.memory_plan")
     plan.describe_memory = lambda config: [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
     monkeypatch.setitem(sys.modules, "synpick_warp.memory_plan", plan)
+    sizes = types.ModuleType("synpick_warp.scheduling.sizes")
+    sizes.fit_to_device, sizes.count_writers = lambda config, *_: config, lambda _: 1
+    monkeypatch.setitem(sys.modules, "synpick_warp.scheduling.sizes", sizes)
     return module
 
 
@@ -77,6 +81,12 @@ def test_bake_passes_resolved_settings_on(tmp_path, bakes, capsys):
     assert "4 of 4 episodes and 120 views in 0:02 (60.0 views/s); arrangements drawn again: 1" in printed
 
 
+def test_bake_passes_devices_and_automatic_sizes_on(tmp_path, bakes):
+    assert main(["bake", "--out", str(tmp_path), "--devices", "cpu, cpu", "--worlds", "auto", "--writers", "auto"]) == 0
+    [(config, *_)] = bakes.calls
+    assert (config.bake.worlds, config.bake.writers, bakes.devices) == (0, 0, ("cpu", "cpu"))
+
+
 def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, capsys):
     bakes.result = finished(2)
     bakes.result.episodes[1] = bakes.result.episodes[1]._replace(arrangement=19, ending=Ending.UNSETTLED, frames=0)
@@ -87,7 +97,7 @@ def test_bake_says_so_by_exit_code_if_episodes_are_missing(tmp_path, bakes, caps
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--worlds", "0"], "bake.worlds is 0 on the command line; allowed: at least 1, at most 65536"),
+        (["--worlds=-1"], "bake.worlds is -1 on the command line; allowed: at least 0, at most 65536"),
         (["--episodes", "0"], "bake.episodes is 0 on the command line; allowed: at least 1"),
         (["--worlds", "many"], '--worlds is "many"; allowed: a whole number in decimal digits, such as 8'),
         (["--resolution", "0x0"], "cameras.resolution is [0, 0] on the command line; allowed: each at least 1, at most 8192 [px]"),
@@ -256,7 +266,7 @@ def test_help_shows_units_and_defaults(capsys):
     assert main(["bake", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "default 1920x1080 px; cameras.resolution" in text
-    assert "Totes simulated in parallel; a GPU simulates at least 8. (at least 1, at most 65536; default 4; bake.worlds)" in text
+    assert "A GPU simulates at least 8. auto is 0. (at least 0, at most 65536; default 0; bake.worlds)" in text
 
 
 def test_help_says_how_modes_are_mixed(capsys):

@@ -126,8 +126,8 @@ def test_object_rows_of_a_file_replace_those_of_the_preset(tmp_path):
 def test_paths_and_no_arguments_do_as_names_do(tmp_path):
     assert load_config() == load_config("synpick")
     assert load_config(Path(write(tmp_path, 'preset = "smoke"\n'))) == load_config("smoke", {})
-    with pytest.raises(ConfigError, match=r"^bake.worlds is 0 in the settings passed; allowed: at least 1, at most 65536$"):
-        load_config("smoke", {"bake.worlds": 0})
+    with pytest.raises(ConfigError, match=r"^bake.worlds is -1 in the settings passed; allowed: at least 0, at most 65536$"):
+        load_config("smoke", {"bake.worlds": -1})
 
 
 def test_whole_numbers_are_allowed_for_floats():
@@ -141,7 +141,7 @@ def test_whole_numbers_are_allowed_for_floats():
     [
         ("physics.step", 0.5, "physics.step is 0.5 on the command line; allowed: above 0, at most 0.02 [s]"),
         ("physics.step", 0, "physics.step is 0 on the command line; allowed: above 0, at most 0.02 [s]"),
-        ("bake.worlds", 0, "bake.worlds is 0 on the command line; allowed: at least 1, at most 65536"),
+        ("bake.worlds", -1, "bake.worlds is -1 on the command line; allowed: at least 0, at most 65536"),
         ("bake.worlds", 2.0, "bake.worlds is 2.0 on the command line; allowed: a whole number"),
         ("bake.worlds", True, "bake.worlds is true on the command line; allowed: a whole number"),
         ("physics.gravity", True, "physics.gravity is true on the command line; allowed: a finite number [m/s²]"),
@@ -221,7 +221,7 @@ def test_files_that_cannot_be_read(tmp_path):
 
 
 def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_it(tmp_path):
-    assert " in " in message(write(tmp_path, "[bake]\nworlds = 0\n"), {"bake.worlds": 1})
+    assert " in " in message(write(tmp_path, "[bake]\nworlds = -1\n"), {"bake.worlds": 1})
 
 
 @pytest.mark.parametrize(

@@ -66,12 +66,12 @@ class WriterPool:
     The processes are fresh interpreters, and the shared memory is anonymous, so nothing leaks however the bake ends.
     """
 
-    def __init__(self, processes: int, slot_bytes: int, inherited_handle: int | None = None) -> None:
+    def __init__(self, processes: int, slot_bytes: int, *inherited_handles: int) -> None:
         """
         Args:
             processes: Number of processes; 0: tasks run in the calling process.
             slot_bytes: Maximum size of the images of one task, see `shared_bytes` [B].
-            inherited_handle: A file handle that the processes keep open until they exit, such as one that holds a lock.
+            inherited_handles: File handles that the processes keep open until they exit, such as one that holds a lock.
 
         Raises:
             OutputError: Memory or processes cannot be allocated.
@@ -94,7 +94,7 @@ class WriterPool:
             raise OutputError(f"no shared memory for {processes} writer processes: {error}; set bake.writers lower") from error
         try:
             for _ in range(processes):
-                worker = start_process(_WORKER, (handle,), () if inherited_handle is None else (inherited_handle,))
+                worker = start_process(_WORKER, (handle,), inherited_handles)
                 self._workers.append(worker)
                 self._links.register(worker.link, selectors.EVENT_READ, worker)
         except OSError as error:

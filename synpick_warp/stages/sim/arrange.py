@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import warp as wp
 
+from synpick_warp.codes import Phase
+from synpick_warp.configs.schema import Config
 from synpick_warp.kernels.sim import arrangement, endings, rest
-from synpick_warp.stages.constants import SceneData
+from synpick_warp.stages.constants import SceneData, mode_data, mode_rows
 from synpick_warp.stages.perception.arrays import Observation
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
@@ -45,6 +48,25 @@ def sample_objects(scene: SceneData, state: WorldState, seed: int) -> None:
         outputs=[state.light, state.light_yaw, state.light_exposure],
         device=device,
     )
+
+
+def sample_modes_of(config: Config, episodes: np.ndarray, device: wp.Device) -> np.ndarray:
+    """Sample the modes of episodes ahead of their start: `Mode` (episode) int32 of indices (episode) int32. Waits for the device."""
+    identity = np.stack([episodes, np.zeros_like(episodes)], axis=1)
+    mode = wp.empty(len(episodes), dtype=wp.int32, device=device)
+    wp.launch(
+        arrangement.sample_modes_kernel,
+        dim=len(episodes),
+        inputs=[
+            wp.uint64(config.bake.seed),
+            mode_data(mode_rows(config), device),
+            wp.array(identity, dtype=wp.vec2i, device=device),
+            wp.full(len(episodes), int(Phase.START), dtype=wp.int32, device=device),
+        ],
+        outputs=[mode],
+        device=device,
+    )
+    return mode.numpy()
 
 
 def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:

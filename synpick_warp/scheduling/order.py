@@ -1,0 +1,48 @@
+"""Order of episodes: longest processing time first (Graham, 1969), and the share of each device.
+
+Episodes that begin last determine when a bake ends, so long ones begin first. No episode depends on the order or on its device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.codes import Mode
+from synpick_warp.configs.modes import possible_modes
+from synpick_warp.configs.schema import Config
+from synpick_warp.stages.sim.arrange import sample_modes_of
+
+EXPECTED_FRAMES = {Mode.TARGET: 638, Mode.PICK: 502, Mode.MOVE: 416}
+"""Mean frames of an episode: tools/README.md, "Picking", and for MOVE those of the paper's data set."""
+
+
+def order_longest_first(config: Config, episodes: Sequence[int], device: wp.Device) -> list[int]:
+    """Sort episodes by the expected frames of their mode, the longest first, and then by index.
+
+    Args:
+        config: All settings.
+        episodes: Indices.
+        device: Device that samples the modes.
+    """
+    if len(possible_modes(config)) == 1:
+        return sorted(episodes)
+    indices = np.sort(np.asarray(episodes, np.int32))
+    frames = np.array([EXPECTED_FRAMES[mode] for mode in sorted(Mode)])[sample_modes_of(config, indices, device)]
+    return indices[np.argsort(-frames, kind="stable")].tolist()
+
+
+def deal_episodes(ordered: Sequence[int], devices: int) -> list[list[int]]:
+    """Deal ordered episodes to devices in turn, there and back (0, 1, 1, 0, 0, ...), so that none gets the longer one every time."""
+    turns = [*range(devices), *reversed(range(devices))]
+    shares: list[list[int]] = [[] for _ in range(devices)]
+    for position, episode in enumerate(ordered):
+        shares[turns[position % len(turns)]].append(episode)
+    return shares
+
+
+def deal_writers(writers: int, devices: int) -> list[int]:
+    """Share writer processes out among devices: equal numbers up to one, and at least one each."""
+    return [max(1, writers // devices + (device < writers % devices)) for device in range(devices)]

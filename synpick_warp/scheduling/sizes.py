@@ -1,0 +1,100 @@
+"""Sizes of a bake that its settings leave open (0): worlds and batches of a device, and writer processes, from what the machine has free.
+
+No output depends on them. Worlds follow from the number of episodes; where memory is short, batches and worlds are halved until the memory
+plan and its headroom fit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+
+import warp as wp
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
+from synpick_warp.exporters.writing.pool import QUEUE_DEPTH
+from synpick_warp.memory_plan import Term, free_memory, plan_memory
+from synpick_warp.stages.perception.images import count_views
+from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
+from synpick_warp.stages.stream import views_per_batch
+
+HEADROOM = 1.5
+"""Room for what a bake takes beyond its plan, which is a lower bound, as a multiple of it. tools/README.md has both measured."""
+RUNTIME_BYTES = 1 << 30
+"""Room for what no plan counts: CUDA's context and kernels; a process's libraries and objects, 0.7 GiB [bytes]."""
+WRITER_BYTES = 100 << 20
+"""Memory of a writer process besides its images [bytes]: 50 MB, its part of shared libraries included, at full HD with bop and shards, and
+headroom for formats with larger libraries."""
+WRITERS_FRACTION = 0.5
+"""Fraction of the free host memory that writer processes may take if their number is chosen."""
+
+
+def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int = 1, processes: int = 1) -> Config:
+    """Choose worlds and batches that the settings leave open. What they name stays, whether it fits or not.
+
+    Args:
+        config: All settings.
+        device: Device of the simulation.
+        episodes: Episodes that the device simulates.
+        writers: Writer processes of the device.
+        processes: Processes that share the host's memory.
+    """
+    is_open = {key: _value(config, key) == 0 for key in ("render.views_per_batch", "perception.views", "bake.worlds")}
+    config = with_enough_worlds(config, device, episodes)
+    while terms := _short_terms(config, device, writers, processes):
+        for term in sorted(terms, key=lambda term: -term.size):
+            key = next(
+                (key for key in is_open if is_open[key] and key in term.settings and _amount(config, key, device) > _least(key, device)), ""
+            )
+            if key:
+                config = _halve(config, key, device)
+                break
+        else:
+            return config
+    return config
+
+
+def count_writers(config: Config) -> int:
+    """Writer processes of a bake: `bake.writers`, or one per usable CPU core, as far as the host's free memory has room for them."""
+    if config.bake.writers:
+        return config.bake.writers
+    each = WRITER_BYTES + QUEUE_DEPTH * slot_bytes(load_exporter_classes(config.bake.formats), config)
+    room = int(WRITERS_FRACTION * free_memory(None)) // each
+    return max(1, min(len(os.sched_getaffinity(0)), room))
+
+
+def _short_terms(config: Config, device: wp.Device, writers: int, processes: int) -> Sequence[Term]:
+    """Terms of the plan in a memory that they, with headroom, do not fit into; empty: they fit."""
+    terms = plan_memory(config, device, writers)
+    for on_device in (True, False):
+        part = [term for term in terms if term.on_device == on_device]
+        free = free_memory(device) if on_device and device.is_cuda else free_memory(None) // processes
+        if part and HEADROOM * sum(term.size for term in part) + RUNTIME_BYTES > free:
+            return part
+    return ()
+
+
+def _amount(config: Config, key: str, device: wp.Device) -> int:
+    """Number of views or worlds that a setting stands for."""
+    if key == "render.views_per_batch":
+        return views_per_batch(config, device)
+    if key == "perception.views":
+        return count_views(config.perception, config.bake.worlds, config.arrangement.max_objects, device)
+    return config.bake.worlds
+
+
+def _least(key: str, device: wp.Device) -> int:
+    return MIN_GPU_WORLDS if key == "bake.worlds" and device.is_cuda else 1
+
+
+def _halve(config: Config, key: str, device: wp.Device) -> Config:
+    section, _, name = key.partition(".")
+    half = max(_least(key, device), -(-_amount(config, key, device) // 2))
+    return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **{name: half})})
+
+
+def _value(config: Config, key: str) -> int:
+    section, _, name = key.partition(".")
+    return getattr(getattr(config, section), name)

@@ -1,0 +1,105 @@
+"""Main program of a device's process: receives its share of a bake, reports progress, and ends when the bake does, however that ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection
+from types import FrameType, TracebackType
+from typing import TYPE_CHECKING, Self
+
+from synpick_warp.errors import SynpickError
+from synpick_warp.system.processes import send
+
+if TYPE_CHECKING:
+    from synpick_warp.episodes import BakeSummary
+    from synpick_warp.scheduling.devices import Share
+
+_MAX_FAULT = 200
+"""Longest description of an unexpected error [characters]; the standard error stream has its traceback."""
+
+
+class BakeLink:
+    """Link to the bake's main process: observer (`Progress`) that forwards all reports, and stop request (as `StopRequest`).
+
+    A thread listens: a number is the signal for which to stop after the current tick; when the link closes, writers and process end.
+    """
+
+    def __init__(self, link: Connection) -> None:
+        self.number = 0
+        """Number of the signal; 0: none."""
+        self.writers: Sequence[int] = ()
+        """Process ids of the writers, once they run."""
+        self._link = link
+
+    def listen(self) -> None:
+        """Start the thread, and take SIGTERM, which a job scheduler may send to every process, as a request to stop."""
+        signal.signal(signal.SIGTERM, self._stop)
+        threading.Thread(target=self._listen, daemon=True).start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        return None
+
+    def stage(self, text: str) -> None:
+        """Forward a stage."""
+        self.report("stage", text)
+
+    def update(
+        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
+    ) -> None:
+        """Forward counts."""
+        counts = {"episodes_done": episodes_done, "worlds_active": worlds_active, "views": views}
+        self.report("update", counts | {"views_per_s": views_per_s, "seconds_left": seconds_left})
+
+    def note(self, text: str) -> None:
+        """Forward a note."""
+        self.report("note", text)
+
+    def report(self, kind: str, content: object) -> None:
+        """Send a message; see `devices.DeviceProcesses`."""
+        with contextlib.suppress(OSError):  # The main process is gone: the thread ends this one.
+            send(self._link, (kind, content))
+
+    def _listen(self) -> None:
+        with contextlib.suppress(EOFError, OSError):
+            while True:
+                self.number = self._link.recv()
+        for pid in self.writers:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        os._exit(1)
+
+    def _stop(self, number: int, _: FrameType | None) -> None:
+        self.number = number
+
+
+def main(generate: Callable[[Share, Sequence[int], BakeLink], BakeSummary]) -> None:
+    """Serve one share from the socket with handle argv[1]; the other handles are for the writers to keep open.
+
+    Args:
+        generate: Generates the episodes of a share; its other arguments are these handles and the link.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    connection, *handles = map(int, sys.argv[1:])
+    link = Connection(connection)
+    try:
+        share: Share = link.recv()
+    except (EOFError, OSError):
+        return  # The bake has ended before it began.
+    bake = BakeLink(link)
+    bake.listen()
+    try:
+        bake.report("summary", generate(share, handles, bake))
+    except SynpickError as error:
+        bake.report("error", error)
+    except Exception as error:
+        traceback.print_exc()
+        bake.report("fault", f"{type(error).__name__}: {' '.join(str(error).split())}"[:_MAX_FAULT])

@@ -1,0 +1,77 @@
+"""Stand-ins for the processes of devices: they speak the protocol of `scheduling.worker`, and simulate nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from types import SimpleNamespace
+
+from synpick_warp.errors import OutputError
+from synpick_warp.scheduling.worker import BakeLink
+from synpick_warp.system.processes import start_process
+
+FOREVER = 60.0
+"""Longer than any test waits [s]."""
+_SLEEPER = f"import time; time.sleep({FOREVER})"
+
+
+def program(behaviour: str) -> str:
+    """Program of a process that behaves as the function of this module with that name."""
+    return f"from synpick_warp.scheduling.worker import main; from {__name__} import {behaviour}; main({behaviour})"
+
+
+def finish(share: SimpleNamespace, _: Sequence[int], link: BakeLink) -> SimpleNamespace:
+    """Report each episode, and end."""
+    link.stage("compiling")
+    link.note("an object is never drawn")
+    for done, episode in enumerate(share.episodes, start=1):
+        counts = {"episodes": len(share.episodes), "worlds_active": 1, "views_per_s": 2.0, "seconds_left": 10.0 * episode}
+        link.update(episodes_done=done, views=3 * done, **counts)
+    return SimpleNamespace(episodes=share.episodes, stopped=0)
+
+
+def wait_for_stop(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> SimpleNamespace:
+    """Start a writer that never ends by itself, report its process id, and wait for a stop; the first device is ended by SIGTERM."""
+    writer = start_process(_SLEEPER, (), handles)
+    link.writers = (writer.process.pid,)
+    link.note(f"{os.getpid()} {writer.process.pid}")
+    if share.episodes == [0]:
+        os.kill(os.getpid(), signal.SIGTERM)
+    deadline = time.monotonic() + FOREVER
+    while not link.number and time.monotonic() < deadline:
+        time.sleep(0.01)
+    writer.kill()
+    return SimpleNamespace(episodes=[], stopped=link.number)
+
+
+def ignore_stop(_: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> None:
+    """Start a writer, and hear of no stop."""
+    writer = start_process(_SLEEPER, (), handles)
+    link.writers = (writer.process.pid,)
+    link.note(f"{os.getpid()} {writer.process.pid}")
+    time.sleep(FOREVER)
+
+
+def die(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> SimpleNamespace:
+    """The first device is killed, the others finish."""
+    if share.episodes == [0]:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return finish(share, handles, link)
+
+
+def fail(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> SimpleNamespace:
+    """The first device has an error of the program, the others finish."""
+    if share.episodes == [0]:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115 (for the rest of the process)
+        raise RuntimeError("CUDA error 700:\nan illegal memory access")
+    return finish(share, handles, link)
+
+
+def refuse(share: SimpleNamespace, handles: Sequence[int], link: BakeLink) -> SimpleNamespace:
+    """The first device has an error that the user can correct, the others wait."""
+    if share.episodes == [0]:
+        raise OutputError("cannot write here")
+    return wait_for_stop(share, handles, link)

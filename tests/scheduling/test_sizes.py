@@ -1,0 +1,93 @@
+"""Sizes that settings leave open: worlds from episodes, and batches, worlds and writers from the memory that is free."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from synpick_warp import memory_plan
+from synpick_warp.configs.load import load_config
+from synpick_warp.memory_plan import check_memory, plan_memory
+from synpick_warp.scheduling import sizes
+from synpick_warp.scheduling.sizes import HEADROOM, RUNTIME_BYTES, count_writers, fit_to_device
+from synpick_warp.stages.perception.images import count_views
+from synpick_warp.stages.sim.physics import balance_worlds
+from synpick_warp.stages.stream import views_per_batch
+
+GIB = 1024**3
+CPU = SimpleNamespace(is_cuda=False, alias="cpu")
+GPU = SimpleNamespace(is_cuda=True, alias="cuda:0")
+"""Stand-ins for devices."""
+
+
+@pytest.fixture
+def give(monkeypatch):
+    """Set the free memory of GPU and host [GiB]."""
+
+    def give(gpu: float = 140.0, host: float = 128.0) -> None:
+        monkeypatch.setattr(memory_plan, "free_device_memory", lambda device: int(gpu * GIB))
+        monkeypatch.setattr(memory_plan, "free_host_memory", lambda: int(host * GIB))
+
+    give()
+    return give
+
+
+@pytest.mark.parametrize(
+    ("episodes", "limit", "worlds"),
+    [(1, 512, 1), (150, 512, 150), (512, 512, 512), (513, 512, 257), (600, 512, 300), (1100, 512, 367), (0, 8, 1)],
+)
+def test_rounds_are_balanced(episodes, limit, worlds):
+    assert balance_worlds(episodes, limit) == worlds
+
+
+@pytest.mark.parametrize(
+    ("machine", "episodes", "worlds"), [(GPU, 150, 150), (GPU, 600, 300), (GPU, 3, 8), (CPU, 3, 3), (CPU, 6, 3), (CPU, 150, 4)]
+)
+def test_worlds_follow_from_the_number_of_episodes(give, machine, episodes, worlds):
+    config = load_config("synpick", {"bake.mode": "mixed"})
+    fitted = fit_to_device(config, machine, episodes)
+    assert fitted.bake.worlds == worlds
+    assert (fitted.render.views_per_batch, fitted.perception.views) == (0, 0)
+    assert fit_to_device(load_config("synpick", {"bake.worlds": 60}), machine, episodes).bake.worlds == 60
+
+
+@pytest.mark.parametrize("mode", ["mixed", "move"])
+@pytest.mark.parametrize("gpu", [3.0, 4.0, 6.0, 8.0, 12.0, 24.0, 80.0])
+def test_batches_shrink_until_plan_and_headroom_fit(give, gpu, mode):
+    give(gpu)
+    config = fit_to_device(load_config("synpick", {"bake.mode": mode}), GPU, 512)
+    planned = sum(term.size for term in plan_memory(config, GPU) if term.on_device)
+    assert HEADROOM * planned + RUNTIME_BYTES <= gpu * GIB
+    # Batches shrink before worlds do: a batch of few views costs little, a world less costs its share.
+    assert config.bake.worlds == 512 or max(config.render.views_per_batch, config.perception.views) == 1
+    if gpu >= 12.0:
+        assert views_per_batch(config, GPU) >= 12
+    check_memory(config, GPU)
+
+
+def test_settings_that_are_named_stay(give):
+    give(2.0)
+    named = {"bake.worlds": 512, "render.views_per_batch": 25, "perception.views": 23, "bake.mode": "mixed"}
+    config = load_config("synpick", named)
+    assert fit_to_device(config, GPU, 512) == config
+
+
+def test_processes_share_the_hosts_memory(give):
+    give(host=4.0)
+    config = load_config("synpick", {"bake.mode": "mixed", "cameras.resolution": [3840, 2160]})
+    alone, shared = (fit_to_device(config, CPU, 4, processes=processes) for processes in (1, 4))
+    assert views_per_batch(shared, CPU) < views_per_batch(alone, CPU) or count_views(shared.perception, 4, 24, CPU) < count_views(
+        alone.perception, 4, 24, CPU
+    )
+
+
+def test_writers_are_as_many_as_cores_if_memory_suffices(give, monkeypatch):
+    monkeypatch.setattr(sizes.os, "sched_getaffinity", lambda _: set(range(64)))
+    config = load_config("synpick", {})
+    assert count_writers(config) == 64
+    give(host=8.0)
+    assert 1 < count_writers(config) < 64
+    give(host=0.1)
+    assert count_writers(config) == 1
+    assert count_writers(load_config("synpick", {"bake.writers": 99})) == 99
