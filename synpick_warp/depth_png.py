@@ -1,7 +1,7 @@
 """Depth images as PNG: 16-bit greyscale, "up" filter in every row, one deflate block with constant Huffman codes.
 
-Here are the codes, and what precedes them in the file's data (IDAT); the encoder is `stages.encoding.png`. Deflate's matches are only such
-as repeat one of the eight filtered samples before, so that segments of rows are coded in parallel.
+Here are the codes, and what precedes them in the file's data (IDAT); the encoder is `stages.encoding.png`. Matches reach back by whole
+samples, at most eight, in the same row, so that segments of rows are coded in parallel.
 """
 
 from __future__ import annotations

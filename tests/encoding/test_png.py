@@ -18,6 +18,7 @@ from synpick_warp.arrays import allocate
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.png import frame_depth_png
 from synpick_warp.inputs.image_files import decode_image
+from synpick_warp.kernels.encoding import png as kernels
 from synpick_warp.stages.encoding import png
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
 from tests.harness.fuzz import fuzz_examples
@@ -130,6 +131,8 @@ def test_codes_are_complete():
     assert max(depth_png.code_lengths()) == png.CODE_BITS
     assert max(depth_png.code_lengths()[: depth_png.END_OF_BLOCK]) == png.CODE_BITS
     assert png.SEGMENT == SEGMENT
+    for name in ("MIN_RUN", "MAX_RUN", "MAX_DISTANCE"):
+        assert getattr(kernels, name) == getattr(depth_png, name)
     # A match takes no more than the literals of two samples may.
     longest = max(bits for _, bits in depth_png.run_codes()) + max(bits for _, bits in depth_png.distance_codes())
     assert longest <= 4 * png.CODE_BITS
