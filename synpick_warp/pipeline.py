@@ -63,7 +63,6 @@ def build_factory(
     episodes: Sequence[int] | None = None,
     records_physics: bool = False,
     needs_images: bool = True,
-    depth_files: bool = False,
 ) -> Factory:
     """Load assets and build the stages on the device.
 
@@ -73,7 +72,6 @@ def build_factory(
         episodes: Indices of the episodes to simulate; None: all.
         records_physics: Whether ticks are recorded with their physics.
         needs_images: Whether all images are copied to the host; see `Exporter`.
-        depth_files: Whether the device makes depth files; see `Exporter`.
 
     Raises:
         SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
@@ -94,6 +92,7 @@ def build_factory(
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
     tick_time = config.physics.step * config.physics.steps_per_tick
+    depth_files = any(kind.writes_depth for kind in load_exporter_classes(config.bake.formats))
     host = host_images(config, device, needs_images, depth_files)
     stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device, host)
     return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.perception.resolution, object_ids))
@@ -160,7 +159,7 @@ def run_bake(config: Config, out: Path, progress: Progress, shard: tuple[int, in
 
 def _fill(config: Config, output: OutputFolder, kinds: tuple[type[Exporter], ...], summary: BakeSummary, progress: Progress) -> None:
     """Generate the remaining episodes, then the indices over all."""
-    needs = [any(getattr(kind, name) for kind in kinds) for name in ("needs_physics", "needs_images", "writes_depth")]
+    needs = [any(getattr(kind, name) for kind in kinds) for name in ("needs_physics", "needs_images")]
     with scope("build"):
         factory = build_factory(config, progress, output.remaining, *needs) if output.remaining else None
     with WriterPool(count_writers(config), slot_bytes(kinds, config), output.lock) as pool:

@@ -112,7 +112,6 @@ def measure(config: Config, parts: tuple[str, ...], min_seconds: float) -> Itera
             SilentProgress(),
             records_physics="write" in parts and any(kind.needs_physics for kind in kinds),
             needs_images=any(kind.needs_images for kind in kinds),
-            depth_files=any(kind.writes_depth for kind in kinds),
         )
         wp.synchronize_device(factory.simulation.device)
         yield Row("setup", "load and build", time.perf_counter() - started, "s")
