@@ -38,7 +38,7 @@ class FrameBatch:
     """Simulated time since the episode's first frame [s] (B) float64."""
     color: np.ndarray | Images
     """Colour image, sRGB, RGB order (B, H, W, 3) uint8."""
-    depth: np.ndarray
+    depth: np.ndarray | Images
     """Planar depth (along the optical axis) in units of `bop.depth_scale` mm; 0: no surface (B, H, W) uint16."""
     instance: np.ndarray | Images
     """Segmentation id of the nearest surface: 0 none, 1 + instance_id, or a `Segment` (B, H, W) uint8."""
@@ -73,6 +73,10 @@ class FrameBatch:
     """Size of each JPEG file [B] (B) int32; above F: `jpeg` is cut."""
     jpeg: np.ndarray | None = None
     """JPEG files of `color` that the device has made (B, F) uint8."""
+    depth_idat_size: np.ndarray | None = None
+    """Size of the data of each depth PNG [B] (B) int32; above G: `depth_idat` is cut."""
+    depth_idat: np.ndarray | None = None
+    """Data (IDAT) of the PNG files of `depth` that the device has made (B, G) uint8."""
 
     def __len__(self) -> int:
         return len(self.episode)
@@ -82,6 +86,12 @@ class FrameBatch:
         if self.jpeg is None or self.jpeg_size is None or self.jpeg_size[view] > self.jpeg.shape[1]:
             return self.color[view]
         return self.jpeg[view, : self.jpeg_size[view]]
+
+    def depth_source(self, view: int) -> np.ndarray:
+        """Data of a view's depth PNG (bytes) uint8 if the device has made it, else its depth image (H, W) uint16."""
+        if self.depth_idat is None or self.depth_idat_size is None or self.depth_idat_size[view] > self.depth_idat.shape[1]:
+            return self.depth[view]
+        return self.depth_idat[view, : self.depth_idat_size[view]]
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,6 +23,7 @@ from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
 from synpick_warp.scenes import build
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch, jpeg_sizes
+from synpick_warp.stages.encoding.png import DEPTH_SCRATCH, DepthBuffers, depth_sizes
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.images import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
@@ -224,6 +225,9 @@ def _images(config: Config, device: wp.Device) -> Iterator[Term]:
     if _host_images(config, device).jpeg_quality:
         files = jpeg_sizes(views["view"], width, height)
         groups += [(JpegBuffers, files, ring), (JpegScratch, files, 1)]
+    if _host_images(config, device).depth_files:
+        data = depth_sizes(views["view"], width, height)
+        groups += [(DepthBuffers, data, ring), *((kind, data, 1) for kind in DEPTH_SCRATCH)]
     term = _term(name, _VIEWS, groups)
     layers = memory_table(LayerBuffers, views, config.render.layers)
     yield Term(term.name, (*term.rows, *(ring * layers)), term.settings)
@@ -266,6 +270,8 @@ def _host(config: Config, device: wp.Device, writers: int) -> Iterator[Term]:
         groups += memory_table(LayerBuffers, views, config.render.layers)
         if host.jpeg_quality:
             groups += memory_table(JpegBuffers, jpeg_sizes(views["view"], *config.cameras.resolution))
+        if host.depth_files:
+            groups += memory_table(DepthBuffers, depth_sizes(views["view"], *config.cameras.resolution))
         rows = tuple((f"pinned {name}", shape, unit, size) for name, shape, unit, size in RING * groups)
         yield Term(f"pinned copies of {views['view']:,} views", rows, _VIEWS, False)
     size = slot_bytes(load_exporter_classes(config.bake.formats), config)
@@ -275,7 +281,8 @@ def _host(config: Config, device: wp.Device, writers: int) -> Iterator[Term]:
 
 def _host_images(config: Config, device: wp.Device) -> HostImages:
     """What a bake copies to the host."""
-    return host_images(config, device, any(kind.needs_images for kind in load_exporter_classes(config.bake.formats)))
+    kinds = load_exporter_classes(config.bake.formats)
+    return host_images(config, device, any(kind.needs_images for kind in kinds), any(kind.writes_depth for kind in kinds))
 
 
 def _advice(term: Term, config: Config) -> str:

@@ -106,7 +106,8 @@ def build_factory(
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
     tick_time = config.physics.step * config.physics.steps_per_tick
-    host = host_images(config, device, needs_images)
+    depth_files = any(kind.writes_depth for kind in load_exporter_classes(config.bake.formats))
+    host = host_images(config, device, needs_images, depth_files)
     stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device, host)
     return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.perception.resolution, object_ids))
 

@@ -19,9 +19,11 @@ from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.writing.png import frame_depth_png
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import timing
+from tests.twins.depth_png import encode_depth
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import QUICK, catalog, settings
 
@@ -136,6 +138,13 @@ def test_every_episode_has_a_scene_for_each_camera_and_every_frame_its_files(bak
             assert cv2.imread(str(pictures[-1]), cv2.IMREAD_UNCHANGED).shape[:2] == (HEIGHT, WIDTH)
     assert baked.summary.views == CAMERAS * sum(row.frames for row in baked.summary.episodes)
     assert [path.name for path in baked.out.iterdir() if path.name.startswith(".")] == []
+
+
+def test_depth_files_are_those_of_the_device(baked):
+    for scene in baked.scenes():
+        for path in sorted((scene / "depth").iterdir()):
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            assert path.read_bytes() == frame_depth_png(encode_depth(image), WIDTH, HEIGHT)
 
 
 def test_the_list_of_episodes_is_right(baked):

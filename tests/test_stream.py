@@ -35,6 +35,7 @@ from synpick_warp.stages.stream import (
     view_sizes,
     views_per_batch,
 )
+from tests.twins.depth_png import encode_depth
 from tests.worlds.small_worlds import settings
 from tests.worlds.toy_scene import even_light, sun
 
@@ -324,43 +325,43 @@ def test_run_boundaries_are_those_of_the_batchs_own_images(device):
 
 
 def test_files_and_lists_stand_for_images(device):
-    """JPEG files equal the encoded colour images; images that stay on the device are copied on demand, one at a time."""
+    """JPEG and depth files equal the encoded images; images that stay on the device are copied on demand, one at a time."""
     renderer, config = FakeRenderer([]), config_of(render__views_per_batch=4)
     sizes, tick_time = view_sizes(config, device), config.physics.step * config.physics.steps_per_tick
-    host = stream.HostImages(("color", "instance", "amodal"), 90)
+    host = stream.HostImages(("color", "depth", "instance", "amodal"), 90, depth_files=True)
     frames = FrameStream(sizes, (), 3, tick_time, renderer, OBJECT_IDS, LIGHTS, device, host)  # type: ignore[arg-type]
     code = iter([11, 12, 13, 41, 42, 43])
     for batch in frames.render("snapshot", report_of([0, 1, 0, 0, 1])):  # type: ignore[arg-type]
         for view in range(len(batch)):
             value = next(code)
-            for name, shape in (("color", (6, 8, 3)), ("instance", (6, 8)), ("amodal", (6, 8))):
+            for name, shape in (("color", (6, 8, 3)), ("depth", (6, 8)), ("instance", (6, 8)), ("amodal", (6, 8))):
                 image = getattr(batch, name)[view]
                 assert image.shape == shape
                 assert (image == value).all()
             # The quality is that of the effects, which this renderer sets to the view's code.
             assert batch.color_source(view).tobytes() == encode_jpeg(batch.color[view], value).tobytes()
-            assert (batch.depth[view] == value).all()
+            assert batch.depth_source(view).tobytes() == encode_depth(batch.depth[view])
     assert next(code, None) is None
 
 
 @pytest.mark.parametrize(
     ("cuda", "needs_images", "settings_", "expected"),
     [
-        (False, False, {}, stream.HostImages()),
-        (True, True, {}, stream.HostImages()),
+        (False, False, {}, stream.HostImages(depth_files=True)),
+        (True, True, {}, stream.HostImages(depth_files=True)),
         (
             True,
             False,
             {"bop__split": "train_pbr", "bop__color_format": "jpg", "bop__jpeg_quality": 90},
-            stream.HostImages(("color", "instance", "amodal"), 90),
+            stream.HostImages(("depth", "color", "instance", "amodal"), 90, True),
         ),
-        (True, False, {"bop__color_format": "png"}, stream.HostImages(("instance", "amodal"))),
-        (True, False, {"cameras__resolution": [300, 287]}, stream.HostImages()),
+        (True, False, {"bop__color_format": "png"}, stream.HostImages(("depth", "instance", "amodal"), depth_files=True)),
+        (True, False, {"cameras__resolution": [300, 287]}, stream.HostImages(("depth",), depth_files=True)),
     ],
 )
 def test_what_is_copied_to_the_host(cuda, needs_images, settings_, expected):
     config = settings(**({"cameras__resolution": [640, 360]} | settings_))
-    assert stream.host_images(config, SimpleNamespace(is_cuda=cuda), needs_images) == expected  # type: ignore[arg-type]
+    assert stream.host_images(config, SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
 
 
 def test_the_largest_lists_are_no_larger_than_images():

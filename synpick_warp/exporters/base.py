@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import ClassVar, NamedTuple, Protocol
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.depth_png import max_data_bytes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
@@ -67,7 +68,9 @@ class Exporter(Protocol):
     """Whether views must be rendered; if no exporter needs them, none are."""
 
     needs_images: ClassVar[bool]
-    """Whether it reads all images of a batch; else only depth, and those for which neither a file nor run boundaries stand."""
+    """Whether it reads all images of a batch; else only those for which neither a file nor run boundaries stand."""
+    writes_depth: ClassVar[bool]
+    """Whether it writes depth files, `FrameBatch.depth_idat`."""
 
     def __init__(self, context: ExportContext) -> None:
         """Writes nothing yet."""
@@ -150,4 +153,5 @@ def view_bytes(resolution: tuple[int, int], has_layers: bool) -> int:
     """
     width, height = resolution
     layer = (height * width * LAYER_BYTES,) if has_layers else ()
-    return max(shared_bytes(height * width * size for size in PIXEL_BYTES), shared_bytes(layer))
+    color, depth, *sources = (height * width * size for size in PIXEL_BYTES)
+    return max(shared_bytes((color, max(depth, max_data_bytes(width, height)), *sources)), shared_bytes(layer))

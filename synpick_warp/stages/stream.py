@@ -16,6 +16,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor
+from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
@@ -126,24 +127,30 @@ class HostImages:
     """Arrays of `ViewBuffers` of which exporters copy single images, where something else stands for most: files, run boundaries."""
     jpeg_quality: int = 0
     """JPEG quality of the files that stand for colour images; 0: there are none."""
+    depth_files: bool = False
+    """Whether data of PNG files stands for depth images."""
 
 
-def host_images(config: Config, device: wp.Device, needs_images: bool) -> HostImages:
+def host_images(config: Config, device: wp.Device, needs_images: bool, depth_files: bool) -> HostImages:
     """Choose what is copied to the host.
 
-    On a GPU, files and run boundaries stand for all images but depth, unless exporters need these or the images are small: copying
-    single images waits for the device.
+    Depth files are made on every device, so that their bytes do not depend on it. On a GPU, files and run boundaries stand for all images,
+    unless exporters need these; in small images only for depth, since lists of run boundaries may be incomplete there, and copying single
+    images waits for the device.
 
     Args:
         config: All settings.
         device: Device of the rendering.
         needs_images: Whether an exporter reads all images.
+        depth_files: Whether an exporter writes depth files.
     """
-    if not device.is_cuda or needs_images or config.cameras.resolution[1] < MIN_LISTED_ROWS:
-        return HostImages()
+    if not device.is_cuda or needs_images:
+        return HostImages(depth_files=depth_files)
+    if config.cameras.resolution[1] < MIN_LISTED_ROWS:
+        return HostImages(("depth",), depth_files=depth_files)
     if config.bop.color_format != "jpg":
-        return HostImages(("instance", "amodal"))
-    return HostImages(("color", "instance", "amodal"), config.bop.jpeg_quality)
+        return HostImages(("depth", "instance", "amodal"), depth_files=depth_files)
+    return HostImages(("depth", "color", "instance", "amodal"), config.bop.jpeg_quality, depth_files)
 
 
 class HostCopy:
@@ -269,9 +276,13 @@ class FrameStream:
         self.boundary_scratch = allocate(BoundaryScratch, boundary_sizes(sizes), device)
         self.layer_buffers = [allocate(LayerBuffers, sizes, device, self.layers) for _ in ring]
         self.compressor = Compressor(sizes, self.host.jpeg_quality, len(ring), device) if self.host.jpeg_quality else None
+        self.depth_encoder = DepthEncoder(self.batch, sizes["column"], sizes["row"], device) if self.host.depth_files else None
+        files = depth_sizes(self.batch, sizes["column"], sizes["row"])
+        self.depth_files = [allocate(DepthBuffers, files, device) for _ in ring] if self.depth_encoder else []
         self.copies = []
         for slot in ring:
             parts = [self.buffers[slot], self.boundaries[slot], *([self.compressor.out[slot]] if self.compressor else [])]
+            parts += self.depth_files[slot : slot + 1]
             arrays = {item.name: getattr(part, item.name) for part in parts for item in fields(part)}
             copied = {name: array for name, array in arrays.items() if name not in self.host.on_demand}
             self.images = list(copied)
@@ -308,6 +319,8 @@ class FrameStream:
             list_boundaries(self.boundary_scratch, len(world), self.buffers[slot], self.boundaries[slot])
             if self.compressor is not None:
                 self.compressor.compress(slot, len(world), self.buffers[slot])
+            if self.depth_encoder is not None:
+                self.depth_encoder.encode(self.buffers[slot].depth, len(world), self.depth_files[slot])
         self.copies[slot].start(self.copy_stream)
 
     def _collect(self, waiting: tuple[int, slice], world: np.ndarray, camera: np.ndarray, report: TickReport) -> FrameBatch:

@@ -20,6 +20,7 @@ class Fake:
     needs_physics = False
     needs_views = False
     needs_images = False
+    writes_depth = False
     paths: tuple[str, ...] = ()
 
     def __init__(self, _: ExportContext | None) -> None:
@@ -53,6 +54,7 @@ class Other(Fake):
     needs_physics = True
     needs_views = True
     needs_images = False
+    writes_depth = False
     paths = ("b", "a")
 
     @staticmethod

@@ -18,6 +18,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.writing.files import PARTIAL
+from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.jpeg import encode_jpeg
@@ -28,6 +29,8 @@ from tests.worlds.box_views import batches, cameras, catalog, ends, ticks
 
 FRAMES = 3
 LENSES = cameras()
+_IDAT = slice(41, -16)
+"""Data of a PNG file with one chunk of it: behind signature, header and the chunk's own head, before its checksum and the end."""
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -93,12 +96,17 @@ def feed(
 
 
 def with_files(batch: FrameBatch) -> FrameBatch:
-    """The batch with JPEG files as a GPU makes them; those of camera 1 exceed the capacity."""
-    files = [bytes(encode_jpeg(image, 95)) for image in batch.color]
+    """The batch with JPEG files and data of depth PNGs as a GPU makes them; those of cameras 1 and 2 exceed their capacity."""
+    jpeg, jpeg_size = _pad([bytes(encode_jpeg(image, 95)) for image in batch.color], batch.camera == 1)
+    idat, idat_size = _pad([encode_png(image)[_IDAT] for image in batch.depth], batch.camera == 2)
+    return dataclasses.replace(batch, jpeg=jpeg, jpeg_size=jpeg_size, depth_idat=idat, depth_idat_size=idat_size)
+
+
+def _pad(files: list[bytes], exceeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Files in an array (B, capacity) uint8, and their sizes."""
     capacity = max(map(len, files))
-    jpeg = np.stack([np.frombuffer(file.ljust(capacity, b"x"), np.uint8) for file in files])
-    size = np.array([capacity + 1 if camera == 1 else len(file) for file, camera in zip(files, batch.camera, strict=True)], np.int32)
-    return dataclasses.replace(batch, jpeg=jpeg, jpeg_size=size)
+    sizes = np.array([capacity + 1 if flag else len(file) for file, flag in zip(files, exceeds, strict=True)], np.int32)
+    return np.stack([np.frombuffer(file.ljust(capacity, b"x"), np.uint8) for file in files]), sizes
 
 
 def overwrite(batch: FrameBatch | TickBatch) -> None:

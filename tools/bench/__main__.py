@@ -1,4 +1,4 @@
-"""Benchmark of a bake's parts: physics, perception and planning, rendering, writing, a small bake, a large one in steady state.
+"""Benchmark of a bake's parts: physics, perception and planning, rendering, encoders, writing, a small bake, a large one in steady state.
 
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
 mode pick; with `--set bake.mode=move`, piles are stirred instead. Writers get the same views repeatedly. Files are written to the
@@ -38,13 +38,14 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.system.device import pick_device
+from tools.bench.encode import measure_encoding
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
 from tools.bench.sensor import measure_sensor
 from tools.bench.steady import measure_steady
 from tools.bench.write import measure_writing
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
 
-PARTS = ("physics", "perception", "render", "sensor", "write", "bake", "steady")
+PARTS = ("physics", "perception", "render", "encode", "sensor", "write", "bake", "steady")
 WHOLE_BAKES = {"bake", "steady"}
 """Parts that run bakes of their own."""
 STREAM_BATCHES = 12
@@ -108,8 +109,13 @@ def measure(config: Config, parts: tuple[str, ...], min_seconds: float) -> Itera
     """Measure the parts; yields rows as they arrive. Each measurement is repeated for at least `min_seconds` [s]."""
     if set(parts) - WHOLE_BAKES:
         started = time.perf_counter()
-        records = "write" in parts and any(exporter.needs_physics for exporter in load_exporter_classes(config.bake.formats))
-        factory = build_factory(config, SilentProgress(), records_physics=records)
+        kinds = load_exporter_classes(config.bake.formats)
+        factory = build_factory(
+            config,
+            SilentProgress(),
+            records_physics="write" in parts and any(kind.needs_physics for kind in kinds),
+            needs_images=any(kind.needs_images for kind in kinds),
+        )
         wp.synchronize_device(factory.simulation.device)
         yield Row("setup", "load and build", time.perf_counter() - started, "s")
         values: dict[str, float] = {}
@@ -132,6 +138,11 @@ def _measure_worlds(config: Config, factory: Factory, min_seconds: float, parts:
     yield from measure_simulation(factory, min_seconds, parts)
     if "render" in parts:
         yield from _measure_rendering(config, factory, min_seconds)
+    if "encode" in parts:
+        count = min(factory.stream.batch, factory.simulation.layout.worlds * len(factory.cameras))
+        images = factory.stream.buffers[0]
+        factory.stream.renderer.render(factory.simulation.records[0].snapshot, _first_views(factory, count), images)
+        yield from measure_encoding(images, count, config.bop.jpeg_quality, factory.simulation.device, min_seconds)
     if "sensor" in parts:
         yield from measure_sensor(config, factory, min_seconds)
 

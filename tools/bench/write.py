@@ -20,7 +20,7 @@ from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.pipeline import Factory
-from synpick_warp.stages.stream import TickReport, tick_batch
+from synpick_warp.stages.stream import DeviceImages, TickReport, tick_batch
 from tools.bench.physics import Row
 
 COPIES = 8
@@ -93,8 +93,11 @@ def _measure_format(name: str, config: Config, factory: Factory, source: _Input,
 
 
 def _copy(batch: FrameBatch) -> FrameBatch:
-    """Deep copy of a batch, whose arrays the stream would overwrite."""
+    """Deep copy of a batch, whose arrays the stream would overwrite, with the images that stay on the device."""
     arrays = {name: array.copy() for name, array in vars(batch).items() if isinstance(array, np.ndarray)}
+    for name, images in vars(batch).items():
+        if isinstance(images, DeviceImages):
+            arrays[name] = np.stack([images[view] for view in range(len(batch))])
     return dataclasses.replace(batch, **arrays, layers={name: array.copy() for name, array in batch.layers.items()})
 
 

@@ -60,6 +60,7 @@ def annotation_file(split: str) -> Path:
 class CocoExporter(SceneExporter):
     """`Exporter` of COCO. A scene is a folder of images, and a part of the annotations, from which a file a split is made at the end."""
 
+    writes_depth = False
     staging = "coco"
 
     def __init__(self, context: ExportContext) -> None:
@@ -78,9 +79,10 @@ class CocoExporter(SceneExporter):
         truth: ViewTruth,
     ) -> None:
         """See `SceneExporter`."""
-        masks = extract_masks(visible_source, amodal_source, truth, depth.shape[0])
+        width, height = settings.resolution
+        masks = extract_masks(visible_source, amodal_source, truth, height)
         infos = make_gt_info_entries(truth)
-        annotations = make_annotations(truth.object_id.tolist(), truth.instance_id.tolist(), infos, masks, *depth.shape)
+        annotations = make_annotations(truth.object_id.tolist(), truth.instance_id.tolist(), infos, masks, height, width)
         write_image(scene, truth.frame, settings.color_suffix, encode_color(color, settings, truth.jpeg_quality), annotations)
 
     @staticmethod

@@ -49,6 +49,7 @@ class SceneExporter(ABC):
     needs_physics = False
     needs_views = True
     needs_images = False
+    writes_depth = True
     staging: ClassVar[str]
     """Name of the format's folder in `PARTIAL`."""
     write_view: ClassVar[Callable[..., None]]
@@ -67,9 +68,18 @@ class SceneExporter(ABC):
         effects = tuple(name for name, limits in effect_ranges(config.effects).items() if any(limits))
         entries = context.catalog.entries if bop.keypoints else ()
         self._keypoints = {entry.obj_id: sample_keypoints(entry.mesh.vertices, bop.keypoints) for entry in entries}
-        quality, points = bop.jpeg_quality, self._keypoints
         self._views = tuple(
-            ViewSettings(self._suffix, quality, effects, bop.masks, bop.coco, make_camera_constants(camera, bop.depth_scale), points)
+            ViewSettings(
+                color_suffix=self._suffix,
+                jpeg_quality=bop.jpeg_quality,
+                effects=effects,
+                masks=bop.masks,
+                coco=bop.coco,
+                camera=make_camera_constants(camera, bop.depth_scale),
+                resolution=(camera.width, camera.height),
+                depth=self.writes_depth,
+                keypoints=self._keypoints,
+            )
             for camera in context.cameras
         )
         self._episodes: dict[int, _Episode] = {}

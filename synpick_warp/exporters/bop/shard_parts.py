@@ -20,6 +20,7 @@ from synpick_warp.exporters.bop.view import (
     ViewSettings,
     ViewTruth,
     encode_color,
+    encode_depth,
     extract_masks,
     make_camera_entry,
     make_gt_entries,
@@ -62,10 +63,10 @@ def write_shard_view(
     truth: ViewTruth,
 ) -> None:
     """Task: write a view as tar entries, without end-of-archive marker, to a file in the scene's staging folder named by its frame."""
-    height, width = depth.shape
+    width, height = settings.resolution
     entries: list[tuple[str, Buffer]] = [
         (f"rgb{settings.color_suffix}", encode_color(color, settings, truth.jpeg_quality)),
-        ("depth.png", encode_png(depth)),
+        ("depth.png", encode_depth(depth, settings)),
         ("camera.json", to_json(make_camera_entry(truth, settings))),
         ("gt.json", to_json(make_gt_entries(truth, settings.camera))),
         ("gt_info.json", to_json(make_gt_info_entries(truth))),

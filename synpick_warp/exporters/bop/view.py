@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import orjson
 
@@ -17,7 +18,7 @@ from synpick_warp.codes import Effect, names
 from synpick_warp.exporters.base import PIXEL_BYTES
 from synpick_warp.exporters.bop.keypoints import MILLIMETERS, Keypoints, project_keypoints
 from synpick_warp.exporters.writing.folder import Buffer, open_folder
-from synpick_warp.exporters.writing.png import encode_mask_png, encode_png
+from synpick_warp.exporters.writing.png import encode_mask_png, encode_png, frame_depth_png
 from synpick_warp.exporters.writing.rle import Runs, find_run_boundaries, unpack_run_boundaries
 from synpick_warp.frames import FrameBatch
 from synpick_warp.jpeg import encode_jpeg
@@ -59,6 +60,10 @@ class ViewSettings:
     """Whether COCO annotations are written."""
     camera: dict[str, Any]
     """Constant part of the views' entries in scene_camera.json."""
+    resolution: tuple[int, int]
+    """Width and height of the images [px]."""
+    depth: bool = True
+    """Whether depth files are written."""
     keypoints: dict[int, Keypoints] = field(default_factory=dict)
     """Keypoints in COCO annotations, by obj_id; empty: none."""
 
@@ -116,14 +121,16 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
     """Collect the inputs of the task that writes a view.
 
     Returns:
-        Colour (image or file), depth, and two mask sources, of visible and of amodal masks: the device's run boundaries of the images
-        `instance` and `amodal`, or, if these lists are incomplete or larger, the images themselves, cropped to the objects. And the
-        ground truth.
+        Colour (image or file), depth (image, data of its file, or nothing if no depth files are written), and two mask sources, of visible
+        and of amodal masks: the device's run boundaries of the images `instance` and `amodal`, or, if these lists are incomplete or larger,
+        the images themselves, cropped to the objects. And the ground truth.
     """
     present = np.flatnonzero(batch.object_id[view] >= 0)
     boxes = batch.boxes[view][present]
-    boundaries = _select_boundaries(batch, view)
-    rows, columns = (slice(0, 0), slice(0, 0)) if boundaries else _crop_to_boxes(boxes, *batch.depth.shape[1:])
+    width, height = settings.resolution
+    boundaries = _select_boundaries(batch, view, width * height)
+    rows, columns = (slice(0, 0), slice(0, 0)) if boundaries else _crop_to_boxes(boxes, height, width)
+    depth = batch.depth_source(view) if settings.depth else np.empty(0, np.uint8)
     parameters: dict[str, float] = dict(zip(names(Effect), batch.effects[view].tolist(), strict=True))
     truth = ViewTruth(
         scene=scene,
@@ -140,7 +147,7 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
         left=columns.start,
     )
     sources = boundaries or tuple(images[view][rows, columns] for images in (batch.instance, batch.amodal))
-    return (batch.color_source(view), batch.depth[view], *sources), truth
+    return (batch.color_source(view), depth, *sources), truth
 
 
 def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dict[str, Any]:
@@ -155,13 +162,12 @@ def _make_extras(batch: FrameBatch, view: int, effects: dict[str, float]) -> dic
     return {"light": light} | ({"effects": {name: round(value, _DIGITS) for name, value in effects.items()}} if effects else {})
 
 
-def _select_boundaries(batch: FrameBatch, view: int) -> tuple[np.ndarray, ...]:
-    """Run boundaries of `instance` and `amodal`; empty unless both lists are present, complete, and no larger than the images."""
+def _select_boundaries(batch: FrameBatch, view: int, pixels: int) -> tuple[np.ndarray, ...]:
+    """Run boundaries of `instance` and `amodal`; empty unless both are present, complete, and no larger than images of `pixels` pixels."""
     if batch.boundaries is None or batch.boundary_count is None or (batch.boundary_count[view] > batch.boundaries.shape[-1]).any():
         return ()
     counts = batch.boundary_count[view].tolist()
     lists = tuple(packed[:, :count] for packed, count in zip(batch.boundaries[view], counts, strict=True))
-    pixels = batch.depth[view].size
     sizes = [pixels * size for size in PIXEL_BYTES[-2:]]
     return lists if all(packed.nbytes <= size for packed, size in zip(lists, sizes, strict=True)) else ()
 
@@ -197,10 +203,11 @@ def write_view(
     The block holds the entries of scene_camera, scene_gt and scene_gt_info, then the COCO annotations, without their ids.
     """
     name = f"{truth.frame:06d}"
-    height, width = depth.shape
+    width, height = settings.resolution
     with open_folder(scene) as folder:
         folder.write(f"rgb/{name}{settings.color_suffix}", encode_color(color, settings, truth.jpeg_quality))
-        folder.write(f"depth/{name}.png", encode_png(depth))
+        depth_file = encode_depth(depth, settings)
+        folder.write(f"depth/{name}.png", depth_file)
         masks = extract_masks(visible_source, amodal_source, truth, height) if settings.masks or settings.coco else []
         if settings.masks:
             for index, mask in enumerate(masks):
@@ -211,7 +218,8 @@ def write_view(
         poses = make_gt_entries(truth, settings.camera)
         entries = [make_camera_entry(truth, settings), poses, infos]
         if settings.coco:
-            points = project_keypoints(poses, settings.camera, depth, settings.keypoints) if settings.keypoints else None
+            image = depth if depth.ndim > 1 or not settings.keypoints else decode_depth(depth_file)
+            points = project_keypoints(poses, settings.camera, image, settings.keypoints) if settings.keypoints else None
             entries += make_coco_annotations(truth, infos, masks, height, width, points)
         folder.append(ANNOTATIONS, annotation_block(truth.frame, map(to_json, entries)))
 
@@ -232,6 +240,19 @@ def encode_color(color: np.ndarray, settings: ViewSettings, jpeg_quality: int) -
     if color.ndim == 1:
         return color.data
     return encode_png(color) if settings.color_suffix == ".png" else encode_jpeg(color, jpeg_quality)
+
+
+def encode_depth(depth: np.ndarray, settings: ViewSettings) -> bytes:
+    """Encode a depth image (H, W) uint16 as PNG, or frame the data (bytes) uint8 of a file that the device has made."""
+    return encode_png(depth) if depth.ndim > 1 else frame_depth_png(depth.data, *settings.resolution)
+
+
+def decode_depth(data: bytes) -> np.ndarray:
+    """Decode a depth image (H, W) uint16 from its PNG file."""
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise ValueError("OpenCV cannot decode a depth image; this is an error of synpick-warp, please report it")
+    return image
 
 
 def encode_masks(masks: Masks, height: int, width: int) -> tuple[bytes, bytes]:

@@ -81,6 +81,7 @@ class LerobotExporter:
     needs_physics = True
     needs_views = True
     needs_images = True
+    writes_depth = False
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""

@@ -57,6 +57,7 @@ class TrajectoryExporter:
     needs_physics = True
     needs_views = False
     needs_images = False
+    writes_depth = False
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""

@@ -32,6 +32,7 @@ class UsdExporter:
     needs_physics = False
     needs_views = False
     needs_images = False
+    writes_depth = False
 
     def __init__(self, context: ExportContext) -> None:
         """See `Exporter`."""

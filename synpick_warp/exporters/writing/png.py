@@ -12,6 +12,7 @@ import numpy as np
 from isal import isal_zlib
 
 from synpick_warp.exporters.writing.deflate import Deflater
+from synpick_warp.exporters.writing.folder import Buffer
 from synpick_warp.exporters.writing.rle import Runs
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -55,6 +56,11 @@ def encode_png(image: np.ndarray) -> bytes:
         pixels[0] = pixels[count]
     data = b"".join((*parts, stream.flush()))
     return _assemble(width, height, 8 * image.dtype.itemsize, _RGB if image.ndim == 3 else _GREY, data)
+
+
+def frame_depth_png(data: Buffer, width: int, height: int) -> bytes:
+    """A 16-bit greyscale PNG file from its data (IDAT): a zlib stream of filtered rows."""
+    return _assemble(width, height, 16, _GREY, data)
 
 
 def encode_mask_png(runs: Runs, height: int, width: int) -> bytes:
@@ -110,10 +116,10 @@ def _adler32(count: int, total: int, moment: int) -> bytes:
     return struct.pack(">I", (count + count * total - moment) % modulus << 16 | (1 + total) % modulus)
 
 
-def _assemble(width: int, height: int, bits: int, color_type: int, data: bytes) -> bytes:
+def _assemble(width: int, height: int, bits: int, color_type: int, data: Buffer) -> bytes:
     header = struct.pack(">IIBBBBB", width, height, bits, color_type, 0, 0, 0)
     return b"".join((_SIGNATURE, *_chunk(b"IHDR", header), *_chunk(b"IDAT", data), *_chunk(b"IEND", b"")))
 
 
-def _chunk(kind: bytes, data: bytes) -> tuple[bytes, bytes, bytes, bytes]:
+def _chunk(kind: bytes, data: Buffer) -> tuple[bytes, bytes, Buffer, bytes]:
     return struct.pack(">I", len(data)), kind, data, struct.pack(">I", isal_zlib.crc32(data, isal_zlib.crc32(kind)))

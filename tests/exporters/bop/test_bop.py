@@ -227,7 +227,7 @@ def test_bytes_do_not_depend_on_the_number_of_processes(dataset, tmp_path):
         assert digests(make(tmp_path / str(processes), processes)) == digests(dataset)
 
 
-def test_files_of_the_device_stand_for_colour_images(dataset, tmp_path):
+def test_files_of_the_device_stand_for_images(dataset, tmp_path):
     with exporting(BopExporter, tmp_path, config(), 2) as exporter:
         exporter.write_constants()
         feed(exporter, EPISODES, FRAMES, prepare=with_files)

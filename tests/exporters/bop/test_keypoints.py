@@ -12,9 +12,10 @@ from pycocotools.coco import COCO
 import synpick_warp
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.keypoints import Keypoints, project_keypoints, sample_keypoints
-from tests.exporters.bop.test_bop import make
+from tests.exporters.bop.test_bop import EPISODES, FRAMES, make
+from tests.harness.exporter_contract import digests, exporting, feed, finish, with_files
 from tests.worlds.box_sets import write_set
-from tests.worlds.box_views import SIZES
+from tests.worlds.box_views import SIZES, config
 
 CAMERA = {"cam_K": [100.0, 0.0, 50.0, 0.0, 100.0, 40.0, 0.0, 0.0, 1.0], "depth_scale": 0.1}
 POSE = {"obj_id": 1, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0.0, 0.0, 1000.0]}
@@ -72,6 +73,15 @@ def test_pycocotools_reads_keypoints_whose_flags_agree_with_rays(folder, capsys)
                 view_count[int(each)] += 1
     capsys.readouterr()
     assert min(view_count.values()) > 0  # All three occur.
+
+
+def test_depth_files_of_the_device_give_the_same_flags(tmp_path):
+    reference = make(tmp_path / "images", 0, keypoints=8)
+    with exporting(BopExporter, tmp_path / "files", config(keypoints=8), 0) as exporter:
+        exporter.write_constants()
+        feed(exporter, EPISODES, FRAMES, prepare=with_files)
+        finish(exporter)
+    assert digests(tmp_path / "files") == digests(reference)
 
 
 def test_without_the_option_annotations_have_no_keypoints(tmp_path):

@@ -20,7 +20,7 @@ from tests.harness.exporter_contract import digests, exporting, finish
 from tests.worlds.box_views import batches, cameras, config, ends
 
 LENSES = cameras()
-SETTINGS = ViewSettings(".jpg", 95, (), masks=True, coco=True, camera={})
+SETTINGS = ViewSettings(".jpg", 95, (), masks=True, coco=True, camera={}, resolution=(LENSES[0].width, LENSES[0].height))
 
 
 def list_on_device(instance: np.ndarray, amodal: np.ndarray, device: wp.Device) -> tuple[np.ndarray, np.ndarray]:

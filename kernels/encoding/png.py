@@ -1,0 +1,320 @@
+"""Depth PNG encoder: "up" filter (PNG specification, section 9.2) and Huffman codes of deflate (RFC 1951), all in integers.
+
+Rows are cut into segments, which are coded independently into slots of their own: strings of bits, the first bit the lowest of its word.
+Then the slots are joined bit by bit. Matches repeat one of the `MAX_DISTANCE` filtered samples before, also those of the segment before.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+UP = wp.constant(2)
+"""Filter type "up": difference to the byte above."""
+MIN_RUN, MAX_RUN = wp.constant(2), wp.constant(129)
+"""Samples in a match."""
+MAX_DISTANCE = wp.constant(8)
+"""Longest distance of a match [samples]."""
+ADLER = wp.constant(65521)
+ADLER_LONG = wp.constant(wp.int64(65521))
+"""Modulus of Adler-32 (RFC 1950, section 8.2)."""
+WORD_BITS = wp.constant(32)
+WORD_SHIFT = wp.constant(wp.uint64(32))
+"""Bits of a word of a slot."""
+GROUP = wp.constant(64)
+"""Slots whose sizes a thread adds up."""
+CODE_BITS = wp.constant(24)
+"""Bits of a packed code's value; above them is the number of its bits."""
+
+
+history_vec = wp.types.vector(length=8, dtype=wp.int32)
+"""The `MAX_DISTANCE` filtered samples before, the last one first; -1: there is none in the row."""
+
+
+@wp.struct
+class Codes:
+    """Packed codes: value, and in the highest byte the number of bits."""
+
+    literal: wp.array[wp.uint32]
+    """(byte)"""
+    run: wp.array[wp.uint32]
+    """(samples): length of a match."""
+    distance: wp.array[wp.uint32]
+    """(samples): distance of a match, less 1."""
+
+
+@wp.struct
+class SlotWriter:
+    """State of a writer of bits to a slot."""
+
+    view: int
+    slot: int
+
+    pending: wp.uint64
+    """Bits that do not fill a word yet."""
+    bits: int
+    """Their number, below `WORD_BITS`."""
+    words: int
+    """Words written."""
+
+
+@wp.struct
+class SlotSums:
+    """Sizes and checksums of slots, or of groups of slots."""
+
+    bits: wp.array2d[int]
+    """(view, slot): bits."""
+    total: wp.array2d[int]
+    """(view, slot): Σ value of the filtered bytes."""
+    moment: wp.array2d[int]
+    """(view, slot): Σ position · value of the filtered bytes, modulo `ADLER`; for groups, of up to `GROUP` such sums."""
+
+
+@wp.func
+def put_bits(writer: SlotWriter, slot: wp.array3d[wp.uint32], value: wp.uint32, count: int) -> SlotWriter:
+    """Append `count` bits, at most 32."""
+    writer.pending = writer.pending | (wp.uint64(value) << wp.uint64(writer.bits))
+    writer.bits += count
+    if writer.bits >= WORD_BITS:
+        slot[writer.view, writer.slot, writer.words] = wp.uint32(writer.pending & wp.uint64(0xFFFFFFFF))
+        writer.words += 1
+        writer.bits -= WORD_BITS
+        writer.pending = writer.pending >> WORD_SHIFT
+    return writer
+
+
+@wp.func
+def put_code(writer: SlotWriter, slot: wp.array3d[wp.uint32], code: wp.uint32) -> SlotWriter:
+    """Append a packed code."""
+    return put_bits(writer, slot, code & wp.uint32((1 << CODE_BITS) - 1), int(code >> wp.uint32(CODE_BITS)))
+
+
+@wp.func
+def put_sample(writer: SlotWriter, slot: wp.array3d[wp.uint32], codes: Codes, sample: int) -> SlotWriter:
+    """Append a filtered sample as two literals, the high byte first."""
+    writer = put_code(writer, slot, codes.literal[sample >> 8])
+    return put_code(writer, slot, codes.literal[sample & 0xFF])
+
+
+@wp.func
+def put_run(writer: SlotWriter, slot: wp.array3d[wp.uint32], codes: Codes, count: int, matches: int, last: int) -> SlotWriter:
+    """Append `count` samples that repeat earlier ones: a match at the shortest distance of those in `matches`, or one sample, `last`.
+
+    `matches` is a bit field: bit d - 1 is set if all samples equal those at distance d.
+    """
+    if count == 1:
+        return put_sample(writer, slot, codes, last)
+    if count >= MIN_RUN:
+        distance = int(0)
+        while ((matches >> distance) & 1) == 0:
+            distance += 1
+        writer = put_code(writer, slot, codes.run[count])
+        writer = put_code(writer, slot, codes.distance[distance])
+    return writer
+
+
+@wp.func
+def finish_slot(writer: SlotWriter, slot: wp.array3d[wp.uint32]) -> int:
+    """Write the last word; returns the number of bits in the slot."""
+    if writer.bits > 0:
+        slot[writer.view, writer.slot, writer.words] = wp.uint32(writer.pending)
+    return writer.words * WORD_BITS + writer.bits
+
+
+@wp.func
+def filter_sample(image: wp.array3d[wp.uint16], view: int, row: int, column: int) -> int:
+    """16-bit sample after the filter "up": each byte less the one above, modulo 256. Above the image there is 0."""
+    value, above = int(image[view, row, column]), int(0)
+    if row > 0:
+        above = int(image[view, row - 1, column])
+    return ((value & 0xFF00) - (above & 0xFF00)) & 0xFF00 | (value - above) & 0xFF
+
+
+@wp.func
+def find_matches(history: history_vec, sample: int) -> int:
+    """Bit field of the distances at which there is the same sample."""
+    matches = int(0)
+    for k in range(MAX_DISTANCE):
+        matches = matches | wp.where(history[k] == sample, 1 << k, 0)
+    return matches
+
+
+@wp.func
+def push_sample(history: history_vec, sample: int) -> history_vec:
+    """The history after a sample."""
+    for k in range(MAX_DISTANCE - 1):
+        history[MAX_DISTANCE - 1 - k] = history[MAX_DISTANCE - 2 - k]
+    history[0] = sample
+    return history
+
+
+@wp.func
+def modulo_product(a: int, b: int) -> int:
+    """a · b modulo `ADLER`, for numbers that are not negative."""
+    return int((wp.int64(a % ADLER) * wp.int64(b % ADLER)) % ADLER_LONG)
+
+
+@wp.kernel
+def encode_segments_kernel(
+    # In:
+    image: wp.array3d[wp.uint16],  # (view, row, column)
+    codes: Codes,
+    segment: int,
+    # Out:
+    slot_out: wp.array3d[wp.uint32],  # (view, slot, word)
+    sums_out: SlotSums,
+):
+    """Filter and code segments of `segment` pixels of the rows. Launched over view, row, part of the row.
+
+    Slot 0 is not written: it holds what precedes all segments. The first segment of a row begins with the filter's type. Matches are
+    greedy: the longest one that begins at a sample, at the shortest distance that it has.
+    """
+    view, row, part = wp.tid()
+    width = image.shape[2]
+    begin, end = part * segment, wp.min((part + 1) * segment, width)
+    writer = SlotWriter()
+    writer.view = view
+    writer.slot = 1 + row * ((width + segment - 1) // segment) + part
+    total, moment, position = int(0), int(0), int(0)
+    if part == 0:
+        writer = put_code(writer, slot_out, codes.literal[UP])
+        total, position = int(UP), int(1)
+    history = history_vec()
+    for k in range(MAX_DISTANCE):
+        history[k] = -1
+    for column in range(wp.max(begin - MAX_DISTANCE, 0), begin):
+        history = push_sample(history, filter_sample(image, view, row, column))
+    run, matches = int(0), int(0)
+    for column in range(begin, end):
+        sample = filter_sample(image, view, row, column)
+        high, low = sample >> 8, sample & 0xFF
+        total += high + low
+        moment += position * high + (position + 1) * low
+        position += 2
+        here = find_matches(history, sample)
+        if run > 0 and run < MAX_RUN and (matches & here) != 0:
+            matches = matches & here
+            run += 1
+        else:
+            writer = put_run(writer, slot_out, codes, run, matches, history[0])
+            matches = here
+            run = wp.where(here != 0, 1, 0)
+            if here == 0:
+                writer = put_sample(writer, slot_out, codes, sample)
+        history = push_sample(history, sample)
+    writer = put_run(writer, slot_out, codes, run, matches, history[0])
+    first = modulo_product(row, 2 * width + 1) + wp.where(part == 0, 0, 1 + 2 * begin)
+    sums_out.bits[view, writer.slot] = finish_slot(writer, slot_out)
+    sums_out.total[view, writer.slot] = total
+    sums_out.moment[view, writer.slot] = (moment + modulo_product(first, total)) % ADLER
+
+
+@wp.kernel
+def sum_groups_kernel(
+    # In:
+    slots: SlotSums,
+    # Out:
+    begin_out: wp.array2d[int],  # (view, slot)
+    groups_out: SlotSums,
+):
+    """Sums over each `GROUP` slots but the last of a view. `begin_out` receives each slot's first bit within its group.
+
+    Launched over view, group.
+    """
+    view, group = wp.tid()
+    bits, total, moment = int(0), int(0), int(0)
+    for slot in range(group * GROUP, wp.min((group + 1) * GROUP, begin_out.shape[1])):
+        begin_out[view, slot] = bits
+        if slot < begin_out.shape[1] - 1:
+            bits += slots.bits[view, slot]
+            total += slots.total[view, slot]
+            moment += slots.moment[view, slot]
+    groups_out.bits[view, group] = bits
+    groups_out.total[view, group] = total
+    groups_out.moment[view, group] = moment
+
+
+@wp.kernel
+def close_streams_kernel(
+    # In:
+    groups: SlotSums,
+    end_code: wp.uint32,
+    rows: int,
+    columns: int,
+    # Out:
+    group_begin_out: wp.array2d[int],  # (view, group)
+    slot_out: wp.array3d[wp.uint32],  # (view, slot, word)
+    slots_inout: SlotSums,
+    size_out: wp.array[int],  # (view)
+):
+    """Write the last slot of each view: end of the block, bits that fill a byte, Adler-32 of the filtered rows. Launched over view.
+
+    `group_begin_out` receives the first bit of each group, `size_out` the size of the data [B].
+    """
+    view = wp.tid()
+    bits, total, moment = int(0), int(0), int(0)
+    for group in range(groups.bits.shape[1]):
+        group_begin_out[view, group] = bits
+        bits += groups.bits[view, group]
+        total = (total + groups.total[view, group]) % ADLER
+        moment = (moment + groups.moment[view, group]) % ADLER
+    count = modulo_product(rows, 2 * columns + 1)
+    high = (count + modulo_product(count, total) + ADLER - moment) % ADLER
+    low = (1 + total) % ADLER
+    writer = SlotWriter()
+    writer.view = view
+    writer.slot = slot_out.shape[1] - 1
+    writer = put_code(writer, slot_out, end_code)
+    end = bits + int(end_code >> wp.uint32(CODE_BITS))
+    writer = put_bits(writer, slot_out, wp.uint32(0), (8 - end % 8) % 8)
+    # The checksum's highest byte comes first.
+    for value in range(2):
+        half = wp.where(value == 0, high, low)
+        writer = put_bits(writer, slot_out, wp.uint32((half >> 8) | ((half & 0xFF) << 8)), 16)
+    slots_inout.bits[view, writer.slot] = finish_slot(writer, slot_out)
+    size_out[view] = (bits + slots_inout.bits[view, writer.slot]) // 8
+
+
+@wp.func
+def read_bits(slot: wp.array3d[wp.uint32], view: int, index: int, first: int) -> wp.uint32:
+    """32 bits of a slot from bit `first` on; those beyond its last word are 0."""
+    word, shift = first // WORD_BITS, first % WORD_BITS
+    value = slot[view, index, word] >> wp.uint32(shift)
+    if shift > 0 and word + 1 < slot.shape[2]:
+        value = value | (slot[view, index, word + 1] << wp.uint32(WORD_BITS - shift))
+    return value
+
+
+@wp.kernel
+def join_slots_kernel(
+    # In:
+    slot: wp.array3d[wp.uint32],  # (view, slot, word)
+    slots: SlotSums,
+    begin: wp.array2d[int],  # (view, slot)
+    group_begin: wp.array2d[int],  # (view, group)
+    lanes: int,
+    # Out:
+    data_out: wp.array2d[wp.uint8],  # (view, byte)
+):
+    """Join the slots of a view. Launched over view, slot, lane: `lanes` threads write the words of the data that begin in a slot.
+
+    Bytes beyond the capacity of `data_out` are left out.
+    """
+    view, index, lane = wp.tid()
+    first = group_begin[view, index // GROUP] + begin[view, index]
+    end = first + slots.bits[view, index]
+    for word in range((first + WORD_BITS - 1) // WORD_BITS + lane, (end + WORD_BITS - 1) // WORD_BITS, lanes):
+        source, offset, count = int(index), word * WORD_BITS - first, int(0)
+        value = wp.uint32(0)
+        while count < WORD_BITS and source < slot.shape[1]:
+            bits = wp.min(slots.bits[view, source] - offset, WORD_BITS - count)
+            part = read_bits(slot, view, source, offset)
+            if bits < WORD_BITS:
+                part = part & ((wp.uint32(1) << wp.uint32(bits)) - wp.uint32(1))
+            value = value | (part << wp.uint32(count))
+            count += bits
+            source += 1
+            offset = int(0)
+        for k in range(4):
+            byte = 4 * word + k
+            if 8 * k < count and byte < data_out.shape[1]:
+                data_out[view, byte] = wp.uint8((value >> wp.uint32(8 * k)) & wp.uint32(0xFF))

@@ -1,0 +1,148 @@
+"""Depth PNG encoder on the device: data (IDAT) of 16-bit greyscale PNG files, which writers only frame; see `synpick_warp.depth_png`.
+
+The bytes depend on the image alone, not on the device: all arithmetic is in integers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
+from synpick_warp.depth_png import (
+    MAX_RUN,
+    distance_codes,
+    end_code,
+    literal_codes,
+    make_prefix,
+    max_data_bytes,
+    pack_codes,
+    pack_words,
+    run_codes,
+)
+from synpick_warp.kernels.encoding.png import (
+    GROUP,
+    Codes,
+    SlotSums,
+    close_streams_kernel,
+    encode_segments_kernel,
+    join_slots_kernel,
+    sum_groups_kernel,
+)
+
+SEGMENT = 2 * MAX_RUN
+"""Pixels of a segment of a row; the last one may have fewer. Enough segments to fill a GPU; flat areas are whole runs, of a short code."""
+LANES = 8
+"""Threads that copy a slot, which has 10 words on average."""
+CODE_BITS = 13
+"""Bits of a literal's code, at most; a match has fewer than the literals of two samples."""
+CODES = struct_arrays(Codes, literal=("byte",), run=("run",), distance=("distance",))
+SLOT_SUMS = struct_arrays(SlotSums, "view", "slot")
+GROUP_SUMS = struct_arrays(SlotSums, "view", "group")
+
+
+@dataclass(frozen=True, eq=False)
+class DepthBuffers:
+    """Data of the depth PNGs of one batch of views."""
+
+    depth_idat_size: wp.array = device_array("view", dtype=wp.int32)
+    """Size of each [B]; above the capacity of `depth_idat`: it is incomplete."""
+    depth_idat: wp.array = device_array("view", "depth_byte", dtype=wp.uint8)
+    """zlib streams, from the first byte."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthScratch:
+    """Scratch of the encoder."""
+
+    slot: wp.array = device_array("view", "slot", "slot_word", dtype=wp.uint32)
+    """Codes of the header, of each segment of a row, and of the end, the first bit lowest."""
+    begin: wp.array = device_array("view", "slot", dtype=wp.int32)
+    """First bit of each slot in the data of its group."""
+    group_begin: wp.array = device_array("view", "group", dtype=wp.int32)
+    """First bit of each group of slots."""
+
+
+DEPTH_SCRATCH = (DepthScratch, SLOT_SUMS, GROUP_SUMS)
+"""All scratch of the encoder."""
+
+
+def depth_sizes(views: int, width: int, height: int) -> dict[str, int]:
+    """Extents of the dimensions of `DepthBuffers` and `DEPTH_SCRATCH`, for `views` images [px]."""
+    slots = height * -(-width // SEGMENT) + 2
+    bits = CODE_BITS * (1 + 2 * min(width, SEGMENT))
+    sizes = {"view": views, "slot": slots, "group": -(-slots // int(GROUP))}
+    return sizes | {"slot_word": max(len(pack_words(make_prefix())), -(-bits // 32)), "depth_byte": max_data_bytes(width, height)}
+
+
+class DepthEncoder:
+    """Encodes batches of depth images. Owns its scratch; `encode` only launches kernels."""
+
+    def __init__(self, views: int, width: int, height: int, device: wp.Device) -> None:
+        """
+        Args:
+            views: Maximum number of views.
+            width: Of the images [px].
+            height: Of the images [px].
+            device: Where to encode.
+        """
+        sizes = depth_sizes(views, width, height)
+        self.device, self.width, self.height = device, width, height
+        self.scratch: DepthScratch = allocate(DepthScratch, sizes, device)
+        self.slots: Any = allocate_struct(SLOT_SUMS, sizes, device)
+        self.groups: Any = allocate_struct(GROUP_SUMS, sizes, device)
+        tables = {"literal": literal_codes(), "run": run_codes(), "distance": distance_codes()}
+        self.codes: Any = allocate_struct(CODES, {"byte": 256, "run": len(tables["run"]), "distance": len(tables["distance"])}, device)
+        for name, codes in tables.items():
+            getattr(self.codes, name).assign(pack_codes(codes))
+        self.end_code = int(pack_codes([end_code()])[0])
+        self._fill_first_slot()
+
+    def _fill_first_slot(self) -> None:
+        """Write the header that all files begin with; no kernel writes to its slot."""
+        prefix = make_prefix()
+        words = pack_words(prefix)
+        header = np.broadcast_to(words, (self.scratch.slot.shape[0], len(words)))
+        wp.copy(self.scratch.slot[:, 0, : len(words)], wp.array(header, dtype=wp.uint32, device=self.device))
+        self.slots.bits[:, 0].fill_(prefix[1])
+
+    def encode(self, image: wp.array, count: int, out: DepthBuffers) -> None:
+        """Encode the first `count` views.
+
+        Args:
+            image: Depth images (view, row, column) uint16.
+            count: Views in use.
+            out: Written.
+        """
+        scratch, device = self.scratch, self.device
+        wp.launch(
+            encode_segments_kernel,
+            dim=(count, self.height, -(-self.width // SEGMENT)),
+            inputs=[image, self.codes, SEGMENT],
+            outputs=[scratch.slot, self.slots],
+            device=device,
+        )
+        wp.launch(
+            sum_groups_kernel,
+            dim=(count, scratch.group_begin.shape[1]),
+            inputs=[self.slots],
+            outputs=[scratch.begin, self.groups],
+            device=device,
+        )
+        wp.launch(
+            close_streams_kernel,
+            dim=count,
+            inputs=[self.groups, self.end_code, self.height, self.width],
+            outputs=[scratch.group_begin, scratch.slot, self.slots, out.depth_idat_size],
+            device=device,
+        )
+        wp.launch(
+            join_slots_kernel,
+            dim=(count, scratch.slot.shape[1], LANES),
+            inputs=[scratch.slot, self.slots, scratch.begin, scratch.group_begin, LANES],
+            outputs=[out.depth_idat],
+            device=device,
+        )

@@ -1,0 +1,68 @@
+"""Depth PNG data in NumPy and whole numbers, from the laws in `synpick_warp.depth_png` and kernels.encoding.png's docstrings."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+
+from synpick_warp.depth_png import (
+    MAX_DISTANCE,
+    MAX_RUN,
+    MIN_RUN,
+    Bits,
+    distance_codes,
+    end_code,
+    join_bits,
+    literal_codes,
+    make_prefix,
+    run_codes,
+)
+
+SEGMENT = 258
+"""Samples that are coded on their own; matches do not cross their ends."""
+
+
+def filter_rows(image: np.ndarray) -> np.ndarray:
+    """Rows (H, 1 + 2 W) uint8 as PNG has them: filter type 2 ("up"), then each big-endian byte less the one above."""
+    rows = np.ascontiguousarray(image.astype(">u2")).view(np.uint8).reshape(len(image), -1)
+    above = np.concatenate((np.zeros_like(rows[:1]), rows[:-1]))
+    return np.concatenate((np.full((len(rows), 1), 2, np.uint8), rows - above), axis=1)
+
+
+def encode_depth(image: np.ndarray) -> bytes:
+    """Data (IDAT) of a depth image (H, W) uint16."""
+    literals, runs, distances = literal_codes(), run_codes(), distance_codes()
+    filtered = filter_rows(image)
+    parts = [make_prefix()]
+    for row in filtered:
+        parts.append(literals[row[0]])
+        samples = row[1:].reshape(-1, 2).tolist()
+        for begin in range(0, len(samples), SEGMENT):
+            parts += _encode_segment(samples, begin, min(begin + SEGMENT, len(samples)), literals, runs, distances)
+    value, count = join_bits([*parts, end_code()])
+    return value.to_bytes(-(-count // 8), "little") + zlib.adler32(filtered.tobytes()).to_bytes(4, "big")
+
+
+def _encode_segment(
+    samples: list[list[int]], begin: int, end: int, literals: list[Bits], runs: list[Bits], distances: list[Bits]
+) -> list[Bits]:
+    """Greedy matches: at each sample the longest run, at its shortest distance; literals where it is shorter than two samples."""
+    parts = []
+    place = begin
+    while place < end:
+        found = [(_run_length(samples, place, end, distance), -distance) for distance in range(1, min(MAX_DISTANCE, place) + 1)]
+        length, distance = max(found, default=(0, 0))
+        if length >= MIN_RUN:
+            parts += [runs[length], distances[-distance - 1]]
+        else:
+            parts += [literals[byte] for byte in samples[place]]
+        place += max(length, 1)
+    return parts
+
+
+def _run_length(samples: list[list[int]], place: int, end: int, distance: int) -> int:
+    length = 0
+    while length < MAX_RUN and place + length < end and samples[place + length] == samples[place + length - distance]:
+        length += 1
+    return length
