@@ -36,7 +36,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 def kill_one(out: Path, killed: list[int]) -> None:
     """Kill a device's process when an episode is committed."""
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 300
     while len(committed_episodes(out)) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)
     for process in device_processes()[:1]:
