@@ -146,11 +146,13 @@ def host_images(config: Config, device: wp.Device, needs_images: bool, depth_fil
     """
     if not device.is_cuda or needs_images:
         return HostImages(depth_files=depth_files)
+    # Without files, keypoints are the only ones to read depth.
+    depth = ("depth",) if depth_files or not config.bop.keypoints else ()
     if config.cameras.resolution[1] < MIN_LISTED_ROWS:
-        return HostImages(("depth",), depth_files=depth_files)
+        return HostImages(depth, depth_files=depth_files)
     if config.bop.color_format != "jpg":
-        return HostImages(("depth", "instance", "amodal"), depth_files=depth_files)
-    return HostImages(("depth", "color", "instance", "amodal"), config.bop.jpeg_quality, depth_files)
+        return HostImages((*depth, "instance", "amodal"), depth_files=depth_files)
+    return HostImages((*depth, "color", "instance", "amodal"), config.bop.jpeg_quality, depth_files)
 
 
 class HostCopy:

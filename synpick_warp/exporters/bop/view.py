@@ -121,16 +121,16 @@ def make_view_task(batch: FrameBatch, view: int, scene: int, settings: ViewSetti
     """Collect the inputs of the task that writes a view.
 
     Returns:
-        Colour (image or file), depth (image, data of its file, or nothing if no depth files are written), and two mask sources, of visible
-        and of amodal masks: the device's run boundaries of the images `instance` and `amodal`, or, if these lists are incomplete or larger,
-        the images themselves, cropped to the objects. And the ground truth.
+        Colour (image or file), depth (image, data of its file, or nothing if neither files nor keypoints need it), and two mask sources,
+        of visible and of amodal masks: the device's run boundaries of the images `instance` and `amodal`, or, if these lists are incomplete
+        or larger, the images themselves, cropped to the objects. And the ground truth.
     """
     present = np.flatnonzero(batch.object_id[view] >= 0)
     boxes = batch.boxes[view][present]
     width, height = settings.resolution
     boundaries = _select_boundaries(batch, view, width * height)
     rows, columns = (slice(0, 0), slice(0, 0)) if boundaries else _crop_to_boxes(boxes, height, width)
-    depth = batch.depth_source(view) if settings.depth else np.empty(0, np.uint8)
+    depth = batch.depth_source(view) if settings.depth or settings.keypoints else np.empty(0, np.uint8)
     parameters: dict[str, float] = dict(zip(names(Effect), batch.effects[view].tolist(), strict=True))
     truth = ViewTruth(
         scene=scene,
@@ -206,8 +206,7 @@ def write_view(
     width, height = settings.resolution
     with open_folder(scene) as folder:
         folder.write(f"rgb/{name}{settings.color_suffix}", encode_color(color, settings, truth.jpeg_quality))
-        depth_file = encode_depth(depth, settings)
-        folder.write(f"depth/{name}.png", depth_file)
+        folder.write(f"depth/{name}.png", encode_depth(depth, settings))
         masks = extract_masks(visible_source, amodal_source, truth, height) if settings.masks or settings.coco else []
         if settings.masks:
             for index, mask in enumerate(masks):
@@ -218,8 +217,8 @@ def write_view(
         poses = make_gt_entries(truth, settings.camera)
         entries = [make_camera_entry(truth, settings), poses, infos]
         if settings.coco:
-            image = depth if depth.ndim > 1 or not settings.keypoints else decode_depth(depth_file)
-            points = project_keypoints(poses, settings.camera, image, settings.keypoints) if settings.keypoints else None
+            keypoints = settings.keypoints
+            points = project_keypoints(poses, settings.camera, read_depth(depth, settings), keypoints) if keypoints else None
             entries += make_coco_annotations(truth, infos, masks, height, width, points)
         folder.append(ANNOTATIONS, annotation_block(truth.frame, map(to_json, entries)))
 
@@ -247,9 +246,11 @@ def encode_depth(depth: np.ndarray, settings: ViewSettings) -> bytes:
     return encode_png(depth) if depth.ndim > 1 else frame_depth_png(depth.data, *settings.resolution)
 
 
-def decode_depth(data: bytes) -> np.ndarray:
-    """Decode a depth image (H, W) uint16 from its PNG file."""
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+def read_depth(depth: np.ndarray, settings: ViewSettings) -> np.ndarray:
+    """Depth image (H, W) uint16, decoded if `depth` is the data (bytes) uint8 of its file."""
+    if depth.ndim > 1:
+        return depth
+    image = cv2.imdecode(np.frombuffer(encode_depth(depth, settings), np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise ValueError("OpenCV cannot decode a depth image; this is an error of synpick-warp, please report it")
     return image
