@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import warp as wp
 
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.codes import Phase
@@ -39,7 +40,7 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import RECORDS, Simulation
-from synpick_warp.stages.stream import FrameStream, TickReader, TickReport, host_images, name_lights, tick_batch, view_sizes
+from synpick_warp.stages.stream import FrameStream, LightTable, TickReader, TickReport, host_images, name_lights, tick_batch, view_sizes
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device
 from synpick_warp.system.interrupt import StopRequest
@@ -55,6 +56,33 @@ class Factory:
     simulation: Simulation
     stream: FrameStream
     log: AttemptLog
+
+
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """What makes pictures, on the device: assets, worlds and renderer; a bake's `Factory` without its way to the host."""
+
+    config: Config
+    """The settings, with as many worlds as there are."""
+    catalog: Catalog
+    cameras: tuple[Camera, ...]
+    lights: tuple[EnvironmentMap, ...]
+    simulation: Simulation
+    renderer: Renderer
+    sizes: dict[str, int]
+    """Extents by `view_sizes`."""
+    object_ids: np.ndarray
+    """obj_id of each catalog entry (entry) int32."""
+    light_table: LightTable
+
+    @property
+    def tick_time(self) -> float:
+        """Time between two frames [s]."""
+        return self.config.physics.step * self.config.physics.steps_per_tick
+
+    def make_log(self) -> AttemptLog:
+        """A new attempt log."""
+        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids)
 
 
 def build_factory(
@@ -79,6 +107,18 @@ def build_factory(
     device = pick_device(config.bake.device)
     config = with_enough_worlds(config, device)
     check_memory(config, device, count_writers(config))
+    stages = build_stages(config, device, progress, episodes, records_physics)
+    host = host_images(config, device, needs_images)
+    table, tick_time = stages.light_table, stages.tick_time
+    layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
+    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
+    return Factory(stages.catalog, stages.cameras, stages.lights, stages.simulation, stream, stages.make_log())
+
+
+def build_stages(
+    config: Config, device: wp.Device, progress: Progress, episodes: Sequence[int] | None = None, records_physics: bool = False
+) -> Stages:
+    """Load assets and build worlds and renderer; arguments and errors as of `build_factory`, for `with_enough_worlds` settings."""
     progress.stage("loading objects and lights")
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
@@ -91,10 +131,7 @@ def build_factory(
     renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"])
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
-    tick_time = config.physics.step * config.physics.steps_per_tick
-    host = host_images(config, device, needs_images)
-    stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device, host)
-    return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.perception.resolution, object_ids))
+    return Stages(config, catalog, cameras, lights, simulation, renderer, sizes, object_ids, table)
 
 
 def count_writers(config: Config) -> int:
