@@ -148,7 +148,7 @@ class StreamDataset(IterableDataset):
         """
         info, (index, count) = get_worker_info(), self.shard
         if info is not None:
-            index, count = index * info.num_workers + info.id, count * info.num_workers
+            index, count = index + count * info.id, count * info.num_workers
             device = pick_device(self.config.bake.device)
             if device.is_cuda:
                 raise ConfigError(f"a DataLoader's workers cannot share {device.alias}; use num_workers=0, or device='cpu' for workers")

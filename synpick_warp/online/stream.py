@@ -8,7 +8,6 @@ It runs in the caller's process and starts no other (but CoACD's, while concave 
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Iterator, Sequence
 from types import TracebackType
 from typing import Self
@@ -109,8 +108,10 @@ class ViewStream:
         self.close()
 
     def __del__(self) -> None:
-        with contextlib.suppress(Exception):  # At the interpreter's end, modules may be gone.
+        try:
             self.close()
+        except Exception:  # At the interpreter's end, modules may be gone.
+            self._batches = None
 
 
 class Producer:
