@@ -58,6 +58,7 @@ class ViewStream:
         self.device = stages.simulation.device
         # The generator must not refer to this object: without a cycle, the last reference frees the device's memory at once.
         self._batches: Iterator[ViewBatch] | None = _explain_shortage(producer.batches(), stages.config, self.device)
+        self._ring: BatchRing | None = producer.ring
         self._stream = self.device.stream if self.device.is_cuda else None
         self._current: ViewBatch | None = None
         self._ahead: ViewBatch | None = None
@@ -99,6 +100,7 @@ class ViewStream:
         if self._stream is not None:
             # Consumers' queues may still read the buffers, and freed memory goes to whoever asks next.
             wp.synchronize_device(self.device)
+        self._ring = None
         batches.close()  # type: ignore[attr-defined]
 
     def __enter__(self) -> Self:
@@ -111,7 +113,7 @@ class ViewStream:
         try:
             self.close()
         except Exception:  # At the interpreter's end, modules may be gone.
-            self._batches = None
+            self._batches = self._ring = None
 
 
 class Producer:

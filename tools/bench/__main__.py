@@ -1,4 +1,4 @@
-"""Benchmark of a bake's parts: physics, perception and planning, rendering, writing, and a whole small bake.
+"""Benchmark of a bake's parts: physics, perception and planning, rendering, writing, the online stream, and a whole small bake.
 
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
 mode pick; with `--set bake.mode=move`, piles are stirred instead. Writers get the same views repeatedly. Files are written to the
@@ -40,10 +40,11 @@ from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.system.device import pick_device
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
 from tools.bench.sensor import measure_sensor
+from tools.bench.stream import measure_stream
 from tools.bench.write import measure_writing
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
 
-PARTS = ("physics", "perception", "render", "sensor", "write", "bake")
+PARTS = ("physics", "perception", "render", "sensor", "write", "stream", "bake")
 STREAM_BATCHES = 12
 """Batches rendered and copied in a row."""
 WRITE_VIEWS = 12
@@ -117,6 +118,8 @@ def measure(config: Config, parts: tuple[str, ...], min_seconds: float) -> Itera
         if "write" in parts:
             worlds = min(factory.simulation.layout.worlds, -(-WRITE_VIEWS // len(factory.cameras)))
             yield from measure_writing(config, factory, _mark_live(factory.simulation, worlds), min_seconds)
+        if "stream" in parts:
+            yield from measure_stream(config, factory, _mark_live(factory.simulation, factory.simulation.layout.worlds), min_seconds)
         yield _memory_in_use(factory.simulation.device)
     if "bake" in parts:
         yield from _measure_bake(config)
