@@ -118,7 +118,7 @@ def stream(
         splits: Only episodes of these splits of the settings; empty: all.
         cameras: Indices of the cameras to render; None: all.
         stride: Every n-th frame of an episode; the others are simulated only.
-        progress: As for `bake`.
+        progress: Receives stages and notes; None: silent.
 
     Raises:
         SynpickError: An error that the user can correct, before the first batch or while one is made.

@@ -51,7 +51,7 @@ class ViewStream:
         summary: How the episodes so far ended, as `bake` returns it; `views` counts those handed out.
     """
 
-    def __init__(self, producer: Producer, progress: Progress) -> None:
+    def __init__(self, producer: Producer) -> None:
         stages = producer.stages
         self.config, self.cameras, self.summary = stages.config, stages.cameras, producer.summary
         self.object_names = {entry.obj_id: entry.name for entry in stages.catalog.entries}
@@ -62,8 +62,7 @@ class ViewStream:
         self._stream = self.device.stream if self.device.is_cuda else None
         self._current: ViewBatch | None = None
         self._ahead: ViewBatch | None = None
-        self._progress = progress
-        progress.stage("compiling kernels, dropping objects")
+        producer.progress.stage("compiling kernels, dropping objects")
 
     def __iter__(self) -> Self:
         return self
@@ -203,7 +202,7 @@ def open_stream(
         if not is_shortage(error):
             raise
         raise shortage_error(config, device) from error
-    return ViewStream(Producer(stages, ring, selection, BakeSummary(len(indices)), progress), progress)
+    return ViewStream(Producer(stages, ring, selection, BakeSummary(len(indices)), progress))
 
 
 def _explain_shortage(batches: Iterator[ViewBatch], config: Config, device: wp.Device) -> Iterator[ViewBatch]:

@@ -16,13 +16,14 @@ from synpick_warp.online.selection import Selection
 from synpick_warp.online.stream import Producer, ViewStream
 from synpick_warp.pipeline import Factory, Stages
 from synpick_warp.progress import SilentProgress
+from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.simulate import RECORDS
 from synpick_warp.stages.stream import TickReader, TickReport, view_sizes
-from tools.bench.physics import BURST, Row, seconds_per_call
+from tools.bench.physics import Row
 
-ROUNDS = 3
+ROUNDS = 5
 """Turns of the two loops that are compared."""
 
 
@@ -55,35 +56,52 @@ def measure_stream(config: Config, factory: Factory, report: TickReport, min_sec
     ring = BatchRing(sizes, config.render.layers, renderer, config.bop.depth_scale)
     parts = (stages, ring, Selection().resolve(config), BakeSummary(), SilentProgress())
     yield Row("stream", "views in a batch", ring.views, "")
-    alone = _render_rate(stages, ring, report, min_seconds)
-    yield Row("stream", "renderer alone, views", alone, "1/s")
-    still = _stream_rate(ViewStream(_StillProducer(report, *parts), SilentProgress()), device, min_seconds)
-    yield Row("stream", "stream of one tick, views", still, "1/s")
-    yield Row("stream", "stream of one tick: of the renderer's rate", 100.0 * still / alone, "%")
-    loop, stream = _tick_loop(stages, ring), ViewStream(Producer(*parts), SilentProgress())
-    totals = {name: [0.0, 0.0] for name in ("simulation and renderer alone", "stream")}
+    still = ViewStream(_StillProducer(report, *parts))
+    sources = {"renderer alone": _render_loop(stages, ring, report), "stream of one tick": map(_consumer(device), still)}
+    yield from _compare(sources, device, min_seconds)
+    sources = {
+        "simulation and renderer alone": _tick_loop(stages, ring),
+        "stream of ticks": map(_consumer(device), ViewStream(Producer(*parts))),
+    }
+    yield from _compare(sources, device, min_seconds)
+
+
+def _compare(sources: dict[str, Iterator[int]], device: wp.Device, min_seconds: float) -> Iterator[Row]:
+    """Rows of the views per second of two sources, which take turns, and of the second's rate in percent of the first's.
+
+    Args:
+        sources: Name -> iterator over the numbers of views that it makes.
+        device: Device that makes them.
+        min_seconds: Time for each source, at least [s]; it should be many times that of a tick.
+    """
+    totals = {name: [0.0, 0.0] for name in sources}
     for _ in range(ROUNDS):
-        for name, source in zip(totals, (loop, map(_consumer(device), stream)), strict=True):
+        for name, source in sources.items():
             for index, value in enumerate(_count(source, device, min_seconds / ROUNDS)):
                 totals[name][index] += value
-    rates = [views / seconds for views, seconds in totals.values()]
-    if not all(rates):
+    rates = {name: views / seconds for name, (views, seconds) in totals.items()}
+    if not all(rates.values()):
         return  # All episodes have ended.
-    for name, rate in zip(totals, rates, strict=True):
-        yield Row("stream", f"{name}, with physics, views", rate, "1/s")
-    yield Row("stream", "stream with physics: of the rate without it", 100.0 * rates[1] / rates[0], "%")
+    for name, rate in rates.items():
+        yield Row("stream", f"{name}, views", rate, "1/s")
+    (alone, own), (name, rate) = rates.items()
+    yield Row("stream", f"{name}: of {alone}", 100.0 * rate / own, "%")
 
 
-def _render_rate(stages: Stages, ring: BatchRing, report: TickReport, min_seconds: float) -> float:
-    """Views per second of the renderer, which gets a full batch again and again."""
-    simulation, renderer, slot = stages.simulation, stages.renderer, ring.slots[0]
-    world, camera = _select(stages, report)
-    count = min(ring.views, len(world))
-    rows = [wp.array(values[:count], dtype=wp.int32, device=simulation.device) for values in (world, camera)]
-    views = make_views(rows[0], rows[1], count, ring.instances)
-    snapshot = simulation.records[0].snapshot
-    seconds = seconds_per_call(lambda: renderer.render(snapshot, views, slot.images, slot.layers), simulation.device, min_seconds, BURST)
-    return count / seconds
+def _render_loop(stages: Stages, ring: BatchRing, report: TickReport) -> Iterator[int]:
+    """Render the views of one tick again and again into one buffer; yields the number of views of each batch."""
+    snapshot, (world, camera) = stages.simulation.records[0].snapshot, _select(stages, report)
+    while True:
+        yield from _render_all(stages, ring, snapshot, world, camera)
+
+
+def _render_all(stages: Stages, ring: BatchRing, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray) -> Iterator[int]:
+    slot = ring.slots[0]
+    for first in range(0, len(world), ring.views):
+        rows = [wp.array(values[first : first + ring.views], dtype=wp.int32, device=ring.device) for values in (world, camera)]
+        views = make_views(rows[0], rows[1], len(rows[0]), ring.instances)
+        stages.renderer.render(snapshot, views, slot.images, slot.layers)
+        yield views.count
 
 
 def _select(stages: Stages, report: TickReport) -> tuple[np.ndarray, np.ndarray]:
@@ -105,11 +123,6 @@ def _consumer(device: wp.Device) -> Callable[[ViewBatch], int]:
     return consume
 
 
-def _stream_rate(stream: ViewStream, device: wp.Device, min_seconds: float) -> float:
-    views, seconds = _count(map(_consumer(device), stream), device, min_seconds)
-    return views / seconds
-
-
 def _count(source: Iterator[int], device: wp.Device, min_seconds: float) -> tuple[float, float]:
     """Views that a source makes in at least `min_seconds`, and the time until the device has made them [s]; one batch goes before.
 
@@ -128,7 +141,7 @@ def _count(source: Iterator[int], device: wp.Device, min_seconds: float) -> tupl
 
 def _tick_loop(stages: Stages, ring: BatchRing) -> Iterator[int]:
     """Simulate and render, tick by tick as a bake does, into one buffer; yields the number of views of each batch."""
-    simulation, renderer, slot = stages.simulation, stages.renderer, ring.slots[0]
+    simulation = stages.simulation
     readers = [TickReader(record) for record in simulation.records]
     for tick in itertools.count(1):
         current, following = (tick - 1) % RECORDS, tick % RECORDS
@@ -139,8 +152,4 @@ def _tick_loop(stages: Stages, ring: BatchRing) -> Iterator[int]:
         if (report.column("phase") == Phase.IDLE).all():
             return
         world, camera = _select(stages, report)
-        for first in range(0, len(world), ring.views):
-            rows = [wp.array(values[first : first + ring.views], dtype=wp.int32, device=ring.device) for values in (world, camera)]
-            views = make_views(rows[0], rows[1], len(rows[0]), ring.instances)
-            renderer.render(simulation.records[current].snapshot, views, slot.images, slot.layers)
-            yield views.count
+        yield from _render_all(stages, ring, simulation.records[current].snapshot, world, camera)
