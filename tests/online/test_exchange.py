@@ -43,6 +43,7 @@ class NumberingRenderer:
         self.count += 1
         wp.launch(spin_kernel, dim=1, inputs=[self.busy, SPINS], device=self.scene.device)
         out.depth.fill_(self.count)
+        out.instance.fill_(1 + self.count % ROOM)
 
 
 @pytest.fixture
@@ -65,6 +66,7 @@ def test_slow_consumers_on_their_own_stream_read_each_batch_whole(ring):
     device = ring.device
     consumer = wp.Stream(device) if device.is_cuda else None
     kept = [wp.zeros((VIEWS, 16, 32), dtype=wp.uint16, device=device) for _ in range(BATCHES)]
+    masks = [wp.zeros((VIEWS, ROOM, 16, 32), dtype=wp.bool, device=device) for _ in range(BATCHES)]
     busy = wp.zeros(1, dtype=float, device=device)
     assert len(ring.slots) == (GPU_RING if device.is_cuda else 1)
     if device.is_cuda:
@@ -77,8 +79,10 @@ def test_slow_consumers_on_their_own_stream_read_each_batch_whole(ring):
             imported = wp.from_dlpack(batch.depth)
             wp.launch(spin_kernel, dim=1, inputs=[busy, 5 * SPINS], device=device)
             wp.copy(kept[index], imported)
+            wp.copy(masks[index], wp.from_dlpack(batch.visible_masks(), dtype=wp.bool))
         batch.expire()
     assert [np.unique(values.numpy()).tolist() for values in kept] == [[1 + index] for index in range(BATCHES)]
+    assert [values.numpy().all(axis=(0, 2, 3)).argmax() for values in masks] == [(1 + index) % ROOM for index in range(BATCHES)]
 
 
 def test_what_an_array_says_of_itself(device):

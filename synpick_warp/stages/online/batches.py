@@ -73,6 +73,7 @@ class Slot:
         if self._expanded.get(name) == self.gate.turn:
             return masks
         self._expanded[name] = self.gate.turn
+        self.gate.admit_current()
         wp.launch(
             expand_masks_kernel,
             dim=(count, *masks.shape[1:]),

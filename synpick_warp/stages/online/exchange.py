@@ -68,6 +68,11 @@ class Gate:
         with wp.ScopedDevice(self.device):
             self._consumers[handle][0].wait_event(self._ready)
 
+    def admit_current(self) -> None:
+        """Let the device's current stream wait for the rendering of this batch: it may be one of a consumer that uses Warp."""
+        if self._ready is not None:
+            self.admit(self.device.stream.cuda_stream)
+
     def expire(self) -> None:
         """End the batch: its arrays refuse further use, and what the consumers' streams have queued so far is noted."""
         self.turn += 1
@@ -131,7 +136,9 @@ class DeviceArray:
         Raises:
             BufferError: The batch has expired.
         """
-        return self._valid().numpy()
+        array = self._valid()
+        self._gate.admit_current()
+        return array.numpy()
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """For `numpy.asarray`; as `numpy()`."""
