@@ -24,6 +24,8 @@ ROWS = "object_rows"
 _OFFERED = "offered splits"
 """Key of the splits of a preset, which hold only if they are asked for."""
 _BASE = "preset"
+_OF_SPLITS = ("bake.mode", "bake.episodes")
+"""Settings from which splits are resolved."""
 _ROW_NEEDS = ("id", "diameter")
 _ROW_IDENTITY = ("id", "name", "diameter")
 """Keys by which a row finds its model."""
@@ -74,12 +76,41 @@ def load_config(
         else:
             values |= _section_values(section, {name: value}, source)
     config = _build(values, source if settings else "")
+    _check_conflicts(config, values)
+    return config
+
+
+def override_config(config: Config, settings: Mapping[str, object], source: str = "in the settings passed") -> Config:
+    """Override single settings of a finished configuration, and validate the result.
+
+    Args:
+        config: The configuration.
+        settings: Full key, such as "physics.step", -> value.
+        source: Where `settings` come from, for error messages.
+
+    Raises:
+        ConfigError: A key is unknown, a value is not allowed, values contradict each other, or a setting belongs to splits, which are
+            resolved when a configuration is loaded.
+    """
+    values: Values = {}
+    for key, value in settings.items():
+        section, _, name = key.partition(".")
+        if section == SPLITS or (config.splits and key in _OF_SPLITS):
+            raise ConfigError(f"{key} is set {source}, but the configuration has its splits already; pass it to load_config")
+        values |= _section_values(section, {name: value}, source)
+        part = dataclasses.replace(getattr(config, section), **{name: values[key][0]})
+        config = dataclasses.replace(config, **{section: part})
+    _check_conflicts(config, values)
+    return config
+
+
+def _check_conflicts(config: Config, values: Values) -> None:
+    """Raise a ConfigError for the first violated rule between settings; `values` has the sources of those that were set."""
     for key, rule in find_conflicts(config):
         owner = values.get(SPLITS if key.startswith(f"{SPLITS}.") else key, (None, "by default"))
         value, origin = _value_of(config, key), owner[1]
         has = f"has {len(value)} rows" if key == ROWS else f"is {format_value(value)}"
         raise ConfigError(f"{key} {has} {origin}; allowed: {rule}")
-    return config
 
 
 def preset_names() -> list[str]:

@@ -4,6 +4,8 @@
 
     synpick_warp.bake("smoke", "DATA", {"bake.mode": "move"})
     view = synpick_warp.open("DATA")[0].view(frame=3)
+    for batch in synpick_warp.stream("smoke", worlds=8):     # the same views on the device, without files
+        ...
 
 Importing this package loads neither simulator, NumPy nor OpenCV; the functions import them when they are called.
 """
@@ -20,6 +22,7 @@ if TYPE_CHECKING:
     from synpick_warp.configs.schema import Config
     from synpick_warp.dataset.reading import DataSet
     from synpick_warp.episodes import BakeSummary
+    from synpick_warp.online.stream import ViewStream
     from synpick_warp.progress import Progress
 
 __version__ = "0.1.0"
@@ -35,6 +38,7 @@ __all__ = [
     "bake",
     "load_config",
     "open",
+    "stream",
 ]
 
 
@@ -76,6 +80,62 @@ def bake(
     elif settings:
         raise TypeError("settings override a preset or a file; pass them to load_config, or use dataclasses.replace on the Config")
     return run_bake(config, Path(out), progress if progress is not None else SilentProgress(), shard, splits, devices)
+
+
+def stream(
+    config: Config | Path | str | None = None,
+    settings: Mapping[str, object] | None = None,
+    *,
+    worlds: int | None = None,
+    device: str | None = None,
+    seed: int | None = None,
+    mode: str | None = None,
+    resolution: tuple[int, int] | None = None,
+    models: Path | str | None = None,
+    lights: Path | str | None = None,
+    layers: Sequence[str] | None = None,
+    batch: int | None = None,
+    episodes: int | range | None = None,
+    shard: tuple[int, int] = (0, 1),
+    splits: Sequence[str] = (),
+    cameras: Sequence[int] | None = None,
+    stride: int = 1,
+    progress: Progress | None = None,
+) -> ViewStream:
+    """Generate views for a consumer in this process: an iterator over batches whose arrays stay on the device, without files.
+
+        for batch in synpick_warp.stream("synpick", worlds=64, device="cuda:0", episodes=range(1000)):
+            color = torch.from_dlpack(batch.color)      # (B, H, W, 3) uint8, no copy; valid until the next batch
+
+    Views and values are those of a bake with the same settings, images before they are compressed. See `synpick_warp/online/README.md`.
+
+    Args:
+        config: Settings, as for `bake`.
+        settings: Full key -> value; they override `config`, a finished `Config`, too.
+        worlds, device, seed, mode, models, lights: Override the settings `bake.*` of these names.
+        resolution: Width and height of the images [px], instead of `cameras.resolution`.
+        layers: Names of the layers to render, instead of `render.layers`.
+        batch: Maximum views of a batch, instead of `render.views_per_batch`; a tick's last batch may have fewer.
+        episodes: How many, from 0 on, or a range of indices; None: those of the settings.
+        shard: (i, n): only episodes with index % n == i, such as those of a training process.
+        splits: Only episodes of these splits of the settings; empty: all.
+        cameras: Indices of the cameras to render; None: all.
+        stride: Every n-th frame of an episode; the others are simulated only. Above 1, colours are those of `render.history` 0.
+        progress: Receives stages and notes; None: silent.
+
+    Raises:
+        SynpickError: An error that the user can correct, before the first batch or while one is made.
+    """
+    from synpick_warp.online.settings import resolve_settings
+    from synpick_warp.online.stream import Selection, open_stream
+    from synpick_warp.progress import SilentProgress
+
+    given = {"worlds": worlds, "device": device, "seed": seed, "mode": mode, "models": models, "lights": lights}
+    given |= {"resolution": resolution, "layers": layers, "batch": batch}
+    resolved = resolve_settings(config, settings or {}, given, bool(splits))
+    selection = Selection(None if cameras is None else tuple(cameras), stride)
+    progress = progress if progress is not None else SilentProgress()
+    return open_stream(resolved, progress, episodes=episodes, shard=shard, splits=splits, selection=selection)
 
 
 def load_config(preset_or_file: Path | str | None = None, settings: Mapping[str, object] | None = None, *, splits: bool = False) -> Config:

@@ -91,13 +91,13 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
     Args:
         config: All settings.
         device: Device of the simulation; on a GPU the plan is for `with_enough_worlds`.
-        writers: Writer processes.
+        writers: Writer processes; 0: nothing is written, views stay on the device.
     """
     config = with_enough_worlds(config, device)
-    terms = [*_simulation(config, device), *_images(config, device), *_perception(config, device)]
+    terms = [*_simulation(config, device), *_images(config, device, writers > 0), *_perception(config, device)]
     if not device.is_cuda:
         terms = [Term(term.name, term.rows, term.settings, False, term.indexed) for term in terms]
-    return [*terms, *_newton(config, device), *_host(config, device, writers)]
+    return [*terms, *_newton(config, device), *(_host(config, device, writers) if writers else ())]
 
 
 def free_memory(device: wp.Device | None) -> int:
@@ -203,15 +203,17 @@ def _simulation(config: Config, device: wp.Device) -> Iterator[Term]:
         yield _term("records of physics steps", _STEPS, [(kind, sizes, 1 + RECORDS) for kind in record_kinds(config.trajectory)])
 
 
-def _images(config: Config, device: wp.Device) -> Iterator[Term]:
-    """Images of a batch of views, and scratch of the renderer."""
+def _images(config: Config, device: wp.Device, written: bool = True) -> Iterator[Term]:
+    """Images of a batch of views, and scratch of the renderer; what only writers need if they are `written`."""
     room, ring = config.arrangement.max_objects, RING if device.is_cuda else 1
     width, height = config.cameras.resolution
     views = view_sizes(config, device) | body_sizes(room, width, height)
     name = f"images of {views['view']:,} views of {width:,}x{height:,} px"
-    boundaries = boundary_sizes(views)
-    groups: list[tuple[Any, dict[str, int], int]] = [(ViewBuffers, views, ring), (BoundaryBuffers, boundaries, ring)]
-    groups += [(BoundaryScratch, boundaries, 1)] + [(kind, views, 1) for kind in (VIEW_BODIES, GBUFFER, SHADED_IMAGE)]
+    groups: list[tuple[Any, dict[str, int], int]] = [(ViewBuffers, views, ring)]
+    if written:
+        boundaries = boundary_sizes(views)
+        groups += [(BoundaryBuffers, boundaries, ring), (BoundaryScratch, boundaries, 1)]
+    groups += [(kind, views, 1) for kind in (VIEW_BODIES, GBUFFER, SHADED_IMAGE)]
     groups += [(VISIBILITY_BUFFER, visibility_sizes(views["view"], width, height), 1), (BORDER_BOXES, border_sizes(views["view"], room), 1)]
     if MOTION_LAYERS.intersection(config.render.layers):
         groups += [(BODY_MOTIONS, views, 1)]
@@ -222,10 +224,10 @@ def _images(config: Config, device: wp.Device) -> Iterator[Term]:
         groups += [(MOVING_BODIES, views, 1)]
         histories = history_sizes(config.render, width, height, config.bake.worlds * len(config.cameras.positions))
         yield _term("light averaged over frames", _HISTORY, [(LIGHT_HISTORY, histories, 1)])
-    if _host_images(config, device).jpeg_quality:
+    if written and _host_images(config, device).jpeg_quality:
         files = jpeg_sizes(views["view"], width, height)
         groups += [(JpegBuffers, files, ring), (JpegScratch, files, 1)]
-    if _host_images(config, device).depth_files:
+    if written and _host_images(config, device).depth_files:
         data = depth_sizes(views["view"], width, height)
         groups += [(DepthBuffers, data, ring), *((kind, data, 1) for kind in DEPTH_SCRATCH)]
     term = _term(name, _VIEWS, groups)

@@ -43,7 +43,7 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.simulate import RECORDS, Simulation
-from synpick_warp.stages.stream import FrameStream, TickReader, TickReport, host_images, name_lights, tick_batch, view_sizes
+from synpick_warp.stages.stream import FrameStream, LightTable, TickReader, TickReport, host_images, name_lights, tick_batch, view_sizes
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device, pick_devices
 from synpick_warp.system.interrupt import StopRequest
@@ -64,6 +64,33 @@ class Factory:
     simulation: Simulation
     stream: FrameStream
     log: AttemptLog
+
+
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """What makes pictures, on the device: assets, worlds and renderer; a bake's `Factory` without its way to the host."""
+
+    config: Config
+    """The settings, with as many worlds as there are."""
+    catalog: Catalog
+    cameras: tuple[Camera, ...]
+    lights: tuple[EnvironmentMap, ...]
+    simulation: Simulation
+    renderer: Renderer
+    sizes: dict[str, int]
+    """Extents by `view_sizes`."""
+    object_ids: np.ndarray
+    """obj_id of each catalog entry (entry) int32."""
+    light_table: LightTable
+
+    @property
+    def tick_time(self) -> float:
+        """Time between two frames [s]."""
+        return self.config.physics.step * self.config.physics.steps_per_tick
+
+    def make_log(self) -> AttemptLog:
+        """A new attempt log."""
+        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids)
 
 
 def build_factory(
@@ -92,6 +119,19 @@ def build_factory(
     writers = count_writers(config)
     config = fit_to_device(config, device, planned, writers, processes)
     check_memory(config, device, writers, processes)
+    stages = build_stages(config, device, progress, episodes, records_physics)
+    depth_files = any(kind.writes_depth for kind in load_exporter_classes(config.bake.formats))
+    host = host_images(config, device, needs_images, depth_files)
+    table, tick_time = stages.light_table, stages.tick_time
+    layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
+    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
+    return Factory(stages.catalog, stages.cameras, stages.lights, stages.simulation, stream, stages.make_log())
+
+
+def build_stages(
+    config: Config, device: wp.Device, progress: Progress, episodes: Sequence[int] | None = None, records_physics: bool = False
+) -> Stages:
+    """Load assets and build worlds and renderer; arguments and errors as of `build_factory`, for settings by `fit_to_device`."""
     progress.stage("loading objects and lights")
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
@@ -105,11 +145,7 @@ def build_factory(
     renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
     object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
     table = name_lights([light.name for light in lights], scene.lights)
-    tick_time = config.physics.step * config.physics.steps_per_tick
-    depth_files = any(kind.writes_depth for kind in load_exporter_classes(config.bake.formats))
-    host = host_images(config, device, needs_images, depth_files)
-    stream = FrameStream(sizes, config.render.layers, len(cameras), tick_time, renderer, object_ids, table, device, host)
-    return Factory(catalog, cameras, lights, simulation, stream, AttemptLog(config.suction, config.perception.resolution, object_ids))
+    return Stages(config, catalog, cameras, lights, simulation, renderer, sizes, object_ids, table)
 
 
 def make_renderer(config: Config, scene: RenderScene, instances: int, views: int, histories: int = 0) -> Renderer:

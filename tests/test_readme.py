@@ -20,6 +20,7 @@ DOCUMENTS = [
     *ROOT.glob("*.md"),
     *ROOT.glob("*/README.md"),
     ROOT / "synpick_warp" / "exporters" / "README.md",
+    ROOT / "synpick_warp" / "online" / "README.md",
     ROOT / ".github" / "CONTRIBUTING.md",
 ]
 SECONDS = 600

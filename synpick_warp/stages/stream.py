@@ -234,6 +234,35 @@ def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> 
     )
 
 
+def describe_views(
+    report: TickReport, world: np.ndarray, camera: np.ndarray, tick_time: float, object_ids: np.ndarray, lights: LightTable
+) -> dict[str, Any]:
+    """Fields of `FrameBatch` that follow from the report of a tick, by name.
+
+    Args:
+        report: Report of the tick.
+        world: World of each view (B) int32.
+        camera: Camera of each view (B) int32.
+        tick_time: Time between two frames [s].
+        object_ids: obj_id of each catalog entry, and behind them -1 for none (entry + 1) int32.
+        lights: Table of the environment maps.
+    """
+    frame = report.column("frame")[world]
+    light, yaw = report.snapshot.light[world], report.snapshot.light_yaw[world]
+    return {
+        "episode": report.column("episode")[world],
+        "camera": camera,
+        "frame": frame,
+        "time": frame * tick_time,
+        "object_id": object_ids[report.catalog_index[world]],
+        "pose": report.pose[world],
+        "light_name": lights.name[light],
+        "light_yaw": yaw,
+        "light_exposure": report.snapshot.light_exposure[world],
+        "light_direction": lights.directions(light, yaw),
+    }
+
+
 class FrameStream:
     """Renders the live worlds of snapshots as FrameBatches; while one is consumed, the next is rendered (ring buffer)."""
 
@@ -331,20 +360,8 @@ class FrameStream:
         with scope("wait for images"):
             copied = self.copies[slot].wait()
         arrays = {name: array[:count] for name, array in zip(self.images + self.layers, copied, strict=True)}
-        worlds = world[part]
-        frame = report.column("frame")[worlds]
-        light, turn = report.snapshot.light[worlds], report.snapshot.light_yaw[worlds]
         return FrameBatch(
-            episode=report.column("episode")[worlds],
-            camera=camera[part],
-            frame=frame,
-            time=frame * self.tick_time,
-            object_id=self.object_ids[report.catalog_index[worlds]],
-            pose=report.pose[worlds],
-            light_name=self.lights.name[light],
-            light_yaw=turn,
-            light_exposure=report.snapshot.light_exposure[worlds],
-            light_direction=self.lights.directions(light, turn),
+            **describe_views(report, world[part], camera[part], self.tick_time, self.object_ids, self.lights),
             **{name: arrays[name] for name in self.images},
             **{name: DeviceImages(getattr(self.buffers[slot], name)) for name in self.host.on_demand},
             layers={name: arrays[name] for name in self.layers},

@@ -1,4 +1,4 @@
-"""Benchmark of a bake's parts: physics, perception and planning, rendering, encoders, writing, a small bake, a large one in steady state.
+"""Benchmark of a bake's parts: physics, perception, rendering, encoders, writing, the online stream, a small bake, one in steady state.
 
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
 mode pick; with `--set bake.mode=move`, piles are stirred instead. Writers get the same views repeatedly. Files are written to the
@@ -42,10 +42,11 @@ from tools.bench.encode import measure_encoding
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
 from tools.bench.sensor import measure_sensor
 from tools.bench.steady import measure_steady
+from tools.bench.stream import measure_stream
 from tools.bench.write import measure_writing
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
 
-PARTS = ("physics", "perception", "render", "encode", "sensor", "write", "bake", "steady")
+PARTS = ("physics", "perception", "render", "encode", "sensor", "write", "stream", "bake", "steady")
 WHOLE_BAKES = {"bake", "steady"}
 """Parts that run bakes of their own."""
 STREAM_BATCHES = 12
@@ -126,6 +127,8 @@ def measure(config: Config, parts: tuple[str, ...], min_seconds: float) -> Itera
         if "write" in parts:
             worlds = min(factory.simulation.layout.worlds, -(-WRITE_VIEWS // len(factory.cameras)))
             yield from measure_writing(config, factory, _mark_live(factory.simulation, worlds), min_seconds)
+        if "stream" in parts:
+            yield from measure_stream(config, factory, _mark_live(factory.simulation, factory.simulation.layout.worlds), min_seconds)
         yield _memory_in_use(factory.simulation.device)
     if "bake" in parts:
         yield from _measure_bake(config)

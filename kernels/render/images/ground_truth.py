@@ -1,0 +1,107 @@
+"""Per-view ground truth on the device: gather of each view's episode, camera, object ids and poses; masks from ids and amodal bits."""
+
+import warp as wp
+
+from synpick_warp.kernels.render.images.layers import position_of, rotation_of
+from synpick_warp.kernels.render.visibility.camera import Cameras, Views
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def camera_matrix(fx_fy_cx_cy: wp.vec4) -> wp.mat33:
+    """Camera matrix K of fx, fy, cx, cy [px]."""
+    k = fx_fy_cx_cy
+    return wp.mat33(k[0], 0.0, k[2], 0.0, k[1], k[3], 0.0, 0.0, 1.0)
+
+
+@wp.func
+def rigid_transform(r: wp.mat33d, t: wp.vec3d) -> wp.mat44:
+    """Homogeneous matrix of a rotation and a translation [m], rounded to float32."""
+    return wp.mat44(
+        float(r[0, 0]), float(r[0, 1]), float(r[0, 2]), float(t[0]),
+        float(r[1, 0]), float(r[1, 1]), float(r[1, 2]), float(t[1]),
+        float(r[2, 0]), float(r[2, 1]), float(r[2, 2]), float(t[2]),
+        0.0, 0.0, 0.0, 1.0,
+    )  # fmt: skip
+
+
+@wp.kernel
+def gather_cameras_kernel(
+    # Scene:
+    cameras: Cameras,
+    # State:
+    episode: wp.array[int],  # (world)
+    frame: wp.array[int],  # (world)
+    # In:
+    views: Views,
+    # Out:
+    episode_out: wp.array[int],  # (view)
+    camera_out: wp.array[int],  # (view)
+    frame_out: wp.array[int],  # (view)
+    intrinsics_out: wp.array[wp.mat33],  # (view) [px]
+    world_to_camera_out: wp.array[wp.mat44],  # (view) [m]
+):
+    """Gather what belongs to a view as a whole: episode, camera and frame index, camera matrix and extrinsics."""
+    view = wp.tid()
+    world = views.world[view]
+    camera = views.camera[view]
+    episode_out[view] = episode[world]
+    camera_out[view] = camera
+    frame_out[view] = frame[world]
+    intrinsics_out[view] = camera_matrix(cameras.intrinsics[camera])
+    rotation = cameras.rotation[camera]
+    world_to_camera_out[view] = rigid_transform(rotation, -(rotation * cameras.center[camera]))
+
+
+@wp.kernel
+def gather_objects_kernel(
+    # Scene:
+    cameras: Cameras,
+    object_ids: wp.array[int],  # (entry)
+    # State:
+    catalog_index: wp.array2d[int],  # (world, instance)
+    pose: wp.array2d[wp.transform],  # (world, instance) [m]
+    # In:
+    views: Views,
+    # Out:
+    object_id_out: wp.array2d[int],  # (view, instance)
+    pose_out: wp.array2d[wp.transform],  # (view, instance) [m]
+    object_to_camera_out: wp.array2d[wp.mat44],  # (view, instance) [m]
+):
+    """Gather obj_id and pose of each instance: object to world as simulated, object to camera computed in float64.
+
+    Instances that are not in the scene get obj_id -1 and the identity.
+    """
+    view, instance = wp.tid()
+    world = views.world[view]
+    camera = views.camera[view]
+    entry = catalog_index[world, instance]
+    if entry < 0:
+        object_id_out[view, instance] = -1
+        pose_out[view, instance] = wp.transform_identity()
+        object_to_camera_out[view, instance] = wp.identity(n=4, dtype=float)
+        return
+    body = pose[world, instance]
+    rotation = cameras.rotation[camera]
+    object_id_out[view, instance] = object_ids[entry]
+    pose_out[view, instance] = body
+    position = rotation * (position_of(body) - cameras.center[camera])
+    object_to_camera_out[view, instance] = rigid_transform(rotation * rotation_of(body), position)
+
+
+@wp.kernel
+def expand_masks_kernel(
+    # In:
+    instance: wp.array3d[wp.uint8],  # (view, row, column)
+    amodal: wp.array3d[wp.uint32],  # (view, row, column)
+    hidden: bool,
+    # Out:
+    mask_out: wp.array4d[wp.bool],  # (view, instance, row, column)
+):
+    """Expand the id image to visible masks, or with `hidden` the bit field to amodal masks: one image per instance."""
+    view, index, row, column = wp.tid()
+    if hidden:
+        mask_out[view, index, row, column] = ((amodal[view, row, column] >> wp.uint32(index)) & wp.uint32(1)) != wp.uint32(0)
+    else:
+        mask_out[view, index, row, column] = int(instance[view, row, column]) == index + 1

@@ -1,0 +1,66 @@
+"""Selection of what a stream delivers: which episodes, and of these which cameras and frames."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from synpick_warp.configs.fields import INT32_MAX
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import plan_episodes
+from synpick_warp.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Cameras and frames of each episode; what is left out is not rendered, and changes nothing in the other views."""
+
+    cameras: tuple[int, ...] | None = None
+    """Indices of the cameras; None: all."""
+    stride: int = 1
+    """Every n-th frame of an episode, from the first on."""
+
+    def resolve(self, config: Config) -> Selection:
+        """The selection with all its cameras named.
+
+        Raises:
+            ConfigError: There is no such camera, or a value is out of range.
+        """
+        count = len(config.cameras.positions)
+        cameras = tuple(range(count) if self.cameras is None else self.cameras)
+        if not cameras or len(set(cameras)) < len(cameras) or not set(cameras) <= set(range(count)):
+            raise ConfigError(f"cameras are {list(cameras)}; allowed: one or more of 0 to {count - 1}, each once")
+        if self.stride < 1:
+            raise ConfigError(f"stride is {self.stride}; allowed: at least 1")
+        return replace(self, cameras=cameras)
+
+
+def choose_episodes(
+    config: Config, episodes: int | range | None, shard: tuple[int, int], splits: Sequence[str]
+) -> tuple[Config, list[int]]:
+    """Choose the episode indices of a stream, in order.
+
+    Args:
+        config: All settings.
+        episodes: How many, from 0 on, or their indices; None: those that the settings plan.
+        shard: (i, n): only indices with index % n == i.
+        splits: Only episodes of these splits; empty: all.
+
+    Returns:
+        The settings, which plan these episodes, and the indices.
+
+    Raises:
+        ConfigError: There is no such split, an index is out of range, or `episodes` are given beside splits.
+    """
+    index, count = shard
+    if not (count >= 1 and 0 <= index < count):
+        raise ConfigError(f"shard is {index}/{count}; allowed: i/n with 0 <= i < n")
+    if episodes is None:
+        return config, [episode for each in plan_episodes(config, splits, shard) for episode in each]
+    if splits or config.splits:
+        raise ConfigError("episodes are given beside splits, which name their episodes; give one of both")
+    chosen = range(episodes) if isinstance(episodes, int) else episodes
+    if not isinstance(chosen, range) or not chosen or min(chosen) < 0 or max(chosen) >= INT32_MAX:
+        raise ConfigError(f"episodes are {episodes!r}; allowed: how many, or a range of indices from 0 to {INT32_MAX - 1}")
+    config = replace(config, bake=replace(config.bake, episodes=max(chosen) + 1))
+    return config, [episode for episode in chosen if episode % count == index]

@@ -1,0 +1,50 @@
+"""Settings of a stream: a preset, a file or a finished configuration, overridden by full keys and by arguments of short names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from synpick_warp.configs.load import load_config, override_config
+from synpick_warp.configs.schema import Config
+
+ARGUMENTS = {
+    "worlds": "bake.worlds",
+    "device": "bake.device",
+    "seed": "bake.seed",
+    "mode": "bake.mode",
+    "models": "bake.models",
+    "lights": "bake.lights",
+    "resolution": "cameras.resolution",
+    "layers": "render.layers",
+    "batch": "render.views_per_batch",
+}
+"""Setting that each argument of `synpick_warp.stream` overrides."""
+
+
+def resolve_settings(
+    config: Config | Path | str | None, settings: Mapping[str, object], arguments: Mapping[str, object], splits: bool = False
+) -> Config:
+    """Resolve the settings of a stream; arguments override full keys, and both the configuration.
+
+    Args:
+        config: A configuration, or a preset's name or a .toml file; None: the default preset.
+        settings: Full key, such as "bake.mode", -> value.
+        arguments: Key of ARGUMENTS -> value; None: not given.
+        splits: Whether the splits that a preset offers hold.
+
+    Raises:
+        ConfigError: A setting is unknown or not allowed.
+    """
+    given = {ARGUMENTS[name]: _plain(value) for name, value in arguments.items() if value is not None}
+    overrides = dict(settings) | given
+    if isinstance(config, Config):
+        return override_config(config, overrides)
+    return load_config(config, overrides, splits=splits)
+
+
+def _plain(value: object) -> object:
+    """The value as TOML would have it: paths as text, tuples as lists."""
+    if isinstance(value, Path):
+        return str(value)
+    return list(value) if isinstance(value, tuple) else value

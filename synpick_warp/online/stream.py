@@ -1,0 +1,219 @@
+"""Online generator: the views of a bake, batch by batch on the device, made as the consumer takes them.
+
+    for batch in synpick_warp.stream("synpick", worlds=64):
+        color = torch.from_dlpack(batch.color)
+
+It runs in the caller's process and starts no other (but CoACD's, while concave objects are decomposed for the first time).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.codes import Phase
+from synpick_warp.configs.schema import Config
+from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
+from synpick_warp.errors import ConfigError
+from synpick_warp.memory_plan import check_episodes, check_memory, is_shortage, shortage_error
+from synpick_warp.online.selection import Selection, choose_episodes
+from synpick_warp.pipeline import Stages, build_stages
+from synpick_warp.progress import Progress
+from synpick_warp.scheduling.sizes import fit_to_device
+from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.online.batches import BatchRing, ViewBatch
+from synpick_warp.stages.sim.simulate import RECORDS
+from synpick_warp.stages.stream import TickReader, TickReport, describe_views
+from synpick_warp.stages.timing import scope
+from synpick_warp.system.device import pick_device
+
+DEVICE_ONLY = 0
+"""Writer processes of a memory plan in which views stay on the device."""
+
+
+class ViewStream:
+    """Iterator over batches of views. Each batch is valid until the next one is requested.
+
+    On a GPU the batch after the one handed out is queued already, and with it the next tick of all worlds, so that the GPU is busy while
+    the consumer works; nothing else is made ahead. On the CPU a batch is made when it is requested.
+
+    A stream that is left early, by `break`, an error or `close`, frees its worlds and buffers; arrays that another library has imported
+    live on as long as that library keeps them.
+
+    Attributes:
+        config: The settings.
+        cameras: Cameras of the views, by camera index.
+        object_names: Name of each object, by obj_id.
+        summary: How the episodes so far ended, as `bake` returns it; `views` counts those handed out.
+    """
+
+    def __init__(self, producer: Producer) -> None:
+        stages = producer.stages
+        self.config, self.cameras, self.summary = stages.config, stages.cameras, producer.summary
+        self.object_names = {entry.obj_id: entry.name for entry in stages.catalog.entries}
+        self.device = stages.simulation.device
+        # The generator must not refer to this object: without a cycle, the last reference frees the device's memory at once.
+        self._batches: Iterator[ViewBatch] | None = _explain_shortage(producer.batches(), stages.config, self.device)
+        self._ring: BatchRing | None = producer.ring
+        self._stream = self.device.stream if self.device.is_cuda else None
+        self._current: ViewBatch | None = None
+        self._ahead: ViewBatch | None = None
+        producer.progress.stage("compiling kernels, dropping objects")
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> ViewBatch:
+        if self._batches is None:
+            raise StopIteration
+        if self._current is not None:
+            self._current.expire()
+            self._current = None
+        try:
+            with wp.ScopedStream(self._stream, sync_enter=False):
+                batch = self._ahead if self._ahead is not None else next(self._batches, None)
+                self._ahead = next(self._batches, None) if self._stream is not None and batch is not None else None
+        except BaseException:
+            self.close()
+            raise
+        if batch is None:
+            self.close()
+            raise StopIteration
+        self._current = batch
+        self.summary.views += len(batch)
+        return batch
+
+    def close(self) -> None:
+        """End the stream and free its worlds and buffers; the current batch expires. May be called again."""
+        batches, self._batches = self._batches, None
+        if batches is None:
+            return
+        for batch in (self._current, self._ahead):
+            if batch is not None:
+                batch.expire()
+        self._current = self._ahead = None
+        if self._stream is not None:
+            # Consumers' queues may still read the buffers, and freed memory goes to whoever asks next.
+            wp.synchronize_device(self.device)
+        self._ring = None
+        batches.close()  # type: ignore[attr-defined]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def __del__(self) -> None:
+        try:
+            self.close()
+        except Exception:  # At the interpreter's end, modules may be gone.
+            self._batches = self._ring = None
+
+
+class Producer:
+    """Tick loop of a stream: simulate, read the report, render what is selected."""
+
+    def __init__(self, stages: Stages, ring: BatchRing, selection: Selection, summary: BakeSummary, progress: Progress) -> None:
+        self.stages, self.ring, self.selection, self.summary, self.progress = stages, ring, selection, summary, progress
+        self.log = stages.make_log()
+        self.object_ids = np.append(stages.object_ids, -1).astype(np.int32)
+
+    def batches(self) -> Iterator[ViewBatch]:
+        """Render until no episode remains; a batch must have expired before its slot's turn comes again.
+
+        Double-buffered as a bake: the device simulates the next tick before it renders this one.
+        """
+        records = self.stages.simulation.records
+        readers = [TickReader(record) for record in records]
+        self._simulate(readers, 0)
+        current = 0
+        while True:
+            following = (current + 1) % RECORDS
+            self._simulate(readers, following)
+            with scope("wait for tick"):
+                report = readers[current].wait()
+            yield from self.render(report, records[current].snapshot)
+            self._end_episodes(report)
+            if (report.column("phase") == Phase.IDLE).all():
+                return
+            current = following
+
+    def render(self, report: TickReport, snapshot: Snapshot) -> Iterator[ViewBatch]:
+        """Render the selected views of a tick, world by world and camera by camera."""
+        stages, cameras = self.stages, np.asarray(self.selection.cameras, np.int32)
+        shown = report.column("live").astype(bool) & (report.column("frame") % self.selection.stride == 0)
+        live = np.flatnonzero(shown).astype(np.int32)
+        world, camera = np.repeat(live, len(cameras)), np.tile(cameras, len(live))
+        for first in range(0, len(world), self.ring.views):
+            part = slice(first, first + self.ring.views)
+            host = describe_views(report, world[part], camera[part], stages.tick_time, self.object_ids, stages.light_table)
+            host["arrangement"] = report.column("arrangement")[world[part]]
+            yield self.ring.render(snapshot, world[part], camera[part], host)
+
+    def _simulate(self, readers: list[TickReader], record: int) -> None:
+        """Enqueue a tick and the copy of its report."""
+        simulation = self.stages.simulation
+        with scope("simulate", simulation.device):
+            simulation.tick(simulation.records[record])
+        readers[record].start()
+
+    def _end_episodes(self, report: TickReport) -> None:
+        """Add the episodes that ended in a tick to the summary."""
+        config, records = self.stages.config, self.log.update(report)
+        for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
+            record = records[int(report.column("episode")[world])]
+            row = episode_row(config, report, world, record)
+            if is_resampled(config, row):
+                self.summary.take_resample(row.ending)
+                self.progress.note(f"episode {row.episode}, arrangement {row.arrangement + 1}: {row.ending.sentence}")
+            else:
+                self.summary.take_episode(row, record)
+            if advice := remedy(config, row.ending):
+                self.summary.remedies[row.ending] = advice
+
+
+def open_stream(
+    config: Config,
+    progress: Progress,
+    *,
+    episodes: int | range | None = None,
+    shard: tuple[int, int] = (0, 1),
+    splits: Sequence[str] = (),
+    selection: Selection,
+) -> ViewStream:
+    """Build worlds and renderer, and open a stream of their views; arguments and errors as of `synpick_warp.stream`."""
+    config, indices = choose_episodes(config, episodes, shard, splits)
+    if not indices:
+        raise ConfigError(f"shard {shard[0]}/{shard[1]} has no episode; give more episodes, or fewer parts")
+    device = pick_device(config.bake.device)
+    check_episodes(len(indices), config)
+    selection = selection.resolve(config)
+    if selection.stride > 1:
+        # A history holds the frame before, which is not rendered.
+        config = replace(config, render=replace(config.render, history=0))
+    config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
+    check_memory(config, device, DEVICE_ONLY)
+    try:
+        stages = build_stages(config, device, progress, indices)
+        ring = BatchRing(stages.sizes, config.render.layers, stages.renderer, config.bop.depth_scale)
+    except (MemoryError, RuntimeError) as error:
+        if not is_shortage(error):
+            raise
+        raise shortage_error(config, device) from error
+    return ViewStream(Producer(stages, ring, selection, BakeSummary(len(indices)), progress))
+
+
+def _explain_shortage(batches: Iterator[ViewBatch], config: Config, device: wp.Device) -> Iterator[ViewBatch]:
+    """The same batches; memory that runs out is a ConfigError with advice."""
+    try:
+        yield from batches
+    except (MemoryError, RuntimeError) as error:
+        if not is_shortage(error):
+            raise
+        raise shortage_error(config, device) from error

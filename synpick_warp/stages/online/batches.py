@@ -1,0 +1,225 @@
+"""Ring of view batches on the device: rendered views with their ground truth, which nothing copies to the host."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.arrays import allocate, device_array
+from synpick_warp.kernels.render.images.ground_truth import expand_masks_kernel, gather_cameras_kernel, gather_objects_kernel
+from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.online.exchange import DeviceArray, Gate
+from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.timing import scope
+
+GPU_RING = 3
+"""Slots on a GPU: one with the consumer, one rendered ahead, and one that the consumer's queue may still read."""
+
+
+@dataclass(frozen=True, eq=False)
+class TruthBuffers:
+    """Ground truth of one batch of views that the renderer does not write; matrices are row by row."""
+
+    episode: wp.array = device_array("view", dtype=wp.int32)
+    """Episode index."""
+    camera: wp.array = device_array("view", dtype=wp.int32)
+    """Camera index."""
+    frame: wp.array = device_array("view", dtype=wp.int32)
+    """Frame index within the episode, from 0."""
+    object_id: wp.array = device_array("view", "instance", dtype=wp.int32)
+    """obj_id of each instance; -1: the instance is not in the scene."""
+    pose: wp.array = device_array("view", "instance", dtype=wp.transformf, unit="m")
+    """Object to world: x, y, z, quaternion x, y, z, w."""
+    object_to_camera: wp.array = device_array("view", "instance", dtype=wp.mat44, unit="m")
+    """Object to camera, OpenCV's axes."""
+    intrinsics: wp.array = device_array("view", dtype=wp.mat33, unit="px")
+    """Camera matrix K; the centre of pixel (row, column) is (column + 0.5, row + 0.5)."""
+    world_to_camera: wp.array = device_array("view", dtype=wp.mat44, unit="m")
+    """Extrinsics."""
+
+
+@dataclass(frozen=True, eq=False)
+class MaskBuffers:
+    """Masks of one batch of views: an image per instance, allocated when they are first asked for."""
+
+    visible: wp.array = device_array("view", "instance", "row", "column", dtype=wp.bool)
+    amodal: wp.array = device_array("view", "instance", "row", "column", dtype=wp.bool)
+
+
+class Slot:
+    """Buffers of one batch."""
+
+    def __init__(self, sizes: dict[str, int], layers: list[str], device: wp.Device) -> None:
+        self.sizes, self.device = sizes, device
+        self.images = allocate(ViewBuffers, sizes, device)
+        self.truth = allocate(TruthBuffers, sizes, device)
+        self.layers = allocate(LayerBuffers, sizes, device, layers)
+        self.lists = wp.zeros((2, sizes["view"]), dtype=wp.int32, device=device)
+        self.masks: dict[str, wp.array] = {}
+        self.gate = Gate(device)
+        self._expanded: dict[str, int] = {}
+        """Turn of the gate in which each of `masks` was written last."""
+
+    def expand_masks(self, name: str, count: int) -> wp.array:
+        """Masks of the first `count` views; `name` is a field of `MaskBuffers`."""
+        if name not in self.masks:
+            self.masks[name] = getattr(allocate(MaskBuffers, self.sizes, self.device, [name]), name)
+        masks, images = self.masks[name], self.images
+        if self._expanded.get(name) == self.gate.turn:
+            return masks
+        self._expanded[name] = self.gate.turn
+        self.gate.admit_current()
+        wp.launch(
+            expand_masks_kernel,
+            dim=(count, *masks.shape[1:]),
+            inputs=[images.instance, images.amodal, name == "amodal"],
+            outputs=[masks],
+            device=self.device,
+        )
+        self.gate.mark_ready()
+        return masks
+
+
+class ViewBatch:
+    """Batch of `B` rendered views with their ground truth, on the device: what the writers of a bake get.
+
+    The arrays are valid until the next batch is requested; copy what you keep. They are `DeviceArray`s: give them to `from_dlpack` of
+    torch, JAX, CuPy, Warp or NumPy. `I` is the instance capacity of a world; an instance's index along `I` is its `instance_id`, which
+    denotes the same object for the whole episode.
+
+    Attributes:
+        color: Colour image, sRGB, red first (B, H, W, 3) uint8.
+        depth: Planar depth in units of `depth_scale` mm; 0: no surface (B, H, W) uint16.
+        instance: Segmentation id of the nearest surface: 0 none, 1 + instance_id, 252 to 255 table and fixtures (`Segment`)
+            (B, H, W) uint8.
+        amodal: Amodal masks as a bit field: bit i is set where the pixel's ray hits instance i, hidden or not (B, H, W) uint32.
+        layers: Layers (AOVs) that `render.layers` names, as they are before quantization (B, H, W[, C]); see `synpick_warp.layers`.
+        object_id: obj_id of each instance; -1: the instance is not in the scene (B, I) int32.
+        pose: Object to world: x, y, z [m], quaternion x, y, z, w (B, I, 7) float32.
+        object_to_camera: The same in the camera's frame, as matrices (B, I, 4, 4) float32 [m].
+        pixels: BOP's px_count_all, px_count_valid, px_count_visib (B, I, 3) int32.
+        boxes: Amodal and visible boxes x_min, y_min, x_max, y_max [px], inclusive; x_max < x_min: empty (B, I, 2, 4) int32.
+        effects: Camera-effect parameters in the order of `Effect`; 0: off (B, E) float32.
+        intrinsics: Camera matrix K (B, 3, 3) float32 [px].
+        world_to_camera: Extrinsics (B, 4, 4) float32 [m].
+        episode: Episode index (B) int32.
+        camera: Camera index (B) int32.
+        frame: Frame index within the episode, from 0 (B) int32.
+        depth_scale: Millimetres per count of `depth`.
+        host: The numbers of the views that the host knows anyway, as NumPy arrays that stay valid, by name: episode, arrangement (how
+            often the episode's arrangement was resampled), camera, frame, time [s], object_id, pose, light_name, light_yaw,
+            light_exposure, light_direction; see `synpick_warp.frames.FrameBatch`.
+    """
+
+    color: DeviceArray
+    depth: DeviceArray
+    instance: DeviceArray
+    amodal: DeviceArray
+    pixels: DeviceArray
+    boxes: DeviceArray
+    effects: DeviceArray
+    episode: DeviceArray
+    camera: DeviceArray
+    frame: DeviceArray
+    object_id: DeviceArray
+    pose: DeviceArray
+    object_to_camera: DeviceArray
+    intrinsics: DeviceArray
+    world_to_camera: DeviceArray
+
+    def __init__(self, slot: Slot, count: int, depth_scale: float, host: Mapping[str, np.ndarray]) -> None:
+        self._slot, self._count, self.depth_scale, self.host = slot, count, depth_scale, host
+        for part in (slot.images, slot.truth):
+            for item in fields(part):
+                setattr(self, item.name, self._export(getattr(part, item.name)))
+        present = {item.name: getattr(slot.layers, item.name) for item in fields(slot.layers)}
+        self.layers = {name: self._export(array) for name, array in present.items() if array is not None}
+
+    def visible_masks(self) -> DeviceArray:
+        """Modal (visible) mask of each instance (B, I, H, W) bool, made on the device. Takes I bytes a pixel."""
+        return self._masks("visible")
+
+    def amodal_masks(self) -> DeviceArray:
+        """Amodal mask of each instance, visible or hidden (B, I, H, W) bool, likewise."""
+        return self._masks("amodal")
+
+    def expire(self) -> None:
+        """End the batch; called before the next one is made. Its arrays refuse further use."""
+        self._slot.gate.expire()
+
+    def _masks(self, name: str) -> DeviceArray:
+        self.color.check()
+        return self._export(self._slot.expand_masks(name, self._count))
+
+    def _export(self, array: wp.array) -> DeviceArray:
+        return DeviceArray(array[: self._count], self._slot.gate)
+
+    def __len__(self) -> int:
+        """Number of views B."""
+        return self._count
+
+    def __repr__(self) -> str:
+        return f"ViewBatch({self._count} views of {self.color.shape[2]}x{self.color.shape[1]} px on {self.color.device})"
+
+
+class BatchRing:
+    """Renders batches of views into a ring of slots; `render` only launches kernels."""
+
+    def __init__(self, sizes: dict[str, int], layers: tuple[str, ...], renderer: Renderer, depth_scale: float) -> None:
+        """Allocate the slots.
+
+        Args:
+            sizes: Extents by `stages.stream.view_sizes`.
+            layers: Names of the layers to render.
+            renderer: Renderer and annotator of views.
+            depth_scale: Millimetres per count of the depth image.
+        """
+        self.renderer, self.device, self.depth_scale = renderer, renderer.scene.device, depth_scale
+        self.views, self.instances = sizes["view"], sizes["instance"]
+        names = [item.name for item in fields(LayerBuffers) if item.name in layers]
+        self.slots = [Slot(sizes, names, self.device) for _ in range(GPU_RING if self.device.is_cuda else 1)]
+        self._next = 0
+
+    def render(self, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray, host: Mapping[str, Any]) -> ViewBatch:
+        """Render views into the next slot, whose last batch must have expired.
+
+        Args:
+            snapshot: State of the worlds.
+            world: World of each view (B) int32, at most `views`.
+            camera: Camera of each view (B) int32.
+            host: For `ViewBatch.host`.
+        """
+        slot, count = self.slots[self._next], len(world)
+        self._next = (self._next + 1) % len(self.slots)
+        slot.gate.wait_for_consumers()
+        padded = np.zeros((2, self.views), dtype=np.int32)
+        padded[:, :count] = world, camera
+        slot.lists.assign(padded)
+        views = make_views(slot.lists[0], slot.lists[1], count, self.instances)
+        with scope("render", self.device):
+            self.renderer.render(snapshot, views, slot.images, slot.layers)
+            self._gather(snapshot, views, slot.truth)
+        slot.gate.mark_ready()
+        return ViewBatch(slot, count, self.depth_scale, host)
+
+    def _gather(self, snapshot: Snapshot, views: Any, truth: TruthBuffers) -> None:
+        cameras, object_ids = self.renderer.scene.cameras, self.renderer.scene.obj_id
+        wp.launch(
+            gather_cameras_kernel,
+            dim=views.count,
+            inputs=[cameras, snapshot.episode, snapshot.frame, views],
+            outputs=[truth.episode, truth.camera, truth.frame, truth.intrinsics, truth.world_to_camera],
+            device=self.device,
+        )
+        wp.launch(
+            gather_objects_kernel,
+            dim=(views.count, self.instances),
+            inputs=[cameras, object_ids, snapshot.catalog_index, snapshot.pose, views],
+            outputs=[truth.object_id, truth.pose, truth.object_to_camera],
+            device=self.device,
+        )

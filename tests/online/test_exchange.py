@@ -1,0 +1,102 @@
+"""Ring of batches: consumers read after the rendering, and the renderer waits for them, on streams of their own where there is a GPU."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from synpick_warp.kernels.render.visibility.camera import Cameras
+from synpick_warp.stages.buffers import Snapshot, view_buffer_sizes
+from synpick_warp.stages.online.batches import GPU_RING, BatchRing, ViewBatch
+from synpick_warp.stages.online.exchange import DeviceArray, Gate
+
+BATCHES, VIEWS, ROOM = 12, 3, 2
+SPINS = 20_000
+"""Rounds of a thread that keeps a queue busy for about a millisecond."""
+
+
+@wp.kernel
+def spin_kernel(value: wp.array[float], rounds: int):
+    i = wp.tid()
+    x = value[i]
+    for _ in range(rounds):
+        x = wp.sin(x) + 1.0
+    value[i] = x
+
+
+class NumberingRenderer:
+    """Fills the depth of its n-th batch with n, after some time."""
+
+    def __init__(self, device: wp.Device) -> None:
+        cameras = Cameras()
+        cameras.intrinsics = wp.zeros(1, dtype=wp.vec4, device=device)
+        cameras.rotation = wp.zeros(1, dtype=wp.mat33d, device=device)
+        cameras.center = wp.zeros(1, dtype=wp.vec3d, device=device)
+        self.scene = SimpleNamespace(device=device, cameras=cameras, obj_id=wp.zeros(1, dtype=wp.int32, device=device))
+        self.busy, self.count = wp.zeros(1, dtype=float, device=device), 0
+
+    def render(self, snapshot, views, out, layers) -> None:
+        self.count += 1
+        wp.launch(spin_kernel, dim=1, inputs=[self.busy, SPINS], device=self.scene.device)
+        out.depth.fill_(self.count)
+        out.instance.fill_(1 + self.count % ROOM)
+
+
+@pytest.fixture
+def ring(device) -> BatchRing:
+    sizes = view_buffer_sizes(VIEWS, 32, 16, ROOM)
+    return BatchRing(sizes, (), NumberingRenderer(device), 0.1)  # type: ignore[arg-type]
+
+
+def render(ring: BatchRing) -> ViewBatch:
+    device = ring.device
+    worlds = {"world": 1, "instance": ROOM, "fixture": 3}
+    arrays = {item.name: item.metadata["array"] for item in dataclasses.fields(Snapshot)}
+    snapshot = Snapshot(**{n: wp.zeros([worlds[d] for d in spec.shape], dtype=spec.dtype, device=device) for n, spec in arrays.items()})
+    zeros = np.zeros(VIEWS, np.int32)
+    return ring.render(snapshot, zeros, zeros, {})
+
+
+def test_slow_consumers_on_their_own_stream_read_each_batch_whole(ring):
+    """A batch is rendered ahead, the consumer's queue is behind: nothing waits on the host, and every copy has its batch's number."""
+    device = ring.device
+    consumer = wp.Stream(device) if device.is_cuda else None
+    kept = [wp.zeros((VIEWS, 16, 32), dtype=wp.uint16, device=device) for _ in range(BATCHES)]
+    masks = [wp.zeros((VIEWS, ROOM, 16, 32), dtype=wp.bool, device=device) for _ in range(BATCHES)]
+    busy = wp.zeros(1, dtype=float, device=device)
+    assert len(ring.slots) == (GPU_RING if device.is_cuda else 1)
+    if device.is_cuda:
+        wp.synchronize_device(device)
+    ahead: ViewBatch | None = None
+    for index in range(BATCHES):
+        batch = ahead if ahead is not None else render(ring)
+        ahead = render(ring) if device.is_cuda else None
+        with wp.ScopedStream(consumer, sync_enter=False):
+            imported = wp.from_dlpack(batch.depth)
+            wp.launch(spin_kernel, dim=1, inputs=[busy, 5 * SPINS], device=device)
+            wp.copy(kept[index], imported)
+            wp.copy(masks[index], wp.from_dlpack(batch.visible_masks(), dtype=wp.bool))
+        batch.expire()
+    assert [np.unique(values.numpy()).tolist() for values in kept] == [[1 + index] for index in range(BATCHES)]
+    assert [values.numpy().all(axis=(0, 2, 3)).argmax() for values in masks] == [(1 + index) % ROOM for index in range(BATCHES)]
+
+
+def test_what_an_array_says_of_itself(device):
+    gate = Gate(device)
+    array = DeviceArray(wp.zeros((2, 3), dtype=wp.transformf, device=device), gate)
+    matrices = DeviceArray(wp.zeros(4, dtype=wp.mat44, device=device), gate)
+    assert (array.shape, array.dtype, array.device) == ((2, 3, 7), np.float32, device.alias)
+    assert (matrices.shape, len(matrices)) == ((4, 4, 4), 4)
+    assert array.numpy().shape == np.asarray(array).shape == (2, 3, 7)
+    assert np.asarray(array, dtype=np.float64).dtype == np.float64
+    assert repr(array) == f"DeviceArray(float32, (2, 3, 7), {device.alias})"
+    assert array.__dlpack_device__() == ((2, device.ordinal) if device.is_cuda else (1, 0))
+    with pytest.raises(BufferError, match="import it there"):
+        array.__dlpack__(dl_device=(99, 0))
+    gate.expire()
+    with pytest.raises(BufferError, match="expired"):
+        array.__dlpack__(stream=None)

@@ -1,0 +1,253 @@
+"""Online generator: the views of a bake in memory, whatever is chosen of them; and nothing is left of a stream that was left."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import subprocess
+import sys
+import weakref
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import synpick_warp
+from synpick_warp.configs.schema import LAYERS
+from synpick_warp.errors import ConfigError
+from synpick_warp.layer_codec import decode_layer, encode_layer
+from synpick_warp.online import stream as online
+from tests.harness.environment import checkout_environment
+from tests.online.conftest import LAYERED, tiny
+from tests.worlds.small_worlds import QUICK, settings
+
+View = dict[str, np.ndarray]
+SCRIPT = """
+import synpick_warp
+for batch in synpick_warp.stream("smoke", {settings!r}, resolution=(32, 18)):
+    print(len(batch), batch.color.shape)
+    break
+"""
+
+
+def taken(stream) -> dict[tuple[int, int, int], View]:
+    """Copies of all views, by episode, camera and frame."""
+    views = {}
+    for batch in stream:
+        arrays = {name: value.numpy().copy() for name, value in vars(batch).items() if hasattr(value, "__dlpack__")}
+        arrays |= {"visible_masks": batch.visible_masks().numpy().copy(), "amodal_masks": batch.amodal_masks().numpy().copy()}
+        arrays |= {name: value.numpy().copy() for name, value in batch.layers.items()}
+        for view in range(len(batch)):
+            row = {name: values[view] for name, values in arrays.items()}
+            row |= {f"host_{name}": values[view] for name, values in batch.host.items()}
+            views[int(row["episode"]), int(row["camera"]), int(row["frame"])] = row
+    return views
+
+
+@pytest.fixture(scope="module")
+def streamed() -> tuple[dict[tuple[int, int, int], View], online.ViewStream]:
+    stream = synpick_warp.stream(settings(**LAYERED))
+    refs = held_by(stream)
+    views = taken(stream)
+    assert next(stream, None) is None
+    assert [ref() for ref in refs[:2]] == [None] * 2  # An exhausted stream holds nothing, either.
+    return views, stream
+
+
+def equal(one: dict[tuple[int, int, int], View], other: dict[tuple[int, int, int], View]) -> None:
+    assert one.keys() == other.keys()
+    for key, view in one.items():
+        assert view.keys() == other[key].keys()
+        for name, values in view.items():
+            np.testing.assert_array_equal(values, other[key][name], err_msg=name)
+
+
+# ---- the same content as a bake ----
+
+
+def test_views_are_those_that_a_bake_writes(streamed, tmp_path):
+    views, stream = streamed
+    summary = synpick_warp.bake(settings(**LAYERED | {"bake__worlds": 1}), tmp_path / "set")
+    assert (stream.summary.episodes, stream.summary.views) == (summary.episodes, summary.views)
+    data = synpick_warp.open(tmp_path / "set")
+    expected = {(index, camera, frame) for index in data for camera in range(3) for frame in range(len(data[index]))}
+    assert views.keys() == expected
+    for (episode, camera, frame), made in views.items():
+        view = data[episode].view(frame, camera)
+        np.testing.assert_array_equal(made["color"], view.rgb)
+        np.testing.assert_array_equal(made["depth"] * np.float32(stream.config.bop.depth_scale / 1000), view.depth)
+        for name in LAYERS:
+            np.testing.assert_array_equal(decode_layer(name, encode_layer(name, made[name])), view.layer(name), err_msg=name)
+        present = made["object_id"] >= 0
+        np.testing.assert_array_equal(np.flatnonzero(present), view.instance_ids)
+        np.testing.assert_array_equal(made["object_id"][present], view.object_ids)
+        np.testing.assert_array_equal(made["visible_masks"][present], view.masks)
+        np.testing.assert_array_equal(made["amodal_masks"][present], view.amodal_masks)
+        assert not made["amodal_masks"][~present].any()
+        for row, count in zip(view.records.gt_info, made["pixels"][present].tolist(), strict=True):
+            assert [row[f"px_count_{name}"] for name in ("all", "valid", "visib")] == count
+        seen = made["pixels"][present, 2] > 0
+        for written, box in ((view.boxes, made["boxes"][present, 0]), (view.visible_boxes, made["boxes"][present, 1])):
+            np.testing.assert_array_equal(written[seen], np.concatenate((box[:, :2], box[:, 2:] - box[:, :2]), axis=1)[seen])
+        np.testing.assert_allclose(made["object_to_camera"][present], view.object_to_camera, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(made["world_to_camera"], view.world_to_camera, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(made["intrinsics"], view.intrinsics, rtol=1e-6)
+        light = view.records.camera["light"]
+        assert (made["host_light_name"], round(float(made["host_light_yaw"]), 6)) == (light["map"], light["yaw"])
+
+
+def test_what_the_host_knows_is_what_the_device_has(streamed):
+    for (episode, camera, frame), view in streamed[0].items():
+        assert (view["host_episode"], view["host_camera"], view["host_frame"]) == (episode, camera, frame)
+        assert view["host_arrangement"] == 0
+        np.testing.assert_array_equal(view["object_id"], view["host_object_id"])
+        present = view["object_id"] >= 0
+        np.testing.assert_array_equal(view["pose"][present], view["host_pose"][present])
+        np.testing.assert_array_equal(view["pose"][~present], np.tile([0, 0, 0, 0, 0, 0, 1], (int((~present).sum()), 1)))
+
+
+@pytest.mark.parametrize(("worlds", "batch"), [(1, 2), (4, 5)])
+def test_neither_worlds_nor_batches_change_a_view(streamed, worlds, batch):
+    with synpick_warp.stream(settings(**LAYERED), worlds=worlds, batch=batch) as stream:
+        equal(taken(stream), streamed[0])
+
+
+def test_what_is_left_out_changes_nothing_in_the_rest(streamed):
+    views, _ = streamed
+    some = taken(synpick_warp.stream(settings(**LAYERED), cameras=(2, 0), stride=3, episodes=range(1, 9), shard=(1, 8)))
+    expected = {key: dict(view) for key, view in views.items() if key[0] == 1 and key[1] != 1 and key[2] % 3 == 0}
+    # Light accumulates from frame to frame; where frames are left out, each is rendered by itself, as the first one always is.
+    for key in [key for key in expected if key[2] > 0]:
+        del some[key]["color"], expected[key]["color"]
+    equal(some, expected)
+
+
+# ---- settings ----
+
+
+def test_settings_come_from_presets_files_and_arguments(tmp_path):
+    (tmp_path / "my.toml").write_text('preset = "smoke"\n[bake]\nworlds = 3\nseed = 7\n')
+    names = ("bake.seed", "bake.worlds", "bake.device", "cameras.resolution")
+    given = dict(QUICK) | {"bake.worlds": 5}
+    for config in (tmp_path / "my.toml", synpick_warp.load_config(tmp_path / "my.toml")):
+        stream = synpick_warp.stream(config, given, worlds=2, device="cpu", resolution=(32, 18), layers=("normals",), batch=4)
+        found = [getattr(getattr(stream.config, key.partition(".")[0]), key.partition(".")[2]) for key in names]
+        assert found == [7, 2, "cpu", (32, 18)]
+        assert (stream.config.render.layers, stream.config.render.views_per_batch) == (("normals",), 4)
+        assert [camera.width for camera in stream.cameras] == [32] * 3
+        assert stream.object_names[1] == "boxes_1"
+        stream.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"settings": {"bake.world": 3}}, r"did you mean worlds"),
+        ({"worlds": -1}, r"bake\.worlds is -1 .*at least 0"),
+        ({"device": "cuda:99"}, r"cuda:99 was requested"),
+        ({"resolution": (31, -1)}, r"cameras\.resolution"),
+        ({"cameras": (3,)}, r"cameras are \[3\]; allowed: one or more of 0 to 2"),
+        ({"stride": 0}, r"stride is 0"),
+        ({"episodes": range(-2, 4)}, r"episodes are range\(-2, 4\)"),
+        ({"episodes": 0}, r"episodes are 0"),
+        ({"shard": (2, 2)}, r"shard is 2/2"),
+        ({"shard": (5, 8)}, r"shard 5/8 has no episode"),
+        ({"splits": ("train",)}, r"there is no split"),
+        ({"batch": -1}, r"render\.views_per_batch"),
+    ],
+)
+def test_a_mistake_is_one_line(arguments, message):
+    with pytest.raises(synpick_warp.SynpickError, match=message) as raised:
+        synpick_warp.stream(tiny(), **arguments)
+    assert "\n" not in str(raised.value)
+
+
+def test_splits_name_their_episodes():
+    config = synpick_warp.load_config("synpick", splits=True)
+    with pytest.raises(ConfigError, match="beside splits"):
+        synpick_warp.stream(config, device="cpu", episodes=3)
+    with pytest.raises(ConfigError, match=r"bake\.mode is set .* has its splits already"):
+        synpick_warp.stream(config, device="cpu", mode="move")
+
+
+# ---- an end at any time ----
+
+
+def held_by(stream) -> tuple[weakref.ref, ...]:
+    """What takes memory: worlds, renderer, ring."""
+    producer = stream._batches.gi_frame.f_locals["batches"].gi_frame.f_locals["self"]
+    return tuple(weakref.ref(part) for part in (producer, producer.ring, producer.stages.simulation, producer.stages.renderer))
+
+
+@pytest.mark.parametrize("end", ["break", "error", "close", "before the first"])
+def test_nothing_is_left_of_a_stream(end):
+    gc.collect()
+    gc.disable()
+    try:
+        refs = leave(end)
+        assert [ref() for ref in refs] == [None] * 4
+    finally:
+        gc.enable()
+
+
+def leave(end: str) -> tuple[weakref.ref, ...]:
+    """Open a stream and leave it; references to what it held."""
+    stream = synpick_warp.stream(tiny(bake__episodes=1), worlds=1)
+    refs = held_by(stream)
+    if end == "before the first":
+        return refs
+    with contextlib.suppress(ZeroDivisionError):
+        for batch in stream:
+            if end == "error":
+                raise ZeroDivisionError
+            if end == "break":
+                break
+            stream.close()
+            with pytest.raises(BufferError, match="expired"):
+                np.from_dlpack(batch.color)
+            assert next(stream, None) is None
+    return refs
+
+
+def test_a_batch_refuses_use_after_its_time():
+    with synpick_warp.stream(tiny(bake__episodes=1), worlds=1) as stream:
+        first = next(stream)
+        colour = np.from_dlpack(first.color)
+        assert colour.ctypes.data == first.color.numpy().ctypes.data
+        with pytest.raises(BufferError, match="without a copy"):
+            np.from_dlpack(first.color, copy=True)
+        next(stream)
+        for use in (lambda: np.from_dlpack(first.color), first.depth.numpy, first.visible_masks):
+            with pytest.raises(BufferError, match="clone what you keep"):
+                use()
+        assert first.host["frame"].tolist() == [0, 0, 0]
+    assert colour.shape == (3, 36, 64, 3)  # What was imported keeps its memory.
+
+
+def test_a_failure_while_a_batch_is_made_ends_the_stream(monkeypatch):
+    stream = synpick_warp.stream(tiny(bake__episodes=1), worlds=1)
+    next(stream)
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("Failed to allocate 1 bytes on device 'cpu'")
+
+    monkeypatch.setattr(online.TickReader, "wait", fail)
+    with pytest.raises(ConfigError, match="ran out of memory"):
+        for _ in stream:
+            pass
+    assert next(stream, None) is None
+
+
+def test_a_script_needs_no_main_guard(tmp_path):
+    """It leaves the loop early, and the process ends by itself, without children."""
+    script = tmp_path / "train.py"
+    script.write_text(
+        SCRIPT.format(settings=QUICK | {"bake.device": "cpu"})
+        + "import os\nos.execvp('ps', ['ps', '--ppid', str(os.getpid()), '--no-headers'])"
+    )
+    root = Path(__file__).resolve().parents[2]
+    environment = checkout_environment(PYTHONPATH=os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")]))
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, cwd=tmp_path, env=environment, timeout=300)
+    assert (done.stdout, done.stderr) == ("3 (3, 18, 32, 3)\n", "")
+    assert done.returncode == 1  # ps found no children.

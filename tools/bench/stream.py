@@ -1,0 +1,155 @@
+"""Benchmark of the online generator: its views per second beside those of the renderer, and of simulation and renderer, without it."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.codes import Phase
+from synpick_warp.configs.schema import Config
+from synpick_warp.episodes import BakeSummary
+from synpick_warp.online.selection import Selection
+from synpick_warp.online.stream import Producer, ViewStream
+from synpick_warp.pipeline import Factory, Stages
+from synpick_warp.progress import SilentProgress
+from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.online.batches import BatchRing, ViewBatch
+from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.sim.simulate import RECORDS
+from synpick_warp.stages.stream import TickReader, TickReport, view_sizes
+from tools.bench.physics import Row
+
+ROUNDS = 5
+"""Turns of the two loops that are compared."""
+
+
+class _StillProducer(Producer):
+    """Renders the same tick again and again."""
+
+    def __init__(self, still: TickReport, *arguments: object) -> None:
+        super().__init__(*arguments)  # type: ignore[arg-type]
+        self.still = still
+
+    def batches(self) -> Iterator[ViewBatch]:
+        while True:
+            yield from self.render(self.still, self.stages.simulation.records[0].snapshot)
+
+
+def measure_stream(config: Config, factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
+    """Benchmark of batches of one tick, and of ticks.
+
+    Args:
+        config: Settings.
+        factory: Worlds in the middle of acting, and renderer.
+        report: Report of the last tick, with the worlds that are rendered marked as live.
+        min_seconds: Time for which a measurement is repeated, at least [s].
+    """
+    device = factory.simulation.device
+    sizes, renderer, ids = view_sizes(config, device), factory.stream.renderer, factory.log.object_ids
+    stages = Stages(
+        config, factory.catalog, factory.cameras, factory.lights, factory.simulation, renderer, sizes, ids, factory.stream.lights
+    )
+    ring = BatchRing(sizes, config.render.layers, renderer, config.bop.depth_scale)
+    parts = (stages, ring, Selection().resolve(config), BakeSummary(), SilentProgress())
+    yield Row("stream", "views in a batch", ring.views, "")
+    still = ViewStream(_StillProducer(report, *parts))
+    sources = {"renderer alone": _render_loop(stages, ring, report), "stream of one tick": map(_consumer(device), still)}
+    yield from _compare(sources, device, min_seconds)
+    sources = {
+        "simulation and renderer alone": _tick_loop(stages, ring),
+        "stream of ticks": map(_consumer(device), ViewStream(Producer(*parts))),
+    }
+    yield from _compare(sources, device, min_seconds)
+
+
+def _compare(sources: dict[str, Iterator[int]], device: wp.Device, min_seconds: float) -> Iterator[Row]:
+    """Rows of the views per second of two sources, which take turns, and of the second's rate in percent of the first's.
+
+    Args:
+        sources: Name -> iterator over the numbers of views that it makes.
+        device: Device that makes them.
+        min_seconds: Time for each source, at least [s]; it should be many times that of a tick.
+    """
+    totals = {name: [0.0, 0.0] for name in sources}
+    for _ in range(ROUNDS):
+        for name, source in sources.items():
+            for index, value in enumerate(_count(source, device, min_seconds / ROUNDS)):
+                totals[name][index] += value
+    rates = {name: views / seconds for name, (views, seconds) in totals.items()}
+    if not all(rates.values()):
+        return  # All episodes have ended.
+    for name, rate in rates.items():
+        yield Row("stream", f"{name}, views", rate, "1/s")
+    (alone, own), (name, rate) = rates.items()
+    yield Row("stream", f"{name}: of {alone}", 100.0 * rate / own, "%")
+
+
+def _render_loop(stages: Stages, ring: BatchRing, report: TickReport) -> Iterator[int]:
+    """Render the views of one tick again and again into one buffer; yields the number of views of each batch."""
+    snapshot, (world, camera) = stages.simulation.records[0].snapshot, _select(stages, report)
+    while True:
+        yield from _render_all(stages, ring, snapshot, world, camera)
+
+
+def _render_all(stages: Stages, ring: BatchRing, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray) -> Iterator[int]:
+    slot = ring.slots[0]
+    for first in range(0, len(world), ring.views):
+        rows = [wp.array(values[first : first + ring.views], dtype=wp.int32, device=ring.device) for values in (world, camera)]
+        views = make_views(rows[0], rows[1], len(rows[0]), ring.instances)
+        stages.renderer.render(snapshot, views, slot.images, slot.layers)
+        yield views.count
+
+
+def _select(stages: Stages, report: TickReport) -> tuple[np.ndarray, np.ndarray]:
+    """World and camera of each view of a tick."""
+    live, cameras = np.flatnonzero(report.column("live")), len(stages.cameras)
+    return np.repeat(live, cameras).astype(np.int32), np.tile(np.arange(cameras, dtype=np.int32), len(live))
+
+
+def _consumer(device: wp.Device) -> Callable[[ViewBatch], int]:
+    """Consumer that imports colour and ids on a stream of its own; returns the number of views."""
+    stream = wp.Stream(device) if device.is_cuda else None
+
+    def consume(batch: ViewBatch) -> int:
+        with wp.ScopedStream(stream, sync_enter=False):
+            wp.from_dlpack(batch.color)
+            wp.from_dlpack(batch.instance)
+        return len(batch)
+
+    return consume
+
+
+def _count(source: Iterator[int], device: wp.Device, min_seconds: float) -> tuple[float, float]:
+    """Views that a source makes in at least `min_seconds`, and the time until the device has made them [s]; one batch goes before.
+
+    A source may end before.
+    """
+    next(source, None)
+    wp.synchronize_device(device)
+    started, views = time.perf_counter(), 0
+    for count in source:
+        views += count
+        if time.perf_counter() - started >= min_seconds:
+            break
+    wp.synchronize_device(device)
+    return views, time.perf_counter() - started
+
+
+def _tick_loop(stages: Stages, ring: BatchRing) -> Iterator[int]:
+    """Simulate and render, tick by tick as a bake does, into one buffer; yields the number of views of each batch."""
+    simulation = stages.simulation
+    readers = [TickReader(record) for record in simulation.records]
+    for tick in itertools.count(1):
+        current, following = (tick - 1) % RECORDS, tick % RECORDS
+        for record in (current, following) if tick == 1 else (following,):
+            simulation.tick(simulation.records[record])
+            readers[record].start()
+        report = readers[current].wait()
+        if (report.column("phase") == Phase.IDLE).all():
+            return
+        world, camera = _select(stages, report)
+        yield from _render_all(stages, ring, simulation.records[current].snapshot, world, camera)

@@ -1,0 +1,146 @@
+"""Train a small segmentation network from the stream, without files, and print its held-out mIoU for several amounts of data.
+
+The network names each pixel's object. For each amount it is trained anew, on views that come once; the held-out views are of other
+episodes. Needs PyTorch; the defaults are for a GPU.
+
+    python -m tools.examples.train_online --device cuda:0 --worlds 64 --models MODELS --lights LIGHTS --views 2000,8000,32000
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import math
+import time
+
+import torch  # pyright: ignore[reportMissingImports]
+from torch import nn  # pyright: ignore[reportMissingImports]
+from torch.nn import functional  # pyright: ignore[reportMissingImports]
+
+import synpick_warp
+from synpick_warp.cli.commands import parse_resolution
+from synpick_warp.configs.schema import Config
+from synpick_warp.online.dataset import FIELDS, StreamDataset
+from tools.options import configure, make_parser
+
+TRAINING, HELD_OUT = range(100_000), range(100_000, 101_000)
+"""Episodes to train on, and to measure on."""
+HELD_OUT_STRIDE = 20
+"""Every so many frames of a held-out episode one is measured on: 1.3 s apart."""
+LEARNING_RATE = 2e-3
+WARM_UP = 0.1
+"""Fraction of the training in which the learning rate rises; afterwards it falls as a cosine."""
+
+
+class Network(nn.Module):
+    """U-Net: four levels of two convolutions each, with `width` to 8 x `width` channels."""
+
+    def __init__(self, classes: int, width: int) -> None:
+        super().__init__()
+        widths = [width * factor for factor in (1, 2, 4, 8)]
+        self.down = nn.ModuleList(_convolutions(before, after) for before, after in itertools.pairwise((3, *widths)))
+        self.up = nn.ModuleList(_convolutions(low + high, high) for high, low in itertools.pairwise(widths))
+        self.head = nn.Conv2d(width, classes, 1)
+
+    def forward(self, rgb: torch.Tensor) -> torch.Tensor:
+        """Logits (B, classes, H, W) of an image (B, 3, H, W) uint8."""
+        x, skips = rgb.float().div(255).sub(0.5), []
+        for level in self.down:
+            x = level(functional.max_pool2d(x, 2) if skips else x)
+            skips.append(x)
+        for level, skip in zip(reversed(self.up), reversed(skips[:-1]), strict=True):
+            x = functional.interpolate(x, size=skip.shape[2:], mode="bilinear", align_corners=False)
+            x = level(torch.cat((x, skip), dim=1))
+        return self.head(x)
+
+
+def _convolutions(before: int, after: int) -> nn.Sequential:
+    pairs = [(nn.Conv2d(count, after, 3, padding=1, bias=False), nn.BatchNorm2d(after), nn.ReLU()) for count in (before, after)]
+    return nn.Sequential(*itertools.chain.from_iterable(pairs))
+
+
+def hold_out(config: Config, views: int) -> tuple[list[dict[str, torch.Tensor]], int]:
+    """Copies of `views` views or a few more of episodes that nobody trains on, in batches; and the number of classes, 0 for no object."""
+    batches, count = [], 0
+    with synpick_warp.stream(config, episodes=HELD_OUT, stride=HELD_OUT_STRIDE) as stream:
+        while count < views:
+            batch = next(stream)
+            batches.append({name: FIELDS[name](batch).clone() for name in ("rgb", "classes")})
+            count += len(batch)
+        return batches, 1 + max(stream.object_names)
+
+
+def train(config: Config, views: int, stride: int, classes: int, width: int, device: torch.device) -> tuple[Network, list[float]]:
+    """Train a new network on `views` views, or up to a batch more; returns it and the loss of each batch."""
+    torch.manual_seed(config.bake.seed)
+    network = Network(classes, width).to(device)
+    optimizer = torch.optim.AdamW(network.parameters(), LEARNING_RATE)
+    losses, seen = [], 0
+    dataset = StreamDataset(config, fields=("rgb", "classes"), episodes=TRAINING, stride=stride)
+    for batch in torch.utils.data.DataLoader(dataset, batch_size=None):
+        done = seen / views
+        factor = done / WARM_UP if done < WARM_UP else 0.5 + 0.5 * math.cos(math.pi * (done - WARM_UP) / (1 - WARM_UP))
+        optimizer.param_groups[0]["lr"] = LEARNING_RATE * max(factor, 0.01)
+        loss = functional.cross_entropy(network(batch["rgb"]), batch["classes"])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.detach())
+        seen += len(batch["rgb"])
+        if seen >= views:
+            break
+    return network, torch.stack(losses).tolist()
+
+
+def mean_iou(network: Network, batches: list[dict[str, torch.Tensor]], classes: int) -> float:
+    """Intersection over union of each object's pixels in all views, averaged over the objects that occur."""
+    network.eval()
+    counts = torch.zeros(classes * classes, dtype=torch.int64, device=batches[0]["rgb"].device)
+    with torch.no_grad():
+        for batch in batches:
+            pairs = batch["classes"] * classes + network(batch["rgb"]).argmax(dim=1)
+            counts += torch.bincount(pairs.flatten(), minlength=classes * classes)
+    table = counts.view(classes, classes).double().cpu()
+    union = table.sum(0) + table.sum(1) - table.diagonal()
+    occurs = table.sum(1) > 0
+    occurs[0] = False  # What is no object.
+    return float((table.diagonal() / union.clamp(min=1))[occurs].mean())
+
+
+def main(arguments: list[str] | None = None) -> list[float]:
+    """Train and measure for each amount; returns the values of mIoU."""
+    options = _parse(arguments)
+    fixed = {"bake.worlds": options.worlds, "cameras.resolution": parse_resolution(options.resolution)}
+    config = configure(options, fixed, {"bake.mode": "mixed", "render.views_per_batch": options.batch})
+    device = torch.device(options.device)
+    results = []
+    # A stream of its own: work on CUDA's default stream would wait for all that the renderer has queued.
+    with torch.cuda.stream(torch.cuda.Stream(device) if device.type == "cuda" else None):
+        batches, classes = hold_out(config, options.held_out)
+        print(f"held out: {sum(len(batch['rgb']) for batch in batches)} views, obj_id up to {classes - 1}")
+        for views in options.views:
+            started = time.perf_counter()
+            network, losses = train(config, views, options.stride, classes, options.width, device)
+            seconds = time.perf_counter() - started
+            results.append(mean_iou(network, batches, classes))
+            tail = losses[-max(1, len(losses) // 10) :]
+            print(f"{views} views in {seconds:.1f} s: cross entropy {losses[0]:.3f} to {sum(tail) / len(tail):.3f}, mIoU {results[-1]:.3f}")
+    return results
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = make_parser(__doc__, "models", "lights", "seed", "set")
+    parser.add_argument("--device", default="cuda:0", help="cpu or cuda:N (default: cuda:0)")
+    parser.add_argument("--worlds", type=int, default=64, help="worlds simulated in parallel (default: 64)")
+    parser.add_argument("--resolution", default="320x180", help="WIDTHxHEIGHT [px] (default: 320x180)")
+    parser.add_argument("--batch", type=int, default=24, help="views of a batch, at most (default: 24)")
+    parser.add_argument("--stride", type=int, default=3, help="every n-th frame is trained on (default: 3)")
+    parser.add_argument("--width", type=int, default=32, help="channels of the network's first level (default: 32)")
+    parser.add_argument("--held-out", type=int, default=600, help="views to measure on (default: 600)")
+    amounts = "views to train on, a network for each number, comma-separated (default: 2000,8000,32000)"
+    parser.add_argument("--views", type=lambda text: [int(part) for part in text.split(",")], default=[2000, 8000, 32000], help=amounts)
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    main()
