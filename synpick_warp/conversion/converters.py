@@ -19,12 +19,13 @@ from synpick_warp.conversion.source import Source, SourceEpisode
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import ExportContext
-from synpick_warp.exporters.bop import coco
+from synpick_warp.exporters.bop.coco import annotation_files as coco
+from synpick_warp.exporters.bop.coco.exporter import CocoExporter
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
-from synpick_warp.exporters.bop.shard_parts import find_shards
-from synpick_warp.exporters.bop.shards import ShardsExporter
+from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.exporters.bop.shards.tar_files import find_shards
 from synpick_warp.exporters.registry import Exporters
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -186,7 +187,7 @@ class BopConverter(_SceneConverter):
 class CocoConverter(_SceneConverter):
     """To COCO: images are copied."""
 
-    exporter = coco.CocoExporter
+    exporter = CocoExporter
 
     def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
         super().__init__(source, out, config, pool)

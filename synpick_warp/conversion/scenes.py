@@ -17,9 +17,9 @@ import numpy as np
 from synpick_warp.conversion.masks import read_masks
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, SceneShards, ViewRecords, check_planes
 from synpick_warp.errors import OutputError
-from synpick_warp.exporters.bop.coco import make_annotations, write_image
+from synpick_warp.exporters.bop.coco.annotation_files import make_annotations, write_image
 from synpick_warp.exporters.bop.scene import create_scene_folders
-from synpick_warp.exporters.bop.shard_parts import END_OF_ARCHIVE, MAX_SHARD_VIEWS, mask_json, shard_name, tar_entry, view_key
+from synpick_warp.exporters.bop.shards.tar_files import END_OF_ARCHIVE, MAX_SHARD_VIEWS, mask_json, shard_name, tar_entry, view_key
 from synpick_warp.exporters.bop.view import (
     ANNOTATIONS,
     ViewTruth,

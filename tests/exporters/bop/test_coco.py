@@ -15,7 +15,8 @@ from pycocotools.coco import COCO
 from synpick_warp.configs.schema import Split
 from synpick_warp.dataset.reading import COCO_PARTS
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.coco import CATEGORIES, IMAGES, PARTS, CocoExporter
+from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS
+from synpick_warp.exporters.bop.coco.exporter import CocoExporter
 from tests.harness.exporter_contract import ExporterContract, export, exporting, finish
 from tests.worlds.box_views import batches, cameras, config, ends
 

@@ -1,6 +1,6 @@
-"""Exporter of COCO instance segmentation: one annotation file for each split, with visible boxes, for detectors' training code.
+"""Files of the COCO format: images and annotations of a scene, as views are written, and the annotation file of each split.
 
-Beside BOP's scene_gt_coco.json, which is a file a scene with amodal boxes: here boxes enclose the visible mask, as COCO's readers expect.
+Runs in writer processes, so it imports neither Warp nor Newton.
 """
 
 from __future__ import annotations
@@ -8,34 +8,19 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import bop_folder, bop_folders
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
-from synpick_warp.exporters.bop.scene_exporter import SceneExporter
-from synpick_warp.exporters.bop.view import (
-    ANNOTATIONS,
-    Masks,
-    ViewSettings,
-    ViewTruth,
-    annotation_block,
-    encode_color,
-    extract_masks,
-    make_gt_info_entries,
-    make_rle,
-    to_json,
-)
+from synpick_warp.exporters.bop.view import ANNOTATIONS, Masks, annotation_block, make_rle, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, output_error, sync_folder, write_synced
 from synpick_warp.exporters.writing.folder import open_folder
-from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.json import MAX_JSON, decode_json, read_json
 from synpick_warp.inputs.paths import path_inside
@@ -55,70 +40,6 @@ class _Category(msgspec.Struct):
 def annotation_file(split: str) -> Path:
     """The annotations of a split's images, relative to the data set; `split`: its name in BOP, such as test_pbr."""
     return FOLDER / "annotations" / f"instances_{split}.json"
-
-
-class CocoExporter(SceneExporter):
-    """`Exporter` of COCO. A scene is a folder of images, and a part of the annotations, from which a file a split is made at the end."""
-
-    staging = "coco"
-
-    def __init__(self, context: ExportContext) -> None:
-        """See `Exporter`."""
-        super().__init__(context)
-        self._layers = ()
-
-    @staticmethod
-    def write_view(
-        color: np.ndarray,
-        depth: np.ndarray,
-        visible_source: np.ndarray,
-        amodal_source: np.ndarray,
-        scene: Path,
-        settings: ViewSettings,
-        truth: ViewTruth,
-    ) -> None:
-        """See `SceneExporter`."""
-        masks = extract_masks(visible_source, amodal_source, truth, depth.shape[0])
-        infos = make_gt_info_entries(truth)
-        annotations = make_annotations(truth.object_id.tolist(), truth.instance_id.tolist(), infos, masks, *depth.shape)
-        write_image(scene, truth.frame, settings.color_suffix, encode_color(color, settings, truth.jpeg_quality), annotations)
-
-    @staticmethod
-    def folder_name(split: str) -> str:
-        """See `SceneExporter`: one for all splits."""
-        return FOLDER.name
-
-    @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
-        """See `Exporter`."""
-        places = tuple(map(annotation_file, bop_folders(config)))
-        return SharedFiles((CATEGORIES,), places, (IMAGES, PARTS, places[0].parent, FOLDER))
-
-    @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
-        """See `Exporter`: the annotations of each split."""
-        try:
-            return write_annotation_files(out, config)
-        except OSError as error:
-            raise output_error(out / FOLDER, error) from error
-
-    def write_constants(self) -> list[Path]:
-        """See `Exporter`: the names of the objects."""
-        write_categories(self._out, {entry.obj_id: entry.name for entry in self._context.catalog.entries})
-        return [CATEGORIES]
-
-    def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: folders of images, and parts."""
-        return scene_files(self._out, [self.scene_id(episode, camera) for camera in range(len(self._cameras))])
-
-    def _stage_scene(self, scene: Path) -> None:
-        scene.mkdir()
-
-    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        raise NotImplementedError("COCO has no layers")
-
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return commit_scenes, (scenes, self._out)
 
 
 def write_categories(out: Path, names: dict[int, str]) -> None:
