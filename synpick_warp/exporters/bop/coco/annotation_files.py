@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import msgspec
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import bop_folder, bop_folders
 from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
 from synpick_warp.exporters.bop.view import ANNOTATIONS, Masks, annotation_block, make_rle, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, output_error, sync_folder, write_synced
@@ -35,6 +36,9 @@ _ADVICE = "remove it and its episode's two files in manifest/, and resume the ba
 class _Category(msgspec.Struct):
     id: int
     name: str
+    keypoints: list[str] | msgspec.UnsetType = msgspec.UNSET
+    skeleton: list[tuple[int, int]] | msgspec.UnsetType = msgspec.UNSET
+    keypoint_positions: list[tuple[float, float, float]] | msgspec.UnsetType = msgspec.UNSET
 
 
 def annotation_file(split: str) -> Path:
@@ -42,12 +46,14 @@ def annotation_file(split: str) -> Path:
     return FOLDER / "annotations" / f"instances_{split}.json"
 
 
-def write_categories(out: Path, names: dict[int, str]) -> None:
-    """Write the names of the objects, and the folders of the format."""
+def write_categories(out: Path, names: Mapping[int, str], keypoints: Mapping[int, Keypoints]) -> None:
+    """Write names and keypoints (or none) of the objects by obj_id, and the folders of the format."""
     try:
         for folder in (FOLDER, IMAGES, PARTS):
             (out / folder).mkdir(exist_ok=True)
-        categories = [{"id": index, "name": name, "supercategory": "object"} for index, name in sorted(names.items())]
+        extras = {obj_id: make_category_keys(points) for obj_id, points in keypoints.items()}
+        named = [{"id": obj_id, "name": name, "supercategory": "object"} for obj_id, name in sorted(names.items())]
+        categories = [category | extras.get(obj_id, {}) for category, obj_id in zip(named, sorted(names), strict=True)]
         (out / CATEGORIES).write_text(json.dumps(categories, indent=2) + "\n", encoding="ascii")
     except OSError as error:
         raise output_error(out / CATEGORIES, error) from error
@@ -60,23 +66,37 @@ def scene_files(out: Path, scenes: Iterable[int]) -> list[Path]:
 
 
 def make_annotations(
-    object_ids: Sequence[int], instance_ids: Sequence[int], infos: Sequence[dict[str, Any]], masks: Sequence[Masks], height: int, width: int
+    poses: Sequence[dict[str, Any]],
+    infos: Sequence[dict[str, Any]],
+    masks: Sequence[Masks],
+    height: int,
+    width: int,
+    points: Sequence[dict[str, Any]] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Annotations of a view's visible instances, without ids: box of the visible mask, its run lengths, and extras of ours."""
-    for object_id, instance_id, info, mask in zip(object_ids, instance_ids, infos, masks, strict=True):
+    """Annotations of a view's visible instances, without ids: box of the visible mask, its run lengths, extras of ours, keypoints.
+
+    Args:
+        poses: The view's entry in scene_gt.json.
+        infos: The view's entry in scene_gt_info.json.
+        masks: Masks of the instances.
+        height: Of the image [px].
+        width: Of the image [px].
+        points: Keys of keypoints by instance (`project_keypoints`); None: no keypoints.
+    """
+    for pose, info, mask, extra in zip(poses, infos, masks, points or [{} for _ in infos], strict=True):
         box = mask.visible.box()
         if box is not None:
             left, top, right, bottom = box
             yield {
-                "category_id": object_id,
+                "category_id": pose["obj_id"],
                 "bbox": [left, top, right - left + 1, bottom - top + 1],
                 "area": mask.visible.count,
                 "iscrowd": 0,
                 "segmentation": make_rle(mask.visible, height, width),
                 "bbox_amodal": info["bbox_obj"],
                 "visib_fract": info["visib_fract"],
-                "instance_id": instance_id,
-            }
+                "instance_id": pose["instance_id"],
+            } | extra
 
 
 def write_image(scene: Path, frame: int, suffix: str, data: Any, annotations: Iterable[dict[str, Any]]) -> None:

@@ -27,8 +27,9 @@ from synpick_warp.exporters.bop.coco.annotation_files import (
     write_categories,
     write_image,
 )
+from synpick_warp.exporters.bop.keypoints import project_keypoints
 from synpick_warp.exporters.bop.scene_exporter import SceneExporter
-from synpick_warp.exporters.bop.view import ViewSettings, ViewTruth, encode_color, extract_masks, make_gt_info_entries
+from synpick_warp.exporters.bop.view import ViewSettings, ViewTruth, encode_color, extract_masks, make_gt_entries, make_gt_info_entries
 from synpick_warp.exporters.writing.files import output_error
 from synpick_warp.exporters.writing.pool import WriterPool
 
@@ -55,8 +56,9 @@ class CocoExporter(SceneExporter):
     ) -> None:
         """See `SceneExporter`."""
         masks = extract_masks(visible_source, amodal_source, truth, depth.shape[0])
-        infos = make_gt_info_entries(truth)
-        annotations = make_annotations(truth.object_id.tolist(), truth.instance_id.tolist(), infos, masks, *depth.shape)
+        poses, keypoints = make_gt_entries(truth, settings.camera), settings.keypoints
+        points = project_keypoints(poses, settings.camera, depth, keypoints) if keypoints else None
+        annotations = make_annotations(poses, make_gt_info_entries(truth), masks, depth.shape[0], depth.shape[1], points)
         write_image(scene, truth.frame, settings.color_suffix, encode_color(color, settings, truth.jpeg_quality), annotations)
 
     @staticmethod
@@ -79,8 +81,8 @@ class CocoExporter(SceneExporter):
             raise output_error(out / FOLDER, error) from error
 
     def write_constants(self) -> list[Path]:
-        """See `Exporter`: the names of the objects."""
-        write_categories(self._out, {entry.obj_id: entry.name for entry in self._context.catalog.entries})
+        """See `Exporter`: names and keypoints of the objects."""
+        write_categories(self._out, {entry.obj_id: entry.name for entry in self._context.catalog.entries}, self._keypoints)
         return [CATEGORIES]
 
     def files(self, episode: int) -> list[Path]:
