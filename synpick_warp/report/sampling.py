@@ -58,7 +58,7 @@ def find_content(data_set: DataSet, view: View) -> Content:
     """Look whether a view has masks and depth: folders of its scene; shards always have depth."""
     files = data_set.scene_files(view.episode, view.camera)
     if isinstance(files, SceneFolder):
-        return Content((files.folder / "mask_visib").is_dir(), (files.folder / "depth").is_dir())
+        return Content(files.images("mask_visib").is_dir(), files.images("depth").is_dir())
     return Content(data_set.config.bop.masks, True)
 
 
