@@ -31,7 +31,6 @@ KILLS = int(os.environ.get("SYNPICK_KILLS", 20))
 WRITERS_KILLED = 0.25
 """Fraction of these kills that meet a writer."""
 EPISODES = TINY["bake.episodes"]
-SENSORS = {"bop.layout": "multisensor", "bop.keypoints": 4, "bake.formats": ["bop"], "bake.episodes": 2}
 PAGE = os.sysconf("SC_PAGE_SIZE")
 FILES_OF_THE_MANIFEST = 2 + 2 * (EPISODES + 2)
 """Settings, manifest and records have no checksum of their own."""
@@ -112,14 +111,6 @@ def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected
     assert digests(out) == expected
 
 
-@pytest.fixture(scope="module")
-def sensors(server, tmp_path_factory) -> tuple[Path, int]:
-    """An undisturbed bake of the layout of several sensors, and its number of changes."""
-    folder = tmp_path_factory.mktemp("sensors")
-    assert server.bake(folder / "set", settings=SENSORS, alone=True, count=str(folder / "count")) == 0
-    return folder / "set", int((folder / "count").read_text())
-
-
 @pytest.fixture
 def splits(tmp_path) -> str:
     """Settings with the episodes of `whole` in two splits."""
@@ -176,24 +167,6 @@ def test_parts_of_splits_are_merged(server, splits, tmp_path):
     assert server.bake(tmp_path / "once", config=splits, settings={"bake.formats": ["bop"]}) == 0
     assert merge(parts, tmp_path / "merged").missing == []
     assert digests(tmp_path / "merged") == digests(tmp_path / "once")
-
-
-@pytest.mark.parametrize("share", [0.3, 0.5, 0.7])
-def test_scenes_of_several_sensors_are_whole_after_kills(server, sensors, tmp_path, share):
-    """A scene brings the files of all cameras together by many renames, some of which a kill prevents."""
-    once, changes = sensors
-    out = tmp_path / "set"
-    assert server.bake(out, settings=SENSORS, alone=True, kill_at=round(share * changes)) == -signal.SIGKILL
-    assert server.bake(out, settings=SENSORS) == 0
-    assert digests(out) == digests(once)
-
-
-def test_parts_of_several_sensors_are_merged(server, sensors, tmp_path):
-    parts = [tmp_path / str(part) for part in range(2)]
-    for part, folder in enumerate(parts):
-        assert server.bake(folder, settings=SENSORS, arguments=["--shard", f"{part}/2"]) == 0
-    assert merge(parts, tmp_path / "merged").missing == []
-    assert digests(tmp_path / "merged") == digests(sensors[0])
 
 
 def test_a_bake_of_other_settings_is_refused_and_says_which(server, whole, expected, tmp_path):
