@@ -51,15 +51,18 @@ class Content:
     """Images that the data set has beside colour."""
 
     masks: bool
+    """Visible masks."""
+    amodal: bool
     depth: bool
 
 
 def find_content(data_set: DataSet, view: View) -> Content:
-    """Look whether a view has masks and depth: folders of its scene; shards always have depth."""
+    """Look whether a view has masks of both kinds and depth: folders of its scene; shards always have depth."""
     files = data_set.scene_files(view.episode, view.camera)
     if isinstance(files, SceneFolder):
-        return Content(files.images("mask_visib").is_dir(), files.images("depth").is_dir())
-    return Content(data_set.config.bop.masks, True)
+        visible, amodal, depth = (files.images(name).is_dir() for name in ("mask_visib", "mask", "depth"))
+        return Content(visible, amodal, depth)
+    return Content(data_set.config.bop.masks, data_set.config.bop.masks, True)
 
 
 def spread(items: Sequence[int], count: int) -> list[int]:
