@@ -42,7 +42,7 @@ def decode_layer(name: str, image: np.ndarray) -> np.ndarray:
     return CODECS[LAYER_TABLE[name].encoding].decode(image)
 
 
-def read_layer(scene: Path, name: str, frame: int, size: tuple[int, int] | None = None) -> np.ndarray:
+def read_layer(scene: Path, name: str, frame: int, size: tuple[int, int] | None = None, sensor: str = "") -> np.ndarray:
     """Read a layer of one image of a BOP scene; the values are those of `decode_layer`.
 
     Args:
@@ -50,13 +50,14 @@ def read_layer(scene: Path, name: str, frame: int, size: tuple[int, int] | None 
         name: Name of the layer.
         frame: Index of the image.
         size: Width and height that it must have [px]; None: any.
+        sensor: Suffix of the folders of one sensor, such as "_cam1"; empty: classic layout.
 
     Raises:
         DatasetError: There is no such layer or file, or the file is no image of this layer and size.
     """
     if name not in LAYER_TABLE:
         raise DatasetError(f"there is no layer {name}; layers: {', '.join(LAYER_TABLE)}")
-    path = layer_path(scene, name, frame)
+    path = layer_path(scene, f"{name}{sensor}", frame)
     if not path.exists():
         raise DatasetError(f"there is no {path}; bake with render.layers naming {name}")
     dtype, channels = image_format(name)

@@ -36,6 +36,7 @@ from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.scheduling.devices import Share, bake_on_devices
+from synpick_warp.scheduling.meter import ThroughputMeter
 from synpick_warp.scheduling.order import order_longest_first
 from synpick_warp.scheduling.sizes import count_writers, fit_to_device
 from synpick_warp.scheduling.worker import BakeLink
@@ -297,7 +298,7 @@ class _Run:
         self.stop = stop
         self.config, self.factory, self.exporters = config, factory, exporters
         self.commit, self.summary, self.progress = commit, summary, progress
-        self.meter = _Meter(config, summary, progress)
+        self.meter = ThroughputMeter(config, summary, progress)
         device = factory.simulation.device
         self.physics_stream = wp.Stream(device, priority=HIGH_PRIORITY) if device.is_cuda else None
 
@@ -374,35 +375,3 @@ class _Run:
         else:
             self.summary.take_episode(row, record)
             self.exporters.end_episode(end, partial(self.commit, end))
-
-
-class _Meter:
-    """Throughput and remaining time, reported to the observer."""
-
-    def __init__(self, config: Config, summary: BakeSummary, progress: Progress) -> None:
-        self.summary, self.progress = summary, progress
-        self.started: float | None = None
-        self.cameras = len(config.cameras.positions)
-
-    def show(self, active: int) -> None:
-        """Report after a tick in which `active` worlds were busy. Time counts from the first view, when all kernels are compiled."""
-        summary, now = self.summary, time.perf_counter()
-        if self.started is None and summary.views:
-            self.started = now
-        elapsed = now - self.started if self.started is not None else 0.0
-        done = [row for row in summary.episodes if row.ending.delivers]
-        left = None
-        if len(summary.episodes) > summary.resumed and elapsed > 0.0 and done and summary.views:
-            # Short episodes end first: running ones can already be longer than the mean of the ended ones.
-            running = summary.views / self.cameras / (len(summary.episodes) - summary.resumed + active)
-            frames = max(sum(row.frames for row in done) / len(done), running)
-            fraction = summary.views / ((summary.total - summary.resumed) * self.cameras * frames)
-            left = (1.0 / fraction - 1.0) * elapsed if fraction < 1.0 else None
-        self.progress.update(
-            episodes_done=len(summary.episodes),
-            episodes=summary.total,
-            worlds_active=active,
-            views=summary.views,
-            views_per_s=summary.views / elapsed if elapsed > 0.0 else 0.0,
-            seconds_left=left,
-        )

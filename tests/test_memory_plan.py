@@ -64,7 +64,7 @@ CAMERAS = {"cameras__positions": [[0.0, 0.0, 2.0]] * 1000, "cameras__ups": [[0.0
         ),
         (
             {"cameras__resolution": [8192, 8192], "bake__worlds": 65536, "bake__mode": "pick"},
-            "Newton's contacts",
+            "light averaged over frames",
             "lower bake.worlds (65536)",
         ),
         (

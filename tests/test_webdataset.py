@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.shards import ShardsExporter
+from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.layer_codec import decode_layer, encode_layer
 from synpick_warp.webdataset import decode_view
 from tests.harness.exporter_contract import export

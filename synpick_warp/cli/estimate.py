@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -90,12 +91,14 @@ def run_method(
     from synpick_warp.estimation.run import list_targets, read_scenes, run_estimation
     from synpick_warp.estimation.selection import plan_scenes
     from synpick_warp.evaluation.results import write_results
-    from synpick_warp.evaluation.targets import encode_targets
+    from synpick_warp.evaluation.targets import encode_targets, in_layout
     from synpick_warp.exporters.writing.files import output_error, write_atomically
 
     data_set = open_data_set(data)
     if split is not None:
         data_set = data_set.split(split)
+    if selection.targets is not None:
+        selection = replace(selection, targets=selection.targets.in_classic_layout(data_set.config))
     plans, complete = plan_scenes(data_set, selection)
     processes = open_pool(options.threads, sum(len(plan.frames) for plan in plans))
     with processes or nullcontext() as pool, ViewCounter(make_console()) as counter:
@@ -108,7 +111,7 @@ def run_method(
     listed = None if complete and split is None else targets_file(out)
     if listed is not None:
         try:
-            write_atomically(listed, encode_targets(list_targets(scenes)))
+            write_atomically(listed, encode_targets(in_layout(list_targets(scenes), data_set.config)))
         except OSError as error:
             raise output_error(listed, error) from error
     write_results(out, run.poses)

@@ -13,6 +13,7 @@ from cyclopts import Parameter
 
 from synpick_warp.cli.options import WholeNumber
 from synpick_warp.configs.check import escape, format_value
+from synpick_warp.configs.schema import MULTISENSOR
 from synpick_warp.configs.splits import bop_folders, split_kind
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 
@@ -29,6 +30,8 @@ FILTER = "ema"
 MAX_FAILURES = 12
 """Objects on a sheet of failures."""
 _MAX_VERTICES = 10**7
+_FIRST_SENSOR = "awk -F, -v OFS=, 'NR == 1 || $1 %% %d == 0 { if (NR > 1) $1 /= %d; print }'"
+"""Command that keeps results of the first of several sensors, and replaces a camera's scene id by the episode's."""
 _TRACK = re.compile(r"([0-9]{1,9}):([0-9]{1,9})")
 
 
@@ -150,7 +153,7 @@ def make_table(
     for file in files:
         check_results(file, truth, known)
     if targets is not None:
-        truth = select_targets(truth, read_targets(targets))
+        truth = select_targets(truth, read_targets(targets).in_classic_layout(data_set.config))
     if not (truth.visibility >= visib_min).any():
         raise ConfigError(f"--visib-min is {visib_min:g}; no instance of {data_set.folder} is as visible as that; lower it")
     methods = make_methods(results, files, alpha)
@@ -295,7 +298,11 @@ def method_names(results: Sequence[Path]) -> list[str]:
 
 
 def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
-    """Command that computes BOP's scores (VSD, MSSD, MSPD), with comments about names that the toolkit needs otherwise."""
+    """Command that computes BOP's scores (VSD, MSSD, MSPD), with comments about names that the toolkit needs otherwise.
+
+    For several sensors, results of the first one get the data set's scene ids, and VSD, which the toolkit does not compute, is left out.
+    """
+    cameras = len(data_set.config.cameras.positions) if data_set.config.bop.layout == MULTISENSOR else 0
     folder = data_set.folder.absolute()
     name = re.sub("[^A-Za-z0-9]", "", folder.name).lower() or "synpick"
     folders = bop_folders(data_set.config)
@@ -308,17 +315,18 @@ def toolkit_command(data_set: DataSet, results: Sequence[Path]) -> str:
     files: list[str] = []
     for path in results:
         file = path.name if path.absolute().parent == place else str(path.absolute())
-        if not re.fullmatch(rf"[^_.-]+_{re.escape(ending)}(_[^.]*)?\.csv", path.name):
+        if cameras or not re.fullmatch(rf"[^_.-]+_{re.escape(ending)}(_[^.]*)?\.csv", path.name):
             method = re.sub("[^A-Za-z0-9]", "", path.stem) or "method"
             file = f"{method}_{ending}.csv"
             while file in files:
                 method += "B"
                 file = f"{method}_{ending}.csv"
-            lines.append(f"cp {shlex.quote(str(path.absolute()))} {shlex.quote(str(place / file))}")
+            source, target = shlex.quote(str(path.absolute())), shlex.quote(str(place / file))
+            lines.append(f"{_FIRST_SENSOR % (cameras, cameras)} {source} > {target}" if cameras else f"cp {source} {target}")
         files.append(file)
-    where = shlex.quote(str(place))
+    where, year = shlex.quote(str(place)), "24" if cameras else "19"
     lines.append(
-        f"BOP_PATH={shlex.quote(str(folder.parent))} python scripts/eval_bop19_pose.py --results_path={where} --eval_path={where}"
-        f" --result_filenames={shlex.quote(','.join(files))} --targets_filename=test_targets_bop19.json"
+        f"BOP_PATH={shlex.quote(str(folder.parent))} python scripts/eval_bop{year}_pose.py --results_path={where} --eval_path={where}"
+        f" --result_filenames={shlex.quote(','.join(files))} --targets_filename=test_targets_bop{year}.json"
     )
     return "\n".join(map(escape, lines))

@@ -5,6 +5,7 @@ A converter commits an episode as its exporter does: staged in `PARTIAL`, rename
 
 from __future__ import annotations
 
+import functools
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
@@ -19,12 +20,14 @@ from synpick_warp.conversion.source import Source, SourceEpisode
 from synpick_warp.dataset.object_names import object_names
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.base import ExportContext
-from synpick_warp.exporters.bop import coco
+from synpick_warp.exporters.bop.coco import annotation_files as coco
+from synpick_warp.exporters.bop.coco.exporter import CocoExporter
 from synpick_warp.exporters.bop.exporter import BopExporter
+from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys, sample_keypoints
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
-from synpick_warp.exporters.bop.shard_parts import find_shards
-from synpick_warp.exporters.bop.shards import ShardsExporter
+from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
+from synpick_warp.exporters.bop.shards.tar_files import find_shards
 from synpick_warp.exporters.registry import Exporters
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -96,7 +99,11 @@ class _SceneConverter(Converter):
         super().__init__(source, out, config, pool)
         self.require_images()
         bop = config.bop
-        self.content = SceneContent(bop.masks, bop.coco, config.render.layers)
+        self.content = SceneContent(bop.masks, bop.coco, config.render.layers, self.sample_keypoints())
+
+    def sample_keypoints(self) -> dict[int, Keypoints]:
+        """Keypoints that the format's annotations have, by obj_id: those of the bake, from the vertices of its objects."""
+        return {}
 
     exporter: ClassVar[type[SceneExporter]]
     """The format's exporter, which names the folders of scenes."""
@@ -145,6 +152,13 @@ class ShardsConverter(_SceneConverter):
         self.submit_all(tasks, lambda: self.pool.submit(place_shards, (), arguments, path=split, on_done=on_committed))
 
 
+def _sample_keypoints(source: Source) -> dict[int, Keypoints]:
+    """Keypoints of the objects, by obj_id. Objects are loaded again, since model files are rounded to millimetres in single precision."""
+    count = source.config.bop.keypoints
+    entries = load_assets(source)[0].entries if count else ()
+    return {entry.obj_id: sample_keypoints(entry.mesh.vertices, count) for entry in entries}
+
+
 def _read_names(source: Source) -> dict[int, str]:
     """Names of the objects (obj_id -> name) from the store; without one from models and settings, where some may have none."""
     data = source.data
@@ -163,8 +177,13 @@ class BopConverter(_SceneConverter):
         super().__init__(source, out, config, pool)
         if config.bop.coco and not config.bop.masks:
             raise DatasetError(f"{source.folder} has no masks, which bop.coco needs; bake it with bop.masks = true")
-        names = sorted(_read_names(source).items())
-        self._categories = tuple({"id": obj_id, "name": name, "supercategory": "synpick"} for obj_id, name in names)
+        names = {obj_id: {"id": obj_id, "name": name, "supercategory": "synpick"} for obj_id, name in sorted(_read_names(source).items())}
+        points = {obj_id: make_category_keys(keypoints) for obj_id, keypoints in self.content.keypoints.items()}
+        self._categories = tuple(category | points.get(obj_id, {}) for obj_id, category in names.items())
+
+    def sample_keypoints(self) -> dict[int, Keypoints]:
+        """See base class."""
+        return _sample_keypoints(self.source) if self.config.bop.coco else {}
 
     def files(self, episode: int) -> list[Path]:
         """See `Exporter`."""
@@ -186,16 +205,20 @@ class BopConverter(_SceneConverter):
 class CocoConverter(_SceneConverter):
     """To COCO: images are copied."""
 
-    exporter = coco.CocoExporter
+    exporter = CocoExporter
 
     def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
         super().__init__(source, out, config, pool)
         if not config.bop.masks:
             raise DatasetError(f"{source.folder} has no masks, which COCO needs; bake it with bop.masks = true")
 
+    def sample_keypoints(self) -> dict[int, Keypoints]:
+        """See base class."""
+        return _sample_keypoints(self.source)
+
     def write_constants(self) -> list[Path]:
         """See base class."""
-        coco.write_categories(self.out, _read_names(self.source))
+        coco.write_categories(self.out, _read_names(self.source), self.content.keypoints)
         return [coco.CATEGORIES]
 
     def files(self, episode: int) -> list[Path]:
@@ -207,7 +230,7 @@ class CocoConverter(_SceneConverter):
         folder = self.stage("coco", episode)
         scenes = episode.scenes()
         staged = tuple((folder / f"{scene.scene:06d}", scene.scene) for scene in scenes)
-        tasks = [(write_coco, (scene, place), place) for scene, (place, _) in zip(scenes, staged, strict=True)]
+        tasks = [(write_coco, (scene, self.content, place), place) for scene, (place, _) in zip(scenes, staged, strict=True)]
         arguments = (staged, self.out)
         self.submit_all(tasks, lambda: self.pool.submit(coco.commit_scenes, (), arguments, path=folder, on_done=on_committed))
 
@@ -275,6 +298,7 @@ class LerobotConverter(Converter):
         self.submit_all(tasks, lambda: self.pool.submit(commit_episode, (), arguments, path=place, on_done=on_committed))
 
 
+@functools.lru_cache(maxsize=1)
 def load_assets(source: Source) -> tuple[Catalog, tuple[EnvironmentMap, ...]]:
     """Load the objects and lights of a data set again.
 
@@ -342,8 +366,6 @@ def check_formats(names: Sequence[str], config: Config, folder: Path) -> None:
     """
     if config.bop.layout != CLASSIC:
         raise ConfigError(f'{folder} has bop.layout = "{config.bop.layout}", which convert does not read; bake the other formats')
-    if config.bop.keypoints and "bop" in names:
-        raise ConfigError(f"{folder} has bop.keypoints = {config.bop.keypoints}, which convert does not write; bake the format bop")
     for name in names:
         if name not in CONVERTERS:
             why = "; no other format has the physics of zarr" if name == "zarr" else ""

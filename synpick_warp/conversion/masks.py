@@ -55,14 +55,3 @@ def _read_runs(files: SceneFolder, name: str, frame: int, index: int, box: list[
 
 def _find_runs(mask: np.ndarray, top: int = 0, left: int = 0) -> Runs:
     return find_run_boundaries(mask.astype(np.uint8), top, left).runs_of(1)
-
-
-def has_masks(files: SceneFiles, frame: int) -> bool:
-    """Whether a scene has masks."""
-    if isinstance(files, SceneFolder):
-        return (files.folder / "mask").is_dir()
-    try:
-        files.masks("mask", frame, 0)
-    except DatasetError:
-        return False
-    return True

@@ -7,19 +7,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from synpick_warp.conversion.masks import read_masks
 from synpick_warp.dataset.view_files import SceneFiles, SceneFolder, SceneShards, ViewRecords, check_planes
-from synpick_warp.errors import OutputError
-from synpick_warp.exporters.bop.coco import make_annotations, write_image
+from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.exporters.bop.coco.annotation_files import make_annotations, write_image
+from synpick_warp.exporters.bop.keypoints import Keypoints, project_keypoints
 from synpick_warp.exporters.bop.scene import create_scene_folders
-from synpick_warp.exporters.bop.shard_parts import END_OF_ARCHIVE, MAX_SHARD_VIEWS, mask_json, shard_name, tar_entry, view_key
+from synpick_warp.exporters.bop.shards.tar_files import END_OF_ARCHIVE, MAX_SHARD_VIEWS, mask_json, shard_name, tar_entry, view_key
 from synpick_warp.exporters.bop.view import (
     ANNOTATIONS,
     ViewTruth,
@@ -56,6 +57,8 @@ class SceneContent:
     masks: bool
     coco: bool
     layers: tuple[str, ...]
+    keypoints: dict[int, Keypoints] = field(default_factory=dict)
+    """Keypoints in COCO annotations, by obj_id; empty: none."""
 
 
 def write_shards(source: SceneSource, content: SceneContent, staging: Path) -> None:
@@ -113,8 +116,19 @@ def write_scene(source: SceneSource, content: SceneContent, staging: Path) -> No
                     folder.write(f"mask_visib/{frame:06d}_{index:06d}.png", visible)
             entries: list[object] = [records.camera, records.gt, records.gt_info]
             if content.coco:
-                entries += make_coco_annotations(_make_truth(source, frame, records), records.gt_info, masks, height, width)
+                truth, points = _make_truth(source, frame, records), _project_keypoints(files, frame, records, content)
+                entries += make_coco_annotations(truth, records.gt_info, masks, height, width, points)
             folder.append(ANNOTATIONS, annotation_block(frame, map(to_json, entries)))
+
+
+def _project_keypoints(files: SceneFiles, frame: int, records: ViewRecords, content: SceneContent) -> list[dict[str, Any]] | None:
+    """Keys of keypoints in the annotations of a view's instances; None: there are none."""
+    if not content.keypoints:
+        return None
+    if unknown := {row["obj_id"] for row in records.gt} - content.keypoints.keys():
+        raise DatasetError(f"image {frame} in {files.place} has obj_id {min(unknown)}, which is none of the bake's objects")
+    depth = check_planes(files.image("depth", frame), None, f"depth of image {frame} in {files.place}", "uint16")
+    return project_keypoints(records.gt, records.camera, depth, content.keypoints)
 
 
 def _make_truth(source: SceneSource, frame: int, records: ViewRecords) -> ViewTruth:
@@ -138,7 +152,7 @@ def write_video_group(source: SceneSource, first: int, rate: Fraction, path: Pat
     write_group(planes, levels, rate, path)
 
 
-def write_coco(source: SceneSource, staging: Path) -> None:
+def write_coco(source: SceneSource, content: SceneContent, staging: Path) -> None:
     """Task: write the images and annotations of a COCO scene to a staging folder, which it creates."""
     files = source.open()
     staging.mkdir()
@@ -147,8 +161,8 @@ def write_coco(source: SceneSource, staging: Path) -> None:
         suffix, data = files.image_file("rgb", frame)
         records = files.records(frame)
         masks = read_masks(files, frame, records.gt_info, source.size)
-        object_ids, instance_ids = ([row[key] for row in records.gt] for key in ("obj_id", "instance_id"))
-        write_image(staging, frame, suffix, data, make_annotations(object_ids, instance_ids, records.gt_info, masks, height, width))
+        points = _project_keypoints(files, frame, records, content)
+        write_image(staging, frame, suffix, data, make_annotations(records.gt, records.gt_info, masks, height, width, points))
 
 
 def place_shards(scenes: tuple[tuple[Path, int], ...], split: Path, frames: int) -> None:

@@ -42,7 +42,7 @@ class SceneIndex:
             DatasetError: The data set has no images of it.
         """
         from synpick_warp.dataset.view_files import SceneFolder, SceneShards
-        from synpick_warp.exporters.bop.shard_parts import find_shards
+        from synpick_warp.exporters.bop.shards.tar_files import find_shards
 
         size = self._config.cameras.resolution
         folder, web = self._folders[bop_folder(self._config, episode)]

@@ -27,11 +27,11 @@ from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 
 EXPORTERS = {
     "bop": ("bop.exporter", "BopExporter"),
-    "shards": ("bop.shards", "ShardsExporter"),
+    "shards": ("bop.shards.exporter", "ShardsExporter"),
     "usd": ("usd.exporter", "UsdExporter"),
     "zarr": ("trajectory.exporter", "TrajectoryExporter"),
     "lerobot": ("lerobot.exporter", "LerobotExporter"),
-    "coco": ("bop.coco", "CocoExporter"),
+    "coco": ("bop.coco.exporter", "CocoExporter"),
 }
 """Format -> (module in this package, class in it). Modules are imported when their format is used."""
 

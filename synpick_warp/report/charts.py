@@ -102,7 +102,7 @@ def _stack(rows: Rows, category: str, value: str, order: Sequence[str], titles: 
     }
 
 
-_COUNT_AXIS: Spec = {"tickCount": 6, "labelExpr": "datum.value == floor(datum.value) ? datum.label : ''"}
+_COUNT_AXIS: Spec = {"tickCount": 6, "labelExpr": "datum.value == floor(datum.value) ? format(datum.value, ',d') : ''"}
 """Axis of counts: fractions between them have no label."""
 _LEGEND: Spec = {"name": "chosen", "select": {"type": "point", "fields": ["mode"]}, "bind": "legend"}
 """A click on a mode in the legend chooses it."""
@@ -113,7 +113,7 @@ def _mode_color(rows: Rows) -> Spec:
     """Colour by mode, in a fixed order, so that a mode has one colour in all plots; the page sets the range `category`."""
     present = {row["mode"] for row in rows}
     domain = [*MODES, *sorted(present - set(MODES))]
-    legend = None if len(present) < 2 else {"orient": "top", "offset": 16, "values": [mode for mode in domain if mode in present]}
+    legend = None if len(present) < 2 else {"orient": "top", "offset": 22, "values": [mode for mode in domain if mode in present]}
     return _field("mode", "nominal", None, scale={"domain": domain}, legend=legend)
 
 

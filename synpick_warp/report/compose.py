@@ -111,7 +111,7 @@ def take_samples(data_set: DataSet, statistics: Statistics, episodes: Episodes, 
         return Samples(data, [], asked)
     names = {each.object_id: each.name for each in statistics.objects}
     views = sample_views(data_set, episodes, frames)
-    content = find_content(data_set, views[0]) if views else Content(False, False)
+    content = find_content(data_set, views[0]) if views else Content(False, False, False)
     asked["frames"] = len(views)
     for done, view in enumerate(views):
         report("frames", done, len(views))

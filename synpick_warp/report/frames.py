@@ -1,4 +1,4 @@
-"""Sampled frames for a page: colour, visible masks as ids, boxes, depth and layers, with a line per instance."""
+"""Sampled frames for a page: colour, visible and amodal masks as ids, boxes, depth and layers, with a line per instance."""
 
 from __future__ import annotations
 
@@ -40,6 +40,9 @@ def make_frame(view: View, content: Content, names: Mapping[int, str], mode: str
     ids = _instance_ids(view, content, color.shape[:2])
     if ids is not None:
         panels.append(("ids", "visible masks", encode_ids(shrink(ids, WIDTH, smooth=False))))
+        if content.amodal:
+            planes = [shrink(plane, WIDTH, smooth=False) for plane in _amodal_planes(view, color.shape[:2])]
+            panels.append(("amodal", "amodal masks", encode_ids(np.concatenate(planes))))
     if content.depth:
         depth = view.depth * MILLIMETERS
         colored = color_depth(depth)
@@ -93,6 +96,20 @@ def _instance_ids(view: View, content: Content, size: tuple[int, ...]) -> np.nda
     for index, mask in enumerate(view.masks[:MAX_IDS]):
         ids[mask] = index + 1
     return ids
+
+
+def _amodal_planes(view: View, size: tuple[int, ...]) -> list[np.ndarray]:
+    """Index + 1 of the instance whose silhouette covers each pixel (H, W) uint8; 0: none.
+
+    Silhouettes overlap, so there are planes: each instance is in the first one where it overlaps no other (greedy colouring).
+    """
+    planes = [np.zeros(size, np.uint8)]
+    for index, mask in enumerate(view.amodal_masks[:MAX_IDS]):
+        plane = next((plane for plane in planes if not plane[mask].any()), None)
+        if plane is None:
+            planes.append(plane := np.zeros(size, np.uint8))
+        plane[mask] = index + 1
+    return planes
 
 
 def _light(view: View) -> str:

@@ -12,15 +12,13 @@ from synpick_warp.dataset.manifest import episode_entry
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.dataset.view_files import SceneFolder
+from synpick_warp.low_discrepancy import r2_points
 from synpick_warp.statistics.records import EpisodeFacts
 
 MAX_EPISODES = 2000
 """Maximum number of episodes whose manifest entry is read; larger data sets are sampled at equal steps."""
 SURVEY_VIEWS = 48
 """Number of views whose brightness is measured."""
-_STEPS = (0.7548776662466927, 0.5698402909980532)
-"""Steps of frame and camera: 1 / p and 1 / p² of the plastic number p, whose multiples modulo 1 fill the unit square evenly for any
-count (Roberts, The unreasonable effectiveness of quasirandom sequences, 2018)."""
 _WEIGHTS = np.array((0.2126, 0.7152, 0.0722), np.float32)
 """Luma of red, green and blue (Rec. 709)."""
 
@@ -53,15 +51,18 @@ class Content:
     """Images that the data set has beside colour."""
 
     masks: bool
+    """Visible masks."""
+    amodal: bool
     depth: bool
 
 
 def find_content(data_set: DataSet, view: View) -> Content:
-    """Look whether a view has masks and depth: folders of its scene; shards always have depth."""
+    """Look whether a view has masks of both kinds and depth: folders of its scene; shards always have depth."""
     files = data_set.scene_files(view.episode, view.camera)
     if isinstance(files, SceneFolder):
-        return Content((files.folder / "mask_visib").is_dir(), (files.folder / "depth").is_dir())
-    return Content(data_set.config.bop.masks, True)
+        visible, amodal, depth = (files.images(name).is_dir() for name in ("mask_visib", "mask", "depth"))
+        return Content(visible, amodal, depth)
+    return Content(data_set.config.bop.masks, data_set.config.bop.masks, True)
 
 
 def spread(items: Sequence[int], count: int) -> list[int]:
@@ -95,10 +96,10 @@ def sample_views(data_set: DataSet, episodes: Episodes, count: int) -> list[View
     """
     indices = [index for index, row in episodes.rows.items() if row.frames]
     cameras, keys = data_set.camera_count, set()
-    for number in range(count if indices else 0):
+    places = r2_points(np.arange(count if indices else 0), start=0.5).tolist()
+    for number, (time, place) in enumerate(places):
         index = indices[number * len(indices) // count]
         frames = episodes.rows[index].frames
-        time, place = ((0.5 + number * step) % 1.0 for step in _STEPS)
         first = int(time * frames) * cameras + int(place * cameras)
         views = (divmod((first + step) % (frames * cameras), cameras) for step in range(min(count, frames * cameras)))
         keys.update(next(([(index, *view)] for view in views if (index, *view) not in keys), []))

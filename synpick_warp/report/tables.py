@@ -84,7 +84,7 @@ def settings_tables(config: Config, versions: Mapping[str, str]) -> Html:
     """Settings that differ from the default preset with their meaning, versions, and all settings as TOML."""
     rows = changed_settings(config)
     if rows:
-        changed = plain_table(("setting", "here", "default", "meaning"), rows, ("", "wide", "wide", ""))
+        changed = plain_table(("setting", "here", "default", "meaning"), rows, ("", "wide", "wide", "meaning"))
     else:
         changed = element("p", "All settings are those of the preset synpick.", class_="empty")
     parts = [element("div", changed, class_="scroll")]

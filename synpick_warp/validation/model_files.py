@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull, QhullError
 from synpick_warp.dataset.annotations import ContinuousSymmetry, Length, Matrix4
 from synpick_warp.errors import CatalogError, DatasetError
 from synpick_warp.inputs.json import decode_json
+from synpick_warp.low_discrepancy import sample_triangles
 from synpick_warp.scenes.assets.asset_files import MAX_MESH_FILE
 from synpick_warp.scenes.assets.meshes import read_mesh
 from synpick_warp.scenes.assets.models_info import MAX_INFO
@@ -138,16 +139,11 @@ def diameter(points: np.ndarray) -> float:
 
 
 def sample_area(vertices: np.ndarray, faces: np.ndarray, count: int) -> np.ndarray:
-    """Sample points of a surface (N, 3), evenly by area: golden-ratio sequence over the cumulative area, R2 sequence in the triangle."""
+    """Sample points of a surface (N, 3), evenly by area; see `sample_triangles`."""
     corners = vertices[faces].astype(np.float64)
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    cumulative = np.cumsum(area)
-    index = np.arange(1, count + 1)
-    face = np.searchsorted(cumulative, np.mod(index * (np.sqrt(5.0) - 1.0) / 2.0, 1.0) * cumulative[-1], side="right")
-    u, v = np.mod(index[:, None] / 1.324717957244746 ** np.array([1.0, 2.0]), 1.0).T
-    fold = u + v > 1.0
-    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
-    return np.einsum("sk,skc->sc", np.stack([1.0 - u - v, u, v], axis=1), corners[np.minimum(face, len(faces) - 1)])
+    face, weights = sample_triangles(area, count)
+    return np.einsum("sk,skc->sc", weights, corners[face])
 
 
 def turn_about(axis: Sequence[float], offset: Sequence[float], angle: float) -> np.ndarray:

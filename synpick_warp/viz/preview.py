@@ -5,11 +5,12 @@ from __future__ import annotations
 import colorsys
 import itertools
 import os
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -32,6 +33,8 @@ _GAP = 4
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 _GOLDEN = 0.6180339887498949
 """Golden ratio conjugate (√5 - 1) / 2: multiples modulo 1 are a low-discrepancy sequence for any count."""
+_SENSOR = re.compile(r"(_[A-Za-z0-9_]+)?")
+"""Suffix of a sensor's files; empty: classic layout."""
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _DEPTH_RANGE = (1.0, 99.0)
 """Percentiles of the depths that map to the first and the last colour."""
@@ -40,9 +43,25 @@ Image = np.ndarray
 """(H, W, 3) uint8, blue first, OpenCV's order."""
 
 
+class Scene(NamedTuple):
+    """A scene as one camera sees it: a folder, or with several sensors the files of one of them."""
+
+    folder: Path
+    sensor: str = ""
+    """Suffix of the sensor's folders and files, such as "_cam1"; empty: classic layout."""
+
+    def images(self, name: str) -> Path:
+        """Folder of one kind of images, such as "rgb"."""
+        return self.folder / f"{name}{self.sensor}"
+
+    def annotations(self) -> Path:
+        """File of the cameras."""
+        return self.folder / f"scene_camera{self.sensor}.json"
+
+
 @dataclass(frozen=True)
 class _View:
-    scene: Path
+    scene: Scene
     frame: int
     depth_scale: float
     """[mm]"""
@@ -109,23 +128,22 @@ def write_picture(out: Path, picture: Image) -> Path:
     return out
 
 
-def find_scenes(dataset: Path) -> list[Path]:
-    """Find the folders of all scenes of a data set, sorted.
+def find_scenes(dataset: Path) -> list[Scene]:
+    """Find the scenes of a data set, of each sensor, sorted.
 
     Raises:
         DatasetError: There is none.
     """
     if not dataset.is_dir():
         raise DatasetError(f"there is no folder {dataset}; name the folder of a BOP data set")
-    scenes = sorted(path.parent for path in dataset.glob("*/*/scene_camera.json") if path.parent.name.isdecimal())
-    if not scenes and any(dataset.glob("*/*/scene_camera_*.json")):
-        raise DatasetError(f"{dataset} has scenes of several sensors, which are not drawn; synpick_warp.open reads them")
+    files = [path for path in dataset.glob("*/*/scene_camera*.json") if path.parent.name.isdecimal()]
+    scenes = sorted(Scene(path.parent, sensor) for path in files if _SENSOR.fullmatch(sensor := path.stem.removeprefix("scene_camera")))
     if not scenes:
         raise DatasetError(f"{dataset} has no complete scene; a BOP data set has folders such as train_pbr/000000 with a scene_camera.json")
     return scenes
 
 
-def sample(scenes: list[Path], views: int) -> list[tuple[Path, int]]:
+def sample(scenes: list[Scene], views: int) -> list[tuple[Scene, int]]:
     """Sample views: (scene, frame), sorted and distinct; all views if no more are there than asked for.
 
     Cameras in turn; a camera's scenes evenly; within a scene at frames of a low-discrepancy sequence.
@@ -134,16 +152,16 @@ def sample(scenes: list[Path], views: int) -> list[tuple[Path, int]]:
         DatasetError: A file is damaged, or no scene has a view.
         OutputError: More views are there and asked for than a sheet shows.
     """
-    by_camera: dict[tuple[float, ...], list[tuple[Path, list[int]]]] = {}
+    by_camera: dict[tuple[float, ...], list[tuple[Scene, list[int]]]] = {}
     for scene in scenes:
-        cameras = read_checked(scene / "scene_camera.json", SCENE_SCHEMAS["camera"])
+        cameras = read_checked(scene.annotations(), SCENE_SCHEMAS["camera"])
         if cameras:
             first = cameras[min(cameras)]
             group = by_camera.setdefault((*first.get("cam_R_w2c", ()), *first.get("cam_t_w2c", ())), [])
             group.append((scene, sorted(cameras)))
     groups = list(by_camera.values())
     if not groups:
-        raise DatasetError(f"no scene in {scenes[0].parent} has a view; bake the data set again")
+        raise DatasetError(f"no scene in {scenes[0].folder.parent} has a view; bake the data set again")
     present = sum(len(frames) for group in groups for _, frames in group)
     if min(views, present) > MAX_VIEWS:
         raise OutputError(f"{views} views requested, and the data set has {present}; a contact sheet has at most {MAX_VIEWS}")
@@ -158,10 +176,10 @@ def sample(scenes: list[Path], views: int) -> list[tuple[Path, int]]:
     return sorted(samples)
 
 
-def _read_views(samples: list[tuple[Path, int]]) -> Iterator[_View]:
+def _read_views(samples: list[tuple[Scene, int]]) -> Iterator[_View]:
     """Read the annotations of views, which are sorted by scene: those of each scene once."""
     for scene, group in itertools.groupby(samples, key=lambda one: one[0]):
-        files = SceneFolder(scene)
+        files = SceneFolder(scene.folder, suffix=scene.sensor)
         for _, frame in group:
             camera, truth, infos = files.records(frame)
             yield _View(scene, frame, float(camera["depth_scale"]), list(zip(truth, infos, strict=True)))
@@ -170,17 +188,18 @@ def _read_views(samples: list[tuple[Path, int]]) -> Iterator[_View]:
 def _row(view: _View) -> Image:
     """Draw all panels of a view side by side."""
     stem = f"{view.frame:06d}"
-    color = read_image(view.scene / "rgb", stem, cv2.IMREAD_COLOR)
+    folder, sensor = view.scene
+    color = read_image(view.scene.images("rgb"), stem, cv2.IMREAD_COLOR)
     size = color.shape[1::-1]
-    counts = read_image(view.scene / "depth", stem, cv2.IMREAD_UNCHANGED, size)
-    depth = check_planes(counts, None, f"{view.scene / 'depth' / stem}.png") * view.depth_scale
+    counts = read_image(view.scene.images("depth"), stem, cv2.IMREAD_UNCHANGED, size)
+    depth = check_planes(counts, None, f"{view.scene.images('depth') / stem}.png") * view.depth_scale
     panels: list[tuple[str, Callable[[float], Image]]] = [
-        (f"{view.scene.parent.name}/{view.scene.name} image {view.frame}", lambda scale: _fit(color, scale)),
+        (f"{folder.parent.name}/{folder.name}{sensor.replace('_', ' ', 1)} image {view.frame}", lambda scale: _fit(color, scale)),
         (describe_depth(depth), lambda scale: _fit(color_depth(depth), scale, smooth=False)),
         (_instances_caption(view), lambda scale: _fit(_color_instances(view, color), scale, smooth=False)),
         ("boxes: amodal thin, visible thick; obj_id and visible fraction", lambda scale: _draw_boxes(view, _fit(color, scale), scale)),
     ]
-    panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layer_pictures(view.scene, view.frame, size)]
+    panels += [(caption, partial(_fit, picture, smooth=False)) for caption, picture in layer_pictures(folder, view.frame, size, sensor)]
     scale = min(_PANEL_WIDTH / size[0], _MAX_PANEL_HEIGHT / size[1])
     return np.concatenate([_captioned(draw(scale), caption) for caption, draw in panels], axis=1)
 
@@ -239,7 +258,7 @@ def _color_instances(view: _View, color: Image) -> Image:
     """Visible masks in their instances' colours over the darkened grey image."""
     grey = cv2.cvtColor(color, cv2.COLOR_BGR2GRAY) // 3
     drawn = np.repeat(grey[..., None], 3, axis=2)
-    folder = view.scene / "mask_visib"
+    folder = view.scene.images("mask_visib")
     if not folder.is_dir():
         put_text(drawn, "no masks in this data set", (8, 24), 0.5, (230, 230, 230))
         return drawn

@@ -33,13 +33,16 @@ def draw_layer(name: str, values: np.ndarray) -> tuple[str, Image]:
     return _DRAW[name](values)
 
 
-def layer_pictures(scene: Path, frame: int, size: tuple[int, int]) -> list[tuple[str, Image]]:
+def layer_pictures(scene: Path, frame: int, size: tuple[int, int], sensor: str = "") -> list[tuple[str, Image]]:
     """Draw each layer of a scene that `_DRAW` has: caption and image, whose width and height must be `size` [px].
+
+    `sensor` is the suffix of the folders of one sensor, such as "_cam1"; empty: classic layout.
 
     Raises:
         DatasetError: The scene has a layer, but not for this frame, or not of this size.
     """
-    return [draw(read_layer(scene, name, frame, size)) for name, draw in _DRAW.items() if (scene / name).is_dir()]
+    present = {name: draw for name, draw in _DRAW.items() if (scene / f"{name}{sensor}").is_dir()}
+    return [draw(read_layer(scene, name, frame, size, sensor)) for name, draw in present.items()]
 
 
 def _draw_normals(values: np.ndarray) -> tuple[str, Image]:

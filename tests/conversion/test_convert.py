@@ -23,10 +23,10 @@ from tests.harness.scripted_bake import INPUTS, snapshot
 from tests.worlds import box_views
 
 
-def settings(*formats: str, jpg: bool = False) -> Config:
+def settings(*formats: str, jpg: bool = False, keypoints: int = 0) -> Config:
     """Settings of two episodes with two layers: two splits as PNG, or one as JPEG."""
     config = scripted_bake.settings(2, formats)
-    bop = dataclasses.replace(config.bop, split="train_pbr" if jpg else "train", color_format="jpg" if jpg else "png")
+    bop = dataclasses.replace(config.bop, split="train_pbr" if jpg else "train", color_format="jpg" if jpg else "png", keypoints=keypoints)
     splits = () if jpg else (Split("train", 1, 0, "pick", "train"), Split("test", 1, 1, "pick", "test"))
     render = dataclasses.replace(config.render, layers=("flow", "classes"))
     return dataclasses.replace(config, bop=bop, splits=splits, render=render)
@@ -43,6 +43,9 @@ def sets(tmp_path_factory) -> dict[str, Path]:
         "lerobot": settings("lerobot"),
         "usd": settings("usd"),
         "coco": settings("coco"),
+        "keypoints": settings("bop", keypoints=8),
+        "keypoints shards": settings("shards", keypoints=8),
+        "keypoints coco": settings("coco", keypoints=8),
         "jpg": settings("bop", jpg=True),
         "jpg shards": settings("shards", jpg=True),
     }
@@ -73,6 +76,9 @@ def run(source: Path, out: Path, *formats: str, report=lambda *_: None):
         ("source", ("usd",), "usd"),
         ("source", ("coco",), "coco"),
         ("shards", ("coco",), "coco"),
+        ("keypoints", ("coco",), "keypoints coco"),
+        ("keypoints shards", ("coco",), "keypoints coco"),
+        ("keypoints shards", ("bop",), "keypoints"),
         ("jpg", ("shards",), "jpg shards"),
         ("jpg shards", ("bop",), "jpg"),
     ],
@@ -163,11 +169,23 @@ def test_what_cannot_be_converted_is_one_error_and_leaves_nothing(sets, tmp_path
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("formats", "bop"), [(("shards",), {"layout": "multisensor"}), (("bop",), {"keypoints": 8})])
-def test_what_only_a_bake_has_is_refused(formats, bop):
-    config = settings("bop" if "bop" not in formats else "shards", "zarr")
-    with pytest.raises(ConfigError, match=f"has bop.{next(iter(bop))} = .*, which convert does not"):
-        check_formats(formats, dataclasses.replace(config, bop=dataclasses.replace(config.bop, **bop)), Path("DATA"))
+def test_sets_of_several_sensors_are_refused():
+    config = settings("bop", "zarr")
+    bop = dataclasses.replace(config.bop, layout="multisensor")
+    with pytest.raises(ConfigError, match=r"has bop.layout = .*, which convert does not"):
+        check_formats(("shards",), dataclasses.replace(config, bop=bop), Path("DATA"))
+
+
+def test_keypoints_need_the_objects_of_the_bake(sets, tmp_path, assets, monkeypatch):
+    source = tmp_path / "source"
+    shutil.copytree(sets["keypoints"], source)
+    truth = source / "train/000000/scene_gt.json"
+    truth.write_text(truth.read_text().replace('"obj_id":7', '"obj_id":8'))
+    with pytest.raises(DatasetError, match="obj_id 8, which is none of the bake's objects"):
+        run(source, tmp_path / "first", "coco")
+    monkeypatch.setattr("synpick_warp.dataset.digests.digest_inputs", lambda *_: {})
+    with pytest.raises(DatasetError, match="have changed since its bake"):
+        run(sets["keypoints"], tmp_path / "second", "coco")
 
 
 @pytest.mark.parametrize("place", [".", "inside", ".."])

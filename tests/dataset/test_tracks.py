@@ -7,7 +7,7 @@ import pytest
 
 import synpick_warp
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.bop.shards import ShardsExporter
+from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from tests.harness.exporter_contract import FRAMES, LENSES
 from tests.worlds.box_sets import EPISODES, write_set
 from tests.worlds.box_views import OBJECT_IDS, batches

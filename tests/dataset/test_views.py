@@ -10,7 +10,7 @@ from synpick_warp.dataset.manifest import episode_entry
 from synpick_warp.dataset.view_files import decode_run_lengths
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.bop.shards import ShardsExporter
+from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.frames import FrameBatch
 from tests.harness.exporter_contract import FRAMES, LENSES
 from tests.worlds.box_sets import ATTEMPT, EPISODES, LAYERS, write_set

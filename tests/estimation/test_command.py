@@ -15,7 +15,7 @@ from synpick_warp.cli.estimate import parse_indices
 from synpick_warp.errors import ConfigError
 from synpick_warp.estimation import decoder_pool, factories
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.bop.shards import ShardsExporter
+from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.writing.png import encode_png
 from tests.estimation.fakes import FakeEstimator
 from tests.worlds.box_sets import write_set

@@ -20,7 +20,7 @@ from synpick_warp.estimation.decoder_pool import VIEWS_PER_PROCESS, DecoderPool,
 from synpick_warp.estimation.reading import SceneReader
 from synpick_warp.estimation.scenes import Scene, ScenePlan, read_scene
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.bop.shards import ShardsExporter
+from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.stages.pose.batch import ViewBatch
 from synpick_warp.system.processes import ProcessError
 from tests.estimation.probes import Divide, ListModules, Sleep, Stop

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shlex
+import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import cv2
 import pytest
@@ -96,6 +99,20 @@ def test_the_toolkits_command_has_the_names_that_the_toolkit_parses(folder, file
     lines = toolkit_command(synpick_warp.open(other), files[:1]).splitlines()
     assert shlex.split(lines[1]) == ["ln", "-sfn", str(other), str(folder.parent / "myset1")]
     assert shlex.split(lines[2])[2] == str(folder.parent / "icgsynpicktrainpbr_myset1-train-pbr.csv")
+
+
+def test_the_toolkit_gets_results_of_the_first_sensor_with_the_ids_of_its_scenes(folder, files, tmp_path):
+    data = synpick_warp.open(folder)
+    config = dataclasses.replace(data.config, bop=dataclasses.replace(data.config.bop, layout="multisensor"))
+    source = shutil.copy(files[0], tmp_path / "icg.csv")
+    lines = toolkit_command(SimpleNamespace(folder=folder, config=config), [source]).splitlines()
+    assert "scripts/eval_bop24_pose.py" in lines[-1]
+    assert lines[-1].endswith("--result_filenames=icg_synpick-train-pbr.csv --targets_filename=test_targets_bop24.json")
+    subprocess.run(["bash", "-c", lines[-2]], check=True)
+    all_rows, rows = (path.read_text().splitlines() for path in (source, tmp_path / "icg_synpick-train-pbr.csv"))
+    expected = [row.split(",", 1) for row in all_rows[1:] if int(row.partition(",")[0]) % 3 == 0]
+    assert rows == [all_rows[0], *(f"{int(scene) // 3},{rest}" for scene, rest in expected)]
+    assert {row.partition(",")[0] for row in rows[1:]} == {"0", "1"}
 
 
 def test_methods_have_different_names(tmp_path):

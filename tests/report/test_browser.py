@@ -86,6 +86,10 @@ def test_masks_boxes_and_depth_are_switched(browser, page):
     opened.tab.wait_for_function(painted, arg=canvas)
     opened.tab.keyboard.press("m")
     opened.tab.wait_for_function(f"canvas => !({painted})(canvas)", arg=canvas)
+    opened.tab.keyboard.press("a")
+    opened.tab.wait_for_function(painted, arg=canvas)
+    opened.tab.keyboard.press("a")
+    opened.tab.wait_for_function(f"canvas => !({painted})(canvas)", arg=canvas)
     before = opened.tab.get_attribute("#frames .stage img", "src")
     opened.tab.click("#frames button:has-text('depth')")
     assert opened.tab.get_attribute("#frames .stage img", "src") != before

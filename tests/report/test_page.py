@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import dataclasses
 import json
 import re
 import shutil
@@ -9,6 +11,8 @@ import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 pytest.importorskip("vl_convert")
@@ -19,6 +23,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.report import album, compose, write_report
 from synpick_warp.report import page as page_module
 from synpick_warp.report.markup import content_hash
+from tests.harness import scripted_bake
 from tests.report.conftest import EVIL
 
 SECTIONS = ["frames", "strips", "attempts", "figures", "findings", "settings"]
@@ -134,6 +139,37 @@ def test_sets_of_every_shape(data, tmp_path, capsys):
     assert main(["report", str(folder), "--views", "2"]) == 0
     assert Parsed(folder / "report.html").content()["frames"] == []
     assert "This data set has no images." in (folder / "report.html").read_text()
+
+
+def test_sets_of_several_sensors_have_the_same_pictures(tmp_path):
+    found = []
+    for layout in ("classic", "multisensor"):
+        config = scripted_bake.settings(2, ("bop",))
+        scripted_bake.bake(tmp_path / layout, dataclasses.replace(config, bop=dataclasses.replace(config.bop, layout=layout)))
+        parsed = Parsed(write_report(synpick_warp.open(tmp_path / layout), tmp_path / f"{layout}.html"))
+        pictures = [
+            text for (_, each), text in zip(parsed.elements, parsed.texts, strict=True) if str(each.get("id")).startswith("picture-")
+        ]
+        found.append((parsed.content()["frames"], pictures))
+    assert found[0] == found[1]
+    assert all("ids" in frame["pictures"] for frame in found[0][0])
+
+
+def test_amodal_masks_are_planes_of_ids(data, page):
+    """Each instance stands in one plane, whole; overlapping ones stand in different planes."""
+    parsed = Parsed(page)
+    frame = parsed.content()["frames"][0]
+    place = frame["pictures"]["amodal"]["picture"]
+    texts = {each.get("id"): text for (_, each), text in zip(parsed.elements, parsed.texts, strict=True)}
+    image = cv2.imdecode(np.frombuffer(base64.b64decode(texts[f"picture-{place}"]), np.uint8), cv2.IMREAD_UNCHANGED)
+    width, height = frame["size"]
+    planes = image.reshape(-1, height, width)
+    masks = synpick_warp.open(data)[frame["episode"]].view(frame["frame"], frame["camera"]).amodal_masks
+    assert len(planes) <= len(masks)
+    for index, mask in enumerate(masks):
+        shown = planes == index + 1
+        assert shown.any(axis=(1, 2)).sum() <= 1
+        np.testing.assert_array_equal(shown.any(axis=0), mask)
 
 
 def test_a_damaged_manifest_is_a_finding(data, tmp_path):

@@ -18,7 +18,7 @@ import trimesh
 
 from synpick_warp.configs.schema import Bake, Config
 from synpick_warp.errors import CatalogError, LightError
-from synpick_warp.exporters.bop.models import write_models
+from synpick_warp.exporters.bop.shared.models import write_models
 from synpick_warp.scenes.assets.asset_files import MAX_ROWS
 from synpick_warp.scenes.assets.image_size import image_size
 from synpick_warp.scenes.assets.meshes import read_mesh

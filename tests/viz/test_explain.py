@@ -104,6 +104,12 @@ def test_the_target_is_bright_tinted_and_has_a_contour_where_its_mask_is(dataset
     assert (image[around] > 230).all(axis=1).mean() > 0.8
 
 
+def test_sets_of_several_sensors_look_the_same(dataset, tmp_path):
+    other = bake(tmp_path / "sensors", split="train", color_format="png", layout="multisensor")
+    shutil.copy(dataset / "attempts.jsonl", other)
+    np.testing.assert_array_equal(drawn(dataset)[TOP:], drawn(other)[TOP:])
+
+
 def test_another_target_another_highlight(dataset):
     image = image_of(drawn(dataset, 1))
     inside = cv2.erode(masked(dataset, 2, 1).astype(np.uint8), np.ones((15, 15))) > 0

@@ -41,7 +41,7 @@ def test_a_row_a_view_and_four_pictures_a_row(dataset, tmp_path):
     assert sheet.shape == (4 * (20 + 360 + 4), 4 * (480 + 4), 3)
     first = sheet[20:380, :480]
     scene, frame = sample(find_scenes(dataset), 4)[0]
-    color = cv2.imread(str(scene / "rgb" / f"{frame:06d}.jpg"))
+    color = cv2.imread(str(scene.images("rgb") / f"{frame:06d}.jpg"))
     np.testing.assert_array_equal(first[2::5, 2::5], color)
 
 
@@ -58,7 +58,7 @@ def test_layers_get_columns_of_their_own(dataset, tmp_path):
         "flow": flow,
         "scene_flow": np.full((*shape, 3), np.nan, np.float32),
     }
-    for scene in find_scenes(dataset):
+    for scene, _ in find_scenes(dataset):
         for name, layer in values.items():
             (scene / name).mkdir()
             for frame in range(FRAMES):
@@ -72,16 +72,16 @@ def test_layers_get_columns_of_their_own(dataset, tmp_path):
     # Flow to the right is red, none is black, unknown is grey.
     scale = 480 // shape[1]
     assert [panels["flow"][100, scale * column].tolist() for column in (5, 15, 30)] == [[64, 64, 64], [0, 0, 255], [0, 0, 0]]
-    (find_scenes(dataset)[0] / "flow" / "000002.png").unlink()
+    (find_scenes(dataset)[0].folder / "flow" / "000002.png").unlink()
     with pytest.raises(DatasetError, match=r"there is no .*flow/000002.png"):
         write_contact_sheet(dataset, tmp_path / "sheet.png", 100)
 
 
 def test_views_are_spread_over_cameras_scenes_and_time(dataset):
     views = sample(find_scenes(dataset), 6)
-    assert [int(scene.name) for scene, _ in views] == [0, 1, 2, 3, 4, 5]
+    assert [int(scene.folder.name) for scene, _ in views] == [0, 1, 2, 3, 4, 5]
     assert len({frame for _, frame in views}) >= 4
-    assert {int(scene.name) % 3 for scene, _ in sample(find_scenes(dataset), 3)} == {0, 1, 2}
+    assert {int(scene.folder.name) % 3 for scene, _ in sample(find_scenes(dataset), 3)} == {0, 1, 2}
 
 
 def test_more_views_than_there_are_show_each_at_most_once(dataset):
@@ -93,17 +93,27 @@ def test_instances_and_boxes_are_drawn_where_they_are(dataset, tmp_path):
     sheet = cv2.imread(str(write_contact_sheet(dataset, tmp_path / "sheet.png", 1)))
     scene, frame = sample(find_scenes(dataset), 1)[0]
     index = 1
-    mask = cv2.imread(str(scene / "mask_visib" / f"{frame:06d}_{index:06d}.png"), cv2.IMREAD_GRAYSCALE) > 0
+    mask = cv2.imread(str(scene.images("mask_visib") / f"{frame:06d}_{index:06d}.png"), cv2.IMREAD_GRAYSCALE) > 0
     instances = sheet[20:380, 2 * 484 : 2 * 484 + 480][2::5, 2::5]
     assert len(np.unique(instances[mask], axis=0)) == 1
     color = instances[mask][0]
     boxes = sheet[20:380, 3 * 484 : 3 * 484 + 480]
     rows, columns = np.nonzero((boxes == color).all(axis=2))
-    x, y, width, height = json.loads((scene / "scene_gt_info.json").read_text())[str(frame)][index]["bbox_obj"]
+    x, y, width, height = json.loads((scene.folder / "scene_gt_info.json").read_text())[str(frame)][index]["bbox_obj"]
     assert abs(columns.min() - 5 * x) <= 2
     assert abs(rows.min() - 5 * y) <= 2
     assert abs(columns.max() - 5 * (x + width + 1)) <= 2
     assert abs(rows.max() - 5 * (y + height + 1)) <= 2
+
+
+def test_sets_of_several_sensors_are_drawn_as_the_classic_layout(tmp_path):
+    sheets = []
+    for layout in ("classic", "multisensor"):
+        folder = export(BopExporter, tmp_path / layout, config(("flow",), layout=layout), EPISODES, 0, FRAMES)
+        sheets.append(cv2.imread(str(write_contact_sheet(folder, tmp_path / f"{layout}.png", 6))))
+    first, second = (np.delete(sheet.reshape(6, 384, -1), np.s_[:20], axis=1) for sheet in sheets)
+    np.testing.assert_array_equal(first, second)
+    assert {scene.sensor for scene in find_scenes(tmp_path / "multisensor")} == {"_cam0", "_cam1", "_cam2"}
 
 
 def test_a_set_without_masks_and_with_png_colour(tmp_path):

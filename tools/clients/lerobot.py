@@ -1,11 +1,13 @@
-"""LeRobot v3 by its parts' own readers: parquet by pyarrow, videos by PyAV."""
+"""LeRobot v3 by its parts' readers, parquet by pyarrow and videos by PyAV, and each split by LeRobotDataset where it is installed."""
 
 # Runs where the packages are, which the type checker may not see.
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
 
+import importlib.util
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +15,8 @@ import numpy as np
 
 from tools.clients.base import PICTURE, Reading, Sources, first_episode, sample_frames, sampled_views
 
-PACKAGES = ("av", "pyarrow")
-BOUNDS = {"position": 1e-6}
+PACKAGES = ("av", "pyarrow", "lerobot", "torch")
+BOUNDS = {"position": 1e-6, "dataset": 1e-6}
 CAMERA = "observation.images.camera_0"
 
 
@@ -41,7 +43,31 @@ def read(place: Path, data: Path, sources: Sources) -> Reading:
         pictures = [picture.to_ndarray(format="rgb24") for picture in video.decode(video=0)]
     for frame in frames:
         values[f"{PICTURE} {frame}"] = pictures[frame] / 255.0
-    return Reading(f"{place.name}: {info['total_episodes']} episodes, {info['total_frames']} frames; {len(pictures)} pictures", values)
+    what = f"{place.name}: {info['total_episodes']} episodes, {info['total_frames']} frames; {len(pictures)} pictures"
+    if importlib.util.find_spec("lerobot") is None:
+        return Reading(what, values, ["the package lerobot is not installed: its reader was not tried"])
+    ranges = {name: range(*map(int, span.split(":"))) for name, span in info["splits"].items()}
+    for name, episodes in ranges.items():
+        values |= read_split(place, name, list(episodes), frames)
+    return Reading(f"{what}; {len(ranges)} splits by LeRobotDataset", values, ["decoded by pyav: torchcodec needs a system's FFmpeg"])
+
+
+def read_split(place: Path, name: str, episodes: list[int], frames: list[int]) -> dict[str, np.ndarray]:
+    """Read a split by LeRobot's own reader: its numbers of episodes and frames; of the first episode of all, the sampled frames, too."""
+    os.environ["HF_HUB_OFFLINE"] = "1"
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    if not episodes:
+        return {}
+    data_set = LeRobotDataset("local/set", root=place, episodes=episodes, video_backend="pyav")
+    first, last = data_set[0], data_set[len(data_set) - 1]
+    values = {f"split {name}": np.array([data_set.num_episodes, len(data_set), bool(last["next.done"])])}
+    if int(first["episode_index"]) == 0:
+        rows = [data_set[frame] for frame in frames]
+        values["dataset position"] = np.array([row["observation.state"][:3].numpy() for row in rows])
+        for frame, row in zip(frames, rows, strict=True):
+            values[f"{PICTURE} of dataset {frame}"] = row[CAMERA].permute(1, 2, 0).numpy()
+    return values
 
 
 def expect(data_set: Any) -> dict[str, np.ndarray]:
@@ -51,6 +77,9 @@ def expect(data_set: Any) -> dict[str, np.ndarray]:
     views = sampled_views(data_set)
     if data_set.has_store:
         values["position"] = np.asarray(episode.ticks["fixture_pose"][:])[list(views), 2, :3]
+        values["dataset position"] = values["position"]
     for frame, view in views.items():
-        values[f"{PICTURE} {frame}"] = view.rgb / 255.0
+        values[f"{PICTURE} {frame}"] = values[f"{PICTURE} of dataset {frame}"] = view.rgb / 255.0
+    for name, part in (data_set.splits or {"train": data_set}).items():
+        values[f"split {name}"] = np.array([len(part), sum(len(part[index]) for index in part), True])
     return values

@@ -15,7 +15,7 @@ import numpy as np
 
 from tools.clients.base import MILLIMETERS, Reading, Sources, first_episode, first_shard, sample_frames, sampled_views
 
-PACKAGES = ("webdataset", "synpick-warp")
+PACKAGES = ("webdataset", "torch", "synpick-warp")
 BOUNDS = {"depth": 1e-6}
 BATCH = 2
 

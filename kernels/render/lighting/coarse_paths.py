@@ -15,6 +15,7 @@ from synpick_warp.kernels.render.lighting.history import (
     LightHistory,
     MovingBodies,
     blend_light,
+    history_frame,
     read_history,
     usable_paths,
     write_history,
@@ -173,7 +174,6 @@ def trace_coarse_paths_kernel(
     coarse: CoarseGrid,
     # State: worlds
     episode: wp.array[int],  # (world)
-    frame: wp.array[int],  # (world)
     light: wp.array[int],  # (world)
     light_yaw: wp.array[float],  # (world) [rad]
     # In:
@@ -209,22 +209,21 @@ def trace_coarse_paths_kernel(
     position = hit_position(cameras, camera, ray, hit.depth)
     width = float(coarse.size) * hit.depth / cameras.intrinsics[camera][0]
     vertex = make_vertex(scene, bodies, view, views.instances, hit, position, outgoing, width, 0.0)
-
     context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
     unoccluded = unoccluded_light(scene.lights, context.light, context.yaw, vertex.brdf)
     known = usable_paths(scene.meshes, history_inout, moving, views, view, row, column, hit.segment, position)
     slot = world * history_inout.cameras + camera
+    frame = history_frame(history_inout, slot, known)
     # Neighbours of a full history take turns; the coarse pixels of a warp, LANE_STRIDE apart, trace or rest together.
-    if known > 0 and known == history_inout.max_paths and (row + column + frame[world]) % 2 == 0:
+    if known > 0 and known == history_inout.max_paths and (row + column + frame) % 2 == 0:
         store_light(coarse_light_out, view, row, column, read_history(history_inout, slot, row, column), unoccluded)
     else:
         samples = wp.where(known > 0, 1, rules.samples)
-        index = first_path_index(rules.samples, row, column, frame[world], known > 0)
+        index = first_path_index(rules.samples, row, column, frame, known > 0)
         mean = average_paths(scene, bodies, rules, context, index, samples, vertex, width, unoccluded, firefly_clamp)
         if known > 0:
             mean = blend_light(read_history(history_inout, slot, row, column), mean, 1.0 / float(known + 1))
-        if history_inout.max_paths > 0:
-            write_history(history_inout, slot, row, column, hit.segment, mean, known + samples)
+        write_history(history_inout, slot, row, column, hit.segment, mean, known + samples)
         store_light(coarse_light_out, view, row, column, mean, unoccluded)
     guide_out.normal[view, row, column] = wp.transpose(cameras.to_world[camera]) * vertex.brdf.normal
     guide_out.depth[view, row, column] = hit.depth

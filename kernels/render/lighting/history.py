@@ -79,12 +79,39 @@ def max_displacement(now: wp.transformf, then: wp.transformf, center: wp.vec3, r
 
 
 @wp.kernel
+def advance_history_kernel(
+    # State: worlds
+    episode: wp.array[int],  # (world)
+    frame: wp.array[int],  # (world)
+    # In:
+    views: Views,
+    # Out:
+    history_inout: LightHistory,
+    moving_out: MovingBodies,
+):
+    """Write `holds`, and advance the history's frame index to this frame."""
+    view = wp.tid()
+    world = views.world[view]
+    slot = world * history_inout.cameras + views.camera[view]
+    moving_out.holds[view] = int(history_inout.episode[slot] == episode[world] and history_inout.frame[slot] + 1 == frame[world])
+    history_inout.episode[slot] = episode[world]
+    history_inout.frame[slot] = frame[world]
+
+
+@wp.func
+def displacement_fraction(meshes: Meshes, mesh: int, now: wp.transformf, then: wp.transformf) -> float:
+    """Displacement of a body's points as a fraction of its size, at most 1; 0: it rests."""
+    displacement = max_displacement(now, then, meshes.center[mesh], meshes.radius[mesh])
+    if displacement <= REST_DISPLACEMENT:
+        return 0.0
+    return wp.min(displacement / wp.sqrt(mean_projected_area(meshes.upper[mesh] - meshes.lower[mesh])), 1.0)
+
+
+@wp.kernel
 def find_moving_bodies_kernel(
     # Scene:
     meshes: Meshes,
     # State: worlds
-    episode: wp.array[int],  # (world)
-    frame: wp.array[int],  # (world)
     catalog_index: wp.array2d[int],  # (world, instance)
     pose: wp.array2d[wp.transformf],  # (world, instance) [m]
     fixture_pose: wp.array2d[wp.transformf],  # (world, fixture) [m]
@@ -97,59 +124,40 @@ def find_moving_bodies_kernel(
     views: Views,
     bodies: int,
     # Out:
-    history_inout: LightHistory,
-    moving_out: MovingBodies,
+    moving_inout: MovingBodies,
 ):
-    """List the bodies of each view that moved since the previous frame, and advance the history's frame index to this one.
-
-    Without the previous frame of the same episode in the history, `holds` is 0 and the rest of `moving_out` is not written.
-    """
+    """List the bodies of each view that moved since the previous frame, came or went, if the history holds that frame (`holds`)."""
     view = wp.tid()
-    world = views.world[view]
-    slot = world * history_inout.cameras + views.camera[view]
-    holds = int(history_inout.episode[slot] == episode[world] and history_inout.frame[slot] + 1 == frame[world])
-    history_inout.episode[slot] = episode[world]
-    history_inout.frame[slot] = frame[world]
-    moving_out.holds[view] = holds
-    if holds == 0:
+    if moving_inout.holds[view] == 0:
         return
+    world = views.world[view]
     count = int(0)
     for body in range(bodies):
-        now = wp.transform_identity(dtype=float)
-        then = wp.transform_identity(dtype=float)
         mesh = int(-1)
         last_mesh = int(-1)
+        now = wp.transform_identity(dtype=float)
+        then = wp.transform_identity(dtype=float)
         if body < views.instances:
-            now = pose[world, body]
-            then = last_pose[world, body]
             mesh = catalog_index[world, body]
             last_mesh = last_catalog_index[world, body]
+            now = pose[world, body]
+            then = last_pose[world, body]
         else:
             fixture = body - views.instances
+            mesh = wp.where(fixture_visible[world, fixture] != 0, meshes.entries + fixture, -1)
+            last_mesh = wp.where(last_fixture_visible[world, fixture] != 0, meshes.entries + fixture, -1)
             now = fixture_pose[world, fixture]
             then = last_fixture_pose[world, fixture]
-            if fixture_visible[world, fixture] != 0:
-                mesh = meshes.entries + fixture
-            if last_fixture_visible[world, fixture] != 0:
-                last_mesh = meshes.entries + fixture
-        moving_out.rests[view, body] = 1
-        if mesh >= 0 or last_mesh >= 0:
-            which = mesh
-            where = now
-            if mesh < 0:
-                which = last_mesh
-                where = then
-            size = wp.sqrt(mean_projected_area(meshes.upper[which] - meshes.lower[which]))
-            displacement = size
-            if mesh == last_mesh:
-                displacement = max_displacement(now, then, meshes.center[which], meshes.radius[which])
-            if displacement > REST_DISPLACEMENT:
-                moving_out.rests[view, body] = 0
-                moving_out.mesh[view, count] = which
-                moving_out.to_body[view, count] = wp.transform_inverse(where)
-                moving_out.change[view, count] = wp.min(displacement / size, 1.0)
-                count += 1
-    moving_out.count[view] = count
+        change = float(mesh != last_mesh)
+        if mesh == last_mesh and mesh >= 0:
+            change = displacement_fraction(meshes, mesh, now, then)
+        moving_inout.rests[view, body] = int(change == 0.0)
+        if change > 0.0:
+            moving_inout.mesh[view, count] = wp.where(mesh >= 0, mesh, last_mesh)
+            moving_inout.to_body[view, count] = wp.transform_inverse(wp.where(mesh >= 0, now, then))
+            moving_inout.change[view, count] = change
+            count += 1
+    moving_inout.count[view] = count
 
 
 @wp.func
@@ -196,6 +204,14 @@ def usable_paths(
 
 
 @wp.func
+def history_frame(history: LightHistory, slot: int, usable: int) -> int:
+    """Index of this frame in its episode; 0 if the history has no usable paths."""
+    if usable == 0:
+        return 0
+    return history.frame[slot]
+
+
+@wp.func
 def read_history(history: LightHistory, slot: int, row: int, column: int) -> SplitRadiance:
     """Average light of a coarse pixel."""
     result = SplitRadiance()
@@ -213,7 +229,9 @@ def to_half(light: wp.vec3) -> wp.vec3h:
 
 @wp.func
 def write_history(history: LightHistory, slot: int, row: int, column: int, segment: int, light: SplitRadiance, paths: int):
-    """Store the average light of a coarse pixel and the paths that it counts."""
+    """Store the average light of a coarse pixel and the paths that it counts, if a history is kept."""
+    if history.max_paths == 0:
+        return
     history.diffuse[slot, row, column] = to_half(light.diffuse)
     history.specular[slot, row, column] = to_half(light.specular)
     history.indirect[slot, row, column] = to_half(light.indirect)

@@ -15,7 +15,7 @@ from synpick_warp.exporters.bop.keypoints import make_category_keys
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
 from synpick_warp.exporters.bop.sensors import commit_sensor_scene
-from synpick_warp.exporters.bop.targets import (
+from synpick_warp.exporters.bop.shared.targets import (
     concatenate_targets,
     find_scenes,
     scene_target_files,

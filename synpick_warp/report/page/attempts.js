@@ -24,11 +24,11 @@ function showAttempt(attempt, panel) {
   const right = el("div", {}, el("h3", {}, `Episode ${attempt.episode}, attempt ${attempt.attempt} (${attempt.mode === "target" ? "targeted" : "untargeted"})`),
     el("p", { class: attempt.success ? "verdict success" : "verdict" }, `${attempt.sentence[0]?.toUpperCase() ?? ""}${attempt.sentence.slice(1)}.`),
     el("ul", { class: "words" }, words), attempt.objects.length ? objectTable(attempt.objects) : null);
-  const force = el("figure", {}, el("h3", {}, "Seal force"), plot, el("figcaption", {}, attempt.force
+  const force = el("figure", { class: "later" }, el("h3", {}, "Seal force"), plot, el("figcaption", {}, attempt.force
     ? "Largest force on a seal in each frame of the lift; the line is where this seal breaks." : "No force: nothing was engaged."));
-  const graph = attempt.graph ? el("figure", {}, el("h3", {}, "Clutter graph"), drawGraph(attempt.graph),
+  const graph = attempt.graph ? el("figure", { class: "later" }, el("h3", {}, "Clutter graph"), drawGraph(attempt.graph),
     el("figcaption", {}, "An arrow points from the object on top to the one below, with its votes; the small number counts the objects above. Dashed edges were removed.")) : null;
-  panel.replaceChildren(...[left, right, force, graph].filter(Boolean));
+  panel.replaceChildren(el("div", { class: "column" }, left, force), el("div", { class: "column" }, right, graph));
   forgetPlots(".attempt");
   if (attempt.force) addPlot(plot, forceSpec(attempt.force), ".attempt");
 }

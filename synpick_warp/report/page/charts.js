@@ -12,7 +12,7 @@ function plotConfig() {
     view: { stroke: null },
     axis: {
       labelColor: color("--soft"), titleColor: color("--soft"), titleFontWeight: "normal", gridColor: color("--line"), domainColor: color("--line"),
-      tickColor: color("--line"), labelFontSize: 12, titleFontSize: 12, labelFont: font, titleFont: font,
+      tickColor: color("--line"), labelSeparation: 8, labelFlush: false, labelFontSize: 12, titleFontSize: 12, labelFont: font, titleFont: font,
     },
     axisX: { grid: true }, axisY: { grid: true }, axisDiscrete: { grid: false },
     legend: { labelColor: color("--soft"), titleColor: color("--soft"), labelFontSize: 12, titleFontSize: 12, titleFontWeight: "normal", labelFont: font, titleFont: font },

@@ -1,7 +1,9 @@
-// Sampled frames: a base picture (colour, depth, layers), and above it visible masks and boxes that can be switched on.
+// Sampled frames: a base picture (colour, depth, layers), and above it visible masks, amodal masks and boxes that can be switched on.
 "use strict";
 const MASK_ALPHA = 130;
-const frameState = { base: "rgb", masks: false, boxes: false };
+/** Hidden parts of amodal masks are stripes: period and width of a stripe [px], opacity. */
+const STRIPE = { period: 8, width: 4, alpha: 200 };
+const frameState = { base: "rgb", masks: false, amodal: false, boxes: false };
 const cards = [];
 
 function frameCaption(frame) {
@@ -20,7 +22,7 @@ function frameCard(frame, opened) {
   const stage = el("div", { class: "stage", tabindex: opened ? null : "0", role: opened ? null : "button", "aria-label": "Enlarge" }, image, canvas, boxes);
   stage.style.aspectRatio = `${width} / ${height}`;
   const caption = frameCaption(frame);
-  const card = { frame, node: el("figure", {}, stage, caption), stage, ids: null, hovered: 0, visible: false };
+  const card = { frame, node: el("figure", {}, stage, caption), stage, ids: {}, hovered: 0, visible: false };
 
   card.update = () => {
     if (!card.visible) return;
@@ -30,28 +32,31 @@ function frameCard(frame, opened) {
     boxes.replaceChildren(...(frameState.boxes ? frame.instances.flatMap(frameBoxes) : []));
     card.drawMasks();
   };
-  card.loadIds = async () => {
-    if (card.ids || !frame.pictures.ids) return;
-    const picture = await loadPicture(frame.pictures.ids.picture);
-    canvas.width = picture.naturalWidth;
-    canvas.height = picture.naturalHeight;
-    const pen = canvas.getContext("2d", { willReadFrequently: true, colorSpace: "srgb" });
-    pen.drawImage(picture, 0, 0);
-    const data = pen.getImageData(0, 0, canvas.width, canvas.height).data;
-    pen.clearRect(0, 0, canvas.width, canvas.height);
-    card.ids = Uint8Array.from({ length: data.length / 4 }, (_, pixel) => data[4 * pixel]);
+  card.loadIds = async (name) => {
+    if (card.ids[name] || !frame.pictures[name]) return;
+    const read = await readIds(frame.pictures[name].picture);
+    card.ids[name] = read.ids;
+    if (name !== "ids") return;
+    canvas.width = read.width;
+    canvas.height = read.height;
   };
   card.drawMasks = async () => {
-    if (frameState.masks || card.hovered) await card.loadIds();
-    if (card.ids) paintMasks(canvas, card.ids, frame.instances, frameState.masks, card.hovered);
+    if (frameState.masks || frameState.amodal || card.hovered) await card.loadIds("ids");
+    if (frameState.amodal) await card.loadIds("amodal");
+    if (!card.ids.ids) return;
+    const pen = canvas.getContext("2d", { willReadFrequently: true });
+    const image = pen.createImageData(canvas.width, canvas.height);
+    paintMasks(image, card.ids.ids, frame.instances, frameState.masks, card.hovered);
+    if (frameState.amodal && card.ids.amodal) paintAmodal(image, card.ids, frame.instances);
+    pen.putImageData(image, 0, 0);
   };
   stage.addEventListener("pointermove", async (event) => {
-    await card.loadIds();
-    if (!card.ids) return;
+    await card.loadIds("ids");
+    if (!card.ids.ids) return;
     const place = stage.getBoundingClientRect();
     const column = Math.min(canvas.width - 1, Math.max(0, Math.floor((event.clientX - place.left) / place.width * canvas.width)));
     const row = Math.min(canvas.height - 1, Math.max(0, Math.floor((event.clientY - place.top) / place.height * canvas.height)));
-    const id = card.ids[row * canvas.width + column];
+    const id = card.ids.ids[row * canvas.width + column];
     const one = frame.instances[id - 1];
     showTip(one ? `${one.name}: ${(100 * one.visible).toFixed(0)} % visible` : null, event);
     if (id !== card.hovered) { card.hovered = id; card.drawMasks(); }
@@ -69,22 +74,52 @@ function frameBoxes(one) {
   });
 }
 
+/** Ids of a picture's pixels, which are its grey levels. */
+async function readIds(place) {
+  const picture = await loadPicture(place);
+  const scratch = el("canvas");
+  const { naturalWidth: width, naturalHeight: height } = picture;
+  Object.assign(scratch, { width, height });
+  const pen = scratch.getContext("2d", { willReadFrequently: true, colorSpace: "srgb" });
+  pen.drawImage(picture, 0, 0);
+  const data = pen.getImageData(0, 0, width, height).data;
+  return { width, height, ids: Uint8Array.from({ length: width * height }, (_, pixel) => data[4 * pixel]) };
+}
+
+const colorsOf = (instances) => instances.map((one) => one.color.match(/\d+/g).map(Number));
+
+/** Whether a pixel has a neighbour of another id. */
+function isEdge(ids, pixel, width) {
+  const id = ids[pixel];
+  return ids[pixel + 1] !== id || ids[pixel - 1] !== id || ids[pixel + width] !== id || ids[pixel - width] !== id;
+}
+
 /** Fill visible masks and draw their outlines; the hovered one also when masks are off. */
-function paintMasks(canvas, ids, instances, all, hovered) {
-  const { width, height } = canvas;
-  const pen = canvas.getContext("2d");
-  const image = pen.createImageData(width, height);
-  const colors = instances.map((one) => one.color.match(/\d+/g).map(Number));
-  for (let row = 0, pixel = 0; row < height; row++) {
-    for (let column = 0; column < width; column++, pixel++) {
-      const id = ids[pixel];
-      if (!id || !(all || id === hovered) || id > colors.length) continue;
-      const edge = ids[pixel + 1] !== id || ids[pixel - 1] !== id || ids[pixel + width] !== id || ids[pixel - width] !== id;
-      const [red, green, blue] = colors[id - 1];
-      image.data.set([red, green, blue, edge ? 255 : id === hovered ? 90 : MASK_ALPHA], 4 * pixel);
+function paintMasks(image, ids, instances, all, hovered) {
+  const colors = colorsOf(instances);
+  for (let pixel = 0; pixel < ids.length; pixel++) {
+    const id = ids[pixel];
+    if (!id || !(all || id === hovered) || id > colors.length) continue;
+    const alpha = isEdge(ids, pixel, image.width) ? 255 : id === hovered ? 90 : MASK_ALPHA;
+    image.data.set([...colors[id - 1], alpha], 4 * pixel);
+  }
+}
+
+/** Draw outlines of amodal masks and stripes on their hidden parts; silhouettes overlap, so they come in planes below each other. */
+function paintAmodal(image, { ids, amodal }, instances) {
+  const colors = colorsOf(instances), size = ids.length;
+  for (let first = 0; first < amodal.length; first += size) {
+    const plane = amodal.subarray(first, first + size);
+    for (let pixel = 0; pixel < size; pixel++) {
+      const id = plane[pixel];
+      if (!id || id > colors.length) continue;
+      const edge = isEdge(plane, pixel, image.width);
+      const diagonal = pixel % image.width + Math.floor(pixel / image.width);
+      if (edge || (ids[pixel] !== id && diagonal % STRIPE.period < STRIPE.width)) {
+        image.data.set([...colors[id - 1], edge ? 255 : STRIPE.alpha], 4 * pixel);
+      }
     }
   }
-  pen.putImageData(image, 0, 0);
 }
 
 function switchButton(label, key, name) {
@@ -123,14 +158,15 @@ function frameDialog() {
 function showFrames(host) {
   if (!host || !content.frames.length) return;
   const show = frameDialog();
-  const names = [...new Set(content.frames.flatMap((frame) => Object.keys(frame.pictures)))].filter((name) => name !== "ids");
+  const names = [...new Set(content.frames.flatMap((frame) => Object.keys(frame.pictures)))].filter((name) => !["ids", "amodal"].includes(name));
   const labels = names.map((name) => [name, name === "rgb" ? "colour" : name.replace("_", " ")]);
   const base = choiceButtons("Picture", labels, (name) => { frameState.base = name; cards.forEach((card) => card.update()); });
-  const masks = content.frames.some((frame) => frame.pictures.ids);
-  const switches = [...(masks ? [switchButton("masks", "m", "masks")] : []), switchButton("boxes", "b", "boxes")];
+  const has = (name) => content.frames.some((frame) => frame.pictures[name]);
+  const switches = [...(has("ids") ? [switchButton("masks", "m", "masks")] : []),
+    ...(has("amodal") ? [switchButton("amodal masks", "a", "amodal")] : []), switchButton("boxes", "b", "boxes")];
   const keys = switches.map(({ key }) => el("kbd", {}, key));
   host.append(el("div", { class: "tools" }, base.group, el("div", { class: "group" }, switches.map(({ button }) => button)),
-    el("span", { class: "hint" }, keys.flatMap((key, place) => [place ? " " : "", key]), " switch overlays; point at an object for its name; click to enlarge")));
+    el("span", { class: "hint" }, keys.flatMap((key, place) => [place ? " " : "", key]), " switch overlays; stripes: hidden parts; point at an object for its name; click to enlarge")));
   content.frames.forEach((frame, index) => {
     const card = frameCard(frame, false);
     card.stage.addEventListener("click", () => show(index));

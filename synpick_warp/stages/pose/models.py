@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.arrays import allocate_struct, struct_arrays
 from synpick_warp.kernels.pose.hypotheses import Symmetries
 from synpick_warp.kernels.pose.residuals import Models
+from synpick_warp.low_discrepancy import sample_triangles
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import Material, TriangleMesh
 from synpick_warp.stages.pose.batch import ObjectModel
@@ -102,25 +103,16 @@ def build_models(objects: Sequence[ObjectModel], device: wp.Device, samples: int
 
 
 def sample_surface(mesh: TriangleMesh, material: Material, count: int) -> SurfaceSamples:
-    """Sample a surface evenly by area: a golden-ratio (Weyl) sequence over the cumulative area, and one in each triangle (R2 sequence)."""
+    """Sample a surface evenly by area: low-discrepancy points of its triangles (see `sample_triangles`), with normal and colour."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = 0.5 * np.linalg.norm(doubled, axis=1)
-    cumulative = np.cumsum(areas)
-    index = np.arange(1, count + 1)
-    place = np.mod(index * ((np.sqrt(5.0) - 1.0) / 2.0), 1.0) * cumulative[-1]
-    face = np.minimum(np.searchsorted(cumulative, place, side="right"), len(areas) - 1)
-    # R2 sequence (Roberts, 2018): the plastic number's powers.
-    plastic = 1.324717957244746
-    u, v = np.mod(index[:, None] / plastic ** np.array([1.0, 2.0]), 1.0).T
-    fold = u + v > 1.0
-    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
-    weights = np.stack([1.0 - u - v, u, v], axis=1)
+    face, weights = sample_triangles(areas, count)
     position = np.einsum("sk,skc->sc", weights, corners[face])
     normal = doubled[face] / np.linalg.norm(doubled[face], axis=1, keepdims=True)
     uv = np.einsum("sk,skc->sc", weights, mesh.uv[mesh.faces[face]].astype(np.float64))
     color = sample_color(mesh, material, uv)
-    return SurfaceSamples(position.astype(np.float32), normal.astype(np.float32), color, float(cumulative[-1]))
+    return SurfaceSamples(position.astype(np.float32), normal.astype(np.float32), color, float(np.cumsum(areas)[-1]))
 
 
 def sample_color(mesh: TriangleMesh, material: Material, uv: np.ndarray) -> np.ndarray:

@@ -13,7 +13,13 @@ from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, f
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, trace_coarse_paths_kernel
 from synpick_warp.kernels.render.lighting.denoise import RatioImages, choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
-from synpick_warp.kernels.render.lighting.history import NEVER, LightHistory, MovingBodies, find_moving_bodies_kernel
+from synpick_warp.kernels.render.lighting.history import (
+    NEVER,
+    LightHistory,
+    MovingBodies,
+    advance_history_kernel,
+    find_moving_bodies_kernel,
+)
 from synpick_warp.kernels.render.lighting.shading import shade_kernel
 from synpick_warp.kernels.render.lighting.shadows import filter_shadows_kernel, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
@@ -188,18 +194,18 @@ class DenoisedRenderer:
         """Compare the worlds with the previous frame, where a history holds it."""
         if self.history.max_paths == 0:
             return
-        inputs = [self.scene.meshes, snapshot.episode, snapshot.frame, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose]
-        inputs += [snapshot.fixture_visible, snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose]
-        inputs += [snapshot.last_fixture_visible, views, self.moving.rests.shape[1]]
-        outputs = [self.history, self.moving]
-        wp.launch(
-            find_moving_bodies_kernel, dim=views.count, inputs=inputs, outputs=outputs, device=self.scene.device, block_dim=VIEW_BLOCK
-        )
+        options: dict[str, Any] = {"dim": views.count, "device": self.scene.device, "block_dim": VIEW_BLOCK}
+        inputs = [snapshot.episode, snapshot.frame, views]
+        wp.launch(advance_history_kernel, inputs=inputs, outputs=[self.history, self.moving], **options)
+        inputs = [self.scene.meshes, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.fixture_visible]
+        inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible]
+        inputs += [views, self.moving.rests.shape[1]]
+        wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
 
     def trace_coarse_paths(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
         """Coarse path pass: guide image and light of coarse pixels."""
         scene = self.scene
-        inputs = [scene.paths, scene.cameras, self.coarse, snapshot.episode, snapshot.frame, snapshot.light, snapshot.light_yaw]
+        inputs = [scene.paths, scene.cameras, self.coarse, snapshot.episode, snapshot.light, snapshot.light_yaw]
         inputs += [bodies, gbuffer, views, self.moving, self.rules, self.firefly_clamp]
         outputs = [self.history, self.guide, self.coarse_light]
         launch_pixels(trace_coarse_paths_kernel, views.count * interleaved_threads(self.coarse), inputs, outputs, scene.device)

@@ -26,7 +26,7 @@ from synpick_warp.dataset.manifest import CONFIG_FILE, CONSTANTS, ENTRIES, MANIF
 from synpick_warp.dataset.view_files import SceneShards, list_members
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.bop.shards import ShardsExporter
+from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.inputs.image_files import decode_image, image_size
 from tests.harness.exporter_contract import LENSES, export
 from tests.harness.fuzz import fuzz_examples

@@ -18,8 +18,8 @@ from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.merge import merge
 from synpick_warp.dataset.verify import verify
 from synpick_warp.errors import DatasetError, SynpickError
-from synpick_warp.exporters.bop import targets
-from synpick_warp.exporters.bop.shard_parts import list_keys
+from synpick_warp.exporters.bop.shards.tar_files import list_keys
+from synpick_warp.exporters.bop.shared import targets
 from synpick_warp.exporters.writing.checksums import parse_checksums
 from tests.harness.fuzz import fuzz_examples
 from tests.harness.hostile import LEAVES, WHOLE, hostile_contents, places, replaced

@@ -21,8 +21,8 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import Effects
 from synpick_warp.errors import CatalogError, OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.bop.models import encode_model, write_models
 from synpick_warp.exporters.bop.scene import SceneSettings, commit_scenes, create_scene_folders
+from synpick_warp.exporters.bop.shared.models import encode_model, write_models
 from synpick_warp.exporters.bop.view import ANNOTATIONS, annotation_block
 from synpick_warp.exporters.writing.files import check_output_folder
 from synpick_warp.exporters.writing.folder import open_folder

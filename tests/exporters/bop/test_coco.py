@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
+import json
 from pathlib import Path
 
 import cv2
@@ -15,7 +16,9 @@ from pycocotools.coco import COCO
 from synpick_warp.configs.schema import Split
 from synpick_warp.dataset.reading import COCO_PARTS
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.coco import CATEGORIES, IMAGES, PARTS, CocoExporter
+from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS
+from synpick_warp.exporters.bop.coco.exporter import CocoExporter
+from synpick_warp.exporters.bop.exporter import BopExporter
 from tests.harness.exporter_contract import ExporterContract, export, exporting, finish
 from tests.worlds.box_views import batches, cameras, config, ends
 
@@ -57,6 +60,22 @@ def test_pycocotools_reads_back_masks_boxes_and_images(tmp_path):
             rows, columns = np.flatnonzero(visible.any(axis=1)), np.flatnonzero(visible.any(axis=0))
             assert row["bbox"] == [columns[0], rows[0], columns[-1] - columns[0] + 1, rows[-1] - rows[0] + 1]
             assert (row["area"], row["category_id"]) == (visible.sum(), batch.object_id[0, row["instance_id"]])
+
+
+def test_keypoints_are_those_of_bop_annotations(tmp_path):
+    settings = config(keypoints=8)
+    scenes = [export(kind, tmp_path / kind.__name__, settings, (0,), processes=0) for kind in (BopExporter, CocoExporter)]
+    split = read(scenes[1])
+    for camera in range(len(LENSES)):
+        scene = json.loads((scenes[0] / "train_pbr" / f"{camera:06d}" / "scene_gt_coco.json").read_text())
+        images = [index for index, image in split.imgs.items() if image["camera"] == camera]
+        ours = [row for index in images for row in split.loadAnns(split.getAnnIds(imgIds=index))]
+        assert [(row["keypoints"], row["num_keypoints"]) for row in ours] == [
+            (row["keypoints"], row["num_keypoints"]) for row in scene["annotations"]
+        ]
+        for mine, other in zip(split.dataset["categories"], scene["categories"], strict=True):
+            assert mine == {key: value for key, value in other.items() if key != "supercategory"}
+            assert len(mine["keypoint_positions"]) == 8
 
 
 def test_every_split_has_an_annotation_file(tmp_path):

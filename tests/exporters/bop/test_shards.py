@@ -16,9 +16,9 @@ from pycocotools import mask as coco
 from webdataset import tariterators
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.exporters.bop import shard_parts
 from synpick_warp.exporters.bop.exporter import BopExporter
-from synpick_warp.exporters.bop.shards import ShardsExporter
+from synpick_warp.exporters.bop.shards import tar_files
+from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
 from synpick_warp.exporters.registry import Exporters
 from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, finish
 from tests.worlds.box_views import batches, cameras, config, ends
@@ -178,7 +178,7 @@ def test_png_colour_without_masks(tmp_path):
 
 
 def test_a_long_scene_has_several_shards(tmp_path, dataset, monkeypatch):
-    monkeypatch.setattr(shard_parts, "MAX_SHARD_VIEWS", 2)
+    monkeypatch.setattr(tar_files, "MAX_SHARD_VIEWS", 2)
     out = tmp_path / "set"
     with exporting(ShardsExporter, out, config(), processes=0) as exporter:
         exporter.write_constants()

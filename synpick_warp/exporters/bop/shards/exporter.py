@@ -10,9 +10,9 @@ from typing import Any
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import effect_ranges
 from synpick_warp.exporters.base import SharedFiles
-from synpick_warp.exporters.bop.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
 from synpick_warp.exporters.bop.scene_exporter import CONSTANTS, SceneExporter
-from synpick_warp.exporters.bop.shard_parts import (
+from synpick_warp.exporters.bop.shards.card import CARD_FILE, CardContent, SplitContent, hub_splits, make_card
+from synpick_warp.exporters.bop.shards.tar_files import (
     commit_shards,
     find_shards,
     list_keys,

@@ -12,7 +12,7 @@ import numpy as np
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import MULTISENSOR, Config
 from synpick_warp.errors import CatalogError
-from synpick_warp.exporters.bop.toolkit import describe_toolkit
+from synpick_warp.exporters.bop.shared.toolkit import describe_toolkit
 from synpick_warp.exporters.bop.view import MILLIMETERS
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.inputs.paths import path_inside

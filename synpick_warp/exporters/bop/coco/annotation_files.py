@@ -1,6 +1,6 @@
-"""Exporter of COCO instance segmentation: one annotation file for each split, with visible boxes, for detectors' training code.
+"""Files of the COCO format: images and annotations of a scene, as views are written, and the annotation file of each split.
 
-Beside BOP's scene_gt_coco.json, which is a file a scene with amodal boxes: here boxes enclose the visible mask, as COCO's readers expect.
+Runs in writer processes, so it imports neither Warp nor Newton.
 """
 
 from __future__ import annotations
@@ -8,34 +8,20 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import bop_folder, bop_folders
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.base import ExportContext, SharedFiles
+from synpick_warp.exporters.bop.keypoints import Keypoints, make_category_keys
 from synpick_warp.exporters.bop.scene import AnnotationBlocks
-from synpick_warp.exporters.bop.scene_exporter import SceneExporter
-from synpick_warp.exporters.bop.view import (
-    ANNOTATIONS,
-    Masks,
-    ViewSettings,
-    ViewTruth,
-    annotation_block,
-    encode_color,
-    extract_masks,
-    make_gt_info_entries,
-    make_rle,
-    to_json,
-)
+from synpick_warp.exporters.bop.view import ANNOTATIONS, Masks, annotation_block, make_rle, to_json
 from synpick_warp.exporters.writing.files import PARTIAL, output_error, sync_folder, write_synced
 from synpick_warp.exporters.writing.folder import open_folder
-from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.inputs.files import read_file
 from synpick_warp.inputs.json import MAX_JSON, decode_json, read_json
 from synpick_warp.inputs.paths import path_inside
@@ -50,6 +36,9 @@ _ADVICE = "remove it and its episode's two files in manifest/, and resume the ba
 class _Category(msgspec.Struct):
     id: int
     name: str
+    keypoints: list[str] | msgspec.UnsetType = msgspec.UNSET
+    skeleton: list[tuple[int, int]] | msgspec.UnsetType = msgspec.UNSET
+    keypoint_positions: list[tuple[float, float, float]] | msgspec.UnsetType = msgspec.UNSET
 
 
 def annotation_file(split: str) -> Path:
@@ -57,78 +46,14 @@ def annotation_file(split: str) -> Path:
     return FOLDER / "annotations" / f"instances_{split}.json"
 
 
-class CocoExporter(SceneExporter):
-    """`Exporter` of COCO. A scene is a folder of images, and a part of the annotations, from which a file a split is made at the end."""
-
-    writes_depth = False
-    staging = "coco"
-
-    def __init__(self, context: ExportContext) -> None:
-        """See `Exporter`."""
-        super().__init__(context)
-        self._layers = ()
-
-    @staticmethod
-    def write_view(
-        color: np.ndarray,
-        depth: np.ndarray,
-        visible_source: np.ndarray,
-        amodal_source: np.ndarray,
-        scene: Path,
-        settings: ViewSettings,
-        truth: ViewTruth,
-    ) -> None:
-        """See `SceneExporter`."""
-        width, height = settings.resolution
-        masks = extract_masks(visible_source, amodal_source, truth, height)
-        infos = make_gt_info_entries(truth)
-        annotations = make_annotations(truth.object_id.tolist(), truth.instance_id.tolist(), infos, masks, height, width)
-        write_image(scene, truth.frame, settings.color_suffix, encode_color(color, settings, truth.jpeg_quality), annotations)
-
-    @staticmethod
-    def folder_name(split: str) -> str:
-        """See `SceneExporter`: one for all splits."""
-        return FOLDER.name
-
-    @staticmethod
-    def shared_files(config: Config) -> SharedFiles:
-        """See `Exporter`."""
-        places = tuple(map(annotation_file, bop_folders(config)))
-        return SharedFiles((CATEGORIES,), places, (IMAGES, PARTS, places[0].parent, FOLDER))
-
-    @staticmethod
-    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
-        """See `Exporter`: the annotations of each split."""
-        try:
-            return write_annotation_files(out, config)
-        except OSError as error:
-            raise output_error(out / FOLDER, error) from error
-
-    def write_constants(self) -> list[Path]:
-        """See `Exporter`: the names of the objects."""
-        write_categories(self._out, {entry.obj_id: entry.name for entry in self._context.catalog.entries})
-        return [CATEGORIES]
-
-    def files(self, episode: int) -> list[Path]:
-        """See `Exporter`: folders of images, and parts."""
-        return scene_files(self._out, [self.scene_id(episode, camera) for camera in range(len(self._cameras))])
-
-    def _stage_scene(self, scene: Path) -> None:
-        scene.mkdir()
-
-    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        raise NotImplementedError("COCO has no layers")
-
-    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return commit_scenes, (scenes, self._out)
-
-
-def write_categories(out: Path, names: dict[int, str]) -> None:
-    """Write the names of the objects, and the folders of the format."""
+def write_categories(out: Path, names: Mapping[int, str], keypoints: Mapping[int, Keypoints]) -> None:
+    """Write names and keypoints (or none) of the objects by obj_id, and the folders of the format."""
     try:
         for folder in (FOLDER, IMAGES, PARTS):
             (out / folder).mkdir(exist_ok=True)
-        categories = [{"id": index, "name": name, "supercategory": "object"} for index, name in sorted(names.items())]
+        extras = {obj_id: make_category_keys(points) for obj_id, points in keypoints.items()}
+        named = [{"id": obj_id, "name": name, "supercategory": "object"} for obj_id, name in sorted(names.items())]
+        categories = [category | extras.get(obj_id, {}) for category, obj_id in zip(named, sorted(names), strict=True)]
         (out / CATEGORIES).write_text(json.dumps(categories, indent=2) + "\n", encoding="ascii")
     except OSError as error:
         raise output_error(out / CATEGORIES, error) from error
@@ -141,23 +66,37 @@ def scene_files(out: Path, scenes: Iterable[int]) -> list[Path]:
 
 
 def make_annotations(
-    object_ids: Sequence[int], instance_ids: Sequence[int], infos: Sequence[dict[str, Any]], masks: Sequence[Masks], height: int, width: int
+    poses: Sequence[dict[str, Any]],
+    infos: Sequence[dict[str, Any]],
+    masks: Sequence[Masks],
+    height: int,
+    width: int,
+    points: Sequence[dict[str, Any]] | None = None,
 ) -> Iterator[dict[str, Any]]:
-    """Annotations of a view's visible instances, without ids: box of the visible mask, its run lengths, and extras of ours."""
-    for object_id, instance_id, info, mask in zip(object_ids, instance_ids, infos, masks, strict=True):
+    """Annotations of a view's visible instances, without ids: box of the visible mask, its run lengths, extras of ours, keypoints.
+
+    Args:
+        poses: The view's entry in scene_gt.json.
+        infos: The view's entry in scene_gt_info.json.
+        masks: Masks of the instances.
+        height: Of the image [px].
+        width: Of the image [px].
+        points: Keys of keypoints by instance (`project_keypoints`); None: no keypoints.
+    """
+    for pose, info, mask, extra in zip(poses, infos, masks, points or [{} for _ in infos], strict=True):
         box = mask.visible.box()
         if box is not None:
             left, top, right, bottom = box
             yield {
-                "category_id": object_id,
+                "category_id": pose["obj_id"],
                 "bbox": [left, top, right - left + 1, bottom - top + 1],
                 "area": mask.visible.count,
                 "iscrowd": 0,
                 "segmentation": make_rle(mask.visible, height, width),
                 "bbox_amodal": info["bbox_obj"],
                 "visib_fract": info["visib_fract"],
-                "instance_id": instance_id,
-            }
+                "instance_id": pose["instance_id"],
+            } | extra
 
 
 def write_image(scene: Path, frame: int, suffix: str, data: Any, annotations: Iterable[dict[str, Any]]) -> None:

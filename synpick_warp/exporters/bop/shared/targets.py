@@ -53,7 +53,7 @@ def _kinds(config: Config) -> tuple[str, ...]:
 def scene_target_files(config: Config, folder: str) -> tuple[str, ...]:
     """Files that list a split's targets, BOP19, BOP24, and MULTIVIEW with several sensors: those of its kind.
 
-    Without splits, all scenes are in the lists named test.
+    Without splits, all scenes are in the lists named test, which the toolkit's scripts open for any split.
 
     Lists begin with the kind of their splits, as in val_targets_bop19.json; splits of one kind share them, as scene ids are unique.
     """

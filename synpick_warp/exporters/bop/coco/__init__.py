@@ -1,0 +1,1 @@
+"""COCO instance segmentation: images, and one annotation file for each split."""

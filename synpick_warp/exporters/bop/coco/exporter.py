@@ -1,0 +1,109 @@
+"""Exporter of COCO instance segmentation: one annotation file for each split, with visible boxes, for detectors' training code.
+
+Beside BOP's scene_gt_coco.json, which is a file a scene with amodal boxes: here boxes enclose the visible mask, as COCO's readers expect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import bop_folders
+from synpick_warp.exporters.base import ExportContext, SharedFiles
+from synpick_warp.exporters.bop.coco.annotation_files import (
+    CATEGORIES,
+    FOLDER,
+    IMAGES,
+    PARTS,
+    annotation_file,
+    commit_scenes,
+    make_annotations,
+    scene_files,
+    write_annotation_files,
+    write_categories,
+    write_image,
+)
+from synpick_warp.exporters.bop.keypoints import project_keypoints
+from synpick_warp.exporters.bop.scene_exporter import SceneExporter
+from synpick_warp.exporters.bop.view import (
+    ViewSettings,
+    ViewTruth,
+    encode_color,
+    extract_masks,
+    make_gt_entries,
+    make_gt_info_entries,
+    read_depth,
+)
+from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.exporters.writing.pool import WriterPool
+
+
+class CocoExporter(SceneExporter):
+    """`Exporter` of COCO. A scene is a folder of images, and a part of the annotations, from which a file a split is made at the end."""
+
+    writes_depth = False
+    staging = "coco"
+
+    def __init__(self, context: ExportContext) -> None:
+        """See `Exporter`."""
+        super().__init__(context)
+        self._layers = ()
+
+    @staticmethod
+    def write_view(
+        color: np.ndarray,
+        depth: np.ndarray,
+        visible_source: np.ndarray,
+        amodal_source: np.ndarray,
+        scene: Path,
+        settings: ViewSettings,
+        truth: ViewTruth,
+    ) -> None:
+        """See `SceneExporter`."""
+        width, height = settings.resolution
+        masks = extract_masks(visible_source, amodal_source, truth, height)
+        poses, keypoints = make_gt_entries(truth, settings.camera), settings.keypoints
+        points = project_keypoints(poses, settings.camera, read_depth(depth, settings), keypoints) if keypoints else None
+        annotations = make_annotations(poses, make_gt_info_entries(truth), masks, height, width, points)
+        write_image(scene, truth.frame, settings.color_suffix, encode_color(color, settings, truth.jpeg_quality), annotations)
+
+    @staticmethod
+    def folder_name(split: str) -> str:
+        """See `SceneExporter`: one for all splits."""
+        return FOLDER.name
+
+    @staticmethod
+    def shared_files(config: Config) -> SharedFiles:
+        """See `Exporter`."""
+        places = tuple(map(annotation_file, bop_folders(config)))
+        return SharedFiles((CATEGORIES,), places, (IMAGES, PARTS, places[0].parent, FOLDER))
+
+    @staticmethod
+    def finalize(out: Path, config: Config, pool: WriterPool) -> list[Path]:
+        """See `Exporter`: the annotations of each split."""
+        try:
+            return write_annotation_files(out, config)
+        except OSError as error:
+            raise output_error(out / FOLDER, error) from error
+
+    def write_constants(self) -> list[Path]:
+        """See `Exporter`: names and keypoints of the objects."""
+        write_categories(self._out, {entry.obj_id: entry.name for entry in self._context.catalog.entries}, self._keypoints)
+        return [CATEGORIES]
+
+    def files(self, episode: int) -> list[Path]:
+        """See `Exporter`: folders of images, and parts."""
+        return scene_files(self._out, [self.scene_id(episode, camera) for camera in range(len(self._cameras))])
+
+    def _stage_scene(self, scene: Path) -> None:
+        scene.mkdir()
+
+    def _layer_task(self, scene: Path, scene_id: int, name: str, frame: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        raise NotImplementedError("COCO has no layers")
+
+    def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
+        return commit_scenes, (scenes, self._out)

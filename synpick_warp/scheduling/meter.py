@@ -1,0 +1,41 @@
+"""Throughput of a bake and its remaining time, reported to the observer after each tick."""
+
+from __future__ import annotations
+
+import time
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.episodes import BakeSummary
+from synpick_warp.progress import Progress
+
+
+class ThroughputMeter:
+    """Throughput and remaining time, reported to the observer."""
+
+    def __init__(self, config: Config, summary: BakeSummary, progress: Progress) -> None:
+        self.summary, self.progress = summary, progress
+        self.started: float | None = None
+        self.cameras = len(config.cameras.positions)
+
+    def show(self, active: int) -> None:
+        """Report after a tick in which `active` worlds were busy. Time counts from the first view, when all kernels are compiled."""
+        summary, now = self.summary, time.perf_counter()
+        if self.started is None and summary.views:
+            self.started = now
+        elapsed = now - self.started if self.started is not None else 0.0
+        done = [row for row in summary.episodes if row.ending.delivers]
+        left = None
+        if len(summary.episodes) > summary.resumed and elapsed > 0.0 and done and summary.views:
+            # Short episodes end first: running ones can already be longer than the mean of the ended ones.
+            running = summary.views / self.cameras / (len(summary.episodes) - summary.resumed + active)
+            frames = max(sum(row.frames for row in done) / len(done), running)
+            fraction = summary.views / ((summary.total - summary.resumed) * self.cameras * frames)
+            left = (1.0 / fraction - 1.0) * elapsed if fraction < 1.0 else None
+        self.progress.update(
+            episodes_done=len(summary.episodes),
+            episodes=summary.total,
+            worlds_active=active,
+            views=summary.views,
+            views_per_s=summary.views / elapsed if elapsed > 0.0 else 0.0,
+            seconds_left=left,
+        )
