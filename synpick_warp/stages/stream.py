@@ -347,12 +347,23 @@ class FrameStream:
         views = make_views(rows[0], rows[1], len(world), self.instances)
         with scope("render", self.device):
             self.renderer.render(snapshot, views, self.buffers[slot], self.layer_buffers[slot])
-            list_boundaries(self.boundary_scratch, len(world), self.buffers[slot], self.boundaries[slot])
-            if self.compressor is not None:
-                self.compressor.compress(slot, len(world), self.buffers[slot])
-            if self.depth_encoder is not None:
-                self.depth_encoder.encode(self.buffers[slot].depth, len(world), self.depth_files[slot])
-        self.copies[slot].start(self.copy_stream)
+        with wp.ScopedStream(self.copy_stream):
+            with scope("encode", self.device):
+                self._encode(slot, len(world))
+            self.copies[slot].start(self.copy_stream)
+
+    def _encode(self, slot: int, count: int) -> None:
+        """Make what is copied in place of the images of `count` views: run boundaries and files.
+
+        It runs on the copy stream, after the rendering of these views and beside that of the next ones: entropy coders are few long
+        threads, which leave a GPU nearly idle. One batch at a time uses their scratch, in the order of this stream.
+        """
+        buffers = self.buffers[slot]
+        list_boundaries(self.boundary_scratch, count, buffers, self.boundaries[slot])
+        if self.compressor is not None:
+            self.compressor.compress(slot, count, buffers)
+        if self.depth_encoder is not None:
+            self.depth_encoder.encode(buffers.depth, count, self.depth_files[slot])
 
     def _collect(self, waiting: tuple[int, slice], world: np.ndarray, camera: np.ndarray, report: TickReport) -> FrameBatch:
         slot, part = waiting
