@@ -242,6 +242,32 @@ def doctor(
     return 0
 
 
+@app.command
+def warmup(
+    *,
+    config: ConfigOption = None,
+    mode: Annotated[str | None, Parameter(help=_help("bake.mode"))] = None,
+    device: DeviceOption = None,
+    models: Annotated[str | None, Parameter(help=_help("bake.models"))] = None,
+    lights: Annotated[str | None, Parameter(help=_help("bake.lights"))] = None,
+    formats: Annotated[str | None, Parameter(help=_help("bake.formats", " Joined by commas."))] = None,
+    resolution: ResolutionOption = None,
+    set_: SetOption = None,
+) -> int:
+    """Compile all kernels of a bake with these settings ahead, and prepare its objects and lights; later bakes find them in the caches."""
+    names = None if formats is None else [name.strip() for name in formats.split(",")]
+    given = {"bake.mode": mode, "bake.device": device, "bake.models": models, "bake.lights": lights, "bake.formats": names}
+    resolved = _resolve(config, given, resolution, set_)
+    _check_inputs(resolved)
+    from synpick_warp.cli.display import make_console, make_progress
+    from synpick_warp.warmup import warm_up
+
+    with make_progress(make_console()) as progress:
+        result = warm_up(resolved, progress)
+    print(f"ready in {result.seconds:.1f} s: {result.compiled} modules compiled, the others were in the kernel cache")
+    return 0
+
+
 @app.command(name="config")
 def show_config(*, config: ConfigOption = None, set_: SetOption = None) -> int:
     """Print all settings as TOML with meaning, unit and range: a template for your own file."""
@@ -328,6 +354,20 @@ def _bake_profiled(config: Config, out: Path, shard: tuple[int, int], splits: Se
     return code
 
 
+def _check_inputs(config: Config) -> None:
+    """Check that the folders of models and lights exist.
+
+    Raises:
+        CatalogError: There are no models.
+        LightError: There are no lights.
+    """
+    models, lights = config.bake.models, config.bake.lights
+    if models and not os.path.isdir(models):
+        raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes")
+    if lights and not os.path.isdir(lights):
+        raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets")
+
+
 def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], devices: Sequence[str] = ()) -> int:
     """Check device and folders, which is cheap, then bake."""
     from synpick_warp.cli.display import make_console, make_progress, print_summary
@@ -338,11 +378,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
         devices = pick_devices(devices)
     else:
         pick_device(config.bake.device)
-    models, lights = config.bake.models, config.bake.lights
-    if models and not os.path.isdir(models):
-        raise CatalogError(f"there is no models folder {models}; --models takes a folder of BOP models or of OBJ, GLB or PLY meshes")
-    if lights and not os.path.isdir(lights):
-        raise LightError(f"there is no lights folder {lights}; --lights takes a folder of .hdr maps and sIBL sets")
+    _check_inputs(config)
     check_output_folder(out)
     from synpick_warp.pipeline import run_bake
 

@@ -62,15 +62,19 @@ class Perception:
             self._loop(snapshot)
             return
         if not self._warm:
-            # Kernels cannot be loaded during capture; one eager batch loads all of them, even if the worklist is empty.
-            self.list_worlds()
-            self.perceive_batch(snapshot)
+            # Kernels cannot be loaded during capture.
+            self.load_kernels(snapshot)
             self._warm = True
         if id(snapshot) not in self._graphs:
             with wp.ScopedCapture(device=self.device) as capture:
                 self._loop(snapshot)
             self._graphs[id(snapshot)] = capture.graph
         wp.capture_launch(self._graphs[id(snapshot)])
+
+    def load_kernels(self, snapshot: Snapshot) -> None:
+        """Launch one batch, which loads all kernels, even if the worklist is empty."""
+        self.list_worlds()
+        self.perceive_batch(snapshot)
 
     def _loop(self, snapshot: Snapshot) -> None:
         self.list_worlds()
