@@ -45,7 +45,7 @@ _ZLIB_HEADER = (0x0178, 16)
 """Header of a zlib stream (RFC 1950, section 2.2): deflate, window of 32 kB, fastest compression."""
 _SAMPLE_BYTES = 2
 _MIN_CAPACITY = 1 << 16
-"""Capacity besides half a byte a pixel [B]."""
+"""Constant part of the capacity of a file [B]; half a byte a pixel is added."""
 _FRAME_BYTES, _PIXEL_BYTES = 256, 6
 """Header and end of the data [B], and two literals and a row's filter type [B], at most."""
 

@@ -80,7 +80,7 @@ def read_sample(
 
 @wp.func
 def is_padding(image: wp.array3d[wp.vec3ub], block: int, mcu_row: int, mcu_column: int) -> bool:
-    """Whether a block of an MCU at the border shows no pixel of the image."""
+    """Whether a block of an MCU at the border is padding (libjpeg's dummy block): it contains no pixel of the image."""
     if block >= MCU_BLOCKS_ACROSS * MCU_BLOCKS_ACROSS:
         return False
     row, column = mcu_row * MCU + (block // MCU_BLOCKS_ACROSS) * BLOCK, mcu_column * MCU + (block % MCU_BLOCKS_ACROSS) * BLOCK

@@ -87,7 +87,7 @@ def bit_length(value: int) -> int:
 
 @wp.func
 def signed_bits(value: int, count: int) -> wp.uint32:
-    """The `count` low bits that JPEG writes for a value: itself, or for negative ones its one's complement."""
+    """Magnitude bits of a value (T.81, F.1.2.1): its `count` low bits; for negative ones those of value - 1."""
     bits = wp.where(value < 0, value - 1, value)
     return wp.uint32(bits & ((1 << count) - 1))
 

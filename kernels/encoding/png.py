@@ -1,7 +1,8 @@
-"""Depth PNG encoder: "up" filter (PNG specification, section 9.2) and Huffman codes of deflate (RFC 1951), all in integers.
+"""Depth PNG encoder: "up" filter (PNG specification, section 9.2), LZ77 matches and Huffman codes of deflate (RFC 1951), all in integers.
 
-Rows are cut into segments, which are coded independently into slots of their own: strings of bits, the first bit the lowest of its word.
-Then the slots are joined bit by bit. Matches repeat one of the `MAX_DISTANCE` filtered samples before, also those of the segment before.
+Rows are cut into segments. Each is coded by one thread into a slot of its own, a bit string stored least significant bit first; a prefix
+sum over the sizes of slots gives the bit offsets at which they are joined. Matches begin at most `MAX_DISTANCE` samples back in the same
+row; they may reach into the segment before.
 """
 
 import warp as wp
@@ -11,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 UP = wp.constant(2)
 """Filter type "up": difference to the byte above."""
 MIN_RUN, MAX_RUN = wp.constant(2), wp.constant(129)
-"""Samples in a match."""
+"""Shortest and longest match length [samples]."""
 MAX_DISTANCE = wp.constant(8)
 """Longest distance of a match [samples]."""
 ADLER = wp.constant(65521)
@@ -21,9 +22,9 @@ WORD_BITS = wp.constant(32)
 WORD_SHIFT = wp.constant(wp.uint64(32))
 """Bits of a word of a slot."""
 GROUP = wp.constant(64)
-"""Slots whose sizes a thread adds up."""
+"""Slots of one group of the two-level prefix sum; one thread adds them up."""
 CODE_BITS = wp.constant(24)
-"""Bits of a packed code's value; above them is the number of its bits."""
+"""Position of the length in a packed code: the code is in bits 0 to 23, its number of bits in bits 24 to 31."""
 
 
 history_vec = wp.types.vector(length=8, dtype=wp.int32)
@@ -37,9 +38,9 @@ class Codes:
     literal: wp.array[wp.uint32]
     """(byte)"""
     run: wp.array[wp.uint32]
-    """(samples): length of a match."""
+    """(length): packed code of a match length [samples]."""
     distance: wp.array[wp.uint32]
-    """(samples): distance of a match, less 1."""
+    """(distance - 1): packed code of a match distance [samples]."""
 
 
 @wp.struct
@@ -59,14 +60,14 @@ class SlotWriter:
 
 @wp.struct
 class SlotSums:
-    """Sizes and checksums of slots, or of groups of slots."""
+    """Sizes and partial Adler-32 sums of slots, or of groups of slots."""
 
     bits: wp.array2d[int]
-    """(view, slot): bits."""
+    """(view, slot): size [bits]."""
     total: wp.array2d[int]
-    """(view, slot): Σ value of the filtered bytes."""
+    """(view, slot): sum of the filtered bytes."""
     moment: wp.array2d[int]
-    """(view, slot): Σ position · value of the filtered bytes, modulo `ADLER`; for groups, of up to `GROUP` such sums."""
+    """(view, slot): sum of position in the filtered image times byte, modulo `ADLER`; of a group: sum of up to `GROUP` of these."""
 
 
 @wp.func
@@ -216,9 +217,10 @@ def sum_groups_kernel(
     begin_out: wp.array2d[int],  # (view, slot)
     groups_out: SlotSums,
 ):
-    """Sums over each `GROUP` slots but the last of a view. `begin_out` receives each slot's first bit within its group.
+    """Prefix sum, level 1: bit offset of each slot within its group, and the sums of each group of `GROUP` slots.
 
-    Launched over view, group.
+    The last slot of a view is left out: `close_streams_kernel` writes it. `begin_out` receives the offsets [bits]. Launched over view,
+    group.
     """
     view, group = wp.tid()
     bits, total, moment = int(0), int(0), int(0)
@@ -246,9 +248,9 @@ def close_streams_kernel(
     slots_inout: SlotSums,
     size_out: wp.array[int],  # (view)
 ):
-    """Write the last slot of each view: end of the block, bits that fill a byte, Adler-32 of the filtered rows. Launched over view.
+    """Prefix sum, level 2, and end of the stream, in the last slot: end-of-block code, padding to a byte, Adler-32 of the filtered rows.
 
-    `group_begin_out` receives the first bit of each group, `size_out` the size of the data [B].
+    `group_begin_out` receives the bit offset of each group, `size_out` the size of the zlib stream [B]. Launched over view.
     """
     view = wp.tid()
     bits, total, moment = int(0), int(0), int(0)

@@ -1,1 +1,1 @@
-"""Conversion of baked data sets to further formats: the bytes that a bake would have written, wherever the source is lossless for them."""
+"""Format conversion of baked data sets. Output files equal those of a bake byte for byte, unless the source stores its data with loss."""

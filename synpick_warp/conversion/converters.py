@@ -129,7 +129,7 @@ class _SceneConverter(Converter):
 
 
 class ShardsConverter(_SceneConverter):
-    """To webdataset shards: images are copied."""
+    """Converter to webdataset shards; images are copied."""
 
     exporter = ShardsExporter
 
@@ -169,7 +169,7 @@ def _read_names(source: Source) -> dict[int, str]:
 
 
 class BopConverter(_SceneConverter):
-    """To scene folders: images are copied, masks drawn from run lengths."""
+    """Converter to BOP scene folders; images are copied, masks are decoded from run lengths (RLE)."""
 
     exporter = BopExporter
 
@@ -203,7 +203,7 @@ class BopConverter(_SceneConverter):
 
 
 class CocoConverter(_SceneConverter):
-    """To COCO: images are copied."""
+    """Converter to COCO; images are copied."""
 
     exporter = CocoExporter
 
@@ -236,7 +236,7 @@ class CocoConverter(_SceneConverter):
 
 
 class UsdConverter(Converter):
-    """To USD, from the trajectories; objects and lights are loaded again, and compared with the source's."""
+    """Converter to USD, from trajectories. Objects and lights are loaded again, and compared with the digests of the source."""
 
     def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
         super().__init__(source, out, config, pool)
@@ -263,7 +263,8 @@ class UsdConverter(Converter):
 
 
 class LerobotConverter(Converter):
-    """To LeRobot, from views and trajectories; videos from JPEG images are not those of a bake."""
+    """Converter to LeRobot, from views and trajectories. Videos of JPEG images differ from a bake's, since the images were compressed
+    before."""
 
     def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
         super().__init__(source, out, config, pool)
@@ -326,7 +327,7 @@ CONVERTERS: dict[str, type[Converter]] = {
 
 
 class Converters(Exporters):
-    """All converters of a conversion, with the part of `Exporters` that an output folder calls."""
+    """Composite of the converters of all target formats, with the methods of `Exporters` that an output folder calls."""
 
     def __init__(self, source: Source, out: Path, config: Config, pool: WriterPool) -> None:
         """See `Converter`."""

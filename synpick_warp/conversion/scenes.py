@@ -52,7 +52,7 @@ class SceneSource:
 
 @dataclass(frozen=True)
 class SceneContent:
-    """What a converted scene holds, by the settings."""
+    """Configured contents of a converted scene: masks, COCO annotations, layers and keypoints."""
 
     masks: bool
     coco: bool

@@ -33,7 +33,7 @@ from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device
 
 DEVICE_ONLY = 0
-"""Writer processes of a memory plan in which views stay on the device."""
+"""Writer processes in the memory plan of a stream: none, as views stay on the device."""
 
 
 class ViewStream:

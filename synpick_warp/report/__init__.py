@@ -1,4 +1,5 @@
-"""Report of a data set as one HTML page: frames, film strips, explained attempts, plots, findings, settings; it loads nothing."""
+"""Self-contained HTML report of a data set: frames, film strips, explained attempts, plots, findings and settings; no external
+resources."""
 
 from synpick_warp.report.compose import write_report
 

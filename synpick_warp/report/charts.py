@@ -43,7 +43,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Source:
-    """What plots are drawn from."""
+    """Input data of the charts."""
 
     statistics: Statistics
     brightness: Sequence[Brightness]
@@ -105,7 +105,7 @@ def _stack(rows: Rows, category: str, value: str, order: Sequence[str], titles: 
 _COUNT_AXIS: Spec = {"tickCount": 6, "labelExpr": "datum.value == floor(datum.value) ? format(datum.value, ',d') : ''"}
 """Axis of counts: fractions between them have no label."""
 _LEGEND: Spec = {"name": "chosen", "select": {"type": "point", "fields": ["mode"]}, "bind": "legend"}
-"""A click on a mode in the legend chooses it."""
+"""Selection bound to the legend: a click on a mode selects it."""
 _FADED: Spec = {"condition": {"param": "chosen", "value": 1}, "value": 0.15}
 
 
@@ -251,7 +251,7 @@ _FORCE = "largest seal force [N]"
 
 
 def _limit(force: float, text: str, side: str) -> Spec:
-    """A dashed line at a force, with its text on the other side."""
+    """Dashed rule at a force [N] with a label; `side` is how the label is aligned to the rule."""
     return {
         "data": {"values": [{"limit": force, "what": text}]},
         "encoding": {"x": _field("limit", "quantitative", _FORCE)},

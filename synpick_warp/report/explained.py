@@ -31,7 +31,7 @@ GRAPH_SIZE = (440, 420)
 
 @dataclass(frozen=True)
 class Found:
-    """An attempt of the sample."""
+    """Reference to a chosen attempt."""
 
     episode: int
     place: int

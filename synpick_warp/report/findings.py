@@ -13,9 +13,9 @@ from synpick_warp.statistics import Statistics
 
 WARNING, NOTE = "warning", "note"
 FAILURE_SHARE = 0.3
-"""Share of all attempts from which one way to fail is raised."""
+"""Threshold: fraction of all attempts that fail in the same way."""
 LOST_SHARE = 0.2
-"""Share of the objects that left the scene otherwise than picked."""
+"""Threshold: fraction of the objects that left the scene without being picked."""
 GIVEN_UP_SHARE = 0.3
 """Share of the episodes with picking that ended after too many failures."""
 RARE = 0.25
@@ -25,7 +25,7 @@ INVISIBLE_SHARE = 0.3
 DARK, BRIGHT = 0.12, 0.88
 """Mean luma of a view below or above which it is too dark or too bright; middle grey is 0.46."""
 EXTREME_SHARE = 0.1
-"""Share of the measured views from which dark or bright ones are raised."""
+"""Threshold: fraction of the measured views that are too dark, or too bright."""
 MISSING_DEPTH = 0.2
 """Share of the depth pixels without measurement."""
 ONE_MAP_SHARE = 0.5
@@ -42,7 +42,7 @@ MAX_NAMED = 6
 
 
 class Finding(NamedTuple):
-    """One remark."""
+    """Remark of the report on the quality of a data set."""
 
     level: str
     """WARNING, or NOTE: may be meant."""

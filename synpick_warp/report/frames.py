@@ -83,7 +83,7 @@ def _instance(view: View, index: int, names: Mapping[int, str]) -> dict[str, Any
 
 
 def _box(box: list[int]) -> list[int]:
-    """A box that includes its last pixel, as BOP's do."""
+    """Convert a BOP box (x, y, width, height) [px], whose width is x_max - x_min, to one whose width and height count the last pixel."""
     x, y, width, height = box
     return [x, y, width + 1, height + 1]
 

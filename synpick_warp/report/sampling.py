@@ -25,7 +25,7 @@ _WEIGHTS = np.array((0.2126, 0.7152, 0.0722), np.float32)
 
 @dataclass(frozen=True)
 class Episodes:
-    """Sampled episodes."""
+    """Manifest rows of the sampled episodes."""
 
     rows: dict[int, EpisodeFacts]
     """Row of each episode by its index."""

@@ -13,7 +13,7 @@ from synpick_warp.report.sampling import Episodes, spread
 MAX_STRIPS = 4
 """Most episodes."""
 MAX_FRAMES = 72
-"""Most frames of an episode: a step each of the slider."""
+"""Maximum number of frames of an episode, one a step of the slider."""
 MAX_CAMERAS = 3
 WIDTH = 420
 """Largest width of a picture [px]: three stand side by side."""
@@ -26,7 +26,7 @@ _MARGIN = 1.15
 
 
 def choose_episodes(episodes: Episodes) -> list[int]:
-    """One episode of each mode, of median length, at most MAX_STRIPS; by mode in the order of the episodes."""
+    """Choose an episode of median length of each mode, at most MAX_STRIPS; modes in the order of their first episodes."""
     by_mode: dict[str, list[int]] = {}
     for index, row in episodes.rows.items():
         if row.frames:

@@ -43,7 +43,7 @@ from synpick_warp.system.interrupt import StopRequest
 from synpick_warp.system.processes import END_TIMEOUT, WorkerProcess, send, start_process
 
 _INTERVAL = 0.1
-"""Longest time between two looks at a requested stop [s]."""
+"""Polling interval of the stop request, at most [s]."""
 _NONE = {"episodes_done": 0, "worlds_active": 0, "views": 0, "views_per_s": 0.0, "seconds_left": None}
 
 

@@ -35,7 +35,7 @@ def order_longest_first(config: Config, episodes: Sequence[int], device: wp.Devi
 
 
 def deal_episodes(ordered: Sequence[int], devices: int) -> list[list[int]]:
-    """Deal ordered episodes to devices in turn, there and back (0, 1, 1, 0, 0, ...), so that none gets the longer one every time."""
+    """Deal ordered episodes to devices in snake order (0, 1, 1, 0, 0, ...), which balances their loads; a list for each device."""
     turns = [*range(devices), *reversed(range(devices))]
     shares: list[list[int]] = [[] for _ in range(devices)]
     for position, episode in enumerate(ordered):
@@ -44,5 +44,5 @@ def deal_episodes(ordered: Sequence[int], devices: int) -> list[list[int]]:
 
 
 def deal_writers(writers: int, devices: int) -> list[int]:
-    """Share writer processes out among devices: equal numbers up to one, and at least one each."""
+    """Split writer processes evenly among devices: shares differ by at most one, and each is at least one, even of fewer writers."""
     return [max(1, writers // devices + (device < writers % devices)) for device in range(devices)]

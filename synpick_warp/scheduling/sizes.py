@@ -25,8 +25,8 @@ HEADROOM = 1.5
 RUNTIME_BYTES = 1 << 30
 """Room for what no plan counts: CUDA's context and kernels; a process's libraries and objects, 0.7 GiB [bytes]."""
 WRITER_BYTES = 100 << 20
-"""Memory of a writer process besides its images [bytes]: 50 MB, its part of shared libraries included, at full HD with bop and shards, and
-headroom for formats with larger libraries."""
+"""Memory reserved for a writer process besides its image slots [bytes]. Measured are 50 MB, with its part of shared libraries, at full HD
+with bop and shards; the rest is headroom for formats with larger libraries."""
 WRITERS_FRACTION = 0.5
 """Fraction of the free host memory that writer processes may take if their number is chosen."""
 
@@ -66,7 +66,7 @@ def count_writers(config: Config) -> int:
 
 
 def _short_terms(config: Config, device: wp.Device, writers: int, processes: int) -> Sequence[Term]:
-    """Terms of the plan in a memory that they, with headroom, do not fit into; empty: they fit."""
+    """Terms of the memory plan for the first memory, device or host, that is too small for them with HEADROOM; empty: all fit."""
     terms = plan_memory(config, device, writers)
     for on_device in (True, False):
         part = [term for term in terms if term.on_device == on_device]

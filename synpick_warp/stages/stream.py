@@ -67,7 +67,7 @@ class TickReport:
     pose: np.ndarray
     """Object to world: x, y, z [m], quaternion x, y, z, w (world, instance, 7) float32."""
     observation: SimpleNamespace
-    """Arrays named and shaped as those of `Observation`; vectors have their components as a last dimension. After the tick's look."""
+    """Arrays of `Observation` by name, in its shapes; components of vectors are the last dimension. State after perception."""
     plan: SimpleNamespace
     """Arrays of `Plan`, likewise."""
     snapshot: SimpleNamespace = field(default_factory=SimpleNamespace)
@@ -121,14 +121,14 @@ class DeviceImages:
 
 @dataclass(frozen=True)
 class HostImages:
-    """Which images of a batch are copied to the host, and in which form."""
+    """Transfer settings of a batch: which images are copied to the host, and which are replaced by encoded files or run boundaries."""
 
     on_demand: tuple[str, ...] = ()
-    """Arrays of `ViewBuffers` of which exporters copy single images, where something else stands for most: files, run boundaries."""
+    """Arrays of `ViewBuffers` that stay on the device; files or run boundaries replace them, but for single images that exporters copy."""
     jpeg_quality: int = 0
-    """JPEG quality of the files that stand for colour images; 0: there are none."""
+    """Quality of the JPEG files that are copied instead of colour images; 0: there are none."""
     depth_files: bool = False
-    """Whether data of PNG files stands for depth images."""
+    """Whether data of PNG files (IDAT) is copied instead of depth images."""
 
 
 def host_images(config: Config, device: wp.Device, needs_images: bool, depth_files: bool) -> HostImages:

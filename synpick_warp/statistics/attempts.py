@@ -19,7 +19,7 @@ _UNIT = 10**6
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes of a group, and their attempts to pick."""
+    """Aggregate statistics of a group's episodes and of their picking attempts."""
 
     episodes: int
     frames: int

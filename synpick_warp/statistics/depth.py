@@ -13,7 +13,7 @@ DEPTH_BIN = 5.0
 """Width of a bin of depth [mm]."""
 QUANTILES = (0.0, 0.01, 0.25, 0.5, 0.75, 0.99, 1.0)
 _LEVELS = 2**16
-"""Number of possible counts in a 16-bit depth image."""
+"""Number of values of a 16-bit depth image."""
 
 
 @dataclass(frozen=True)

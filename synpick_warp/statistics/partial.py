@@ -24,7 +24,7 @@ from synpick_warp.statistics.scenes import SceneTruth, read_scene
 from synpick_warp.statistics.timeline import TimelineCounts
 
 MAX_OBJECTS = 65_536
-"""Most objects of a data set; more are no data set but a fault."""
+"""Maximum number of distinct objects; more are a sign of corrupt annotations."""
 
 
 @dataclass

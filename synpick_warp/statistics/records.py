@@ -15,7 +15,7 @@ Name = Annotated[str, Meta(max_length=MAX_NAME)]
 
 
 class EpisodeFacts(msgspec.Struct):
-    """Row of an episode."""
+    """Manifest row of an episode: mode, frames, ending and object counts."""
 
     mode: Name
     frames: Index

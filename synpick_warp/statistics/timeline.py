@@ -20,7 +20,7 @@ class TimePoint(NamedTuple):
     """A bin of time."""
 
     time: float
-    """Begin of the bin since the first frame [s]."""
+    """Start of the bin since the first frame [s]."""
     frames: int
     """Frames of the bin, over all episodes that last so long."""
     objects: float

@@ -21,9 +21,11 @@ EXACT_DEPTH, MEASURED_DEPTH = 1.0, 15.0
 MIN_PIXELS = 40
 """Smallest silhouette or mask that is compared [px]: smaller ones consist of their border."""
 EXACT_AREA, EXACT_OUTLINE = 0.002, 0.1
-"""Pixels that may differ in data sets of ours, as a fraction of the area and per pixel of outline: a shift by 1 px exceeds it."""
+"""Mask tolerance in data sets that this package baked: EXACT_AREA x area + EXACT_OUTLINE x length of the outline [px] may differ, plus a
+few. A shift by 1 px exceeds it."""
 AREA, OUTLINE = 0.02, 0.4
-"""As above, in other data sets: sampling pixels at their corners, which moves masks by half a pixel, does not exceed it; 2 px do."""
+"""Mask tolerance in other data sets, by the same formula. It allows the half-pixel shift of sampling at pixel corners, but not a shift by 2
+px."""
 MARGIN = 24
 """Largest shift of a mask that is looked for [px]."""
 

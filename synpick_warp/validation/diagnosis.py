@@ -19,13 +19,13 @@ SCALE_SPREAD = 0.003
 RAY_GAIN = 0.25
 """Depth is taken for the ray's length if that leaves less than this fraction of the error."""
 AGREEING = 0.8
-"""Fraction of a pose's visible pixels whose depth agrees with it, for the pose to be right."""
+"""Minimum fraction of a pose's visible pixels whose image depth has the rendered depth, for the pose to be accepted."""
 AGREEING_BESIDE = 0.5
-"""The same of pixels beside the mask: there depth shows either the object or what is behind it."""
+"""Minimum fraction, as AGREEING, of visible pixels outside the mask. It is lower, because depth there may also show the background."""
 MIN_BESIDE = 10
 """Smallest number of pixels beside the mask that decide [px]."""
 BEYOND = 0.2
-"""Largest fraction of a visible mask whose depth is off by more than the tolerance."""
+"""Maximum fraction of a visible mask's pixels whose depth error exceeds the tolerance."""
 SWAPPED = 0.85
 """Intersection over union from which a mask is that of another instance."""
 MAX_OTHERS = 8
@@ -35,7 +35,7 @@ LEFT_OUT = 0.05
 
 
 class Kind(StrEnum):
-    """What contradicts the rest."""
+    """Error class of a finding: the image or annotation that is inconsistent with the others."""
 
     SCALE = "depth scale"
     RAY = "ray length"
@@ -164,7 +164,7 @@ def _overlap(item: Instance, other: Instance) -> float:
 
 
 def _explain(item: Instance, rendered: RenderedView) -> Finding:
-    """A mask that does not fit the silhouette: whether it is shifted, or otherwise wrong, or the pose is."""
+    """Classify a mismatch of mask and silhouette: shifted mask, other object, wrong pose or wrong mask."""
     tolerance, place = rendered.tolerance, f"image {rendered.view.image}, instance {item.index}"
     mask, silhouette = _reference(item, tolerance)
     fit = fit_masks(mask, silhouette)
@@ -206,7 +206,11 @@ def _find_object(item: Instance, mask: np.ndarray, rendered: RenderedView) -> in
 
 
 def _pose_agrees(item: Instance, mask: np.ndarray, tolerance: float) -> bool:
-    """Whether the depth image shows the object where its pose is: beside the mask, if the silhouette reaches there, else everywhere."""
+    """Depth consistency test of a pose: whether enough pixels of the depth image have the rendered depth within `tolerance` [mm].
+
+    Tested are the visible pixels outside the mask if there are MIN_BESIDE (AGREEING_BESIDE of them must agree), else all (AGREEING). A
+    median error beyond the tolerance with little spread contradicts the pose.
+    """
     part = item.visible_part(tolerance)
     if item.depth is None:
         return False

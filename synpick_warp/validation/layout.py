@@ -1,4 +1,5 @@
-"""Layout of a BOP data set: splits, scenes, sensors, shards and models folders, as the files have them and not as a name promises."""
+"""Layout detection of a BOP data set: splits, scenes, sensors, shards and models folders, from the files that exist, not from folder
+names."""
 
 from __future__ import annotations
 
@@ -43,7 +44,7 @@ class SceneRef:
 
 
 class Layout:
-    """Folders of a data set."""
+    """Detected layout of a data set."""
 
     def __init__(self, folder: Path) -> None:
         """

@@ -1,4 +1,4 @@
-"""Registry of validation rules: a rule is one function with a name, a sentence and a cure, declared by the decorator `rule`."""
+"""Registry of validation rules: a rule is a function with a name, a description and advice, declared by the decorator `rule`."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def load_rules() -> dict[str, Rule]:
 
 
 def apply_rules(subject: object) -> Iterator[Violation]:
-    """Check a subject by all rules about its type. A rule that meets unreadable data ends with a violation that says so."""
+    """Check a subject by all rules for its type. A rule that meets unreadable data ends with a violation about it."""
     for item in load_rules().values():
         if item.subject is not type(subject):
             continue

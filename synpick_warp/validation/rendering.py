@@ -20,7 +20,7 @@ _MILLIMETRE = 1e-3
 _FAR = 1e20
 """Larger depths are misses [m]: the rasterizer's are `FAR`."""
 _NEAR = 1e-3
-"""Depth from which points are projected [m]."""
+"""Near plane of the crop [m]: nothing is cropped if a point is nearer, and nothing is rendered if all are."""
 MAX_MODELS = 64
 """Models that are kept in memory; the least recently used one is dropped."""
 

@@ -28,15 +28,15 @@ _STEM = re.compile(r"([0-9]{6,9})(?:_([0-9]{6,9}))?\.(\w+)")
 
 @dataclass(eq=False)
 class RecordFile:
-    """Entries of an annotation file by image."""
+    """Parsed annotation file (scene_camera, scene_gt or scene_gt_info), by image."""
 
     file: str
     """Path relative to the data set."""
     present: bool = True
     raw: dict[int, Any] = field(default_factory=dict)
-    """Entries as they are."""
+    """Decoded JSON entries, not checked."""
     entries: dict[int, Any] = field(default_factory=dict)
-    """Entries of the right schema, as its types."""
+    """Entries that fit the schema, as its types."""
     faults: list[tuple[str, str]] = field(default_factory=list)
     """(file, what does not fit the schema)."""
     keys: list[str] = field(default_factory=list)

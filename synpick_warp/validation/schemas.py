@@ -15,7 +15,7 @@ PLAIN_KEY = re.compile(r"0|[1-9][0-9]{0,8}")
 
 
 class Camera(Struct, gc=False):
-    """A view's entry in scene_camera.json [mm]."""
+    """Entry of scene_camera.json: intrinsics [px], depth scale [mm per unit], pose of the world in the camera [mm]."""
 
     cam_K: Matrix3 | UnsetType = UNSET  # noqa: N815
     cam_model: dict[str, Any] | UnsetType = UNSET

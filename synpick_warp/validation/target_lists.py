@@ -46,7 +46,7 @@ class TargetLists:
         return TargetList(scenes)
 
     def splits(self, name: str) -> list[str]:
-        """Splits that a list is about: those with its prefix, else, since BOP's lists are of test splits only, val or all splits."""
+        """Splits that a target list refers to: those with its prefix, else the validation splits, else all."""
         prefix = name.split("_targets")[0]
         with_scenes = [split for split, listing in self.layout.splits.items() if any(map(is_index, listing.folders))]
         names = with_scenes or list(self.layout.splits) or list(self.layout.keyed)

@@ -18,13 +18,14 @@ from synpick_warp.progress import SilentProgress
 from tools.bench.physics import Row
 
 LIVE_FRACTION = 0.9
-"""Fraction of the worlds whose views a tick must have before the measurement begins: until then worlds settle, and physics weighs more."""
+"""Steady-state threshold: fraction of the worlds that must deliver views in a tick. Before, worlds settle, and physics has a larger
+part."""
 LEAD_TICKS = 2
-"""Such ticks before the measurement: the writers' queues are then full."""
+"""Warm-up: ticks above LIVE_FRACTION before the measurement, which fill the writers' queues."""
 SPARE_EPISODES = 2
-"""Episodes for each world, so that none is idle in the measurement."""
+"""Episodes planned for each world, so that none runs out of them in the measurement."""
 PARENT_FIELD, USER_FIELD, SYSTEM_FIELD = 1, 11, 12
-"""Fields of /proc/PID/stat after the command's name: parent, CPU time in user mode and in the kernel [clock ticks]."""
+"""Indices in /proc/PID/stat after the command's name: parent process, CPU time in user mode and in system mode [clock ticks]."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from synpick_warp.stages.stream import TickReader, TickReport, view_sizes
 from tools.bench.physics import Row
 
 ROUNDS = 5
-"""Turns of the two loops that are compared."""
+"""Alternations between the two loops of a comparison."""
 
 
 class _StillProducer(Producer):

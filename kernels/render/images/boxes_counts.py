@@ -16,10 +16,10 @@ AMODAL_BOX = wp.constant(0)
 VISIBLE_BOX = wp.constant(1)
 """Index of a box: of the amodal mask and of the visible mask."""
 UNSET = wp.constant(2147483647)
-"""Side of a box without pixels: the largest int32, negative for the maxima, so that the first pixel replaces it."""
+"""Sentinel of an empty box: minima are the largest int32 and maxima its negative, so that the first pixel replaces all four."""
 HALF = wp.constant(wp.uint64(32))
 LOWER_HALF = wp.constant(wp.uint64(0xFFFFFFFF))
-"""Bits of one of the two counts in `BorderBoxes.length`, and the mask of the lower one."""
+"""Shift of the upper, and mask of the lower, of the two 32-bit counters packed in `BorderBoxes.length`."""
 
 
 @wp.kernel
@@ -165,7 +165,7 @@ def list_border_boxes_kernel(
 
 @wp.func
 def find_box(first_chunk: wp.array[int], listed: int, chunk: int) -> int:
-    """Index of the listed box that a chunk belongs to: binary search for the last one that starts at it or before."""
+    """Index of the listed box that contains chunk number `chunk`: binary search for the last box that starts at it or before."""
     low = int(0)
     high = int(listed)
     while high - low > 1:

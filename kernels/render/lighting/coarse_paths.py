@@ -39,15 +39,16 @@ from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 SEQUENCE_PERIOD = wp.constant(16)
-"""Coarse pixels share one Sobol' sequence by their Morton index in squares of this width; aligned smaller squares hold aligned runs."""
+"""Tile width of the sampler [coarse pixels]: the pixels of a tile share one Sobol' sequence, dealt out by Morton index, so that every
+aligned power-of-two sub-tile holds a contiguous, well-stratified part of it."""
 INDIRECT_CLAMP = wp.constant(4.0)
 """Firefly clamp of indirect light: at most this many times the radiance of a white surface that faces the sun, on top of the clamp for
 unoccluded light. Few paths find sunlit surfaces, so each of them has a large weight."""
 SEQUENCE_FRAMES = wp.constant(64)
 """Frames until accumulated paths repeat their random numbers: four times as many as an average remembers by default."""
 SHIFT_RANGE = wp.constant(1.0)
-"""Cranley-Patterson rotation of the first dimension over an image's height and width: slow enough that the points of a filter kernel
-stay stratified, and large enough that the image's mean is unbiased."""
+"""Range of the Cranley-Patterson rotation of the first dimension over the image: a slow gradient keeps neighbouring pixels stratified
+within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
 
 
 @wp.struct
@@ -90,9 +91,10 @@ def make_context(
     light: int,
     yaw: float,
 ) -> PathContext:
-    """Context of a coarse pixel's paths. All images of an episode use one stream of random numbers; see `path_indices`.
+    """Path-tracing context of a coarse pixel: stream of random numbers, rotation and map of the environment.
 
-    The sun is left out of the light on the first surface: row `light` + maps of `Lights.radiance`.
+    All images of an episode use one stream; see `first_path_index`. The first surface is lit by the map without its sun: row `light` +
+    number of maps of `Lights.radiance`. `yaw` is in radians.
     """
     context = PathContext()
     context.view = view
@@ -118,10 +120,10 @@ def average_paths(
     unoccluded: SplitRadiance,
     firefly_clamp: float,
 ) -> SplitRadiance:
-    """Mean reflected light over `samples` paths from `index` on that start at `first`, each with a firefly clamp.
+    """Monte Carlo mean of the reflected light over `samples` paths from `index` on, which start at `first`, `width` [m] wide.
 
-    The clamp is `firefly_clamp` times the unoccluded light; for light from other surfaces INDIRECT_CLAMP is added, because the unoccluded
-    light lacks the sun.
+    Firefly clamp: a path counts with at most `firefly_clamp` times the unoccluded light; indirect light with INDIRECT_CLAMP more, because
+    the unoccluded light lacks the sun.
     """
     sum = SplitRadiance()
     sunlit = (INDIRECT_CLAMP / wp.PI) * scene.lights.sun_irradiance[context.light]
@@ -146,9 +148,10 @@ def average_paths(
 
 @wp.func
 def first_path_index(samples: int, row: int, column: int, frame: int, accumulates: bool) -> int:
-    """Index of a coarse pixel's first path in the sequence that SEQUENCE_PERIOD² coarse pixels share.
+    """Sobol' index of a coarse pixel's first path, in the sequence of its tile of SEQUENCE_PERIOD² coarse pixels.
 
-    The paths of a frame by itself start with the sequence; one that is added to a history takes the next point of its coarse pixel.
+    Without accumulation each frame has the first `samples` points of every coarse pixel. With it, `frame` selects the coarse pixel's next
+    point, modulo SEQUENCE_FRAMES.
     """
     index = morton_index(SEQUENCE_PERIOD, row, column)
     if accumulates:
@@ -191,8 +194,8 @@ def trace_coarse_paths_kernel(
 ):
     """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
-    With a usable history one path is added to it, in every other frame once it is full; else N paths are traced. The sun's direct light is
-    left out: it casts sharp shadows, and `shadows` samples it at more pixels. `variance` is not written.
+    A coarse pixel with a usable history traces one path and blends it in; once the history holds `max_paths`, only in every second frame.
+    One without traces `rules.samples` paths. The sun's direct light is left out, see `shadows`; `variance` is not written.
     """
     view, row, column = interleaved_pixel(coarse, wp.tid() + first)
     if not in_image(coarse.grid, row, column):

@@ -14,12 +14,12 @@ from synpick_warp.kernels.render.visibility.gbuffer import Meshes, body_of
 wp.set_module_options({"enable_backward": False})
 
 REST_DISPLACEMENT = wp.constant(2.5e-4)
-"""A body rests if none of its points is displaced by more in a frame [m]: in the 16 frames that an average remembers, by two coarse pixels
-of a full-HD image at most."""
+"""Rest threshold: a body rests if none of its points is displaced by more in a frame [m]. Over the 16 frames that an average remembers,
+that is at most two coarse pixels in full HD."""
 LIGHT_CHANGE = wp.constant(0.05)
-"""Change of a coarse pixel's light that its history may miss, as a fraction: the number of remembered paths times the change in a frame."""
+"""Temporal lag that an average may have, as a fraction of the light: remembered paths times the change in a frame (`light_change`)."""
 NEVER = wp.constant(-2)
-"""Frame index of a history without a frame: no frame follows it."""
+"""Frame index of an empty history, which no frame continues."""
 MAX_HALF = wp.constant(60000.0)
 """Largest stored radiance; half precision ends at 65,504."""
 
@@ -35,7 +35,7 @@ class LightHistory:
     segment: wp.array3d[wp.uint8]
     """(world_camera, cell_row, cell_column): segmentation id of the surface."""
     paths: wp.array3d[wp.uint8]
-    """(world_camera, cell_row, cell_column): paths that the average counts, at most `max_paths`."""
+    """(world_camera, cell_row, cell_column): history length, the number of paths in the average, at most `max_paths`."""
     episode: wp.array[int]
     """(world_camera): episode of the last frame."""
     frame: wp.array[int]
@@ -43,7 +43,7 @@ class LightHistory:
     cameras: int
     """Cameras of a world."""
     max_paths: int
-    """Paths that an average counts at most; 0: no history is kept."""
+    """Maximum history length [paths]; 0: no history is kept."""
 
 
 @wp.struct
@@ -164,7 +164,8 @@ def find_moving_bodies_kernel(
 def light_change(meshes: Meshes, moving: MovingBodies, view: int, point: wp.vec3) -> float:
     """Estimate of the fraction of a point's light that the moving bodies change in a frame.
 
-    Each counts with the fraction of all directions that its projected area covers at its distance, times that by which it moved.
+    Sum over them: fraction of the full sphere that the body covers (solid angle of its mean projected area at the distance of its box)
+    times its displacement in sizes.
     """
     total = float(0.0)
     for rank in range(moving.count[view]):
@@ -190,7 +191,11 @@ def usable_paths(
     segment: int,
     point: wp.vec3,
 ) -> int:
-    """Paths of a coarse pixel's history that still count; 0: none, because another surface shows, or its light changed."""
+    """History length after rejection: paths of a coarse pixel's average that may be kept.
+
+    0 if another segmentation id is visible, the body moved, or the history lacks the previous frame; else at most LIGHT_CHANGE /
+    `light_change`.
+    """
     if history.max_paths == 0 or moving.holds[view] == 0:
         return 0
     slot = views.world[view] * history.cameras + views.camera[view]

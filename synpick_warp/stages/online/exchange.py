@@ -15,13 +15,13 @@ import warp as wp
 _LEGACY_STREAM = 1
 """DLPack's number of CUDA's legacy default stream, which `stream=None` means."""
 _NO_ORDER = -1
-"""DLPack's stream number of a consumer that keeps the order itself."""
+"""DLPack's stream argument for "do not synchronize"."""
 _EXPIRED = "this batch has expired: its buffers are rendered into again; clone what you keep before you ask for the next batch"
 
 
 class ConsumerStream(wp.Stream):
-    """CUDA stream of another library, by its handle. Warp's registry does not learn of it: it keeps one entry a handle, and another
-    object of the consumer's may own that one."""
+    """Non-owning wrapper of another library's CUDA stream. It is not registered with Warp, whose registry has one entry a handle, which may
+    belong to a stream object of the consumer."""
 
     def __init__(self, device: wp.Device, handle: int) -> None:
         self.device, self.cuda_stream = device, handle
@@ -44,13 +44,13 @@ class Gate:
         """By the stream's handle: the stream, and the event behind its work on this batch."""
 
     def wait_for_consumers(self) -> None:
-        """Let the device's current stream wait for the work of consumers on the batch before; then forget them."""
+        """Make the current stream wait for the consumers of the previous batch, and forget these."""
         for _, event in self._consumers.values():
             self.device.stream.wait_event(event)
         self._consumers.clear()
 
     def mark_ready(self) -> None:
-        """Note that the current stream's queue ends with the rendering of this batch."""
+        """Record the event "rendered" of this batch on the current stream."""
         if self._ready is not None:
             self.device.stream.record_event(self._ready)
 
