@@ -10,12 +10,16 @@ import warp as wp
 from synpick_warp.arrays import StructArrays, allocate, allocate_struct, device_array, memory_table, struct_arrays
 from synpick_warp.memory_plan import describe_arrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.encoding.png import DEPTH_SCRATCH, DepthBuffers
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan, SegmentationScratch
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays
+from synpick_warp.stages.render.annotate import BORDER_BOXES
 from synpick_warp.stages.render.denoised import (
     COARSE_LIGHT,
     GUIDE,
+    LIGHT_HISTORY,
+    MOVING_BODIES,
     RATIO_IMAGES,
     FootprintLists,
     ShadowArrays,
@@ -35,7 +39,8 @@ from tests.worlds.small_worlds import settings
 
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
-    "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_footprint block"
+    "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_footprint block "
+    "world_camera view_instance one slot slot_word group depth_byte"
 )
 WORLDS = MIN_GPU_WORLDS + 1
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
@@ -60,6 +65,11 @@ BASE = [
     ShadowArrays,
     FootprintLists,
     VISIBILITY_BUFFER,
+    BORDER_BOXES,
+    LIGHT_HISTORY,
+    MOVING_BODIES,
+    DepthBuffers,
+    *DEPTH_SCRATCH,
 ]
 PERCEPTION = [VIEWS, PerceptionArrays, SegmentationScratch, VoteArrays, CYCLES]
 LAYERS = [LayerBuffers, BODY_MOTIONS]

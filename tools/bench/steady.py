@@ -68,7 +68,7 @@ class _Meter(SilentProgress):
         self.first_view = self.first_view or time.perf_counter() - self.started
         self.ticks += int(self.ticks > 0 or views - self.last_views >= self.live_views)
         self.last_views = views
-        if self.ticks <= LEAD_TICKS or (self.readings and self._measured() >= self.seconds):
+        if self.ticks <= LEAD_TICKS or (len(self.readings) > 1 and self._measured() >= self.seconds):
             return
         used = shutil.disk_usage(self.folder).used
         self.readings.append(_Reading(time.perf_counter(), views, time.process_time(), _writers_cpu_time(), used))
