@@ -18,9 +18,6 @@ from synpick_warp.stages.stream import TickReport
 from tests.worlds.small_worlds import catalog
 from tools.bench import __main__ as bench
 from tools.bench import physics as bench_physics
-from tools.bench import sensor as bench_sensor
-from tools.bench import steady as bench_steady
-from tools.bench import write as bench_write
 from tools.reports import pick as pick_report
 from tools.reports import pick_tally
 from tools.reports import rest as rest_report
@@ -336,11 +333,10 @@ def test_at_the_time_limit_ended_sequences_are_reported(tmp_path, capsys):
 def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys):
     for name in ("FALL_TICKS", "SETTLE_TICKS", "STIR_TICKS", "LEAD_TICKS", "PICK_TICKS", "MIN_REPEATS", "BURST"):
         monkeypatch.setattr(bench_physics, name, 1)
-    monkeypatch.setattr(bench_sensor, "BURST", 1)
+    for target in ("sensor.BURST", "write.COPIES", "steady.LEAD_TICKS"):
+        monkeypatch.setattr(f"tools.bench.{target}", 1)
     for name, value in (("BURST", 1), ("STREAM_BATCHES", 1), ("WRITE_VIEWS", 3), ("BAKE_SPEED", 10.0)):
         monkeypatch.setattr(bench, name, value)
-    monkeypatch.setattr(bench_write, "COPIES", 1)
-    monkeypatch.setattr(bench_steady, "LEAD_TICKS", 0)
     file = tmp_path / "bench.json"
     small = ("--worlds", "1", "--resolution", "32x18", "--seconds", "0", "--set", 'bake.formats=["bop", "shards"]')
     assert bench.main([*small, "--json", str(file), *FEW_STEPS, *SMALL_IMAGES, *SHORT_EPISODES]) == 0
