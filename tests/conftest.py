@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from pathlib import Path
 
 import pytest
@@ -33,7 +34,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Start Warp before the first test, so that its messages stay out of captured output."""
+    """Start Warp before the first test, so that its messages stay out of captured output.
+
+    Shells let background jobs ignore SIGINT, and so would all processes that tests start; it acts here as in the foreground.
+    """
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ[VARIABLE] = devices(config)[0]
     if config.getoption("--check-bounds"):
         _check_bounds(config)
