@@ -6,6 +6,7 @@ bake declares, Newton's by measured factors, the pinned copies of images, shared
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
@@ -161,6 +162,21 @@ def check_episodes(count: int, config: Config) -> None:
 def is_shortage(error: BaseException) -> bool:
     """Whether an error says that memory ran out: Python's own, or that of Warp's allocators."""
     return isinstance(error, MemoryError) or str(error).startswith("Failed to allocate")
+
+
+@contextlib.contextmanager
+def explain_shortage(config: Config) -> Iterator[None]:
+    """Replace an out-of-memory error of the enclosed code by one that names the setting to lower.
+
+    Raises:
+        ConfigError: Memory ran out.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if not is_shortage(error):
+            raise
+        raise shortage_error(config, pick_device(config.bake.device)) from error
 
 
 def shortage_error(config: Config, device: wp.Device) -> ConfigError:

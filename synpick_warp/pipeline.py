@@ -28,7 +28,7 @@ from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import Exporters, aborting, load_exporter_classes, slot_bytes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
-from synpick_warp.memory_plan import check_episodes, check_memory, is_shortage, shortage_error
+from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
 from synpick_warp.progress import Progress
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
@@ -203,7 +203,7 @@ def run_bake(
         if output.committed:
             progress.note(f"{len(output.committed)} of {len(output.episodes)} episodes are complete; resuming with the others")
         try:
-            with _naming_shortage(config):
+            with explain_shortage(config):
                 _fill(config, output, kinds, names[: max(1, len(output.remaining))], summary, progress)
         except OutputError as error:
             if out.exists():
@@ -212,17 +212,6 @@ def run_bake(
         finally:
             output.clean_up()
     return summary
-
-
-@contextlib.contextmanager
-def _naming_shortage(config: Config) -> Iterator[None]:
-    """Turn an error that says that memory ran out into one that names the setting to lower."""
-    try:
-        yield
-    except (MemoryError, RuntimeError) as error:
-        if not is_shortage(error):
-            raise
-        raise shortage_error(config, pick_device(config.bake.device)) from error
 
 
 def _fill(
@@ -268,7 +257,7 @@ def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> Bake
     """
     config, summary = share.config, BakeSummary(len(share.episodes))
     kinds = load_exporter_classes(config.bake.formats)
-    with _naming_shortage(config):
+    with explain_shortage(config):
         factory = build_factory(config, link, share.episodes, *_needs(kinds), processes=share.processes)
         with WriterPool(config.bake.writers, slot_bytes(kinds, config), *handles) as pool:
             link.writers = pool.pids()

@@ -20,7 +20,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.errors import ConfigError
-from synpick_warp.memory_plan import check_episodes, check_memory, is_shortage, shortage_error
+from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
 from synpick_warp.online.selection import Selection, choose_episodes
 from synpick_warp.pipeline import Stages, build_stages
 from synpick_warp.progress import Progress
@@ -58,7 +58,7 @@ class ViewStream:
         self.object_names = {entry.obj_id: entry.name for entry in stages.catalog.entries}
         self.device = stages.simulation.device
         # The generator must not refer to this object: without a cycle, the last reference frees the device's memory at once.
-        self._batches: Iterator[ViewBatch] | None = _explain_shortage(producer.batches(), stages.config, self.device)
+        self._batches: Iterator[ViewBatch] | None = _batches(producer)
         self._ring: BatchRing | None = producer.ring
         self._stream = self.device.stream if self.device.is_cuda else None
         self._current: ViewBatch | None = None
@@ -199,21 +199,13 @@ def open_stream(
         config = replace(config, render=replace(config.render, history=0))
     config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
     check_memory(config, device, DEVICE_ONLY)
-    try:
+    with explain_shortage(config):
         stages = build_stages(config, device, progress, indices)
         ring = BatchRing(stages.sizes, config.render.layers, stages.renderer, config.bop.depth_scale)
-    except (MemoryError, RuntimeError) as error:
-        if not is_shortage(error):
-            raise
-        raise shortage_error(config, device) from error
     return ViewStream(Producer(stages, ring, selection, BakeSummary(len(indices)), progress))
 
 
-def _explain_shortage(batches: Iterator[ViewBatch], config: Config, device: wp.Device) -> Iterator[ViewBatch]:
-    """The same batches; memory that runs out is a ConfigError with advice."""
-    try:
-        yield from batches
-    except (MemoryError, RuntimeError) as error:
-        if not is_shortage(error):
-            raise
-        raise shortage_error(config, device) from error
+def _batches(producer: Producer) -> Iterator[ViewBatch]:
+    """The producer's batches, with a ConfigError if memory runs out."""
+    with explain_shortage(producer.stages.config):
+        yield from producer.batches()

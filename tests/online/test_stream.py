@@ -177,7 +177,7 @@ def test_splits_name_their_episodes():
 
 def held_by(stream) -> tuple[weakref.ref, ...]:
     """What takes memory: worlds, renderer, ring."""
-    producer = stream._batches.gi_frame.f_locals["batches"].gi_frame.f_locals["self"]
+    producer = stream._batches.gi_frame.f_locals["producer"]
     return tuple(weakref.ref(part) for part in (producer, producer.ring, producer.stages.simulation, producer.stages.renderer))
 
 

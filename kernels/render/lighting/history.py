@@ -18,6 +18,8 @@ REST_DISPLACEMENT = wp.constant(2.5e-4)
 that is at most two coarse pixels in full HD."""
 LIGHT_CHANGE = wp.constant(0.05)
 """Temporal lag that an average may have, as a fraction of the light: remembered paths times the change in a frame (`light_change`)."""
+MIN_CHANGE = wp.constant(1.0e-6)
+"""Change of a point's light below which it counts as unchanged: histories are far shorter than LIGHT_CHANGE / MIN_CHANGE."""
 NEVER = wp.constant(-2)
 """Frame index of an empty history, which no frame continues."""
 MAX_HALF = wp.constant(60000.0)
@@ -205,7 +207,7 @@ def usable_paths(
         if moving.rests[view, body_of(segment, views.instances)] == 0:
             return 0
     paths = int(history.paths[slot, row, column])
-    return wp.min(paths, int(LIGHT_CHANGE / wp.max(light_change(meshes, moving, view, point), 1.0e-6)))
+    return wp.min(paths, int(LIGHT_CHANGE / wp.max(light_change(meshes, moving, view, point), MIN_CHANGE)))
 
 
 @wp.func
