@@ -144,7 +144,7 @@ def load_config(preset_or_file: Path | str | None = None, settings: Mapping[str,
     Args:
         preset_or_file: Name of a preset, such as "smoke", or path of a file that ends in .toml; None: the preset "synpick".
         settings: Full key, such as "physics.step", -> value.
-        splits: Whether the splits that a preset offers hold; those of a file always do.
+        splits: Whether the splits that a preset defines apply; those of a file always do.
 
     Raises:
         ConfigError: There is no such preset, file or key, or a value is not allowed.

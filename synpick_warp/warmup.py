@@ -20,7 +20,7 @@ from synpick_warp.progress import Progress
 from synpick_warp.stages.stream import TickReader
 
 POLL = 0.5
-"""Time between two looks into the kernel cache [s]."""
+"""Polling interval of the kernel cache [s]."""
 BINARIES = ("*.cubin", "*.ptx", "*.o")
 """Compiled modules in Warp's kernel cache."""
 
@@ -36,7 +36,7 @@ class WarmUp:
 
 
 class CompilationWatch:
-    """Counter of newly compiled modules in the kernel cache, which reports while a block of code compiles them."""
+    """Monitor of the kernel cache: counts the modules that are compiled while its block runs, and reports them."""
 
     def __init__(self, progress: Progress) -> None:
         self.progress = progress

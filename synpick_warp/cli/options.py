@@ -34,14 +34,14 @@ def parse_whole_number(_: Any, tokens: Sequence[Token]) -> int:
 
 
 def parse_count(kind: Any, tokens: Sequence[Token]) -> int:
-    """Parse the value of an option that counts something: `auto`, which is 0, or a whole number. Raises as `parse_whole_number`."""
+    """Parse the value of a count option: a whole number, or `auto`, which is 0. Errors as in `parse_whole_number`."""
     return 0 if tokens[0].value == "auto" else parse_whole_number(kind, tokens)
 
 
 WholeNumber = Annotated[int, Parameter(converter=parse_whole_number)]
-"""Type of all integer options."""
+"""Type of integer options."""
 Count = Annotated[int, Parameter(converter=parse_count)]
-"""Type of options whose number the program can choose."""
+"""Type of count options that accept `auto`."""
 
 
 def one_line(text: str) -> str:

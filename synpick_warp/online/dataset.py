@@ -137,7 +137,7 @@ class StreamDataset(IterableDataset):
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # Workers that live through all epochs see it change.
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the index of the epoch that the next pass is, before the pass; as of `DistributedSampler`."""
+        """Set the epoch index of the next iteration, as `DistributedSampler.set_epoch` does; call it before iterating."""
         self._epoch.fill_(epoch)
 
     def __iter__(self) -> Iterator[Any]:

@@ -1,4 +1,4 @@
-"""Settings of a stream: a preset, a file or a finished configuration, overridden by full keys and by arguments of short names."""
+"""Settings of a stream: a preset, a file or a `Config`, overridden by full keys and by keyword arguments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ARGUMENTS = {
     "layers": "render.layers",
     "batch": "render.views_per_batch",
 }
-"""Setting that each argument of `synpick_warp.stream` overrides."""
+"""Full key of the setting that each keyword argument of `synpick_warp.stream` overrides."""
 
 
 def resolve_settings(
@@ -31,7 +31,7 @@ def resolve_settings(
         config: A configuration, or a preset's name or a .toml file; None: the default preset.
         settings: Full key, such as "bake.mode", -> value.
         arguments: Key of ARGUMENTS -> value; None: not given.
-        splits: Whether the splits that a preset offers hold.
+        splits: Whether the splits that a preset defines apply; those of a file always do.
 
     Raises:
         ConfigError: A setting is unknown or not allowed.
@@ -44,7 +44,7 @@ def resolve_settings(
 
 
 def _plain(value: object) -> object:
-    """The value as TOML would have it: paths as text, tuples as lists."""
+    """Convert a value to its TOML equivalent: paths to strings, tuples to lists."""
     if isinstance(value, Path):
         return str(value)
     return list(value) if isinstance(value, tuple) else value

@@ -206,6 +206,6 @@ def open_stream(
 
 
 def _batches(producer: Producer) -> Iterator[ViewBatch]:
-    """The producer's batches, with a ConfigError if memory runs out."""
+    """Iterate over a producer's batches; an out-of-memory error becomes a ConfigError with advice."""
     with explain_shortage(producer.stages.config):
         yield from producer.batches()

@@ -83,7 +83,7 @@ def encode_photo(image: np.ndarray, quality: int = PHOTO_QUALITY) -> Picture:
 
 
 def encode_ids(image: np.ndarray) -> Picture:
-    """Encode ids (H, W) uint8 as PNG, exactly."""
+    """Encode an id image (H, W) uint8 as a lossless PNG."""
     return Picture("png", _encode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 9]))
 
 

@@ -1,4 +1,5 @@
-"""Benchmark of the online generator: its views per second beside those of the renderer, and of simulation and renderer, without it."""
+"""Benchmark of the online generator: its views per second against the bare renderer, and against the bare loop of simulation and
+rendering."""
 
 from __future__ import annotations
 
@@ -28,7 +29,7 @@ ROUNDS = 5
 
 
 class _StillProducer(Producer):
-    """Renders the same tick again and again."""
+    """Producer without simulation: renders one tick repeatedly."""
 
     def __init__(self, still: TickReport, *arguments: object) -> None:
         super().__init__(*arguments)  # type: ignore[arg-type]
@@ -89,7 +90,7 @@ def _compare(sources: dict[str, Iterator[int]], device: wp.Device, min_seconds: 
 
 
 def _render_loop(stages: Stages, ring: BatchRing, report: TickReport) -> Iterator[int]:
-    """Render the views of one tick again and again into one buffer; yields the number of views of each batch."""
+    """Render the views of one tick repeatedly into one buffer; yields the number of views of each batch."""
     snapshot, (world, camera) = stages.simulation.records[0].snapshot, _select(stages, report)
     while True:
         yield from _render_all(stages, ring, snapshot, world, camera)
@@ -111,7 +112,8 @@ def _select(stages: Stages, report: TickReport) -> tuple[np.ndarray, np.ndarray]
 
 
 def _consumer(device: wp.Device) -> Callable[[ViewBatch], int]:
-    """Consumer that imports colour and ids on a stream of its own; returns the number of views."""
+    """Make a consumer that imports colour and ids through DLPack on a CUDA stream of its own, and returns the number of views of a
+    batch."""
     stream = wp.Stream(device) if device.is_cuda else None
 
     def consume(batch: ViewBatch) -> int:
@@ -124,9 +126,9 @@ def _consumer(device: wp.Device) -> Callable[[ViewBatch], int]:
 
 
 def _count(source: Iterator[int], device: wp.Device, min_seconds: float) -> tuple[float, float]:
-    """Views that a source makes in at least `min_seconds`, and the time until the device has made them [s]; one batch goes before.
+    """Views made in at least `min_seconds` after one warm-up batch, and the elapsed time with synchronization of the device [s].
 
-    A source may end before.
+    The count ends early if the source does.
     """
     next(source, None)
     wp.synchronize_device(device)

@@ -71,7 +71,7 @@ def hold_out(config: Config, views: int) -> tuple[list[dict[str, torch.Tensor]],
 
 
 def train(config: Config, views: int, stride: int, classes: int, width: int, device: torch.device) -> tuple[Network, list[float]]:
-    """Train a new network on `views` views, or up to a batch more; returns it and the loss of each batch."""
+    """Train a new network on at least `views` views, in whole batches; returns the network and the loss of each batch."""
     torch.manual_seed(config.bake.seed)
     network = Network(classes, width).to(device)
     optimizer = torch.optim.AdamW(network.parameters(), LEARNING_RATE)

@@ -35,7 +35,7 @@ class LightHistory:
     indirect: wp.array3d[wp.vec3h]
     """(world_camera, cell_row, cell_column)"""
     segment: wp.array3d[wp.uint8]
-    """(world_camera, cell_row, cell_column): segmentation id of the surface."""
+    """(world_camera, cell_row, cell_column): segmentation id of the visible surface."""
     paths: wp.array3d[wp.uint8]
     """(world_camera, cell_row, cell_column): history length, the number of paths in the average, at most `max_paths`."""
     episode: wp.array[int]
@@ -53,15 +53,15 @@ class MovingBodies:
     """Motion of the bodies of each view since the previous frame. Scratch."""
 
     holds: wp.array[int]
-    """(view): 1: the history holds the previous frame of the same episode."""
+    """(view): 1: the history contains the previous frame of the same episode."""
     rests: wp.array2d[int]
-    """(view, body): 1: the body is where it was in the previous frame."""
+    """(view, body): 1: the body is at rest."""
     count: wp.array[int]
-    """(view): bodies that moved, came or went."""
+    """(view): number of bodies that moved, appeared or disappeared."""
     mesh: wp.array2d[int]
-    """(view, rank): row of `Meshes` of each of them."""
+    """(view, rank): row of `Meshes` of each moving body."""
     to_body: wp.array2d[wp.transformf]
-    """(view, rank): world to body [m]; of a body that went, at its last pose."""
+    """(view, rank): world to body [m]; of a body that disappeared, at its last pose."""
     change: wp.array2d[float]
     """(view, rank): displacement as a fraction of the body's size, at most 1."""
 

@@ -1,6 +1,6 @@
-"""Depth PNG encoder on the device: data (IDAT) of 16-bit greyscale PNG files, which writers only frame; see `synpick_warp.depth_png`.
+"""Depth PNG encoder on the device: compressed data (IDAT) of 16-bit greyscale PNG files, to which writers add the other chunks.
 
-The bytes depend on the image alone, not on the device: all arithmetic is in integers.
+See `synpick_warp.depth_png` for the format. The bytes depend on the image alone, not on the device: all arithmetic is in integers.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class DepthScratch:
     """Scratch of the encoder."""
 
     slot: wp.array = device_array("view", "slot", "slot_word", dtype=wp.uint32)
-    """Codes of the header, of each segment of a row, and of the end, the first bit lowest."""
+    """Bit strings of the header, of each segment of a row, and of the trailer; least significant bit first."""
     begin: wp.array = device_array("view", "slot", dtype=wp.int32)
     """First bit of each slot in the data of its group."""
     group_begin: wp.array = device_array("view", "group", dtype=wp.int32)

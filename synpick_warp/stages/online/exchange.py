@@ -69,7 +69,7 @@ class Gate:
             self._consumers[handle][0].wait_event(self._ready)
 
     def admit_current(self) -> None:
-        """Let the device's current stream wait for the rendering of this batch: it may be one of a consumer that uses Warp."""
+        """Let the device's current stream, which may be that of a consumer that uses Warp, wait for the rendering of this batch."""
         if self._ready is not None:
             self.admit(self.device.stream.cuda_stream)
 
