@@ -25,6 +25,7 @@ from synpick_warp.scenes import build
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch, jpeg_sizes
 from synpick_warp.stages.encoding.png import DEPTH_SCRATCH, DepthBuffers, depth_sizes
+from synpick_warp.stages.host_copies import HostImages, host_images
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.images import SCRATCH, count_views, perception_sizes
 from synpick_warp.stages.perception.plan import CYCLES, VoteArrays, plan_sizes
@@ -40,7 +41,7 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import RECORDS
 from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
-from synpick_warp.stages.stream import RING, HostImages, host_images, view_sizes
+from synpick_warp.stages.stream import RING, view_sizes
 from synpick_warp.system.device import pick_device
 from synpick_warp.system.free_memory import free_device_memory, free_host_memory
 

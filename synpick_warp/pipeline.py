@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -27,7 +27,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import Exporters, aborting, load_exporter_classes, slot_bytes
 from synpick_warp.exporters.writing.pool import WriterPool
-from synpick_warp.frames import EpisodeEnd
+from synpick_warp.frames import EpisodeEnd, FrameBatch
 from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
 from synpick_warp.progress import Progress
 from synpick_warp.scenes.cameras import make_cameras
@@ -41,10 +41,11 @@ from synpick_warp.scheduling.order import order_longest_first
 from synpick_warp.scheduling.sizes import count_writers, fit_to_device
 from synpick_warp.scheduling.worker import BakeLink
 from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.host_copies import host_images
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.simulate import RECORDS, Simulation
-from synpick_warp.stages.stream import FrameStream, LightTable, TickReader, TickReport, host_images, name_lights, tick_batch, view_sizes
+from synpick_warp.stages.stream import FrameStream, LightTable, TickReader, TickReport, name_lights, tick_batch, view_sizes
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device, pick_devices
 from synpick_warp.system.interrupt import StopRequest
@@ -301,8 +302,8 @@ class _Run:
         self.progress.stage("compiling kernels, dropping objects")
         with self.stop as stop, self._simulation_ended():
             self._simulate(readers, 0)
-            current = 0
-            while not stop.number:
+            current, done = 0, False
+            while not (done or stop.number):
                 following = (current + 1) % RECORDS
                 self._simulate(readers, following)
                 with scope("wait for tick"):
@@ -310,10 +311,9 @@ class _Run:
                 self._hand_over(report, simulation.records[current].snapshot)
                 phase = report.column("phase")
                 self.meter.show(int(np.isin(phase, (Phase.SETTLE, Phase.ACT)).sum()))
-                if (phase == Phase.IDLE).all():
-                    return
-                current = following
-        self.summary.stopped = stop.number
+                current, done = following, bool((phase == Phase.IDLE).all())
+            self._write(self.factory.stream.drain())
+        self.summary.stopped = 0 if done else stop.number
 
     def _simulate(self, readers: list[TickReader], record: int) -> None:
         """Enqueue a tick and its copy to the host."""
@@ -334,18 +334,27 @@ class _Run:
                     wp.synchronize_stream(self.physics_stream)
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot) -> None:
-        """Hand a tick's frames, views and episode ends to the exporters."""
+        """Hand a tick's frames to the exporters, launch its views, and hand over those that are ready, with the ends of episodes."""
         physics = self.config.physics
         batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
         if len(batch):
             with scope("hand over ticks"):
                 self.exporters.write_ticks(batch)
-        if self.exporters.needs_views:
-            for views in self.factory.stream.render(snapshot, report):
-                with scope("hand over views"):
-                    self.exporters.write_views(views)
-                self.summary.views += len(views)
         records = self.factory.log.update(report)
+        if self.exporters.needs_views:
+            self._write(self.factory.stream.advance(snapshot, report, partial(self._end_episodes, report, records)))
+        else:
+            self._end_episodes(report, records)
+
+    def _write(self, batches: Iterator[FrameBatch]) -> None:
+        """Hand batches of views over to the exporters."""
+        for views in batches:
+            with scope("hand over views"):
+                self.exporters.write_views(views)
+            self.summary.views += len(views)
+
+    def _end_episodes(self, report: TickReport, records: Mapping[int, EpisodeRecord]) -> None:
+        """End the episodes that ended in a tick, after its views."""
         for world in np.flatnonzero(report.column("phase") == Phase.OVER).tolist():
             with scope("end episode"):
                 self._end(report, world, records[int(report.column("episode")[world])])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,8 +19,9 @@ from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.frames import FrameBatch
 from synpick_warp.jpeg import encode_jpeg
-from synpick_warp.stages import stream
+from synpick_warp.stages import host_copies, stream
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
+from synpick_warp.stages.host_copies import HostCopy
 from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.render.mask_runs import BOUNDARIES_PER_COLUMN, FIELDS
 from synpick_warp.stages.render.scene import build_lights
@@ -26,7 +29,6 @@ from synpick_warp.stages.sim import worlds
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.stream import (
     FrameStream,
-    HostCopy,
     LightTable,
     TickReader,
     TickReport,
@@ -213,6 +215,25 @@ def test_a_tick_that_is_stopped_early_leaves_nothing_behind(device):
     assert [int(episode) for made in batches for episode in made.episode] == [22, 22, 22]
 
 
+def test_ticks_follow_each_other_without_a_gap(device):
+    """Batches in flight are those of one tick at most, come in order with their own images, and a tick ends behind its last."""
+    frames = frame_stream(config_of(render__views_per_batch=2), FakeRenderer([]), device)
+    events: list[object] = []
+    ticks = [[1, 1, 1, 1, 1], [0, 0, 1, 0, 0], [0, 0, 0, 0, 0], [1, 0, 0, 0, 1], [0, 1, 0, 0, 0]]
+    for tick, live in enumerate(ticks):
+        for made in frames.advance("snapshot", report_of(live), partial(events.append, f"end of {tick}")):
+            world = made.episode - 20
+            assert (np.asarray(made.color[:, 0, 0, 0]) == 10 * world + made.camera + 1).all()
+            events += world.tolist()
+        assert tick == 0 or f"end of {tick - 1}" in events
+    left = len(frames.in_flight)
+    assert left == (2 if device.is_cuda else 0)
+    for made in frames.drain():
+        events += (made.episode - 20).tolist()
+    expected = [[*np.repeat(np.flatnonzero(live), 3).tolist(), f"end of {tick}"] for tick, live in enumerate(ticks)]
+    assert events == list(itertools.chain.from_iterable(expected))
+
+
 # ---- sizes ----
 
 
@@ -328,7 +349,7 @@ def test_files_and_lists_stand_for_images(device):
     """JPEG and depth files equal the encoded images; images that stay on the device are copied on demand, one at a time."""
     renderer, config = FakeRenderer([]), config_of(render__views_per_batch=4)
     sizes, tick_time = view_sizes(config, device), config.physics.step * config.physics.steps_per_tick
-    host = stream.HostImages(("color", "depth", "instance", "amodal"), 90, depth_files=True)
+    host = host_copies.HostImages(("color", "depth", "instance", "amodal"), 90, depth_files=True)
     frames = FrameStream(sizes, (), 3, tick_time, renderer, OBJECT_IDS, LIGHTS, device, host)  # type: ignore[arg-type]
     code = iter([11, 12, 13, 41, 42, 43])
     for batch in frames.render("snapshot", report_of([0, 1, 0, 0, 1])):  # type: ignore[arg-type]
@@ -347,23 +368,23 @@ def test_files_and_lists_stand_for_images(device):
 @pytest.mark.parametrize(
     ("cuda", "needs_images", "settings_", "expected"),
     [
-        (False, False, {}, stream.HostImages(depth_files=True)),
-        (True, True, {}, stream.HostImages(depth_files=True)),
+        (False, False, {}, host_copies.HostImages(depth_files=True)),
+        (True, True, {}, host_copies.HostImages(depth_files=True)),
         (
             True,
             False,
             {"bop__split": "train_pbr", "bop__color_format": "jpg", "bop__jpeg_quality": 90},
-            stream.HostImages(("depth", "color", "instance", "amodal"), 90, True),
+            host_copies.HostImages(("depth", "color", "instance", "amodal"), 90, True),
         ),
-        (True, False, {"bop__color_format": "png"}, stream.HostImages(("depth", "instance", "amodal"), depth_files=True)),
-        (True, False, {"cameras__resolution": [300, 287]}, stream.HostImages(("depth",), depth_files=True)),
+        (True, False, {"bop__color_format": "png"}, host_copies.HostImages(("depth", "instance", "amodal"), depth_files=True)),
+        (True, False, {"cameras__resolution": [300, 287]}, host_copies.HostImages(("depth",), depth_files=True)),
     ],
 )
 def test_what_is_copied_to_the_host(cuda, needs_images, settings_, expected):
     config = settings(**({"cameras__resolution": [640, 360]} | settings_))
-    assert stream.host_images(config, SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
+    assert host_copies.host_images(config, SimpleNamespace(is_cuda=cuda), needs_images, True) == expected  # type: ignore[arg-type]
 
 
 def test_the_largest_lists_are_no_larger_than_images():
     one, columns = np.dtype(np.uint32).itemsize * FIELDS, 7
-    assert one * BOUNDARIES_PER_COLUMN * columns <= stream.MIN_LISTED_ROWS * columns
+    assert one * BOUNDARIES_PER_COLUMN * columns <= host_copies.MIN_LISTED_ROWS * columns

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from synpick_warp.frames import FrameBatch, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
+from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
@@ -30,10 +32,8 @@ BATCH_BYTES = 512 << 20
 PIXEL_BYTES = 3 + 2 + 1 + 4
 # Arrays of a snapshot that a report copies, besides catalog indices and poses.
 _SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
-# Ring size of view batches: one is rendered while another is copied and a third is read.
+# Ring size of view batches: one is read while another is copied and a third is rendered.
 RING = 3
-# Rows from which the largest lists of run boundaries are no larger than the images.
-MIN_LISTED_ROWS = 288
 
 
 def views_per_batch(config: Config, device: wp.Device) -> int:
@@ -106,81 +106,6 @@ def name_lights(names: list[str], lights: Any) -> LightTable:
     """Build the table of environment maps from their names and the struct `Lights`."""
     shines = lights.sun_irradiance.numpy().max(axis=1, keepdims=True) > 0.0
     return LightTable(np.array(names), np.where(shines, lights.sun_direction.numpy(), 0.0).astype(np.float32))
-
-
-class DeviceImages:
-    """Images of a batch that stay on the device: `Images` of `frames`."""
-
-    def __init__(self, array: wp.array) -> None:
-        self.array = array
-
-    def __getitem__(self, view: int) -> np.ndarray:
-        """Copy an image to the host; waits for the device."""
-        return self.array[view].numpy()
-
-
-@dataclass(frozen=True)
-class HostImages:
-    """Transfer settings of a batch: which images are copied to the host, and which are replaced by encoded files or run boundaries."""
-
-    on_demand: tuple[str, ...] = ()
-    """Arrays of `ViewBuffers` that stay on the device; files or run boundaries replace them, but for single images that exporters copy."""
-    jpeg_quality: int = 0
-    """Quality of the JPEG files that are copied instead of colour images; 0: there are none."""
-    depth_files: bool = False
-    """Whether data of PNG files (IDAT) is copied instead of depth images."""
-
-
-def host_images(config: Config, device: wp.Device, needs_images: bool, depth_files: bool) -> HostImages:
-    """Choose what is copied to the host.
-
-    Depth files are made on every device, so that their bytes do not depend on it. On a GPU, files and run boundaries stand for all images,
-    unless exporters need these; in small images only for depth, since lists of run boundaries may be incomplete there, and copying single
-    images waits for the device.
-
-    Args:
-        config: All settings.
-        device: Device of the rendering.
-        needs_images: Whether an exporter reads all images.
-        depth_files: Whether an exporter writes depth files.
-    """
-    if not device.is_cuda or needs_images:
-        return HostImages(depth_files=depth_files)
-    # Without files, keypoints are the only ones to read depth.
-    depth = ("depth",) if depth_files or not config.bop.keypoints else ()
-    if config.cameras.resolution[1] < MIN_LISTED_ROWS:
-        return HostImages(depth, depth_files=depth_files)
-    if config.bop.color_format != "jpg":
-        return HostImages((*depth, "instance", "amodal"), depth_files=depth_files)
-    return HostImages((*depth, "color", "instance", "amodal"), config.bop.jpeg_quality, depth_files)
-
-
-class HostCopy:
-    """Host mirror of device arrays: pinned memory and asynchronous copies on CUDA, the arrays themselves on the CPU."""
-
-    def __init__(self, arrays: list[wp.array]) -> None:
-        self.source = arrays
-        self.device = arrays[0].device
-        self.target = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays] if self.device.is_cuda else arrays
-        self.done = wp.Event(self.device) if self.device.is_cuda else None
-
-    def start(self, stream: wp.Stream | None) -> None:
-        """Begin to copy on `stream`, after the work queued on the current stream; None: on the current stream."""
-        if self.done is None:
-            return
-        if stream is None:
-            stream = self.device.stream
-        else:
-            stream.wait_stream(self.device.stream)
-        for target, source in zip(self.target, self.source, strict=True):
-            wp.copy(target, source, stream=stream)
-        stream.record_event(self.done)
-
-    def wait(self) -> list[np.ndarray]:
-        """Wait for the copies and return them as NumPy arrays (views, no further copy)."""
-        if self.done is not None:
-            wp.synchronize_event(self.done)
-        return [array.numpy() for array in self.target]
 
 
 class TickReader:
@@ -263,8 +188,22 @@ def describe_views(
     }
 
 
+@dataclass(eq=False)
+class _Launched:
+    """A batch in flight: rendered, encoded and copied by the device."""
+
+    slot: int
+    """Its place in the ring."""
+    count: int
+    """Its views."""
+    description: dict[str, Any]
+    """Fields by `describe_views`."""
+    finished: Callable[[], None] | None = None
+    """Called once the consumer has the batch behind it."""
+
+
 class FrameStream:
-    """Renders the live worlds of snapshots as FrameBatches; while one is consumed, the next is rendered (ring buffer)."""
+    """Renders the live worlds of snapshots as FrameBatches; while one is consumed, the next two are rendered (ring buffer)."""
 
     def __init__(
         self,
@@ -319,25 +258,58 @@ class FrameStream:
             self.images = list(copied)
             self.copies.append(HostCopy([*copied.values(), *(getattr(self.layer_buffers[slot], name) for name in self.layers)]))
         self.lists = [wp.zeros((2, self.batch), dtype=wp.int32, device=device) for _ in self.buffers]
+        self.in_flight: deque[_Launched] = deque()
+        self.next_slot = 0
 
     def render(self, snapshot: Snapshot, report: TickReport) -> Iterator[FrameBatch]:
         """Yield the tick's views, world by world and camera by camera. A batch is valid until the next one is requested."""
+        while self.in_flight:
+            # Left by a consumer that stopped early.
+            self.copies[self.in_flight.popleft().slot].wait()
+        yield from self.advance(snapshot, report)
+        yield from self.drain()
+
+    def advance(self, snapshot: Snapshot, report: TickReport, finished: Callable[[], None] = lambda: None) -> Iterator[FrameBatch]:
+        """Launch the tick's views; yield those of the tick before and those whose slots are needed. On a GPU the last ones stay in flight.
+
+        So the GPU has work while the host turns from tick to tick. A batch is valid until the next one is requested.
+
+        Args:
+            snapshot: State of the worlds; reused after the rendering in the order of the device's stream.
+            report: Report of the tick.
+            finished: Called once the consumer has the tick's last batch behind it, after that of earlier ticks.
+        """
         live = np.flatnonzero(report.column("live"))
         world = np.repeat(live, self.cameras).astype(np.int32)
         camera = np.tile(np.arange(self.cameras, dtype=np.int32), len(live))
-        waiting: tuple[int, slice] | None = None
-        for index, first in enumerate(range(0, len(world), self.batch)):
+        ahead = 0
+        for first in range(0, len(world), self.batch):
+            if len(self.in_flight) == len(self.buffers):
+                yield from self._deliver()
             part = slice(first, min(first + self.batch, len(world)))
-            slot = index % len(self.buffers)
-            if waiting is not None and len(self.buffers) == 1:
-                yield self._collect(waiting, world, camera, report)
-                waiting = None
-            self._launch(slot, snapshot, world[part], camera[part])
-            if waiting is not None:
-                yield self._collect(waiting, world, camera, report)
-            waiting = (slot, part)
-        if waiting is not None:
-            yield self._collect(waiting, world, camera, report)
+            self._launch(self.next_slot, snapshot, world[part], camera[part])
+            description = describe_views(report, world[part], camera[part], self.tick_time, self.object_ids, self.lights)
+            self.in_flight.append(_Launched(self.next_slot, part.stop - first, description))
+            self.next_slot = (self.next_slot + 1) % len(self.buffers)
+            ahead += int(self.device.is_cuda)
+        if len(world):
+            self.in_flight[-1].finished = finished
+        while len(self.in_flight) > ahead:
+            yield from self._deliver()
+        if not len(world):
+            finished()
+
+    def drain(self) -> Iterator[FrameBatch]:
+        """Yield the batches that are still in flight."""
+        while self.in_flight:
+            yield from self._deliver()
+
+    def _deliver(self) -> Iterator[FrameBatch]:
+        """Yield the oldest batch in flight."""
+        launched = self.in_flight.popleft()
+        yield self._collect(launched)
+        if launched.finished is not None:
+            launched.finished()
 
     def _launch(self, slot: int, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray) -> None:
         rows = self.lists[slot]
@@ -365,14 +337,14 @@ class FrameStream:
         if self.depth_encoder is not None:
             self.depth_encoder.encode(buffers.depth, count, self.depth_files[slot])
 
-    def _collect(self, waiting: tuple[int, slice], world: np.ndarray, camera: np.ndarray, report: TickReport) -> FrameBatch:
-        slot, part = waiting
-        count = part.stop - part.start
+    def _collect(self, launched: _Launched) -> FrameBatch:
+        """Wait for a batch's copies."""
+        slot = launched.slot
         with scope("wait for images"):
             copied = self.copies[slot].wait()
-        arrays = {name: array[:count] for name, array in zip(self.images + self.layers, copied, strict=True)}
+        arrays = {name: array[: launched.count] for name, array in zip(self.images + self.layers, copied, strict=True)}
         return FrameBatch(
-            **describe_views(report, world[part], camera[part], self.tick_time, self.object_ids, self.lights),
+            **launched.description,
             **{name: arrays[name] for name in self.images},
             **{name: DeviceImages(getattr(self.buffers[slot], name)) for name in self.host.on_demand},
             layers={name: arrays[name] for name in self.layers},

@@ -20,7 +20,8 @@ from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.pipeline import Factory
-from synpick_warp.stages.stream import DeviceImages, TickReport, tick_batch
+from synpick_warp.stages.host_copies import DeviceImages
+from synpick_warp.stages.stream import TickReport, tick_batch
 from tools.bench.physics import Row
 
 COPIES = 8

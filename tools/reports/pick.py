@@ -28,9 +28,10 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.pipeline import Factory, build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.host_copies import HostCopy
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.sim.simulate import RECORDS
-from synpick_warp.stages.stream import HostCopy, TickReader, TickReport
+from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.system.device import pick_device
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, print_machine, write_json
 from tools.reports.pick_tally import MODES, PAPER, ModeRow, Tally, report, sum_visibility

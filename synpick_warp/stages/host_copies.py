@@ -1,0 +1,88 @@
+"""Host copies of a batch's images: which are copied, which are replaced by encoded files or run boundaries, and the copies themselves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.configs.schema import Config
+
+# Rows from which the largest lists of run boundaries are no larger than the images.
+MIN_LISTED_ROWS = 288
+
+
+class DeviceImages:
+    """Images of a batch that stay on the device: `Images` of `frames`."""
+
+    def __init__(self, array: wp.array) -> None:
+        self.array = array
+
+    def __getitem__(self, view: int) -> np.ndarray:
+        """Copy an image to the host; waits for the device."""
+        return self.array[view].numpy()
+
+
+@dataclass(frozen=True)
+class HostImages:
+    """Transfer settings of a batch: which images are copied to the host, and which are replaced by encoded files or run boundaries."""
+
+    on_demand: tuple[str, ...] = ()
+    """Arrays of `ViewBuffers` that stay on the device; files or run boundaries replace them, but for single images that exporters copy."""
+    jpeg_quality: int = 0
+    """Quality of the JPEG files that are copied instead of colour images; 0: there are none."""
+    depth_files: bool = False
+    """Whether data of PNG files (IDAT) is copied instead of depth images."""
+
+
+def host_images(config: Config, device: wp.Device, needs_images: bool, depth_files: bool) -> HostImages:
+    """Choose what is copied to the host.
+
+    Depth files are made on every device, so that their bytes do not depend on it. On a GPU, files and run boundaries stand for all images,
+    unless exporters need these; in small images only for depth, since lists of run boundaries may be incomplete there, and copying single
+    images waits for the device.
+
+    Args:
+        config: All settings.
+        device: Device of the rendering.
+        needs_images: Whether an exporter reads all images.
+        depth_files: Whether an exporter writes depth files.
+    """
+    if not device.is_cuda or needs_images:
+        return HostImages(depth_files=depth_files)
+    # Without files, keypoints are the only ones to read depth.
+    depth = ("depth",) if depth_files or not config.bop.keypoints else ()
+    if config.cameras.resolution[1] < MIN_LISTED_ROWS:
+        return HostImages(depth, depth_files=depth_files)
+    if config.bop.color_format != "jpg":
+        return HostImages((*depth, "instance", "amodal"), depth_files=depth_files)
+    return HostImages((*depth, "color", "instance", "amodal"), config.bop.jpeg_quality, depth_files)
+
+
+class HostCopy:
+    """Host mirror of device arrays: pinned memory and asynchronous copies on CUDA, the arrays themselves on the CPU."""
+
+    def __init__(self, arrays: list[wp.array]) -> None:
+        self.source = arrays
+        self.device = arrays[0].device
+        self.target = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays] if self.device.is_cuda else arrays
+        self.done = wp.Event(self.device) if self.device.is_cuda else None
+
+    def start(self, stream: wp.Stream | None) -> None:
+        """Begin to copy on `stream`, after the work queued on the current stream; None: on the current stream."""
+        if self.done is None:
+            return
+        if stream is None:
+            stream = self.device.stream
+        else:
+            stream.wait_stream(self.device.stream)
+        for target, source in zip(self.target, self.source, strict=True):
+            wp.copy(target, source, stream=stream)
+        stream.record_event(self.done)
+
+    def wait(self) -> list[np.ndarray]:
+        """Wait for the copies and return them as NumPy arrays (views, no further copy)."""
+        if self.done is not None:
+            wp.synchronize_event(self.done)
+        return [array.numpy() for array in self.target]
