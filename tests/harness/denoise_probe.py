@@ -10,7 +10,7 @@ from synpick_warp.kernels.render.lighting.sampling import scrambled_point, sobol
 from synpick_warp.kernels.render.visibility.camera import in_image
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.render.denoised import COARSE_LIGHT, GUIDE, RATIO_IMAGES, build_coarse_grid
-from synpick_warp.stages.render.scene import build_cameras, build_grid
+from synpick_warp.stages.render.scene import build_cameras, build_grid, pack_half3_array
 from synpick_warp.stages.render.view_setup import make_views
 
 wp.set_module_options({"enable_backward": False})
@@ -102,7 +102,7 @@ class FlatDenoiser:
     def assign(self, name: str, values: np.ndarray) -> None:
         """Set an array of `CoarseLight`: (row, column) grey, or (row, column, 3)."""
         rgb = values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
-        getattr(self.coarse_light, name).assign(rgb[None].astype(np.float32))
+        getattr(self.coarse_light, name).assign(rgb[None].astype(np.float32) if name == "variance" else pack_half3_array(rgb[None]))
 
     def run(self, variance_scale: float = 1.0) -> dict[str, np.ndarray]:
         """Denoise: arrays (row, column, 3) of `RatioImages` by name after smoothing, and with the prefix "chosen_" before."""
@@ -114,5 +114,10 @@ class FlatDenoiser:
         ):
             wp.launch(kernel, self.count, [*shared, source, self.views, *rules, 0], [out], device=self.device)
         names = ("diffuse", "specular", "indirect")
-        smoothed = {name: getattr(self.ratios, name).numpy()[0] for name in names}
-        return smoothed | {f"chosen_{name}": getattr(self.chosen, name).numpy()[0] for name in names}
+        smoothed = {name: unpack_half3_array(getattr(self.ratios, name).numpy()[0]) for name in names}
+        return smoothed | {f"chosen_{name}": unpack_half3_array(getattr(self.chosen, name).numpy()[0]) for name in names}
+
+
+def unpack_half3_array(packed: np.ndarray) -> np.ndarray:
+    """Values (..., 3) float32 of `pack_half3_array`."""
+    return packed[..., None].view(np.float16)[..., :3].astype(np.float32)

@@ -10,15 +10,18 @@ import warp as wp
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.lighting.brdf import SplitRadiance, specular_albedo
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide, interleaved_pixel, middle_pixel, morton_index
-from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE
+from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE, pack_half3
 from synpick_warp.kernels.render.lighting.history import (
     LightHistory,
     MovingBodies,
-    blend_light,
+    accumulate,
     history_frame,
+    lag_limit,
     read_history,
+    rest_bits,
+    rest_turn,
+    scale_light,
     usable_paths,
-    write_history,
 )
 from synpick_warp.kernels.render.lighting.path_tracing import (
     TERMINATED,
@@ -55,18 +58,18 @@ within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
 class CoarseLight:
     """Light that the surfaces of coarse pixels reflect; diffuse light without the surface's colour. Scratch.
 
-    All arrays are (view, cell_row, cell_column).
+    All arrays are (view, cell_row, cell_column). Light is exposed: radiance times the map's exposure, about 1, and packed by `pack_half3`.
     """
 
-    diffuse: wp.array3d[wp.vec3]
+    diffuse: wp.array3d[wp.uint64]
     """Diffuse reflection of the environment map without its sun."""
-    specular: wp.array3d[wp.vec3]
+    specular: wp.array3d[wp.uint64]
     """Specular reflection of the environment map without its sun, and of light from other surfaces."""
-    unoccluded_diffuse: wp.array3d[wp.vec3]
+    unoccluded_diffuse: wp.array3d[wp.uint64]
     """`diffuse` if nothing blocked the map."""
-    unoccluded_specular: wp.array3d[wp.vec3]
+    unoccluded_specular: wp.array3d[wp.uint64]
     """`specular` if nothing blocked the map."""
-    indirect: wp.array3d[wp.vec3]
+    indirect: wp.array3d[wp.uint64]
     """Indirect diffuse: diffuse reflection of light from other surfaces. It varies slowly, but few paths carry much of it."""
     variance: wp.array3d[wp.vec2]
     """Variance of the visibility ratios of `diffuse` and `specular`, in luminance; of filtered means, not of single paths."""
@@ -150,8 +153,8 @@ def average_paths(
 def first_path_index(samples: int, row: int, column: int, frame: int, accumulates: bool) -> int:
     """Sobol' index of a coarse pixel's first path, in the sequence of its tile of SEQUENCE_PERIOD² coarse pixels.
 
-    Without accumulation each frame has the first `samples` points of every coarse pixel. With it, `frame` selects the coarse pixel's next
-    point, modulo SEQUENCE_FRAMES.
+    Without accumulation each frame has the first `samples` points of every coarse pixel. With it, `frame`, which counts the frames with a
+    path, selects the coarse pixel's next point, modulo SEQUENCE_FRAMES.
     """
     index = morton_index(SEQUENCE_PERIOD, row, column)
     if accumulates:
@@ -161,12 +164,12 @@ def first_path_index(samples: int, row: int, column: int, frame: int, accumulate
 
 @wp.func
 def store_light(out: CoarseLight, view: int, row: int, column: int, light: SplitRadiance, unoccluded: SplitRadiance):
-    """Write a coarse pixel."""
-    out.diffuse[view, row, column] = light.diffuse
-    out.indirect[view, row, column] = light.indirect
-    out.specular[view, row, column] = light.specular
-    out.unoccluded_diffuse[view, row, column] = unoccluded.diffuse
-    out.unoccluded_specular[view, row, column] = unoccluded.specular
+    """Write a coarse pixel; both are exposed."""
+    out.diffuse[view, row, column] = pack_half3(light.diffuse)
+    out.indirect[view, row, column] = pack_half3(light.indirect)
+    out.specular[view, row, column] = pack_half3(light.specular)
+    out.unoccluded_diffuse[view, row, column] = pack_half3(unoccluded.diffuse)
+    out.unoccluded_specular[view, row, column] = pack_half3(unoccluded.specular)
 
 
 @wp.kernel(cuda_max_registers=COARSE_PATH_REGISTERS)
@@ -194,8 +197,8 @@ def trace_coarse_paths_kernel(
 ):
     """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
-    A coarse pixel with a usable history traces one path and blends it in; once the history holds `max_paths`, only in every second frame.
-    One without traces `rules.samples` paths. The sun's direct light is left out, see `shadows`; `variance` is not written.
+    A coarse pixel with a usable history traces one path and blends it in; once the history holds `max_paths`, only in one of 2 to 8 frames,
+    see `rest_bits`. One without traces `rules.samples` paths. The sun's direct light is left out, see `shadows`; `variance` is not written.
     """
     view, row, column = interleaved_pixel(coarse, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
@@ -205,8 +208,7 @@ def trace_coarse_paths_kernel(
     guide_out.segment[view, row, column] = wp.uint8(hit.segment)
     if hit.segment == Segment.NOTHING:
         return
-    camera = views.camera[view]
-    world = views.world[view]
+    camera, world = views.camera[view], views.world[view]
     ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
     outgoing = -wp.normalize(cameras.to_world[camera] * ray)
     position = hit_position(cameras, camera, ray, hit.depth)
@@ -214,19 +216,20 @@ def trace_coarse_paths_kernel(
     vertex = make_vertex(scene, bodies, view, views.instances, hit, position, outgoing, width, 0.0)
     context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
     unoccluded = unoccluded_light(scene.lights, context.light, context.yaw, vertex.brdf)
-    known = usable_paths(scene.meshes, history_inout, moving, views, view, row, column, hit.segment, position)
+    limit = lag_limit(scene.meshes, history_inout, moving, views, view, row, column, hit.segment, position)
     slot = world * history_inout.cameras + camera
+    known = usable_paths(history_inout, slot, row, column, limit)
+    bits = rest_bits(history_inout, known, limit)
     frame = history_frame(history_inout, slot, known)
-    # Neighbours of a full history take turns; the coarse pixels of a warp, LANE_STRIDE apart, trace or rest together.
-    if known > 0 and known == history_inout.max_paths and (row + column + frame) % 2 == 0:
-        store_light(coarse_light_out, view, row, column, read_history(history_inout, slot, row, column), unoccluded)
+    exposure = scene.lights.exposure[context.light]
+    mean = SplitRadiance()
+    if bits > 0 and rest_turn(row, column, bits) != frame % (1 << bits):
+        mean = read_history(history_inout, slot, row, column)
     else:
         samples = wp.where(known > 0, 1, rules.samples)
-        index = first_path_index(rules.samples, row, column, frame, known > 0)
-        mean = average_paths(scene, bodies, rules, context, index, samples, vertex, width, unoccluded, firefly_clamp)
-        if known > 0:
-            mean = blend_light(read_history(history_inout, slot, row, column), mean, 1.0 / float(known + 1))
-        write_history(history_inout, slot, row, column, hit.segment, mean, known + samples)
-        store_light(coarse_light_out, view, row, column, mean, unoccluded)
+        index = first_path_index(rules.samples, row, column, frame >> bits, known > 0)
+        paths = average_paths(scene, bodies, rules, context, index, samples, vertex, width, unoccluded, firefly_clamp)
+        mean = accumulate(history_inout, slot, row, column, hit.segment, scale_light(paths, exposure), known, samples)
+    store_light(coarse_light_out, view, row, column, mean, scale_light(unoccluded, exposure))
     guide_out.normal[view, row, column] = wp.transpose(cameras.to_world[camera]) * vertex.brdf.normal
     guide_out.depth[view, row, column] = hit.depth

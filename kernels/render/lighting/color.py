@@ -1,4 +1,4 @@
-"""Colour: Rec. 709 luminance and the sRGB transfer function."""
+"""Colour: Rec. 709 luminance, the sRGB transfer function, and packed colours in half precision."""
 
 import warp as wp
 
@@ -10,6 +10,8 @@ LUMINANCE_BLUE = wp.constant(0.0722)
 """Rec. 709 luma coefficients, linear."""
 MIN_RADIANCE = wp.constant(1.0e-20)
 """Divisors that are radiances are at least this."""
+MAX_HALF = wp.constant(60000.0)
+"""Largest packed value; half precision ends at 65,504."""
 
 
 @wp.func
@@ -25,3 +27,18 @@ def srgb_byte(linear: float) -> wp.uint8:
     if linear > 0.0031308:
         encoded = 1.055 * wp.pow(linear, 1.0 / 2.4) - 0.055
     return wp.uint8(wp.rint(255.0 * wp.clamp(encoded, 0.0, 1.0)))
+
+
+@wp.func
+def pack_half3(color: wp.vec3) -> wp.uint64:
+    """Pack three non-negative values in half precision, clamped to its range, so that a single load reads them."""
+    clamped = wp.min(color, wp.vec3(MAX_HALF, MAX_HALF, MAX_HALF))
+    halves = wp.vec4h(wp.float16(clamped[0]), wp.float16(clamped[1]), wp.float16(clamped[2]), wp.float16(0.0))
+    return wp.cast(halves, wp.uint64)
+
+
+@wp.func
+def unpack_half3(packed: wp.uint64) -> wp.vec3:
+    """Unpack the values of `pack_half3`."""
+    halves = wp.cast(packed, wp.vec4h)
+    return wp.vec3(float(halves[0]), float(halves[1]), float(halves[2]))

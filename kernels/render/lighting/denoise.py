@@ -16,7 +16,7 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     middle_pixel,
 )
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight
-from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE, luminance
+from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE, luminance, pack_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, in_image, tile_pixel
@@ -37,14 +37,14 @@ SAME_BODY_WEIGHT = wp.constant(0.02)
 
 @wp.struct
 class RatioImages:
-    """Denoised light of coarse pixels. Scratch. All arrays are (view, cell_row, cell_column)."""
+    """Denoised light of coarse pixels, packed by `pack_half3`. Scratch. All arrays are (view, cell_row, cell_column)."""
 
-    diffuse: wp.array3d[wp.vec3]
+    diffuse: wp.array3d[wp.uint64]
     """Visibility ratio of diffuse light: a pixel multiplies its own unoccluded light by it."""
-    specular: wp.array3d[wp.vec3]
+    specular: wp.array3d[wp.uint64]
     """Visibility ratio of specular light."""
-    indirect: wp.array3d[wp.vec3]
-    """Indirect diffuse light, without the surface's colour: no ratio."""
+    indirect: wp.array3d[wp.uint64]
+    """Indirect diffuse light, without the surface's colour: no ratio, but exposed as `CoarseLight`."""
 
 
 @wp.struct
@@ -99,14 +99,27 @@ class KernelSum:
 
 
 @wp.func
-def add_light(total: KernelSum, light: CoarseLight, view: int, row: int, column: int, weight: float) -> KernelSum:
+def read_light(light: CoarseLight, view: int, row: int, column: int) -> KernelSum:
+    """One coarse pixel, with weight 1."""
+    result = KernelSum()
+    result.diffuse = unpack_half3(light.diffuse[view, row, column])
+    result.specular = unpack_half3(light.specular[view, row, column])
+    result.unoccluded_diffuse = unpack_half3(light.unoccluded_diffuse[view, row, column])
+    result.unoccluded_specular = unpack_half3(light.unoccluded_specular[view, row, column])
+    result.indirect = unpack_half3(light.indirect[view, row, column])
+    result.weight = 1.0
+    return result
+
+
+@wp.func
+def add_light(total: KernelSum, one: KernelSum, weight: float) -> KernelSum:
     """Add one coarse pixel to the sums."""
     result = KernelSum()
-    result.diffuse = total.diffuse + weight * light.diffuse[view, row, column]
-    result.specular = total.specular + weight * light.specular[view, row, column]
-    result.unoccluded_diffuse = total.unoccluded_diffuse + weight * light.unoccluded_diffuse[view, row, column]
-    result.unoccluded_specular = total.unoccluded_specular + weight * light.unoccluded_specular[view, row, column]
-    result.indirect = total.indirect + weight * light.indirect[view, row, column]
+    result.diffuse = total.diffuse + weight * one.diffuse
+    result.specular = total.specular + weight * one.specular
+    result.unoccluded_diffuse = total.unoccluded_diffuse + weight * one.unoccluded_diffuse
+    result.unoccluded_specular = total.unoccluded_specular + weight * one.unoccluded_specular
+    result.indirect = total.indirect + weight * one.indirect
     result.weight = total.weight + weight
     return result
 
@@ -154,18 +167,19 @@ def filter_blocks_kernel(
                 if c >= 0 and c < coarse.grid.width:
                     weight = bilateral_weight(guide, plane, view, r, c, down, right, 1)
                     if weight > 0.0:
-                        sums = add_light(sums, coarse_light, view, r, c, weight)
-                        d = luminance_ratio(coarse_light.diffuse[view, r, c], coarse_light.unoccluded_diffuse[view, r, c])
-                        s = luminance_ratio(coarse_light.specular[view, r, c], coarse_light.unoccluded_specular[view, r, c])
+                        one = read_light(coarse_light, view, r, c)
+                        sums = add_light(sums, one, weight)
+                        d = luminance_ratio(one.diffuse, one.unoccluded_diffuse)
+                        s = luminance_ratio(one.specular, one.unoccluded_specular)
                         mean += weight * wp.vec2(d, s)
                         square += weight * wp.vec2(d * d, s * s)
                         squared_weight += weight * weight
     total = sums.weight
-    blocks_out.diffuse[view, row, column] = sums.diffuse / total
-    blocks_out.specular[view, row, column] = sums.specular / total
-    blocks_out.unoccluded_diffuse[view, row, column] = sums.unoccluded_diffuse / total
-    blocks_out.unoccluded_specular[view, row, column] = sums.unoccluded_specular / total
-    blocks_out.indirect[view, row, column] = sums.indirect / total
+    blocks_out.diffuse[view, row, column] = pack_half3(sums.diffuse / total)
+    blocks_out.specular[view, row, column] = pack_half3(sums.specular / total)
+    blocks_out.unoccluded_diffuse[view, row, column] = pack_half3(sums.unoccluded_diffuse / total)
+    blocks_out.unoccluded_specular[view, row, column] = pack_half3(sums.unoccluded_specular / total)
+    blocks_out.indirect[view, row, column] = pack_half3(sums.indirect / total)
     mean = mean / total
     variance = square / total - wp.cw_mul(mean, mean)
     count = total * total / squared_weight
@@ -220,16 +234,18 @@ def choose_widths_kernel(
                 if c >= 0 and c < coarse.grid.width:
                     weight = bilateral_weight(guide, plane, view, r, c, down, right, BLOCK)
                     if weight > 0.0:
-                        wide = add_light(wide, blocks, view, r, c, weight)
+                        block = read_light(blocks, view, r, c)
+                        wide = add_light(wide, block, weight)
                         variance += weight * blocks.variance[view, r, c]
                         if (i == 1 or i == 2) and (j == 1 or j == 2):
-                            medium = add_light(medium, blocks, view, r, c, weight)
-    narrow_diffuse = visibility_ratio(blocks.diffuse[view, row, column], blocks.unoccluded_diffuse[view, row, column])
-    narrow_specular = visibility_ratio(blocks.specular[view, row, column], blocks.unoccluded_specular[view, row, column])
+                            medium = add_light(medium, block, weight)
+    narrow = read_light(blocks, view, row, column)
+    narrow_diffuse = visibility_ratio(narrow.diffuse, narrow.unoccluded_diffuse)
+    narrow_specular = visibility_ratio(narrow.specular, narrow.unoccluded_specular)
     if wide.weight <= 0.0:
         # The middles of all blocks may lie off the body.
-        ratios_out.diffuse[view, row, column] = narrow_diffuse
-        ratios_out.specular[view, row, column] = narrow_specular
+        ratios_out.diffuse[view, row, column] = pack_half3(narrow_diffuse)
+        ratios_out.specular[view, row, column] = pack_half3(narrow_specular)
         ratios_out.indirect[view, row, column] = blocks.indirect[view, row, column]
         return
     variance = variance_scale * variance / wide.weight
@@ -238,9 +254,9 @@ def choose_widths_kernel(
     if medium.weight > 0.0:
         diffuse = shrink(diffuse, visibility_ratio(medium.diffuse, medium.unoccluded_diffuse), variance[0] / MEDIUM_BLOCKS)
         specular = shrink(specular, visibility_ratio(medium.specular, medium.unoccluded_specular), variance[1] / MEDIUM_BLOCKS)
-    ratios_out.diffuse[view, row, column] = shrink(diffuse, narrow_diffuse, variance[0])
-    ratios_out.specular[view, row, column] = shrink(specular, narrow_specular, variance[1])
-    ratios_out.indirect[view, row, column] = wide.indirect / wide.weight
+    ratios_out.diffuse[view, row, column] = pack_half3(shrink(diffuse, narrow_diffuse, variance[0]))
+    ratios_out.specular[view, row, column] = pack_half3(shrink(specular, narrow_specular, variance[1]))
+    ratios_out.indirect[view, row, column] = pack_half3(wide.indirect / wide.weight)
 
 
 @wp.kernel
@@ -274,13 +290,13 @@ def smooth_ratios_kernel(
                 c = column + right
                 if c >= 0 and c < coarse.grid.width:
                     weight = bilateral_weight(guide, plane, view, r, c, down, right, 1)
-                    diffuse += weight * ratios.diffuse[view, r, c]
-                    specular += weight * ratios.specular[view, r, c]
-                    indirect += weight * ratios.indirect[view, r, c]
+                    diffuse += weight * unpack_half3(ratios.diffuse[view, r, c])
+                    specular += weight * unpack_half3(ratios.specular[view, r, c])
+                    indirect += weight * unpack_half3(ratios.indirect[view, r, c])
                     total += weight
-    ratios_out.diffuse[view, row, column] = diffuse / total
-    ratios_out.specular[view, row, column] = specular / total
-    ratios_out.indirect[view, row, column] = indirect / total
+    ratios_out.diffuse[view, row, column] = pack_half3(diffuse / total)
+    ratios_out.specular[view, row, column] = pack_half3(specular / total)
+    ratios_out.indirect[view, row, column] = pack_half3(indirect / total)
 
 
 @wp.func
@@ -300,9 +316,9 @@ def upsampling_weight(guide: Guide, coarse: CoarseGrid, plane: Plane, view: int,
 def add_ratios(total: Ratios, ratios: RatioImages, view: int, row: int, column: int, weight: float) -> Ratios:
     """Add one coarse pixel to a weighted sum."""
     result = Ratios()
-    result.diffuse = total.diffuse + weight * ratios.diffuse[view, row, column]
-    result.specular = total.specular + weight * ratios.specular[view, row, column]
-    result.indirect = total.indirect + weight * ratios.indirect[view, row, column]
+    result.diffuse = total.diffuse + weight * unpack_half3(ratios.diffuse[view, row, column])
+    result.specular = total.specular + weight * unpack_half3(ratios.specular[view, row, column])
+    result.indirect = total.indirect + weight * unpack_half3(ratios.indirect[view, row, column])
     return result
 
 

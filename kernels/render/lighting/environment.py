@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from synpick_warp.kernels.render.lighting.color import unpack_half3
+
 wp.set_module_options({"enable_backward": False})
 
 PREFILTER_LEVELS = wp.constant(5)
@@ -22,8 +24,9 @@ class Lights:
     radiance: wp.array3d[wp.vec3]
     """(2 maps, row, column): first every map as it is, then every map without its sun. Row 0 is the zenith, column
     u = azimuth / 2π + 0.5."""
-    prefiltered: wp.array4d[wp.vec3]
-    """(map, level, row, column): radiance without the sun, convolved with GGX lobes of increasing roughness."""
+    prefiltered: wp.array4d[wp.uint64]
+    """(map, level, row, column): radiance without the sun, convolved with GGX lobes of increasing roughness; times the map's exposure, and
+    packed as by `pack_half3`."""
     irradiance: wp.array2d[wp.vec3]
     """(map, coefficient): irradiance without the sun as nine real spherical harmonics, already convolved with the cosine."""
     sun_direction: wp.array[wp.vec3]
@@ -105,13 +108,13 @@ def environment_radiance(lights: Lights, light: int, direction: wp.vec3) -> wp.v
 
 @wp.func
 def prefiltered_level(lights: Lights, light: int, level: int, taps: BilinearTaps) -> wp.vec3:
-    """One level of the prefiltered specular map, bilinear."""
+    """One level of the prefiltered specular map, bilinear; exposed."""
     return bilinear(
         taps,
-        lights.prefiltered[light, level, taps.upper, taps.west],
-        lights.prefiltered[light, level, taps.upper, taps.east],
-        lights.prefiltered[light, level, taps.lower, taps.west],
-        lights.prefiltered[light, level, taps.lower, taps.east],
+        unpack_half3(lights.prefiltered[light, level, taps.upper, taps.west]),
+        unpack_half3(lights.prefiltered[light, level, taps.upper, taps.east]),
+        unpack_half3(lights.prefiltered[light, level, taps.lower, taps.west]),
+        unpack_half3(lights.prefiltered[light, level, taps.lower, taps.east]),
     )
 
 
@@ -121,11 +124,12 @@ def prefiltered_radiance(lights: Lights, light: int, direction: wp.vec3, roughne
     level = wp.clamp(roughness * float(PREFILTER_LEVELS) - 1.0, 0.0, float(PREFILTER_LEVELS - 1))
     lower = wp.min(int(level), PREFILTER_LEVELS - 2)
     taps = find_taps(direction, lights.prefiltered.shape[2], lights.prefiltered.shape[3])
-    return wp.lerp(
+    exposed = wp.lerp(
         prefiltered_level(lights, light, lower, taps),
         prefiltered_level(lights, light, lower + 1, taps),
         level - float(lower),
     )
+    return exposed / lights.exposure[light]
 
 
 @wp.func

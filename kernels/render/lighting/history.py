@@ -8,6 +8,7 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import SplitRadiance
+from synpick_warp.kernels.render.lighting.color import pack_half3, unpack_half3
 from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, body_of
 
@@ -20,20 +21,22 @@ LIGHT_CHANGE = wp.constant(0.05)
 """Temporal lag that an average may have, as a fraction of the light: remembered paths times the change in a frame (`light_change`)."""
 MIN_CHANGE = wp.constant(1.0e-6)
 """Change of a point's light below which it counts as unchanged: histories are far shorter than LIGHT_CHANGE / MIN_CHANGE."""
+MAX_REST_BITS = wp.constant(3)
+"""Binary logarithm of the longest rest period [frames]."""
+BAYER_BITS = wp.constant(4)
+"""Bits of a threshold of the 4 x 4 Bayer matrix."""
 NEVER = wp.constant(-2)
 """Frame index of an empty history, which no frame continues."""
-MAX_HALF = wp.constant(60000.0)
-"""Largest stored radiance; half precision ends at 65,504."""
 
 
 @wp.struct
 class LightHistory:
     """Average light of the coarse pixels of each world and camera, over the frames of an episode; members as in `CoarseLight`."""
 
-    diffuse: wp.array3d[wp.vec3h]
-    specular: wp.array3d[wp.vec3h]
-    indirect: wp.array3d[wp.vec3h]
-    """(world_camera, cell_row, cell_column)"""
+    diffuse: wp.array3d[wp.uint64]
+    specular: wp.array3d[wp.uint64]
+    indirect: wp.array3d[wp.uint64]
+    """(world_camera, cell_row, cell_column): packed as in `CoarseLight`."""
     segment: wp.array3d[wp.uint8]
     """(world_camera, cell_row, cell_column): segmentation id of the visible surface."""
     paths: wp.array3d[wp.uint8]
@@ -182,7 +185,7 @@ def light_change(meshes: Meshes, moving: MovingBodies, view: int, point: wp.vec3
 
 
 @wp.func
-def usable_paths(
+def lag_limit(
     meshes: Meshes,
     history: LightHistory,
     moving: MovingBodies,
@@ -193,10 +196,9 @@ def usable_paths(
     segment: int,
     point: wp.vec3,
 ) -> int:
-    """History length after rejection: paths of a coarse pixel's average that may be kept.
+    """Longest memory that a coarse pixel's average may have [frames]: LIGHT_CHANGE / `light_change`.
 
-    0 if another segmentation id is visible, the body moved, or the history lacks the previous frame; else at most LIGHT_CHANGE /
-    `light_change`.
+    0, which rejects the history, if another segmentation id was visible, the body moved, or the history lacks the previous frame.
     """
     if history.max_paths == 0 or moving.holds[view] == 0:
         return 0
@@ -206,8 +208,50 @@ def usable_paths(
     if segment != Segment.TABLE:
         if moving.rests[view, body_of(segment, views.instances)] == 0:
             return 0
-    paths = int(history.paths[slot, row, column])
-    return wp.min(paths, int(LIGHT_CHANGE / wp.max(light_change(meshes, moving, view, point), MIN_CHANGE)))
+    return int(LIGHT_CHANGE / wp.max(light_change(meshes, moving, view, point), MIN_CHANGE))
+
+
+@wp.func
+def usable_paths(history: LightHistory, slot: int, row: int, column: int, limit: int) -> int:
+    """History length after rejection: paths of a coarse pixel's average that may be kept, for its `lag_limit`."""
+    if limit == 0:
+        return 0
+    return wp.min(int(history.paths[slot, row, column]), limit)
+
+
+@wp.func
+def rest_bits(history: LightHistory, known: int, limit: int) -> int:
+    """Binary logarithm of a coarse pixel's rest period: it traces a path in one of 2, 4 or 8 frames once its history is full; 0: in each.
+
+    The period is the longest with which the average remembers at most `limit` frames, but at least 2.
+    """
+    if known == 0 or known < history.max_paths:
+        return 0
+    bits = int(1)
+    while bits < MAX_REST_BITS and (history.max_paths << (bits + 1)) <= limit:
+        bits += 1
+    return bits
+
+
+@wp.func
+def rest_turn(row: int, column: int, bits: int) -> int:
+    """Frame of a rest period, from 0 to 2^bits - 1, in which a coarse pixel traces its path: ordered dithering (Bayer, 1973) of 4 x 4.
+
+    Those that trace in the same frame are spread evenly, and LANE_STRIDE apart, so that those of a warp trace or rest together.
+    """
+    other = row ^ column
+    threshold = ((other & 1) << 3) | ((row & 1) << 2) | (other & 2) | ((row & 2) >> 1)
+    return threshold >> (BAYER_BITS - bits)
+
+
+@wp.func
+def scale_light(light: SplitRadiance, factor: float) -> SplitRadiance:
+    """Multiply all members by a factor."""
+    result = SplitRadiance()
+    result.diffuse = factor * light.diffuse
+    result.specular = factor * light.specular
+    result.indirect = factor * light.indirect
+    return result
 
 
 @wp.func
@@ -220,30 +264,12 @@ def history_frame(history: LightHistory, slot: int, usable: int) -> int:
 
 @wp.func
 def read_history(history: LightHistory, slot: int, row: int, column: int) -> SplitRadiance:
-    """Average light of a coarse pixel."""
+    """Average light of a coarse pixel, in units of `CoarseLight`."""
     result = SplitRadiance()
-    result.diffuse = wp.vec3(history.diffuse[slot, row, column])
-    result.specular = wp.vec3(history.specular[slot, row, column])
-    result.indirect = wp.vec3(history.indirect[slot, row, column])
+    result.diffuse = unpack_half3(history.diffuse[slot, row, column])
+    result.specular = unpack_half3(history.specular[slot, row, column])
+    result.indirect = unpack_half3(history.indirect[slot, row, column])
     return result
-
-
-@wp.func
-def to_half(light: wp.vec3) -> wp.vec3h:
-    """Radiance in half precision, clamped to its range."""
-    return wp.vec3h(wp.min(light, wp.vec3(MAX_HALF, MAX_HALF, MAX_HALF)))
-
-
-@wp.func
-def write_history(history: LightHistory, slot: int, row: int, column: int, segment: int, light: SplitRadiance, paths: int):
-    """Store the average light of a coarse pixel and the paths that it counts, if a history is kept."""
-    if history.max_paths == 0:
-        return
-    history.diffuse[slot, row, column] = to_half(light.diffuse)
-    history.specular[slot, row, column] = to_half(light.specular)
-    history.indirect[slot, row, column] = to_half(light.indirect)
-    history.segment[slot, row, column] = wp.uint8(segment)
-    history.paths[slot, row, column] = wp.uint8(wp.min(paths, history.max_paths))
 
 
 @wp.func
@@ -254,3 +280,27 @@ def blend_light(history: SplitRadiance, light: SplitRadiance, weight: float) -> 
     result.specular = wp.lerp(history.specular, light.specular, weight)
     result.indirect = wp.lerp(history.indirect, light.indirect, weight)
     return result
+
+
+@wp.func
+def write_history(history: LightHistory, slot: int, row: int, column: int, segment: int, light: SplitRadiance, paths: int):
+    """Store the average light of a coarse pixel and the paths that it counts, if a history is kept."""
+    if history.max_paths == 0:
+        return
+    history.diffuse[slot, row, column] = pack_half3(light.diffuse)
+    history.specular[slot, row, column] = pack_half3(light.specular)
+    history.indirect[slot, row, column] = pack_half3(light.indirect)
+    history.segment[slot, row, column] = wp.uint8(segment)
+    history.paths[slot, row, column] = wp.uint8(wp.min(paths, history.max_paths))
+
+
+@wp.func
+def accumulate(
+    history: LightHistory, slot: int, row: int, column: int, segment: int, light: SplitRadiance, known: int, samples: int
+) -> SplitRadiance:
+    """Blend the mean of `samples` new paths into an average of `known` ones, and store it; returns the new average."""
+    average = light
+    if known > 0:
+        average = blend_light(read_history(history, slot, row, column), light, 1.0 / float(known + 1))
+    write_history(history, slot, row, column, segment, average, known + samples)
+    return average

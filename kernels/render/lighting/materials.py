@@ -11,6 +11,13 @@ PIXEL_VARIANCE = wp.constant(1.0 / 12.0)
 """Variance of a uniformly distributed position in a pixel, along one axis [px²]."""
 MAX_WIDENING = wp.constant(0.18)
 """Specular anti-aliasing: largest increase of the squared GGX width alpha² (Tokuyoshi and Kaplanyan, 2019)."""
+TEXEL_BITS = wp.constant(10)
+"""Bits of a texel's channel: the square root of a linear value, an encoding that a multiplication decodes, in steps of at most a third of
+those of 8-bit sRGB."""
+TEXEL_MASK = wp.constant((1 << 10) - 1)
+"""Largest value of a texel's channel."""
+TEXEL_SCALE = wp.constant(1.0 / ((1 << 10) - 1) ** 2)
+"""Linear value of a square of 1."""
 MIN_TILT = wp.constant(0.1)
 """Smallest cosine for a pixel's footprint on a surface seen edge-on."""
 
@@ -40,9 +47,7 @@ class Surfaces:
     texture_levels: wp.array[int]
     """(mesh): number of mip levels."""
     texel: wp.array[wp.uint32]
-    """(texel): sRGB, red in the lowest byte, so that one load reads all three channels."""
-    linear: wp.array[float]
-    """(256): linear value of each sRGB value."""
+    """(texel): square roots of linear red, green and blue in TEXEL_BITS bits each, red in the lowest, so that one load reads all."""
     albedo: AlbedoTables
     """Directional albedo of the specular lobe, the same for all surfaces."""
 
@@ -126,7 +131,10 @@ def interpolate_surface(
 def decode_texel(surfaces: Surfaces, index: int) -> wp.vec3:
     """Linear colour of a texel."""
     texel = int(surfaces.texel[index])
-    return wp.vec3(surfaces.linear[texel & 255], surfaces.linear[(texel >> 8) & 255], surfaces.linear[(texel >> 16) & 255])
+    red = float(texel & TEXEL_MASK)
+    green = float((texel >> TEXEL_BITS) & TEXEL_MASK)
+    blue = float((texel >> (2 * TEXEL_BITS)) & TEXEL_MASK)
+    return TEXEL_SCALE * wp.vec3(red * red, green * green, blue * blue)
 
 
 @wp.func

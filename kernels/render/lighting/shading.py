@@ -83,6 +83,7 @@ def shade_kernel(
     normal = wp.transpose(cameras.to_world[camera]) * surface.face_normal
     plane = tangent_plane(intrinsics, row, column, gbuffer.segment[view, row, column], depth, normal)
     pixel_ratios = upsample_ratios(guide, ratios, coarse, view, row, column, plane)
+    pixel_ratios.indirect = pixel_ratios.indirect / scene.lights.exposure[which]
     sun = float(0.0)
     if wp.max(scene.lights.sun_irradiance[which]) > 0.0:
         if wp.dot(surface.face_normal, rotate_z(scene.lights.sun_direction[which], yaw)) > 0.0:

@@ -48,6 +48,8 @@ class Meshes:
     """(mesh + 1): index of the mesh's first triangle among all triangles; the last entry is their number."""
     corner: wp.array[wp.vec3]
     """(3 x triangle): corners of all triangles [m]."""
+    face_normal: wp.array[wp.vec3]
+    """(triangle): unit normals by the winding; zero for degenerate triangles."""
     entries: int
     """Number of catalog meshes; the mesh of fixture f is entries + f."""
     interior: Interior
@@ -159,9 +161,7 @@ def read_hit(gbuffer: GBuffer, view: int, row: int, column: int) -> Hit:
 @wp.func
 def triangle_normal(meshes: Meshes, mesh: int, triangle: int) -> wp.vec3:
     """Unit normal of a mesh's triangle, in the mesh's own frame."""
-    first = 3 * (meshes.first_triangle[mesh] + triangle)
-    corner = meshes.corner[first]
-    return wp.normalize(wp.cross(meshes.corner[first + 1] - corner, meshes.corner[first + 2] - corner))
+    return meshes.face_normal[meshes.first_triangle[mesh] + triangle]
 
 
 @wp.func

@@ -10,8 +10,9 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs import schema
+from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import Lights
-from synpick_warp.kernels.render.lighting.materials import Surfaces
+from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MASK, Surfaces
 from synpick_warp.kernels.render.lighting.path_tracing import PathScene
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
@@ -67,14 +68,24 @@ def mip_levels(texture: np.ndarray) -> list[np.ndarray]:
 
 
 def pack_texels(image: np.ndarray) -> np.ndarray:
-    """Pack an image (H, W, 3) uint8 into texels (H W) uint32, red in the lowest byte: the layout of `Surfaces.texel`."""
-    red, green, blue = image.reshape(-1, 3).T.astype(np.uint32)
-    return red | green << 8 | blue << 16
+    """Pack an sRGB image (H, W, 3) uint8 into texels (H W) uint32: the layout of `Surfaces.texel`."""
+    bits = int(TEXEL_BITS)
+    root = np.rint(np.sqrt(srgb_to_linear(np.arange(256) / 255.0)) * int(TEXEL_MASK)).astype(np.uint32)
+    red, green, blue = root[image.reshape(-1, 3).T]
+    return red | green << bits | blue << 2 * bits
 
 
 def corner_values(values: np.ndarray, mesh: TriangleMesh) -> np.ndarray:
     """Expand vertex values (V, C) to triangle corners (3 F, C), so that a triangle's values are contiguous."""
     return values[mesh.faces].reshape(-1, values.shape[1])
+
+
+def face_normals(mesh: TriangleMesh) -> np.ndarray:
+    """Unit normals of triangles by their winding (F, 3) float32; zero for degenerate ones."""
+    corners = mesh.vertices[mesh.faces].astype(np.float64)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return (normals / np.where(length > 0.0, length, np.inf)).astype(np.float32)
 
 
 def uv_density(mesh: TriangleMesh) -> np.ndarray:
@@ -113,6 +124,7 @@ def build_meshes(
     meshes.radius = wp.array(np.array(radius) * (1.0 + 1e-6), dtype=wp.float32, device=device)
     meshes.first_triangle = wp.array(np.cumsum([0] + [len(shape.faces) for shape in shapes]), dtype=wp.int32, device=device)
     meshes.corner = wp.array(np.concatenate([corner_values(s.vertices, s) for s in shapes]), dtype=wp.vec3, device=device)
+    meshes.face_normal = wp.array(np.concatenate([face_normals(shape) for shape in shapes]), dtype=wp.vec3, device=device)
     meshes.entries = entries
     meshes.interior.half = wp.vec3(-1.0, -1.0, -1.0)
     if interior is not None:
@@ -146,7 +158,6 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     surfaces.texture_levels = wp.array([len(chain) for chain in chains], dtype=wp.int32, device=device)
     surfaces.texel = wp.array(np.concatenate(texels) if texels else np.zeros(1, np.uint32), dtype=wp.uint32, device=device)
     surfaces.albedo = measure_albedo(device)
-    surfaces.linear = wp.array(srgb_to_linear(np.arange(256) / 255.0), dtype=wp.float32, device=device)
     return surfaces
 
 
@@ -183,6 +194,13 @@ def build_grid(width: int, height: int) -> Any:
     return grid
 
 
+def pack_half3_array(colors: np.ndarray) -> np.ndarray:
+    """Pack colours (..., 3) into (...) uint64: the kernels' `pack_half3`."""
+    halves = np.zeros((*colors.shape[:-1], 4), np.float16)
+    halves[..., :3] = np.minimum(colors, float(MAX_HALF))
+    return halves.view(np.uint64)[..., 0]
+
+
 def build_lights(maps: tuple[EnvironmentMap, ...], ground: np.ndarray | None, exposure: float, device: wp.Device) -> Any:
     """The struct `Lights`; `exposure` multiplies the automatic exposure, `ground` is the table's linear albedo."""
     tables = [precompute_environment(light, ground) for light in maps]
@@ -190,7 +208,7 @@ def build_lights(maps: tuple[EnvironmentMap, ...], ground: np.ndarray | None, ex
     lights.maps = len(tables)
     radiance = np.stack([t.radiance for t in tables] + [t.sunless for t in tables])
     lights.radiance = wp.array(radiance, dtype=wp.vec3, device=device)
-    lights.prefiltered = wp.array(np.stack([t.prefiltered for t in tables]), dtype=wp.vec3, device=device)
+    lights.prefiltered = wp.array(np.stack([pack_half3_array(exposure * t.exposure * t.prefiltered) for t in tables]), device=device)
     lights.irradiance = wp.array(np.stack([t.irradiance for t in tables]), dtype=wp.vec3, device=device)
     lights.sun_direction = wp.array(np.stack([t.sun_direction for t in tables]), dtype=wp.vec3, device=device)
     lights.sun_irradiance = wp.array(np.stack([t.sun_irradiance for t in tables]), dtype=wp.vec3, device=device)

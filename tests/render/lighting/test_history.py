@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.kernels.render.lighting.history import MAX_REST_BITS
 from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
@@ -18,6 +20,7 @@ from synpick_warp.stages.render.view_setup import make_views
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot
 
 PATHS = 16
+LONGEST_REST = 1 << int(MAX_REST_BITS)
 VIEW = camera(64, 48, 300.0, (0.0, 0.0, 1.5))
 LIGHT = EnvironmentMap("gradient", even_light(1.0, 32).radiance * np.linspace(3.0, 0.1, 64, dtype=np.float32)[None, :, None])
 
@@ -70,6 +73,29 @@ def test_a_still_scene_is_remembered_up_to_the_limit(renderer, device):
     counts = [np.unique(remembered(renderer)).tolist() for _ in show(renderer, [(frame, toy()) for frame in range(PATHS + 4)], device)]
     assert counts[:3] == [[1], [2], [3]]
     assert counts[PATHS - 1 :] == [[PATHS]] * 5
+
+
+def test_full_histories_take_turns(renderer, device):
+    """In a still scene a coarse pixel traces a path in one of 8 frames, an even part of all in each, also in each 4 x 4."""
+    frames = [(frame, toy()) for frame in range(PATHS + 1 + 2 * LONGEST_REST)]
+    stored = [renderer.shading.history.diffuse.numpy()[0].copy() for _ in show(renderer, frames, device)]
+    changed = np.array([now != before for before, now in itertools.pairwise(stored[PATHS:])])
+    assert (changed[:LONGEST_REST].sum(axis=0) <= 1).all()
+    assert (changed[LONGEST_REST:].sum(axis=0) <= 1).all()
+    squares = changed[:, :24, :32].reshape(2 * LONGEST_REST, 6, 4, 8, 4).sum(axis=(2, 4))
+    assert squares.max() == 16 // LONGEST_REST
+    assert squares.mean() > 0.9 * 16 // LONGEST_REST
+
+
+@pytest.mark.parametrize("scale", [1e-7, 1e6])
+def test_accumulated_light_does_not_depend_on_the_unit_of_maps(device, scale):
+    colors = []
+    for light in (LIGHT, EnvironmentMap("scaled", scale * LIGHT.radiance)):
+        each = replace(toy(), lights=(light,))
+        made = make_renderer(each.settings(), build_scene(each, device), each.instances, 1, 1)
+        factor = made.scene.lights.exposure.numpy()[0]
+        colors.append([factor * radiance for radiance in show(made, [(frame, each) for frame in range(4)], device)])
+    np.testing.assert_allclose(colors[1], colors[0], rtol=5e-3, atol=1e-3)
 
 
 def test_the_first_frame_is_that_of_a_renderer_without_history(renderer, device):

@@ -62,7 +62,8 @@ def test_textures_of_any_size_render(device, size):
     shown_rows = shown(matte(texture=texture), device).radiance[0, 12:36, 14:50]
     # Light is sampled without the surface's colour: its noise is the same on both.
     plain = shown(matte(color=(0.0, 120 / 255, 0.0)), device).radiance[0, 12:36, 14:50]
-    np.testing.assert_allclose(shown_rows[..., 1], plain[..., 1], rtol=1e-3)
+    # Texels are rounded to 10 bits of the square root.
+    np.testing.assert_allclose(shown_rows[..., 1], plain[..., 1], rtol=2.5e-3)
     # Both colours have the same noise except for the specular part: some per cent of the light, to some per cent.
     ratio = shown_rows[..., 0] / shown_rows[..., 1]
     assert (np.ptp(ratio, axis=0) < 5e-3).all()
