@@ -156,13 +156,17 @@ def transform_blocks_kernel(
     divisor: wp.array3d[int],  # (quality, component, coefficient)
     zigzag: wp.array[int],  # (coefficient)
     # Out:
-    coefficient_out: wp.array4d[wp.int16],  # (view, mcu, block, coefficient)
+    coefficient_out: wp.array3d[wp.uint64],  # (view, quad, block)
+    nonzero_out: wp.array2d[wp.uint64],  # (view, block)
 ):
-    """Quantized DCT coefficients of all blocks, in zigzag order. Launched over view, mcu, block.
+    """Quantized DCT coefficients of all blocks, in zigzag order. Launched over view, block.
 
-    Padding blocks repeat the DC coefficient of the block before them, and have no other, which costs the fewest bits.
+    `coefficient_out` receives four coefficients of 16 bits in each element, the first one lowest; `nonzero_out` a bit for each
+    coefficient that is not 0. Padding blocks repeat the DC coefficient of the block before them, and have no other, which costs the
+    fewest bits.
     """
-    view, mcu, block = wp.tid()
+    view, index = wp.tid()
+    mcu, block = index // BLOCKS_PER_MCU, index % BLOCKS_PER_MCU
     across = (image.shape[2] + MCU - 1) // MCU
     source = int(block)
     while is_padding(image, source, mcu // across, mcu % across):
@@ -172,8 +176,15 @@ def transform_blocks_kernel(
         samples[k] = read_sample(image, view, source, mcu // across, mcu % across, k // BLOCK, k % BLOCK)
     samples = transform_block(samples)
     table = wp.where(block < BLOCKS_PER_MCU - 2, 0, 1)
+    mask, packed = wp.uint64(0), wp.uint64(0)
     for k in range(BLOCK_SIZE):
         value = quantize(samples[zigzag[k]], divisor[quality[view], table, k])
         if k > 0 and source != block:
             value = 0
-        coefficient_out[view, mcu, block, k] = wp.int16(value)
+        if value != 0:
+            mask = mask | (wp.uint64(1) << wp.uint64(k))
+        packed = packed | (wp.uint64(value & 0xFFFF) << wp.uint64(16 * (k & 3)))
+        if k & 3 == 3:
+            coefficient_out[view, k >> 2, index] = packed
+            packed = wp.uint64(0)
+    nonzero_out[view, index] = mask

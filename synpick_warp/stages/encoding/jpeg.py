@@ -26,9 +26,23 @@ from synpick_warp.jpeg import (
     zigzag_order,
 )
 from synpick_warp.kernels.encoding.dct import transform_blocks_kernel
-from synpick_warp.kernels.encoding.huffman import HuffmanTables, encode_intervals_kernel, join_intervals_kernel
+from synpick_warp.kernels.encoding.huffman import (
+    CODE_BITS,
+    HuffmanTables,
+    measure_blocks_kernel,
+    place_blocks_kernel,
+    write_blocks_kernel,
+)
+from synpick_warp.kernels.encoding.stuffing import (
+    MARKER_BYTES,
+    WORD_BYTES,
+    count_stuffing_kernel,
+    join_intervals_kernel,
+    place_intervals_kernel,
+)
 from synpick_warp.kernels.encoding.tables import BLOCK_SIZE, BLOCKS_PER_MCU, MCU
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
+from synpick_warp.kernels.tuning import VIEW_BLOCK
 from synpick_warp.stages.buffers import ViewBuffers
 
 SLOT_BYTES_PER_PIXEL = 1.0
@@ -39,6 +53,10 @@ MIN_FILE_BYTES = 1024
 """Capacity for header and markers [B]."""
 LANES = 32
 """Threads that copy an interval: a warp."""
+INTERVAL_BLOCKS = RESTART_INTERVAL * int(BLOCKS_PER_MCU)
+"""Blocks of a restart interval."""
+QUAD = 4
+"""Coefficients of 16 bits in an element of 64."""
 HUFFMAN = struct_arrays(HuffmanTables, "component", "symbol")
 
 
@@ -56,19 +74,32 @@ class JpegBuffers:
 class JpegScratch:
     """Scratch of the encoder."""
 
-    coefficient: wp.array = device_array("view", "mcu", "block", "coefficient", dtype=wp.int16)
-    """Quantized DCT coefficients in zigzag order."""
-    slot: wp.array = device_array("view", "interval", "slot_byte", dtype=wp.uint8)
-    """Data of each restart interval."""
-    slot_size: wp.array = device_array("view", "interval", dtype=wp.int32)
-    """Size of each interval [B], also beyond its slot."""
+    coefficient: wp.array = device_array("view", "quad", "block", dtype=wp.uint64)
+    """Quantized DCT coefficients in zigzag order, four of 16 bits in each element."""
+    nonzero: wp.array = device_array("view", "block", dtype=wp.uint64)
+    """Bit field of the coefficients that are not 0."""
+    block_bits: wp.array = device_array("view", "block", dtype=wp.int32)
+    """Length of each block's code [bit]."""
+    block_begin: wp.array = device_array("view", "block", dtype=wp.int32)
+    """First bit of each block in its interval."""
+    slot: wp.array = device_array("view", "interval", "slot_word", dtype=wp.uint32)
+    """Bit string of each restart interval, most significant bit first."""
+    coded: wp.array = device_array("view", "interval", dtype=wp.int32)
+    """Size of each bit string [B], also beyond its slot."""
+    stuffing: wp.array = device_array("view", "interval", "lane", dtype=wp.int32)
+    """Bytes that each lane stuffs into its chunk of an interval."""
+    interval_size: wp.array = device_array("view", "interval", dtype=wp.int32)
+    """Size of each interval in the file [B], with stuffing and marker."""
+    interval_begin: wp.array = device_array("view", "interval", dtype=wp.int32)
+    """First byte of each interval in the file."""
 
 
 def jpeg_sizes(views: int, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions of `JpegBuffers` and `JpegScratch`, for `views` images [px]."""
     mcus = -(-width // int(MCU)) * -(-height // int(MCU))
-    sizes = {"view": views, "mcu": mcus, "block": int(BLOCKS_PER_MCU), "coefficient": int(BLOCK_SIZE)}
-    sizes |= {"interval": -(-mcus // RESTART_INTERVAL), "slot_byte": int(SLOT_BYTES_PER_PIXEL * MCU**2 * RESTART_INTERVAL)}
+    slot_bytes = int(SLOT_BYTES_PER_PIXEL * MCU**2 * RESTART_INTERVAL)
+    sizes = {"view": views, "block": mcus * int(BLOCKS_PER_MCU), "quad": int(BLOCK_SIZE) // QUAD}
+    sizes |= {"interval": -(-mcus // RESTART_INTERVAL), "lane": LANES, "slot_word": slot_bytes // int(WORD_BYTES)}
     return sizes | {"byte": MIN_FILE_BYTES + int(FILE_BYTES_PER_PIXEL * width * height)}
 
 
@@ -102,25 +133,69 @@ class JpegEncoder:
             out: Written.
         """
         scratch, device = self.scratch, self.device
+        blocks, intervals = (count, scratch.nonzero.shape[1]), (count, scratch.slot.shape[1])
         wp.launch(
             transform_blocks_kernel,
-            dim=(count, *scratch.coefficient.shape[1:3]),
+            dim=blocks,
             inputs=[image, quality, self.divisor, self.zigzag],
-            outputs=[scratch.coefficient],
+            outputs=[scratch.coefficient, scratch.nonzero],
             device=device,
         )
         wp.launch(
-            encode_intervals_kernel,
-            dim=(count, scratch.slot.shape[1]),
-            inputs=[self.tables, scratch.coefficient, RESTART_INTERVAL],
-            outputs=[scratch.slot, scratch.slot_size],
+            measure_blocks_kernel,
+            dim=blocks,
+            inputs=[self.tables, scratch.coefficient, scratch.nonzero, INTERVAL_BLOCKS],
+            outputs=[scratch.block_bits],
             device=device,
+        )
+        wp.launch(
+            place_blocks_kernel,
+            dim=intervals,
+            inputs=[scratch.block_bits, INTERVAL_BLOCKS, int(MARKER_BYTES)],
+            outputs=[scratch.block_begin, scratch.slot, scratch.coded, scratch.interval_size],
+            device=device,
+        )
+        wp.launch(
+            write_blocks_kernel,
+            dim=blocks,
+            inputs=[self.tables, scratch.coefficient, scratch.nonzero, scratch.block_begin, INTERVAL_BLOCKS],
+            outputs=[scratch.slot],
+            device=device,
+        )
+        self._join(quality, count, out)
+
+    def _join(self, quality: wp.array, count: int, out: JpegBuffers) -> None:
+        """Stuff bytes, and join the intervals to files."""
+        scratch, device = self.scratch, self.device
+        wp.launch(
+            count_stuffing_kernel,
+            dim=(count, *scratch.stuffing.shape[1:]),
+            inputs=[scratch.slot, scratch.coded],
+            outputs=[scratch.stuffing, scratch.interval_size],
+            device=device,
+        )
+        slot_bytes = int(WORD_BYTES) * scratch.slot.shape[2]
+        wp.launch(
+            place_intervals_kernel,
+            dim=count,
+            inputs=[scratch.coded, scratch.interval_size, slot_bytes, self.header.shape[1], out.jpeg.shape[1]],
+            outputs=[scratch.interval_begin, out.jpeg_size],
+            device=device,
+            block_dim=VIEW_BLOCK,
         )
         wp.launch(
             join_intervals_kernel,
-            dim=(count, scratch.slot.shape[1], LANES),
-            inputs=[scratch.slot, scratch.slot_size, quality, self.header, LANES],
-            outputs=[out.jpeg, out.jpeg_size],
+            dim=(count, *scratch.stuffing.shape[1:]),
+            inputs=[
+                scratch.slot,
+                scratch.coded,
+                scratch.interval_size,
+                scratch.interval_begin,
+                scratch.stuffing,
+                quality,
+                self.header,
+            ],
+            outputs=[out.jpeg],
             device=device,
         )
 
@@ -158,6 +233,6 @@ def _upload_huffman(device: wp.Device) -> Any:
     tables = allocate_struct(HUFFMAN, {"component": 2, "symbol": 256}, device)
     for kind, counts, symbols in (("dc", DC_COUNTS, DC_SYMBOLS), ("ac", AC_COUNTS, AC_SYMBOLS)):
         codes = [huffman_codes(*table) for table in zip(counts, symbols, strict=True)]
-        getattr(tables, f"{kind}_code").assign(np.stack([code for code, _ in codes]))
-        getattr(tables, f"{kind}_length").assign(np.stack([length for _, length in codes]))
+        packed = [code | length.astype(np.uint32) << np.uint32(CODE_BITS) for code, length in codes]
+        getattr(tables, kind).assign(np.stack(packed))
     return tables
