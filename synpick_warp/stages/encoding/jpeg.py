@@ -23,9 +23,8 @@ from synpick_warp.jpeg import (
     huffman_codes,
     make_header,
     quantization,
-    zigzag_order,
 )
-from synpick_warp.kernels.encoding.dct import transform_blocks_kernel
+from synpick_warp.kernels.encoding.dct import convert_colors_kernel, transform_blocks_kernel
 from synpick_warp.kernels.encoding.huffman import (
     CODE_BITS,
     HuffmanTables,
@@ -40,7 +39,7 @@ from synpick_warp.kernels.encoding.stuffing import (
     join_intervals_kernel,
     place_intervals_kernel,
 )
-from synpick_warp.kernels.encoding.tables import BLOCK_SIZE, BLOCKS_PER_MCU, MCU
+from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
 from synpick_warp.kernels.tuning import VIEW_BLOCK
 from synpick_warp.stages.buffers import ViewBuffers
@@ -74,6 +73,8 @@ class JpegBuffers:
 class JpegScratch:
     """Scratch of the encoder."""
 
+    sample: wp.array = device_array("view", "sample_row", "sample_block", dtype=wp.uint64)
+    """Rows of eight samples: Y, below it Cb and Cr side by side, of whole MCUs."""
     coefficient: wp.array = device_array("view", "quad", "block", dtype=wp.uint64)
     """Quantized DCT coefficients in zigzag order, four of 16 bits in each element."""
     nonzero: wp.array = device_array("view", "block", dtype=wp.uint64)
@@ -96,9 +97,11 @@ class JpegScratch:
 
 def jpeg_sizes(views: int, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions of `JpegBuffers` and `JpegScratch`, for `views` images [px]."""
-    mcus = -(-width // int(MCU)) * -(-height // int(MCU))
+    across, down = -(-width // int(MCU)), -(-height // int(MCU))
+    mcus = across * down
     slot_bytes = int(SLOT_BYTES_PER_PIXEL * MCU**2 * RESTART_INTERVAL)
     sizes = {"view": views, "block": mcus * int(BLOCKS_PER_MCU), "quad": int(BLOCK_SIZE) // QUAD}
+    sizes |= {"sample_row": down * int(MCU + BLOCK), "sample_block": across * int(MCU // BLOCK)}
     sizes |= {"interval": -(-mcus // RESTART_INTERVAL), "lane": LANES, "slot_word": slot_bytes // int(WORD_BYTES)}
     return sizes | {"byte": MIN_FILE_BYTES + int(FILE_BYTES_PER_PIXEL * width * height)}
 
@@ -118,10 +121,12 @@ class JpegEncoder:
         self.scratch: JpegScratch = allocate(JpegScratch, jpeg_sizes(views, width, height), device)
         self.tables = _upload_huffman(device)
         divisor = np.stack([quantization(quality) for quality in range(QUALITIES)]) * DIVISOR_SCALE
-        self.divisor = wp.array(divisor, dtype=wp.int32, device=device)
+        self.reciprocal = wp.array(-(-(1 << 32) // divisor.astype(np.int64)), dtype=wp.uint32, device=device)
         header = [np.frombuffer(make_header(width, height, quality), np.uint8) for quality in range(QUALITIES)]
         self.header = wp.array(np.stack(header), dtype=wp.uint8, device=device)
-        self.zigzag = wp.array(zigzag_order(), dtype=wp.int32, device=device)
+        rows = self.scratch.sample
+        shape = (*rows.shape[:2], rows.shape[2] * int(BLOCK))
+        self._samples = wp.array(ptr=rows.ptr, dtype=wp.uint8, shape=shape, device=device)
 
     def encode(self, image: wp.array, quality: wp.array, count: int, out: JpegBuffers) -> None:
         """Encode the first `count` views.
@@ -135,9 +140,16 @@ class JpegEncoder:
         scratch, device = self.scratch, self.device
         blocks, intervals = (count, scratch.nonzero.shape[1]), (count, scratch.slot.shape[1])
         wp.launch(
+            convert_colors_kernel,
+            dim=(count, self._samples.shape[1] // 3, self._samples.shape[2] // 2),
+            inputs=[image],
+            outputs=[self._samples],
+            device=device,
+        )
+        wp.launch(
             transform_blocks_kernel,
             dim=blocks,
-            inputs=[image, quality, self.divisor, self.zigzag],
+            inputs=[scratch.sample, *image.shape[1:3], quality, self.reciprocal],
             outputs=[scratch.coefficient, scratch.nonzero],
             device=device,
         )
@@ -154,6 +166,7 @@ class JpegEncoder:
             inputs=[scratch.block_bits, INTERVAL_BLOCKS, int(MARKER_BYTES)],
             outputs=[scratch.block_begin, scratch.slot, scratch.coded, scratch.interval_size],
             device=device,
+            block_dim=VIEW_BLOCK,
         )
         wp.launch(
             write_blocks_kernel,
