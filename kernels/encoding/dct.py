@@ -149,12 +149,15 @@ def transform_block(samples: block_vec) -> block_vec:
 
 @wp.func
 def quantize(coefficient: int, reciprocal: wp.uint32) -> int:
-    """Coefficient / divisor, rounded to nearest, halves away from zero; exact for magnitudes below 2^16 and even divisors below 2^16.
+    """Coefficient / divisor, rounded to nearest, halves away from zero; exact for magnitudes m and even divisors d below 2^16.
+
+    m · reciprocal / 2^32 exceeds m / d by less than m / 2^32 < 1 / d, and m / d + 1 / 2 is a multiple of 1 / d, so that both sums have the
+    same integer part. Coefficients of 8 x 8 samples of at most 128 are below 2^14: an orthonormal transform keeps their norm, 8 · 128,
+    and ours is 8 times as large.
 
     Args:
-        coefficient: Magnitude m.
-        reciprocal: 2^32 / divisor, rounded up. Hence m · reciprocal / 2^32 exceeds m / d by less than m / 2^32 < 2^-16 < 1 / d, and
-            m / d + 1 / 2 is a multiple of 1 / d, so that both have the same integer part.
+        coefficient: Of the transform.
+        reciprocal: 2^32 / divisor, rounded up.
     """
     magnitude = int((wp.uint64(wp.abs(coefficient)) * wp.uint64(reciprocal) + HALF) >> RECIPROCAL_BITS)
     return wp.where(coefficient < 0, -magnitude, magnitude)

@@ -23,6 +23,7 @@ from synpick_warp.jpeg import (
     huffman_codes,
     make_header,
     quantization,
+    reciprocals,
 )
 from synpick_warp.kernels.encoding.dct import convert_colors_kernel, transform_blocks_kernel
 from synpick_warp.kernels.encoding.huffman import (
@@ -119,9 +120,9 @@ class JpegEncoder:
         """
         self.device = device
         self.scratch: JpegScratch = allocate(JpegScratch, jpeg_sizes(views, width, height), device)
-        self.tables = _upload_huffman(device)
+        self.tables = upload_huffman(device)
         divisor = np.stack([quantization(quality) for quality in range(QUALITIES)]) * DIVISOR_SCALE
-        self.reciprocal = wp.array(-(-(1 << 32) // divisor.astype(np.int64)), dtype=wp.uint32, device=device)
+        self.reciprocal = wp.array(reciprocals(divisor), dtype=wp.uint32, device=device)
         header = [np.frombuffer(make_header(width, height, quality), np.uint8) for quality in range(QUALITIES)]
         self.header = wp.array(np.stack(header), dtype=wp.uint8, device=device)
         rows = self.scratch.sample
@@ -241,7 +242,7 @@ class Compressor:
         self.encoder.encode(images.color, self.quality, count, self.out[slot])
 
 
-def _upload_huffman(device: wp.Device) -> Any:
+def upload_huffman(device: wp.Device) -> Any:
     """The standard codes, as the struct `HuffmanTables`."""
     tables = allocate_struct(HUFFMAN, {"component": 2, "symbol": 256}, device)
     for kind, counts, symbols in (("dc", DC_COUNTS, DC_SYMBOLS), ("ac", AC_COUNTS, AC_SYMBOLS)):
