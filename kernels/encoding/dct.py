@@ -9,7 +9,7 @@ byte, and do not depend on the device.
 
 import warp as wp
 
-from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU, MCU_BLOCKS_ACROSS, ZIGZAG
+from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, LUMA_BLOCKS, MCU, MCU_BLOCKS_ACROSS, ZIGZAG
 
 wp.set_module_options({"enable_backward": False, "max_unroll": 64})
 
@@ -24,8 +24,6 @@ PASS_BITS = wp.constant(2)
 """Fractional bits that are kept between the passes over rows and columns."""
 CENTER = wp.constant(128)
 """Level shift of the samples."""
-LUMA_BLOCKS = wp.constant(4)
-"""Blocks of Y in an MCU; those of Cb and Cr follow."""
 RECIPROCAL_BITS = wp.constant(wp.uint64(32))
 """Fractional bits of the divisors' reciprocals."""
 HALF = wp.constant(wp.uint64(1 << 31))
@@ -195,7 +193,7 @@ def transform_blocks_kernel(
 
     `coefficient_out` receives four coefficients of 16 bits in each element, the first one lowest; `nonzero_out` a bit for each
     coefficient that is not 0. Padding blocks of images of `rows` x `columns` pixels repeat the DC coefficient of the block before them,
-    and have no other, which costs the fewest bits.
+    and have no other (only `nonzero_out` tells so), which costs the fewest bits.
     """
     view, index = wp.tid()
     mcu, block = index // BLOCKS_PER_MCU, index % BLOCKS_PER_MCU
@@ -212,14 +210,14 @@ def transform_blocks_kernel(
         column = (block - LUMA_BLOCKS) * across + mcu_column
         table = int(1)
     samples = transform_block(read_block(sample, view, row, column))
-    kept = wp.where(source == block, ~wp.uint64(0), ONE)
     mask, packed, bit = wp.uint64(0), wp.uint64(0), wp.uint64(1)
     for k in range(BLOCK_SIZE):
         value = quantize(samples[wp.static(ZIGZAG[k])], reciprocal[quality[view], table, k])
-        value = wp.where((kept & bit) != wp.uint64(0), value, 0)
         mask = mask | wp.where(value != 0, bit, wp.uint64(0))
         bit = bit << ONE
         packed = (packed >> VALUE_BITS) | (wp.uint64(value & 0xFFFF) << (wp.uint64(3) * VALUE_BITS))
         if k & 3 == 3:
             coefficient_out[view, k >> 2, index] = packed
+    if source != block:
+        mask = mask & ONE
     nonzero_out[view, index] = mask

@@ -7,7 +7,7 @@ files of them.
 
 import warp as wp
 
-from synpick_warp.kernels.encoding.tables import BLOCK_SIZE, BLOCKS_PER_MCU
+from synpick_warp.kernels.encoding.tables import BLOCK_SIZE, BLOCKS_PER_MCU, LUMA_BLOCKS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -86,7 +86,7 @@ def code_length(code: wp.uint32) -> int:
 @wp.func
 def component_of(block: int) -> int:
     """Huffman tables of a block of a view: 0 (Y) or 1 (Cb and Cr)."""
-    return wp.where(block % BLOCKS_PER_MCU < BLOCKS_PER_MCU - 2, 0, 1)
+    return wp.where(block % BLOCKS_PER_MCU < LUMA_BLOCKS, 0, 1)
 
 
 @wp.func
@@ -111,9 +111,9 @@ def dc_difference(
     part = block % BLOCKS_PER_MCU
     previous = block - BLOCKS_PER_MCU
     if part == 0:
-        # Of the MCU before, the last block of Y.
-        previous = block - 3
-    elif part < BLOCKS_PER_MCU - 2:
+        # The last block of Y in the MCU before.
+        previous += LUMA_BLOCKS - 1
+    elif part < LUMA_BLOCKS:
         previous = block - 1
     value = read_coefficient(coefficient, view, block, 0)
     if previous >= block - block % interval_blocks:

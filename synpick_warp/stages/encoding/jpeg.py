@@ -42,7 +42,7 @@ from synpick_warp.kernels.encoding.stuffing import (
 )
 from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
-from synpick_warp.kernels.tuning import VIEW_BLOCK
+from synpick_warp.kernels.tuning import TRANSFORM_BLOCK, VIEW_BLOCK
 from synpick_warp.stages.buffers import ViewBuffers
 
 SLOT_BYTES_PER_PIXEL = 1.0
@@ -153,6 +153,7 @@ class JpegEncoder:
             inputs=[scratch.sample, *image.shape[1:3], quality, self.reciprocal],
             outputs=[scratch.coefficient, scratch.nonzero],
             device=device,
+            block_dim=TRANSFORM_BLOCK,
         )
         wp.launch(
             measure_blocks_kernel,
