@@ -84,6 +84,11 @@ def quantization(quality: int) -> np.ndarray:
     return np.clip((tables * scale + 50) // 100, 1, 255).astype(np.int32)
 
 
+def reciprocals(divisors: np.ndarray) -> np.ndarray:
+    """2^32 / divisor, rounded up, uint32; divisors are at least 2."""
+    return (-(-(1 << 32) // divisors.astype(np.int64))).astype(np.uint32)
+
+
 def huffman_codes(counts: bytes, symbols: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Canonical Huffman codes (T.81, annex C): code (256) uint32 and length (256) int32 [bits] by symbol; length 0: no code."""
     codes, lengths = np.zeros(256, np.uint32), np.zeros(256, np.int32)

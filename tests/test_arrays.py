@@ -10,6 +10,7 @@ import warp as wp
 from synpick_warp.arrays import StructArrays, allocate, allocate_struct, device_array, memory_table, struct_arrays
 from synpick_warp.memory_plan import describe_arrays
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
+from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch
 from synpick_warp.stages.encoding.png import DEPTH_SCRATCH, DepthBuffers
 from synpick_warp.stages.perception.arrays import Observation, PerceptionArrays, Plan, SegmentationScratch
 from synpick_warp.stages.perception.images import count_views
@@ -40,7 +41,8 @@ from tests.worlds.small_worlds import settings
 NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
     "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_footprint block "
-    "world_camera view_instance one slot slot_word group depth_byte"
+    "world_camera view_instance one slot slot_word group depth_byte "
+    "sample_row sample_block quad interval lane byte"
 )
 WORLDS = MIN_GPU_WORLDS + 1
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}
@@ -102,7 +104,7 @@ def test_a_missing_extent_is_an_error(device):
         allocate(Sample, {"world": 3}, device)
 
 
-@pytest.mark.parametrize("kind", DECLARED, ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [*DECLARED, JpegBuffers, JpegScratch], ids=lambda kind: kind.__name__)
 def test_the_memory_table_of_every_declaration_matches_its_allocation(device, kind):
     is_struct = isinstance(kind, StructArrays)
     arrays = allocate_struct(kind, SIZES, device) if is_struct else allocate(kind, SIZES, device)

@@ -1,14 +1,17 @@
 """Forward transform of baseline JPEG (ITU-T T.81): YCbCr with 4:2:0 chroma, integer DCT, quantization; all in integers, as libjpeg does it.
 
+A kernel writes the samples of Y, Cb and Cr, row by row: Y on top, below it Cb and Cr side by side. Another one transforms a block a thread;
+its loops are unrolled, so that all 64 values stay in registers.
+
 The arithmetic is that of libjpeg's slow integer DCT (Loeffler, Ligtenberg, Moschytz, 1989), so that files equal those of libjpeg byte for
 byte, and do not depend on the device.
 """
 
 import warp as wp
 
-from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU, MCU_BLOCKS_ACROSS
+from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, LUMA_BLOCKS, MCU, MCU_BLOCKS_ACROSS, ZIGZAG
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "max_unroll": 64})
 
 vec8i = wp.types.vector(length=8, dtype=wp.int32)
 block_vec = wp.types.vector(length=64, dtype=wp.int32)
@@ -21,6 +24,13 @@ PASS_BITS = wp.constant(2)
 """Fractional bits that are kept between the passes over rows and columns."""
 CENTER = wp.constant(128)
 """Level shift of the samples."""
+RECIPROCAL_BITS = wp.constant(wp.uint64(32))
+"""Fractional bits of the divisors' reciprocals."""
+HALF = wp.constant(wp.uint64(1 << 31))
+"""Half of 2^32, which rounds."""
+ONE = wp.constant(wp.uint64(1))
+VALUE_BITS = wp.constant(wp.uint64(16))
+"""Bits of a stored coefficient."""
 
 
 @wp.func
@@ -40,51 +50,45 @@ def chroma(color: wp.vec3ub, difference: int) -> int:
 
 
 @wp.func
-def read_chroma(
-    image: wp.array3d[wp.vec3ub],  # (view, row, column)
-    view: int,
-    row: int,
-    column: int,
-    difference: int,
-) -> int:
-    """Cb or Cr of a pixel; the last column is repeated to the right, the last row below the image."""
-    i, j = wp.min(row, image.shape[1] - 1), wp.min(column, image.shape[2] - 1)
-    return chroma(image[view, i, j], difference)
-
-
-@wp.func
-def read_sample(
-    image: wp.array3d[wp.vec3ub],  # (view, row, column)
-    view: int,
-    block: int,
-    mcu_row: int,
-    mcu_column: int,
-    row: int,
-    column: int,
-) -> int:
-    """Sample of a block of a minimum coded unit (MCU), less 128. Blocks 0 to 3: Y in 2 x 2; 4: Cb, 5: Cr, means of 2 x 2 pixels.
-
-    Means are rounded up and down in alternate columns. Below the image libjpeg repeats the last row of means, not of pixels.
-    """
-    if block < MCU_BLOCKS_ACROSS * MCU_BLOCKS_ACROSS:
-        i = wp.min(mcu_row * MCU + (block // MCU_BLOCKS_ACROSS) * BLOCK + row, image.shape[1] - 1)
-        j = wp.min(mcu_column * MCU + (block % MCU_BLOCKS_ACROSS) * BLOCK + column, image.shape[2] - 1)
-        return luma(image[view, i, j]) - CENTER
-    i = 2 * wp.min(mcu_row * BLOCK + row, (image.shape[1] - 1) // 2)
-    j = 2 * (mcu_column * BLOCK + column)
-    difference = block - MCU_BLOCKS_ACROSS * MCU_BLOCKS_ACROSS
-    total = read_chroma(image, view, i, j, difference) + read_chroma(image, view, i, j + 1, difference)
-    total += read_chroma(image, view, i + 1, j, difference) + read_chroma(image, view, i + 1, j + 1, difference)
-    return ((total + 1 + column % 2) >> 2) - CENTER
-
-
-@wp.func
-def is_padding(image: wp.array3d[wp.vec3ub], block: int, mcu_row: int, mcu_column: int) -> bool:
+def is_padding(block: int, mcu_row: int, mcu_column: int, rows: int, columns: int) -> bool:
     """Whether a block of an MCU at the border is padding (libjpeg's dummy block): it contains no pixel of the image."""
-    if block >= MCU_BLOCKS_ACROSS * MCU_BLOCKS_ACROSS:
+    if block >= LUMA_BLOCKS:
         return False
     row, column = mcu_row * MCU + (block // MCU_BLOCKS_ACROSS) * BLOCK, mcu_column * MCU + (block % MCU_BLOCKS_ACROSS) * BLOCK
-    return row >= image.shape[1] or column >= image.shape[2]
+    return row >= rows or column >= columns
+
+
+@wp.kernel
+def convert_colors_kernel(
+    # In:
+    image: wp.array3d[wp.vec3ub],  # (view, row, column)
+    # Out:
+    sample_out: wp.array3d[wp.uint8],  # (view, sample_row, sample_column)
+):
+    """Samples of whole MCUs: Y of 2 x 2 pixels, and the means of their Cb and Cr. Launched over view, pair of rows, pair of columns.
+
+    The last column is repeated to the right. Below the image, libjpeg repeats the last row of Y and the last row of means of Cb and Cr.
+    Means are rounded up and down in alternate columns.
+    """
+    view, row, column = wp.tid()
+    last = (image.shape[1] - 1) // 2
+    upper = 2 * wp.min(row, last)
+    lower = wp.min(upper + 1, image.shape[1] - 1)
+    left, right = wp.min(2 * column, image.shape[2] - 1), wp.min(2 * column + 1, image.shape[2] - 1)
+    a, b = image[view, upper, left], image[view, upper, right]
+    c, d = image[view, lower, left], image[view, lower, right]
+    rounding = 1 + column % 2
+    cb = (chroma(a, 0) + chroma(b, 0) + chroma(c, 0) + chroma(d, 0) + rounding) >> 2
+    cr = (chroma(a, 1) + chroma(b, 1) + chroma(c, 1) + chroma(d, 1) + rounding) >> 2
+    below_left, below_right = luma(c), luma(d)
+    above_left, above_right = wp.where(row > last, below_left, luma(a)), wp.where(row > last, below_right, luma(b))
+    sample_out[view, 2 * row, 2 * column] = wp.uint8(above_left)
+    sample_out[view, 2 * row, 2 * column + 1] = wp.uint8(above_right)
+    sample_out[view, 2 * row + 1, 2 * column] = wp.uint8(below_left)
+    sample_out[view, 2 * row + 1, 2 * column + 1] = wp.uint8(below_right)
+    bottom = sample_out.shape[1] // 3 * 2 + row
+    sample_out[view, bottom, column] = wp.uint8(cb)
+    sample_out[view, bottom, sample_out.shape[2] // 2 + column] = wp.uint8(cr)
 
 
 @wp.func
@@ -142,38 +146,78 @@ def transform_block(samples: block_vec) -> block_vec:
 
 
 @wp.func
-def quantize(coefficient: int, divisor: int) -> int:
-    """Coefficient / divisor, rounded to nearest, halves away from zero."""
-    magnitude = (wp.abs(coefficient) + (divisor >> 1)) // divisor
+def quantize(coefficient: int, reciprocal: wp.uint32) -> int:
+    """Coefficient / divisor, rounded to nearest, halves away from zero; exact for magnitudes m and even divisors d below 2^16.
+
+    m · reciprocal / 2^32 exceeds m / d by less than m / 2^32 < 1 / d, and m / d + 1 / 2 is a multiple of 1 / d, so that both sums have the
+    same integer part. Coefficients of 8 x 8 samples of at most 128 are below 2^14: an orthonormal transform keeps their norm, 8 · 128,
+    and ours is 8 times as large.
+
+    Args:
+        coefficient: Of the transform.
+        reciprocal: 2^32 / divisor, rounded up.
+    """
+    magnitude = int((wp.uint64(wp.abs(coefficient)) * wp.uint64(reciprocal) + HALF) >> RECIPROCAL_BITS)
     return wp.where(coefficient < 0, -magnitude, magnitude)
+
+
+@wp.func
+def read_block(
+    sample: wp.array3d[wp.uint64],  # (view, sample_row, sample_block)
+    view: int,
+    row: int,
+    column: int,
+) -> block_vec:
+    """Samples of a block, less 128, from its first row and its column of blocks."""
+    block = block_vec()
+    for i in range(BLOCK):
+        line = sample[view, row + i, column]
+        for k in range(BLOCK):
+            block[BLOCK * i + k] = int((line >> wp.uint64(8 * k)) & wp.uint64(0xFF)) - CENTER
+    return block
 
 
 @wp.kernel
 def transform_blocks_kernel(
     # In:
-    image: wp.array3d[wp.vec3ub],  # (view, row, column)
+    sample: wp.array3d[wp.uint64],  # (view, sample_row, sample_block)
+    rows: int,
+    columns: int,
     quality: wp.array[int],  # (view)
-    divisor: wp.array3d[int],  # (quality, component, coefficient)
-    zigzag: wp.array[int],  # (coefficient)
+    reciprocal: wp.array3d[wp.uint32],  # (quality, component, coefficient)
     # Out:
-    coefficient_out: wp.array4d[wp.int16],  # (view, mcu, block, coefficient)
+    coefficient_out: wp.array3d[wp.uint64],  # (view, quad, block)
+    nonzero_out: wp.array2d[wp.uint64],  # (view, block)
 ):
-    """Quantized DCT coefficients of all blocks, in zigzag order. Launched over view, mcu, block.
+    """Quantized DCT coefficients of all blocks, in zigzag order. Launched over view, block.
 
-    Padding blocks repeat the DC coefficient of the block before them, and have no other, which costs the fewest bits.
+    `coefficient_out` receives four coefficients of 16 bits in each element, the first one lowest; `nonzero_out` a bit for each
+    coefficient that is not 0. Padding blocks of images of `rows` x `columns` pixels repeat the DC coefficient of the block before them,
+    and have no other (only `nonzero_out` tells so), which costs the fewest bits.
     """
-    view, mcu, block = wp.tid()
-    across = (image.shape[2] + MCU - 1) // MCU
+    view, index = wp.tid()
+    mcu, block = index // BLOCKS_PER_MCU, index % BLOCKS_PER_MCU
+    across = sample.shape[2] // MCU_BLOCKS_ACROSS
+    mcu_row, mcu_column = mcu // across, mcu % across
     source = int(block)
-    while is_padding(image, source, mcu // across, mcu % across):
+    while is_padding(source, mcu_row, mcu_column, rows, columns):
         source -= 1
-    samples = block_vec()
+    row = mcu_row * MCU + (source // MCU_BLOCKS_ACROSS) * BLOCK
+    column = mcu_column * MCU_BLOCKS_ACROSS + source % MCU_BLOCKS_ACROSS
+    table = int(0)
+    if block >= LUMA_BLOCKS:
+        row = sample.shape[1] // 3 * 2 + mcu_row * BLOCK
+        column = (block - LUMA_BLOCKS) * across + mcu_column
+        table = int(1)
+    samples = transform_block(read_block(sample, view, row, column))
+    mask, packed, bit = wp.uint64(0), wp.uint64(0), wp.uint64(1)
     for k in range(BLOCK_SIZE):
-        samples[k] = read_sample(image, view, source, mcu // across, mcu % across, k // BLOCK, k % BLOCK)
-    samples = transform_block(samples)
-    table = wp.where(block < BLOCKS_PER_MCU - 2, 0, 1)
-    for k in range(BLOCK_SIZE):
-        value = quantize(samples[zigzag[k]], divisor[quality[view], table, k])
-        if k > 0 and source != block:
-            value = 0
-        coefficient_out[view, mcu, block, k] = wp.int16(value)
+        value = quantize(samples[wp.static(ZIGZAG[k])], reciprocal[quality[view], table, k])
+        mask = mask | wp.where(value != 0, bit, wp.uint64(0))
+        bit = bit << ONE
+        packed = (packed >> VALUE_BITS) | (wp.uint64(value & 0xFFFF) << (wp.uint64(3) * VALUE_BITS))
+        if k & 3 == 3:
+            coefficient_out[view, k >> 2, index] = packed
+    if source != block:
+        mask = mask & ONE
+    nonzero_out[view, index] = mask

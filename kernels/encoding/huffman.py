@@ -1,88 +1,73 @@
-"""Entropy coding of baseline JPEG (ITU-T T.81, annex F): Huffman codes of quantized coefficients, in restart intervals of a few MCUs.
+"""Entropy coding of baseline JPEG (ITU-T T.81, annex F): Huffman codes of quantized coefficients, a thread for each block.
 
-Restart intervals do not depend on each other: each is written by a thread into a slot of its own, then the slots are joined.
+A prefix sum over the lengths of the blocks' codes gives the bit offset of each block in its restart interval, so that all blocks write
+to the interval's slot at the same time. Slots hold bit strings in 32-bit words, the first bit the most significant; `stuffing` makes
+files of them.
 """
 
 import warp as wp
 
-from synpick_warp.kernels.encoding.tables import BLOCK_SIZE, BLOCKS_PER_MCU
+from synpick_warp.kernels.encoding.tables import BLOCK_SIZE, BLOCKS_PER_MCU, LUMA_BLOCKS
 
 wp.set_module_options({"enable_backward": False})
 
-MARKER = wp.constant(0xFF)
-"""First byte of a marker; in coded data a byte 0 follows it."""
-RESTART, END = wp.constant(0xD0), wp.constant(0xD9)
-"""Second bytes of the markers RST0 and EOI."""
-RESTARTS = wp.constant(8)
-"""Restart markers are numbered modulo this."""
 ZERO_RUN = wp.constant(0xF0)
 """Symbol (ZRL) of sixteen zeros."""
+RUN_BITS = wp.constant(4)
+"""Bits of a run of zeros in a symbol, above the number of magnitude bits."""
 LONGEST_RUN = wp.constant(15)
 """Most zeros before a coefficient in one symbol."""
+CODE_BITS = wp.constant(24)
+"""Position of the length in a packed code: the code is in bits 0 to 23, its number of bits in bits 24 to 31."""
+WORD_BITS = wp.constant(32)
+"""Bits of a word of a slot."""
+WORD_SHIFT = wp.constant(5)
+"""2^5 bits are a word."""
+ONE = wp.constant(wp.uint64(1))
 
 
 @wp.struct
 class HuffmanTables:
-    """Huffman codes by component (0: Y, 1: Cb and Cr) and symbol."""
+    """Packed codes (`CODE_BITS`) by component (0: Y, 1: Cb and Cr) and symbol."""
 
-    dc_code: wp.array2d[wp.uint32]
+    dc: wp.array2d[wp.uint32]
     """(component, symbol): code of a difference's number of bits."""
-    dc_length: wp.array2d[int]
-    """(component, symbol): bits of the code."""
-    ac_code: wp.array2d[wp.uint32]
+    ac: wp.array2d[wp.uint32]
     """(component, symbol): code of 16 x zeros before a coefficient + its number of bits."""
-    ac_length: wp.array2d[int]
-    """(component, symbol): bits of the code."""
 
 
 @wp.struct
-class BitWriter:
-    """State of a writer of bits to a slot, the first bit the most significant of its byte."""
+class WordWriter:
+    """State of a writer of bits to a slot, within its words."""
 
     view: int
     interval: int
     """Slot."""
 
-    pending: wp.uint32
-    """Bits that do not fill a byte yet, at the low end."""
+    pending: wp.uint64
+    """Bits that do not fill a word yet, at the low end; bits of earlier blocks in the word are 0."""
     bits: int
-    """Their number, below 8."""
-    size: int
-    """Bytes so far, also those beyond the capacity."""
+    """Their number, with those of earlier blocks, below `WORD_BITS`."""
+    word: int
+    """Index of the word that they belong to."""
+    shared: bool
+    """Whether the word begins with bits of an earlier block."""
 
 
 @wp.func
-def put_byte(writer: BitWriter, slot: wp.array3d[wp.uint8], value: wp.uint32) -> BitWriter:
-    """Append a byte if the slot has space for it; the size counts it in any case."""
-    if writer.size < slot.shape[2]:
-        slot[writer.view, writer.interval, writer.size] = wp.uint8(value)
-    writer.size += 1
-    return writer
-
-
-@wp.func
-def put_bits(writer: BitWriter, slot: wp.array3d[wp.uint8], value: wp.uint32, count: int) -> BitWriter:
-    """Append `count` bits, at most 16; after a byte 0xFF a byte 0 follows, so that it is no marker."""
-    writer.pending = (writer.pending << wp.uint32(count)) | value
-    writer.bits += count
-    while writer.bits >= 8:
-        writer.bits -= 8
-        byte = (writer.pending >> wp.uint32(writer.bits)) & wp.uint32(0xFF)
-        writer = put_byte(writer, slot, byte)
-        if byte == wp.uint32(MARKER):
-            writer = put_byte(writer, slot, wp.uint32(0))
-    writer.pending = writer.pending & wp.uint32(0xFF)
-    return writer
+def lowest_bit(mask: wp.uint64) -> int:
+    """Index of the lowest set bit (count trailing zeros) of a mask that is not 0."""
+    return wp.bit_count((mask - ONE) & ~mask)
 
 
 @wp.func
 def bit_length(value: int) -> int:
-    """Number of bits of a magnitude; 0 has none."""
-    count = int(0)
-    while value > 0:
-        value = value >> 1
-        count += 1
-    return count
+    """Number of bits of a magnitude below 2^16; 0 has none."""
+    ones = value | (value >> 1)
+    ones = ones | (ones >> 2)
+    ones = ones | (ones >> 4)
+    ones = ones | (ones >> 8)
+    return wp.bit_count(ones)
 
 
 @wp.func
@@ -93,104 +78,189 @@ def signed_bits(value: int, count: int) -> wp.uint32:
 
 
 @wp.func
-def encode_block(
-    tables: HuffmanTables,
-    coefficient: wp.array4d[wp.int16],  # (view, mcu, block, coefficient)
-    mcu: int,
+def code_length(code: wp.uint32) -> int:
+    """Number of bits of a packed code."""
+    return int(code >> wp.uint32(CODE_BITS))
+
+
+@wp.func
+def component_of(block: int) -> int:
+    """Huffman tables of a block of a view: 0 (Y) or 1 (Cb and Cr)."""
+    return wp.where(block % BLOCKS_PER_MCU < LUMA_BLOCKS, 0, 1)
+
+
+@wp.func
+def read_coefficient(
+    coefficient: wp.array3d[wp.uint64],  # (view, quad, block)
+    view: int,
     block: int,
-    previous: int,
-    writer: BitWriter,
-    slot: wp.array3d[wp.uint8],  # (view, interval, byte)
-) -> BitWriter:
-    """Append a block: its DC coefficient less the `previous` one of its component, then runs of zeros and AC coefficients."""
-    component = wp.where(block < BLOCKS_PER_MCU - 2, 0, 1)
-    difference = int(coefficient[writer.view, mcu, block, 0]) - previous
-    bits = bit_length(wp.abs(difference))
-    writer = put_bits(writer, slot, tables.dc_code[component, bits], tables.dc_length[component, bits])
-    writer = put_bits(writer, slot, signed_bits(difference, bits), bits)
-    zeros = int(0)
-    for k in range(1, BLOCK_SIZE):
-        value = int(coefficient[writer.view, mcu, block, k])
-        if value == 0:
-            zeros += 1
-        else:
-            while zeros > LONGEST_RUN:
-                writer = put_bits(writer, slot, tables.ac_code[component, ZERO_RUN], tables.ac_length[component, ZERO_RUN])
-                zeros -= LONGEST_RUN + 1
-            bits = bit_length(wp.abs(value))
-            symbol = 16 * zeros + bits
-            writer = put_bits(writer, slot, tables.ac_code[component, symbol], tables.ac_length[component, symbol])
-            writer = put_bits(writer, slot, signed_bits(value, bits), bits)
-            zeros = 0
-    if zeros > 0:
+    k: int,
+) -> int:
+    """Coefficient k of a block, in zigzag order."""
+    return int(wp.int16(coefficient[view, k >> 2, block] >> wp.uint64(16 * (k & 3))))
+
+
+@wp.func
+def dc_difference(
+    coefficient: wp.array3d[wp.uint64],  # (view, quad, block)
+    view: int,
+    block: int,
+    interval_blocks: int,
+) -> int:
+    """DC coefficient of a block less that of the block before it of the same component in the restart interval, or less 0."""
+    part = block % BLOCKS_PER_MCU
+    previous = block - BLOCKS_PER_MCU
+    if part == 0:
+        # The last block of Y in the MCU before.
+        previous += LUMA_BLOCKS - 1
+    elif part < LUMA_BLOCKS:
+        previous = block - 1
+    value = read_coefficient(coefficient, view, block, 0)
+    if previous >= block - block % interval_blocks:
+        value -= read_coefficient(coefficient, view, previous, 0)
+    return value
+
+
+@wp.kernel
+def measure_blocks_kernel(
+    # In:
+    tables: HuffmanTables,
+    coefficient: wp.array3d[wp.uint64],  # (view, quad, block)
+    nonzero: wp.array2d[wp.uint64],  # (view, block)
+    interval_blocks: int,
+    # Out:
+    bits_out: wp.array2d[int],  # (view, block) [bit]
+):
+    """Length of each block's code. Launched over view, block."""
+    view, block = wp.tid()
+    component = component_of(block)
+    bits = bit_length(wp.abs(dc_difference(coefficient, view, block, interval_blocks)))
+    length = code_length(tables.dc[component, bits]) + bits
+    long_run = code_length(tables.ac[component, ZERO_RUN])
+    last = int(0)
+    mask = nonzero[view, block] & ~ONE
+    while mask != wp.uint64(0):
+        k = lowest_bit(mask)
+        mask = mask & (mask - ONE)
+        zeros = k - last - 1
+        bits = bit_length(wp.abs(read_coefficient(coefficient, view, block, k)))
+        symbol = ((zeros & LONGEST_RUN) << RUN_BITS) + bits
+        length += (zeros >> RUN_BITS) * long_run + code_length(tables.ac[component, symbol]) + bits
+        last = k
+    if last < BLOCK_SIZE - 1:
         # End of block (EOB).
-        writer = put_bits(writer, slot, tables.ac_code[component, 0], tables.ac_length[component, 0])
+        length += code_length(tables.ac[component, 0])
+    bits_out[view, block] = length
+
+
+@wp.kernel
+def place_blocks_kernel(
+    # In:
+    bits: wp.array2d[int],  # (view, block) [bit]
+    interval_blocks: int,
+    marker_bytes: int,
+    # Out:
+    begin_out: wp.array2d[int],  # (view, block) [bit]
+    slot_out: wp.array3d[wp.uint32],  # (view, interval, slot_word)
+    coded_out: wp.array2d[int],  # (view, interval) [B]
+    size_out: wp.array2d[int],  # (view, interval) [B]
+):
+    """Prefix sum over the blocks of a restart interval: `begin_out` receives their bit offsets. Launched over view, interval.
+
+    Also clears the words of the slot that blocks share. `coded_out` receives the bytes of the bit string, which may be more than the slot
+    has, `size_out` the same with the closing marker.
+    """
+    view, interval = wp.tid()
+    begin = int(0)
+    for block in range(interval * interval_blocks, wp.min((interval + 1) * interval_blocks, bits.shape[1])):
+        begin_out[view, block] = begin
+        if begin >> WORD_SHIFT < slot_out.shape[2]:
+            slot_out[view, interval, begin >> WORD_SHIFT] = wp.uint32(0)
+        begin += bits[view, block]
+    if begin >> WORD_SHIFT < slot_out.shape[2]:
+        slot_out[view, interval, begin >> WORD_SHIFT] = wp.uint32(0)
+    coded_out[view, interval] = (begin + 7) // 8
+    size_out[view, interval] = (begin + 7) // 8 + marker_bytes
+
+
+@wp.func
+def put_bits(writer: WordWriter, slot: wp.array3d[wp.uint32], value: wp.uint32, count: int) -> WordWriter:
+    """Append `count` bits, at most 32. Full words are written, if the slot has space for them."""
+    writer.pending = (writer.pending << wp.uint64(count)) | wp.uint64(value)
+    writer.bits += count
+    if writer.bits >= WORD_BITS:
+        writer.bits -= WORD_BITS
+        word = wp.uint32(writer.pending >> wp.uint64(writer.bits))
+        if writer.word < slot.shape[2]:
+            if writer.shared:
+                wp.atomic_or(slot, writer.view, writer.interval, writer.word, word)
+            else:
+                slot[writer.view, writer.interval, writer.word] = word
+        writer.word += 1
+        writer.shared = False
     return writer
 
 
+@wp.func
+def finish_words(writer: WordWriter, slot: wp.array3d[wp.uint32]):
+    """Write the last word, of which the next block has the rest."""
+    if writer.bits > 0 and writer.word < slot.shape[2]:
+        word = wp.uint32(writer.pending << wp.uint64(WORD_BITS - writer.bits))
+        wp.atomic_or(slot, writer.view, writer.interval, writer.word, word)
+
+
+@wp.func
+def put_value(writer: WordWriter, slot: wp.array3d[wp.uint32], code: wp.uint32, value: int, count: int) -> WordWriter:
+    """Append a packed code of at most 16 bits and the `count` magnitude bits of a value, at most 11."""
+    symbol = (code & wp.uint32((1 << CODE_BITS) - 1)) << wp.uint32(count)
+    return put_bits(writer, slot, symbol | signed_bits(value, count), code_length(code) + count)
+
+
 @wp.kernel
-def encode_intervals_kernel(
+def write_blocks_kernel(
     # In:
     tables: HuffmanTables,
-    coefficient: wp.array4d[wp.int16],  # (view, mcu, block, coefficient)
-    interval_mcus: int,
+    coefficient: wp.array3d[wp.uint64],  # (view, quad, block)
+    nonzero: wp.array2d[wp.uint64],  # (view, block)
+    begin: wp.array2d[int],  # (view, block) [bit]
+    interval_blocks: int,
     # Out:
-    slot_out: wp.array3d[wp.uint8],  # (view, interval, byte)
-    size_out: wp.array2d[int],  # (view, interval)
+    slot_out: wp.array3d[wp.uint32],  # (view, interval, slot_word)
 ):
-    """Entropy-coded data of each restart interval with its closing marker (RST, or EOI after the last one). Launched over view, interval.
+    """Write each block's code at its bit offset: DC difference, then runs of zeros and AC coefficients. Launched over view, block.
 
-    `size_out` receives the bytes that it takes, which may be more than the slot has.
+    Words that blocks share are combined by atomic "or", which gives the same in any order. The last block of an interval fills up the
+    last byte with ones.
     """
-    view, interval = wp.tid()
-    writer = BitWriter()
+    view, block = wp.tid()
+    component = component_of(block)
+    offset = begin[view, block]
+    writer = WordWriter()
     writer.view = view
-    writer.interval = interval
-    previous = wp.vec3i(0, 0, 0)
-    for mcu in range(interval * interval_mcus, wp.min((interval + 1) * interval_mcus, coefficient.shape[1])):
-        for block in range(BLOCKS_PER_MCU):
-            component = wp.max(block - (BLOCKS_PER_MCU - 3), 0)
-            writer = encode_block(tables, coefficient, mcu, block, previous[component], writer, slot_out)
-            previous[component] = int(coefficient[view, mcu, block, 0])
-    if writer.bits > 0:
-        # The last byte is filled up with ones.
-        writer = put_bits(writer, slot_out, wp.uint32((1 << (8 - writer.bits)) - 1), 8 - writer.bits)
-    marker = wp.where(interval < size_out.shape[1] - 1, RESTART + interval % RESTARTS, END)
-    writer = put_byte(writer, slot_out, wp.uint32(MARKER))
-    writer = put_byte(writer, slot_out, wp.uint32(marker))
-    size_out[view, interval] = writer.size
-
-
-@wp.kernel
-def join_intervals_kernel(
-    # In:
-    slot: wp.array3d[wp.uint8],  # (view, interval, byte)
-    size: wp.array2d[int],  # (view, interval)
-    quality: wp.array[int],  # (view)
-    header: wp.array2d[wp.uint8],  # (quality, header_byte)
-    lanes: int,
-    # Out:
-    file_out: wp.array2d[wp.uint8],  # (view, byte)
-    total_out: wp.array[int],  # (view)
-):
-    """Join header and intervals to a file for each view. Launched over view, interval, lane: `lanes` threads copy an interval.
-
-    `total_out` receives the size of the file [B]. If it or an interval exceeds its capacity, the file is incomplete, and the size is
-    above the capacity.
-    """
-    view, interval, lane = wp.tid()
-    begin = int(header.shape[1])
-    if interval == 0:
-        for k in range(lane, header.shape[1], lanes):
-            file_out[view, k] = header[quality[view], k]
-    for k in range(interval):
-        begin += size[view, k]
-    count = wp.min(size[view, interval], slot.shape[2])
-    for k in range(lane, wp.min(count, file_out.shape[1] - begin), lanes):
-        file_out[view, begin + k] = slot[view, interval, k]
-    if lane == 0 and interval == size.shape[1] - 1:
-        total = begin + size[view, interval]
-        for k in range(size.shape[1]):
-            if size[view, k] > slot.shape[2]:
-                total = wp.max(total, file_out.shape[1] + 1)
-        total_out[view] = total
+    writer.interval = block // interval_blocks
+    writer.word = offset >> WORD_SHIFT
+    writer.bits = offset & (WORD_BITS - 1)
+    writer.shared = writer.bits > 0
+    value = dc_difference(coefficient, view, block, interval_blocks)
+    bits = bit_length(wp.abs(value))
+    writer = put_value(writer, slot_out, tables.dc[component, bits], value, bits)
+    last = int(0)
+    mask = nonzero[view, block] & ~ONE
+    while mask != wp.uint64(0):
+        k = lowest_bit(mask)
+        mask = mask & (mask - ONE)
+        zeros = k - last - 1
+        while zeros > LONGEST_RUN:
+            writer = put_value(writer, slot_out, tables.ac[component, ZERO_RUN], 0, 0)
+            zeros -= LONGEST_RUN + 1
+        value = read_coefficient(coefficient, view, block, k)
+        bits = bit_length(wp.abs(value))
+        writer = put_value(writer, slot_out, tables.ac[component, (zeros << RUN_BITS) + bits], value, bits)
+        last = k
+    if last < BLOCK_SIZE - 1:
+        # End of block (EOB).
+        writer = put_value(writer, slot_out, tables.ac[component, 0], 0, 0)
+    if (block + 1) % interval_blocks == 0 or block == begin.shape[1] - 1:
+        padding = (WORD_BITS - writer.bits) & 7
+        writer = put_bits(writer, slot_out, wp.uint32((1 << padding) - 1), padding)
+    finish_words(writer, slot_out)

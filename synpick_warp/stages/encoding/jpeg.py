@@ -23,12 +23,26 @@ from synpick_warp.jpeg import (
     huffman_codes,
     make_header,
     quantization,
-    zigzag_order,
+    reciprocals,
 )
-from synpick_warp.kernels.encoding.dct import transform_blocks_kernel
-from synpick_warp.kernels.encoding.huffman import HuffmanTables, encode_intervals_kernel, join_intervals_kernel
-from synpick_warp.kernels.encoding.tables import BLOCK_SIZE, BLOCKS_PER_MCU, MCU
+from synpick_warp.kernels.encoding.dct import convert_colors_kernel, transform_blocks_kernel
+from synpick_warp.kernels.encoding.huffman import (
+    CODE_BITS,
+    HuffmanTables,
+    measure_blocks_kernel,
+    place_blocks_kernel,
+    write_blocks_kernel,
+)
+from synpick_warp.kernels.encoding.stuffing import (
+    MARKER_BYTES,
+    WORD_BYTES,
+    count_stuffing_kernel,
+    join_intervals_kernel,
+    place_intervals_kernel,
+)
+from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
+from synpick_warp.kernels.tuning import JPEG_BLOCK
 from synpick_warp.stages.buffers import ViewBuffers
 
 SLOT_BYTES_PER_PIXEL = 1.0
@@ -39,6 +53,10 @@ MIN_FILE_BYTES = 1024
 """Capacity for header and markers [B]."""
 LANES = 32
 """Threads that copy an interval: a warp."""
+INTERVAL_BLOCKS = RESTART_INTERVAL * int(BLOCKS_PER_MCU)
+"""Blocks of a restart interval."""
+QUAD = 4
+"""Coefficients of 16 bits in an element of 64."""
 HUFFMAN = struct_arrays(HuffmanTables, "component", "symbol")
 
 
@@ -56,19 +74,36 @@ class JpegBuffers:
 class JpegScratch:
     """Scratch of the encoder."""
 
-    coefficient: wp.array = device_array("view", "mcu", "block", "coefficient", dtype=wp.int16)
-    """Quantized DCT coefficients in zigzag order."""
-    slot: wp.array = device_array("view", "interval", "slot_byte", dtype=wp.uint8)
-    """Data of each restart interval."""
-    slot_size: wp.array = device_array("view", "interval", dtype=wp.int32)
-    """Size of each interval [B], also beyond its slot."""
+    sample: wp.array = device_array("view", "sample_row", "sample_block", dtype=wp.uint64)
+    """Rows of eight samples: Y, below it Cb and Cr side by side, of whole MCUs."""
+    coefficient: wp.array = device_array("view", "quad", "block", dtype=wp.uint64)
+    """Quantized DCT coefficients in zigzag order, four of 16 bits in each element."""
+    nonzero: wp.array = device_array("view", "block", dtype=wp.uint64)
+    """Bit field of the coefficients that are not 0."""
+    block_bits: wp.array = device_array("view", "block", dtype=wp.int32)
+    """Length of each block's code [bit]."""
+    block_begin: wp.array = device_array("view", "block", dtype=wp.int32)
+    """First bit of each block in its interval."""
+    slot: wp.array = device_array("view", "interval", "slot_word", dtype=wp.uint32)
+    """Bit string of each restart interval, most significant bit first."""
+    coded: wp.array = device_array("view", "interval", dtype=wp.int32)
+    """Size of each bit string [B], also beyond its slot."""
+    stuffing: wp.array = device_array("view", "interval", "lane", dtype=wp.int32)
+    """Bytes that each lane stuffs into its chunk of an interval."""
+    interval_size: wp.array = device_array("view", "interval", dtype=wp.int32)
+    """Size of each interval in the file [B], with stuffing and marker."""
+    interval_begin: wp.array = device_array("view", "interval", dtype=wp.int32)
+    """First byte of each interval in the file."""
 
 
 def jpeg_sizes(views: int, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions of `JpegBuffers` and `JpegScratch`, for `views` images [px]."""
-    mcus = -(-width // int(MCU)) * -(-height // int(MCU))
-    sizes = {"view": views, "mcu": mcus, "block": int(BLOCKS_PER_MCU), "coefficient": int(BLOCK_SIZE)}
-    sizes |= {"interval": -(-mcus // RESTART_INTERVAL), "slot_byte": int(SLOT_BYTES_PER_PIXEL * MCU**2 * RESTART_INTERVAL)}
+    across, down = -(-width // int(MCU)), -(-height // int(MCU))
+    mcus = across * down
+    slot_bytes = int(SLOT_BYTES_PER_PIXEL * MCU**2 * RESTART_INTERVAL)
+    sizes = {"view": views, "block": mcus * int(BLOCKS_PER_MCU), "quad": int(BLOCK_SIZE) // QUAD}
+    sizes |= {"sample_row": down * int(MCU + BLOCK), "sample_block": across * int(MCU // BLOCK)}
+    sizes |= {"interval": -(-mcus // RESTART_INTERVAL), "lane": LANES, "slot_word": slot_bytes // int(WORD_BYTES)}
     return sizes | {"byte": MIN_FILE_BYTES + int(FILE_BYTES_PER_PIXEL * width * height)}
 
 
@@ -85,12 +120,14 @@ class JpegEncoder:
         """
         self.device = device
         self.scratch: JpegScratch = allocate(JpegScratch, jpeg_sizes(views, width, height), device)
-        self.tables = _upload_huffman(device)
+        self.tables = upload_huffman(device)
         divisor = np.stack([quantization(quality) for quality in range(QUALITIES)]) * DIVISOR_SCALE
-        self.divisor = wp.array(divisor, dtype=wp.int32, device=device)
+        self.reciprocal = wp.array(reciprocals(divisor), dtype=wp.uint32, device=device)
         header = [np.frombuffer(make_header(width, height, quality), np.uint8) for quality in range(QUALITIES)]
         self.header = wp.array(np.stack(header), dtype=wp.uint8, device=device)
-        self.zigzag = wp.array(zigzag_order(), dtype=wp.int32, device=device)
+        rows = self.scratch.sample
+        shape = (*rows.shape[:2], rows.shape[2] * int(BLOCK))
+        self._samples = wp.array(ptr=rows.ptr, dtype=wp.uint8, shape=shape, device=device)
 
     def encode(self, image: wp.array, quality: wp.array, count: int, out: JpegBuffers) -> None:
         """Encode the first `count` views.
@@ -102,26 +139,84 @@ class JpegEncoder:
             out: Written.
         """
         scratch, device = self.scratch, self.device
+        blocks, intervals = (count, scratch.nonzero.shape[1]), (count, scratch.slot.shape[1])
         wp.launch(
-            transform_blocks_kernel,
-            dim=(count, *scratch.coefficient.shape[1:3]),
-            inputs=[image, quality, self.divisor, self.zigzag],
-            outputs=[scratch.coefficient],
+            convert_colors_kernel,
+            dim=(count, self._samples.shape[1] // 3, self._samples.shape[2] // 2),
+            inputs=[image],
+            outputs=[self._samples],
             device=device,
+            block_dim=JPEG_BLOCK,
         )
         wp.launch(
-            encode_intervals_kernel,
-            dim=(count, scratch.slot.shape[1]),
-            inputs=[self.tables, scratch.coefficient, RESTART_INTERVAL],
-            outputs=[scratch.slot, scratch.slot_size],
+            transform_blocks_kernel,
+            dim=blocks,
+            inputs=[scratch.sample, *image.shape[1:3], quality, self.reciprocal],
+            outputs=[scratch.coefficient, scratch.nonzero],
             device=device,
+            block_dim=JPEG_BLOCK,
+        )
+        wp.launch(
+            measure_blocks_kernel,
+            dim=blocks,
+            inputs=[self.tables, scratch.coefficient, scratch.nonzero, INTERVAL_BLOCKS],
+            outputs=[scratch.block_bits],
+            device=device,
+            block_dim=JPEG_BLOCK,
+        )
+        wp.launch(
+            place_blocks_kernel,
+            dim=intervals,
+            inputs=[scratch.block_bits, INTERVAL_BLOCKS, int(MARKER_BYTES)],
+            outputs=[scratch.block_begin, scratch.slot, scratch.coded, scratch.interval_size],
+            device=device,
+            block_dim=JPEG_BLOCK,
+        )
+        wp.launch(
+            write_blocks_kernel,
+            dim=blocks,
+            inputs=[self.tables, scratch.coefficient, scratch.nonzero, scratch.block_begin, INTERVAL_BLOCKS],
+            outputs=[scratch.slot],
+            device=device,
+            block_dim=JPEG_BLOCK,
+        )
+        self._join(quality, count, out)
+
+    def _join(self, quality: wp.array, count: int, out: JpegBuffers) -> None:
+        """Stuff bytes, and join the intervals to files."""
+        scratch, device = self.scratch, self.device
+        wp.launch(
+            count_stuffing_kernel,
+            dim=(count, *scratch.stuffing.shape[1:]),
+            inputs=[scratch.slot, scratch.coded],
+            outputs=[scratch.stuffing, scratch.interval_size],
+            device=device,
+            block_dim=JPEG_BLOCK,
+        )
+        slot_bytes = int(WORD_BYTES) * scratch.slot.shape[2]
+        wp.launch(
+            place_intervals_kernel,
+            dim=count,
+            inputs=[scratch.coded, scratch.interval_size, slot_bytes, self.header.shape[1], out.jpeg.shape[1]],
+            outputs=[scratch.interval_begin, out.jpeg_size],
+            device=device,
+            block_dim=JPEG_BLOCK,
         )
         wp.launch(
             join_intervals_kernel,
-            dim=(count, scratch.slot.shape[1], LANES),
-            inputs=[scratch.slot, scratch.slot_size, quality, self.header, LANES],
-            outputs=[out.jpeg, out.jpeg_size],
+            dim=(count, *scratch.stuffing.shape[1:]),
+            inputs=[
+                scratch.slot,
+                scratch.coded,
+                scratch.interval_size,
+                scratch.interval_begin,
+                scratch.stuffing,
+                quality,
+                self.header,
+            ],
+            outputs=[out.jpeg],
             device=device,
+            block_dim=JPEG_BLOCK,
         )
 
 
@@ -153,11 +248,11 @@ class Compressor:
         self.encoder.encode(images.color, self.quality, count, self.out[slot])
 
 
-def _upload_huffman(device: wp.Device) -> Any:
+def upload_huffman(device: wp.Device) -> Any:
     """The standard codes, as the struct `HuffmanTables`."""
     tables = allocate_struct(HUFFMAN, {"component": 2, "symbol": 256}, device)
     for kind, counts, symbols in (("dc", DC_COUNTS, DC_SYMBOLS), ("ac", AC_COUNTS, AC_SYMBOLS)):
         codes = [huffman_codes(*table) for table in zip(counts, symbols, strict=True)]
-        getattr(tables, f"{kind}_code").assign(np.stack([code for code, _ in codes]))
-        getattr(tables, f"{kind}_length").assign(np.stack([length for _, length in codes]))
+        packed = [code | length.astype(np.uint32) << np.uint32(CODE_BITS) for code, length in codes]
+        getattr(tables, kind).assign(np.stack(packed))
     return tables
