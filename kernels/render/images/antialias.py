@@ -9,9 +9,9 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
-from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, intersect_body
+from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -196,34 +196,32 @@ def corner_column(column: int, corner: int) -> int:
 
 
 @wp.func
-def trace_visible_bodies(
-    meshes: Meshes,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    grid: ImageGrid,
-    view: int,
-    row: int,
-    column: int,
-    own: int,
-    ray: wp.vec3,
-    instances: int,
-) -> Hit:
-    """Closest hit of a coverage ray among the bodies that its footprint's corners show; that of corner `own` is tested first."""
-    hit = Hit()
-    hit.segment = Segment.NOTHING
-    hit.depth = FAR
-    tested = wp.uint64(0)
-    for turn in range(FOOTPRINT_PIXELS):
-        r = corner_row(row, turn ^ own)
-        c = corner_column(column, turn ^ own)
+def visible_bodies(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, column: int, instances: int) -> wp.uint64:
+    """Bit mask, by body index, of the bodies that a footprint's corners show."""
+    mask = wp.uint64(0)
+    for corner in range(FOOTPRINT_PIXELS):
+        r = corner_row(row, corner)
+        c = corner_column(column, corner)
         if in_image(grid, r, c):
             segment = int(gbuffer.segment[view, r, c])
             if segment != Segment.NOTHING and segment != Segment.TABLE:
-                body = body_of(segment, instances)
-                if ((tested >> wp.uint64(body)) & wp.uint64(1)) == wp.uint64(0):
-                    tested = tested | (wp.uint64(1) << wp.uint64(body))
-                    hit = intersect_body(meshes, bodies, view, body, ray, instances, hit)
-    return hit
+                mask = mask | (wp.uint64(1) << wp.uint64(body_of(segment, instances)))
+    return mask
+
+
+@wp.func
+def filter_body_mask(bodies: ViewBodies, view: int, tile: int, visible: wp.uint64) -> wp.uint64:
+    """The tile's body mask, without bodies that have no bit in `visible`: rays test no others."""
+    body_mask = bodies.body_mask[view, tile]
+    result = wp.uint64(0)
+    rank = int(0)
+    while (body_mask >> wp.uint64(rank)) != wp.uint64(0):
+        bit = wp.uint64(1) << wp.uint64(rank)
+        if (body_mask & bit) != wp.uint64(0):
+            if ((visible >> wp.uint64(bodies.order[view, rank])) & wp.uint64(1)) != wp.uint64(0):
+                result = result | bit
+        rank += 1
+    return result
 
 
 @wp.func
@@ -296,7 +294,9 @@ def resolve_footprints_kernel(
         if in_image(grid, r, c):
             offset = wp.vec2(FOUR_ROOKS[sample, 0], FOUR_ROOKS[sample, 1])
             ray = camera_ray(intrinsics, r, c, offset)
-            hit = trace_visible_bodies(meshes, bodies, gbuffer, grid, view, row, column, own, ray, views.instances)
+            visible = visible_bodies(gbuffer, grid, view, row, column, views.instances)
+            body_mask = filter_body_mask(bodies, view, tile_of(grid, r, c), visible)
+            hit = trace_bodies(meshes, bodies, view, body_mask, ray, views.instances)
             hit = hit_table(table, cameras, camera, ray, hit)
             normal = wp.vec3(0.0, 0.0, 0.0)
             if hit.segment != Segment.NOTHING:

@@ -64,25 +64,6 @@ def hits_body(meshes: Meshes, bodies: ViewBodies, view: int, body: int, ray: wp.
 
 
 @wp.func
-def intersect_body(meshes: Meshes, bodies: ViewBodies, view: int, body: int, ray: wp.vec3, instances: int, best: Hit) -> Hit:
-    """Closer one of a camera ray's hit `best` and its hit on a body."""
-    result = best
-    near = bodies.near[view, body]
-    if near < best.depth:
-        reach = best.depth - near
-        start = body_ray_start(bodies, view, body, ray)
-        direction = bodies.rotation[view, body] * ray
-        if body != instances or not stays_in_interior(meshes.interior, start, direction, reach):
-            query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, direction, reach)
-            if query.result:
-                result.depth = near + query.t
-                result.triangle = query.face
-                result.barycentric = wp.vec2(query.u, query.v)
-                result.segment = segment_of(body, instances)
-    return result
-
-
-@wp.func
 def trace_bodies(
     meshes: Meshes,
     bodies: ViewBodies,
@@ -99,7 +80,19 @@ def trace_bodies(
     rank = int(0)
     while left != wp.uint64(0):
         if (left & wp.uint64(1)) != wp.uint64(0):
-            best = intersect_body(meshes, bodies, view, bodies.order[view, rank], ray, instances, best)
+            body = bodies.order[view, rank]
+            near = bodies.near[view, body]
+            if near < best.depth:
+                reach = best.depth - near
+                start = body_ray_start(bodies, view, body, ray)
+                direction = bodies.rotation[view, body] * ray
+                if body != instances or not stays_in_interior(meshes.interior, start, direction, reach):
+                    query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, direction, reach)
+                    if query.result:
+                        best.depth = near + query.t
+                        best.triangle = query.face
+                        best.barycentric = wp.vec2(query.u, query.v)
+                        best.segment = segment_of(body, instances)
         left = left >> wp.uint64(1)
         rank += 1
     return best
