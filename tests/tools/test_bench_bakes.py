@@ -1,0 +1,130 @@
+"""Benchmarks of whole bakes: their rows, and the process that verifies and deletes episodes. Measured values are not asserted."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.dataset.manifest import episode_entry
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.writing.checksums import write_manifest_entry
+from tests.harness.entries import episode_content
+from tests.tools.test_tools import FEW_STEPS, SHORT_EPISODES, SMALL_IMAGES
+from tools.bench import __main__ as bench
+from tools.bench import meter, steady
+from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
+from tools.bench.usage import Usage
+
+TINY = ("--worlds", "2", "--resolution", "32x18", *FEW_STEPS, *SMALL_IMAGES, *SHORT_EPISODES)
+SHARED = ("train", "deep/shared")
+
+
+def write_episode(out: Path, episode: int) -> list[Path]:
+    """Commit two files of an episode, in folders of its own; returns their paths."""
+    names = [Path(f"train/{episode:06d}/rgb/000000.jpg"), Path(f"deep/shared/{episode:06d}.json")]
+    for name in names:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_bytes(b"content")
+    (out / "manifest").mkdir(exist_ok=True)
+    write_manifest_entry(out, episode_entry(episode), names, episode_content(episode))
+    return [out / name for name in names]
+
+
+def wait_for(condition) -> None:
+    """Wait until a condition holds, at most 20 s."""
+    deadline = time.monotonic() + 20.0
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert condition()
+
+
+def reading(seconds: float, count: int) -> meter.Reading:
+    return meter.Reading(seconds, count, Usage(), Usage(), Usage(), Tally(), 0, 0)
+
+
+def test_a_verified_episode_is_deleted_and_nothing_else(tmp_path):
+    ours, others = write_episode(tmp_path, 1), write_episode(tmp_path, 2)
+    tally = clean_episode(Assignment(tmp_path, SHARED), 1, Tally(episodes=3, files=10))
+    assert (tally.episodes, tally.files, tally.problem) == (4, 12, "")
+    assert not any(path.exists() for path in ours)
+    assert not (tmp_path / "train/000001").exists()
+    assert all(path.exists() for path in others)
+
+
+def test_shared_folders_stay_when_they_are_empty(tmp_path):
+    write_episode(tmp_path, 1)
+    clean_episode(Assignment(tmp_path, SHARED), 1, Tally())
+    assert sorted(path.name for path in tmp_path.rglob("*") if path.is_dir()) == ["deep", "manifest", "shared", "train"]
+    assert (tmp_path / "manifest/000001.json").exists()
+
+
+def test_only_files_with_the_suffixes_are_deleted(tmp_path):
+    image, table = write_episode(tmp_path, 1)
+    clean_episode(Assignment(tmp_path, SHARED, (".jpg",)), 1, Tally())
+    assert not image.exists()
+    assert table.exists()
+
+
+@pytest.mark.parametrize(("content", "said"), [(b"other", "has changed since it was written"), (None, "is missing")])
+def test_a_damaged_episode_stays_and_is_named(tmp_path, content, said):
+    image, table = write_episode(tmp_path, 1)
+    image.unlink()
+    if content:
+        image.write_bytes(content)
+    tally = clean_episode(Assignment(tmp_path, SHARED), 1, Tally())
+    assert str(image) in tally.problem
+    assert said in tally.problem
+    assert tally.episodes == 0
+    assert table.exists()
+
+
+def test_the_process_follows_a_growing_data_set_until_it_finds_damage(tmp_path):
+    with Cleaner(Assignment(tmp_path, SHARED)) as cleaner:
+        write_episode(tmp_path, 0)
+        wait_for(lambda: cleaner.poll().episodes == 1)
+        write_episode(tmp_path, 7)
+        wait_for(lambda: cleaner.poll().episodes == 2)
+        assert not cleaner.poll().problem
+        (tmp_path / "manifest/000009.json").write_text("{")
+        wait_for(lambda: cleaner.poll().problem)
+        assert cleaner.poll().episodes == 2
+
+
+def test_a_process_that_dies_is_a_problem(tmp_path):
+    with Cleaner(Assignment(tmp_path, SHARED)) as cleaner:
+        cleaner._worker.process.kill()
+        wait_for(lambda: cleaner.poll().problem)
+    assert cleaner.tally.problem == "the process that verifies scenes was ended by SIGKILL"
+
+
+def test_slices_are_between_readings_and_the_rest_is_left_out():
+    readings = [reading(seconds, count) for seconds, count in ((0, 0), (1, 5), (2, 20), (3, 21), (4.5, 45), (5, 99))]
+    assert meter.slice_rates(readings, 2.0) == [10.0, 10.0]
+    assert meter.slice_rates(readings[:1], 2.0) == []
+
+
+def test_damage_ends_a_steady_bake_with_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(steady.Cleaner, "poll", lambda self: Tally(problem="a file is missing"))
+    assert bench.main([*TINY, "--parts", "steady", "--seconds", "60"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == "bench: a file is missing"
+
+
+def test_a_steady_bake_verifies_what_it_writes(tmp_path, monkeypatch):
+    monkeypatch.setattr(meter, "SLICE_SECONDS", 1.0)
+    file = tmp_path / "bench.json"
+    assert bench.main([*TINY, "--parts", "steady", "--seconds", "3", "--json", str(file)]) == 0
+    rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}
+    assert rows["errors found in them"] == 0
+    assert rows["scenes verified and deleted"] % 3 == 0
+    assert rows["views to disk, slowest 1 s"] <= rows["views to disk, fastest 1 s"]
+    assert rows["resident memory of all writers, at the end"] > 0.0
+    assert rows["CPU time of a view, verification and deletion"] >= 0.0
+
+
+def test_damage_is_raised_when_the_bake_has_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(steady.Cleaner, "poll", lambda self: Tally(problem="damaged"))
+    with pytest.raises(DatasetError, match="damaged"), steady.clean_up_behind(bench.Config(), tmp_path):
+        pass
