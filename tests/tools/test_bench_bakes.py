@@ -14,7 +14,7 @@ from synpick_warp.exporters.writing.checksums import write_manifest_entry
 from tests.harness.entries import episode_content
 from tests.tools.test_tools import FEW_STEPS, SHORT_EPISODES, SMALL_IMAGES
 from tools.bench import __main__ as bench
-from tools.bench import meter, steady
+from tools.bench import meter, steady, whole
 from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
 from tools.bench.usage import Usage
 
@@ -128,3 +128,52 @@ def test_damage_is_raised_when_the_bake_has_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(steady.Cleaner, "poll", lambda self: Tally(problem="damaged"))
     with pytest.raises(DatasetError, match="damaged"), steady.clean_up_behind(bench.Config(), tmp_path):
         pass
+
+
+# ---- whole bakes ----
+
+
+def points(*ticks: tuple[float, int, int]) -> list[whole.TracePoint]:
+    """Trace of ticks (time, views so far, active worlds)."""
+    return [whole.TracePoint(seconds, views, active, 0) for seconds, views, active in ticks]
+
+
+def test_phases_add_up_to_the_whole_bake():
+    """Two cameras, ten worlds: settling, 3 live, 9 live, 5 live, 10 live, and two ticks of a tail."""
+    trace = points((5, 0, 10), (6, 6, 10), (7, 14, 10), (8, 32, 10), (10, 42, 10), (11, 62, 10), (12, 66, 2), (13, 68, 1))
+    phases = whole.split_phases(trace, 2, 15.0)
+    assert phases == {
+        "start": (6, 6),
+        "settling": (1, 8),
+        "steady": (2, 38),
+        "between": (2, 10),
+        "tail": (2, 6),
+        "finishing": (2, 0),
+    }
+    assert whole.count_live(trace, 2) == [0, 3, 4, 9, 5, 10, 2, 1]
+
+
+def test_a_bake_that_never_has_all_worlds_live_only_settles():
+    phases = whole.split_phases(points((1, 0, 10), (2, 2, 10), (3, 4, 10)), 1, 4.0)
+    assert (phases["start"], phases["settling"], phases["steady"]) == ((2, 2), (1, 2), (0, 0))
+    assert whole.split_phases([], 1, 4.0)["finishing"] == (4, 0)
+
+
+def test_the_mean_is_compared_with_both_steady_rates():
+    rows = {row.name: row.value for row in whole.summarize(points((5, 10, 10), (6, 20, 10)), 1, 10.0, 4.0)}
+    assert rows["mean of the whole: views"] == 2.0
+    assert rows["mean, of the rate of its own steady ticks"] == 20.0
+    assert rows["mean, of the rate of the part steady"] == 50.0
+
+
+def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
+    file = tmp_path / "bench.json"
+    assert bench.main([*TINY, "--parts", "whole", "--episodes", "2", "--json", str(file)]) == 0
+    record = json.loads(file.read_text())
+    rows = {row["name"]: row["value"] for row in record["rows"]}
+    trace = record["traces"]["whole"]
+    assert rows["worlds"] == 2
+    assert rows["ticks"] == len(trace["live"]) == len(trace["seconds"])
+    assert rows["views"] == trace["views"][-1] == 3 * sum(trace["live"])
+    assert trace["episodes"][-1] == 2
+    assert trace["seconds"] == sorted(trace["seconds"])
