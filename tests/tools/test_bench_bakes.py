@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import time
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
 from synpick_warp.dataset.manifest import episode_entry
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import write_manifest_entry
+from synpick_warp.stages.stream import FrameStream
 from tests.harness.entries import episode_content
 from tests.tools.test_tools import FEW_STEPS, SHORT_EPISODES, SMALL_IMAGES
 from tools.bench import __main__ as bench
@@ -42,7 +44,7 @@ def wait_for(condition) -> None:
 
 
 def reading(seconds: float, count: int) -> meter.Reading:
-    return meter.Reading(seconds, count, Usage(), Usage(), Usage(), Tally(), 0, 0)
+    return meter.Reading(seconds, count, 0, Usage(), Usage(), Usage(), Tally(), 0, 0)
 
 
 def test_a_verified_episode_is_deleted_and_nothing_else(tmp_path):
@@ -177,3 +179,15 @@ def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
     assert rows["views"] == trace["views"][-1] == 3 * sum(trace["live"])
     assert trace["episodes"][-1] == 2
     assert trace["seconds"] == sorted(trace["seconds"])
+
+
+def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):
+    rendered = mock.Mock(side_effect=AssertionError("a view was rendered"))
+    monkeypatch.setattr(FrameStream, "render", rendered)
+    file = tmp_path / "bench.json"
+    assert bench.main([*TINY, "--parts", "trajectories", "--seconds", "1", "--json", str(file)]) == 0
+    rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}
+    assert rows["worlds"] == 2
+    assert 0.0 < rows["worlds with a frame in a tick"] <= 100.0
+    assert rows["world-steps"] > 0.0
+    assert rows["episodes, if of 502 frames as in tools/README.md"] > 0.0

@@ -44,13 +44,14 @@ from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
 from tools.bench.sensor import measure_sensor
 from tools.bench.steady import measure_steady
 from tools.bench.stream import measure_stream
+from tools.bench.trajectories import measure_trajectories
 from tools.bench.whole import measure_whole
 from tools.bench.write import measure_writing
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
 
 DEFAULT_PARTS = ("physics", "perception", "render", "encode", "sensor", "write", "stream", "bake", "steady")
-PARTS = (*DEFAULT_PARTS, "whole")
-WHOLE_BAKES = {"bake", "steady", "whole"}
+PARTS = (*DEFAULT_PARTS, "whole", "trajectories")
+WHOLE_BAKES = {"bake", "steady", "whole", "trajectories"}
 """Parts that run bakes of their own."""
 STREAM_BATCHES = 12
 """Batches rendered and copied in a row."""
@@ -166,6 +167,8 @@ def measure(
             yield row
     if "whole" in parts:
         yield from measure_whole(config, episodes, steady_rate, traces)
+    if "trajectories" in parts:
+        yield from measure_trajectories(config, min_seconds)
 
 
 def _measure_worlds(config: Config, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:

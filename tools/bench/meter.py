@@ -36,6 +36,8 @@ class Reading:
     """[s]"""
     count: int
     """Views, or frames of worlds, so far."""
+    episodes: int
+    """Ended episodes."""
     main: Usage
     """Of the main process."""
     writers: Usage
@@ -96,7 +98,7 @@ class SteadyMeter(SilentProgress):
             self.ticks += int(self.ticks > 0 or count - self.last_count >= self.steady_count)
             self.last_count = count
             if self.ticks > LEAD_TICKS and not self.is_stopped:
-                self.readings.append(self._read(count, tally))
+                self.readings.append(self._read(count, episodes_done, tally))
         measured = len(self.readings) > 1 and self.readings[-1].time - self.readings[0].time >= self.seconds
         if measured or tally.problem or episodes_done >= episodes - self.worlds:
             self._stop()
@@ -106,11 +108,11 @@ class SteadyMeter(SilentProgress):
             self.is_stopped = True
             os.kill(os.getpid(), signal.SIGINT)
 
-    def _read(self, count: int, tally: Tally) -> Reading:
+    def _read(self, count: int, episodes: int, tally: Tally) -> Reading:
         now, disk, usages = time.perf_counter(), shutil.disk_usage(self.folder).used, measure_usage()
         main, cleaner = usages.pop(os.getpid(), Usage()), usages.pop(self.cleaner.pid, Usage()) if self.cleaner else Usage()
         device = self.device.total_memory - self.device.free_memory if self.device.is_cuda else 0
-        return Reading(now, count, main, reduce(Usage.plus, usages.values(), Usage()), cleaner, tally, disk, device)
+        return Reading(now, count, episodes, main, reduce(Usage.plus, usages.values(), Usage()), cleaner, tally, disk, device)
 
 
 def slice_rates(readings: Sequence[Reading], seconds: float) -> list[float]:
