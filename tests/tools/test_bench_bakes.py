@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
@@ -16,7 +17,7 @@ from synpick_warp.stages.stream import FrameStream
 from tests.harness.entries import episode_content
 from tests.tools.test_tools import FEW_STEPS, SHORT_EPISODES, SMALL_IMAGES
 from tools.bench import __main__ as bench
-from tools.bench import meter, steady, whole
+from tools.bench import growth, meter, physics, steady, whole
 from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
 from tools.bench.usage import Usage
 
@@ -191,3 +192,50 @@ def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):
     assert 0.0 < rows["worlds with a frame in a tick"] <= 100.0
     assert rows["world-steps"] > 0.0
     assert rows["episodes, if of 502 frames as in tools/README.md"] > 0.0
+
+
+# ---- growth ----
+
+
+def test_each_factor_changes_its_setting_alone():
+    config = bench.Config()
+    varied = {factor: growth.VARIATIONS[factor](config, factor == "paths" or 0.5) for factor in growth.VARIATIONS}
+    assert varied["objects"][0] == "3.5 l"
+    assert varied["resolution"][0] == "960x540"
+    assert varied["paths"][0] == "1"
+    changed = {
+        "objects": ("arrangement", "volume", 3.5e-3),
+        "resolution": ("cameras", "resolution", (960, 540)),
+        "paths": ("render", "coarse_paths", 1),
+    }
+    for factor, (section, name, value) in changed.items():
+        assert varied[factor][1] == replace(config, **{section: replace(getattr(config, section), **{name: value})})
+
+
+def test_more_cameras_are_turned_about_the_vertical():
+    cameras = replace(bench.Config().cameras, positions=((1.0, 2.0, 3.0), (0.0, 0.0, 2.0)), ups=((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)))
+    value, varied = growth.vary_cameras(replace(bench.Config(), cameras=cameras), 1.5)
+    assert value == "3"
+    assert varied.cameras.positions == ((1.0, 2.0, 3.0), (0.0, 0.0, 2.0), (-1.0, -2.0, 3.0))
+    assert varied.cameras.ups == ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def test_growth_is_a_table_of_all_factors(tmp_path, monkeypatch):
+    monkeypatch.setattr(growth, "DROP_TICKS", 1)
+    monkeypatch.setattr(growth, "BURST", 1)
+    monkeypatch.setattr(growth, "PATHS", (4,))
+    monkeypatch.setattr(growth, "FRACTIONS", {"worlds": (0.5, 0.4), "objects": (0.5,), "resolution": (0.5,), "cameras": (2.0,)})
+    monkeypatch.setattr(physics, "MIN_REPEATS", 1)
+    file = tmp_path / "growth.md"
+    assert bench.main([*TINY, "--parts", "growth", "--seconds", "0", "--markdown", str(file)]) == 0
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in file.read_text().splitlines()]
+    assert {len(row) for row in cells} == {len(growth.COLUMNS)}
+    wanted = [("as set", "2 worlds, 32x18, 3 cameras"), ("worlds", "1"), ("objects", "0.5 l")]
+    wanted += [("resolution", "16x9"), ("paths", "4"), ("cameras", "6")]
+    assert [tuple(row[:2]) for row in cells[2:]] == wanted
+
+
+def test_a_missing_folder_of_the_table_is_said_at_once(tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        bench.main([*TINY, "--parts", "growth", "--markdown", str(tmp_path / "none" / "table.md")])
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f"--markdown: there is no folder {tmp_path / 'none'}")

@@ -40,6 +40,7 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.system.device import pick_device
 from tools.bench.encode import measure_encoding
+from tools.bench.growth import measure_growth
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
 from tools.bench.sensor import measure_sensor
 from tools.bench.steady import measure_steady
@@ -50,9 +51,9 @@ from tools.bench.write import measure_writing
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
 
 DEFAULT_PARTS = ("physics", "perception", "render", "encode", "sensor", "write", "stream", "bake", "steady")
-PARTS = (*DEFAULT_PARTS, "whole", "trajectories")
-WHOLE_BAKES = {"bake", "steady", "whole", "trajectories"}
-"""Parts that run bakes of their own."""
+PARTS = (*DEFAULT_PARTS, "whole", "trajectories", "growth")
+OWN_WORLDS = {"bake", "steady", "whole", "trajectories", "growth"}
+"""Parts that build worlds of their own."""
 STREAM_BATCHES = 12
 """Batches rendered and copied in a row."""
 WRITE_VIEWS = 12
@@ -80,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
         machine = dict([*describe_machine(device), ("measured", measured)])
         for name, value in machine.items():
             console.print(f"{name:20} {value}")
-        for row in measure(config, options.parts, options.seconds, traces, episodes=options.episodes):
+        for row in measure(config, options.parts, options.seconds, traces, options.episodes, options.markdown):
             rows.append(row)
             console.print(f"{row.part:10} {row.name:52} {row.value:14,.3f} {row.unit}")
     except SynpickError as error:
@@ -105,7 +106,11 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         "--episodes", type=_positive, default=WHOLE_EPISODES, help=f"episodes of the part whole (default: {WHOLE_EPISODES})"
     )
     parser.add_argument("--seconds", type=float, default=2.0, help="minimum time of a measurement [s] (default: 2)")
-    return parser.parse_args(arguments)
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="table of the part growth")
+    options = parser.parse_args(arguments)
+    if options.markdown and not options.markdown.parent.is_dir():
+        parser.error(f"--markdown: there is no folder {options.markdown.parent}")
+    return options
 
 
 def _positive(text: str) -> int:
@@ -125,7 +130,7 @@ def _config(options: argparse.Namespace) -> Config:
 
 
 def measure(
-    config: Config, parts: tuple[str, ...], min_seconds: float, traces: dict[str, Any], *, episodes: int = WHOLE_EPISODES
+    config: Config, parts: tuple[str, ...], min_seconds: float, traces: dict[str, Any], episodes: int, markdown: Path | None
 ) -> Iterator[Row]:
     """Measure the parts; yields rows as they arrive.
 
@@ -135,8 +140,9 @@ def measure(
         min_seconds: Time for which a measurement is repeated, at least [s].
         traces: Receives what changes during a measurement, by part.
         episodes: Episodes of the part whole.
+        markdown: File for the table of the part growth; None: none.
     """
-    if set(parts) - WHOLE_BAKES:
+    if set(parts) - OWN_WORLDS:
         started = time.perf_counter()
         kinds = load_exporter_classes(config.bake.formats)
         factory = build_factory(
@@ -169,6 +175,8 @@ def measure(
         yield from measure_whole(config, episodes, steady_rate, traces)
     if "trajectories" in parts:
         yield from measure_trajectories(config, min_seconds)
+    if "growth" in parts:
+        yield from measure_growth(config, min_seconds, markdown)
 
 
 def _measure_worlds(config: Config, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:
