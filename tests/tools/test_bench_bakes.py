@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -113,6 +115,12 @@ def test_damage_ends_a_steady_bake_with_one_line(monkeypatch, capsys):
     monkeypatch.setattr(steady.Cleaner, "poll", lambda self: Tally(problem="a file is missing"))
     assert bench.main([*TINY, "--parts", "steady", "--seconds", "60"]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == "bench: a file is missing"
+
+
+def test_ctrl_c_ends_the_benchmark(monkeypatch, capsys):
+    monkeypatch.setattr(meter.SteadyMeter, "update", lambda *_, **counts: os.kill(os.getpid(), signal.SIGINT))
+    assert bench.main([*TINY, "--parts", "steady,whole", "--seconds", "60"]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "bench: interrupted"
 
 
 def test_a_steady_bake_verifies_what_it_writes(tmp_path, monkeypatch):

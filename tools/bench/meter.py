@@ -14,6 +14,7 @@ from pathlib import Path
 import warp as wp
 
 from synpick_warp.cli.doctor import GIB
+from synpick_warp.episodes import BakeSummary
 from synpick_warp.progress import SilentProgress
 from tools.bench.cleaner import Cleaner, Tally
 from tools.bench.physics import Row
@@ -102,6 +103,11 @@ class SteadyMeter(SilentProgress):
         measured = len(self.readings) > 1 and self.readings[-1].time - self.readings[0].time >= self.seconds
         if measured or tally.problem or episodes_done >= episodes - self.worlds:
             self._stop()
+
+    def raise_interruption(self, summary: BakeSummary) -> None:
+        """Raise KeyboardInterrupt if a signal of another process, such as Ctrl-C, stopped the bake."""
+        if summary.stopped and not self.is_stopped:
+            raise KeyboardInterrupt
 
     def _stop(self) -> None:
         if not self.is_stopped:

@@ -50,15 +50,15 @@ def measure_steady(config: Config, min_seconds: float) -> Iterator[Row]:
     live_views = LIVE_FRACTION * config.bake.worlds * len(config.cameras.positions)
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out") as cleaner:
         meter = SteadyMeter(min_seconds, Path(folder), live_views, config.bake.worlds, device, cleaner)
-        run_bake(config, Path(folder) / "out", meter)
-    if len(meter.readings) < 2:
-        return  # The bake was stopped before.
+        summary = run_bake(config, Path(folder) / "out", meter)
+    if len(meter.readings) > 1:
+        yield from _summarize(config, meter)
+    meter.raise_interruption(summary)
+
+
+def _summarize(config: Config, meter: SteadyMeter) -> Iterator[Row]:
+    """Rows of the rates, the verified scenes, and the space on disk."""
     yield from summarize_rates("steady", "view", meter)
-    yield from _summarize_cleaning(meter, config)
-
-
-def _summarize_cleaning(meter: SteadyMeter, config: Config) -> Iterator[Row]:
-    """Rows of the verified scenes, and of the space on disk."""
     first, last = meter.readings[0], meter.readings[-1]
     verified, deleted = last.tally.episodes - first.tally.episodes, last.tally.deleted - first.tally.deleted
     yield Row("steady", "scenes verified and deleted", verified * len(config.cameras.positions), "")

@@ -38,12 +38,10 @@ def measure_trajectories(config: Config, min_seconds: float) -> Iterator[Row]:
     worlds, device = config.bake.worlds, pick_device(config.bake.device)
     with tempfile.TemporaryDirectory() as folder, _count_frames() as frames:
         meter = SteadyMeter(min_seconds, Path(folder), LIVE_FRACTION * worlds, worlds, device, counter=lambda: frames[0])
-        run_bake(config, Path(folder) / "out", meter)
-    if len(meter.readings) < 2:
-        return  # The bake was stopped before.
-    yield Row("trajectories", "worlds", worlds, "")
-    yield from summarize_rates("trajectories", "frame", meter)
-    yield from _summarize_steps(config, meter)
+        summary = run_bake(config, Path(folder) / "out", meter)
+    if len(meter.readings) > 1:
+        yield from _summarize(config, meter)
+    meter.raise_interruption(summary)
 
 
 @contextlib.contextmanager
@@ -59,8 +57,10 @@ def _count_frames() -> Iterator[list[int]]:
         yield frames
 
 
-def _summarize_steps(config: Config, meter: SteadyMeter) -> Iterator[Row]:
-    """Rows of the steps, in which all worlds take part, and of the episodes."""
+def _summarize(config: Config, meter: SteadyMeter) -> Iterator[Row]:
+    """Rows of the rates, of the steps, in which all worlds take part, and of the episodes."""
+    yield Row("trajectories", "worlds", config.bake.worlds, "")
+    yield from summarize_rates("trajectories", "frame", meter)
     first, last, physics = meter.readings[0], meter.readings[-1], config.physics
     seconds, ticks, frames = last.time - first.time, len(meter.readings) - 1, last.count - first.count
     rate = ticks * physics.steps_per_tick * config.bake.worlds / seconds
