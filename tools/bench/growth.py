@@ -70,8 +70,8 @@ class Point:
         return self.factor, self.value, f"{self.pile.objects:.1f}", *numbers, f"{1e3 * views * self.view:.0f}"
 
 
-class Laboratory:
-    """Objects and lights, loaded once, and the measurements on them."""
+class Assets:
+    """Objects and lights, loaded once, and measurements of worlds with them."""
 
     def __init__(self, config: Config, min_seconds: float) -> None:
         self.device, self.min_seconds = pick_device(config.bake.device), min_seconds
@@ -161,18 +161,18 @@ def measure_growth(config: Config, min_seconds: float, markdown: Path | None) ->
         markdown: File that receives the table; None: none.
     """
     started = time.perf_counter()
-    laboratory = Laboratory(config, min_seconds)
-    scene = laboratory.build_scene(config)
-    pile = laboratory.drop(config, scene)
+    assets = Assets(config, min_seconds)
+    scene = assets.build_scene(config)
+    pile = assets.drop(config, scene)
     width, height = config.cameras.resolution
     here = f"{config.bake.worlds} worlds, {width}x{height}, {len(config.cameras.positions)} cameras"
-    points = [Point("as set", here, config, pile, laboratory.time_view(config, scene, pile))]
+    points = [Point("as set", here, config, pile, assets.time_view(config, scene, pile))]
     yield from _rows(points[-1])
     for factor, vary in VARIATIONS.items():
         for value, varied in dict(vary(config, multiple) for multiple in FRACTIONS.get(factor, PATHS)).items():
-            other = laboratory.build_scene(varied) if factor in ("resolution", "cameras") else scene
-            dropped = laboratory.drop(varied, scene) if factor in ("worlds", "objects") else pile
-            points.append(Point(factor, value, varied, dropped, laboratory.time_view(varied, other, dropped)))
+            other = assets.build_scene(varied) if factor in ("resolution", "cameras") else scene
+            dropped = assets.drop(varied, scene) if factor in ("worlds", "objects") else pile
+            points.append(Point(factor, value, varied, dropped, assets.time_view(varied, other, dropped)))
             yield from _rows(points[-1])
     yield Row("growth", "all measurements", time.perf_counter() - started, "s")
     if markdown is not None:

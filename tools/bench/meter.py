@@ -105,7 +105,7 @@ class SteadyMeter(SilentProgress):
             self._stop()
 
     def raise_interruption(self, summary: BakeSummary) -> None:
-        """Raise KeyboardInterrupt if a signal of another process, such as Ctrl-C, stopped the bake."""
+        """Raise KeyboardInterrupt if Ctrl-C or another signal from outside stopped the bake."""
         if summary.stopped and not self.is_stopped:
             raise KeyboardInterrupt
 
