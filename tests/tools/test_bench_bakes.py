@@ -15,7 +15,7 @@ import pytest
 from synpick_warp.dataset.manifest import episode_entry
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import write_manifest_entry
-from synpick_warp.stages.stream import FrameStream
+from synpick_warp.stages.render.renderer import Renderer
 from tests.harness.entries import episode_content
 from tests.tools.test_tools import FEW_STEPS, SHORT_EPISODES, SMALL_IMAGES
 from tools.bench import __main__ as bench
@@ -152,26 +152,26 @@ def points(*ticks: tuple[float, int, int]) -> list[whole.TracePoint]:
 def test_phases_add_up_to_the_whole_bake():
     """Two cameras, ten worlds: settling, 3 live, 9 live, 5 live, 10 live, and two ticks of a tail."""
     trace = points((5, 0, 10), (6, 6, 10), (7, 14, 10), (8, 32, 10), (10, 42, 10), (11, 62, 10), (12, 66, 2), (13, 68, 1))
-    phases = whole.split_phases(trace, 2, 15.0)
+    phases = whole.split_phases(trace, 2, whole.Phase(15.0, 71))
     assert phases == {
         "start": (6, 6),
         "settling": (1, 8),
         "steady": (2, 38),
         "between": (2, 10),
         "tail": (2, 6),
-        "finishing": (2, 0),
+        "finishing": (2, 3),
     }
     assert whole.count_live(trace, 2) == [0, 3, 4, 9, 5, 10, 2, 1]
 
 
 def test_a_bake_that_never_has_all_worlds_live_only_settles():
-    phases = whole.split_phases(points((1, 0, 10), (2, 2, 10), (3, 4, 10)), 1, 4.0)
+    phases = whole.split_phases(points((1, 0, 10), (2, 2, 10), (3, 4, 10)), 1, whole.Phase(4.0, 4))
     assert (phases["start"], phases["settling"], phases["steady"]) == ((2, 2), (1, 2), (0, 0))
-    assert whole.split_phases([], 1, 4.0)["finishing"] == (4, 0)
+    assert whole.split_phases([], 1, whole.Phase(4.0, 0))["finishing"] == (4, 0)
 
 
 def test_the_mean_is_compared_with_both_steady_rates():
-    rows = {row.name: row.value for row in whole.summarize(points((5, 10, 10), (6, 20, 10)), 1, 10.0, 4.0)}
+    rows = {row.name: row.value for row in whole.summarize(points((5, 10, 10), (6, 20, 10)), 1, whole.Phase(10.0, 20), 4.0)}
     assert rows["mean of the whole: views"] == 2.0
     assert rows["mean, of the rate of its own steady ticks"] == 20.0
     assert rows["mean, of the rate of the part steady"] == 50.0
@@ -185,14 +185,15 @@ def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
     trace = record["traces"]["whole"]
     assert rows["worlds"] == 2
     assert rows["ticks"] == len(trace["live"]) == len(trace["seconds"])
-    assert rows["views"] == trace["views"][-1] == 3 * sum(trace["live"])
+    assert rows["views"] >= trace["views"][-1] > 0
+    assert trace["views"][-1] // 3 == sum(trace["live"])
     assert trace["episodes"][-1] == 2
     assert trace["seconds"] == sorted(trace["seconds"])
 
 
 def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):
     rendered = mock.Mock(side_effect=AssertionError("a view was rendered"))
-    monkeypatch.setattr(FrameStream, "render", rendered)
+    monkeypatch.setattr(Renderer, "render", rendered)
     file = tmp_path / "bench.json"
     assert bench.main([*TINY, "--parts", "trajectories", "--seconds", "1", "--json", str(file)]) == 0
     rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}

@@ -6,6 +6,7 @@ Verified pictures are deleted meanwhile, since those of 150 episodes are larger 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -73,17 +74,18 @@ def measure_whole(config: Config, episodes: int, steady_rate: float, traces: dic
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out", PICTURES):
         trace = _Trace()
         summary = run_bake(config, Path(folder) / "out", trace)
-        total = time.perf_counter() - trace.started
+        whole = Phase(time.perf_counter() - trace.started, summary.views)
     cameras = len(config.cameras.positions)
     traces["whole"] = describe_trace(trace.points, cameras)
-    yield from summarize(trace.points, cameras, total, steady_rate)
+    yield from summarize(trace.points, cameras, whole, steady_rate)
     if summary.stopped:
         raise KeyboardInterrupt
 
 
 def count_live(points: Sequence[TracePoint], cameras: int) -> list[int]:
     """Worlds that delivered views in each tick."""
-    return [(point.views - before.views) // cameras for before, point in zip((TracePoint(0.0, 0, 0, 0), *points), points, strict=False)]
+    frames = [0, *(point.views // cameras for point in points)]
+    return [now - before for before, now in itertools.pairwise(frames)]
 
 
 def describe_trace(points: Sequence[TracePoint], cameras: int) -> dict[str, list[float]]:
@@ -97,13 +99,13 @@ def describe_trace(points: Sequence[TracePoint], cameras: int) -> dict[str, list
     }
 
 
-def split_phases(points: Sequence[TracePoint], cameras: int, total: float) -> dict[str, Phase]:
+def split_phases(points: Sequence[TracePoint], cameras: int, whole: Phase) -> dict[str, Phase]:
     """Split a bake into consecutive parts, which add up to the whole; steady are ticks in which LIVE_FRACTION of all worlds are live.
 
     Args:
         points: State after each tick.
         cameras: Number of cameras.
-        total: Time of the whole bake [s].
+        whole: Time and views of the whole bake.
     """
     live = count_live(points, cameras)
     threshold = LIVE_FRACTION * max((point.active for point in points), default=0)
@@ -122,14 +124,13 @@ def split_phases(points: Sequence[TracePoint], cameras: int, total: float) -> di
             name = "steady" if live[index] >= threshold else "between"
         phases[name] = phases[name].plus(point.seconds - before.seconds, point.views - before.views)
         before = point
-    phases["finishing"] = Phase(total - before.seconds, 0)
+    phases["finishing"] = Phase(whole.seconds - before.seconds, whole.views - before.views)
     return phases
 
 
-def summarize(points: Sequence[TracePoint], cameras: int, total: float, steady_rate: float) -> Iterator[Row]:
+def summarize(points: Sequence[TracePoint], cameras: int, whole: Phase, steady_rate: float) -> Iterator[Row]:
     """Rows of a whole bake; arguments as of `split_phases` and `measure_whole`."""
-    views = points[-1].views if points else 0
-    phases = split_phases(points, cameras, total)
+    phases, mean = split_phases(points, cameras, whole), whole.views / whole.seconds
     many = f"{100 * LIVE_FRACTION:.0f} % of worlds"
     titles = {
         "start": "start to the first views",
@@ -141,15 +142,15 @@ def summarize(points: Sequence[TracePoint], cameras: int, total: float, steady_r
     }
     yield Row("whole", "worlds", max((point.active for point in points), default=0), "")
     yield Row("whole", "ticks", len(points), "")
-    yield Row("whole", "views", views, "")
-    yield Row("whole", "start to exit", total, "s")
+    yield Row("whole", "views", whole.views, "")
+    yield Row("whole", "start to exit", whole.seconds, "s")
     for name, phase in phases.items():
         yield Row("whole", titles[name], phase.seconds, "s")
         if phase.views:
             yield Row("whole", f"{name}: views", phase.views / phase.seconds, "1/s")
-    yield Row("whole", "mean of the whole: views", views / total, "1/s")
+    yield Row("whole", "mean of the whole: views", mean, "1/s")
     steady = phases["steady"]
     if steady.views:
-        yield Row("whole", "mean, of the rate of its own steady ticks", 100.0 * views / total * steady.seconds / steady.views, "%")
+        yield Row("whole", "mean, of the rate of its own steady ticks", 100.0 * mean * steady.seconds / steady.views, "%")
     if steady_rate:
-        yield Row("whole", "mean, of the rate of the part steady", 100.0 * views / total / steady_rate, "%")
+        yield Row("whole", "mean, of the rate of the part steady", 100.0 * mean / steady_rate, "%")
