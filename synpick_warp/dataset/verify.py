@@ -57,7 +57,7 @@ def verify(folder: Path) -> Verdict:
         finished = indices is not None and indices["episodes"] == episodes
         entries = [CONSTANTS, *map(episode_entry, episodes), *([INDICES] if indices else [])]
         for entry in entries if episodes or indices else []:
-            for name, problem in _check_files(folder, read_checksums(folder, entry)):
+            for name, problem in check_files(folder, read_checksums(folder, entry)):
                 files += 1
                 if problem:
                     return Verdict(f"{folder / name} {problem}", len(episodes), files, finished)
@@ -68,7 +68,7 @@ def verify(folder: Path) -> Verdict:
     return Verdict(problem, len(episodes), files, finished)
 
 
-def _check_files(folder: Path, known: dict[str, str]) -> Iterator[tuple[str, str]]:
+def check_files(folder: Path, known: dict[str, str]) -> Iterator[tuple[str, str]]:
     """Yield (name, problem) of each file, in order; files are read in parallel, with bounded read-ahead."""
     threads = len(os.sched_getaffinity(0))
     with ThreadPoolExecutor(threads) as pool:

@@ -333,7 +333,7 @@ def test_at_the_time_limit_ended_sequences_are_reported(tmp_path, capsys):
 def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys):
     for name in ("FALL_TICKS", "SETTLE_TICKS", "STIR_TICKS", "LEAD_TICKS", "PICK_TICKS", "MIN_REPEATS", "BURST"):
         monkeypatch.setattr(bench_physics, name, 1)
-    for target in ("sensor.BURST", "write.COPIES", "steady.LEAD_TICKS"):
+    for target in ("sensor.BURST", "write.COPIES", "meter.LEAD_TICKS"):
         monkeypatch.setattr(f"tools.bench.{target}", 1)
     for name, value in (("BURST", 1), ("STREAM_BATCHES", 1), ("WRITE_VIEWS", 3), ("BAKE_SPEED", 10.0)):
         monkeypatch.setattr(bench, name, value)
@@ -341,7 +341,7 @@ def test_bench_measures_every_part_of_small_worlds(tmp_path, monkeypatch, capsys
     small = ("--worlds", "1", "--resolution", "32x18", "--seconds", "0", "--set", 'bake.formats=["bop", "shards"]')
     assert bench.main([*small, "--json", str(file), *FEW_STEPS, *SMALL_IMAGES, *SHORT_EPISODES]) == 0
     rows = json.loads(file.read_text())["rows"]
-    assert {row["part"] for row in rows} == {"setup", *bench.PARTS}
+    assert {row["part"] for row in rows} == {"setup", *bench.DEFAULT_PARTS}
     assert all(row["value"] >= 0.0 for row in rows)
     printed = capsys.readouterr().out
     rows_of_stages = ("views, all stages", "picking, steps alone", "perception and planning: fraction of simulation and rendering")

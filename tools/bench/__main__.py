@@ -1,4 +1,4 @@
-"""Benchmark of a bake's parts: physics, perception, rendering, encoders, writing, the online stream, a small bake, one in steady state.
+"""Benchmark of a bake's parts: physics, perception, rendering, encoders, writing, the online stream, and of whole bakes.
 
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
 mode pick; with `--set bake.mode=move`, piles are stirred instead. Writers get the same views repeatedly. Files are written to the
@@ -27,6 +27,7 @@ from rich.console import Console
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import GIB, describe_machine
 from synpick_warp.codes import Status
+from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import load_exporter_classes
@@ -39,20 +40,26 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.system.device import pick_device
 from tools.bench.encode import measure_encoding
+from tools.bench.growth import measure_growth
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
 from tools.bench.sensor import measure_sensor
 from tools.bench.steady import measure_steady
 from tools.bench.stream import measure_stream
+from tools.bench.trajectories import measure_trajectories
+from tools.bench.whole import measure_whole
 from tools.bench.write import measure_writing
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
 
-PARTS = ("physics", "perception", "render", "encode", "sensor", "write", "stream", "bake", "steady")
-WHOLE_BAKES = {"bake", "steady"}
-"""Parts that run bakes of their own."""
+DEFAULT_PARTS = ("physics", "perception", "render", "encode", "sensor", "write", "stream", "bake", "steady")
+PARTS = (*DEFAULT_PARTS, "whole", "trajectories", "growth")
+OWN_WORLDS = {"bake", "steady", "whole", "trajectories", "growth"}
+"""Parts that build worlds of their own."""
 STREAM_BATCHES = 12
 """Batches rendered and copied in a row."""
 WRITE_VIEWS = 12
 """Views that the writers get repeatedly."""
+WHOLE_EPISODES = 150
+"""Episodes of a whole bake, unless `--episodes` says otherwise."""
 BAKE_WORLDS, BAKE_ROUNDS, BAKE_SPEED = 16, 1, 0.4
 """Worlds of the small bake, at most; rounds and speed [m/s] of its gripper in mode move, for short episodes."""
 
@@ -63,6 +70,7 @@ def main(arguments: list[str] | None = None) -> int:
     console = Console(highlight=False)
     rows: list[Row] = []
     machine: dict[str, str] = {}
+    traces: dict[str, Any] = {}
     code = 0
     try:
         config = _config(options)
@@ -73,7 +81,7 @@ def main(arguments: list[str] | None = None) -> int:
         machine = dict([*describe_machine(device), ("measured", measured)])
         for name, value in machine.items():
             console.print(f"{name:20} {value}")
-        for row in measure(config, options.parts, options.seconds):
+        for row in measure(config, options.parts, options.seconds, traces, options.episodes, options.markdown):
             rows.append(row)
             console.print(f"{row.part:10} {row.name:52} {row.value:14,.3f} {row.unit}")
     except SynpickError as error:
@@ -83,7 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
         code = INTERRUPTED
     if rows:
         record = {"machine": machine, "real_objects": bool(options.models), "rows": [dataclasses.asdict(row) for row in rows]}
-        write_json(options.json, record)
+        write_json(options.json, record | ({"traces": traces} if traces else {}))
     return code
 
 
@@ -91,10 +99,25 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = make_parser(__doc__, "device", "models", "lights", "set", "json")
     parser.add_argument("--worlds", type=int, default=512, help="worlds simulated in parallel (default: 512)")
     parser.add_argument("--resolution", default="1920x1080", help="WIDTHxHEIGHT [px] (default: 1920x1080)")
-    parts_help = f"parts to measure, comma-separated (default: {','.join(PARTS)})"
-    parser.add_argument("--parts", type=make_names_parser(PARTS, "part"), default=PARTS, help=parts_help)
+    more = ",".join(PARTS[len(DEFAULT_PARTS) :])
+    parts_help = f"parts to measure, comma-separated (default: {','.join(DEFAULT_PARTS)}; and {more})"
+    parser.add_argument("--parts", type=make_names_parser(PARTS, "part"), default=DEFAULT_PARTS, help=parts_help)
+    parser.add_argument(
+        "--episodes", type=_positive, default=WHOLE_EPISODES, help=f"episodes of the part whole (default: {WHOLE_EPISODES})"
+    )
     parser.add_argument("--seconds", type=float, default=2.0, help="minimum time of a measurement [s] (default: 2)")
-    return parser.parse_args(arguments)
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="table of the part growth")
+    options = parser.parse_args(arguments)
+    if options.markdown and not options.markdown.parent.is_dir():
+        parser.error(f"--markdown: there is no folder {options.markdown.parent}")
+    return options
+
+
+def _positive(text: str) -> int:
+    """Type of an option: a positive number."""
+    if not text.isdecimal() or not 0 < int(text) <= INT32_MAX:
+        raise argparse.ArgumentTypeError(f"{text} is no number of episodes; allowed: 1 to {INT32_MAX}")
+    return int(text)
 
 
 def _config(options: argparse.Namespace) -> Config:
@@ -106,9 +129,20 @@ def _config(options: argparse.Namespace) -> Config:
     return configure(options, fixed)
 
 
-def measure(config: Config, parts: tuple[str, ...], min_seconds: float) -> Iterator[Row]:
-    """Measure the parts; yields rows as they arrive. Each measurement is repeated for at least `min_seconds` [s]."""
-    if set(parts) - WHOLE_BAKES:
+def measure(
+    config: Config, parts: tuple[str, ...], min_seconds: float, traces: dict[str, Any], episodes: int, markdown: Path | None
+) -> Iterator[Row]:
+    """Measure the parts; yields rows as they arrive.
+
+    Args:
+        config: All settings.
+        parts: Parts, in any order.
+        min_seconds: Time for which a measurement is repeated, at least [s].
+        traces: Receives what changes during a measurement, by part.
+        episodes: Episodes of the part whole.
+        markdown: File for the table of the part growth; None: none.
+    """
+    if set(parts) - OWN_WORLDS:
         started = time.perf_counter()
         kinds = load_exporter_classes(config.bake.formats)
         factory = build_factory(
@@ -132,8 +166,17 @@ def measure(config: Config, parts: tuple[str, ...], min_seconds: float) -> Itera
         yield _memory_in_use(factory.simulation.device)
     if "bake" in parts:
         yield from _measure_bake(config)
+    steady_rate = 0.0
     if "steady" in parts:
-        yield from measure_steady(config, min_seconds)
+        for row in measure_steady(config, min_seconds):
+            steady_rate = row.value if row.name == "views to disk" else steady_rate
+            yield row
+    if "whole" in parts:
+        yield from measure_whole(config, episodes, steady_rate, traces)
+    if "trajectories" in parts:
+        yield from measure_trajectories(config, min_seconds)
+    if "growth" in parts:
+        yield from measure_growth(config, min_seconds, markdown)
 
 
 def _measure_worlds(config: Config, factory: Factory, min_seconds: float, parts: tuple[str, ...]) -> Iterator[Row]:

@@ -1,0 +1,250 @@
+"""Benchmarks of whole bakes: their rows, and the process that verifies and deletes episodes. Measured values are not asserted."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import time
+from dataclasses import replace
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from synpick_warp.dataset.manifest import episode_entry
+from synpick_warp.errors import DatasetError
+from synpick_warp.exporters.writing.checksums import write_manifest_entry
+from synpick_warp.stages.render.renderer import Renderer
+from tests.harness.entries import episode_content
+from tests.tools.test_tools import FEW_STEPS, SHORT_EPISODES, SMALL_IMAGES
+from tools.bench import __main__ as bench
+from tools.bench import growth, meter, physics, steady, whole
+from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
+from tools.bench.usage import Usage
+
+TINY = ("--worlds", "2", "--resolution", "32x18", *FEW_STEPS, *SMALL_IMAGES, *SHORT_EPISODES)
+SHARED = ("train", "deep/shared")
+
+
+def write_episode(out: Path, episode: int) -> list[Path]:
+    """Commit two files of an episode, in folders of its own; returns their paths."""
+    names = [Path(f"train/{episode:06d}/rgb/000000.jpg"), Path(f"deep/shared/{episode:06d}.json")]
+    for name in names:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_bytes(b"content")
+    (out / "manifest").mkdir(exist_ok=True)
+    write_manifest_entry(out, episode_entry(episode), names, episode_content(episode))
+    return [out / name for name in names]
+
+
+def wait_for(condition) -> None:
+    """Wait until a condition holds, at most 20 s."""
+    deadline = time.monotonic() + 20.0
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert condition()
+
+
+def reading(seconds: float, count: int) -> meter.Reading:
+    return meter.Reading(seconds, count, 0, Usage(), Usage(), Usage(), Tally(), 0, 0)
+
+
+def test_a_verified_episode_is_deleted_and_nothing_else(tmp_path):
+    ours, others = write_episode(tmp_path, 1), write_episode(tmp_path, 2)
+    tally = clean_episode(Assignment(tmp_path, SHARED), 1, Tally(episodes=3, files=10))
+    assert (tally.episodes, tally.files, tally.problem) == (4, 12, "")
+    assert not any(path.exists() for path in ours)
+    assert not (tmp_path / "train/000001").exists()
+    assert all(path.exists() for path in others)
+
+
+def test_shared_folders_stay_when_they_are_empty(tmp_path):
+    write_episode(tmp_path, 1)
+    clean_episode(Assignment(tmp_path, SHARED), 1, Tally())
+    assert sorted(path.name for path in tmp_path.rglob("*") if path.is_dir()) == ["deep", "manifest", "shared", "train"]
+    assert (tmp_path / "manifest/000001.json").exists()
+
+
+def test_only_files_with_the_suffixes_are_deleted(tmp_path):
+    image, table = write_episode(tmp_path, 1)
+    clean_episode(Assignment(tmp_path, SHARED, (".jpg",)), 1, Tally())
+    assert not image.exists()
+    assert table.exists()
+
+
+@pytest.mark.parametrize(("content", "said"), [(b"other", "has changed since it was written"), (None, "is missing")])
+def test_a_damaged_episode_stays_and_is_named(tmp_path, content, said):
+    image, table = write_episode(tmp_path, 1)
+    image.unlink()
+    if content:
+        image.write_bytes(content)
+    tally = clean_episode(Assignment(tmp_path, SHARED), 1, Tally())
+    assert str(image) in tally.problem
+    assert said in tally.problem
+    assert tally.episodes == 0
+    assert table.exists()
+
+
+def test_the_process_follows_a_growing_data_set_until_it_finds_damage(tmp_path):
+    with Cleaner(Assignment(tmp_path, SHARED)) as cleaner:
+        write_episode(tmp_path, 0)
+        wait_for(lambda: cleaner.poll().episodes == 1)
+        write_episode(tmp_path, 7)
+        wait_for(lambda: cleaner.poll().episodes == 2)
+        assert not cleaner.poll().problem
+        (tmp_path / "manifest/000009.json").write_text("{")
+        wait_for(lambda: cleaner.poll().problem)
+        assert cleaner.poll().episodes == 2
+
+
+def test_a_process_that_dies_is_a_problem(tmp_path):
+    with Cleaner(Assignment(tmp_path, SHARED)) as cleaner:
+        cleaner._worker.process.kill()
+        wait_for(lambda: cleaner.poll().problem)
+    assert cleaner.tally.problem == "the process that verifies scenes was ended by SIGKILL"
+
+
+def test_slices_are_between_readings_and_the_rest_is_left_out():
+    readings = [reading(seconds, count) for seconds, count in ((0, 0), (1, 5), (2, 20), (3, 21), (4.5, 45), (5, 99))]
+    assert meter.slice_rates(readings, 2.0) == [10.0, 10.0]
+    assert meter.slice_rates(readings[:1], 2.0) == []
+
+
+def test_damage_ends_a_steady_bake_with_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(steady.Cleaner, "poll", lambda self: Tally(problem="a file is missing"))
+    assert bench.main([*TINY, "--parts", "steady", "--seconds", "60"]) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == "bench: a file is missing"
+
+
+def test_ctrl_c_ends_the_benchmark(monkeypatch, capsys):
+    monkeypatch.setattr(meter.SteadyMeter, "update", lambda *_, **counts: os.kill(os.getpid(), signal.SIGINT))
+    assert bench.main([*TINY, "--parts", "steady,whole", "--seconds", "60"]) == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "bench: interrupted"
+
+
+def test_a_steady_bake_verifies_what_it_writes(tmp_path, monkeypatch):
+    monkeypatch.setattr(meter, "SLICE_SECONDS", 1.0)
+    file = tmp_path / "bench.json"
+    assert bench.main([*TINY, "--parts", "steady", "--seconds", "3", "--json", str(file)]) == 0
+    rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}
+    assert rows["errors found in them"] == 0
+    assert rows["scenes verified and deleted"] % 3 == 0
+    assert rows["views to disk, slowest 1 s"] <= rows["views to disk, fastest 1 s"]
+    assert rows["resident memory of all writers, at the end"] > 0.0
+    assert rows["CPU time of a view, verification and deletion"] >= 0.0
+
+
+def test_damage_is_raised_when_the_bake_has_ended(tmp_path, monkeypatch):
+    monkeypatch.setattr(steady.Cleaner, "poll", lambda self: Tally(problem="damaged"))
+    with pytest.raises(DatasetError, match="damaged"), steady.clean_up_behind(bench.Config(), tmp_path):
+        pass
+
+
+# ---- whole bakes ----
+
+
+def points(*ticks: tuple[float, int, int]) -> list[whole.TracePoint]:
+    """Trace of ticks (time, views so far, active worlds)."""
+    return [whole.TracePoint(seconds, views, active, 0) for seconds, views, active in ticks]
+
+
+def test_phases_add_up_to_the_whole_bake():
+    """Two cameras, ten worlds: settling, 3 live, 9 live, 5 live, 10 live, and two ticks of a tail."""
+    trace = points((5, 0, 10), (6, 6, 10), (7, 14, 10), (8, 32, 10), (10, 42, 10), (11, 62, 10), (12, 66, 2), (13, 68, 1))
+    phases = whole.split_phases(trace, 2, whole.Phase(15.0, 71))
+    assert phases == {
+        "start": (6, 6),
+        "settling": (1, 8),
+        "steady": (2, 38),
+        "between": (2, 10),
+        "tail": (2, 6),
+        "finishing": (2, 3),
+    }
+    assert whole.count_live(trace, 2) == [0, 3, 4, 9, 5, 10, 2, 1]
+
+
+def test_a_bake_that_never_has_all_worlds_live_only_settles():
+    phases = whole.split_phases(points((1, 0, 10), (2, 2, 10), (3, 4, 10)), 1, whole.Phase(4.0, 4))
+    assert (phases["start"], phases["settling"], phases["steady"]) == ((2, 2), (1, 2), (0, 0))
+    assert whole.split_phases([], 1, whole.Phase(4.0, 0))["finishing"] == (4, 0)
+
+
+def test_the_mean_is_compared_with_both_steady_rates():
+    rows = {row.name: row.value for row in whole.summarize(points((5, 10, 10), (6, 20, 10)), 1, whole.Phase(10.0, 20), 4.0)}
+    assert rows["mean of the whole: views"] == 2.0
+    assert rows["mean, of the rate of its own steady ticks"] == 20.0
+    assert rows["mean, of the rate of the part steady"] == 50.0
+
+
+def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
+    file = tmp_path / "bench.json"
+    assert bench.main([*TINY, "--parts", "whole", "--episodes", "2", "--json", str(file)]) == 0
+    record = json.loads(file.read_text())
+    rows = {row["name"]: row["value"] for row in record["rows"]}
+    trace = record["traces"]["whole"]
+    assert rows["worlds"] == 2
+    assert rows["ticks"] == len(trace["live"]) == len(trace["seconds"])
+    assert rows["views"] >= trace["views"][-1] > 0
+    assert trace["views"][-1] // 3 == sum(trace["live"])
+    assert trace["episodes"][-1] == 2
+    assert trace["seconds"] == sorted(trace["seconds"])
+
+
+def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):
+    rendered = mock.Mock(side_effect=AssertionError("a view was rendered"))
+    monkeypatch.setattr(Renderer, "render", rendered)
+    file = tmp_path / "bench.json"
+    assert bench.main([*TINY, "--parts", "trajectories", "--seconds", "1", "--json", str(file)]) == 0
+    rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}
+    assert rows["worlds"] == 2
+    assert 0.0 < rows["worlds with a frame in a tick"] <= 100.0
+    assert rows["world-steps"] > 0.0
+    assert rows["episodes, if of 502 frames as in tools/README.md"] > 0.0
+
+
+# ---- growth ----
+
+
+def test_each_factor_changes_its_setting_alone():
+    config = bench.Config()
+    varied = {factor: growth.VARIATIONS[factor](config, factor == "paths" or 0.5) for factor in growth.VARIATIONS}
+    assert varied["objects"][0] == "3.5 l"
+    assert varied["resolution"][0] == "960x540"
+    assert varied["paths"][0] == "1"
+    changed = {
+        "objects": ("arrangement", "volume", 3.5e-3),
+        "resolution": ("cameras", "resolution", (960, 540)),
+        "paths": ("render", "coarse_paths", 1),
+    }
+    for factor, (section, name, value) in changed.items():
+        assert varied[factor][1] == replace(config, **{section: replace(getattr(config, section), **{name: value})})
+
+
+def test_more_cameras_are_turned_about_the_vertical():
+    cameras = replace(bench.Config().cameras, positions=((1.0, 2.0, 3.0), (0.0, 0.0, 2.0)), ups=((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)))
+    value, varied = growth.vary_cameras(replace(bench.Config(), cameras=cameras), 1.5)
+    assert value == "3"
+    assert varied.cameras.positions == ((1.0, 2.0, 3.0), (0.0, 0.0, 2.0), (-1.0, -2.0, 3.0))
+    assert varied.cameras.ups == ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def test_growth_is_a_table_of_all_factors(tmp_path, monkeypatch):
+    monkeypatch.setattr(growth, "DROP_TICKS", 1)
+    monkeypatch.setattr(growth, "BURST", 1)
+    monkeypatch.setattr(growth, "PATHS", (4,))
+    monkeypatch.setattr(growth, "FRACTIONS", {"worlds": (0.5, 0.4), "objects": (0.5,), "resolution": (0.5,), "cameras": (2.0,)})
+    monkeypatch.setattr(physics, "MIN_REPEATS", 1)
+    file = tmp_path / "growth.md"
+    assert bench.main([*TINY, "--parts", "growth", "--seconds", "0", "--markdown", str(file)]) == 0
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in file.read_text().splitlines()]
+    assert {len(row) for row in cells} == {len(growth.COLUMNS)}
+    wanted = [("as set", "2 worlds, 32x18, 3 cameras"), ("worlds", "1"), ("objects", "0.5 l")]
+    wanted += [("resolution", "16x9"), ("paths", "4"), ("cameras", "6")]
+    assert [tuple(row[:2]) for row in cells[2:]] == wanted
+
+
+def test_a_missing_folder_of_the_table_is_said_at_once(tmp_path, capsys):
+    with pytest.raises(SystemExit, match="2"):
+        bench.main([*TINY, "--parts", "growth", "--markdown", str(tmp_path / "none" / "table.md")])
+    assert capsys.readouterr().err.splitlines()[-1].endswith(f"--markdown: there is no folder {tmp_path / 'none'}")

@@ -1,0 +1,193 @@
+"""Benchmark of growth: how physics of a tick and rendering of a view cost more with worlds, objects, resolution, paths and cameras.
+
+One factor varies at a time, and the others stay as set. Physics is that of piles DROP_TICKS ticks after the drop, without gripper; the
+pictures show these piles.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.configs.schema import Cameras, Config
+from synpick_warp.pipeline import make_renderer
+from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.scenes.lights import load_lights
+from synpick_warp.stages.buffers import Snapshot, ViewBuffers, allocate
+from synpick_warp.stages.render.scene import RenderScene, build_render_scene
+from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.sim.physics import with_enough_worlds
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.stream import view_sizes
+from synpick_warp.system.device import pick_device
+from tools.bench.physics import BURST, FOREVER, Row, seconds_per_call
+
+DROP_TICKS = 24
+"""Ticks from the drop to the measurement: 1.6 s, in which nearly all objects land."""
+FRACTIONS = {"worlds": (0.125, 0.25, 0.5), "objects": (0.25, 0.5), "resolution": (1 / 3, 2 / 3), "cameras": (1 / 3, 2.0)}
+"""Values of each factor, as multiples of the settings' own: worlds, volume of the objects, image width and height, cameras."""
+PATHS = (1, 2, 4)
+"""Paths per coarse pixel."""
+COLUMNS = ("factor", "value", "objects a tote", "physics of a tick [ms]", "world-steps/s", "a view [ms]", "views/s", "views of a tick [ms]")
+
+
+@dataclass(frozen=True)
+class Pile:
+    """Worlds after the drop."""
+
+    snapshot: Snapshot
+    objects: float
+    """Mean objects of a world."""
+    seconds: float
+    """Physics of a tick [s]."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """Measurement with one factor varied."""
+
+    factor: str
+    value: str
+    config: Config
+    pile: Pile
+    view: float
+    """Rendering of a view [s]."""
+
+    def cells(self) -> tuple[str, ...]:
+        """Cells of the table, by COLUMNS."""
+        bake, steps, seconds = self.config.bake, self.config.physics.steps_per_tick, self.pile.seconds
+        views = bake.worlds * len(self.config.cameras.positions)
+        numbers = f"{1e3 * seconds:.0f}", f"{steps * bake.worlds / seconds:,.0f}", f"{1e3 * self.view:.3g}", f"{1.0 / self.view:,.0f}"
+        return self.factor, self.value, f"{self.pile.objects:.1f}", *numbers, f"{1e3 * views * self.view:.0f}"
+
+
+class Assets:
+    """Objects and lights, loaded once, and measurements of worlds with them."""
+
+    def __init__(self, config: Config, min_seconds: float) -> None:
+        self.device, self.min_seconds = pick_device(config.bake.device), min_seconds
+        self.catalog, self.lights = load_catalog(config), load_lights(config.bake.lights)
+
+    def build_scene(self, config: Config) -> RenderScene:
+        """Renderer's scene of these settings."""
+        fixtures, cameras = make_fixtures(config.tote, config.gripper), make_cameras(config.cameras)
+        return build_render_scene(config.render, config.tote, self.catalog, fixtures, cameras, self.lights, self.device)
+
+    def drop(self, config: Config, scene: RenderScene) -> Pile:
+        """Drop piles and time ticks of their physics."""
+        simulation = Simulation(config, self.catalog, len(self.lights), self.device, scene, range(config.bake.worlds))
+        simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
+        tick = functools.partial(simulation.tick, simulation.records[0])
+        for _ in range(DROP_TICKS):
+            tick()
+        seconds = seconds_per_call(tick, self.device, self.min_seconds, BURST)
+        snapshot = simulation.records[0].snapshot
+        return Pile(snapshot, float((snapshot.catalog_index.numpy() >= 0).sum(axis=1).mean()), seconds)
+
+    def time_view(self, config: Config, scene: RenderScene, pile: Pile) -> float:
+        """Time of a view [s], in full batches."""
+        cameras, sizes = len(config.cameras.positions), view_sizes(config, self.device)
+        count = min(sizes["view"], config.bake.worlds * cameras)
+        histories = config.bake.worlds * cameras
+        renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
+        images, view = allocate(ViewBuffers, sizes, self.device), np.arange(count, dtype=np.int32)
+        rows = [wp.array(values, dtype=wp.int32, device=self.device) for values in (view // cameras, view % cameras)]
+        views = make_views(rows[0], rows[1], count, renderer.instances)
+        return seconds_per_call(lambda: renderer.render(pile.snapshot, views, images), self.device, self.min_seconds, BURST) / count
+
+
+def vary_worlds(config: Config, factor: float) -> tuple[str, Config]:
+    """Other number of worlds."""
+    worlds = max(1, round(factor * config.bake.worlds))
+    config = with_enough_worlds(replace(config, bake=replace(config.bake, worlds=worlds)), pick_device(config.bake.device))
+    return str(config.bake.worlds), config
+
+
+def vary_objects(config: Config, factor: float) -> tuple[str, Config]:
+    """Other volume of the objects."""
+    volume = factor * config.arrangement.volume
+    return f"{1e3 * volume:.3g} l", replace(config, arrangement=replace(config.arrangement, volume=volume))
+
+
+def vary_resolution(config: Config, factor: float) -> tuple[str, Config]:
+    """Other image size of the same shape."""
+    width, height = (max(1, round(factor * size)) for size in config.cameras.resolution)
+    return f"{width}x{height}", replace(config, cameras=replace(config.cameras, resolution=(width, height)))
+
+
+def vary_paths(config: Config, paths: float) -> tuple[str, Config]:
+    """Other number of paths per coarse pixel."""
+    return str(int(paths)), replace(config, render=replace(config.render, coarse_paths=int(paths)))
+
+
+def vary_cameras(config: Config, factor: float) -> tuple[str, Config]:
+    """Other number of cameras: the first ones, or all, and then these turned by 180° about the vertical."""
+    cameras, present = config.cameras, len(config.cameras.positions)
+    count = max(1, round(factor * present))
+    chosen = replace(cameras, positions=_turn(cameras, "positions", count), ups=_turn(cameras, "ups", count))
+    return str(count), replace(config, cameras=chosen)
+
+
+def _turn(cameras: Cameras, name: str, count: int) -> tuple[tuple[float, float, float], ...]:
+    vectors = getattr(cameras, name)
+    repeats = math.ceil(count / len(vectors))
+    return tuple(((-1) ** turn * x, (-1) ** turn * y, z) for turn in range(repeats) for x, y, z in vectors)[:count]
+
+
+VARIATIONS: dict[str, Callable[[Config, float], tuple[str, Config]]] = {
+    "worlds": vary_worlds,
+    "objects": vary_objects,
+    "resolution": vary_resolution,
+    "paths": vary_paths,
+    "cameras": vary_cameras,
+}
+
+
+def measure_growth(config: Config, min_seconds: float, markdown: Path | None) -> Iterator[Row]:
+    """Measure the settings themselves, then each factor's values.
+
+    Args:
+        config: All settings.
+        min_seconds: Time for which a measurement is repeated, at least [s].
+        markdown: File that receives the table; None: none.
+    """
+    started = time.perf_counter()
+    assets = Assets(config, min_seconds)
+    scene = assets.build_scene(config)
+    pile = assets.drop(config, scene)
+    width, height = config.cameras.resolution
+    here = f"{config.bake.worlds} worlds, {width}x{height}, {len(config.cameras.positions)} cameras"
+    points = [Point("as set", here, config, pile, assets.time_view(config, scene, pile))]
+    yield from _rows(points[-1])
+    for factor, vary in VARIATIONS.items():
+        for value, varied in dict(vary(config, multiple) for multiple in FRACTIONS.get(factor, PATHS)).items():
+            other = assets.build_scene(varied) if factor in ("resolution", "cameras") else scene
+            dropped = assets.drop(varied, scene) if factor in ("worlds", "objects") else pile
+            points.append(Point(factor, value, varied, dropped, assets.time_view(varied, other, dropped)))
+            yield from _rows(points[-1])
+    yield Row("growth", "all measurements", time.perf_counter() - started, "s")
+    if markdown is not None:
+        markdown.write_text(format_table(points))
+
+
+def _rows(point: Point) -> Iterator[Row]:
+    name = f"{point.factor} {point.value}" if point.factor in VARIATIONS else point.factor
+    if point.factor in ("as set", "worlds", "objects"):
+        yield Row("growth", f"{name}: objects a tote", point.pile.objects, "")
+        yield Row("growth", f"{name}: physics of a tick", 1e3 * point.pile.seconds, "ms")
+    yield Row("growth", f"{name}: a view", 1e3 * point.view, "ms")
+
+
+def format_table(points: list[Point]) -> str:
+    """Format a Markdown table, one row a point."""
+    lines = [COLUMNS, ("---",) * len(COLUMNS), *(point.cells() for point in points)]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)

@@ -1,0 +1,163 @@
+"""Meter of a bake's steady state: readings of counts and resources after each tick while nearly all worlds act, and a stop at the end."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+
+import warp as wp
+
+from synpick_warp.cli.doctor import GIB
+from synpick_warp.episodes import BakeSummary
+from synpick_warp.progress import SilentProgress
+from tools.bench.cleaner import Cleaner, Tally
+from tools.bench.physics import Row
+from tools.bench.usage import Usage, measure_usage
+
+LIVE_FRACTION = 0.9
+"""Steady-state threshold: fraction of the worlds that must deliver frames in a tick. Before, worlds settle, and physics has a larger
+part."""
+LEAD_TICKS = 2
+"""Warm-up: ticks above LIVE_FRACTION before the measurement, which fill the writers' queues."""
+SLICE_SECONDS = 20.0
+"""Time over which the slowest and the fastest rate are taken [s]."""
+
+
+@dataclass(frozen=True)
+class Reading:
+    """State of a bake after a tick."""
+
+    time: float
+    """[s]"""
+    count: int
+    """Views, or frames of worlds, so far."""
+    episodes: int
+    """Ended episodes."""
+    main: Usage
+    """Of the main process."""
+    writers: Usage
+    """Of the writers."""
+    cleaner: Usage
+    """Of the process that verifies and deletes."""
+    tally: Tally
+    """Its totals."""
+    disk: int
+    """Bytes in use on the file system."""
+    device: int
+    """Bytes of device memory in use, by all processes; 0 on the CPU."""
+
+
+class SteadyMeter(SilentProgress):
+    """Progress observer that takes readings, and stops the bake by a signal, as a user would.
+
+    That is when `seconds` are measured, when no episodes wait for a world any more, or when a verified episode is damaged.
+    """
+
+    def __init__(
+        self,
+        seconds: float,
+        folder: Path,
+        steady_count: float,
+        worlds: int,
+        device: wp.Device,
+        cleaner: Cleaner | None = None,
+        counter: Callable[[], int] | None = None,
+    ) -> None:
+        """
+        Args:
+            seconds: Time to measure [s].
+            folder: Where the bake writes.
+            steady_count: Views, or frames, of a tick from which it counts as steady.
+            worlds: Worlds of the bake.
+            device: Device of the bake.
+            cleaner: Process that verifies and deletes; None: there is none.
+            counter: Function that returns the number of frames so far; None: views are counted.
+        """
+        self.seconds, self.folder, self.steady_count, self.worlds = seconds, folder, steady_count, worlds
+        self.device, self.cleaner, self.counter = device, cleaner, counter
+        self.ticks, self.last_count = 0, 0
+        self.started = time.perf_counter()
+        self.first_count = 0.0
+        self.initial_disk = shutil.disk_usage(folder).used
+        self.readings: list[Reading] = []
+        self.is_stopped = False
+
+    def update(
+        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
+    ) -> None:
+        """Take a reading after each tick of the measurement."""
+        count = self.counter() if self.counter else views
+        tally = self.cleaner.poll() if self.cleaner else Tally()
+        if count:
+            self.first_count = self.first_count or time.perf_counter() - self.started
+            self.ticks += int(self.ticks > 0 or count - self.last_count >= self.steady_count)
+            self.last_count = count
+            if self.ticks > LEAD_TICKS and not self.is_stopped:
+                self.readings.append(self._read(count, episodes_done, tally))
+        measured = len(self.readings) > 1 and self.readings[-1].time - self.readings[0].time >= self.seconds
+        if measured or tally.problem or episodes_done >= episodes - self.worlds:
+            self._stop()
+
+    def raise_interruption(self, summary: BakeSummary) -> None:
+        """Raise KeyboardInterrupt if Ctrl-C or another signal from outside stopped the bake."""
+        if summary.stopped and not self.is_stopped:
+            raise KeyboardInterrupt
+
+    def _stop(self) -> None:
+        if not self.is_stopped:
+            self.is_stopped = True
+            os.kill(os.getpid(), signal.SIGINT)
+
+    def _read(self, count: int, episodes: int, tally: Tally) -> Reading:
+        now, disk, usages = time.perf_counter(), shutil.disk_usage(self.folder).used, measure_usage()
+        main, cleaner = usages.pop(os.getpid(), Usage()), usages.pop(self.cleaner.pid, Usage()) if self.cleaner else Usage()
+        device = self.device.total_memory - self.device.free_memory if self.device.is_cuda else 0
+        return Reading(now, count, episodes, main, reduce(Usage.plus, usages.values(), Usage()), cleaner, tally, disk, device)
+
+
+def slice_rates(readings: Sequence[Reading], seconds: float) -> list[float]:
+    """Counts per second of consecutive slices of at least `seconds` [s], which begin and end with readings; the rest is left out."""
+    rates: list[float] = []
+    first = readings[0]
+    for reading in readings[1:]:
+        if reading.time - first.time >= seconds:
+            rates.append((reading.count - first.count) / (reading.time - first.time))
+            first = reading
+    return rates
+
+
+def summarize_rates(part: str, unit: str, meter: SteadyMeter) -> Iterator[Row]:
+    """Rows of a measurement: rate, its slices, CPU time, and memory at both ends.
+
+    Args:
+        part: Part of the benchmark.
+        unit: Name of what the readings count, in the singular.
+        meter: Meter with at least two readings.
+    """
+    first, last = meter.readings[0], meter.readings[-1]
+    count, seconds = last.count - first.count, last.time - first.time
+    yield Row(part, f"time to the first {unit}s", meter.first_count, "s")
+    yield Row(part, "measured", seconds, "s")
+    yield Row(part, "a tick", 1e3 * seconds / (len(meter.readings) - 1), "ms")
+    yield Row(part, f"{unit}s to disk", count / seconds, "1/s")
+    rates = slice_rates(meter.readings, SLICE_SECONDS)
+    if rates:
+        yield Row(part, f"{unit}s to disk, slowest {SLICE_SECONDS:.0f} s", min(rates), "1/s")
+        yield Row(part, f"{unit}s to disk, fastest {SLICE_SECONDS:.0f} s", max(rates), "1/s")
+    spent = {"writers": last.writers.cpu - first.writers.cpu, "main process": last.main.cpu - first.main.cpu}
+    if meter.cleaner:
+        spent["verification and deletion"] = last.cleaner.cpu - first.cleaner.cpu
+    for name, value in spent.items():
+        yield Row(part, f"CPU time of a {unit}, {name}", 1e3 * value / max(1, count), "ms")
+    yield Row(part, "cores busy", sum(spent.values()) / seconds, "")
+    for when, reading in (("at the beginning", first), ("at the end", last)):
+        yield Row(part, f"resident memory of the main process, {when}", reading.main.resident / GIB, "GiB")
+        yield Row(part, f"resident memory of all writers, {when}", reading.writers.resident / GIB, "GiB")
+    if meter.device.is_cuda:
+        yield Row(part, "device memory in use by all processes", last.device / GIB, "GiB")

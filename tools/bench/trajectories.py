@@ -1,0 +1,74 @@
+"""Benchmark of a bake without pictures: world-steps per second and episodes per hour of `bake --formats usd,zarr` in steady state.
+
+Such a bake renders no views; worlds that pick still render the images of their perception.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from synpick_warp.codes import Mode
+from synpick_warp.configs.schema import Config
+from synpick_warp.exporters.registry import Exporters
+from synpick_warp.frames import TickBatch
+from synpick_warp.pipeline import run_bake
+from synpick_warp.scheduling.order import EXPECTED_FRAMES
+from synpick_warp.stages.sim.arrange import sample_modes_of
+from synpick_warp.system.device import pick_device
+from tools.bench.meter import LIVE_FRACTION, SteadyMeter, summarize_rates
+from tools.bench.physics import Row
+from tools.bench.steady import plan_spare_episodes
+
+FORMATS = ("usd", "zarr")
+"""Formats without pictures."""
+HOUR = 3600.0
+"""[s]"""
+
+
+def measure_trajectories(config: Config, min_seconds: float) -> Iterator[Row]:
+    """Bake to the temporary folder (TMPDIR) until `min_seconds` [s] with frames are measured; what was written is removed."""
+    config = plan_spare_episodes(dataclasses.replace(config, bake=dataclasses.replace(config.bake, formats=FORMATS)))
+    worlds, device = config.bake.worlds, pick_device(config.bake.device)
+    with tempfile.TemporaryDirectory() as folder, _count_frames() as frames:
+        meter = SteadyMeter(min_seconds, Path(folder), LIVE_FRACTION * worlds, worlds, device, counter=lambda: frames[0])
+        summary = run_bake(config, Path(folder) / "out", meter)
+    if len(meter.readings) > 1:
+        yield from _summarize(config, meter)
+    meter.raise_interruption(summary)
+
+
+@contextlib.contextmanager
+def _count_frames() -> Iterator[list[int]]:
+    """Count the frames that exporters get meanwhile: a list of one number."""
+    frames, write = [0], Exporters.write_ticks
+
+    def count(exporters: Exporters, batch: TickBatch) -> None:
+        frames[0] += len(batch)
+        write(exporters, batch)
+
+    with mock.patch.object(Exporters, "write_ticks", count):
+        yield frames
+
+
+def _summarize(config: Config, meter: SteadyMeter) -> Iterator[Row]:
+    """Rows of the rates, of the steps, in which all worlds take part, and of the episodes."""
+    yield Row("trajectories", "worlds", config.bake.worlds, "")
+    yield from summarize_rates("trajectories", "frame", meter)
+    first, last, physics = meter.readings[0], meter.readings[-1], config.physics
+    seconds, ticks, frames = last.time - first.time, len(meter.readings) - 1, last.count - first.count
+    rate = ticks * physics.steps_per_tick * config.bake.worlds / seconds
+    modes = sample_modes_of(config, np.arange(config.bake.episodes, dtype=np.int32), meter.device)
+    mean = float(np.mean([EXPECTED_FRAMES[Mode(mode)] for mode in modes.tolist()]))
+    yield Row("trajectories", "world-steps", rate, "1/s")
+    yield Row("trajectories", "simulated time: multiple of real time", rate * physics.step, "")
+    yield Row("trajectories", "worlds with a frame in a tick", 100.0 * frames / (ticks * config.bake.worlds), "%")
+    yield Row("trajectories", "size of a frame on disk", 1e-3 * (last.disk - first.disk) / max(1, frames), "kB")
+    yield Row("trajectories", "episodes that ended", last.episodes - first.episodes, "")
+    yield Row("trajectories", f"episodes, if of {mean:.0f} frames as in tools/README.md", HOUR * frames / seconds / mean, "1/h")

@@ -1,0 +1,40 @@
+"""CPU time and resident memory of a benchmark and of its child processes, from /proc."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+_PARENT, _USER, _SYSTEM, _RESIDENT = 1, 11, 12, 21
+"""Indices in /proc/PID/stat after the command's name: parent process, CPU time in user mode and in system mode [clock ticks], resident
+memory [pages]."""
+
+
+class Usage(NamedTuple):
+    """Resources of processes."""
+
+    cpu: float = 0.0
+    """CPU time in user mode and in the kernel [s]."""
+    resident: int = 0
+    """Resident memory [bytes]; memory that processes share counts in each."""
+
+    def plus(self, other: Usage) -> Usage:
+        """Sum of two."""
+        return Usage(self.cpu + other.cpu, self.resident + other.resident)
+
+
+def measure_usage() -> dict[int, Usage]:
+    """Resources of this process and of its running child processes, by process id."""
+    usages: dict[int, Usage] = {}
+    ours = os.getpid()
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                values = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if int(entry.name) == ours or int(values[_PARENT]) == ours:
+                cpu = (int(values[_USER]) + int(values[_SYSTEM])) / os.sysconf("SC_CLK_TCK")
+                usages[int(entry.name)] = Usage(cpu, int(values[_RESIDENT]) * os.sysconf("SC_PAGE_SIZE"))
+    return usages

@@ -1,0 +1,156 @@
+"""Benchmark of a whole bake with automatic worlds: its mean rate from start to exit, and where the time goes.
+
+Verified pictures are deleted meanwhile, since those of 150 episodes are larger than many a disk; lists stay, which the bake's end reads.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.pipeline import run_bake
+from synpick_warp.progress import SilentProgress
+from tools.bench.meter import LIVE_FRACTION
+from tools.bench.physics import Row
+from tools.bench.steady import clean_up_behind
+
+PICTURES = (".jpg", ".png")
+"""Suffixes of the files that are deleted."""
+
+
+class TracePoint(NamedTuple):
+    """State of a bake after a tick."""
+
+    seconds: float
+    """Time since the start [s]."""
+    views: int
+    active: int
+    """Worlds that settle or act."""
+    episodes: int
+    """Episodes that have ended."""
+
+
+class Phase(NamedTuple):
+    """Part of a bake."""
+
+    seconds: float = 0.0
+    views: int = 0
+
+    def plus(self, seconds: float, views: int) -> Phase:
+        """Sum with a tick."""
+        return Phase(self.seconds + seconds, self.views + views)
+
+
+class _Trace(SilentProgress):
+    """Progress observer that records a point after each tick."""
+
+    def __init__(self) -> None:
+        self.started = time.perf_counter()
+        self.points: list[TracePoint] = []
+
+    def update(
+        self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
+    ) -> None:
+        """Record a point."""
+        self.points.append(TracePoint(time.perf_counter() - self.started, views, worlds_active, episodes_done))
+
+
+def measure_whole(config: Config, episodes: int, steady_rate: float, traces: dict[str, Any]) -> Iterator[Row]:
+    """Bake `episodes` episodes to the temporary folder (TMPDIR), with worlds, batches and writers by default.
+
+    Args:
+        config: All settings.
+        episodes: Number of episodes.
+        steady_rate: Views per second of the part steady, for comparison; 0: not measured.
+        traces: Receives the trace of live worlds against time as "whole".
+    """
+    config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, episodes=episodes, worlds=0))
+    with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out", PICTURES):
+        trace = _Trace()
+        summary = run_bake(config, Path(folder) / "out", trace)
+        whole = Phase(time.perf_counter() - trace.started, summary.views)
+    cameras = len(config.cameras.positions)
+    traces["whole"] = describe_trace(trace.points, cameras)
+    yield from summarize(trace.points, cameras, whole, steady_rate)
+    if summary.stopped:
+        raise KeyboardInterrupt
+
+
+def count_live(points: Sequence[TracePoint], cameras: int) -> list[int]:
+    """Worlds that delivered views in each tick."""
+    frames = [0, *(point.views // cameras for point in points)]
+    return [now - before for before, now in itertools.pairwise(frames)]
+
+
+def describe_trace(points: Sequence[TracePoint], cameras: int) -> dict[str, list[float]]:
+    """Columns for JSON: seconds since the start, and after each tick live and active worlds, views and ended episodes."""
+    return {
+        "seconds": [round(point.seconds, 3) for point in points],
+        "live": list(count_live(points, cameras)),
+        "active": [point.active for point in points],
+        "views": [point.views for point in points],
+        "episodes": [point.episodes for point in points],
+    }
+
+
+def split_phases(points: Sequence[TracePoint], cameras: int, whole: Phase) -> dict[str, Phase]:
+    """Split a bake into consecutive parts, which add up to the whole; steady are ticks in which LIVE_FRACTION of all worlds are live.
+
+    Args:
+        points: State after each tick.
+        cameras: Number of cameras.
+        whole: Time and views of the whole bake.
+    """
+    live = count_live(points, cameras)
+    threshold = LIVE_FRACTION * max((point.active for point in points), default=0)
+    steady = [index for index, count in enumerate(live) if count and count >= threshold]
+    first, last = (steady[0], steady[-1]) if steady else (len(points), len(points))
+    phases: dict[str, Phase] = dict.fromkeys(("start", "settling", "steady", "between", "tail", "finishing"), Phase())
+    before = TracePoint(0.0, 0, 0, 0)
+    for index, point in enumerate(points):
+        if before.views == 0:
+            name = "start"
+        elif index < first:
+            name = "settling"
+        elif index > last:
+            name = "tail"
+        else:
+            name = "steady" if live[index] >= threshold else "between"
+        phases[name] = phases[name].plus(point.seconds - before.seconds, point.views - before.views)
+        before = point
+    phases["finishing"] = Phase(whole.seconds - before.seconds, whole.views - before.views)
+    return phases
+
+
+def summarize(points: Sequence[TracePoint], cameras: int, whole: Phase, steady_rate: float) -> Iterator[Row]:
+    """Rows of a whole bake; arguments as of `split_phases` and `measure_whole`."""
+    phases, mean = split_phases(points, cameras, whole), whole.views / whole.seconds
+    many = f"{100 * LIVE_FRACTION:.0f} % of worlds"
+    titles = {
+        "start": "start to the first views",
+        "settling": f"from there to {many} live",
+        "steady": f"ticks with {many} live",
+        "between": f"ticks between these with fewer than {many} live",
+        "tail": f"tail: after the last tick with {many} live",
+        "finishing": "finishing: waiting for writers, lists",
+    }
+    yield Row("whole", "worlds", max((point.active for point in points), default=0), "")
+    yield Row("whole", "ticks", len(points), "")
+    yield Row("whole", "views", whole.views, "")
+    yield Row("whole", "start to exit", whole.seconds, "s")
+    for name, phase in phases.items():
+        yield Row("whole", titles[name], phase.seconds, "s")
+        if phase.views:
+            yield Row("whole", f"{name}: views", phase.views / phase.seconds, "1/s")
+    yield Row("whole", "mean of the whole: views", mean, "1/s")
+    steady = phases["steady"]
+    if steady.views:
+        yield Row("whole", "mean, of the rate of its own steady ticks", 100.0 * mean * steady.seconds / steady.views, "%")
+    if steady_rate:
+        yield Row("whole", "mean, of the rate of the part steady", 100.0 * mean / steady_rate, "%")
