@@ -75,29 +75,10 @@ class Physics:
         self.layout = built.layout
         self.model = built.model
         self.device = self.model.device
-        physics, worlds = settings, built.layout.worlds
-        self.model.rigid_contact_max = physics.contacts_per_world * worlds
-        self.pipeline = newton.CollisionPipeline(
-            # Matching contacts with those of the previous step sorts them, so that their order is deterministic.
-            self.model,
-            broad_phase="nxn",
-            contact_matching="latest",
-            rigid_contact_max=physics.contacts_per_world * worlds,
-            shape_pairs_max=physics.pairs_per_world * worlds,
-            verify_buffers=False,
-        )
+        worlds = built.layout.worlds
+        self.pipeline = make_pipeline(settings, self.model)
         self.contacts = self.pipeline.contacts()
-        self.solver = newton.solvers.SolverSteel(
-            self.model,
-            iterations=physics.iterations,
-            contact_warmstart=True,
-            contact_gap_gate=CONTACT_GAP,
-            articulation_constraint_max=physics.gripper_rows_per_world,
-            enable_joint_limits=True,
-            joint_limit_activation_gap=JOINT_LIMIT_GAP,
-            warn_constraint_overflow=False,
-            **_sweep(physics, built.layout.slots, self.device.is_cuda),
-        )
+        self.solver = make_solver(settings, self.model, built.layout.slots)
         self.state = self.model.state()
         self._other = self.model.state()
         self.control = self.model.control()
@@ -196,6 +177,35 @@ class Physics:
                 watcher.end_step(step, current)
         if current is not self.state:
             self.state.assign(current)
+
+
+def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.CollisionPipeline:
+    """Collision pipeline of all worlds of a model, with the capacities of the settings."""
+    model.rigid_contact_max = physics.contacts_per_world * model.world_count
+    # Matching contacts with those of the previous step sorts them, so that their order is deterministic.
+    return newton.CollisionPipeline(
+        model,
+        broad_phase="nxn",
+        contact_matching="latest",
+        rigid_contact_max=model.rigid_contact_max,
+        shape_pairs_max=physics.pairs_per_world * model.world_count,
+        verify_buffers=False,
+    )
+
+
+def make_solver(physics: PhysicsConfig, model: newton.Model, slots: int) -> newton.solvers.SolverSteel:
+    """Rigid-body solver of all worlds of a model with `slots` free bodies a world."""
+    return newton.solvers.SolverSteel(
+        model,
+        iterations=physics.iterations,
+        contact_warmstart=True,
+        contact_gap_gate=CONTACT_GAP,
+        articulation_constraint_max=physics.gripper_rows_per_world,
+        enable_joint_limits=True,
+        joint_limit_activation_gap=JOINT_LIMIT_GAP,
+        warn_constraint_overflow=False,
+        **_sweep(physics, slots, model.device.is_cuda),
+    )
 
 
 def _sweep(physics: PhysicsConfig, slots: int, parallel: bool) -> dict[str, Any]:
