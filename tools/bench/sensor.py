@@ -254,7 +254,9 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
     yield from _comparison_rows("depth, index, normals, albedo", ", amodal bits", "", (times[0], times[1]), pixels)
     lit = replace(textured, enable_shadows=True)
     times = [time_view(ours.render_color), time_view(functools.partial(scene.render, lit, hit_images | color_images))]
-    yield from _comparison_rows("color, depth, index", ", amodal bits, counts, boxes", ", one light", (times[0], times[1]), pixels)
+    yield from _comparison_rows(
+        "color, depth, index", ", indirect light, anti-aliasing, amodal bits, counts, boxes", ", one light", (times[0], times[1]), pixels
+    )
 
 
 class _OurRenderer:

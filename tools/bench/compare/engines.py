@@ -97,11 +97,11 @@ class NewtonEngine:
     def run(self, steps: int) -> float:
         wp.synchronize_device(self.device)
         started = time.perf_counter()
-        if self._graph is None:
-            self._advance(steps)
-        else:
+        if self._graph is not None:
             for _ in range(steps // GRAPH_STEPS):
                 wp.capture_launch(self._graph)
+            steps %= GRAPH_STEPS
+        self._advance(steps)
         wp.synchronize_device(self.device)
         seconds = time.perf_counter() - started
         contacts = int(self.contacts.rigid_contact_count.numpy()[0])
@@ -167,7 +167,7 @@ class MujocoEngine:
 
     def start(self, pile: Pile) -> None:
         model = build_piles(self.config, pile, 1, wp.get_device("cpu"))
-        # A single contact for two hulls, MuJoCo's default, would let a pile sink centimetres into the floor.
+        # A single contact for two hulls, MuJoCo's default, lets a pile sink 15 mm into the floor.
         solver = newton.solvers.SolverMuJoCo(
             model, use_mujoco_cpu=True, enable_multiccd=True, solver="newton", cone=self.cone, iterations=CONES[self.cone]
         )

@@ -114,8 +114,8 @@ class RayScene:
             # MuJoCo Warp has built the tree of geoms at the origin; one of the geoms where they are is faster.
             context.bvh = wp.Bvh(context.lower, context.upper, groups=context.group, constructor="sah")
             context.bvh_id = context.bvh.id
-            find_roots = importlib.import_module("mujoco_warp._src.bvh").compute_bvh_group_roots
-            wp.launch(find_roots, dim=self.worlds, inputs=[context.bvh_id], outputs=[context.group_root])
+            worlds = wp.array(np.arange(self.worlds), dtype=wp.int32)
+            wp.map(_find_root, wp.full(self.worlds, context.bvh_id, dtype=wp.uint64), worlds, out=context.group_root)
         return context
 
     def render(self, context: Any) -> None:
@@ -137,6 +137,11 @@ class RayScene:
         """Color of the first world's views (view, row, column, 3) uint8, red first."""
         packed = context.rgb_data[:1].numpy().reshape(-1, self.cameras[0].height, self.cameras[0].width)
         return np.stack([packed >> shift & 255 for shift in (16, 8, 0)], axis=-1).astype(np.uint8)
+
+
+@wp.func
+def _find_root(bvh: wp.uint64, world: wp.int32):
+    return wp.bvh_get_group_root(bvh, world)
 
 
 def _add_mesh(mujoco: Any, spec: Any, name: str, mesh: TriangleMesh, material: Material) -> None:

@@ -65,7 +65,7 @@ def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: fl
     yield from _pair(size, pixels, "depth, ids, amodal bits", "depth, ids", seconds)
     context = theirs.make_context(color=True)
     seconds = time_view(functools.partial(ours.render)), time_view(functools.partial(theirs.render, context))
-    everything = "all stages: color by light maps with indirect light and anti-aliasing, depth, ids, amodal bits, counts, boxes"
+    everything = "color by light maps with indirect light and anti-aliasing, depth, ids, amodal bits, counts, boxes"
     yield from _pair(size, pixels, everything, "color by one light with shadows, depth, ids", seconds)
 
 
@@ -74,7 +74,7 @@ def _pair(size: str, pixels: int, ours: str, theirs: str, seconds: tuple[float, 
     our_seconds, their_seconds = seconds
     yield from rate_rows(PART, f"{size}, ours: {ours}", our_seconds, pixels)
     yield from rate_rows(PART, f"{size}, MuJoCo Warp: {theirs}", their_seconds, pixels)
-    yield Row(PART, f"{size}: our rate over MuJoCo Warp's: {theirs}", their_seconds / our_seconds, "")
+    yield Row(PART, f"{size}: rate of ours ({ours}) over MuJoCo Warp's ({theirs})", their_seconds / our_seconds, "")
 
 
 def tile_snapshot(snapshot: Snapshot, worlds: int, device: wp.Device) -> Snapshot:
