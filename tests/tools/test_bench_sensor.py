@@ -45,7 +45,7 @@ def views(device):
 def test_an_independent_renderer_agrees(views):
     scene, index, depth, ours = views
     assert set(np.unique(ours.instance)) == {1, 2, 3, Segment.TABLE, Segment.TOTE, Segment.FINGER}
-    same, close, largest = (row.value for row in bench_sensor.compare_hits(scene, index, depth, ours.instance, ours.depth, 0.1))
+    same, close, largest = (row.value for row in bench_sensor.compare_hits(scene.segment, index, depth, ours.instance, ours.depth, 0.1))
     # Rounding decides on which side of a silhouette a grazing ray passes.
     assert same >= 99.9
     assert close >= 99.9
@@ -57,7 +57,7 @@ def test_differences_are_counted(views):
     segment, counts = ours.instance.copy(), ours.depth.copy()
     segment[0, :30] = Segment.CUP
     counts[0, 30:] += 100
-    same, close, largest = (row.value for row in bench_sensor.compare_hits(scene, index, depth, segment, counts, 0.1))
+    same, close, largest = (row.value for row in bench_sensor.compare_hits(scene.segment, index, depth, segment, counts, 0.1))
     assert same == pytest.approx(87.5, abs=0.2)
     assert close == pytest.approx(75.0, abs=0.2)
     assert largest >= 9.9

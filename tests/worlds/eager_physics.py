@@ -15,4 +15,5 @@ class EagerPhysics(Physics):
     def tick(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
     ) -> None:
-        self._run_steps(before_step, after_collide, watcher)
+        for _ in self._run_substeps(before_step, after_collide, watcher):
+            pass

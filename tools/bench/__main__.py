@@ -3,8 +3,10 @@
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
 mode pick; with `--set bake.mode=move`, piles are stirred instead. Writers get the same views repeatedly. Files are written to the
 system's temporary folder (TMPDIR) and removed. The part sensor renders the same views with Newton's SensorCamera for comparison.
+--compare measures other simulators and renderers beside ours, without any part unless --parts names some.
 
     python -m tools.bench --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
+    python -m tools.bench --compare mujoco-warp,mujoco,sensor-camera --models DIR --lights DIR
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import itertools
+import math
 import resource
 import sys
 import tempfile
@@ -39,6 +42,7 @@ from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader, TickReport
 from synpick_warp.system.device import pick_device
+from tools.bench.compare.peers import PEERS, check_installed, measure_peers
 from tools.bench.encode import measure_encoding
 from tools.bench.growth import measure_growth
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
@@ -73,6 +77,7 @@ def main(arguments: list[str] | None = None) -> int:
     traces: dict[str, Any] = {}
     code = 0
     try:
+        check_installed(options.compare)
         config = _config(options)
         device = pick_device(config.bake.device)
         config = with_enough_worlds(config, device)
@@ -81,16 +86,18 @@ def main(arguments: list[str] | None = None) -> int:
         machine = dict([*describe_machine(device), ("measured", measured)])
         for name, value in machine.items():
             console.print(f"{name:20} {value}")
-        for row in measure(config, options.parts, options.seconds, traces, options.episodes, options.markdown):
+        measured_peers = measure_peers(config, options.compare, options.seconds)
+        parts = measure(config, options.parts, options.seconds, traces, options.episodes, options.markdown)
+        for row in itertools.chain(parts, measured_peers):
             rows.append(row)
-            console.print(f"{row.part:10} {row.name:52} {row.value:14,.3f} {row.unit}")
+            console.print(f"{row.part:11} {row.name:52} {row.value:14,.3f} {row.unit}", soft_wrap=True)
     except SynpickError as error:
         return fail("bench", error)
     except KeyboardInterrupt:
         print("bench: interrupted", file=sys.stderr)
         code = INTERRUPTED
     if rows:
-        record = {"machine": machine, "real_objects": bool(options.models), "rows": [dataclasses.asdict(row) for row in rows]}
+        record = {"machine": machine, "real_objects": bool(options.models), "rows": [_to_record(row) for row in rows]}
         write_json(options.json, record | ({"traces": traces} if traces else {}))
     return code
 
@@ -101,7 +108,9 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--resolution", default="1920x1080", help="WIDTHxHEIGHT [px] (default: 1920x1080)")
     more = ",".join(PARTS[len(DEFAULT_PARTS) :])
     parts_help = f"parts to measure, comma-separated (default: {','.join(DEFAULT_PARTS)}; and {more})"
-    parser.add_argument("--parts", type=make_names_parser(PARTS, "part"), default=DEFAULT_PARTS, help=parts_help)
+    parser.add_argument("--parts", type=make_names_parser(PARTS, "part"), help=parts_help)
+    peers_help = f"peers to measure beside ours, comma-separated, of {', '.join(PEERS)}; then no parts unless --parts names some"
+    parser.add_argument("--compare", type=make_names_parser(PEERS, "peer"), default=(), metavar="PEERS", help=peers_help)
     parser.add_argument(
         "--episodes", type=_positive, default=WHOLE_EPISODES, help=f"episodes of the part whole (default: {WHOLE_EPISODES})"
     )
@@ -110,6 +119,8 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     if options.markdown and not options.markdown.parent.is_dir():
         parser.error(f"--markdown: there is no folder {options.markdown.parent}")
+    if options.parts is None:
+        options.parts = () if options.compare else DEFAULT_PARTS
     return options
 
 
@@ -118,6 +129,11 @@ def _positive(text: str) -> int:
     if not text.isdecimal() or not 0 < int(text) <= INT32_MAX:
         raise argparse.ArgumentTypeError(f"{text} is no number of episodes; allowed: 1 to {INT32_MAX}")
     return int(text)
+
+
+def _to_record(row: Row) -> dict[str, Any]:
+    """Fields for JSON; None for the value of what failed."""
+    return dataclasses.asdict(row) | {"value": row.value if math.isfinite(row.value) else None}
 
 
 def _config(options: argparse.Namespace) -> Config:

@@ -99,7 +99,7 @@ def build_sensor_scene(
         width, height, matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], device=device
     )
     view = np.arange(count)
-    transforms = np.array([_camera_to_world(camera) for camera in cameras], np.float32)[view % len(cameras)]
+    transforms = np.array([camera_to_world(camera) for camera in cameras], np.float32)[view % len(cameras)]
     return SensorScene(
         model,
         model.state(),
@@ -160,26 +160,24 @@ def _add_body(builder: newton.ModelBuilder, mesh: newton.Mesh, material: Materia
     builder.add_shape_mesh(body, mesh=mesh, cfg=shape, color=material.color)
 
 
-def _camera_to_world(camera: Camera) -> np.ndarray:
+def camera_to_world(camera: Camera) -> np.ndarray:
     """Pose x, y, z [m], quaternion x, y, z, w (7) of the camera in OpenGL axes."""
     rotation = camera.rotation.T
     return np.concatenate([-rotation @ camera.translation, Rotation.from_matrix(rotation @ OPENGL).as_quat()])
 
 
-def compare_hits(
-    scene: SensorScene, index: np.ndarray, depth: np.ndarray, segment: np.ndarray, counts: np.ndarray, scale: float
-) -> list[Row]:
-    """Agreement of both renderers in segmentation and depth.
+def compare_hits(ids: np.ndarray, index: np.ndarray, depth: np.ndarray, segment: np.ndarray, counts: np.ndarray, scale: float) -> list[Row]:
+    """Agreement of another renderer with ours in segmentation and depth.
 
     Args:
-        scene: The sensor's scene.
-        index: The sensor's shape indices (view, row, column) uint32; the maximum value without a hit.
-        depth: The sensor's planar depth (view, row, column) float32 [m].
+        ids: Segmentation id of each of its shapes (shape + 1) int64; the last one is of pixels without a shape.
+        index: Its shape indices (view, row, column) uint32; the maximum value without a hit.
+        depth: Its planar depth (view, row, column) float32 [m].
         segment: Our segmentation ids (view, row, column) uint8.
         counts: Our planar depth (view, row, column) uint16 [counts of `scale`].
         scale: Depth of one count [mm].
     """
-    same = scene.segment[np.minimum(index, len(scene.segment) - 1)] == segment
+    same = ids[np.minimum(index, len(ids) - 1)] == segment
     difference = np.abs(depth * (1000.0 / scale) - counts)
     close = same & (difference <= DEPTH_TOLERANCE)
     largest = float(difference[same].max()) * scale if same.any() else 0.0
@@ -242,20 +240,23 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
     checked = min(count, CHECKED_VIEWS)
     arrays = (hit_images["shape_index_image"], hit_images["forward_depth_image"], ours.out.instance, ours.out.depth)
     index, depth, segment, counts = (array[:checked].numpy() for array in arrays)
-    yield from compare_hits(scene, index, depth, segment, counts, config.bop.depth_scale)
+    yield from compare_hits(scene.segment, index, depth, segment, counts, config.bop.depth_scale)
     for name, seconds in orders.items():
         yield Row("sensor", f"SensorCamera, pixels {name}: depth, index", 1e3 * seconds, "ms")
         yield Row("sensor", f"SensorCamera's time over ours: depth, index, pixels {name}", seconds / times[0], "")
-    yield from _comparison_rows("depth, index", ", amodal bits", "", times[0], orders[best])
+    pixels = factory.cameras[0].width * factory.cameras[0].height
+    yield from _comparison_rows("depth, index", ", amodal bits", "", (times[0], orders[best]), pixels)
     textured = replace(ORDERS[best], enable_textures=True)
     times = [time_view(ours.render_layers), time_view(functools.partial(scene.render, textured, hit_images | surface_images))]
     layers = {name: getattr(ours.layers, name)[:checked].numpy() for name in LAYERS}
     normal, albedo = (image[:checked].numpy() for image in surface_images.values())
     yield from compare_surfaces(factory.cameras, normal, albedo, layers)
-    yield from _comparison_rows("depth, index, normals, albedo", ", amodal bits", "", *times)
+    yield from _comparison_rows("depth, index, normals, albedo", ", amodal bits", "", (times[0], times[1]), pixels)
     lit = replace(textured, enable_shadows=True)
     times = [time_view(ours.render_color), time_view(functools.partial(scene.render, lit, hit_images | color_images))]
-    yield from _comparison_rows("color, depth, index", ", amodal bits, counts, boxes", ", one light", *times)
+    yield from _comparison_rows(
+        "color, depth, index", ", indirect light, anti-aliasing, amodal bits, counts, boxes", ", one light", (times[0], times[1]), pixels
+    )
 
 
 class _OurRenderer:
@@ -281,8 +282,16 @@ class _OurRenderer:
         self.renderer.render(self.snapshot, self.views, self.out)
 
 
-def _comparison_rows(outputs: str, our_extras: str, their_extras: str, ours: float, theirs: float) -> Iterator[Row]:
-    """Rows of the times of a view [s] by both renderers, and of their ratio."""
-    yield Row("sensor", f"ours: {outputs}{our_extras}", 1e3 * ours, "ms")
-    yield Row("sensor", f"SensorCamera: {outputs}{their_extras}", 1e3 * theirs, "ms")
+def _comparison_rows(outputs: str, our_extras: str, their_extras: str, times: tuple[float, float], pixels: int) -> Iterator[Row]:
+    """Rows of the times of a view [s] of `pixels` pixels by ours and theirs, of their rates, and of their ratio."""
+    ours, theirs = times
+    for name, seconds in ((f"ours: {outputs}{our_extras}", ours), (f"SensorCamera: {outputs}{their_extras}", theirs)):
+        yield Row("sensor", name, 1e3 * seconds, "ms")
+        yield from rate_rows("sensor", name, seconds, pixels)
     yield Row("sensor", f"SensorCamera's time over ours: {outputs}", theirs / ours, "")
+
+
+def rate_rows(part: str, name: str, seconds: float, pixels: int) -> Iterator[Row]:
+    """Rates of a renderer that takes `seconds` for a view of `pixels` pixels."""
+    yield Row(part, f"{name}: views", 1.0 / seconds, "1/s")
+    yield Row(part, f"{name}: pixels", 1e-6 * pixels / seconds, "Mpx/s")

@@ -18,7 +18,6 @@ from synpick_warp.kernels.render.lighting.history import (
     history_frame,
     lag_limit,
     read_history,
-    rest_bits,
     rest_turn,
     scale_light,
     usable_paths,
@@ -197,8 +196,8 @@ def trace_coarse_paths_kernel(
 ):
     """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
-    A coarse pixel with a usable history traces one path and blends it in; once the history holds `max_paths`, only in one of 2 to 8 frames,
-    see `rest_bits`. One without traces `rules.samples` paths. The sun's direct light is left out, see `shadows`; `variance` is not written.
+    A coarse pixel with a usable history traces one path and blends it in; the longer its history, the less often, see `rest_bits`. One
+    without traces `rules.samples` paths. The sun's direct light is left out, see `shadows`; `variance` is not written.
     """
     view, row, column = interleaved_pixel(coarse, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
@@ -218,8 +217,7 @@ def trace_coarse_paths_kernel(
     unoccluded = unoccluded_light(scene.lights, context.light, context.yaw, vertex.brdf)
     limit = lag_limit(scene.meshes, history_inout, moving, views, view, row, column, hit.segment, position)
     slot = world * history_inout.cameras + camera
-    known = usable_paths(history_inout, slot, row, column, limit)
-    bits = rest_bits(history_inout, known, limit)
+    known, bits = usable_paths(history_inout, slot, row, column, limit)
     frame = history_frame(history_inout, slot, known)
     exposure = scene.lights.exposure[context.light]
     mean = SplitRadiance()

@@ -21,6 +21,8 @@ LIGHT_CHANGE = wp.constant(0.05)
 """Temporal lag that an average may have, as a fraction of the light: remembered paths times the change in a frame (`light_change`)."""
 MIN_CHANGE = wp.constant(1.0e-6)
 """Change of a point's light below which it counts as unchanged: histories are far shorter than LIGHT_CHANGE / MIN_CHANGE."""
+REST_PATHS = wp.constant(4)
+"""Fewest paths of an average that grows only in some frames."""
 MAX_REST_BITS = wp.constant(3)
 """Binary logarithm of the longest rest period [frames]."""
 BAYER_BITS = wp.constant(4)
@@ -212,25 +214,25 @@ def lag_limit(
 
 
 @wp.func
-def usable_paths(history: LightHistory, slot: int, row: int, column: int, limit: int) -> int:
-    """History length after rejection: paths of a coarse pixel's average that may be kept, for its `lag_limit`."""
-    if limit == 0:
-        return 0
-    return wp.min(int(history.paths[slot, row, column]), limit)
+def rest_bits(paths: int, limit: int) -> int:
+    """Binary logarithm of a coarse pixel's rest period: with 4, 8, 16 paths it traces one in 2, 4, 8 frames; 0: one in each frame.
+
+    The period is shorter where REST_PATHS of them would span more than `limit` frames, see `lag_limit`.
+    """
+    bits = int(0)
+    while bits < MAX_REST_BITS and (REST_PATHS << bits) <= paths and (REST_PATHS << (bits + 1)) <= limit:
+        bits += 1
+    return bits
 
 
 @wp.func
-def rest_bits(history: LightHistory, known: int, limit: int) -> int:
-    """Binary logarithm of a coarse pixel's rest period: it traces a path in one of 2, 4 or 8 frames once its history is full; 0: in each.
-
-    The period is the longest with which the average remembers at most `limit` frames, but at least 2.
-    """
-    if known == 0 or known < history.max_paths:
-        return 0
-    bits = int(1)
-    while bits < MAX_REST_BITS and (history.max_paths << (bits + 1)) <= limit:
-        bits += 1
-    return bits
+def usable_paths(history: LightHistory, slot: int, row: int, column: int, limit: int) -> tuple[int, int]:
+    """History length after rejection, for a coarse pixel's `lag_limit`: paths of its average that may be kept, and its `rest_bits`."""
+    if limit == 0:
+        return 0, 0
+    paths = int(history.paths[slot, row, column])
+    bits = rest_bits(paths, limit)
+    return wp.min(paths, limit >> bits), bits
 
 
 @wp.func

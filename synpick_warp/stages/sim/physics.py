@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, Protocol
 
@@ -17,6 +18,7 @@ from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
 
+_ENDED = object()
 # Contacts with a larger gap make no constraint rows [m]: only those that a hook has disabled have one, none that the pipeline finds.
 CONTACT_GAP = 0.1
 # Distance to a joint limit from which its constraint row is active [rad].
@@ -61,7 +63,7 @@ def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None =
 
 
 class Watcher(Protocol):
-    """Observer of the steps of a tick. On a GPU its launches are captured once in a graph, as those of the hooks of `Physics.tick`."""
+    """Observer of the steps of a tick. On a GPU its launches are captured once in graphs, as those of the hooks of `Physics.tick`."""
 
     def begin_step(self) -> None:
         """Called before a step."""
@@ -84,33 +86,14 @@ class Physics:
         self.layout = built.layout
         self.model = built.model
         self.device = self.model.device
-        physics, worlds = settings, built.layout.worlds
-        self.model.rigid_contact_max = physics.contacts_per_world * worlds
-        self.pipeline = newton.CollisionPipeline(
-            # Matching contacts with those of the previous step sorts them, so that their order is deterministic.
-            self.model,
-            broad_phase="nxn",
-            contact_matching="latest",
-            rigid_contact_max=physics.contacts_per_world * worlds,
-            shape_pairs_max=physics.pairs_per_world * worlds,
-            verify_buffers=False,
-        )
+        worlds = built.layout.worlds
+        self.pipeline = make_pipeline(settings, self.model)
         self.contacts = self.pipeline.contacts()
-        self.solver = newton.solvers.SolverSteel(
-            self.model,
-            iterations=physics.iterations,
-            contact_warmstart=True,
-            contact_gap_gate=CONTACT_GAP,
-            articulation_constraint_max=physics.gripper_rows_per_world,
-            enable_joint_limits=True,
-            joint_limit_activation_gap=JOINT_LIMIT_GAP,
-            warn_constraint_overflow=False,
-            **_sweep(physics, built.layout.slots, self.device.is_cuda),
-        )
+        self.solver = make_solver(settings, self.model, built.layout.slots)
         self.state = self.model.state()
         self._other = self.model.state()
         self.control = self.model.control()
-        self._graph: wp.Graph | None = None
+        self._graphs: list[wp.Graph] = []
         self._observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
         fingers = np.arange(worlds) * built.layout.bodies_per_world
         self._finger_joint = wp.array(np.argsort(self.model.joint_child.numpy())[fingers], dtype=wp.int32, device=self.device)
@@ -152,7 +135,7 @@ class Physics:
     def tick(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
     ) -> None:
-        """Advance all worlds by one tick: `steps_per_tick` steps of `substeps` solver steps, on a GPU as a captured graph.
+        """Advance all worlds by one tick: `steps_per_tick` steps of `substeps` solver steps, on a GPU as captured graphs.
 
         Hooks and watcher are captured once, so they must launch the same kernels on the same arrays every time.
 
@@ -161,17 +144,28 @@ class Physics:
             after_collide: Launches kernels that edit `contacts` before the solver reads them.
             watcher: Launches kernels that record the steps.
         """
-        if not self.device.is_cuda:
-            self._run_steps(before_step, after_collide, watcher)
+        if self._graphs:
+            for graph in self._graphs:
+                wp.capture_launch(graph)
             return
-        if self._graph is None:
-            # The first tick runs eagerly: it loads the kernels and triggers Newton's late allocations.
-            self._run_steps(before_step, after_collide, watcher)
+        # On a GPU the first tick runs eagerly: it loads the kernels and triggers Newton's late allocations.
+        for _ in self._run_substeps(before_step, after_collide, watcher):
+            pass
+        if self.device.is_cuda:
+            self._capture(self._run_substeps(before_step, after_collide, watcher))
+
+    def _capture(self, substeps: Iterator[None]) -> None:
+        """Capture each substep in a graph of its own.
+
+        CUDA spread a graph of a whole tick over 66 streams, one a substep, and the renderer's kernels waited in the hardware queues that it
+        shared with them.
+        """
+        busy = True
+        while busy:
             with wp.ScopedCapture(device=self.device) as capture:
-                self._run_steps(before_step, after_collide, watcher)
-            self._graph = capture.graph
-            return
-        wp.capture_launch(self._graph)
+                busy = next(substeps, _ENDED) is not _ENDED
+            if busy:
+                self._graphs.append(capture.graph)
 
     def flag_lost_pairs(self) -> None:
         """Flag worlds whose broad-phase pairs overflowed: Newton drops these pairs silently, while its solver flags contacts and rows."""
@@ -183,28 +177,60 @@ class Physics:
             device=self.device,
         )
 
-    def _run_steps(
+    def _run_substeps(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None, watcher: Watcher | None
-    ) -> None:
+    ) -> Iterator[None]:
+        """Enqueue a tick; yields after each substep. The last one leaves its result in `state`."""
         current, following = self.state, self._other
         physics, observables = self.settings, self._observables if watcher is not None else None
-        for step in range(physics.steps_per_tick):
-            if watcher is not None:
-                watcher.begin_step()
-            before_step(current)
-            for _ in range(physics.substeps):
-                self.pipeline.collide(current, self.contacts)
-                self.flag_lost_pairs()
-                if after_collide is not None:
-                    after_collide()
-                self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps, observables=observables)
-                current, following = following, current
+        for step, substep in itertools.product(range(physics.steps_per_tick), range(physics.substeps)):
+            if substep == 0:
                 if watcher is not None:
-                    watcher.after_solve(self._observables.contact_f)
+                    watcher.begin_step()
+                before_step(current)
+            self.pipeline.collide(current, self.contacts)
+            self.flag_lost_pairs()
+            if after_collide is not None:
+                after_collide()
+            self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps, observables=observables)
+            current, following = following, current
+            ends_step = substep + 1 == physics.substeps
             if watcher is not None:
-                watcher.end_step(step, current)
-        if current is not self.state:
-            self.state.assign(current)
+                watcher.after_solve(self._observables.contact_f)
+                if ends_step:
+                    watcher.end_step(step, current)
+            if ends_step and step + 1 == physics.steps_per_tick and current is not self.state:
+                self.state.assign(current)
+            yield
+
+
+def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.CollisionPipeline:
+    """Collision pipeline of all worlds of a model, with the capacities of the settings."""
+    model.rigid_contact_max = physics.contacts_per_world * model.world_count
+    # Matching contacts with those of the previous step sorts them, so that their order is deterministic.
+    return newton.CollisionPipeline(
+        model,
+        broad_phase="nxn",
+        contact_matching="latest",
+        rigid_contact_max=model.rigid_contact_max,
+        shape_pairs_max=physics.pairs_per_world * model.world_count,
+        verify_buffers=False,
+    )
+
+
+def make_solver(physics: PhysicsConfig, model: newton.Model, slots: int) -> newton.solvers.SolverSteel:
+    """Rigid-body solver of all worlds of a model with `slots` free bodies a world."""
+    return newton.solvers.SolverSteel(
+        model,
+        iterations=physics.iterations,
+        contact_warmstart=True,
+        contact_gap_gate=CONTACT_GAP,
+        articulation_constraint_max=physics.gripper_rows_per_world,
+        enable_joint_limits=True,
+        joint_limit_activation_gap=JOINT_LIMIT_GAP,
+        warn_constraint_overflow=False,
+        **_sweep(physics, slots, model.device.is_cuda),
+    )
 
 
 def _sweep(physics: PhysicsConfig, slots: int, parallel: bool) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
-from synpick_warp.kernels.render.lighting.history import MAX_REST_BITS
+from synpick_warp.kernels.render.lighting.history import MAX_REST_BITS, LightHistory, usable_paths
 from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
@@ -21,6 +21,8 @@ from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, ca
 
 PATHS = 16
 LONGEST_REST = 1 << int(MAX_REST_BITS)
+FILLED = 4 + 4 * 2 + 8 * 4
+"""Frames until the history of a still scene is full: 4 paths in each frame, 4 in every second, 8 in every fourth."""
 VIEW = camera(64, 48, 300.0, (0.0, 0.0, 1.5))
 LIGHT = EnvironmentMap("gradient", even_light(1.0, 32).radiance * np.linspace(3.0, 0.1, 64, dtype=np.float32)[None, :, None])
 
@@ -64,22 +66,66 @@ def renderer(device) -> Renderer:
     return make_renderer(each.settings(), build_scene(each, device), each.instances, 1, 1)
 
 
+@wp.kernel
+def usable_paths_kernel(
+    # In:
+    history: LightHistory,
+    limit: int,
+    # Out:
+    result_out: wp.array[int],
+):
+    """Paths that may be kept, and rest bits, of one coarse pixel."""
+    kept, bits = usable_paths(history, 0, 0, 0, limit)
+    result_out[0] = kept
+    result_out[1] = bits
+
+
+def usable(paths: int, limit: int, device: wp.Device) -> tuple[int, int]:
+    """Paths that may be kept, and the rest period [frames]."""
+    history, result = LightHistory(), wp.zeros(2, dtype=wp.int32, device=device)
+    history.paths = wp.full((1, 1, 1), paths, dtype=wp.uint8, device=device)
+    wp.launch(usable_paths_kernel, dim=1, inputs=[history, limit], outputs=[result], device=device)
+    kept, bits = result.numpy().tolist()
+    return kept, 1 << bits
+
+
 def remembered(renderer: Renderer) -> np.ndarray:
     """Paths that the history counts (row, column)."""
     return renderer.shading.history.paths.numpy()[0]  # type: ignore[union-attr]
 
 
 def test_a_still_scene_is_remembered_up_to_the_limit(renderer, device):
-    counts = [np.unique(remembered(renderer)).tolist() for _ in show(renderer, [(frame, toy()) for frame in range(PATHS + 4)], device)]
-    assert counts[:3] == [[1], [2], [3]]
-    assert counts[PATHS - 1 :] == [[PATHS]] * 5
+    counts = [np.unique(remembered(renderer)).tolist() for _ in show(renderer, [(frame, toy()) for frame in range(FILLED + 4)], device)]
+    assert counts[:4] == [[1], [2], [3], [4]]
+    assert [counts[frame - 1] for frame in (4 + 2, 4 + 8, 4 + 8 + 32)] == [[5], [8], [PATHS]]
+    assert counts[FILLED:] == [[PATHS]] * 4
+
+
+@pytest.mark.parametrize(
+    ("paths", "limit", "kept", "period"),
+    [
+        (3, 99, 3, 1),
+        (4, 99, 4, 2),
+        (7, 99, 7, 2),
+        (8, 99, 8, 4),
+        (16, 99, 12, 8),
+        (16, 128, 16, 8),
+        (16, 31, 7, 4),
+        (16, 8, 4, 2),
+        (16, 7, 7, 1),
+    ],
+)
+def test_averages_span_no_more_frames_than_the_lag_allows(device, paths, limit, kept, period):
+    """Paths and the frames between them, by known cases: 4 paths trace in every second frame, if 8 frames are allowed, and so on."""
+    assert usable(paths, limit, device) == (kept, period)
+    assert kept * period <= limit
 
 
 def test_full_histories_take_turns(renderer, device):
     """In a still scene a coarse pixel traces a path in one of 8 frames, an even part of all in each, also in each 4 x 4."""
-    frames = [(frame, toy()) for frame in range(PATHS + 1 + 2 * LONGEST_REST)]
+    frames = [(frame, toy()) for frame in range(FILLED + 1 + 2 * LONGEST_REST)]
     stored = [renderer.shading.history.diffuse.numpy()[0].copy() for _ in show(renderer, frames, device)]
-    changed = np.array([now != before for before, now in itertools.pairwise(stored[PATHS:])])
+    changed = np.array([now != before for before, now in itertools.pairwise(stored[FILLED:])])
     assert (changed[:LONGEST_REST].sum(axis=0) <= 1).all()
     assert (changed[LONGEST_REST:].sum(axis=0) <= 1).all()
     squares = changed[:, :24, :32].reshape(2 * LONGEST_REST, 6, 4, 8, 4).sum(axis=(2, 4))
@@ -145,7 +191,9 @@ def test_pictures_approach_the_reference_over_the_frames(renderer, device):
     each = toy()
     config = Config(render=replace(each.settings().render, mode=REFERENCE, samples=1024))
     (reference,) = show(make_renderer(config, renderer.scene, each.instances, 1), [(0, each)], device)
-    errors = [np.sqrt(np.mean((picture - reference) ** 2)) for picture in show(renderer, [(index, each) for index in range(24)], device)]
+    errors = [
+        np.sqrt(np.mean((picture - reference) ** 2)) for picture in show(renderer, [(index, each) for index in range(FILLED)], device)
+    ]
     assert errors[-1] < 0.6 * errors[0]
     assert np.mean(errors[-4:]) < np.mean(errors[4:8]) < errors[0]
 

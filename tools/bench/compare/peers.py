@@ -1,0 +1,100 @@
+"""Peers of the benchmark: which there are, what they need, and the order in which they are measured."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+
+import warp as wp
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.errors import SynpickError
+from synpick_warp.pipeline import build_factory
+from synpick_warp.progress import SilentProgress
+from synpick_warp.stages.sim.simulate import Simulation
+from tools.bench import physics
+from tools.bench.compare.engines import CONES, Engine, MujocoEngine, make_mujoco_warp, make_ours
+from tools.bench.compare.piles import Pile, pick_pile
+from tools.bench.compare.rendering import measure_rendering
+from tools.bench.compare.simulation import measure_engine
+from tools.bench.physics import Row
+from tools.bench.sensor import measure_sensor
+
+PEERS = ("mujoco-warp", "mujoco", "sensor-camera")
+MODULES = {"mujoco-warp": ("mujoco", "mujoco_warp"), "mujoco": ("mujoco",)}
+"""Modules that peers import, besides those of the product."""
+PILE_WORLDS = 64
+"""Worlds that are settled for the comparison; rendering repeats them, physics takes one of them."""
+
+
+def check_installed(peers: tuple[str, ...]) -> None:
+    """Look for the peers' libraries.
+
+    Raises:
+        SynpickError: One is missing.
+    """
+    modules = dict.fromkeys(module for peer in peers for module in MODULES.get(peer, ()))
+    if missing := [module for module in modules if importlib.util.find_spec(module) is None]:
+        raise SynpickError(f"--compare {','.join(peers)} needs {' and '.join(missing)}: pip install 'synpick-warp[peers]'")
+
+
+def measure_peers(config: Config, peers: tuple[str, ...], min_seconds: float) -> Iterator[Row]:
+    """Benchmark of peers beside ours, on piles at rest; a peer that fails costs its own rows alone.
+
+    Args:
+        config: All settings; physics is measured in `bake.worlds` worlds.
+        peers: Names out of `PEERS`.
+        min_seconds: Time for which a measurement of rendering is repeated, at least [s].
+    """
+    if not peers:
+        return
+    started = time.perf_counter()
+    few = replace(config, bake=replace(config.bake, worlds=min(config.bake.worlds, PILE_WORLDS)))
+    factory = build_factory(few, SilentProgress())
+    _settle(factory.simulation)
+    pile = pick_pile(factory.catalog, factory.simulation.records[0].snapshot)
+    yield Row("setup", f"build and settle {few.bake.worlds} worlds", time.perf_counter() - started, "s")
+    if "sensor-camera" in peers:
+        yield from _guard("sensor", partial(measure_sensor, few, factory, min_seconds))
+    if "mujoco-warp" in peers:
+        yield from _guard("mujoco-warp", partial(measure_rendering, few, factory, min_seconds))
+    if {"mujoco-warp", "mujoco"} & set(peers):
+        yield from _measure_physics(config, pile, peers, factory.simulation.device)
+
+
+def _settle(simulation: Simulation) -> None:
+    """Let new worlds drop their piles and come to rest."""
+    simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = physics.FOREVER
+    for _ in range(physics.FALL_TICKS + physics.SETTLE_TICKS):
+        simulation.tick(simulation.records[0])
+
+
+def _measure_physics(config: Config, pile: Pile, peers: tuple[str, ...], device: wp.Device) -> Iterator[Row]:
+    """Benchmark of physics engines on one pile: ours, then each peer with each friction cone."""
+
+    def measure(part: str, make: Callable[[], Engine]) -> Iterator[Row]:
+        yield from measure_engine(part, make(), config, pile)
+
+    worlds = config.bake.worlds
+    ours = make_ours(config, pile, worlds, device)
+    yield from measure("ours", lambda: ours)
+    if "mujoco" in peers:
+        for cone in CONES:
+            yield from _guard("mujoco", partial(measure, "mujoco", partial(MujocoEngine, config, pile, cone)))
+    if "mujoco-warp" in peers:
+        for cone in CONES:
+            make = partial(make_mujoco_warp, config, pile, worlds, device, cone, ours.peak_contacts)
+            yield from _guard("mujoco-warp", partial(measure, "mujoco-warp", make))
+
+
+def _guard(part: str, measure: Callable[[], Iterator[Row]]) -> Iterator[Row]:
+    """Rows of a peer; one that says why, if it fails: what others' libraries raise, nobody knows."""
+    try:
+        yield from measure()
+    except Exception as error:
+        reason = (str(error).splitlines() or [""])[0]
+        yield Row(part, f"failed: {type(error).__name__}: {reason}", math.nan, "")

@@ -1,0 +1,106 @@
+"""Benchmark of our renderer against MuJoCo Warp's ray renderer: the same worlds and cameras, large and small images."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from dataclasses import fields, replace
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.pipeline import Factory, make_renderer
+from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.scenes.types import Camera
+from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
+from synpick_warp.stages.render.scene import build_cameras, build_grid
+from synpick_warp.stages.render.view_setup import make_views
+from tools.bench.compare.ray_scene import RayScene
+from tools.bench.physics import BURST, Row, seconds_per_call
+from tools.bench.sensor import CHECKED_VIEWS, compare_hits, rate_rows
+
+PART = "mujoco-warp"
+SMALL_SIZE = (64, 64)
+"""Image size of policies that learn in many worlds [px]."""
+SMALL_WORLDS, SMALL_WORLDS_CPU = 2048, 8
+"""Worlds with such images, on a GPU and on the CPU."""
+
+
+def measure_rendering(config: Config, factory: Factory, min_seconds: float) -> Iterator[Row]:
+    """Benchmark of both renderers, with images of `cameras.resolution` in as many worlds as make a batch, and with small ones in many.
+
+    Worlds beyond the factory's show its piles again.
+    """
+    cameras, device = len(factory.cameras), factory.simulation.device
+    yield from _measure_size(config, factory, max(1, factory.stream.batch // cameras), min_seconds)
+    small = replace(config, cameras=replace(config.cameras, resolution=SMALL_SIZE))
+    yield from _measure_size(small, factory, SMALL_WORLDS if device.is_cuda else SMALL_WORLDS_CPU, min_seconds)
+
+
+def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: float) -> Iterator[Row]:
+    """Benchmark of both renderers with images of `cameras.resolution` in `worlds` worlds."""
+    cameras, device, scene = make_cameras(config.cameras), factory.simulation.device, factory.stream.renderer.scene
+    snapshot = tile_snapshot(factory.simulation.records[0].snapshot, worlds, device)
+    count, pixels = worlds * len(cameras), cameras[0].width * cameras[0].height
+    size = f"{cameras[0].width}x{cameras[0].height}, {worlds:,} world{'' if worlds == 1 else 's'}"
+    yield Row(PART, f"{size}: views in a batch", count, "")
+    ours = OurViews(config, factory, cameras, snapshot, worlds)
+    meshes = [(entry.mesh, entry.material) for entry in factory.catalog.entries]
+    table = (float(scene.table.height), config.render.table_color) if config.render.table else None
+    theirs = RayScene(meshes, make_fixtures(config.tote, config.gripper), cameras, table, snapshot, worlds, device)
+
+    def time_view(function: functools.partial[None]) -> float:
+        """Time of one view [s]."""
+        return seconds_per_call(function, device, min_seconds / 4, BURST) / count
+
+    context = theirs.make_context(color=False)
+    seconds = time_view(functools.partial(ours.render_gbuffer)), time_view(functools.partial(theirs.render, context))
+    checked = min(worlds, -(-CHECKED_VIEWS // len(cameras)))
+    index, depth = theirs.read_hits(context, checked)
+    segment, counts = (array[: len(index)].numpy() for array in (ours.out.instance, ours.out.depth))
+    for row in compare_hits(theirs.segment, index, depth, segment, counts, config.bop.depth_scale):
+        yield replace(row, part=PART, name=f"{size}: {row.name}")
+    yield from _pair(size, pixels, "depth, ids, amodal bits", "depth, ids", seconds)
+    context = theirs.make_context(color=True)
+    seconds = time_view(functools.partial(ours.render)), time_view(functools.partial(theirs.render, context))
+    everything = "color by light maps with indirect light and anti-aliasing, depth, ids, amodal bits, counts, boxes"
+    yield from _pair(size, pixels, everything, "color by one light with shadows, depth, ids", seconds)
+
+
+def _pair(size: str, pixels: int, ours: str, theirs: str, seconds: tuple[float, float]) -> Iterator[Row]:
+    """Rows of the rates of both renderers, from the times of a view [s] by ours and theirs, and of their ratio."""
+    our_seconds, their_seconds = seconds
+    yield from rate_rows(PART, f"{size}, ours: {ours}", our_seconds, pixels)
+    yield from rate_rows(PART, f"{size}, MuJoCo Warp: {theirs}", their_seconds, pixels)
+    yield Row(PART, f"{size}: rate of ours ({ours}) over MuJoCo Warp's ({theirs})", their_seconds / our_seconds, "")
+
+
+def tile_snapshot(snapshot: Snapshot, worlds: int, device: wp.Device) -> Snapshot:
+    """A snapshot of `worlds` worlds: world i shows world i modulo those of `snapshot`."""
+    chosen = np.arange(worlds) % len(snapshot.live)
+    arrays = {field.name: getattr(snapshot, field.name) for field in fields(snapshot)}
+    return Snapshot(**{name: wp.array(array.numpy()[chosen], dtype=array.dtype, device=device) for name, array in arrays.items()})
+
+
+class OurViews:
+    """Our renderer with images of a size of its own, for all cameras of the first worlds of a snapshot."""
+
+    def __init__(self, config: Config, factory: Factory, cameras: tuple[Camera, ...], snapshot: Snapshot, worlds: int) -> None:
+        scene, count, instances = factory.stream.renderer.scene, worlds * len(cameras), factory.stream.renderer.instances
+        width, height = cameras[0].width, cameras[0].height
+        scene = replace(scene, cameras=build_cameras(cameras, scene.device), grid=build_grid(width, height))
+        self.snapshot, view = snapshot, np.arange(count, dtype=np.int32)
+        self.renderer = make_renderer(config, scene, instances, count, histories=count)
+        self.out = allocate_view_buffers(count, width, height, instances, scene.device)
+        world, camera = (wp.array(v, dtype=wp.int32, device=scene.device) for v in (view // len(cameras), view % len(cameras)))
+        self.views = make_views(world, camera, count, instances)
+
+    def render_gbuffer(self) -> None:
+        """Depth, ids and amodal bits alone."""
+        self.renderer.render_gbuffer(self.snapshot, self.views, self.out)
+
+    def render(self) -> None:
+        """All stages."""
+        self.renderer.render(self.snapshot, self.views, self.out)
