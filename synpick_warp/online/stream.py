@@ -8,6 +8,8 @@ It runs in the caller's process and starts no other (but CoACD's, while concave 
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from types import TracebackType
@@ -59,6 +61,7 @@ class ViewStream:
         self.device = stages.simulation.device
         # The generator must not refer to this object: without a cycle, the last reference frees the device's memory at once.
         self._batches: Iterator[ViewBatch] | None = _batches(producer)
+        self._simulation = weakref.ref(stages.simulation)
         self._ring: BatchRing | None = producer.ring
         self._stream = self.device.stream if self.device.is_cuda else None
         self._current: ViewBatch | None = None
@@ -102,6 +105,10 @@ class ViewStream:
             wp.synchronize_device(self.device)
         self._ring = None
         batches.close()  # type: ignore[attr-defined]
+        if self._simulation() is not None:
+            # Warp's code generation catches exceptions in cycles with their frames, and these hold all callers' variables: the worlds of
+            # a stream that compiled kernels. A full collection, which may be minutes away, frees them.
+            gc.collect()
 
     def __enter__(self) -> Self:
         return self
