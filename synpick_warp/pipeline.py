@@ -5,9 +5,8 @@ This is the one module that passes the whole `Config` on; stages take what they 
 
 from __future__ import annotations
 
-import contextlib
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -43,14 +42,13 @@ from synpick_warp.scheduling.worker import BakeLink
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
-from synpick_warp.stages.sim.simulate import RECORDS, Simulation
-from synpick_warp.stages.stream import FrameStream, LightTable, TickReader, TickReport, host_images, name_lights, tick_batch, view_sizes
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, host_images, name_lights, tick_batch, view_sizes
+from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device, pick_devices
 from synpick_warp.system.interrupt import StopRequest
 
-HIGH_PRIORITY = -1
-"""CUDA stream priority of physics: its 25,000 short kernels a tick wait for each other, and should not also wait for the renderer's."""
 _DEVICE_PROGRAM = "from synpick_warp.pipeline import generate_share; from synpick_warp.scheduling.worker import main; main(generate_share)"
 """Program of a device's process, where a bake uses several."""
 
@@ -288,50 +286,19 @@ class _Run:
         self.config, self.factory, self.exporters = config, factory, exporters
         self.commit, self.summary, self.progress = commit, summary, progress
         self.meter = ThroughputMeter(config, summary, progress)
-        device = factory.simulation.device
-        self.physics_stream = wp.Stream(device, priority=HIGH_PRIORITY) if device.is_cuda else None
 
     def run(self) -> None:
-        """Tick until no episode remains or a signal requests a stop.
-
-        Double-buffered: the device simulates the next tick on a stream of its own while this one is rendered, copied and read.
-        """
-        simulation = self.factory.simulation
-        readers = [TickReader(record) for record in simulation.records]
+        """Tick until no episode remains or a signal requests a stop."""
         self.progress.stage("compiling kernels, dropping objects")
-        with self.stop as stop, self._simulation_ended():
-            self._simulate(readers, 0)
-            current = 0
+        with self.stop as stop, TickLoop(self.factory.simulation) as ticks:
             while not stop.number:
-                following = (current + 1) % RECORDS
-                self._simulate(readers, following)
-                with scope("wait for tick"):
-                    report = readers[current].wait()
-                self._hand_over(report, simulation.records[current].snapshot)
+                report, snapshot = ticks.advance()
+                self._hand_over(report, snapshot)
                 phase = report.column("phase")
                 self.meter.show(int(np.isin(phase, (Phase.SETTLE, Phase.ACT)).sum()))
                 if (phase == Phase.IDLE).all():
                     return
-                current = following
         self.summary.stopped = stop.number
-
-    def _simulate(self, readers: list[TickReader], record: int) -> None:
-        """Enqueue a tick and its copy to the host."""
-        simulation = self.factory.simulation
-        with wp.ScopedStream(self.physics_stream):
-            with scope("simulate", simulation.device):
-                simulation.tick(simulation.records[record])
-            readers[record].start()
-
-    @contextlib.contextmanager
-    def _simulation_ended(self) -> Iterator[None]:
-        """Wait at the end for the tick that was simulated ahead: its arrays are freed by another stream."""
-        try:
-            yield
-        finally:
-            if self.physics_stream is not None:
-                with contextlib.suppress(RuntimeError):  # A failed device; the error that ends the loop tells it.
-                    wp.synchronize_stream(self.physics_stream)
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot) -> None:
         """Hand a tick's frames, views and episode ends to the exporters."""

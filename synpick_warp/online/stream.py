@@ -29,9 +29,8 @@ from synpick_warp.progress import Progress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
-from synpick_warp.stages.sim.simulate import RECORDS
-from synpick_warp.stages.stream import TickReader, TickReport, describe_views
-from synpick_warp.stages.timing import scope
+from synpick_warp.stages.stream import TickReport, describe_views
+from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.device import pick_device
 
 DEVICE_ONLY = 0
@@ -41,8 +40,8 @@ DEVICE_ONLY = 0
 class ViewStream:
     """Iterator over batches of views. Each batch is valid until the next one is requested.
 
-    On a GPU the batch after the one handed out is queued already, and with it the next tick of all worlds, so that the GPU is busy while
-    the consumer works; nothing else is made ahead. On the CPU a batch is made when it is requested.
+    On a GPU the batch after the one handed out is queued already, and the next tick of all worlds, on a stream of its own beside the
+    rendering, so that the GPU is busy while the consumer works; nothing else is made ahead. On the CPU a batch is made on request.
 
     A stream that is left early, by `break`, an error or `close`, frees its worlds and buffers; arrays that another library has imported
     live on as long as that library keeps them.
@@ -134,22 +133,15 @@ class Producer:
     def batches(self) -> Iterator[ViewBatch]:
         """Render until no episode remains; a batch must have expired before its slot's turn comes again.
 
-        Double-buffered as a bake: the device simulates the next tick before it renders this one.
+        As in a bake, the device simulates the next tick while it renders this one.
         """
-        records = self.stages.simulation.records
-        readers = [TickReader(record) for record in records]
-        self._simulate(readers, 0)
-        current = 0
-        while True:
-            following = (current + 1) % RECORDS
-            self._simulate(readers, following)
-            with scope("wait for tick"):
-                report = readers[current].wait()
-            yield from self.render(report, records[current].snapshot)
-            self._end_episodes(report)
-            if (report.column("phase") == Phase.IDLE).all():
-                return
-            current = following
+        with TickLoop(self.stages.simulation) as ticks:
+            while True:
+                report, snapshot = ticks.advance()
+                yield from self.render(report, snapshot)
+                self._end_episodes(report)
+                if (report.column("phase") == Phase.IDLE).all():
+                    return
 
     def render(self, report: TickReport, snapshot: Snapshot) -> Iterator[ViewBatch]:
         """Render the selected views of a tick, world by world and camera by camera."""
@@ -162,13 +154,6 @@ class Producer:
             host = describe_views(report, world[part], camera[part], stages.tick_time, self.object_ids, stages.light_table)
             host["arrangement"] = report.column("arrangement")[world[part]]
             yield self.ring.render(snapshot, world[part], camera[part], host)
-
-    def _simulate(self, readers: list[TickReader], record: int) -> None:
-        """Enqueue a tick and the copy of its report."""
-        simulation = self.stages.simulation
-        with scope("simulate", simulation.device):
-            simulation.tick(simulation.records[record])
-        readers[record].start()
 
     def _end_episodes(self, report: TickReport) -> None:
         """Add the episodes that ended in a tick to the summary."""
