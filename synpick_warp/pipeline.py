@@ -5,6 +5,7 @@ This is the one module that passes the whole `Config` on; stages take what they 
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ import warp as wp
 
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.codes import Phase
+from synpick_warp.compilation import compile_launches, is_compiled
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.dataset.digests import digest_inputs
@@ -28,7 +30,7 @@ from synpick_warp.exporters.registry import Exporters, aborting, load_exporter_c
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
 from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
-from synpick_warp.progress import Progress
+from synpick_warp.progress import Progress, SilentProgress
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
@@ -118,6 +120,45 @@ def build_factory(
     writers = count_writers(config)
     config = fit_to_device(config, device, planned, writers, processes)
     check_memory(config, device, writers, processes)
+    renders = any(kind.needs_views for kind in load_exporter_classes(config.bake.formats))
+    compile_if_cold(config, device, progress, records_physics, needs_images, renders)
+    return _assemble(config, device, progress, episodes, records_physics, needs_images)
+
+
+def compile_if_cold(
+    config: Config,
+    device: wp.Device,
+    progress: Progress,
+    records_physics: bool = False,
+    needs_images: bool = True,
+    renders: bool = True,
+) -> None:
+    """Compile the kernels of a bake, beside each other, where the cache has none.
+
+    Args:
+        config, device, progress, records_physics, needs_images: As of `build_factory`.
+        renders: Whether views are rendered.
+    """
+    if is_compiled(device):
+        return
+    progress.stage("compiling kernels of the assets")
+    factory = build_smallest(config, device, SilentProgress(), records_physics, needs_images)
+    compile_launches(factory.simulation, factory.stream if renders else None, progress)
+    del factory
+    gc.collect()  # Tracebacks that Warp's code generation leaves hold frames, and these its arrays.
+
+
+def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
+    """The factory of as few worlds as the device simulates, and of a view a batch; arguments and errors as of `build_factory`."""
+    config = replace(config, bake=replace(config.bake, worlds=1), render=replace(config.render, views_per_batch=1))
+    config = fit_to_device(config, device, 1, count_writers(config))
+    return _assemble(config, device, progress, [0], records_physics, needs_images)
+
+
+def _assemble(
+    config: Config, device: wp.Device, progress: Progress, episodes: Sequence[int] | None, records_physics: bool, needs_images: bool
+) -> Factory:
+    """Build the stages; arguments as of `build_factory`, for settings by `fit_to_device`."""
     stages = build_stages(config, device, progress, episodes, records_physics)
     depth_files = any(kind.writes_depth for kind in load_exporter_classes(config.bake.formats))
     host = host_images(config, device, needs_images, depth_files)
@@ -289,7 +330,7 @@ class _Run:
 
     def run(self) -> None:
         """Tick until no episode remains or a signal requests a stop."""
-        self.progress.stage("compiling kernels, dropping objects")
+        self.progress.stage("loading kernels, dropping objects")
         with self.stop as stop, TickLoop(self.factory.simulation) as ticks:
             while not stop.number:
                 report, snapshot = ticks.advance()

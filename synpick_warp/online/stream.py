@@ -24,7 +24,7 @@ from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.errors import ConfigError
 from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
 from synpick_warp.online.selection import Selection, choose_episodes
-from synpick_warp.pipeline import Stages, build_stages
+from synpick_warp.pipeline import Stages, build_stages, compile_if_cold
 from synpick_warp.progress import Progress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
@@ -65,7 +65,7 @@ class ViewStream:
         self._stream = self.device.stream if self.device.is_cuda else None
         self._current: ViewBatch | None = None
         self._ahead: ViewBatch | None = None
-        producer.progress.stage("compiling kernels, dropping objects")
+        producer.progress.stage("loading kernels, dropping objects")
 
     def __iter__(self) -> Self:
         return self
@@ -192,6 +192,7 @@ def open_stream(
     config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
     check_memory(config, device, DEVICE_ONLY)
     with explain_shortage(config):
+        compile_if_cold(config, device, progress)
         stages = build_stages(config, device, progress, indices)
         ring = BatchRing(stages.sizes, config.render.layers, stages.renderer, config.bop.depth_scale)
     return ViewStream(Producer(stages, ring, selection, BakeSummary(len(indices)), progress))

@@ -15,6 +15,7 @@ import pytest
 import warp as wp
 
 import synpick_warp
+from synpick_warp import pipeline
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.errors import ConfigError
 from synpick_warp.layer_codec import decode_layer, encode_layer
@@ -114,6 +115,11 @@ def test_what_the_host_knows_is_what_the_device_has(streamed):
 def test_neither_worlds_nor_batches_change_a_view(streamed, worlds, batch):
     with synpick_warp.stream(settings(**LAYERED), worlds=worlds, batch=batch) as stream:
         equal(taken(stream), streamed[0])
+
+
+def test_kernels_that_are_compiled_ahead_change_nothing(streamed, monkeypatch):
+    monkeypatch.setattr(pipeline, "is_compiled", lambda device: False)
+    equal(taken(synpick_warp.stream(settings(**LAYERED))), streamed[0])
 
 
 def test_what_is_left_out_changes_nothing_in_the_rest(streamed):
