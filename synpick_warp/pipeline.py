@@ -49,6 +49,7 @@ from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, host
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device, pick_devices
+from synpick_warp.system.garbage import collection_paused
 from synpick_warp.system.interrupt import StopRequest
 
 _DEVICE_PROGRAM = "from synpick_warp.pipeline import generate_share; from synpick_warp.scheduling.worker import main; main(generate_share)"
@@ -168,6 +169,7 @@ def _assemble(
     return Factory(stages.catalog, stages.cameras, stages.lights, stages.simulation, stream, stages.make_log())
 
 
+@collection_paused()
 def build_stages(
     config: Config, device: wp.Device, progress: Progress, episodes: Sequence[int] | None = None, records_physics: bool = False
 ) -> Stages:
