@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from synpick_warp.errors import CatalogError, ConfigError, DatasetError, DeviceError, LightError, OutputError, SynpickError
+from synpick_warp.system.garbage import collection_paused
 
 if TYPE_CHECKING:
     from synpick_warp.configs.schema import Config
@@ -71,9 +72,10 @@ def bake(
         SynpickError: An error that the user can correct. Committed episodes stay, and the same call resumes the bake.
         TypeError: `settings` beside a finished `Config`.
     """
-    from synpick_warp.configs.schema import Config
-    from synpick_warp.pipeline import run_bake
-    from synpick_warp.progress import SilentProgress
+    with collection_paused():
+        from synpick_warp.configs.schema import Config
+        from synpick_warp.pipeline import run_bake
+        from synpick_warp.progress import SilentProgress
 
     if not isinstance(config, Config):
         config = load_config(config, settings, splits=bool(splits))
@@ -126,9 +128,10 @@ def stream(
     Raises:
         SynpickError: An error that the user can correct, before the first batch or while one is made.
     """
-    from synpick_warp.online.settings import resolve_settings
-    from synpick_warp.online.stream import Selection, open_stream
-    from synpick_warp.progress import SilentProgress
+    with collection_paused():
+        from synpick_warp.online.settings import resolve_settings
+        from synpick_warp.online.stream import Selection, open_stream
+        from synpick_warp.progress import SilentProgress
 
     given = {"worlds": worlds, "device": device, "seed": seed, "mode": mode, "models": models, "lights": lights}
     given |= {"resolution": resolution, "layers": layers, "batch": batch}

@@ -5,7 +5,7 @@ This is the one module that passes the whole `Config` on; stages take what they 
 
 from __future__ import annotations
 
-import contextlib
+import gc
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +17,7 @@ import warp as wp
 
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.codes import Phase
+from synpick_warp.compilation import compile_launches, is_compiled
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.dataset.digests import digest_inputs
@@ -29,7 +30,7 @@ from synpick_warp.exporters.registry import Exporters, aborting, load_exporter_c
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch
 from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
-from synpick_warp.progress import Progress
+from synpick_warp.progress import Progress, SilentProgress
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
@@ -44,14 +45,14 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import host_images
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
-from synpick_warp.stages.sim.simulate import RECORDS, Simulation
-from synpick_warp.stages.stream import FrameStream, LightTable, TickReader, TickReport, name_lights, tick_batch, view_sizes
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, tick_batch, view_sizes
+from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device, pick_devices
+from synpick_warp.system.garbage import collection_paused
 from synpick_warp.system.interrupt import StopRequest
 
-HIGH_PRIORITY = -1
-"""CUDA stream priority of physics: its 25,000 short kernels a tick wait for each other, and should not also wait for the renderer's."""
 _DEVICE_PROGRAM = "from synpick_warp.pipeline import generate_share; from synpick_warp.scheduling.worker import main; main(generate_share)"
 """Program of a device's process, where a bake uses several."""
 
@@ -121,6 +122,45 @@ def build_factory(
     writers = count_writers(config)
     config = fit_to_device(config, device, planned, writers, processes)
     check_memory(config, device, writers, processes)
+    renders = any(kind.needs_views for kind in load_exporter_classes(config.bake.formats))
+    compile_if_cold(config, device, progress, records_physics, needs_images, renders)
+    return _assemble(config, device, progress, episodes, records_physics, needs_images)
+
+
+def compile_if_cold(
+    config: Config,
+    device: wp.Device,
+    progress: Progress,
+    records_physics: bool = False,
+    needs_images: bool = True,
+    renders: bool = True,
+) -> None:
+    """Compile the kernels of a bake, beside each other, where the cache has none.
+
+    Args:
+        config, device, progress, records_physics, needs_images: As of `build_factory`.
+        renders: Whether views are rendered.
+    """
+    if is_compiled(device):
+        return
+    progress.stage("compiling kernels of the assets")
+    factory = build_smallest(config, device, SilentProgress(), records_physics, needs_images)
+    compile_launches(factory.simulation, factory.stream if renders else None, progress)
+    del factory
+    gc.collect()  # Tracebacks that Warp's code generation leaves hold frames, and these its arrays.
+
+
+def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
+    """The factory of as few worlds as the device simulates, and of a view a batch; arguments and errors as of `build_factory`."""
+    config = replace(config, bake=replace(config.bake, worlds=1), render=replace(config.render, views_per_batch=1))
+    config = fit_to_device(config, device, 1, count_writers(config))
+    return _assemble(config, device, progress, [0], records_physics, needs_images)
+
+
+def _assemble(
+    config: Config, device: wp.Device, progress: Progress, episodes: Sequence[int] | None, records_physics: bool, needs_images: bool
+) -> Factory:
+    """Build the stages; arguments as of `build_factory`, for settings by `fit_to_device`."""
     stages = build_stages(config, device, progress, episodes, records_physics)
     depth_files = any(kind.writes_depth for kind in load_exporter_classes(config.bake.formats))
     host = host_images(config, device, needs_images, depth_files)
@@ -130,6 +170,7 @@ def build_factory(
     return Factory(stages.catalog, stages.cameras, stages.lights, stages.simulation, stream, stages.make_log())
 
 
+@collection_paused()
 def build_stages(
     config: Config, device: wp.Device, progress: Progress, episodes: Sequence[int] | None = None, records_physics: bool = False
 ) -> Stages:
@@ -289,49 +330,20 @@ class _Run:
         self.config, self.factory, self.exporters = config, factory, exporters
         self.commit, self.summary, self.progress = commit, summary, progress
         self.meter = ThroughputMeter(config, summary, progress)
-        device = factory.simulation.device
-        self.physics_stream = wp.Stream(device, priority=HIGH_PRIORITY) if device.is_cuda else None
 
     def run(self) -> None:
-        """Tick until no episode remains or a signal requests a stop.
-
-        Double-buffered: the device simulates the next tick on a stream of its own while this one is rendered, copied and read.
-        """
-        simulation = self.factory.simulation
-        readers = [TickReader(record) for record in simulation.records]
-        self.progress.stage("compiling kernels, dropping objects")
-        with self.stop as stop, self._simulation_ended():
-            self._simulate(readers, 0)
-            current, done = 0, False
+        """Tick until no episode remains or a signal requests a stop."""
+        self.progress.stage("loading kernels, dropping objects")
+        done = False
+        with self.stop as stop, TickLoop(self.factory.simulation) as ticks:
             while not (done or stop.number):
-                following = (current + 1) % RECORDS
-                self._simulate(readers, following)
-                with scope("wait for tick"):
-                    report = readers[current].wait()
-                self._hand_over(report, simulation.records[current].snapshot)
+                report, snapshot = ticks.advance()
+                self._hand_over(report, snapshot)
                 phase = report.column("phase")
                 self.meter.show(int(np.isin(phase, (Phase.SETTLE, Phase.ACT)).sum()))
-                current, done = following, bool((phase == Phase.IDLE).all())
+                done = bool((phase == Phase.IDLE).all())
             self._write(self.factory.stream.drain())
         self.summary.stopped = 0 if done else stop.number
-
-    def _simulate(self, readers: list[TickReader], record: int) -> None:
-        """Enqueue a tick and its copy to the host."""
-        simulation = self.factory.simulation
-        with wp.ScopedStream(self.physics_stream):
-            with scope("simulate", simulation.device):
-                simulation.tick(simulation.records[record])
-            readers[record].start()
-
-    @contextlib.contextmanager
-    def _simulation_ended(self) -> Iterator[None]:
-        """Wait at the end for the tick that was simulated ahead: its arrays are freed by another stream."""
-        try:
-            yield
-        finally:
-            if self.physics_stream is not None:
-                with contextlib.suppress(RuntimeError):  # A failed device; the error that ends the loop tells it.
-                    wp.synchronize_stream(self.physics_stream)
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot) -> None:
         """Hand a tick's frames to the exporters, launch its views, and hand over those that are ready, with the ends of episodes."""

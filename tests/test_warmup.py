@@ -9,7 +9,9 @@ import warp as wp
 
 from synpick_warp import pipeline, warmup
 from synpick_warp.cli.commands import main
+from synpick_warp.compilation import launch_all
 from synpick_warp.progress import SilentProgress
+from synpick_warp.system.kernels import DryLaunches, Variant
 from tests.worlds.small_worlds import catalog, settings
 
 
@@ -27,23 +29,41 @@ def test_a_warm_up_loads_the_kernels_of_all_stages(monkeypatch):
         return launch(kernel, *arguments, **options)
 
     monkeypatch.setattr(wp, "launch", record)
-    result = warmup.warm_up(settings(bake__mode="pick", cameras__resolution=[32, 18], perception__resolution=[64, 36]), SilentProgress())
+    config = settings(bake__mode="pick", cameras__resolution=[32, 18], perception__resolution=[64, 36])
+    result = warmup.warm_up(config, SilentProgress())
     rooms = {name.split(".")[2] for name in loaded if name.startswith("synpick_warp.kernels.")}
     assert rooms >= {"sim", "perception", "render", "encoding"}
     assert result.compiled >= 0
     assert result.seconds > 0.0
 
 
-def test_compiled_modules_are_counted(tmp_path, monkeypatch):
-    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
-    (tmp_path / "wp_old").mkdir()
-    (tmp_path / "wp_old" / "old.o").touch()
-    watch = warmup.CompilationWatch(SilentProgress())
-    with watch:
-        (tmp_path / "wp_new").mkdir()
-        (tmp_path / "wp_new" / "new.cubin").touch()
-        (tmp_path / "wp_new" / "new.meta").touch()
-    assert watch.compiled == 1
+def test_dry_launches_find_all_that_a_warm_up_loads(device):
+    """What launches for real load afterwards has been found before, whatever the cache holds."""
+    config = settings(bake__mode="pick", cameras__resolution=[32, 18], perception__resolution=[64, 36])
+    factory = pipeline.build_smallest(config, device, SilentProgress(), False, True)
+    found = []
+    for _ in range(2):
+        with DryLaunches() as dry:
+            launch_all(factory.simulation, factory.stream)
+        factory.simulation.forget_graphs()
+        found.append(set(dry.variants))
+        launch_all(factory.simulation, factory.stream)
+        factory.simulation.forget_graphs()
+    assert found[0] == found[1]
+    assert all(variant.is_cached() for variant in found[0])
+
+
+def test_a_cold_start_says_how_many_modules_it_compiles(monkeypatch):
+    """The dry launches of a cold bake find modules to compile; here the compiler is not called."""
+    stages = []
+    monkeypatch.setattr(pipeline, "is_compiled", lambda device: False)
+    monkeypatch.setattr(Variant, "is_cached", lambda self: self.module.name != "synpick_warp.kernels.sim.snapshot")
+    progress = SilentProgress()
+    monkeypatch.setattr(progress, "stage", stages.append, raising=False)
+    config = settings(cameras__resolution=[32, 18])
+    pipeline.build_factory(config, progress, [0])
+    assert stages[:3] == ["compiling kernels of the assets", *(f"compiling kernels: {ready} of 1 modules" for ready in (0, 1))]
+    assert stages[3] == "loading objects and lights"
 
 
 def test_the_command_says_what_it_did(tmp_path, monkeypatch, capsys):

@@ -26,6 +26,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
+from synpick_warp.system.garbage import collection_paused
 
 NAME = "synpick-warp"
 EXIT_INCOMPLETE = 1
@@ -370,9 +371,10 @@ def _check_inputs(config: Config) -> None:
 
 def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[str], devices: Sequence[str] = ()) -> int:
     """Check device and folders, which is cheap, then bake."""
-    from synpick_warp.cli.display import make_console, make_progress, print_summary
-    from synpick_warp.exporters.writing.files import check_output_folder
-    from synpick_warp.system.device import pick_device, pick_devices
+    with collection_paused():
+        from synpick_warp.cli.display import make_console, make_progress, print_summary
+        from synpick_warp.exporters.writing.files import check_output_folder
+        from synpick_warp.system.device import pick_device, pick_devices
 
     if devices:
         devices = pick_devices(devices)
@@ -380,7 +382,8 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
         pick_device(config.bake.device)
     _check_inputs(config)
     check_output_folder(out)
-    from synpick_warp.pipeline import run_bake
+    with collection_paused():
+        from synpick_warp.pipeline import run_bake
 
     console = make_console()
     with make_progress(console) as progress:

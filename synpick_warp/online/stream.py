@@ -8,6 +8,8 @@ It runs in the caller's process and starts no other (but CoACD's, while concave 
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from types import TracebackType
@@ -22,14 +24,13 @@ from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.errors import ConfigError
 from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
 from synpick_warp.online.selection import Selection, choose_episodes
-from synpick_warp.pipeline import Stages, build_stages
+from synpick_warp.pipeline import Stages, build_stages, compile_if_cold
 from synpick_warp.progress import Progress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
-from synpick_warp.stages.sim.simulate import RECORDS
-from synpick_warp.stages.stream import TickReader, TickReport, describe_views
-from synpick_warp.stages.timing import scope
+from synpick_warp.stages.stream import TickReport, describe_views
+from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.device import pick_device
 
 DEVICE_ONLY = 0
@@ -39,8 +40,8 @@ DEVICE_ONLY = 0
 class ViewStream:
     """Iterator over batches of views. Each batch is valid until the next one is requested.
 
-    On a GPU the batch after the one handed out is queued already, and with it the next tick of all worlds, so that the GPU is busy while
-    the consumer works; nothing else is made ahead. On the CPU a batch is made when it is requested.
+    On a GPU the batch after the one handed out is queued already, and the next tick of all worlds, on a stream of its own beside the
+    rendering, so that the GPU is busy while the consumer works; nothing else is made ahead. On the CPU a batch is made on request.
 
     A stream that is left early, by `break`, an error or `close`, frees its worlds and buffers; arrays that another library has imported
     live on as long as that library keeps them.
@@ -59,11 +60,12 @@ class ViewStream:
         self.device = stages.simulation.device
         # The generator must not refer to this object: without a cycle, the last reference frees the device's memory at once.
         self._batches: Iterator[ViewBatch] | None = _batches(producer)
+        self._simulation = weakref.ref(stages.simulation)
         self._ring: BatchRing | None = producer.ring
         self._stream = self.device.stream if self.device.is_cuda else None
         self._current: ViewBatch | None = None
         self._ahead: ViewBatch | None = None
-        producer.progress.stage("compiling kernels, dropping objects")
+        producer.progress.stage("loading kernels, dropping objects")
 
     def __iter__(self) -> Self:
         return self
@@ -102,6 +104,10 @@ class ViewStream:
             wp.synchronize_device(self.device)
         self._ring = None
         batches.close()  # type: ignore[attr-defined]
+        if self._simulation() is not None:
+            # Warp's code generation catches exceptions in cycles with their frames, and these hold all callers' variables: the worlds of
+            # a stream that compiled kernels. A full collection, which may be minutes away, frees them.
+            gc.collect()
 
     def __enter__(self) -> Self:
         return self
@@ -127,22 +133,15 @@ class Producer:
     def batches(self) -> Iterator[ViewBatch]:
         """Render until no episode remains; a batch must have expired before its slot's turn comes again.
 
-        Double-buffered as a bake: the device simulates the next tick before it renders this one.
+        As in a bake, the device simulates the next tick while it renders this one.
         """
-        records = self.stages.simulation.records
-        readers = [TickReader(record) for record in records]
-        self._simulate(readers, 0)
-        current = 0
-        while True:
-            following = (current + 1) % RECORDS
-            self._simulate(readers, following)
-            with scope("wait for tick"):
-                report = readers[current].wait()
-            yield from self.render(report, records[current].snapshot)
-            self._end_episodes(report)
-            if (report.column("phase") == Phase.IDLE).all():
-                return
-            current = following
+        with TickLoop(self.stages.simulation) as ticks:
+            while True:
+                report, snapshot = ticks.advance()
+                yield from self.render(report, snapshot)
+                self._end_episodes(report)
+                if (report.column("phase") == Phase.IDLE).all():
+                    return
 
     def render(self, report: TickReport, snapshot: Snapshot) -> Iterator[ViewBatch]:
         """Render the selected views of a tick, world by world and camera by camera."""
@@ -155,13 +154,6 @@ class Producer:
             host = describe_views(report, world[part], camera[part], stages.tick_time, self.object_ids, stages.light_table)
             host["arrangement"] = report.column("arrangement")[world[part]]
             yield self.ring.render(snapshot, world[part], camera[part], host)
-
-    def _simulate(self, readers: list[TickReader], record: int) -> None:
-        """Enqueue a tick and the copy of its report."""
-        simulation = self.stages.simulation
-        with scope("simulate", simulation.device):
-            simulation.tick(simulation.records[record])
-        readers[record].start()
 
     def _end_episodes(self, report: TickReport) -> None:
         """Add the episodes that ended in a tick to the summary."""
@@ -200,6 +192,7 @@ def open_stream(
     config = fit_to_device(config, device, len(indices), DEVICE_ONLY)
     check_memory(config, device, DEVICE_ONLY)
     with explain_shortage(config):
+        compile_if_cold(config, device, progress)
         stages = build_stages(config, device, progress, indices)
         ring = BatchRing(stages.sizes, config.render.layers, stages.renderer, config.bop.depth_scale)
     return ViewStream(Producer(stages, ring, selection, BakeSummary(len(indices)), progress))

@@ -15,10 +15,13 @@ import pytest
 import warp as wp
 
 import synpick_warp
+from synpick_warp import pipeline
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.errors import ConfigError
 from synpick_warp.layer_codec import decode_layer, encode_layer
 from synpick_warp.online import stream as online
+from synpick_warp.stages.sim.simulate import Simulation, TickRecord
+from synpick_warp.stages.stream import TickReader
 from tests.harness.environment import checkout_environment
 from tests.online.conftest import LAYERED, tiny
 from tests.worlds.small_worlds import QUICK, settings
@@ -114,6 +117,11 @@ def test_neither_worlds_nor_batches_change_a_view(streamed, worlds, batch):
         equal(taken(stream), streamed[0])
 
 
+def test_kernels_that_are_compiled_ahead_change_nothing(streamed, monkeypatch):
+    monkeypatch.setattr(pipeline, "is_compiled", lambda device: False)
+    equal(taken(synpick_warp.stream(settings(**LAYERED))), streamed[0])
+
+
 def test_what_is_left_out_changes_nothing_in_the_rest(streamed):
     views, _ = streamed
     some = taken(synpick_warp.stream(settings(**LAYERED), cameras=(2, 0), stride=3, episodes=range(1, 9), shard=(1, 8)))
@@ -192,6 +200,26 @@ def test_nothing_is_left_of_a_stream(end):
         gc.enable()
 
 
+def test_worlds_are_freed_where_a_traceback_holds_the_frames(monkeypatch):
+    """As Warp's code generation leaves them: exceptions in cycles with the frames that caught them, whose callers are the tick loop."""
+    tick = Simulation.tick
+
+    def compile_and_tick(simulation: Simulation, record: TickRecord) -> None:
+        try:
+            raise KeyError("a name to be looked up elsewhere")
+        except KeyError as error:
+            kept = error  # noqa: F841  # The error's traceback holds this frame, whose variable holds the error.
+        tick(simulation, record)
+
+    monkeypatch.setattr(Simulation, "tick", compile_and_tick)
+    gc.collect()
+    gc.disable()
+    try:
+        assert [ref() for ref in leave("break")] == [None] * 4
+    finally:
+        gc.enable()
+
+
 def leave(end: str) -> tuple[weakref.ref, ...]:
     """Open a stream and leave it; references to what it held."""
     stream = synpick_warp.stream(tiny(bake__episodes=1), worlds=1)
@@ -233,7 +261,7 @@ def test_a_failure_while_a_batch_is_made_ends_the_stream(monkeypatch):
     def fail(*_: object) -> None:
         raise RuntimeError("Failed to allocate 1 bytes on device 'cpu'")
 
-    monkeypatch.setattr(online.TickReader, "wait", fail)
+    monkeypatch.setattr(TickReader, "wait", fail)
     with pytest.raises(ConfigError, match="ran out of memory"):
         for _ in stream:
             pass

@@ -3,7 +3,6 @@ rendering."""
 
 from __future__ import annotations
 
-import itertools
 import time
 from collections.abc import Callable, Iterator
 
@@ -20,8 +19,8 @@ from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.view_setup import make_views
-from synpick_warp.stages.sim.simulate import RECORDS
-from synpick_warp.stages.stream import TickReader, TickReport, view_sizes
+from synpick_warp.stages.stream import TickReport, view_sizes
+from synpick_warp.stages.ticks import TickLoop
 from tools.bench.physics import Row
 
 ROUNDS = 5
@@ -143,15 +142,10 @@ def _count(source: Iterator[int], device: wp.Device, min_seconds: float) -> tupl
 
 def _tick_loop(stages: Stages, ring: BatchRing) -> Iterator[int]:
     """Simulate and render, tick by tick as a bake does, into one buffer; yields the number of views of each batch."""
-    simulation = stages.simulation
-    readers = [TickReader(record) for record in simulation.records]
-    for tick in itertools.count(1):
-        current, following = (tick - 1) % RECORDS, tick % RECORDS
-        for record in (current, following) if tick == 1 else (following,):
-            simulation.tick(simulation.records[record])
-            readers[record].start()
-        report = readers[current].wait()
-        if (report.column("phase") == Phase.IDLE).all():
-            return
-        world, camera = _select(stages, report)
-        yield from _render_all(stages, ring, simulation.records[current].snapshot, world, camera)
+    with TickLoop(stages.simulation) as ticks:
+        while True:
+            report, snapshot = ticks.advance()
+            if (report.column("phase") == Phase.IDLE).all():
+                return
+            world, camera = _select(stages, report)
+            yield from _render_all(stages, ring, snapshot, world, camera)

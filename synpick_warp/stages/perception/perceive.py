@@ -71,6 +71,11 @@ class Perception:
             self._graphs[id(snapshot)] = capture.graph
         wp.capture_launch(self._graphs[id(snapshot)])
 
+    def forget_graphs(self) -> None:
+        """Drop the captured graphs; the next call loads all kernels, and captures them anew."""
+        self._graphs.clear()
+        self._warm = False
+
     def load_kernels(self, snapshot: Snapshot) -> None:
         """Launch one batch, which loads all kernels, even if the worklist is empty."""
         self.list_worlds()

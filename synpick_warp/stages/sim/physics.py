@@ -167,6 +167,10 @@ class Physics:
             if busy:
                 self._graphs.append(capture.graph)
 
+    def forget_graph(self) -> None:
+        """Drop the captured graph; the next tick runs eagerly, and captures it anew."""
+        self._graph = None
+
     def flag_lost_pairs(self) -> None:
         """Flag worlds whose broad-phase pairs overflowed: Newton drops these pairs silently, while its solver flags contacts and rows."""
         wp.launch(

@@ -129,6 +129,12 @@ class Simulation:
                 _copy(record.observation, self.observation)
                 _copy(record.plan, self.plan)
 
+    def forget_graphs(self) -> None:
+        """Drop captured graphs: the next tick launches all kernels one by one, and captures them anew."""
+        self.physics.forget_graph()
+        if self.perception is not None:
+            self.perception.forget_graphs()
+
     def _arrange(self) -> None:
         """Start episodes in free worlds: objects are sampled and dropped."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed

@@ -1,0 +1,96 @@
+"""Compilation of kernels ahead of their launches: dry launches list the modules that they need, and threads compile these.
+
+Warp compiles a module when one of its kernels is first launched, one after the other. Listed first, their number is known. Warp generates
+code under a lock; compilers run beside each other.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import warp as wp
+
+MAX_COMPILERS = 8
+"""Maximum number of compiling threads: the longest module of a bake takes a quarter of all, so that more gain little."""
+BINARIES = ("*.cubin", "*.ptx", "*.o")
+"""Compiled modules in Warp's kernel cache."""
+
+
+def list_binaries() -> set[tuple[Path, int]]:
+    """Paths and modification times [ns] of all compiled modules in the kernel cache."""
+    found = (path for pattern in BINARIES for path in Path(wp.config.kernel_cache_dir or "").glob(f"*/{pattern}"))
+    return {(path, path.stat().st_mtime_ns) for path in found if path.exists()}
+
+
+class Variant(NamedTuple):
+    """A module as it is compiled for a device and a block size."""
+
+    module: wp.Module
+    device: str
+    block: int
+
+    def is_cached(self) -> bool:
+        """Whether the kernel cache has it."""
+        folder = Path(wp.config.kernel_cache_dir or "", self.module.get_module_identifier(self.block))
+        return any(True for pattern in BINARIES for _ in folder.glob(pattern))
+
+
+def variant_of(kernel: Any, device: wp.Device) -> Variant:
+    """The variant that a launch of a kernel with the default block size loads."""
+    return Variant(kernel.module, device.alias, kernel.module.options["block_dim"] if device.is_cuda else 1)
+
+
+class DryLaunches:
+    """Context manager in which launches of kernels load and run nothing, in all threads; copies and fills do run.
+
+    Attributes:
+        variants: Modules that the launches would have loaded, in the order of their first launch.
+    """
+
+    def __init__(self) -> None:
+        self.variants: dict[Variant, None] = {}
+        self._load: Any = None
+
+    def __enter__(self) -> Self:
+        self._load, variants = wp.Module.load, self.variants
+
+        def record(module: wp.Module, device: Any, block_dim: int | None = None, *_: object, **__: object) -> None:
+            block = module.options["block_dim"] if block_dim is None else block_dim
+            variants[Variant(module, wp.get_device(device).alias, block)] = None
+
+        wp.Module.load = record  # type: ignore[method-assign]
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        wp.Module.load = self._load  # type: ignore[method-assign]
+
+
+def compile_modules(variants: Collection[Variant], report: Callable[[int, int], None]) -> int:
+    """Compile and load the modules that are not in the kernel cache, in threads.
+
+    Args:
+        variants: The modules; those that the cache has are left for their first launch to load.
+        report: Called in this thread with the number of modules that are ready, from 0 on, and that of all to compile, if there are any.
+
+    Returns:
+        The number of compiled modules.
+    """
+    missing = [variant for variant in variants if not variant.is_cached()]
+    if not missing:
+        return 0
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with ThreadPoolExecutor(min(len(missing), cores, MAX_COMPILERS), thread_name_prefix="compile") as pool:
+        report(0, len(missing))
+        try:
+            for ready, done in enumerate(as_completed([pool.submit(one.module.load, one.device, one.block) for one in missing]), 1):
+                done.result()
+                report(ready, len(missing))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return len(missing)

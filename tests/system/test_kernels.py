@@ -1,0 +1,77 @@
+"""Compilation ahead of launches: dry launches run nothing and name modules; these are compiled once, in threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+
+from synpick_warp.system import kernels
+from synpick_warp.system.kernels import DryLaunches, Variant, compile_modules, variant_of
+
+MODULES = 3
+
+
+def make_kernel(factor: float) -> wp.Kernel:
+    """A kernel in a module of its own."""
+    constant = wp.constant(factor)
+
+    @wp.kernel(module="unique")
+    def scale_kernel(values: wp.array[float]):
+        values[wp.tid()] *= constant
+
+    return scale_kernel
+
+
+@pytest.fixture
+def empty_cache(tmp_path, monkeypatch):
+    """A kernel cache of this test's own."""
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path))
+    return tmp_path
+
+
+def test_dry_launches_run_nothing_and_list_what_they_would_load(device, empty_cache):
+    scale = make_kernel(3.0)
+    values = wp.ones(4, dtype=float, device=device)
+    load = wp.Module.load
+    with DryLaunches() as dry:
+        for block in (64, 128, 64):
+            wp.launch(scale, dim=4, inputs=[values], device=device, block_dim=block)
+        wp.launch(scale, dim=4, inputs=[values], device=device)
+    assert wp.Module.load is load
+    np.testing.assert_array_equal(values.numpy(), 1.0)
+    blocks = (64, 128, 256) if device.is_cuda else (1,)
+    assert list(dry.variants) == [Variant(scale.module, device.alias, block) for block in blocks]
+    assert variant_of(scale, device) == list(dry.variants)[-1]
+    assert list(empty_cache.iterdir()) == []
+    wp.launch(scale, dim=4, inputs=[values], device=device)
+    np.testing.assert_array_equal(values.numpy(), 3.0)
+
+
+def test_modules_that_the_cache_lacks_are_compiled_once_and_counted(device, empty_cache):
+    scales = [make_kernel(5.0 + index) for index in range(MODULES)]
+    variants = [variant_of(scale, device) for scale in scales]
+    assert not any(variant.is_cached() for variant in variants)
+    reports = []
+    assert compile_modules(variants, lambda *counts: reports.append(counts)) == MODULES
+    assert reports == [(ready, MODULES) for ready in range(MODULES + 1)]
+    assert all(variant.is_cached() for variant in variants)
+    binaries = kernels.list_binaries()
+    assert len(binaries) == MODULES
+    assert compile_modules(variants, lambda *counts: reports.append(counts)) == 0
+    values = wp.ones(4, dtype=float, device=device)
+    for scale in scales:
+        wp.launch(scale, dim=4, inputs=[values], device=device)
+    np.testing.assert_array_equal(values.numpy(), 5.0 * 6.0 * 7.0)
+    assert (len(reports), kernels.list_binaries()) == (MODULES + 1, binaries)
+
+
+def test_a_compiler_that_fails_is_told(device, empty_cache, monkeypatch):
+    variants = [variant_of(make_kernel(9.0 + index), device) for index in range(MODULES)]
+
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("no space left")
+
+    monkeypatch.setattr(wp.Module, "load", fail)
+    with pytest.raises(RuntimeError, match="no space left"):
+        compile_modules(variants, lambda *_: None)
