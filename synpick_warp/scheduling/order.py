@@ -19,8 +19,13 @@ EXPECTED_FRAMES = {Mode.TARGET: 638, Mode.PICK: 502, Mode.MOVE: 416}
 """Mean frames of an episode: tools/README.md, "Picking", and for MOVE those of the paper's data set."""
 
 
+SORTED_EPISODES = 1024
+"""Episodes at the end of the order that are sorted, two rounds of the most worlds that are chosen: before them modes stay mixed, so that
+progress and load are even."""
+
+
 def order_longest_first(config: Config, episodes: Sequence[int], device: wp.Device) -> list[int]:
-    """Sort episodes by the expected frames of their mode, the longest first, and then by index.
+    """Sort the last SORTED_EPISODES episodes by the expected frames of their mode, the longest first, and then by index.
 
     Args:
         config: All settings.
@@ -31,7 +36,9 @@ def order_longest_first(config: Config, episodes: Sequence[int], device: wp.Devi
         return sorted(episodes)
     indices = np.sort(np.asarray(episodes, np.int32))
     frames = np.array([EXPECTED_FRAMES[mode] for mode in sorted(Mode)])[sample_modes_of(config, indices, device)]
-    return indices[np.argsort(-frames, kind="stable")].tolist()
+    first = max(0, len(indices) - SORTED_EPISODES)
+    order = np.concatenate([np.arange(first), first + np.argsort(-frames[first:], kind="stable")])
+    return indices[order].tolist()
 
 
 def deal_episodes(ordered: Sequence[int], devices: int) -> list[list[int]]:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Mode
 from synpick_warp.configs.load import load_config
-from synpick_warp.scheduling.order import EXPECTED_FRAMES, deal_episodes, deal_writers, order_longest_first
+from synpick_warp.scheduling.order import EXPECTED_FRAMES, SORTED_EPISODES, deal_episodes, deal_writers, order_longest_first
 from tests.twins.arrangement import sample_modes
 
 
@@ -21,6 +21,14 @@ def test_mixed_episodes_begin_with_the_longest_modes(device):
     assert set(modes) == set(Mode)
     for mode in Mode:
         assert [episode for episode in order if modes[episode] == mode] == np.flatnonzero(modes == mode).tolist()
+
+
+def test_many_episodes_stay_mixed_but_for_the_last(device):
+    config, count = load_config("smoke", {"bake.mode": "cycle"}), SORTED_EPISODES + 30
+    order = order_longest_first(config, range(count), device)
+    assert order[:30] == list(range(30))
+    assert sorted(order[30:]) == list(range(30, count))
+    assert [episode % 3 for episode in order[30:]] == sorted((episode % 3 for episode in range(30, count)), key=[1, 0, 2].index)
 
 
 def test_modes_in_turn(device):
