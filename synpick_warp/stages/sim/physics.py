@@ -167,9 +167,9 @@ class Physics:
             if busy:
                 self._graphs.append(capture.graph)
 
-    def forget_graph(self) -> None:
-        """Drop the captured graph; the next tick runs eagerly, and captures it anew."""
-        self._graph = None
+    def forget_graphs(self) -> None:
+        """Drop the captured graphs; the next tick runs eagerly, and captures them anew."""
+        self._graphs = []
 
     def flag_lost_pairs(self) -> None:
         """Flag worlds whose broad-phase pairs overflowed: Newton drops these pairs silently, while its solver flags contacts and rows."""

@@ -131,7 +131,7 @@ class Simulation:
 
     def forget_graphs(self) -> None:
         """Drop captured graphs: the next tick launches all kernels one by one, and captures them anew."""
-        self.physics.forget_graph()
+        self.physics.forget_graphs()
         if self.perception is not None:
             self.perception.forget_graphs()
 
