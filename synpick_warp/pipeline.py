@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -47,7 +47,7 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, tick_batch, view_sizes
-from synpick_warp.stages.ticks import TickLoop
+from synpick_warp.stages.ticks import PARTS_PER_BATCH, TickLoop
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device, pick_devices
 from synpick_warp.system.garbage import collection_paused
@@ -338,15 +338,19 @@ class _Run:
         with self.stop as stop, TickLoop(self.factory.simulation) as ticks:
             while not (done or stop.number):
                 report, snapshot = ticks.advance()
-                self._hand_over(report, snapshot)
+                self._hand_over(report, snapshot, ticks)
                 phase = report.column("phase")
                 self.meter.show(int(np.isin(phase, (Phase.SETTLE, Phase.ACT)).sum()))
                 done = bool((phase == Phase.IDLE).all())
-            self._write(self.factory.stream.drain())
+            for views in self.factory.stream.drain():
+                self._write(views)
         self.summary.stopped = 0 if done else stop.number
 
-    def _hand_over(self, report: TickReport, snapshot: Snapshot) -> None:
-        """Hand a tick's frames to the exporters, launch its views, and hand over those that are ready, with the ends of episodes."""
+    def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
+        """Hand a tick's frames to the exporters, launch its views, and hand over those that are ready, with the ends of episodes.
+
+        Between batches the next tick is enqueued.
+        """
         physics = self.config.physics
         batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
         if len(batch):
@@ -354,16 +358,17 @@ class _Run:
                 self.exporters.write_ticks(batch)
         records = self.factory.log.update(report)
         if self.exporters.needs_views:
-            self._write(self.factory.stream.advance(snapshot, report, partial(self._end_episodes, report, records)))
+            for views in self.factory.stream.advance(snapshot, report, partial(self._end_episodes, report, records)):
+                ticks.enqueue(PARTS_PER_BATCH)
+                self._write(views)
         else:
             self._end_episodes(report, records)
 
-    def _write(self, batches: Iterator[FrameBatch]) -> None:
-        """Hand batches of views over to the exporters."""
-        for views in batches:
-            with scope("hand over views"):
-                self.exporters.write_views(views)
-            self.summary.views += len(views)
+    def _write(self, views: FrameBatch) -> None:
+        """Hand a batch of views over to the exporters."""
+        with scope("hand over views"):
+            self.exporters.write_views(views)
+        self.summary.views += len(views)
 
     def _end_episodes(self, report: TickReport, records: Mapping[int, EpisodeRecord]) -> None:
         """End the episodes that ended in a tick, after its views."""

@@ -30,7 +30,7 @@ from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.stream import TickReport, describe_views
-from synpick_warp.stages.ticks import TickLoop
+from synpick_warp.stages.ticks import PARTS_PER_BATCH, TickLoop
 from synpick_warp.system.device import pick_device
 
 DEVICE_ONLY = 0
@@ -138,7 +138,9 @@ class Producer:
         with TickLoop(self.stages.simulation) as ticks:
             while True:
                 report, snapshot = ticks.advance()
-                yield from self.render(report, snapshot)
+                for batch in self.render(report, snapshot):
+                    ticks.enqueue(PARTS_PER_BATCH)
+                    yield batch
                 self._end_episodes(report)
                 if (report.column("phase") == Phase.IDLE).all():
                     return

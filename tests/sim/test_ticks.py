@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +15,8 @@ from synpick_warp.stages.sim.simulate import RECORDS
 from synpick_warp.stages.stream import HostCopy
 
 TICKS, WORLDS = 24, 64
+PARTS = ticks.PARTS_AHEAD + 6 * ticks.PARTS_PER_BATCH
+"""Parts of a tick: more than are enqueued ahead."""
 SPINS = 20_000
 """Rounds of a thread that keeps a queue busy for about a millisecond."""
 
@@ -34,10 +37,13 @@ class NumberingSimulation:
         self.device, self.count, self.events = device, 0, []
         self.records = tuple(SimpleNamespace(snapshot=wp.zeros(WORLDS, dtype=wp.int32, device=device)) for _ in range(RECORDS))
 
-    def tick(self, record: SimpleNamespace) -> None:
+    def tick_parts(self, record: SimpleNamespace) -> Iterator[None]:
         self.count += 1
-        self.events.append(f"tick {self.count}")
-        record.snapshot.fill_(self.count)
+        number = self.count
+        for _ in range(PARTS - 1):
+            yield
+        self.events.append(f"tick {number}")
+        record.snapshot.fill_(number)
 
 
 class RecordReader(HostCopy):
@@ -59,16 +65,22 @@ def simulation(device, monkeypatch) -> NumberingSimulation:
     return NumberingSimulation(device)
 
 
-def test_ticks_come_in_order_one_ahead(simulation):
+@pytest.mark.parametrize("batches", [0, 1, 5, 100])
+def test_ticks_come_in_order_one_ahead(simulation, batches):
+    """A tick has begun when the one before is reported; it is enqueued between the batches of that one, and what is left at their end."""
     with ticks.TickLoop(simulation) as loop:
-        assert simulation.events == ["tick 1"]
+        assert simulation.events == []
         for tick in range(1, TICKS):
             report, snapshot = loop.advance()
-            simulation.events.append(f"report {tick}")
             assert set(report.tolist()) == {tick}
+            assert simulation.count == tick + 1
+            simulation.events.append(f"report {tick}")
             assert snapshot is simulation.records[(tick - 1) % RECORDS].snapshot
-    expected = ["tick 1", *(f"{what} {tick + (what == 'tick')}" for tick in range(1, TICKS) for what in ("tick", "report"))]
-    assert simulation.events == expected
+            for _ in range(batches):
+                loop.enqueue(ticks.PARTS_PER_BATCH)
+    is_early = ticks.PARTS_AHEAD + batches * ticks.PARTS_PER_BATCH >= PARTS
+    expected = [f"{what} {tick}" for tick in range(1, TICKS) for what in ("tick", "report")]
+    assert simulation.events == expected + is_early * [f"tick {TICKS}"]
 
 
 def test_a_slow_renderer_reads_each_record_whole(simulation):

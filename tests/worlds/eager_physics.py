@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import newton
 
@@ -12,8 +12,7 @@ from synpick_warp.stages.sim.physics import Physics, Watcher
 class EagerPhysics(Physics):
     """`Physics` for tests that script the gripper in NumPy."""
 
-    def tick(
+    def tick_parts(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
-    ) -> None:
-        for _ in self._run_substeps(before_step, after_collide, watcher):
-            pass
+    ) -> Iterator[None]:
+        yield from self._run_substeps(before_step, after_collide, watcher)

@@ -20,7 +20,7 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.stream import TickReport, view_sizes
-from synpick_warp.stages.ticks import TickLoop
+from synpick_warp.stages.ticks import PARTS_PER_BATCH, TickLoop
 from tools.bench.physics import Row
 
 ROUNDS = 5
@@ -148,4 +148,6 @@ def _tick_loop(stages: Stages, ring: BatchRing) -> Iterator[int]:
             if (report.column("phase") == Phase.IDLE).all():
                 return
             world, camera = _select(stages, report)
-            yield from _render_all(stages, ring, snapshot, world, camera)
+            for views in _render_all(stages, ring, snapshot, world, camera):
+                ticks.enqueue(PARTS_PER_BATCH)
+                yield views

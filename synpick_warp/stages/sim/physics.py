@@ -18,7 +18,8 @@ from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
 
-_ENDED = object()
+# What `next` returns for an iterator that has ended.
+ENDED = object()
 # Contacts with a larger gap make no constraint rows [m]: only those that a hook has disabled have one, none that the pipeline finds.
 CONTACT_GAP = 0.1
 # Distance to a joint limit from which its constraint row is active [rad].
@@ -135,7 +136,15 @@ class Physics:
     def tick(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
     ) -> None:
-        """Advance all worlds by one tick: `steps_per_tick` steps of `substeps` solver steps, on a GPU as captured graphs.
+        """Advance all worlds by one tick; arguments as of `tick_parts`."""
+        for _ in self.tick_parts(before_step, after_collide, watcher):
+            pass
+
+    def tick_parts(
+        self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
+    ) -> Iterator[None]:
+        """Advance all worlds by one tick: `steps_per_tick` steps of `substeps` solver steps, on a GPU as captured graphs; yields after each
+        solver step.
 
         Hooks and watcher are captured once, so they must launch the same kernels on the same arrays every time.
 
@@ -147,23 +156,19 @@ class Physics:
         if self._graphs:
             for graph in self._graphs:
                 wp.capture_launch(graph)
+                yield
             return
         # On a GPU the first tick runs eagerly: it loads the kernels and triggers Newton's late allocations.
-        for _ in self._run_substeps(before_step, after_collide, watcher):
-            pass
+        yield from self._run_substeps(before_step, after_collide, watcher)
         if self.device.is_cuda:
             self._capture(self._run_substeps(before_step, after_collide, watcher))
 
     def _capture(self, substeps: Iterator[None]) -> None:
-        """Capture each substep in a graph of its own.
-
-        CUDA spread a graph of a whole tick over 66 streams, one a substep, and the renderer's kernels waited in the hardware queues that it
-        shared with them.
-        """
+        """Capture each substep in a graph of its own: CUDA spreads a graph of a whole tick over 66 streams, one a substep."""
         busy = True
         while busy:
             with wp.ScopedCapture(device=self.device) as capture:
-                busy = next(substeps, _ENDED) is not _ENDED
+                busy = next(substeps, ENDED) is not ENDED
             if busy:
                 self._graphs.append(capture.graph)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -23,7 +23,7 @@ from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim import arrange, gripper
-from synpick_warp.stages.sim.physics import Physics
+from synpick_warp.stages.sim.physics import ENDED, Physics
 from synpick_warp.stages.sim.step_log import PhysicsRecord, Recorder
 from synpick_warp.stages.sim.suction import Suction
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
@@ -108,14 +108,24 @@ class Simulation:
         return TickRecord(*(allocate(kind, sizes, self.device) for kind in (Snapshot, WorldStatus, Observation, Plan)), physics=physics)
 
     def tick(self, record: TickRecord) -> None:
-        """Advance all worlds by one tick and write the result to `record`, one of `records`.
+        """Advance all worlds by one tick and write the result to `record`, one of `records`."""
+        for _ in self.tick_parts(record):
+            pass
+
+    def tick_parts(self, record: TickRecord) -> Iterator[None]:
+        """Advance all worlds by one tick as `tick` does, in parts: a caller can enqueue other work on other streams between them.
 
         Start episodes, step physics, update tasks, end episodes, copy the snapshot, then plan attempts in worlds whose task is LOOK.
         """
         with scope("arrange", self.device):
             self._arrange()
-        with scope("physics", self.device):
-            self.physics.tick(self._drive, self._ignore_contacts, self.recorder if self.config.trajectory.steps else None)
+        yield
+        substeps = self.physics.tick_parts(self._drive, self._ignore_contacts, self.recorder if self.config.trajectory.steps else None)
+        while True:
+            with scope("physics", self.device):
+                if next(substeps, ENDED) is ENDED:
+                    break
+            yield
         with scope("judge", self.device):
             self._judge()
         with scope("snapshot", self.device):
