@@ -39,7 +39,7 @@ from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
 from synpick_warp.scheduling.devices import Share, bake_on_devices
 from synpick_warp.scheduling.meter import ThroughputMeter
 from synpick_warp.scheduling.order import order_longest_first
-from synpick_warp.scheduling.sizes import count_writers, fit_to_device
+from synpick_warp.scheduling.sizes import count_writers, fit_to_device, without_pictures
 from synpick_warp.scheduling.worker import BakeLink
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import host_images
@@ -120,7 +120,7 @@ def build_factory(
     device = pick_device(config.bake.device)
     planned = sum(map(len, plan_episodes(config))) if episodes is None else len(episodes)
     writers = count_writers(config)
-    config = fit_to_device(config, device, planned, writers, processes)
+    config = fit_to_device(without_pictures(config), device, planned, writers, processes)
     check_memory(config, device, writers, processes)
     renders = any(kind.needs_views for kind in load_exporter_classes(config.bake.formats))
     compile_if_cold(config, device, progress, records_physics, needs_images, renders)

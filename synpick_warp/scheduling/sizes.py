@@ -31,6 +31,13 @@ WRITERS_FRACTION = 0.5
 """Fraction of the free host memory that writer processes may take if their number is chosen."""
 
 
+def without_pictures(config: Config) -> Config:
+    """Settings with the smallest image buffers and without light histories, if no format of the bake needs views."""
+    if any(kind.needs_views for kind in load_exporter_classes(config.bake.formats)):
+        return config
+    return dataclasses.replace(config, render=dataclasses.replace(config.render, views_per_batch=1, history=0))
+
+
 def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int = 1, processes: int = 1) -> Config:
     """Choose worlds and batches that the settings leave open. What they name stays, whether it fits or not.
 

@@ -10,7 +10,7 @@ from synpick_warp import memory_plan
 from synpick_warp.configs.load import load_config
 from synpick_warp.memory_plan import check_memory, plan_memory
 from synpick_warp.scheduling import sizes
-from synpick_warp.scheduling.sizes import HEADROOM, RUNTIME_BYTES, count_writers, fit_to_device
+from synpick_warp.scheduling.sizes import HEADROOM, RUNTIME_BYTES, count_writers, fit_to_device, without_pictures
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import balance_worlds
 from synpick_warp.stages.stream import views_per_batch
@@ -65,6 +65,17 @@ def test_batches_shrink_until_plan_and_headroom_fit(give, gpu, mode):
     if gpu >= 12.0:
         assert views_per_batch(config, GPU) >= 12
     check_memory(config, GPU)
+
+
+def test_trajectories_alone_need_no_image_buffers(give):
+    give()
+    pictures, trajectories = (load_config("synpick", {"bake.formats": formats}) for formats in (["bop", "zarr"], ["usd", "zarr"]))
+    assert without_pictures(pictures) == pictures
+    needed = {term.name: term.size for term in plan_memory(fit_to_device(without_pictures(trajectories), GPU, 2048), GPU)}
+    assert needed["light averaged over frames"] == 0
+    before = {term.name: term.size for term in plan_memory(fit_to_device(trajectories, GPU, 2048), GPU)}
+    assert before["light averaged over frames"] > 2 * GIB
+    assert sum(needed.values()) < 0.6 * sum(before.values())
 
 
 def test_settings_that_are_named_stay(give):
