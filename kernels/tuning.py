@@ -21,9 +21,9 @@ LANE_COLUMNS = wp.constant(8)
 """Interleaved order: threads of a warp in one row of coarse pixels."""
 VIEW_BLOCK = 32
 """Block size of kernels with a thread a view: small blocks spread few views over many multiprocessors."""
-JPEG_BLOCK = 128
-"""Block size of all kernels of the JPEG coder: with one size a module is compiled once. The transform has 96 registers a thread, so that a
-multiprocessor holds five of these blocks, but two of 256 threads (from ptxas for sm_90, not timed)."""
+JPEG_THREADS = 128
+"""Threads per CUDA block in all kernels of the JPEG encoder: one size, because each size compiles a module again. The DCT uses 96
+registers a thread: a multiprocessor holds five CUDA blocks of 128 threads, or two of 256 (from ptxas for sm_90, not timed)."""
 TRIANGLE_THREADS = 4096
 """Threads that share the triangles of a body in the rasterizer: enough to spread a dense mesh, while those without a triangle cost little.
 Rasterizing triangles takes 0.10 of the 0.18 ms of a view's G-buffer."""

@@ -1,4 +1,4 @@
-"""Ahead-of-time compilation of the kernels that a bake launches, beside each other and with their number known."""
+"""Ahead-of-time compilation of the kernels of a bake, in parallel threads and with progress."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from synpick_warp.kernels.sim.snapshot import take_snapshot_kernel
 from synpick_warp.progress import Progress
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, TickReader
-from synpick_warp.system.kernels import DryLaunches, compile_modules, variant_of
+from synpick_warp.system.kernels import DryLaunches, build_of, compile_modules
 
 
-def is_compiled(device: wp.Device) -> bool:
-    """Whether a bake has run on this machine before, by a kernel that every bake launches."""
-    return variant_of(take_snapshot_kernel, device).is_cached()
+def is_cache_warm(device: wp.Device) -> bool:
+    """Whether the kernel cache is warm: it has a kernel that every bake launches. Other kernels may still be missing."""
+    return build_of(take_snapshot_kernel, device).is_cached()
 
 
 def compile_launches(simulation: Simulation, stream: FrameStream | None, progress: Progress) -> int:
     """Compile and load what `launch_all` launches and the kernel cache lacks.
 
     Args:
-        simulation: New worlds; afterwards they are as new again, but for contents of scratch arrays.
+        simulation: Worlds that have not ticked yet. No kernel runs, so that their state stays; contents of scratch arrays may change.
         stream: Renderer and encoders; None: nothing is rendered.
         progress: Receives "compiling kernels: 14 of 37 modules".
 
@@ -30,14 +30,14 @@ def compile_launches(simulation: Simulation, stream: FrameStream | None, progres
     """
     with DryLaunches() as dry:
         launch_all(simulation, stream)
-    simulation.forget_graphs()
-    return compile_modules(dry.variants, lambda ready, count: progress.stage(f"compiling kernels: {ready} of {count} modules"))
+    simulation.clear_graphs()
+    return compile_modules(dry.builds, lambda ready, count: progress.stage(f"compiling kernels: {ready} of {count} modules"))
 
 
 def launch_all(simulation: Simulation, stream: FrameStream | None) -> None:
     """Launch every kernel of simulation, perception, renderer and encoders once."""
     record = simulation.records[0]
-    for _ in range(2):  # A GPU runs the first tick kernel by kernel, and captures the graph of the second.
+    for _ in range(2):  # On a GPU the first tick launches kernels one by one and captures graphs; the second launches the graphs.
         simulation.tick(record)
     if simulation.perception is not None:
         simulation.perception.load_kernels(record.snapshot)

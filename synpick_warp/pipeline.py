@@ -17,7 +17,7 @@ import warp as wp
 
 from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.codes import Phase
-from synpick_warp.compilation import compile_launches, is_compiled
+from synpick_warp.compilation import compile_launches, is_cache_warm
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.dataset.digests import digest_inputs
@@ -141,7 +141,7 @@ def compile_if_cold(
         config, device, progress, records_physics, needs_images: As of `build_factory`.
         renders: Whether views are rendered.
     """
-    if is_compiled(device):
+    if is_cache_warm(device):
         return
     progress.stage("compiling kernels of the assets")
     factory = build_smallest(config, device, SilentProgress(), records_physics, needs_images)
@@ -314,7 +314,7 @@ def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> Bake
 
 
 class _Run:
-    """Tick loop of a bake: simulate, read back, render, hand over to exporters."""
+    """Main loop of a bake: takes ticks from a `TickLoop`, renders views, hands both to exporters and ends episodes."""
 
     def __init__(
         self,

@@ -11,7 +11,7 @@ from synpick_warp import pipeline, warmup
 from synpick_warp.cli.commands import main
 from synpick_warp.compilation import launch_all
 from synpick_warp.progress import SilentProgress
-from synpick_warp.system.kernels import DryLaunches, Variant
+from synpick_warp.system.kernels import DryLaunches, ModuleBuild
 from tests.worlds.small_worlds import catalog, settings
 
 
@@ -45,19 +45,19 @@ def test_dry_launches_find_all_that_a_warm_up_loads(device):
     for _ in range(2):
         with DryLaunches() as dry:
             launch_all(factory.simulation, factory.stream)
-        factory.simulation.forget_graphs()
-        found.append(set(dry.variants))
+        factory.simulation.clear_graphs()
+        found.append(set(dry.builds))
         launch_all(factory.simulation, factory.stream)
-        factory.simulation.forget_graphs()
+        factory.simulation.clear_graphs()
     assert found[0] == found[1]
-    assert all(variant.is_cached() for variant in found[0])
+    assert all(build.is_cached() for build in found[0])
 
 
 def test_a_cold_start_says_how_many_modules_it_compiles(monkeypatch):
     """The dry launches of a cold bake find modules to compile; here the compiler is not called."""
     stages = []
-    monkeypatch.setattr(pipeline, "is_compiled", lambda device: False)
-    monkeypatch.setattr(Variant, "is_cached", lambda self: self.module.name != "synpick_warp.kernels.sim.snapshot")
+    monkeypatch.setattr(pipeline, "is_cache_warm", lambda device: False)
+    monkeypatch.setattr(ModuleBuild, "is_cached", lambda self: self.module.name != "synpick_warp.kernels.sim.snapshot")
     progress = SilentProgress()
     monkeypatch.setattr(progress, "stage", stages.append, raising=False)
     config = settings(cameras__resolution=[32, 18])

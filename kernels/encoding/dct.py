@@ -65,10 +65,10 @@ def convert_colors_kernel(
     # Out:
     sample_out: wp.array3d[wp.uint8],  # (view, sample_row, sample_column)
 ):
-    """Samples of whole MCUs: Y of 2 x 2 pixels, and the means of their Cb and Cr. Launched over view, pair of rows, pair of columns.
+    """RGB to YCbCr with 4:2:0 chroma subsampling, padded to whole MCUs. Launched over view, pair of rows, pair of columns.
 
-    The last column is repeated to the right. Below the image, libjpeg repeats the last row of Y and the last row of means of Cb and Cr.
-    Means are rounded up and down in alternate columns.
+    Each thread writes Y of 2 x 2 pixels, and the means of their Cb and Cr. The last column is repeated to the right; below the image the
+    last row of Y and the last row of the means are repeated, as in libjpeg. Means are rounded up and down in alternate columns.
     """
     view, row, column = wp.tid()
     last = (image.shape[1] - 1) // 2
@@ -168,7 +168,7 @@ def read_block(
     row: int,
     column: int,
 ) -> block_vec:
-    """Samples of a block, less 128, from its first row and its column of blocks."""
+    """Load a block of 8 x 8 samples, level-shifted by -128; `row` is its first sample row, `column` its index across, in blocks."""
     block = block_vec()
     for i in range(BLOCK):
         line = sample[view, row + i, column]

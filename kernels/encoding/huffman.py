@@ -38,7 +38,7 @@ class HuffmanTables:
 
 @wp.struct
 class WordWriter:
-    """State of a writer of bits to a slot, within its words."""
+    """Bit writer of one block: its position in the slot, and the bits of the word begun."""
 
     view: int
     interval: int
@@ -85,7 +85,7 @@ def code_length(code: wp.uint32) -> int:
 
 @wp.func
 def component_of(block: int) -> int:
-    """Huffman tables of a block of a view: 0 (Y) or 1 (Cb and Cr)."""
+    """Index of a block's Huffman tables: 0 (Y) or 1 (Cb and Cr)."""
     return wp.where(block % BLOCKS_PER_MCU < LUMA_BLOCKS, 0, 1)
 
 
@@ -131,7 +131,7 @@ def measure_blocks_kernel(
     # Out:
     bits_out: wp.array2d[int],  # (view, block) [bit]
 ):
-    """Length of each block's code. Launched over view, block."""
+    """Measure the bit string of each block: Huffman codes and magnitude bits. Launched over view, block."""
     view, block = wp.tid()
     component = component_of(block)
     bits = bit_length(wp.abs(dc_difference(coefficient, view, block, interval_blocks)))
@@ -203,7 +203,7 @@ def put_bits(writer: WordWriter, slot: wp.array3d[wp.uint32], value: wp.uint32, 
 
 @wp.func
 def finish_words(writer: WordWriter, slot: wp.array3d[wp.uint32]):
-    """Write the last word, of which the next block has the rest."""
+    """Flush the incomplete last word by atomic "or": the next block writes its other bits."""
     if writer.bits > 0 and writer.word < slot.shape[2]:
         word = wp.uint32(writer.pending << wp.uint64(WORD_BITS - writer.bits))
         wp.atomic_or(slot, writer.view, writer.interval, writer.word, word)
@@ -227,10 +227,10 @@ def write_blocks_kernel(
     # Out:
     slot_out: wp.array3d[wp.uint32],  # (view, interval, slot_word)
 ):
-    """Write each block's code at its bit offset: DC difference, then runs of zeros and AC coefficients. Launched over view, block.
+    """Write the bit string of each block at its bit offset: DC difference, then zero runs and AC coefficients. Launched over view, block.
 
-    Words that blocks share are combined by atomic "or", which gives the same in any order. The last block of an interval fills up the
-    last byte with ones.
+    Words shared by neighbouring blocks are combined by atomic "or", whose result does not depend on the order. The last block of an
+    interval pads the last byte with ones.
     """
     view, block = wp.tid()
     component = component_of(block)

@@ -23,15 +23,15 @@ LOW_BITS = wp.constant(wp.uint32(0x7F7F7F7F))
 
 
 @wp.func
-def count_markers(word: wp.uint32) -> int:
-    """Number of bytes 0xFF in a word: the zero bytes of its complement, by additions that carry into each byte's highest bit."""
+def count_ff_bytes(word: wp.uint32) -> int:
+    """Number of bytes 0xFF in a word: SWAR count of the zero bytes of its complement, whose additions never carry between bytes."""
     inverse = ~word
     return wp.bit_count(~(((inverse & LOW_BITS) + LOW_BITS) | inverse | LOW_BITS))
 
 
 @wp.func
 def chunk_words(coded: int, capacity: int, lanes: int) -> int:
-    """Words of a lane's chunk of an interval of `coded` bytes, of which those beyond the slot's `capacity` [words] are left out."""
+    """Words per lane: those of an interval of `coded` bytes, at most the slot's `capacity` [words], over `lanes`, rounded up."""
     words = wp.min((coded + WORD_BYTES - 1) // WORD_BYTES, capacity)
     return (words + lanes - 1) // lanes
 
@@ -52,7 +52,7 @@ def count_stuffing_kernel(
     words = wp.min((coded[view, interval] + WORD_BYTES - 1) // WORD_BYTES, slot.shape[2])
     count = int(0)
     for word in range(lane * chunk, wp.min((lane + 1) * chunk, words)):
-        count += count_markers(slot[view, interval, word])
+        count += count_ff_bytes(slot[view, interval, word])
     stuffing_out[view, interval, lane] = count
     if count > 0:
         wp.atomic_add(size_inout, view, interval, count)

@@ -123,7 +123,7 @@ class ViewStream:
 
 
 class Producer:
-    """Tick loop of a stream: simulate, read the report, render what is selected."""
+    """Producer of a stream's batches: takes ticks from a `TickLoop`, renders the selected views, and logs ended episodes."""
 
     def __init__(self, stages: Stages, ring: BatchRing, selection: Selection, summary: BakeSummary, progress: Progress) -> None:
         self.stages, self.ring, self.selection, self.summary, self.progress = stages, ring, selection, summary, progress
@@ -131,9 +131,9 @@ class Producer:
         self.object_ids = np.append(stages.object_ids, -1).astype(np.int32)
 
     def batches(self) -> Iterator[ViewBatch]:
-        """Render until no episode remains; a batch must have expired before its slot's turn comes again.
+        """Yield batches until no episode remains; each must have expired before the ring reuses its slot.
 
-        As in a bake, the device simulates the next tick while it renders this one.
+        The next tick is simulated while this one is rendered.
         """
         with TickLoop(self.stages.simulation) as ticks:
             while True:

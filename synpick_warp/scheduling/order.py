@@ -1,6 +1,7 @@
-"""Order of episodes: longest processing time first (Graham, 1969), and the share of each device.
+"""Order of episodes: longest processing time first (LPT; Graham, 1969) among the last ones, and the episodes of each device.
 
-Episodes that begin last determine when a bake ends, so long ones begin first. No episode depends on the order or on its device.
+The episodes that start last determine when a bake ends, so the longest of them start first; those before start by index. No episode
+depends on the order or on its device.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ EXPECTED_FRAMES = {Mode.TARGET: 638, Mode.PICK: 502, Mode.MOVE: 416}
 
 
 SORTED_EPISODES = 1024
-"""Episodes at the end of the order that are sorted, two rounds of the most worlds that are chosen: before them modes stay mixed, so that
-progress and load are even."""
+"""Number of episodes at the end of the list that are sorted: two rounds of MAX_GPU_WORLDS. Before them modes stay mixed, which keeps
+progress and load even."""
 
 
 def order_longest_first(config: Config, episodes: Sequence[int], device: wp.Device) -> list[int]:

@@ -32,7 +32,7 @@ WRITERS_FRACTION = 0.5
 
 
 def without_pictures(config: Config) -> Config:
-    """Settings with the smallest image buffers and without light histories, if no format of the bake needs views."""
+    """Settings for a bake whose formats need no views: image buffers of one view a batch, no light histories; others are unchanged."""
     if any(kind.needs_views for kind in load_exporter_classes(config.bake.formats)):
         return config
     return dataclasses.replace(config, render=dataclasses.replace(config.render, views_per_batch=1, history=0))

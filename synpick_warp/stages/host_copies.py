@@ -9,7 +9,7 @@ import warp as wp
 
 from synpick_warp.configs.schema import Config
 
-# Rows from which the largest lists of run boundaries are no larger than the images.
+# Image height from which the largest lists of run boundaries are no larger than the images [px].
 MIN_LISTED_ROWS = 288
 
 
@@ -37,11 +37,11 @@ class HostImages:
 
 
 def host_images(config: Config, device: wp.Device, needs_images: bool, depth_files: bool) -> HostImages:
-    """Choose what is copied to the host.
+    """Choose which images of a batch are copied to the host and which stay on the device.
 
-    Depth files are made on every device, so that their bytes do not depend on it. On a GPU, files and run boundaries stand for all images,
-    unless exporters need these; in small images only for depth, since lists of run boundaries may be incomplete there, and copying single
-    images waits for the device.
+    On the CPU, or if an exporter needs all images, all are copied. Else files and run boundaries replace them; below MIN_LISTED_ROWS rows
+    only depth is left out, since lists of run boundaries may be incomplete there, and copying single images waits for the device. Depth
+    files are made on every device, so that their bytes do not depend on it.
 
     Args:
         config: All settings.

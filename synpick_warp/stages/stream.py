@@ -203,7 +203,7 @@ class _Launched:
 
 
 class FrameStream:
-    """Renders the live worlds of snapshots as FrameBatches; while one is consumed, the next two are rendered (ring buffer)."""
+    """Renders the live worlds of snapshots as FrameBatches, in a ring: on a GPU up to two batches are in flight while one is consumed."""
 
     def __init__(
         self,
@@ -270,14 +270,15 @@ class FrameStream:
         yield from self.drain()
 
     def advance(self, snapshot: Snapshot, report: TickReport, finished: Callable[[], None] = lambda: None) -> Iterator[FrameBatch]:
-        """Launch the tick's views; yield those of the tick before and those whose slots are needed. On a GPU the last ones stay in flight.
+        """Launch the tick's views; yield batches, oldest first: where the ring is full, and then all that are left of earlier ticks.
 
-        So the GPU has work while the host turns from tick to tick. A batch is valid until the next one is requested.
+        On a GPU the tick's last batches stay in flight, so that the device has work between ticks; `drain` yields them. A batch is valid
+        until the next one is requested.
 
         Args:
             snapshot: State of the worlds; reused after the rendering in the order of the device's stream.
             report: Report of the tick.
-            finished: Called once the consumer has the tick's last batch behind it, after that of earlier ticks.
+            finished: Called once the consumer is done with the tick's last batch (it requests the next one); ticks finish in order.
         """
         live = np.flatnonzero(report.column("live"))
         world = np.repeat(live, self.cameras).astype(np.int32)
@@ -325,10 +326,10 @@ class FrameStream:
             self.copies[slot].start(self.copy_stream)
 
     def _encode(self, slot: int, count: int) -> None:
-        """Make what is copied in place of the images of `count` views: run boundaries and files.
+        """Encode `count` views: run boundaries and files, which are copied instead of images.
 
-        It runs on the copy stream, after the rendering of these views and beside that of the next ones: entropy coders are few long
-        threads, which leave a GPU nearly idle. One batch at a time uses their scratch, in the order of this stream.
+        Runs on the copy stream: after these views are rendered, beside the rendering of the next batch. Batches share one scratch; the
+        order of this stream protects it.
         """
         buffers = self.buffers[slot]
         list_boundaries(self.boundary_scratch, count, buffers, self.boundaries[slot])

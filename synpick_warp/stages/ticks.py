@@ -18,8 +18,8 @@ from synpick_warp.stages.timing import scope
 HIGH_PRIORITY = -1
 """CUDA stream priority of physics: its 25,000 short kernels a tick wait for each other, and should not also wait for the renderer's."""
 PARTS_AHEAD = 24
-"""Parts of a tick, of which most are substeps, that are enqueued when the report of the one before is awaited. On an H200 some 40 of 66 fit
-into a stream's queue, which then blocks the host: the renderer idled for 0.25 s a tick while all parts were enqueued at once."""
+"""Parts of the next tick, mostly substeps, that are enqueued before waiting for the report of this one. On an H200 some 40 of 66 parts
+fill a stream's queue, and further launches block the host: with all parts at once the renderer idled for 0.25 s a tick."""
 PARTS_PER_BATCH = 4
 """Parts of a tick to enqueue per batch of views: beside a renderer they take about as long as the batch."""
 
@@ -27,8 +27,9 @@ PARTS_PER_BATCH = 4
 class TickLoop:
     """Tick loop of a simulation, one tick ahead; a context manager, which starts the first tick and at its end waits for the last.
 
-    On a GPU physics has a stream of its own. A tick is enqueued there behind all work that the device's current stream has been given by
-    its begin, so a record is not overwritten while it is rendered; what other streams read of a record must be awaited by the current one.
+    On a GPU physics has its own CUDA stream. Each tick waits for all work that was queued on the device's current stream when the tick
+    began, so that no record is overwritten while it is rendered. Work on other streams that reads a record must be awaited by the
+    current stream before the next `advance`.
     """
 
     def __init__(self, simulation: Simulation) -> None:
@@ -45,14 +46,17 @@ class TickLoop:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Wait for the tick that was simulated ahead: its arrays are freed by another stream."""
+        """Drop the parts that are not enqueued, and wait for the rest: another stream frees the arrays of the tick simulated ahead.
+
+        The simulation may be within a tick then, and cannot go on.
+        """
         self._parts = iter(())
         if self.stream is not None:
             with contextlib.suppress(RuntimeError):  # A failed device; the error that ends the loop tells it.
                 wp.synchronize_stream(self.stream)
 
     def advance(self) -> tuple[TickReport, Snapshot]:
-        """Begin the tick after the next, and wait for the next one's report; its snapshot is valid until the following call."""
+        """Begin tick t + 1, wait for tick t, and return its report and snapshot; the snapshot is valid until the next call."""
         self.enqueue()
         current = self._current
         self._current = (current + 1) % RECORDS
@@ -62,7 +66,7 @@ class TickLoop:
         return report, self.simulation.records[current].snapshot
 
     def enqueue(self, parts: int | None = None) -> None:
-        """Enqueue parts of the tick that `advance` began, while its caller consumes the one before; None: all that are left."""
+        """Enqueue the next `parts` parts of the tick that `advance` began, None: all. Call it between batches, while rendering tick t."""
         with wp.ScopedStream(self.stream, sync_enter=False), scope("simulate", self.simulation.device):
             for _ in itertools.islice(self._parts, parts):
                 pass

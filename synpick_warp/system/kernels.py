@@ -27,8 +27,8 @@ def list_binaries() -> set[tuple[Path, int]]:
     return {(path, path.stat().st_mtime_ns) for path in found if path.exists()}
 
 
-class Variant(NamedTuple):
-    """A module as it is compiled for a device and a block size."""
+class ModuleBuild(NamedTuple):
+    """Build of a Warp module: one device and one block size."""
 
     module: wp.Module
     device: str
@@ -36,32 +36,32 @@ class Variant(NamedTuple):
 
     def is_cached(self) -> bool:
         """Whether the kernel cache has it."""
-        folder = Path(wp.config.kernel_cache_dir or "", self.module.get_module_identifier(self.block))
-        return any(True for pattern in BINARIES for _ in folder.glob(pattern))
+        name = self.module._get_compile_output_name(wp.get_device(self.device), block_dim=self.block)
+        return Path(wp.config.kernel_cache_dir or "", self.module.get_module_identifier(self.block), name).exists()
 
 
-def variant_of(kernel: Any, device: wp.Device) -> Variant:
-    """The variant that a launch of a kernel with the default block size loads."""
-    return Variant(kernel.module, device.alias, kernel.module.options["block_dim"] if device.is_cuda else 1)
+def build_of(kernel: Any, device: wp.Device) -> ModuleBuild:
+    """The build that a launch of a kernel with the default block size loads."""
+    return ModuleBuild(kernel.module, device.alias, kernel.module.options["block_dim"] if device.is_cuda else 1)
 
 
 class DryLaunches:
-    """Context manager in which launches of kernels load and run nothing, in all threads; copies and fills do run.
+    """Dry run of kernel launches, by replacing `wp.Module.load`: in all threads kernels neither load nor run; copies and fills do run.
 
     Attributes:
-        variants: Modules that the launches would have loaded, in the order of their first launch.
+        builds: Modules that the launches would have loaded, in the order of their first launch.
     """
 
     def __init__(self) -> None:
-        self.variants: dict[Variant, None] = {}
+        self.builds: dict[ModuleBuild, None] = {}
         self._load: Any = None
 
     def __enter__(self) -> Self:
-        self._load, variants = wp.Module.load, self.variants
+        self._load, builds = wp.Module.load, self.builds
 
         def record(module: wp.Module, device: Any, block_dim: int | None = None, *_: object, **__: object) -> None:
             block = module.options["block_dim"] if block_dim is None else block_dim
-            variants[Variant(module, wp.get_device(device).alias, block)] = None
+            builds[ModuleBuild(module, wp.get_device(device).alias, block)] = None
 
         wp.Module.load = record  # type: ignore[method-assign]
         return self
@@ -70,17 +70,17 @@ class DryLaunches:
         wp.Module.load = self._load  # type: ignore[method-assign]
 
 
-def compile_modules(variants: Collection[Variant], report: Callable[[int, int], None]) -> int:
+def compile_modules(builds: Collection[ModuleBuild], report: Callable[[int, int], None]) -> int:
     """Compile and load the modules that are not in the kernel cache, in threads.
 
     Args:
-        variants: The modules; those that the cache has are left for their first launch to load.
+        builds: The modules; those that the cache has are left for their first launch to load.
         report: Called in this thread with the number of modules that are ready, from 0 on, and that of all to compile, if there are any.
 
     Returns:
         The number of compiled modules.
     """
-    missing = [variant for variant in variants if not variant.is_cached()]
+    missing = [build for build in builds if not build.is_cached()]
     if not missing:
         return 0
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -25,7 +25,7 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import MAX_RADIANCE
 from synpick_warp.scenes.types import Material
 from synpick_warp.stages.buffers import LayerBuffers, ViewBuffers, view_buffer_sizes
-from synpick_warp.stages.render.scene import build_render_scene
+from synpick_warp.stages.render.scene import build_render_scene, pack_texels
 from synpick_warp.stages.render.view_setup import make_views
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, build_scene, camera, entry, even_light, render, sheet, snapshot, sun
 
@@ -65,7 +65,7 @@ def test_a_gltf_material_reaches_the_renderer(tmp_path, device):
     # glTF's factor is linear, as are the renderer's colours.
     assert surfaces.color.numpy()[0] == pytest.approx((1.0, 128 / 255, 0.0), abs=2e-3)
     assert surfaces.texture_size.numpy()[0].tolist() == [5, 3]
-    assert surfaces.texel.numpy()[0] == 200 | 100 << 8 | 50 << 16
+    assert surfaces.texel.numpy()[0] == pack_texels(np.array([[[200, 100, 50]]], np.uint8))[0]
 
 
 def albedo(material: Material, rows: int, columns: int, device) -> np.ndarray:

@@ -118,7 +118,7 @@ def test_neither_worlds_nor_batches_change_a_view(streamed, worlds, batch):
 
 
 def test_kernels_that_are_compiled_ahead_change_nothing(streamed, monkeypatch):
-    monkeypatch.setattr(pipeline, "is_compiled", lambda device: False)
+    monkeypatch.setattr(pipeline, "is_cache_warm", lambda device: False)
     equal(taken(synpick_warp.stream(settings(**LAYERED))), streamed[0])
 
 

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.system import kernels
-from synpick_warp.system.kernels import DryLaunches, Variant, compile_modules, variant_of
+from synpick_warp.system.kernels import DryLaunches, ModuleBuild, build_of, compile_modules
 
 MODULES = 3
 
@@ -41,8 +41,8 @@ def test_dry_launches_run_nothing_and_list_what_they_would_load(device, empty_ca
     assert wp.Module.load is load
     np.testing.assert_array_equal(values.numpy(), 1.0)
     blocks = (64, 128, 256) if device.is_cuda else (1,)
-    assert list(dry.variants) == [Variant(scale.module, device.alias, block) for block in blocks]
-    assert variant_of(scale, device) == list(dry.variants)[-1]
+    assert list(dry.builds) == [ModuleBuild(scale.module, device.alias, block) for block in blocks]
+    assert build_of(scale, device) == list(dry.builds)[-1]
     assert list(empty_cache.iterdir()) == []
     wp.launch(scale, dim=4, inputs=[values], device=device)
     np.testing.assert_array_equal(values.numpy(), 3.0)
@@ -50,15 +50,15 @@ def test_dry_launches_run_nothing_and_list_what_they_would_load(device, empty_ca
 
 def test_modules_that_the_cache_lacks_are_compiled_once_and_counted(device, empty_cache):
     scales = [make_kernel(5.0 + index) for index in range(MODULES)]
-    variants = [variant_of(scale, device) for scale in scales]
-    assert not any(variant.is_cached() for variant in variants)
+    builds = [build_of(scale, device) for scale in scales]
+    assert not any(build.is_cached() for build in builds)
     reports = []
-    assert compile_modules(variants, lambda *counts: reports.append(counts)) == MODULES
+    assert compile_modules(builds, lambda *counts: reports.append(counts)) == MODULES
     assert reports == [(ready, MODULES) for ready in range(MODULES + 1)]
-    assert all(variant.is_cached() for variant in variants)
+    assert all(build.is_cached() for build in builds)
     binaries = kernels.list_binaries()
     assert len(binaries) == MODULES
-    assert compile_modules(variants, lambda *counts: reports.append(counts)) == 0
+    assert compile_modules(builds, lambda *counts: reports.append(counts)) == 0
     values = wp.ones(4, dtype=float, device=device)
     for scale in scales:
         wp.launch(scale, dim=4, inputs=[values], device=device)
@@ -67,11 +67,11 @@ def test_modules_that_the_cache_lacks_are_compiled_once_and_counted(device, empt
 
 
 def test_a_compiler_that_fails_is_told(device, empty_cache, monkeypatch):
-    variants = [variant_of(make_kernel(9.0 + index), device) for index in range(MODULES)]
+    builds = [build_of(make_kernel(9.0 + index), device) for index in range(MODULES)]
 
     def fail(*_: object, **__: object) -> None:
         raise RuntimeError("no space left")
 
     monkeypatch.setattr(wp.Module, "load", fail)
     with pytest.raises(RuntimeError, match="no space left"):
-        compile_modules(variants, lambda *_: None)
+        compile_modules(builds, lambda *_: None)

@@ -129,7 +129,7 @@ def test_a_steady_bake_verifies_what_it_writes(tmp_path, monkeypatch):
     assert bench.main([*TINY, "--parts", "steady", "--seconds", "3", "--json", str(file)]) == 0
     rows = {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}
     assert rows["errors found in them"] == 0
-    assert rows["scenes verified and deleted"] % 3 == 0
+    assert rows["BOP scenes (episode x camera) verified and deleted"] % 3 == 0
     assert rows["views to disk, slowest 1 s"] <= rows["views to disk, fastest 1 s"]
     assert rows["resident memory of all writers, at the end"] > 0.0
     assert rows["CPU time of a view, verification and deletion"] >= 0.0
@@ -152,7 +152,7 @@ def points(*ticks: tuple[float, int, int]) -> list[whole.TracePoint]:
 def test_phases_add_up_to_the_whole_bake():
     """Two cameras, ten worlds: settling, 3 live, 9 live, 5 live, 10 live, and two ticks of a tail."""
     trace = points((5, 0, 10), (6, 6, 10), (7, 14, 10), (8, 32, 10), (10, 42, 10), (11, 62, 10), (12, 66, 2), (13, 68, 1))
-    phases = whole.split_phases(trace, 2, whole.Phase(15.0, 71))
+    phases = whole.split_stretches(trace, 2, whole.Stretch(15.0, 71))
     assert phases == {
         "start": (6, 6),
         "settling": (1, 8),
@@ -165,13 +165,13 @@ def test_phases_add_up_to_the_whole_bake():
 
 
 def test_a_bake_that_never_has_all_worlds_live_only_settles():
-    phases = whole.split_phases(points((1, 0, 10), (2, 2, 10), (3, 4, 10)), 1, whole.Phase(4.0, 4))
+    phases = whole.split_stretches(points((1, 0, 10), (2, 2, 10), (3, 4, 10)), 1, whole.Stretch(4.0, 4))
     assert (phases["start"], phases["settling"], phases["steady"]) == ((2, 2), (1, 2), (0, 0))
-    assert whole.split_phases([], 1, whole.Phase(4.0, 0))["finishing"] == (4, 0)
+    assert whole.split_stretches([], 1, whole.Stretch(4.0, 0))["finishing"] == (4, 0)
 
 
 def test_the_mean_is_compared_with_both_steady_rates():
-    rows = {row.name: row.value for row in whole.summarize(points((5, 10, 10), (6, 20, 10)), 1, whole.Phase(10.0, 20), 4.0)}
+    rows = {row.name: row.value for row in whole.summarize(points((5, 10, 10), (6, 20, 10)), 1, whole.Stretch(10.0, 20), 4.0)}
     assert rows["mean of the whole: views"] == 2.0
     assert rows["mean, of the rate of its own steady ticks"] == 20.0
     assert rows["mean, of the rate of the part steady"] == 50.0

@@ -73,19 +73,33 @@ class Stopwatch:
         function = getattr(owner, method)
 
         def timed(*arguments: object, **options: object) -> object:
-            if not self.device.is_cuda:
-                started = time.perf_counter()
-                result = function(*arguments, **options)
-                self.spent[name] += time.perf_counter() - started
-                return result
-            pair = (wp.Event(self.device, enable_timing=True), wp.Event(self.device, enable_timing=True))
-            self.device.stream.record_event(pair[0])
-            result = function(*arguments, **options)
-            self.device.stream.record_event(pair[1])
-            self.events[name].append(pair)
-            return result
+            with self._time(name):
+                return function(*arguments, **options)
 
         return mock.patch.object(owner, method, timed)
+
+    def time_generator(self, owner: object, method: str, name: str) -> contextlib.AbstractContextManager[object]:
+        """The same for a generator, from its first to its last part, with what its consumer does between."""
+        function = getattr(owner, method)
+
+        def timed(*arguments: object, **options: object) -> Iterator[object]:
+            with self._time(name):
+                yield from function(*arguments, **options)
+
+        return mock.patch.object(owner, method, timed)
+
+    @contextlib.contextmanager
+    def _time(self, name: str) -> Iterator[None]:
+        if not self.device.is_cuda:
+            started = time.perf_counter()
+            yield
+            self.spent[name] += time.perf_counter() - started
+            return
+        pair = (wp.Event(self.device, enable_timing=True), wp.Event(self.device, enable_timing=True))
+        self.device.stream.record_event(pair[0])
+        yield
+        self.device.stream.record_event(pair[1])
+        self.events[name].append(pair)
 
     def seconds(self, name: str) -> float:
         """Total time of the timer `name` [s]; waits for the device."""
@@ -164,14 +178,14 @@ def _measure_tick_parts(simulation: Simulation, tick: Callable[[], None], min_se
     """Breakdown of a tick: physics steps, everything else, launch overhead, collision detection."""
     physics, device = simulation.physics, simulation.device
     watch, calls = Stopwatch(device), 0
-    with watch.time_method(physics, "tick", "steps"):
+    with watch.time_generator(physics, "tick_parts", "steps"):
         while calls < MIN_REPEATS or watch.seconds("steps") < min_seconds:
             tick()
             calls += 1
     started = time.perf_counter()
     tick()
     host = time.perf_counter() - started
-    with mock.patch.object(physics, "tick"):
+    with mock.patch.object(physics, "tick_parts", side_effect=lambda *_: iter(())):
         outside = seconds_per_call(tick, device, min_seconds / 4, BURST)
     collide = _capture_graph(lambda: physics.pipeline.collide(physics.state, physics.contacts), device)
     yield Row("physics", "a tick: physics steps", 1e3 * watch.seconds("steps") / calls, "ms")
@@ -199,7 +213,7 @@ def _measure_pile_steps(simulation: Simulation, min_seconds: float) -> float:
         """Leave the forces of the last step."""
 
     # The captured graph contains the gripper's kernels, so steps without them need a graph of their own.
-    with mock.patch.object(simulation.physics, "_graph", None):
+    with mock.patch.object(simulation.physics, "_graphs", []):
         simulation.physics.tick(keep_forces)
         return seconds_per_call(lambda: simulation.physics.tick(keep_forces), simulation.device, min_seconds, BURST)
 
@@ -216,7 +230,7 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Ro
     perceptions, attached, acting = 0, 0, 0
     wp.synchronize_device(device)
     started = time.perf_counter()
-    with watch.time_method(simulation.physics, "tick", "steps"), watch.time_method(perception, "perceive", "perception"):
+    with watch.time_generator(simulation.physics, "tick_parts", "steps"), watch.time_method(perception, "perceive", "perception"):
         for _ in range(PICK_TICKS):
             simulation.tick(simulation.records[0])
             reader.start()

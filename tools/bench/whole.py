@@ -1,6 +1,7 @@
 """Benchmark of a whole bake with automatic worlds: its mean rate from start to exit, and where the time goes.
 
-Verified pictures are deleted meanwhile, since those of 150 episodes are larger than many a disk; lists stay, which the bake's end reads.
+Verified images are deleted meanwhile, as those of 150 episodes may not fit on the disk; all other files stay, since the bake reads some
+of them at its end.
 """
 
 from __future__ import annotations
@@ -36,15 +37,15 @@ class TracePoint(NamedTuple):
     """Episodes that have ended."""
 
 
-class Phase(NamedTuple):
-    """Part of a bake."""
+class Stretch(NamedTuple):
+    """Time and views of one stretch of a bake, such as settling or the tail."""
 
     seconds: float = 0.0
     views: int = 0
 
-    def plus(self, seconds: float, views: int) -> Phase:
+    def plus(self, seconds: float, views: int) -> Stretch:
         """Sum with a tick."""
-        return Phase(self.seconds + seconds, self.views + views)
+        return Stretch(self.seconds + seconds, self.views + views)
 
 
 class _Trace(SilentProgress):
@@ -74,7 +75,7 @@ def measure_whole(config: Config, episodes: int, steady_rate: float, traces: dic
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out", PICTURES):
         trace = _Trace()
         summary = run_bake(config, Path(folder) / "out", trace)
-        whole = Phase(time.perf_counter() - trace.started, summary.views)
+        whole = Stretch(time.perf_counter() - trace.started, summary.views)
     cameras = len(config.cameras.positions)
     traces["whole"] = describe_trace(trace.points, cameras)
     yield from summarize(trace.points, cameras, whole, steady_rate)
@@ -99,7 +100,7 @@ def describe_trace(points: Sequence[TracePoint], cameras: int) -> dict[str, list
     }
 
 
-def split_phases(points: Sequence[TracePoint], cameras: int, whole: Phase) -> dict[str, Phase]:
+def split_stretches(points: Sequence[TracePoint], cameras: int, whole: Stretch) -> dict[str, Stretch]:
     """Split a bake into consecutive parts, which add up to the whole; steady are ticks in which LIVE_FRACTION of all worlds are live.
 
     Args:
@@ -111,7 +112,7 @@ def split_phases(points: Sequence[TracePoint], cameras: int, whole: Phase) -> di
     threshold = LIVE_FRACTION * max((point.active for point in points), default=0)
     steady = [index for index, count in enumerate(live) if count and count >= threshold]
     first, last = (steady[0], steady[-1]) if steady else (len(points), len(points))
-    phases: dict[str, Phase] = dict.fromkeys(("start", "settling", "steady", "between", "tail", "finishing"), Phase())
+    stretches: dict[str, Stretch] = dict.fromkeys(("start", "settling", "steady", "between", "tail", "finishing"), Stretch())
     before = TracePoint(0.0, 0, 0, 0)
     for index, point in enumerate(points):
         if before.views == 0:
@@ -122,15 +123,15 @@ def split_phases(points: Sequence[TracePoint], cameras: int, whole: Phase) -> di
             name = "tail"
         else:
             name = "steady" if live[index] >= threshold else "between"
-        phases[name] = phases[name].plus(point.seconds - before.seconds, point.views - before.views)
+        stretches[name] = stretches[name].plus(point.seconds - before.seconds, point.views - before.views)
         before = point
-    phases["finishing"] = Phase(whole.seconds - before.seconds, whole.views - before.views)
-    return phases
+    stretches["finishing"] = Stretch(whole.seconds - before.seconds, whole.views - before.views)
+    return stretches
 
 
-def summarize(points: Sequence[TracePoint], cameras: int, whole: Phase, steady_rate: float) -> Iterator[Row]:
-    """Rows of a whole bake; arguments as of `split_phases` and `measure_whole`."""
-    phases, mean = split_phases(points, cameras, whole), whole.views / whole.seconds
+def summarize(points: Sequence[TracePoint], cameras: int, whole: Stretch, steady_rate: float) -> Iterator[Row]:
+    """Rows of a whole bake; arguments as of `split_stretches` and `measure_whole`."""
+    stretches, mean = split_stretches(points, cameras, whole), whole.views / whole.seconds
     many = f"{100 * LIVE_FRACTION:.0f} % of worlds"
     titles = {
         "start": "start to the first views",
@@ -144,12 +145,12 @@ def summarize(points: Sequence[TracePoint], cameras: int, whole: Phase, steady_r
     yield Row("whole", "ticks", len(points), "")
     yield Row("whole", "views", whole.views, "")
     yield Row("whole", "start to exit", whole.seconds, "s")
-    for name, phase in phases.items():
+    for name, phase in stretches.items():
         yield Row("whole", titles[name], phase.seconds, "s")
         if phase.views:
             yield Row("whole", f"{name}: views", phase.views / phase.seconds, "1/s")
     yield Row("whole", "mean of the whole: views", mean, "1/s")
-    steady = phases["steady"]
+    steady = stretches["steady"]
     if steady.views:
         yield Row("whole", "mean, of the rate of its own steady ticks", 100.0 * mean * steady.seconds / steady.views, "%")
     if steady_rate:

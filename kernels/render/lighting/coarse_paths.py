@@ -17,9 +17,10 @@ from synpick_warp.kernels.render.lighting.history import (
     accumulate,
     history_frame,
     lag_limit,
+    path_number,
     read_history,
-    rest_turn,
     scale_light,
+    update_frame,
     usable_paths,
 )
 from synpick_warp.kernels.render.lighting.path_tracing import (
@@ -47,7 +48,7 @@ INDIRECT_CLAMP = wp.constant(4.0)
 """Firefly clamp of indirect light: at most this many times the radiance of a white surface that faces the sun, on top of the clamp for
 unoccluded light. Few paths find sunlit surfaces, so each of them has a large weight."""
 SEQUENCE_FRAMES = wp.constant(64)
-"""Frames until accumulated paths repeat their random numbers: four times as many as an average remembers by default."""
+"""Paths until accumulated paths repeat their random numbers: four times as many as an average remembers by default, see `path_number`."""
 SHIFT_RANGE = wp.constant(1.0)
 """Range of the Cranley-Patterson rotation of the first dimension over the image: a slow gradient keeps neighbouring pixels stratified
 within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
@@ -55,7 +56,7 @@ within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
 
 @wp.struct
 class CoarseLight:
-    """Light that the surfaces of coarse pixels reflect; diffuse light without the surface's colour. Scratch.
+    """Reflected light of the coarse pixels; diffuse light is demodulated (without the surface's colour). Scratch.
 
     All arrays are (view, cell_row, cell_column). Light is exposed: radiance times the map's exposure, about 1, and packed by `pack_half3`.
     """
@@ -149,21 +150,21 @@ def average_paths(
 
 
 @wp.func
-def first_path_index(samples: int, row: int, column: int, frame: int, accumulates: bool) -> int:
+def first_path_index(samples: int, row: int, column: int, number: int, accumulates: bool) -> int:
     """Sobol' index of a coarse pixel's first path, in the sequence of its tile of SEQUENCE_PERIOD² coarse pixels.
 
-    Without accumulation each frame has the first `samples` points of every coarse pixel. With it, `frame`, which counts the frames with a
-    path, selects the coarse pixel's next point, modulo SEQUENCE_FRAMES.
+    Without accumulation each frame has the first `samples` points of every coarse pixel. With it, `number`, see `path_number`, selects
+    another point of the coarse pixel, modulo SEQUENCE_FRAMES.
     """
     index = morton_index(SEQUENCE_PERIOD, row, column)
     if accumulates:
-        return index + SEQUENCE_PERIOD * SEQUENCE_PERIOD * (samples + frame % SEQUENCE_FRAMES)
+        return index + SEQUENCE_PERIOD * SEQUENCE_PERIOD * (samples + number % SEQUENCE_FRAMES)
     return index * samples
 
 
 @wp.func
 def store_light(out: CoarseLight, view: int, row: int, column: int, light: SplitRadiance, unoccluded: SplitRadiance):
-    """Write a coarse pixel; both are exposed."""
+    """Write a coarse pixel; `light` and `unoccluded` are exposed, see `CoarseLight`."""
     out.diffuse[view, row, column] = pack_half3(light.diffuse)
     out.indirect[view, row, column] = pack_half3(light.indirect)
     out.specular[view, row, column] = pack_half3(light.specular)
@@ -196,8 +197,8 @@ def trace_coarse_paths_kernel(
 ):
     """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
-    A coarse pixel with a usable history traces one path and blends it in; the longer its history, the less often, see `rest_bits`. One
-    without traces `rules.samples` paths. The sun's direct light is left out, see `shadows`; `variance` is not written.
+    A coarse pixel without a usable history traces `rules.samples` paths. With one it traces a single path and blends it in, or none in
+    frames that its update period skips, see `period_bits`. The sun's direct light is left out, see `shadows`; `variance` is not written.
     """
     view, row, column = interleaved_pixel(coarse, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
@@ -221,11 +222,11 @@ def trace_coarse_paths_kernel(
     frame = history_frame(history_inout, slot, known)
     exposure = scene.lights.exposure[context.light]
     mean = SplitRadiance()
-    if bits > 0 and rest_turn(row, column, bits) != frame % (1 << bits):
+    if bits > 0 and update_frame(row, column, bits) != frame % (1 << bits):
         mean = read_history(history_inout, slot, row, column)
     else:
         samples = wp.where(known > 0, 1, rules.samples)
-        index = first_path_index(rules.samples, row, column, frame >> bits, known > 0)
+        index = first_path_index(rules.samples, row, column, path_number(frame, bits), known > 0)
         paths = average_paths(scene, bodies, rules, context, index, samples, vertex, width, unoccluded, firefly_clamp)
         mean = accumulate(history_inout, slot, row, column, hit.segment, scale_light(paths, exposure), known, samples)
     store_light(coarse_light_out, view, row, column, mean, scale_light(unoccluded, exposure))

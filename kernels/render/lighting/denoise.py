@@ -44,7 +44,7 @@ class RatioImages:
     specular: wp.array3d[wp.uint64]
     """Visibility ratio of specular light."""
     indirect: wp.array3d[wp.uint64]
-    """Indirect diffuse light, without the surface's colour: no ratio, but exposed as `CoarseLight`."""
+    """Demodulated indirect diffuse light, exposed as in `CoarseLight`; not a ratio."""
 
 
 @wp.struct

@@ -21,12 +21,14 @@ LIGHT_CHANGE = wp.constant(0.05)
 """Temporal lag that an average may have, as a fraction of the light: remembered paths times the change in a frame (`light_change`)."""
 MIN_CHANGE = wp.constant(1.0e-6)
 """Change of a point's light below which it counts as unchanged: histories are far shorter than LIGHT_CHANGE / MIN_CHANGE."""
-REST_PATHS = wp.constant(4)
-"""Fewest paths of an average that grows only in some frames."""
-MAX_REST_BITS = wp.constant(3)
-"""Binary logarithm of the longest rest period [frames]."""
+MIN_SKIP_PATHS = wp.constant(4)
+"""Shortest history [paths] that is updated in only some of the frames."""
+MAX_PERIOD_BITS = wp.constant(3)
+"""Binary logarithm of the longest update period [frames]."""
 BAYER_BITS = wp.constant(4)
 """Bits of a threshold of the 4 x 4 Bayer matrix."""
+PERIOD_PATHS = wp.constant(16)
+"""Part of the sample sequence of each update period [paths]: most paths that a history counts by default."""
 NEVER = wp.constant(-2)
 """Frame index of an empty history, which no frame continues."""
 
@@ -198,9 +200,9 @@ def lag_limit(
     segment: int,
     point: wp.vec3,
 ) -> int:
-    """Longest memory that a coarse pixel's average may have [frames]: LIGHT_CHANGE / `light_change`.
+    """Maximum history length of a coarse pixel [frames], from the estimated change of its light: LIGHT_CHANGE / `light_change`.
 
-    0, which rejects the history, if another segmentation id was visible, the body moved, or the history lacks the previous frame.
+    0 rejects the history: another segmentation id was visible, the body moved, or the previous frame is missing.
     """
     if history.max_paths == 0 or moving.holds[view] == 0:
         return 0
@@ -214,32 +216,39 @@ def lag_limit(
 
 
 @wp.func
-def rest_bits(paths: int, limit: int) -> int:
-    """Binary logarithm of a coarse pixel's rest period: with 4, 8, 16 paths it traces one in 2, 4, 8 frames; 0: one in each frame.
+def period_bits(paths: int, limit: int) -> int:
+    """Binary logarithm of a coarse pixel's update period: with 4, 8, 16 paths it traces one every 2, 4, 8 frames; 0: every frame.
 
-    The period is shorter where REST_PATHS of them would span more than `limit` frames, see `lag_limit`.
+    The period is shortened until MIN_SKIP_PATHS periods fit into `limit` frames, see `lag_limit`.
     """
     bits = int(0)
-    while bits < MAX_REST_BITS and (REST_PATHS << bits) <= paths and (REST_PATHS << (bits + 1)) <= limit:
+    while bits < MAX_PERIOD_BITS and (MIN_SKIP_PATHS << bits) <= paths and (MIN_SKIP_PATHS << (bits + 1)) <= limit:
         bits += 1
     return bits
 
 
 @wp.func
 def usable_paths(history: LightHistory, slot: int, row: int, column: int, limit: int) -> tuple[int, int]:
-    """History length after rejection, for a coarse pixel's `lag_limit`: paths of its average that may be kept, and its `rest_bits`."""
+    """History rejection: (number of paths of the history to keep, `period_bits`), for the `limit` of `lag_limit`; (0, 0): rejected."""
     if limit == 0:
         return 0, 0
     paths = int(history.paths[slot, row, column])
-    bits = rest_bits(paths, limit)
+    bits = period_bits(paths, limit)
     return wp.min(paths, limit >> bits), bits
 
 
 @wp.func
-def rest_turn(row: int, column: int, bits: int) -> int:
-    """Frame of a rest period, from 0 to 2^bits - 1, in which a coarse pixel traces its path: ordered dithering (Bayer, 1973) of 4 x 4.
+def path_number(frame: int, bits: int) -> int:
+    """Index of a coarse pixel's path in its sequence, distinct within a history: paths of each update period have a part of their own."""
+    return (frame >> bits) + PERIOD_PATHS * bits
 
-    Those that trace in the same frame are spread evenly, and LANE_STRIDE apart, so that those of a warp trace or rest together.
+
+@wp.func
+def update_frame(row: int, column: int, bits: int) -> int:
+    """Frame of the update period, 0 to 2^bits - 1, in which a coarse pixel traces its path: 4 x 4 ordered dithering (Bayer, 1973).
+
+    Coarse pixels that trace in the same frame are spread evenly. The pattern repeats every LANE_STRIDE, so that all threads of a warp
+    trace, or none does.
     """
     other = row ^ column
     threshold = ((other & 1) << 3) | ((row & 1) << 2) | (other & 2) | ((row & 2) >> 1)
@@ -300,7 +309,13 @@ def write_history(history: LightHistory, slot: int, row: int, column: int, segme
 def accumulate(
     history: LightHistory, slot: int, row: int, column: int, segment: int, light: SplitRadiance, known: int, samples: int
 ) -> SplitRadiance:
-    """Blend the mean of `samples` new paths into an average of `known` ones, and store it; returns the new average."""
+    """Add the light of new paths to a coarse pixel's history, and return the new average.
+
+    Args:
+        light: Mean of the new paths, exposed.
+        known: Paths of the history that are kept; 0: it is replaced.
+        samples: Number of new paths; 1 if `known` is above 0, so that the new path has the weight 1 / (known + 1).
+    """
     average = light
     if known > 0:
         average = blend_light(read_history(history, slot, row, column), light, 1.0 / float(known + 1))

@@ -12,12 +12,12 @@ PIXEL_VARIANCE = wp.constant(1.0 / 12.0)
 MAX_WIDENING = wp.constant(0.18)
 """Specular anti-aliasing: largest increase of the squared GGX width alpha² (Tokuyoshi and Kaplanyan, 2019)."""
 TEXEL_BITS = wp.constant(10)
-"""Bits of a texel's channel: the square root of a linear value, an encoding that a multiplication decodes, in steps of at most a third of
-those of 8-bit sRGB."""
+"""Bits of a texel's channel in gamma 2.0: the square root of the linear value, decoded by one multiplication. Its steps are at most a third
+of those of 8-bit sRGB."""
 TEXEL_MASK = wp.constant((1 << 10) - 1)
 """Largest value of a texel's channel."""
 TEXEL_SCALE = wp.constant(1.0 / ((1 << 10) - 1) ** 2)
-"""Linear value of a square of 1."""
+"""Scale of a squared channel to a linear value from 0 to 1."""
 MIN_TILT = wp.constant(0.1)
 """Smallest cosine for a pixel's footprint on a surface seen edge-on."""
 

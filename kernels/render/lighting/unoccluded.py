@@ -12,6 +12,8 @@ wp.set_module_options({"enable_backward": False})
 
 MIN_UNOCCLUDED = wp.constant(0.05)
 """Unoccluded light is at least this fraction of the map's mean, so that visibility ratios stay bounded."""
+MIN_EXPOSED = wp.constant(1.0e-3)
+"""And, times the map's exposure, at least this, so that half precision holds it and its ratios where a map is black but for its sun."""
 
 
 @wp.func
@@ -28,7 +30,9 @@ def unoccluded_light(lights: Lights, light: int, yaw: float, brdf: Brdf) -> Spli
     [rad] about +z.
     """
     radiance = SplitRadiance()
-    floor = MIN_UNOCCLUDED * lights.irradiance[light, 0] * SH_CONSTANT
+    floor = max_channels(
+        MIN_UNOCCLUDED * lights.irradiance[light, 0] * SH_CONSTANT, MIN_EXPOSED / lights.exposure[light] * wp.vec3(1.0, 1.0, 1.0)
+    )
     irradiance = max_channels(sh_irradiance(lights, light, rotate_z(brdf.normal, -yaw)), floor)
     radiance.diffuse = ((1.0 - coat_albedo(brdf, brdf.albedo)) / wp.PI) * irradiance
     mirrored = 2.0 * wp.dot(brdf.normal, brdf.outgoing) * brdf.normal - brdf.outgoing

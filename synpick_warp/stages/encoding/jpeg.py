@@ -42,7 +42,7 @@ from synpick_warp.kernels.encoding.stuffing import (
 )
 from synpick_warp.kernels.encoding.tables import BLOCK, BLOCK_SIZE, BLOCKS_PER_MCU, MCU
 from synpick_warp.kernels.render.images.camera_effects import jpeg_quality_kernel
-from synpick_warp.kernels.tuning import JPEG_BLOCK
+from synpick_warp.kernels.tuning import JPEG_THREADS
 from synpick_warp.stages.buffers import ViewBuffers
 
 SLOT_BYTES_PER_PIXEL = 1.0
@@ -146,7 +146,7 @@ class JpegEncoder:
             inputs=[image],
             outputs=[self._samples],
             device=device,
-            block_dim=JPEG_BLOCK,
+            block_dim=JPEG_THREADS,
         )
         wp.launch(
             transform_blocks_kernel,
@@ -154,7 +154,7 @@ class JpegEncoder:
             inputs=[scratch.sample, *image.shape[1:3], quality, self.reciprocal],
             outputs=[scratch.coefficient, scratch.nonzero],
             device=device,
-            block_dim=JPEG_BLOCK,
+            block_dim=JPEG_THREADS,
         )
         wp.launch(
             measure_blocks_kernel,
@@ -162,7 +162,7 @@ class JpegEncoder:
             inputs=[self.tables, scratch.coefficient, scratch.nonzero, INTERVAL_BLOCKS],
             outputs=[scratch.block_bits],
             device=device,
-            block_dim=JPEG_BLOCK,
+            block_dim=JPEG_THREADS,
         )
         wp.launch(
             place_blocks_kernel,
@@ -170,7 +170,7 @@ class JpegEncoder:
             inputs=[scratch.block_bits, INTERVAL_BLOCKS, int(MARKER_BYTES)],
             outputs=[scratch.block_begin, scratch.slot, scratch.coded, scratch.interval_size],
             device=device,
-            block_dim=JPEG_BLOCK,
+            block_dim=JPEG_THREADS,
         )
         wp.launch(
             write_blocks_kernel,
@@ -178,7 +178,7 @@ class JpegEncoder:
             inputs=[self.tables, scratch.coefficient, scratch.nonzero, scratch.block_begin, INTERVAL_BLOCKS],
             outputs=[scratch.slot],
             device=device,
-            block_dim=JPEG_BLOCK,
+            block_dim=JPEG_THREADS,
         )
         self._join(quality, count, out)
 
@@ -191,7 +191,7 @@ class JpegEncoder:
             inputs=[scratch.slot, scratch.coded],
             outputs=[scratch.stuffing, scratch.interval_size],
             device=device,
-            block_dim=JPEG_BLOCK,
+            block_dim=JPEG_THREADS,
         )
         slot_bytes = int(WORD_BYTES) * scratch.slot.shape[2]
         wp.launch(
@@ -200,7 +200,7 @@ class JpegEncoder:
             inputs=[scratch.coded, scratch.interval_size, slot_bytes, self.header.shape[1], out.jpeg.shape[1]],
             outputs=[scratch.interval_begin, out.jpeg_size],
             device=device,
-            block_dim=JPEG_BLOCK,
+            block_dim=JPEG_THREADS,
         )
         wp.launch(
             join_intervals_kernel,
@@ -216,7 +216,7 @@ class JpegEncoder:
             ],
             outputs=[out.jpeg],
             device=device,
-            block_dim=JPEG_BLOCK,
+            block_dim=JPEG_THREADS,
         )
 
 

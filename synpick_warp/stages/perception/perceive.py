@@ -71,7 +71,7 @@ class Perception:
             self._graphs[id(snapshot)] = capture.graph
         wp.capture_launch(self._graphs[id(snapshot)])
 
-    def forget_graphs(self) -> None:
+    def clear_graphs(self) -> None:
         """Drop the captured graphs; the next call loads all kernels, and captures them anew."""
         self._graphs.clear()
         self._warm = False

@@ -18,7 +18,7 @@ from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
 
-# What `next` returns for an iterator that has ended.
+# Sentinel: default of `next` for an exhausted iterator.
 ENDED = object()
 # Contacts with a larger gap make no constraint rows [m]: only those that a hook has disabled have one, none that the pipeline finds.
 CONTACT_GAP = 0.1
@@ -26,13 +26,13 @@ CONTACT_GAP = 0.1
 JOINT_LIMIT_GAP = 0.2
 # On an H200, models of one and two worlds round differently from those of 8, 64 and 512, which agree bit by bit.
 MIN_GPU_WORLDS = 8
-# If `bake.worlds` is 0, a GPU has no more worlds than this fraction of the episodes, so that short ones follow where others ended; but as
-# many as make this many views of a tick, whose pictures take as long as its physics does on an H200 in few worlds, 0.2 s. Monte Carlo of
-# list scheduling with measured lengths and times, as fractions of the rate with 300 worlds: 150 episodes 0.72 in 150 worlds, 0.78 in 100;
-# 300 episodes 0.81 in 300 worlds, 0.88 in 200; 600 episodes 0.93 in 150 to 300.
+# Automatic number of worlds on a GPU: at most this fraction of the episodes, so that worlds whose episodes end early start others while
+# long ones run; but enough for BUSY_VIEWS views a tick, which an H200 renders in the time of a tick of physics in few worlds, 0.2 s.
+# Monte Carlo of list scheduling with measured lengths and times; mean rate of a whole bake over the rate with 300 worlds:
+# 150 episodes: 0.72 in 150 worlds, 0.78 in 100. 300 episodes: 0.81 in 300, 0.88 in 200. 600 episodes: 0.93 in 150 to 300.
 GPU_WORLDS_PER_EPISODE, BUSY_VIEWS = 2.0 / 3.0, 144
-# Most worlds if `bake.worlds` is 0. On an H200 a full-HD bake makes 431 views/s in 300 worlds and 500 in 512, where writers are the limit;
-# on a CPU worlds are simulated one after the other, so that more of them gain nothing.
+# Maximum worlds if `bake.worlds` is 0. On a GPU more worlds need memory and hide more of the latency of physics, which pictures hide as
+# well; on a CPU worlds are simulated one after the other, so that more of them gain nothing.
 MAX_GPU_WORLDS, MAX_CPU_WORLDS = 512, 4
 
 
@@ -42,10 +42,10 @@ def balance_worlds(episodes: int, limit: int) -> int:
 
 
 def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None = None) -> Config:
-    """Settings with the number of worlds of a device.
+    """Resolve `bake.worlds`: as set, or if 0 from the number of episodes; on a GPU at least MIN_GPU_WORLDS.
 
-    If `bake.worlds` is 0, it follows from the number of episodes, in balanced rounds, or on a GPU in fewer worlds: see
-    GPU_WORLDS_PER_EPISODE. A GPU has at least MIN_GPU_WORLDS, so that an episode does not depend on their count; surplus worlds idle.
+    Automatic: balanced rounds (`balance_worlds`), on a GPU limited by GPU_WORLDS_PER_EPISODE. The minimum keeps episodes independent of
+    the number of worlds; surplus worlds idle.
 
     Args:
         config: All settings.
@@ -143,8 +143,9 @@ class Physics:
     def tick_parts(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
     ) -> Iterator[None]:
-        """Advance all worlds by one tick: `steps_per_tick` steps of `substeps` solver steps, on a GPU as captured graphs; yields after each
-        solver step.
+        """Advance all worlds by one tick, `steps_per_tick` x `substeps` substeps: a generator that yields after each substep.
+
+        On a GPU each substep is captured once as a CUDA graph.
 
         Hooks and watcher are captured once, so they must launch the same kernels on the same arrays every time.
 
@@ -164,7 +165,7 @@ class Physics:
             self._capture(self._run_substeps(before_step, after_collide, watcher))
 
     def _capture(self, substeps: Iterator[None]) -> None:
-        """Capture each substep in a graph of its own: CUDA spreads a graph of a whole tick over 66 streams, one a substep."""
+        """Capture a CUDA graph per substep: a tick is enqueued in parts, and CUDA would spread one graph of a tick over 66 streams."""
         busy = True
         while busy:
             with wp.ScopedCapture(device=self.device) as capture:
@@ -172,7 +173,7 @@ class Physics:
             if busy:
                 self._graphs.append(capture.graph)
 
-    def forget_graphs(self) -> None:
+    def clear_graphs(self) -> None:
         """Drop the captured graphs; the next tick runs eagerly, and captures them anew."""
         self._graphs = []
 

@@ -113,7 +113,9 @@ class Simulation:
             pass
 
     def tick_parts(self, record: TickRecord) -> Iterator[None]:
-        """Advance all worlds by one tick as `tick` does, in parts: a caller can enqueue other work on other streams between them.
+        """Advance all worlds by one tick: a generator that yields after episodes are started and after each substep of physics.
+
+        The caller can enqueue other work on other streams between.
 
         Start episodes, step physics, update tasks, end episodes, copy the snapshot, then plan attempts in worlds whose task is LOOK.
         """
@@ -139,11 +141,11 @@ class Simulation:
                 _copy(record.observation, self.observation)
                 _copy(record.plan, self.plan)
 
-    def forget_graphs(self) -> None:
+    def clear_graphs(self) -> None:
         """Drop captured graphs: the next tick launches all kernels one by one, and captures them anew."""
-        self.physics.forget_graphs()
+        self.physics.clear_graphs()
         if self.perception is not None:
-            self.perception.forget_graphs()
+            self.perception.clear_graphs()
 
     def _arrange(self) -> None:
         """Start episodes in free worlds: objects are sampled and dropped."""

@@ -11,16 +11,18 @@ import pytest
 import warp as wp
 
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
-from synpick_warp.kernels.render.lighting.history import MAX_REST_BITS, LightHistory, usable_paths
+from synpick_warp.kernels.render.lighting.coarse_paths import SEQUENCE_FRAMES
+from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS, LightHistory
 from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
+from tests.harness.history_probe import schedule_kernel, usable_paths_kernel
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot
 
 PATHS = 16
-LONGEST_REST = 1 << int(MAX_REST_BITS)
+LONGEST_PERIOD = 1 << int(MAX_PERIOD_BITS)
 FILLED = 4 + 4 * 2 + 8 * 4
 """Frames until the history of a still scene is full: 4 paths in each frame, 4 in every second, 8 in every fourth."""
 VIEW = camera(64, 48, 300.0, (0.0, 0.0, 1.5))
@@ -66,20 +68,6 @@ def renderer(device) -> Renderer:
     return make_renderer(each.settings(), build_scene(each, device), each.instances, 1, 1)
 
 
-@wp.kernel
-def usable_paths_kernel(
-    # In:
-    history: LightHistory,
-    limit: int,
-    # Out:
-    result_out: wp.array[int],
-):
-    """Paths that may be kept, and rest bits, of one coarse pixel."""
-    kept, bits = usable_paths(history, 0, 0, 0, limit)
-    result_out[0] = kept
-    result_out[1] = bits
-
-
 def usable(paths: int, limit: int, device: wp.Device) -> tuple[int, int]:
     """Paths that may be kept, and the rest period [frames]."""
     history, result = LightHistory(), wp.zeros(2, dtype=wp.int32, device=device)
@@ -121,16 +109,24 @@ def test_averages_span_no_more_frames_than_the_lag_allows(device, paths, limit, 
     assert kept * period <= limit
 
 
+@pytest.mark.parametrize("row", range(4))
+@pytest.mark.parametrize("column", range(4))
+def test_the_paths_of_a_history_have_distinct_samples(device, row, column):
+    numbers = wp.empty(PATHS, dtype=wp.int32, device=device)
+    wp.launch(schedule_kernel, dim=1, inputs=[row, column], outputs=[numbers], device=device)
+    assert len(set((numbers.numpy() % SEQUENCE_FRAMES).tolist())) == PATHS
+
+
 def test_full_histories_take_turns(renderer, device):
     """In a still scene a coarse pixel traces a path in one of 8 frames, an even part of all in each, also in each 4 x 4."""
-    frames = [(frame, toy()) for frame in range(FILLED + 1 + 2 * LONGEST_REST)]
+    frames = [(frame, toy()) for frame in range(FILLED + 1 + 2 * LONGEST_PERIOD)]
     stored = [renderer.shading.history.diffuse.numpy()[0].copy() for _ in show(renderer, frames, device)]
     changed = np.array([now != before for before, now in itertools.pairwise(stored[FILLED:])])
-    assert (changed[:LONGEST_REST].sum(axis=0) <= 1).all()
-    assert (changed[LONGEST_REST:].sum(axis=0) <= 1).all()
-    squares = changed[:, :24, :32].reshape(2 * LONGEST_REST, 6, 4, 8, 4).sum(axis=(2, 4))
-    assert squares.max() == 16 // LONGEST_REST
-    assert squares.mean() > 0.9 * 16 // LONGEST_REST
+    assert (changed[:LONGEST_PERIOD].sum(axis=0) <= 1).all()
+    assert (changed[LONGEST_PERIOD:].sum(axis=0) <= 1).all()
+    squares = changed[:, :24, :32].reshape(2 * LONGEST_PERIOD, 6, 4, 8, 4).sum(axis=(2, 4))
+    assert squares.max() == 16 // LONGEST_PERIOD
+    assert squares.mean() > 0.9 * 16 // LONGEST_PERIOD
 
 
 @pytest.mark.parametrize("scale", [1e-7, 1e6])

@@ -21,9 +21,9 @@ WARM_STEPS = 2
 GRAPH_STEPS = 10
 """Steps in a captured CUDA graph."""
 CONES = {"pyramidal": 10, "elliptic": 20}
-"""Friction cones of MuJoCo, each with the maximum of its Newton solver's iterations."""
+"""MuJoCo's friction cones -> maximum iterations of its solver (Newton's method, not the library Newton)."""
 CONTACT_ROOM, MIN_CONTACTS = 2.0, 64
-"""Contacts a world for which MuJoCo Warp gets memory, relative to the most that our runs ended with; and at least."""
+"""Contact capacity of a world in MuJoCo Warp: this multiple of the largest count at the ends of our runs, and the minimum."""
 CONTACT_ROWS = 4
 """Constraint rows of a contact in the pyramidal cone; the elliptic one has three."""
 CAPACITY_STEP = 16
@@ -31,7 +31,7 @@ CAPACITY_STEP = 16
 WORLDS_PER_THREAD = 4
 """Worlds of each thread of MuJoCo."""
 LINEAR = slice(0, 3)
-"""Linear part of a body's velocity, in Newton and in a free joint of MuJoCo."""
+"""First three components: position of a pose, linear part of a velocity (Newton's bodies, MuJoCo's free joints)."""
 
 
 class Engine(Protocol):

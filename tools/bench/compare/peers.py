@@ -92,7 +92,7 @@ def _measure_physics(config: Config, pile: Pile, peers: tuple[str, ...], device:
 
 
 def _guard(part: str, measure: Callable[[], Iterator[Row]]) -> Iterator[Row]:
-    """Rows of a peer; one that says why, if it fails: what others' libraries raise, nobody knows."""
+    """Rows of a peer; if it raises an exception, a last row with the reason."""
     try:
         yield from measure()
     except Exception as error:

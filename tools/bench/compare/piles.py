@@ -27,7 +27,7 @@ class Pile:
     """Object to world: x, y, z [m], quaternion x, y, z, w (body, 7) float64."""
 
     def lift(self) -> Pile:
-        """The same objects above the tote, one above the other: the start of a fall."""
+        """Start of a fall: the same pile, stretched vertically by SPREAD and raised by LIFT; x, y and orientations stay."""
         pose = self.pose.copy()
         pose[:, 2] = LIFT + SPREAD * pose[:, 2]
         return replace(self, pose=pose)

@@ -1,0 +1,40 @@
+"""Test kernels for temporal accumulation: histories of single coarse pixels."""
+
+import warp as wp
+
+from synpick_warp.kernels.render.lighting.history import LightHistory, path_number, period_bits, update_frame, usable_paths
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def usable_paths_kernel(
+    # In:
+    history: LightHistory,
+    limit: int,
+    # Out:
+    result_out: wp.array[int],
+):
+    """Paths that may be kept, and rest bits, of one coarse pixel."""
+    kept, bits = usable_paths(history, 0, 0, 0, limit)
+    result_out[0] = kept
+    result_out[1] = bits
+
+
+@wp.kernel
+def schedule_kernel(
+    # In:
+    row: int,
+    column: int,
+    # Out:
+    number_out: wp.array[int],  # (path)
+):
+    """Numbers of the paths that one coarse pixel of a still scene traces, until the array is full."""
+    paths = wp.int32(0)
+    frame = wp.int32(0)
+    while paths < number_out.shape[0]:
+        bits = period_bits(wp.min(paths, 16), 1000)
+        if bits == 0 or update_frame(row, column, bits) == frame % (1 << bits):
+            number_out[paths] = path_number(frame, bits)
+            paths += 1
+        frame += 1
