@@ -52,7 +52,7 @@ def bakes(monkeypatch):
     plan.describe_memory = lambda config: [("Snapshot.pose", (config.bake.worlds, 24), "m", 2 * 1024**2), ("Goals.goal", (4,), "", 0)]
     monkeypatch.setitem(sys.modules, "synpick_warp.memory_plan", plan)
     sizes = types.ModuleType("synpick_warp.scheduling.sizes")
-    sizes.fit_to_device, sizes.count_writers = lambda config, *_: config, lambda _: 1
+    sizes.fit_to_device, sizes.without_pictures, sizes.count_writers = lambda config, *_: config, lambda config: config, lambda _: 1
     monkeypatch.setitem(sys.modules, "synpick_warp.scheduling.sizes", sizes)
     return module
 
