@@ -1,7 +1,7 @@
-"""Compilation of kernels ahead of their launches: dry launches list the modules that they need, and threads compile these.
+"""Parallel ahead-of-time compilation of Warp modules: a dry run lists the modules that launches need, and a thread pool compiles them.
 
-Warp compiles a module when one of its kernels is first launched, one after the other. Listed first, their number is known. Warp generates
-code under a lock; compilers run beside each other.
+Warp compiles each module when one of its kernels is first launched, one after the other. Listing them first gives their number, for
+progress, and lets compilers run in parallel; Warp generates their source code under a lock.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class DryLaunches:
     """Dry run of kernel launches, by replacing `wp.Module.load`: in all threads kernels neither load nor run; copies and fills do run.
 
     Attributes:
-        builds: Modules that the launches would have loaded, in the order of their first launch.
+        builds: Modules that the launches need, in the order of their first launch.
     """
 
     def __init__(self) -> None:
@@ -71,11 +71,11 @@ class DryLaunches:
 
 
 def compile_modules(builds: Collection[ModuleBuild], report: Callable[[int, int], None]) -> int:
-    """Compile and load the modules that are not in the kernel cache, in threads.
+    """Compile and load in parallel the modules that the kernel cache lacks, in a thread pool.
 
     Args:
-        builds: The modules; those that the cache has are left for their first launch to load.
-        report: Called in this thread with the number of modules that are ready, from 0 on, and that of all to compile, if there are any.
+        builds: Modules; those in the cache are loaded by their first launch.
+        report: Progress callback (ready, total), called in this thread from (0, total) on; not called if nothing is missing.
 
     Returns:
         The number of compiled modules.

@@ -24,10 +24,10 @@ EXACT_AREA, EXACT_OUTLINE = 0.002, 0.1
 """Mask tolerance in data sets that this package baked: EXACT_AREA x area + EXACT_OUTLINE x length of the outline [px] may differ, plus a
 few. A shift by 1 px exceeds it."""
 AREA, OUTLINE = 0.02, 0.4
-"""Mask tolerance in other data sets, by the same formula. It allows the half-pixel shift of sampling at pixel corners, but not a shift by 2
-px."""
+"""Mask tolerance for data sets of other origin, by the same formula. It admits the half-pixel shift of sampling at pixel corners, but no
+shift by 2 px."""
 MARGIN = 24
-"""Largest shift of a mask that is looked for [px]."""
+"""Search range of a mask's shift [px]."""
 
 
 @dataclass(eq=False)

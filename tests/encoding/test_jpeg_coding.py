@@ -28,7 +28,7 @@ def quantize_kernel(reciprocal: wp.array[wp.uint32], out: wp.array2d[int]):
 
 
 def test_reciprocals_divide_exactly(device):
-    """All divisors of all qualities, all magnitudes of 16 bits."""
+    """Exact division by reciprocals: all divisors of all qualities, all 16-bit magnitudes."""
     divisors = jpeg.DIVISOR_SCALE * np.arange(1, 256)
     magnitudes = np.arange(1 << 16)
     out = wp.empty((len(divisors), len(magnitudes)), dtype=int, device=device)
@@ -91,7 +91,7 @@ def random_blocks(views: int, mcus: int, seed: int = 0) -> np.ndarray:
 
 @pytest.mark.parametrize(("mcus", "interval_mcus"), [(1, 32), (1, 1), (7, 1), (9, 4), (64, 32), (65, 32)])
 def test_lengths_and_bits_are_those_of_the_twin(device, mcus, interval_mcus):
-    """Intervals of one MCU, partial last ones, several views."""
+    """Restart intervals of one and of several MCUs, incomplete last intervals, and batches of several views."""
     blocks = random_blocks(2, mcus, mcus)
     interval_blocks = 6 * interval_mcus
     result = code(blocks, interval_blocks, device, slot_words=10_000)

@@ -13,19 +13,9 @@ from synpick_warp.kernels.render.visibility.camera import Cameras
 from synpick_warp.stages.buffers import Snapshot, view_buffer_sizes
 from synpick_warp.stages.online.batches import GPU_RING, BatchRing, ViewBatch
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
+from tests.harness.spin import SPINS, spin_kernel
 
 BATCHES, VIEWS, ROOM = 12, 3, 2
-SPINS = 20_000
-"""Rounds of a thread that keeps a queue busy for about a millisecond."""
-
-
-@wp.kernel
-def spin_kernel(value: wp.array[float], rounds: int):
-    i = wp.tid()
-    x = value[i]
-    for _ in range(rounds):
-        x = wp.sin(x) + 1.0
-    value[i] = x
 
 
 class NumberingRenderer:

@@ -11,23 +11,13 @@ import pytest
 import warp as wp
 
 from synpick_warp.stages import ticks
+from synpick_warp.stages.host_copies import HostCopy
 from synpick_warp.stages.sim.simulate import RECORDS
-from synpick_warp.stages.stream import HostCopy
+from tests.harness.spin import SPINS, spin_kernel
 
 TICKS, WORLDS = 24, 64
 PARTS = ticks.PARTS_AHEAD + 6 * ticks.PARTS_PER_BATCH
 """Parts of a tick: more than are enqueued ahead."""
-SPINS = 20_000
-"""Rounds of a thread that keeps a queue busy for about a millisecond."""
-
-
-@wp.kernel
-def spin_kernel(value: wp.array[float], rounds: int):
-    i = wp.tid()
-    x = value[i]
-    for _ in range(rounds):
-        x = wp.sin(x) + 1.0
-    value[i] = x
 
 
 class NumberingSimulation:

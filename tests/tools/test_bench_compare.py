@@ -29,7 +29,7 @@ SMALL = (
 
 @pytest.fixture
 def short(monkeypatch):
-    """As few ticks, steps and repetitions as there can be."""
+    """Minimum counts of ticks, steps and repetitions, for short tests."""
     for name in ("FALL_TICKS", "SETTLE_TICKS"):
         monkeypatch.setattr(f"tools.bench.physics.{name}", 1)
     for target in ("physics.MIN_REPEATS", "sensor.BURST", "compare.rendering.BURST", "compare.rendering.SMALL_WORLDS_CPU"):

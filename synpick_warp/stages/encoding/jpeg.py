@@ -81,7 +81,7 @@ class JpegScratch:
     nonzero: wp.array = device_array("view", "block", dtype=wp.uint64)
     """Bit field of the coefficients that are not 0."""
     block_bits: wp.array = device_array("view", "block", dtype=wp.int32)
-    """Length of each block's code [bit]."""
+    """Length of each block's bit string [bit]."""
     block_begin: wp.array = device_array("view", "block", dtype=wp.int32)
     """First bit of each block in its interval."""
     slot: wp.array = device_array("view", "interval", "slot_word", dtype=wp.uint32)
@@ -138,86 +138,33 @@ class JpegEncoder:
             count: Views in use.
             out: Written.
         """
-        scratch, device = self.scratch, self.device
+        scratch = self.scratch
         blocks, intervals = (count, scratch.nonzero.shape[1]), (count, scratch.slot.shape[1])
-        wp.launch(
-            convert_colors_kernel,
-            dim=(count, self._samples.shape[1] // 3, self._samples.shape[2] // 2),
-            inputs=[image],
-            outputs=[self._samples],
-            device=device,
-            block_dim=JPEG_THREADS,
-        )
-        wp.launch(
-            transform_blocks_kernel,
-            dim=blocks,
-            inputs=[scratch.sample, *image.shape[1:3], quality, self.reciprocal],
-            outputs=[scratch.coefficient, scratch.nonzero],
-            device=device,
-            block_dim=JPEG_THREADS,
-        )
-        wp.launch(
-            measure_blocks_kernel,
-            dim=blocks,
-            inputs=[self.tables, scratch.coefficient, scratch.nonzero, INTERVAL_BLOCKS],
-            outputs=[scratch.block_bits],
-            device=device,
-            block_dim=JPEG_THREADS,
-        )
-        wp.launch(
-            place_blocks_kernel,
-            dim=intervals,
-            inputs=[scratch.block_bits, INTERVAL_BLOCKS, int(MARKER_BYTES)],
-            outputs=[scratch.block_begin, scratch.slot, scratch.coded, scratch.interval_size],
-            device=device,
-            block_dim=JPEG_THREADS,
-        )
-        wp.launch(
-            write_blocks_kernel,
-            dim=blocks,
-            inputs=[self.tables, scratch.coefficient, scratch.nonzero, scratch.block_begin, INTERVAL_BLOCKS],
-            outputs=[scratch.slot],
-            device=device,
-            block_dim=JPEG_THREADS,
-        )
+        _, rows, columns = self._samples.shape
+        # A third of the rows are chroma: a row for each pair of rows of Y.
+        self._launch(convert_colors_kernel, (count, rows // 3, columns // 2), [image], [self._samples])
+        inputs = [scratch.sample, *image.shape[1:3], quality, self.reciprocal]
+        self._launch(transform_blocks_kernel, blocks, inputs, [scratch.coefficient, scratch.nonzero])
+        inputs = [self.tables, scratch.coefficient, scratch.nonzero]
+        self._launch(measure_blocks_kernel, blocks, [*inputs, INTERVAL_BLOCKS], [scratch.block_bits])
+        placed = [scratch.block_begin, scratch.slot, scratch.coded, scratch.interval_size]
+        self._launch(place_blocks_kernel, intervals, [scratch.block_bits, INTERVAL_BLOCKS, int(MARKER_BYTES)], placed)
+        self._launch(write_blocks_kernel, blocks, [*inputs, scratch.block_begin, INTERVAL_BLOCKS], [scratch.slot])
         self._join(quality, count, out)
 
     def _join(self, quality: wp.array, count: int, out: JpegBuffers) -> None:
         """Stuff bytes, and join the intervals to files."""
-        scratch, device = self.scratch, self.device
-        wp.launch(
-            count_stuffing_kernel,
-            dim=(count, *scratch.stuffing.shape[1:]),
-            inputs=[scratch.slot, scratch.coded],
-            outputs=[scratch.stuffing, scratch.interval_size],
-            device=device,
-            block_dim=JPEG_THREADS,
-        )
-        slot_bytes = int(WORD_BYTES) * scratch.slot.shape[2]
-        wp.launch(
-            place_intervals_kernel,
-            dim=count,
-            inputs=[scratch.coded, scratch.interval_size, slot_bytes, self.header.shape[1], out.jpeg.shape[1]],
-            outputs=[scratch.interval_begin, out.jpeg_size],
-            device=device,
-            block_dim=JPEG_THREADS,
-        )
-        wp.launch(
-            join_intervals_kernel,
-            dim=(count, *scratch.stuffing.shape[1:]),
-            inputs=[
-                scratch.slot,
-                scratch.coded,
-                scratch.interval_size,
-                scratch.interval_begin,
-                scratch.stuffing,
-                quality,
-                self.header,
-            ],
-            outputs=[out.jpeg],
-            device=device,
-            block_dim=JPEG_THREADS,
-        )
+        scratch = self.scratch
+        lanes, slot_bytes = (count, *scratch.stuffing.shape[1:]), int(WORD_BYTES) * scratch.slot.shape[2]
+        self._launch(count_stuffing_kernel, lanes, [scratch.slot, scratch.coded], [scratch.stuffing, scratch.interval_size])
+        inputs = [scratch.coded, scratch.interval_size, slot_bytes, self.header.shape[1], out.jpeg.shape[1]]
+        self._launch(place_intervals_kernel, count, inputs, [scratch.interval_begin, out.jpeg_size])
+        inputs = [scratch.slot, scratch.coded, scratch.interval_size, scratch.interval_begin, scratch.stuffing, quality, self.header]
+        self._launch(join_intervals_kernel, lanes, inputs, [out.jpeg])
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list[Any], outputs: list[wp.array]) -> None:
+        """Launch a kernel with the block size of the encoder."""
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=JPEG_THREADS)
 
 
 class Compressor:
