@@ -135,7 +135,7 @@ def compile_if_cold(
     needs_images: bool = True,
     renders: bool = True,
 ) -> None:
-    """Compile the kernels of a bake, beside each other, where the cache has none.
+    """Compile the kernels of a bake in parallel if the kernel cache is cold, with a minimal factory that is freed again.
 
     Args:
         config, device, progress, records_physics, needs_images: As of `build_factory`.
@@ -151,7 +151,7 @@ def compile_if_cold(
 
 
 def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
-    """The factory of as few worlds as the device simulates, and of a view a batch; arguments and errors as of `build_factory`."""
+    """Build a minimal factory: the fewest worlds that the device simulates, one view a batch; arguments, errors as of `build_factory`."""
     config = replace(config, bake=replace(config.bake, worlds=1), render=replace(config.render, views_per_batch=1))
     config = fit_to_device(config, device, 1, count_writers(config))
     return _assemble(config, device, progress, [0], records_physics, needs_images)

@@ -25,13 +25,13 @@ class WarmUp:
 
 
 def warm_up(config: Config, progress: Progress) -> WarmUp:
-    """Compile what a bake with these settings compiles, then run two ticks and render a view of as few worlds as a device simulates.
+    """Compile the kernels of a bake with these settings, then run two ticks and one rendering in the fewest worlds of the device.
 
     Nothing is written but caches. Kernels depend on the settings only by which of them are used (mode, renderer, layers, formats).
 
     Args:
         config: All settings.
-        progress: Receives the stages, and of how many modules how many are compiled.
+        progress: Receives the stages and the progress of the compilation.
 
     Raises:
         SynpickError: As `synpick_warp.bake`.

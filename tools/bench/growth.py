@@ -1,4 +1,4 @@
-"""Benchmark of growth: how physics of a tick and rendering of a view cost more with worlds, objects, resolution, paths and cameras.
+"""Scaling benchmark: physics time of a tick and rendering time of a view against worlds, objects, resolution, paths and cameras.
 
 One factor varies at a time, and the others stay as set. Physics is that of piles DROP_TICKS ticks after the drop, without gripper; the
 pictures show these piles.

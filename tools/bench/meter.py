@@ -54,9 +54,9 @@ class Reading:
 
 
 class SteadyMeter(SilentProgress):
-    """Progress observer that takes readings, and stops the bake by a signal, as a user would.
+    """Progress observer that takes a reading after each tick of the steady state, and then stops the bake by SIGINT.
 
-    That is when `seconds` are measured, when no episodes wait for a world any more, or when a verified episode is damaged.
+    It stops after `seconds` of readings, when no episode waits for a world any more, or when verification finds a damaged file.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class SteadyMeter(SilentProgress):
         Args:
             seconds: Time to measure [s].
             folder: Where the bake writes.
-            steady_count: Views, or frames, of a tick from which it counts as steady.
+            steady_count: Steady-state threshold: views, or frames, of a tick.
             worlds: Worlds of the bake.
             device: Device of the bake.
             cleaner: Process that verifies and deletes; None: there is none.

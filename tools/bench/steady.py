@@ -45,7 +45,7 @@ def clean_up_behind(config: Config, out: Path, suffixes: tuple[str, ...] = ()) -
 
 
 def measure_steady(config: Config, min_seconds: float) -> Iterator[Row]:
-    """Bake to the temporary folder (TMPDIR) until `min_seconds` [s] with views are measured; what was written is removed."""
+    """Bake to the temporary folder (TMPDIR) until the steady state is measured for `min_seconds` [s]; the files are removed."""
     config, device = plan_spare_episodes(config), pick_device(config.bake.device)
     live_views = LIVE_FRACTION * config.bake.worlds * len(config.cameras.positions)
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out") as cleaner:

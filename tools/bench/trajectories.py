@@ -33,7 +33,7 @@ HOUR = 3600.0
 
 
 def measure_trajectories(config: Config, min_seconds: float) -> Iterator[Row]:
-    """Bake to the temporary folder (TMPDIR) until `min_seconds` [s] with frames are measured; what was written is removed."""
+    """Bake to the temporary folder (TMPDIR) until the steady state is measured for `min_seconds` [s]; the files are removed."""
     config = plan_spare_episodes(dataclasses.replace(config, bake=dataclasses.replace(config.bake, formats=FORMATS)))
     worlds, device = config.bake.worlds, pick_device(config.bake.device)
     with tempfile.TemporaryDirectory() as folder, _count_frames() as frames:
@@ -46,7 +46,7 @@ def measure_trajectories(config: Config, min_seconds: float) -> Iterator[Row]:
 
 @contextlib.contextmanager
 def _count_frames() -> Iterator[list[int]]:
-    """Count the frames that exporters get meanwhile: a list of one number."""
+    """Count frames handed to the exporters within this context; yields a list whose one element is the count."""
     frames, write = [0], Exporters.write_ticks
 
     def count(exporters: Exporters, batch: TickBatch) -> None:
@@ -58,7 +58,7 @@ def _count_frames() -> Iterator[list[int]]:
 
 
 def _summarize(config: Config, meter: SteadyMeter) -> Iterator[Row]:
-    """Rows of the rates, of the steps, in which all worlds take part, and of the episodes."""
+    """Rows: rates, world-steps of all worlds whether live or not, disk space, and episodes."""
     yield Row("trajectories", "worlds", config.bake.worlds, "")
     yield from summarize_rates("trajectories", "frame", meter)
     first, last, physics = meter.readings[0], meter.readings[-1], config.physics

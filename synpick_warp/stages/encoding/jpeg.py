@@ -52,7 +52,7 @@ FILE_BYTES_PER_PIXEL = 0.75
 MIN_FILE_BYTES = 1024
 """Capacity for header and markers [B]."""
 LANES = 32
-"""Threads that copy an interval: a warp."""
+"""Lanes: threads that count and copy the bytes of an interval, a warp."""
 INTERVAL_BLOCKS = RESTART_INTERVAL * int(BLOCKS_PER_MCU)
 """Blocks of a restart interval."""
 QUAD = 4
@@ -196,7 +196,7 @@ class Compressor:
 
 
 def upload_huffman(device: wp.Device) -> Any:
-    """The standard codes, as the struct `HuffmanTables`."""
+    """Upload the standard Huffman tables (T.81, annex K) as the struct `HuffmanTables`."""
     tables = allocate_struct(HUFFMAN, {"component": 2, "symbol": 256}, device)
     for kind, counts, symbols in (("dc", DC_COUNTS, DC_SYMBOLS), ("ac", AC_COUNTS, AC_SYMBOLS)):
         codes = [huffman_codes(*table) for table in zip(counts, symbols, strict=True)]

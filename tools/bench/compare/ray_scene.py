@@ -25,7 +25,7 @@ PIXEL_SIZE = 1e-5
 
 
 class RayScene:
-    """MuJoCo Warp's model and data of the first worlds of a snapshot; objects that worlds do not share differ by their mesh alone."""
+    """MuJoCo Warp's model and data for the first worlds of a snapshot; all worlds have the same geoms, each with its own mesh and pose."""
 
     def __init__(
         self,

@@ -85,7 +85,7 @@ def tile_snapshot(snapshot: Snapshot, worlds: int, device: wp.Device) -> Snapsho
 
 
 class OurViews:
-    """Our renderer with images of a size of its own, for all cameras of the first worlds of a snapshot."""
+    """Our renderer at the image size of `cameras`, for all cameras of the first worlds of a snapshot."""
 
     def __init__(self, config: Config, factory: Factory, cameras: tuple[Camera, ...], snapshot: Snapshot, worlds: int) -> None:
         scene, count, instances = factory.stream.renderer.scene, worlds * len(cameras), factory.stream.renderer.instances
