@@ -31,6 +31,9 @@ CHUNK_TILES = wp.constant(32)
 """Tiles of footprints that share a list and its counter: one counter per view would serialize the atomic additions of all threads."""
 CREASE_SLOPE = wp.constant(1.5)
 """Change of a body's slope [m/m] across a footprint from which it counts as a crease: at a box's edge that points here it is 2."""
+CREASE_TURN = wp.constant(0.36)
+"""Tangent of the angle by which one of a crease's sides must turn, too: 20°. Where a surface is seen at a grazing angle, its slope changes
+much with small turns that no picture shows: a third of the rays went there."""
 FLAT_SLOPE = wp.constant(0.1)
 JUMP_SLOPE = wp.constant(8.0)
 """A surface whose slope seems to change by more than JUMP_SLOPE [m/m], but seen from one side of a footprint by less than FLAT_SLOPE, ends
@@ -77,27 +80,34 @@ def resolve_radiance(image: ShadedImage, view: int, row: int, column: int) -> wp
 
 @wp.func
 def has_crease(gbuffer: GBuffer, grid: ImageGrid, focal: float, view: int, row: int, column: int, down: int, right: int) -> bool:
-    """Crease or depth jump of one body between a pixel and the next one `down` or `right`, by second differences of 1/z.
+    """Crease or depth jump of one body between a pixel and the next one `down` or `right`, by its slopes before, across and behind.
 
-    1/z of a plane is linear in the image, so two pixels on one side predict the next one. At the image border, where one side is
-    missing, the other's difference counts twice.
+    1/z of a plane is linear in the image, so slopes are differences of 1/z over its value. At the image border, where one side is missing,
+    the other's change of slope counts twice.
     """
     middle = 1.0 / gbuffer.depth[view, row, column]
     next = 1.0 / gbuffer.depth[view, row + down, column + right]
-    before = float(0.0)
-    behind = float(0.0)
+    scale = focal / middle
+    across = scale * (next - middle)
     starts = row >= down and column >= right
     ends = row + 2 * down < grid.height and column + 2 * right < grid.width
+    before = across
+    behind = across
     if starts:
-        before = wp.abs(1.0 / gbuffer.depth[view, row - down, column - right] + next - 2.0 * middle)
+        before = scale * (middle - 1.0 / gbuffer.depth[view, row - down, column - right])
     if ends:
-        behind = wp.abs(1.0 / gbuffer.depth[view, row + 2 * down, column + 2 * right] + middle - 2.0 * next)
+        behind = scale * (1.0 / gbuffer.depth[view, row + 2 * down, column + 2 * right] - next)
     if not starts:
-        before = behind
+        before = 2.0 * across - behind
     elif not ends:
-        behind = before
-    bend = focal * (before + behind) / middle
-    return bend > CREASE_SLOPE and (bend < JUMP_SLOPE or focal * wp.min(before, behind) > FLAT_SLOPE * middle)
+        behind = 2.0 * across - before
+    first = wp.abs(across - before)
+    second = wp.abs(behind - across)
+    bend = first + second
+    if bend <= CREASE_SLOPE or (bend >= JUMP_SLOPE and wp.min(first, second) <= FLAT_SLOPE):
+        return False
+    # The difference of two angles has the tangent (a - b) / (1 + a b).
+    return first > CREASE_TURN * (1.0 + before * across) or second > CREASE_TURN * (1.0 + across * behind)
 
 
 @wp.func
