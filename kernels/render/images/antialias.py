@@ -187,8 +187,9 @@ def find_footprints_kernel(
     left = wp.max(column - 1, 0)
     bottom = wp.min(row, grid.height - 1)
     right = wp.min(column, grid.width - 1)
-    if has_discontinuity(gbuffer, grid, cameras.intrinsics[views.camera[view]], view, top, left, bottom, right):
-        if has_contrast(radiance, view, top, left, bottom, right):
+    # Most pixels have no contrast, which costs a fifth of the other test.
+    if has_contrast(radiance, view, top, left, bottom, right):
+        if has_discontinuity(gbuffer, grid, cameras.intrinsics[views.camera[view]], view, top, left, bottom, right):
             chunk = tile_of(footprints, row, column) // CHUNK_TILES
             footprint_out[view, chunk, wp.atomic_add(count_inout, view, chunk, 1)] = row * footprints.width + column
 
