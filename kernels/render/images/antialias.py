@@ -8,6 +8,7 @@ of whichever of the four pixels shows that surface; so a ray costs no shading. T
 import warp as wp
 
 from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.lighting.coarse_grid import clamp_index
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
@@ -18,9 +19,6 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 SAMPLES = wp.constant(4)
 """Coverage rays of a pixel, one in each quarter. Eight are nearer to the reference by 0.07 dB, and cost half as much again."""
-FOUR_ROOKS = wp.constant(wp.types.matrix(shape=(4, 2), dtype=float)(-0.125, -0.375, 0.375, -0.125, -0.375, 0.125, 0.125, 0.375))
-"""Four-rooks (rotated grid) sample pattern: (x, y) [px from the pixel's centre], by quarters: upper left, upper right, lower left, lower
-right. No two share one of four rows or columns, so silhouettes of any direction are resolved."""
 FOOTPRINT_PIXELS = wp.constant(4)
 """Pixels whose centres are a footprint's corners: upper left, upper right, lower left, lower right."""
 SOURCE_BITS = wp.constant(2)
@@ -56,6 +54,18 @@ class ShadedImage:
     resolve: wp.array3d[wp.uint32]
     """Resolve code (view, row, column). 0: the pixel's colour is its own radiance. Else it is the mean over its samples, each with
     SOURCE_BITS that select the pixel whose radiance it takes, see `source_offset`."""
+
+
+@wp.func
+def rook_offset(sample: int) -> wp.vec2:
+    """Four-rooks (rotated grid) sample pattern: (x, y) [px from the pixel's centre], by quarters: upper left, upper right, lower left,
+    lower right. No two share one of four rows or columns, so silhouettes of any direction are resolved.
+
+    Computed, because a table with a variable index would lie in slow local memory.
+    """
+    x = wp.where(sample // 2 == sample % 2, 0.125, 0.375)
+    y = 0.5 - x
+    return wp.vec2(wp.where(sample % 2 == 0, -x, x), wp.where(sample // 2 == 0, -y, y))
 
 
 @wp.func
@@ -211,12 +221,12 @@ def visible_bodies(gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, colum
     """Bit mask, by body index, of the bodies that a footprint's corners show."""
     mask = wp.uint64(0)
     for corner in range(FOOTPRINT_PIXELS):
-        r = corner_row(row, corner)
-        c = corner_column(column, corner)
-        if in_image(grid, r, c):
-            segment = int(gbuffer.segment[view, r, c])
-            if segment != Segment.NOTHING and segment != Segment.TABLE:
-                mask = mask | (wp.uint64(1) << wp.uint64(body_of(segment, instances)))
+        # Clamped, a corner outside the image is another corner within it.
+        r = clamp_index(corner_row(row, corner), grid.height)
+        c = clamp_index(corner_column(column, corner), grid.width)
+        segment = int(gbuffer.segment[view, r, c])
+        if segment != Segment.NOTHING and segment != Segment.TABLE:
+            mask = mask | (wp.uint64(1) << wp.uint64(body_of(segment, instances)))
     return mask
 
 
@@ -287,23 +297,25 @@ def resolve_footprints_kernel(
     `resolve_inout` receives the samples' source bits. The host does not read the counts, so a fixed number of `threads` strides over
     the samples of a chunk; neighbouring threads take samples of one footprint, whose rays meet the same bodies.
     """
-    thread = wp.tid()
-    chunks = count.shape[1]
-    view = thread // (chunks * threads)
-    chunk = (thread // threads) % chunks
+    # Unsigned: cheaper to divide.
+    thread = wp.uint32(wp.tid())
+    place = thread // wp.uint32(threads)
+    chunks = wp.uint32(count.shape[1])
+    view = int(place // chunks)
+    chunk = int(place % chunks)
     camera = views.camera[view]
     intrinsics = cameras.intrinsics[camera]
-    for index in range(thread % threads, SAMPLES * count[view, chunk], threads):
-        cell = footprint[view, chunk, index // SAMPLES]
-        row = cell // footprints.width
-        column = cell % footprints.width
-        own = index % SAMPLES
+    for index in range(int(thread % wp.uint32(threads)), SAMPLES * count[view, chunk], threads):
+        cell = wp.uint32(footprint[view, chunk, int(wp.uint32(index) // wp.uint32(SAMPLES))])
+        row = int(cell // wp.uint32(footprints.width))
+        column = int(cell % wp.uint32(footprints.width))
+        own = int(wp.uint32(index) % wp.uint32(SAMPLES))
         # The footprint is in the lower right quarter of its upper left corner, and so on.
         sample = SAMPLES - 1 - own
         r = corner_row(row, own)
         c = corner_column(column, own)
         if in_image(grid, r, c):
-            offset = wp.vec2(FOUR_ROOKS[sample, 0], FOUR_ROOKS[sample, 1])
+            offset = rook_offset(sample)
             ray = camera_ray(intrinsics, r, c, offset)
             visible = visible_bodies(gbuffer, grid, view, row, column, views.instances)
             body_mask = filter_body_mask(bodies, view, tile_of(grid, r, c), visible)
