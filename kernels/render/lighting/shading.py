@@ -47,7 +47,7 @@ def shade_kernel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     ratios: RatioImages,
-    sun_visibility: wp.array3d[float],  # (view, shadow_row, shadow_column)
+    sun_visibility: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
     views: Views,
     first: int,
     # Out:
@@ -86,5 +86,5 @@ def shade_kernel(
     sun = float(0.0)
     if wp.max(scene.lights.sun_irradiance[which]) > 0.0:
         if wp.dot(surface.face_normal, rotate_z(scene.lights.sun_direction[which], yaw)) > 0.0:
-            sun = upsample_shadow(gbuffer, sun_visibility, shadow_grid, view, row, column, plane)
+            sun = upsample_shadow(sun_visibility, shadow_grid, view, row, column, plane)
     radiance_out[view, row, column] = shade_surface(scene.surfaces.albedo, scene.lights, which, yaw, brdf, pixel_ratios, sun)

@@ -59,11 +59,11 @@ RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 
 @dataclass(frozen=True, eq=False)
 class ShadowArrays:
-    """Sun visibility at the middle of each coarse pixel of the shadow grid."""
+    """Sun visibility at the middle of each coarse pixel of the shadow grid, packed by `pack_visibility`."""
 
-    traced: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.float32)
+    traced: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.uint64)
     """0 or 1, from one shadow ray."""
-    filtered: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.float32)
+    filtered: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.uint64)
     """0 to 1."""
 
 
