@@ -75,10 +75,6 @@ def shade_kernel(
         body = body_of(segment, views.instances)
         width = depth / intrinsics[0]
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
-    color = sample_base_color(scene.surfaces, surface)
-    metallic = scene.surfaces.metallic[surface.row]
-    roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
-    brdf = make_brdf(scene.surfaces.albedo, color, metallic, roughness, surface.normal, outgoing)
     normal = wp.transpose(cameras.to_world[camera]) * surface.face_normal
     plane = tangent_plane(intrinsics, row, column, gbuffer.segment[view, row, column], depth, normal)
     pixel_ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
@@ -87,4 +83,8 @@ def shade_kernel(
     if wp.max(scene.lights.sun_irradiance[which]) > 0.0:
         if wp.dot(surface.face_normal, rotate_z(scene.lights.sun_direction[which], yaw)) > 0.0:
             sun = upsample_shadow(sun_visibility, shadow_grid, view, row, column, plane)
+    color = sample_base_color(scene.surfaces, surface)
+    metallic = scene.surfaces.metallic[surface.row]
+    roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
+    brdf = make_brdf(scene.surfaces.albedo, color, metallic, roughness, surface.normal, outgoing)
     radiance_out[view, row, column] = shade_surface(scene.surfaces.albedo, scene.lights, which, yaw, brdf, pixel_ratios, sun)
