@@ -8,10 +8,9 @@ of whichever of the four pixels shows that surface; so a ray costs no shading. T
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.coarse_grid import clamp_index
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
-from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, in_image, tile_of, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, clamp_index, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 

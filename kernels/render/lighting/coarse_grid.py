@@ -51,13 +51,6 @@ def middle_pixel(coarse: CoarseGrid, row: int, column: int) -> wp.vec2i:
 
 
 @wp.func
-def clamp_index(index: int, size: int) -> int:
-    """Nearest index from 0 to `size` - 1. The maximum comes last: the compiler then knows that the result is not negative, which spares
-    look-ups Warp's test for indices that count from the end."""
-    return wp.max(wp.min(index, size - 1), 0)
-
-
-@wp.func
 def morton_index(period: int, row: int, column: int) -> int:
     """Morton code (Z-order) of a coarse pixel within squares of `period` (2 to 16) pixels: which of period² sample points it takes.
 

@@ -7,7 +7,6 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     MIN_WEIGHT,
     PLANE_TOLERANCE,
     CoarseGrid,
-    clamp_index,
     coarse_coordinate,
     middle_pixel,
     morton_index,
@@ -16,7 +15,7 @@ from synpick_warp.kernels.render.lighting.environment import Lights, rotate_z
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import rotate_to_axis, sobol_point
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
-from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, clamp_index, hit_position, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Meshes, Table, ViewBodies, face_normal, read_hit
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 

@@ -7,12 +7,12 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     MIN_WEIGHT,
     PLANE_TOLERANCE,
     CoarseGrid,
-    clamp_index,
     coarse_coordinate,
     middle_pixel,
 )
 from synpick_warp.kernels.render.lighting.color import half3_tag, pack_half3, tag_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance
+from synpick_warp.kernels.render.visibility.camera import clamp_index
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

@@ -80,6 +80,13 @@ def in_image(grid: ImageGrid, row: int, column: int) -> bool:
 
 
 @wp.func
+def clamp_index(index: int, size: int) -> int:
+    """Nearest index from 0 to `size` - 1. The maximum comes last: the compiler then knows that the result is not negative, which spares
+    look-ups Warp's test for indices that count from the end."""
+    return wp.max(wp.min(index, size - 1), 0)
+
+
+@wp.func
 def tile_of(grid: ImageGrid, row: int, column: int) -> int:
     """Index of the tile that contains a pixel."""
     return (row // TILE_HEIGHT) * grid.tile_columns + column // TILE_WIDTH
