@@ -105,7 +105,7 @@ class FlatDenoiser:
         getattr(self.coarse_light, name).assign(rgb[None].astype(np.float32) if name == "variance" else pack_half3_array(rgb[None]))
 
     def run(self, variance_scale: float = 1.0) -> dict[str, np.ndarray]:
-        """Denoise: arrays (row, column, 3) of `RatioImages` by name after smoothing, and with the prefix "chosen_" before."""
+        """Denoise: arrays (row, column, 3) by the names of `Ratios` after smoothing, and with the prefix "chosen_" before."""
         shared = [self.cameras, self.coarse, self.guide]
         for kernel, source, rules, out in (
             (filter_blocks_kernel, self.coarse_light, (), self.blocks),
@@ -113,9 +113,15 @@ class FlatDenoiser:
             (smooth_ratios_kernel, self.chosen, (), self.ratios),
         ):
             wp.launch(kernel, self.count, [*shared, source, self.views, *rules, 0], [out], device=self.device)
-        names = ("diffuse", "specular", "indirect")
-        smoothed = {name: unpack_half3_array(getattr(self.ratios, name).numpy()[0]) for name in names}
-        return smoothed | {f"chosen_{name}": unpack_half3_array(getattr(self.chosen, name).numpy()[0]) for name in names}
+        pairs = (("", self.ratios), ("chosen_", self.chosen))
+        return {
+            prefix + name: values for prefix, images in pairs for name, values in unpack_ratio_records(images.record.numpy()[0]).items()
+        }
+
+
+def unpack_ratio_records(records: np.ndarray) -> dict[str, np.ndarray]:
+    """Light (..., 3) float32 in `RatioImages.record` (..., 3) uint64, by the names of `Ratios`."""
+    return {name: unpack_half3_array(records[..., index]) for index, name in enumerate(("diffuse", "specular", "indirect"))}
 
 
 def unpack_half3_array(packed: np.ndarray) -> np.ndarray:

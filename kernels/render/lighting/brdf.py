@@ -83,8 +83,9 @@ def directional_albedo(tables: AlbedoTables, roughness: float, cosine: float) ->
     """Directional albedo at a roughness and a cosine, bilinear in roughness and √cosine."""
     y = wp.clamp(roughness, 0.0, 1.0) * float(ALBEDO_ROWS - 1)
     x = wp.sqrt(wp.clamp(cosine, 0.0, 1.0)) * float(ALBEDO_COLUMNS - 1)
-    row = wp.min(int(y), ALBEDO_ROWS - 2)
-    column = wp.min(int(x), ALBEDO_COLUMNS - 2)
+    # Unsigned until they are cut, so that the compiler knows that they are not negative.
+    row = int(wp.min(wp.uint32(y), wp.uint32(ALBEDO_ROWS - 2)))
+    column = int(wp.min(wp.uint32(x), wp.uint32(ALBEDO_COLUMNS - 2)))
     right = x - float(column)
     return wp.lerp(
         wp.lerp(tables.directional[row, column], tables.directional[row, column + 1], right),
@@ -97,7 +98,7 @@ def directional_albedo(tables: AlbedoTables, roughness: float, cosine: float) ->
 def mean_albedo_at(tables: AlbedoTables, roughness: float) -> wp.vec2:
     """Mean albedo at a roughness."""
     y = wp.clamp(roughness, 0.0, 1.0) * float(ALBEDO_ROWS - 1)
-    row = wp.min(int(y), ALBEDO_ROWS - 2)
+    row = int(wp.min(wp.uint32(y), wp.uint32(ALBEDO_ROWS - 2)))
     return wp.lerp(tables.mean[row], tables.mean[row + 1], y - float(row))
 
 
@@ -183,22 +184,22 @@ def smith_term(cosine: float, alpha: float) -> float:
 
 
 @wp.func
-def ggx_distribution(half_way: wp.vec3, alpha: float) -> float:
-    """GGX normal distribution D at a half vector in the shading frame."""
+def ggx_distribution(cosine: float, squared_sine: float, alpha: float) -> float:
+    """GGX normal distribution D at a half vector, by its angle to the normal."""
     a2 = alpha * alpha
-    denominator = (half_way[0] * half_way[0] + half_way[1] * half_way[1]) + a2 * half_way[2] * half_way[2]
+    denominator = squared_sine + a2 * cosine * cosine
     return a2 / (wp.PI * denominator * denominator)
 
 
 @wp.func
-def ggx_disc_distribution(half_way: wp.vec3, alpha: float, radius: float) -> float:
-    """Mean of D over a disc of half-vector slopes with this radius about that of `half_way`; `ggx_distribution` if the radius is 0.
+def ggx_disc_distribution(cosine: float, squared_sine: float, alpha: float, radius: float) -> float:
+    """Mean of D over a disc of half-vector slopes with this radius about that of a half vector; `ggx_distribution` if the radius is 0.
 
     In slope space GGX is the stereographic projection of the uniform distribution on a sphere: discs map to spherical caps, whose area
     has a closed form.
     """
-    c2 = wp.max(half_way[2] * half_way[2], MIN_COSINE)
-    away = (half_way[0] * half_way[0] + half_way[1] * half_way[1]) / (c2 * alpha * alpha)
+    c2 = wp.max(cosine * cosine, MIN_COSINE)
+    away = squared_sine / (c2 * alpha * alpha)
     wide = radius * radius / (alpha * alpha)
     near = 1.0 + away - wide
     root = wp.sqrt(near * near + 4.0 * wide)
@@ -249,36 +250,64 @@ class SplitRadiance:
     """Specular reflection of both."""
 
 
+@wp.struct
+class Angles:
+    """Angles of a light direction, the view direction and their half vector. The BRDF is isotropic, so it needs no tangents."""
+
+    incoming: float
+    """Cosine of the light direction to the normal."""
+    outgoing: float
+    """Cosine of the view direction to the normal."""
+    half_way: float
+    """Cosine of the half vector to the normal."""
+    squared_sine: float
+    """Squared sine of that angle; 1 - cosine² would lose the digits that a sharp lobe needs."""
+    difference: float
+    """Cosine of the half vector to the view direction."""
+
+
 @wp.func
-def evaluate_lobes(tables: AlbedoTables, brdf: Brdf, i: wp.vec3, o: wp.vec3, half_way: wp.vec3, distribution: float) -> BrdfValue:
-    """Both lobes for light from i seen from o, in the shading frame; `distribution` is D at the half vector."""
+def measure_angles(brdf: Brdf, incoming: wp.vec3) -> Angles:
+    """Angles for light from `incoming`."""
+    angles = Angles()
+    angles.incoming = wp.dot(incoming, brdf.normal)
+    angles.outgoing = wp.dot(brdf.outgoing, brdf.normal)
+    half_way = wp.normalize(incoming + brdf.outgoing)
+    angles.half_way = wp.dot(half_way, brdf.normal)
+    across = half_way - angles.half_way * brdf.normal
+    angles.squared_sine = wp.dot(across, across)
+    angles.difference = wp.dot(brdf.outgoing, half_way)
+    return angles
+
+
+@wp.func
+def evaluate_lobes(tables: AlbedoTables, brdf: Brdf, angles: Angles, distribution: float) -> BrdfValue:
+    """Both lobes for light and view directions at these `angles`; `distribution` is D at the half vector."""
     value = BrdfValue()
     one = wp.vec3(1.0, 1.0, 1.0)
-    fresnel = brdf.f0 + schlick_weight(wp.dot(o, half_way)) * (one - brdf.f0)
-    masking = 2.0 / (smith_term(i[2], brdf.alpha) + smith_term(o[2], brdf.alpha))
-    single = distribution * masking / (4.0 * wp.max(o[2], MIN_COSINE)) * fresnel
+    fresnel = brdf.f0 + schlick_weight(angles.difference) * (one - brdf.f0)
+    masking = 2.0 / (smith_term(angles.incoming, brdf.alpha) + smith_term(angles.outgoing, brdf.alpha))
+    single = distribution * masking / (4.0 * wp.max(angles.outgoing, MIN_COSINE)) * fresnel
 
-    albedo = directional_albedo(tables, brdf.roughness, i[2])
+    albedo = directional_albedo(tables, brdf.roughness, angles.incoming)
     lost = (
         (1.0 - albedo[0] - albedo[1])
         * (1.0 - brdf.albedo[0] - brdf.albedo[1])
         / wp.max(1.0 - brdf.mean_albedo[0] - brdf.mean_albedo[1], MIN_LOST_ALBEDO)
     )
     transmitted = (1.0 - coat_albedo(brdf, albedo)) * (1.0 - coat_albedo(brdf, brdf.albedo)) / (1.0 - coat_albedo(brdf, brdf.mean_albedo))
-    value.specular = single + (i[2] / wp.PI * lost) * brdf.multi_scatter
-    value.diffuse = i[2] / wp.PI * transmitted
+    value.specular = single + (angles.incoming / wp.PI * lost) * brdf.multi_scatter
+    value.diffuse = angles.incoming / wp.PI * transmitted
     return value
 
 
 @wp.func
 def evaluate_brdf(tables: AlbedoTables, brdf: Brdf, incoming: wp.vec3) -> BrdfValue:
     """Evaluate the BRDF times cosine for light from `incoming`; zero below the surface."""
-    i = to_local(brdf, incoming)
-    o = to_local(brdf, brdf.outgoing)
-    if i[2] <= 0.0 or o[2] <= 0.0:
+    angles = measure_angles(brdf, incoming)
+    if angles.incoming <= 0.0 or angles.outgoing <= 0.0:
         return BrdfValue()
-    half_way = wp.normalize(i + o)
-    return evaluate_lobes(tables, brdf, i, o, half_way, ggx_distribution(half_way, brdf.alpha))
+    return evaluate_lobes(tables, brdf, angles, ggx_distribution(angles.half_way, angles.squared_sine, brdf.alpha))
 
 
 @wp.func
@@ -289,27 +318,25 @@ def evaluate_disc(tables: AlbedoTables, brdf: Brdf, center: wp.vec3, radius: flo
     approximated by a disc of the same area: in sharp highlights of wide lamps at cosines below 0.5 the middle is too bright and the sides
     are too dark.
     """
-    i = to_local(brdf, center)
-    o = to_local(brdf, brdf.outgoing)
-    if i[2] <= 0.0 or o[2] <= 0.0:
+    angles = measure_angles(brdf, center)
+    if angles.incoming <= 0.0 or angles.outgoing <= 0.0:
         return wp.vec3(0.0, 0.0, 0.0)
-    half_way = wp.normalize(i + o)
     # A half vector rotates by half the angle in the plane of both directions, by more across it; slopes change by more than angles do.
-    slopes = 0.5 * radius / wp.sqrt(wp.max(wp.dot(o, half_way) * half_way[2] * half_way[2] * half_way[2], MIN_COSINE))
-    value = evaluate_lobes(tables, brdf, i, o, half_way, ggx_disc_distribution(half_way, brdf.alpha, slopes))
+    cube = angles.half_way * angles.half_way * angles.half_way
+    slopes = 0.5 * radius / wp.sqrt(wp.max(angles.difference * cube, MIN_COSINE))
+    value = evaluate_lobes(tables, brdf, angles, ggx_disc_distribution(angles.half_way, angles.squared_sine, brdf.alpha, slopes))
     return value.specular + value.diffuse * brdf.diffuse
 
 
 @wp.func
 def brdf_pdf(brdf: Brdf, incoming: wp.vec3) -> float:
     """Probability density over solid angle with which `sample_brdf` returns a direction [1/sr]."""
-    i = to_local(brdf, incoming)
-    o = to_local(brdf, brdf.outgoing)
-    if i[2] <= 0.0:
+    angles = measure_angles(brdf, incoming)
+    if angles.incoming <= 0.0:
         return 0.0
-    half_way = wp.normalize(i + o)
-    visible = ggx_distribution(half_way, brdf.alpha) / (2.0 * wp.max(o[2], MIN_COSINE) * (1.0 + smith_term(o[2], brdf.alpha)))
-    return brdf.specular_probability * visible + (1.0 - brdf.specular_probability) * i[2] / wp.PI
+    facing = wp.max(angles.outgoing, MIN_COSINE) * (1.0 + smith_term(angles.outgoing, brdf.alpha))
+    visible = ggx_distribution(angles.half_way, angles.squared_sine, brdf.alpha) / (2.0 * facing)
+    return brdf.specular_probability * visible + (1.0 - brdf.specular_probability) * angles.incoming / wp.PI
 
 
 @wp.func

@@ -42,3 +42,15 @@ def unpack_half3(packed: wp.uint64) -> wp.vec3:
     """Unpack the values of `pack_half3`."""
     halves = wp.cast(packed, wp.vec4h)
     return wp.vec3(float(halves[0]), float(halves[1]), float(halves[2]))
+
+
+@wp.func
+def tag_half3(packed: wp.uint64, tag: wp.uint32) -> wp.uint64:
+    """Values of `pack_half3` with the lowest 16 bits of `tag` in the bits that they leave free; `unpack_half3` ignores them."""
+    return packed | (wp.uint64(tag) << wp.uint64(48))
+
+
+@wp.func
+def half3_tag(packed: wp.uint64) -> wp.uint32:
+    """The 16 bits of `tag_half3`."""
+    return wp.uint32(packed >> wp.uint64(48))

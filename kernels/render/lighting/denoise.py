@@ -1,24 +1,18 @@
 """Variance-guided denoiser: the widest of three kernels (16², 8², 4² coarse pixels) whose mean agrees with the narrower ones within noise.
 
 It filters visibility ratios (see `coarse_paths`) in three passes: joint bilateral means over blocks, choice of the kernel, smoothing.
-`upsample_ratios` then interpolates them at full resolution: joint bilateral upsampling (Kopf et al., 2007).
+`upsampling` then interpolates them at full resolution.
 """
 
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.coarse_grid import (
-    MIN_WEIGHT,
-    PLANE_TOLERANCE,
-    CoarseGrid,
-    Guide,
-    coarse_coordinate,
-    middle_pixel,
-)
+from synpick_warp.kernels.render.lighting.coarse_grid import PLANE_TOLERANCE, CoarseGrid, Guide, middle_pixel
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight
 from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE, luminance, pack_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
+from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, in_image, tile_pixel
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -29,31 +23,8 @@ BLOCKS = wp.constant(4)
 """Width of the wide kernel [blocks]."""
 MEDIUM_BLOCKS = wp.constant(4.0)
 """Blocks of the medium kernel: 2 x 2."""
-RING = wp.constant(1)
-"""Upsampling fallback: the four nearest coarse pixels are widened by this many on each side if none of them is on the surface."""
 SAME_BODY_WEIGHT = wp.constant(0.02)
 """Bilateral weight of a coarse pixel on the same body but on another surface: it reduces noise where few pixels are similar."""
-
-
-@wp.struct
-class RatioImages:
-    """Denoised light of coarse pixels, packed by `pack_half3`. Scratch. All arrays are (view, cell_row, cell_column)."""
-
-    diffuse: wp.array3d[wp.uint64]
-    """Visibility ratio of diffuse light: a pixel multiplies its own unoccluded light by it."""
-    specular: wp.array3d[wp.uint64]
-    """Visibility ratio of specular light."""
-    indirect: wp.array3d[wp.uint64]
-    """Demodulated indirect diffuse light, exposed as in `CoarseLight`; not a ratio."""
-
-
-@wp.struct
-class Ratios:
-    """One element of `RatioImages`, or a weighted sum of them."""
-
-    diffuse: wp.vec3
-    indirect: wp.vec3
-    specular: wp.vec3
 
 
 @wp.func
@@ -218,8 +189,10 @@ def choose_widths_kernel(
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    if int(guide.segment[view, row, column]) == Segment.NOTHING:
+    segment = guide.segment[view, row, column]
+    if int(segment) == Segment.NOTHING:
         return
+    depth = guide.depth[view, row, column]
     plane = coarse_plane(coarse, guide, cameras.intrinsics[views.camera[view]], view, row, column)
     wide = KernelSum()
     medium = KernelSum()
@@ -244,9 +217,7 @@ def choose_widths_kernel(
     narrow_specular = visibility_ratio(narrow.specular, narrow.unoccluded_specular)
     if wide.weight <= 0.0:
         # The middles of all blocks may lie off the body.
-        ratios_out.diffuse[view, row, column] = pack_half3(narrow_diffuse)
-        ratios_out.specular[view, row, column] = pack_half3(narrow_specular)
-        ratios_out.indirect[view, row, column] = blocks.indirect[view, row, column]
+        ratios_out.record[view, row, column] = pack_ratios(narrow_diffuse, narrow_specular, narrow.indirect, depth, segment)
         return
     variance = variance_scale * variance / wide.weight
     diffuse = visibility_ratio(wide.diffuse, wide.unoccluded_diffuse)
@@ -254,9 +225,9 @@ def choose_widths_kernel(
     if medium.weight > 0.0:
         diffuse = shrink(diffuse, visibility_ratio(medium.diffuse, medium.unoccluded_diffuse), variance[0] / MEDIUM_BLOCKS)
         specular = shrink(specular, visibility_ratio(medium.specular, medium.unoccluded_specular), variance[1] / MEDIUM_BLOCKS)
-    ratios_out.diffuse[view, row, column] = pack_half3(shrink(diffuse, narrow_diffuse, variance[0]))
-    ratios_out.specular[view, row, column] = pack_half3(shrink(specular, narrow_specular, variance[1]))
-    ratios_out.indirect[view, row, column] = pack_half3(wide.indirect / wide.weight)
+    diffuse = shrink(diffuse, narrow_diffuse, variance[0])
+    specular = shrink(specular, narrow_specular, variance[1])
+    ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, wide.indirect / wide.weight, depth, segment)
 
 
 @wp.kernel
@@ -276,12 +247,12 @@ def smooth_ratios_kernel(
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    if int(guide.segment[view, row, column]) == Segment.NOTHING:
+    segment = guide.segment[view, row, column]
+    if int(segment) == Segment.NOTHING:
+        ratios_out.record[view, row, column] = RatioRecord()
         return
     plane = coarse_plane(coarse, guide, cameras.intrinsics[views.camera[view]], view, row, column)
-    diffuse = wp.vec3(0.0, 0.0, 0.0)
-    specular = wp.vec3(0.0, 0.0, 0.0)
-    indirect = wp.vec3(0.0, 0.0, 0.0)
+    sums = Ratios()
     total = float(0.0)
     for down in range(-1, 2):
         r = row + down
@@ -290,79 +261,7 @@ def smooth_ratios_kernel(
                 c = column + right
                 if c >= 0 and c < coarse.grid.width:
                     weight = bilateral_weight(guide, plane, view, r, c, down, right, 1)
-                    diffuse += weight * unpack_half3(ratios.diffuse[view, r, c])
-                    specular += weight * unpack_half3(ratios.specular[view, r, c])
-                    indirect += weight * unpack_half3(ratios.indirect[view, r, c])
+                    sums = add_ratios(sums, ratios.record[view, r, c], weight)
                     total += weight
-    ratios_out.diffuse[view, row, column] = pack_half3(diffuse / total)
-    ratios_out.specular[view, row, column] = pack_half3(specular / total)
-    ratios_out.indirect[view, row, column] = pack_half3(indirect / total)
-
-
-@wp.func
-def upsampling_weight(guide: Guide, coarse: CoarseGrid, plane: Plane, view: int, row: int, column: int, r: int, c: int) -> float:
-    """Edge-stopping weight of the coarse pixel (r, c) for the pixel (row, column): 1 on its surface, MIN_WEIGHT off it, 0 on background."""
-    segment = guide.segment[view, r, c]
-    if int(segment) == Segment.NOTHING:
-        return 0.0
-    pixel = middle_pixel(coarse, r, c)
-    distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, guide.depth[view, r, c])
-    if segment != plane.segment or distance > PLANE_TOLERANCE * float(coarse.size) * plane.width:
-        return MIN_WEIGHT
-    return 1.0
-
-
-@wp.func
-def add_ratios(total: Ratios, ratios: RatioImages, view: int, row: int, column: int, weight: float) -> Ratios:
-    """Add one coarse pixel to a weighted sum."""
-    result = Ratios()
-    result.diffuse = total.diffuse + weight * unpack_half3(ratios.diffuse[view, row, column])
-    result.specular = total.specular + weight * unpack_half3(ratios.specular[view, row, column])
-    result.indirect = total.indirect + weight * unpack_half3(ratios.indirect[view, row, column])
-    return result
-
-
-@wp.func
-def upsample_ratios(guide: Guide, ratios: RatioImages, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane) -> Ratios:
-    """Joint bilateral upsampling: visibility ratios at a pixel from those of the four nearest coarse pixels on its surface.
-
-    If all four are on other surfaces, the ring around them is searched too, because light changes less along a surface than between
-    surfaces. `plane` is the pixel's tangent plane.
-    """
-    y = coarse_coordinate(coarse, row)
-    x = coarse_coordinate(coarse, column)
-    top = int(wp.floor(y))
-    left = int(wp.floor(x))
-    result = Ratios()
-    total = float(0.0)
-    best = float(0.0)
-    for i in range(2):
-        r = wp.clamp(top + i, 0, coarse.grid.height - 1)
-        vertical = 1.0 - wp.abs(y - float(top + i))
-        for j in range(2):
-            c = wp.clamp(left + j, 0, coarse.grid.width - 1)
-            surface_weight = upsampling_weight(guide, coarse, plane, view, row, column, r, c)
-            if surface_weight > 0.0:
-                weight = surface_weight * (vertical * (1.0 - wp.abs(x - float(left + j))) + MIN_WEIGHT)
-                result = add_ratios(result, ratios, view, r, c, weight)
-                total += weight
-                best = wp.max(best, surface_weight)
-    if best < 1.0:
-        # Not unrolled: few pixels come here.
-        ring = int(RING)
-        for i in range(-ring, 2 + ring):
-            r = wp.clamp(top + i, 0, coarse.grid.height - 1)
-            for j in range(-ring, 2 + ring):
-                c = wp.clamp(left + j, 0, coarse.grid.width - 1)
-                if upsampling_weight(guide, coarse, plane, view, row, column, r, c) == 1.0:
-                    result = add_ratios(result, ratios, view, r, c, 1.0)
-                    total += 1.0
-    if total <= 0.0:
-        # Only background around the pixel: light as if nothing blocked it.
-        result.diffuse = wp.vec3(1.0, 1.0, 1.0)
-        result.specular = wp.vec3(1.0, 1.0, 1.0)
-        return result
-    result.diffuse = result.diffuse / total
-    result.specular = result.specular / total
-    result.indirect = result.indirect / total
-    return result
+    depth = guide.depth[view, row, column]
+    ratios_out.record[view, row, column] = pack_ratios(sums.diffuse / total, sums.specular / total, sums.indirect / total, depth, segment)

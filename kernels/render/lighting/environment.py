@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.color import unpack_half3
+from synpick_warp.kernels.render.visibility.camera import clamp_index
 
 wp.set_module_options({"enable_backward": False})
 
@@ -76,8 +77,8 @@ def find_taps(direction: wp.vec3, rows: int, columns: int) -> BilinearTaps:
     taps = BilinearTaps()
     taps.down = at[0] - float(row)
     taps.right = at[1] - float(column)
-    taps.upper = wp.clamp(row, 0, rows - 1)
-    taps.lower = wp.clamp(row + 1, 0, rows - 1)
+    taps.upper = clamp_index(row, rows)
+    taps.lower = clamp_index(row + 1, rows)
     # -1 is the last column, as `columns` is the first.
     taps.west = wp.where(column < 0, columns - 1, column)
     taps.east = wp.where(column + 1 == columns, 0, column + 1)
@@ -122,7 +123,7 @@ def prefiltered_level(lights: Lights, light: int, level: int, taps: BilinearTaps
 def prefiltered_radiance(lights: Lights, light: int, direction: wp.vec3, roughness: float) -> wp.vec3:
     """Prefiltered specular radiance without the sun (Karis, 2013), trilinear: the GGX lobe's mean about a unit direction of the map."""
     level = wp.clamp(roughness * float(PREFILTER_LEVELS) - 1.0, 0.0, float(PREFILTER_LEVELS - 1))
-    lower = wp.min(int(level), PREFILTER_LEVELS - 2)
+    lower = clamp_index(int(level), PREFILTER_LEVELS - 1)
     taps = find_taps(direction, lights.prefiltered.shape[2], lights.prefiltered.shape[3])
     exposed = wp.lerp(
         prefiltered_level(lights, light, lower, taps),

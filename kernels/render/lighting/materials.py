@@ -129,17 +129,20 @@ def interpolate_surface(
 
 @wp.func
 def decode_texel(surfaces: Surfaces, index: int) -> wp.vec3:
-    """Linear colour of a texel."""
+    """Linear colour of a texel over TEXEL_SCALE."""
     texel = int(surfaces.texel[index])
     red = float(texel & TEXEL_MASK)
     green = float((texel >> TEXEL_BITS) & TEXEL_MASK)
     blue = float((texel >> (2 * TEXEL_BITS)) & TEXEL_MASK)
-    return TEXEL_SCALE * wp.vec3(red * red, green * green, blue * blue)
+    return wp.vec3(red * red, green * green, blue * blue)
 
 
 @wp.func
 def sample_mip_level(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> wp.vec3:
-    """Bilinear look-up in one mip level of a repeating texture. v grows upward, row 0 is the image's top; `row` is that of `Surfaces`."""
+    """Bilinear look-up in one mip level of a repeating texture: linear colour over TEXEL_SCALE.
+
+    v grows upward, row 0 is the image's top; `row` is that of `Surfaces`.
+    """
     size = surfaces.texture_size[row]
     width = wp.max(size[0] >> level, 1)
     height = wp.max(size[1] >> level, 1)
@@ -178,7 +181,7 @@ def sample_base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
     upper = wp.min(lower + 1, last)
     fine = sample_mip_level(surfaces, surface.row, lower, surface.uv)
     coarse = sample_mip_level(surfaces, surface.row, upper, surface.uv)
-    return wp.cw_mul(color, wp.lerp(fine, coarse, level - float(lower)))
+    return TEXEL_SCALE * wp.cw_mul(color, wp.lerp(fine, coarse, level - float(lower)))
 
 
 @wp.func

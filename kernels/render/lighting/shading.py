@@ -4,14 +4,14 @@ import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, Brdf, evaluate_disc, make_brdf
-from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
-from synpick_warp.kernels.render.lighting.denoise import RatioImages, Ratios, upsample_ratios
+from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
 from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_z
 from synpick_warp.kernels.render.lighting.materials import interpolate_surface, make_table_surface, sample_base_color, widen_roughness
 from synpick_warp.kernels.render.lighting.path_tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
 from synpick_warp.kernels.render.lighting.shadows import upsample_shadow
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
+from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
 from synpick_warp.kernels.tuning import SHADE_REGISTERS
@@ -46,9 +46,8 @@ def shade_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    guide: Guide,
     ratios: RatioImages,
-    sun_visibility: wp.array3d[float],  # (view, shadow_row, shadow_column)
+    sun_visibility: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
     views: Views,
     first: int,
     # Out:
@@ -76,16 +75,16 @@ def shade_kernel(
         body = body_of(segment, views.instances)
         width = depth / intrinsics[0]
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
-    color = sample_base_color(scene.surfaces, surface)
-    metallic = scene.surfaces.metallic[surface.row]
-    roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
-    brdf = make_brdf(scene.surfaces.albedo, color, metallic, roughness, surface.normal, outgoing)
     normal = wp.transpose(cameras.to_world[camera]) * surface.face_normal
     plane = tangent_plane(intrinsics, row, column, gbuffer.segment[view, row, column], depth, normal)
-    pixel_ratios = upsample_ratios(guide, ratios, coarse, view, row, column, plane)
+    pixel_ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
     pixel_ratios.indirect = pixel_ratios.indirect / scene.lights.exposure[which]
     sun = float(0.0)
     if wp.max(scene.lights.sun_irradiance[which]) > 0.0:
         if wp.dot(surface.face_normal, rotate_z(scene.lights.sun_direction[which], yaw)) > 0.0:
-            sun = upsample_shadow(gbuffer, sun_visibility, shadow_grid, view, row, column, plane)
+            sun = upsample_shadow(sun_visibility, shadow_grid, view, row, column, plane)
+    color = sample_base_color(scene.surfaces, surface)
+    metallic = scene.surfaces.metallic[surface.row]
+    roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
+    brdf = make_brdf(scene.surfaces.albedo, color, metallic, roughness, surface.normal, outgoing)
     radiance_out[view, row, column] = shade_surface(scene.surfaces.albedo, scene.lights, which, yaw, brdf, pixel_ratios, sun)

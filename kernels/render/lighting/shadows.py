@@ -15,11 +15,45 @@ from synpick_warp.kernels.render.lighting.environment import Lights, rotate_z
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import rotate_to_axis, sobol_point
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
-from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, clamp_index, hit_position, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Meshes, Table, ViewBodies, face_normal, read_hit
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+VISIBILITY_BITS = wp.constant(16)
+"""Bits of a packed sun visibility."""
+VISIBILITY_MASK = wp.constant((1 << 16) - 1)
+"""The lowest VISIBILITY_BITS, and packed sun visibility 1."""
+VISIBILITY_STEP = wp.constant(1.0 / ((1 << 16) - 1))
+"""Smallest packed sun visibility above 0."""
+
+
+@wp.func
+def pack_visibility(visibility: float, depth: float, segment: wp.uint8) -> wp.uint64:
+    """Pack a coarse pixel's sun visibility in VISIBILITY_BITS with its segmentation id and, in the upper half, its depth [m]; so filter and
+    upsampling read each neighbour once."""
+    fraction = wp.uint32(visibility * float(VISIBILITY_MASK) + 0.5)
+    lower = (wp.uint32(segment) << wp.uint32(VISIBILITY_BITS)) | fraction
+    return (wp.uint64(wp.cast(depth, wp.uint32)) << wp.uint64(32)) | wp.uint64(lower)
+
+
+@wp.func
+def packed_visibility(packed: wp.uint64) -> float:
+    """Sun visibility of a packed coarse pixel."""
+    return VISIBILITY_STEP * float(int(wp.uint32(packed) & wp.uint32(VISIBILITY_MASK)))
+
+
+@wp.func
+def packed_segment(packed: wp.uint64) -> wp.uint8:
+    """Segmentation id of a packed coarse pixel."""
+    return wp.uint8(wp.uint32(packed) >> wp.uint32(VISIBILITY_BITS))
+
+
+@wp.func
+def packed_depth(packed: wp.uint64) -> float:
+    """Depth of a packed coarse pixel [m]."""
+    return wp.cast(wp.uint32(packed >> wp.uint64(32)), wp.float32)
 
 
 @wp.kernel(cuda_max_registers=RAY_REGISTERS)
@@ -39,16 +73,18 @@ def trace_shadow_rays_kernel(
     views: Views,
     first: int,
     # Out:
-    visibility_out: wp.array3d[float],  # (view, shadow_row, shadow_column)
+    visibility_out: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
 ):
-    """Sun visibility: 1 where the ray from a coarse pixel's middle pixel to a sample point of the sun's disc is free, else 0."""
+    """Sun visibility, packed: 1 where the ray from a coarse pixel's middle pixel to a sample point of the sun's disc is free, else 0."""
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
     which = light[views.world[view]]
     pixel = middle_pixel(coarse, row, column)
     visibility = float(1.0)
-    if wp.max(lights.sun_irradiance[which]) > 0.0 and int(gbuffer.segment[view, pixel[0], pixel[1]]) != Segment.NOTHING:
+    segment = gbuffer.segment[view, pixel[0], pixel[1]]
+    depth = gbuffer.depth[view, pixel[0], pixel[1]]
+    if wp.max(lights.sun_irradiance[which]) > 0.0 and int(segment) != Segment.NOTHING:
         camera = views.camera[view]
         ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
         normal = face_normal(meshes, bodies, view, read_hit(gbuffer, view, pixel[0], pixel[1]), views.instances)
@@ -61,10 +97,10 @@ def trace_shadow_rays_kernel(
             radius = lights.sun_radius[which] * wp.sqrt(point[0])
             angle = wp.TAU * point[1]
             direction = wp.normalize(rotate_to_axis(center, wp.vec3(radius * wp.cos(angle), radius * wp.sin(angle), 1.0)))
-            origin = hit_position(cameras, camera, ray, gbuffer.depth[view, pixel[0], pixel[1]]) + RAY_OFFSET * normal
+            origin = hit_position(cameras, camera, ray, depth) + RAY_OFFSET * normal
             if is_blocked(meshes, table, bodies, view, origin, direction, FAR):
                 visibility = 0.0
-    visibility_out[view, row, column] = visibility
+    visibility_out[view, row, column] = pack_visibility(visibility, depth, segment)
 
 
 @wp.kernel
@@ -79,29 +115,31 @@ def filter_shadows_kernel(
     # In:
     bodies: ViewBodies,
     gbuffer: GBuffer,
-    visibility: wp.array3d[float],  # (view, shadow_row, shadow_column)
+    visibility: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
     views: Views,
     first: int,
     # Out:
-    visibility_out: wp.array3d[float],  # (view, shadow_row, shadow_column)
+    visibility_out: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
 ):
-    """Mean sun visibility over a window of coarse pixels on the same body and near the same tangent plane; not written without a sun."""
+    """Mean sun visibility over a window of coarse pixels on one body and near one tangent plane, packed; not written without a sun."""
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
     pixel = middle_pixel(coarse, row, column)
-    segment = gbuffer.segment[view, pixel[0], pixel[1]]
+    own = visibility[view, row, column]
+    segment = packed_segment(own)
+    depth = packed_depth(own)
     if wp.max(lights.sun_irradiance[light[views.world[view]]]) <= 0.0:
         return
     if int(segment) == Segment.NOTHING:
         # Bodies smaller than a coarse pixel may have only background pixels to interpolate from.
-        visibility_out[view, row, column] = 1.0
+        visibility_out[view, row, column] = pack_visibility(1.0, depth, segment)
         return
     camera = views.camera[view]
     normal = wp.transpose(cameras.to_world[camera]) * face_normal(
         meshes, bodies, view, read_hit(gbuffer, view, pixel[0], pixel[1]), views.instances
     )
-    plane = tangent_plane(cameras.intrinsics[camera], pixel[0], pixel[1], segment, gbuffer.depth[view, pixel[0], pixel[1]], normal)
+    plane = tangent_plane(cameras.intrinsics[camera], pixel[0], pixel[1], segment, depth, normal)
     tolerance = PLANE_TOLERANCE * float(coarse.size) * plane.width
     visible = float(0.0)
     total = float(0.0)
@@ -111,22 +149,21 @@ def filter_shadows_kernel(
             for j in range(coarse.window):
                 c = column + j - coarse.window // 2
                 if c >= 0 and c < coarse.grid.width:
-                    other = middle_pixel(coarse, r, c)
-                    if gbuffer.segment[view, other[0], other[1]] == segment:
-                        depth = gbuffer.depth[view, other[0], other[1]]
-                        if plane_distance(plane, other[0] - pixel[0], other[1] - pixel[1], depth) < tolerance:
-                            visible += visibility[view, r, c]
+                    packed = visibility[view, r, c]
+                    if packed_segment(packed) == segment:
+                        other = middle_pixel(coarse, r, c)
+                        if plane_distance(plane, other[0] - pixel[0], other[1] - pixel[1], packed_depth(packed)) < tolerance:
+                            visible += packed_visibility(packed)
                             total += 1.0
     if total > 0.0:
-        visibility_out[view, row, column] = visible / total
+        visibility_out[view, row, column] = pack_visibility(visible / total, depth, segment)
     else:
-        visibility_out[view, row, column] = visibility[view, row, column]
+        visibility_out[view, row, column] = own
 
 
 @wp.func
 def upsample_shadow(
-    gbuffer: GBuffer,
-    visibility: wp.array3d[float],  # (view, shadow_row, shadow_column)
+    visibility: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
     coarse: CoarseGrid,
     view: int,
     row: int,
@@ -142,15 +179,16 @@ def upsample_shadow(
     visible = float(0.0)
     total = float(0.0)
     for i in range(2):
-        r = wp.clamp(top + i, 0, coarse.grid.height - 1)
+        r = clamp_index(top + i, coarse.grid.height)
         vertical = 1.0 - wp.abs(y - float(top + i))
         for j in range(2):
-            c = wp.clamp(left + j, 0, coarse.grid.width - 1)
+            c = clamp_index(left + j, coarse.grid.width)
             weight = vertical * (1.0 - wp.abs(x - float(left + j))) + MIN_WEIGHT
             pixel = middle_pixel(coarse, r, c)
-            distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, gbuffer.depth[view, pixel[0], pixel[1]])
-            if gbuffer.segment[view, pixel[0], pixel[1]] != plane.segment or distance > tolerance:
+            packed = visibility[view, r, c]
+            distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, packed_depth(packed))
+            if packed_segment(packed) != plane.segment or distance > tolerance:
                 weight *= MIN_WEIGHT
-            visible += weight * visibility[view, r, c]
+            visible += weight * packed_visibility(packed)
             total += weight
     return visible / total

@@ -79,20 +79,23 @@ def trace_bodies(
     left = body_mask
     rank = int(0)
     while left != wp.uint64(0):
-        if (left & wp.uint64(1)) != wp.uint64(0):
-            body = bodies.order[view, rank]
-            near = bodies.near[view, body]
-            if near < best.depth:
-                reach = best.depth - near
-                start = body_ray_start(bodies, view, body, ray)
-                direction = bodies.rotation[view, body] * ray
-                if body != instances or not stays_in_interior(meshes.interior, start, direction, reach):
-                    query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, direction, reach)
-                    if query.result:
-                        best.depth = near + query.t
-                        best.triangle = query.face
-                        best.barycentric = wp.vec2(query.u, query.v)
-                        best.segment = segment_of(body, instances)
+        # Each ray goes on to its next body by itself: rays of a warp then traverse BVHs at the same time, even of different bodies.
+        while (left & wp.uint64(1)) == wp.uint64(0):
+            left = left >> wp.uint64(1)
+            rank += 1
+        body = bodies.order[view, rank]
+        near = bodies.near[view, body]
+        if near < best.depth:
+            reach = best.depth - near
+            start = body_ray_start(bodies, view, body, ray)
+            direction = bodies.rotation[view, body] * ray
+            if body != instances or not stays_in_interior(meshes.interior, start, direction, reach):
+                query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, direction, reach)
+                if query.result:
+                    best.depth = near + query.t
+                    best.triangle = query.face
+                    best.barycentric = wp.vec2(query.u, query.v)
+                    best.segment = segment_of(body, instances)
         left = left >> wp.uint64(1)
         rank += 1
     return best

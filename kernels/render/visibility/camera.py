@@ -60,21 +60,30 @@ class Views:
 @wp.func
 def tile_pixel(grid: ImageGrid, index: int) -> tuple[int, int, int]:
     """(view, row, column) of a flat thread index in tile order: view, tile, pixel of the tile; the pixel may lie outside the image."""
-    lane = index % TILE_PIXELS
-    tile = index // TILE_PIXELS
-    view = tile // grid.tiles
-    tile = tile - view * grid.tiles
-    tile_row = tile // grid.tile_columns
-    tile_column = tile - tile_row * grid.tile_columns
-    row = tile_row * TILE_HEIGHT + lane // TILE_WIDTH
-    column = tile_column * TILE_WIDTH + lane % TILE_WIDTH
-    return view, row, column
+    # Unsigned: cheaper to divide, and known not to be negative, which spares each look-up the test for indices that count from the end.
+    flat = wp.uint32(index)
+    lane = flat % wp.uint32(TILE_PIXELS)
+    tile = flat // wp.uint32(TILE_PIXELS)
+    view = tile // wp.uint32(grid.tiles)
+    tile = tile % wp.uint32(grid.tiles)
+    tile_row = tile // wp.uint32(grid.tile_columns)
+    tile_column = tile % wp.uint32(grid.tile_columns)
+    row = tile_row * wp.uint32(TILE_HEIGHT) + lane // wp.uint32(TILE_WIDTH)
+    column = tile_column * wp.uint32(TILE_WIDTH) + lane % wp.uint32(TILE_WIDTH)
+    return int(view), int(row), int(column)
 
 
 @wp.func
 def in_image(grid: ImageGrid, row: int, column: int) -> bool:
     """True if a pixel lies within the image."""
     return row >= 0 and row < grid.height and column >= 0 and column < grid.width
+
+
+@wp.func
+def clamp_index(index: int, size: int) -> int:
+    """Nearest index from 0 to `size` - 1. The maximum comes last: the compiler then knows that the result is not negative, which spares
+    look-ups Warp's test for indices that count from the end."""
+    return wp.max(wp.min(index, size - 1), 0)
 
 
 @wp.func

@@ -12,7 +12,7 @@ from synpick_warp.configs.schema import Render
 from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, find_footprints_kernel, resolve_footprints_kernel
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, trace_coarse_paths_kernel
-from synpick_warp.kernels.render.lighting.denoise import RatioImages, choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
+from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
 from synpick_warp.kernels.render.lighting.history import (
     NEVER,
     LightHistory,
@@ -22,6 +22,7 @@ from synpick_warp.kernels.render.lighting.history import (
 )
 from synpick_warp.kernels.render.lighting.shading import shade_kernel
 from synpick_warp.kernels.render.lighting.shadows import filter_shadows_kernel, trace_shadow_rays_kernel
+from synpick_warp.kernels.render.lighting.upsampling import RatioImages
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.tuning import FOOTPRINT_THREADS, LANE_COLUMNS, LANE_STRIDE, PIXEL_BLOCK, VIEW_BLOCK
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
@@ -58,11 +59,11 @@ RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 
 @dataclass(frozen=True, eq=False)
 class ShadowArrays:
-    """Sun visibility at the middle of each coarse pixel of the shadow grid."""
+    """Sun visibility at the middle of each coarse pixel of the shadow grid, packed by `pack_visibility`."""
 
-    traced: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.float32)
+    traced: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.uint64)
     """0 or 1, from one shadow ray."""
-    filtered: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.float32)
+    filtered: wp.array = device_array("view", "shadow_row", "shadow_column", dtype=wp.uint64)
     """0 to 1."""
 
 
@@ -229,7 +230,7 @@ class DenoisedRenderer:
         """Deferred shading: radiance of each pixel."""
         scene = self.scene
         inputs = [scene.paths, scene.cameras, self.coarse, self.shadow_grid, snapshot.light, snapshot.light_yaw, bodies, gbuffer]
-        inputs += [self.guide, self.ratios, self.shadows.filtered, views]
+        inputs += [self.ratios, self.shadows.filtered, views]
         self._launch(shade_kernel, scene.grid, views, inputs, [radiance])
 
     def resolve_footprints(self, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:

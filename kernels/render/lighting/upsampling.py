@@ -1,0 +1,138 @@
+"""Denoised light of coarse pixels and its upsampling to full resolution: joint bilateral upsampling (Kopf et al., 2007)."""
+
+import warp as wp
+
+from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.lighting.coarse_grid import (
+    MIN_WEIGHT,
+    PLANE_TOLERANCE,
+    CoarseGrid,
+    coarse_coordinate,
+    middle_pixel,
+)
+from synpick_warp.kernels.render.lighting.color import half3_tag, pack_half3, tag_half3, unpack_half3
+from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance
+from synpick_warp.kernels.render.visibility.camera import clamp_index
+
+wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+RING = wp.constant(1)
+"""Upsampling fallback: the four nearest coarse pixels are widened by this many on each side if none of them is on the surface."""
+RatioRecord = wp.types.vector(length=3, dtype=wp.uint64)
+"""Denoised light of a coarse pixel, packed by `pack_ratios`: diffuse, specular and indirect light by `pack_half3`, with the upper and lower
+half of its depth and its segmentation id as tags. One look-up reads all that upsampling needs."""
+
+
+@wp.struct
+class RatioImages:
+    """Denoised light of coarse pixels. Scratch."""
+
+    record: wp.array3d[RatioRecord]
+    """(view, cell_row, cell_column): zero, and so of no body, where nothing is visible."""
+
+
+@wp.struct
+class Ratios:
+    """Denoised light of a coarse pixel, or a weighted sum of them."""
+
+    diffuse: wp.vec3
+    """Visibility ratio of diffuse light: a pixel multiplies its own unoccluded light by it."""
+    indirect: wp.vec3
+    """Demodulated indirect diffuse light, exposed as in `CoarseLight`; not a ratio."""
+    specular: wp.vec3
+    """Visibility ratio of specular light."""
+
+
+@wp.func
+def pack_ratios(diffuse: wp.vec3, specular: wp.vec3, indirect: wp.vec3, depth: float, segment: wp.uint8) -> RatioRecord:
+    """Pack the denoised light of a coarse pixel with its depth [m] and segmentation id."""
+    bits = wp.cast(depth, wp.uint32)
+    return RatioRecord(
+        tag_half3(pack_half3(diffuse), bits >> wp.uint32(16)),
+        tag_half3(pack_half3(specular), bits),
+        tag_half3(pack_half3(indirect), wp.uint32(segment)),
+    )
+
+
+@wp.func
+def record_depth(record: RatioRecord) -> float:
+    """Depth of a packed coarse pixel [m]."""
+    return wp.cast((half3_tag(record[0]) << wp.uint32(16)) | half3_tag(record[1]), wp.float32)
+
+
+@wp.func
+def record_segment(record: RatioRecord) -> wp.uint8:
+    """Segmentation id of a packed coarse pixel."""
+    return wp.uint8(half3_tag(record[2]))
+
+
+@wp.func
+def add_ratios(total: Ratios, record: RatioRecord, weight: float) -> Ratios:
+    """Add one packed coarse pixel to a weighted sum."""
+    result = Ratios()
+    result.diffuse = total.diffuse + weight * unpack_half3(record[0])
+    result.specular = total.specular + weight * unpack_half3(record[1])
+    result.indirect = total.indirect + weight * unpack_half3(record[2])
+    return result
+
+
+@wp.func
+def upsampling_weight(record: RatioRecord, coarse: CoarseGrid, plane: Plane, row: int, column: int, r: int, c: int) -> float:
+    """Edge-stopping weight of the coarse pixel (r, c) for the pixel (row, column): 1 on its surface, MIN_WEIGHT off it, 0 on background."""
+    segment = record_segment(record)
+    if int(segment) == Segment.NOTHING:
+        return 0.0
+    pixel = middle_pixel(coarse, r, c)
+    distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, record_depth(record))
+    if segment != plane.segment or distance > PLANE_TOLERANCE * float(coarse.size) * plane.width:
+        return MIN_WEIGHT
+    return 1.0
+
+
+@wp.func
+def upsample_ratios(ratios: RatioImages, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane) -> Ratios:
+    """Joint bilateral upsampling: visibility ratios at a pixel from those of the four nearest coarse pixels on its surface.
+
+    If all four are on other surfaces, the ring around them is searched too, because light changes less along a surface than between
+    surfaces. `plane` is the pixel's tangent plane.
+    """
+    y = coarse_coordinate(coarse, row)
+    x = coarse_coordinate(coarse, column)
+    top = int(wp.floor(y))
+    left = int(wp.floor(x))
+    result = Ratios()
+    total = float(0.0)
+    best = float(0.0)
+    for i in range(2):
+        r = clamp_index(top + i, coarse.grid.height)
+        vertical = 1.0 - wp.abs(y - float(top + i))
+        for j in range(2):
+            c = clamp_index(left + j, coarse.grid.width)
+            record = ratios.record[view, r, c]
+            surface_weight = upsampling_weight(record, coarse, plane, row, column, r, c)
+            # Background has weight 0 and holds zeros: adding it costs less than a branch.
+            weight = surface_weight * (vertical * (1.0 - wp.abs(x - float(left + j))) + MIN_WEIGHT)
+            result = add_ratios(result, record, weight)
+            total += weight
+            best = wp.max(best, surface_weight)
+    if best < 1.0:
+        # Not unrolled: few pixels come here.
+        ring = int(RING)
+        for i in range(-ring, 2 + ring):
+            r = clamp_index(top + i, coarse.grid.height)
+            for j in range(-ring, 2 + ring):
+                c = clamp_index(left + j, coarse.grid.width)
+                record = ratios.record[view, r, c]
+                if upsampling_weight(record, coarse, plane, row, column, r, c) == 1.0:
+                    result = add_ratios(result, record, 1.0)
+                    total += 1.0
+    if total <= 0.0:
+        # Only background around the pixel: light as if nothing blocked it.
+        result.diffuse = wp.vec3(1.0, 1.0, 1.0)
+        result.specular = wp.vec3(1.0, 1.0, 1.0)
+        return result
+    scale = 1.0 / total
+    result.diffuse *= scale
+    result.specular *= scale
+    result.indirect *= scale
+    return result
