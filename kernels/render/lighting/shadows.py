@@ -21,6 +21,9 @@ from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
+RING = wp.constant(1)
+"""Upsampling fallback: the four nearest coarse pixels are widened by this many on each side if none of them is on the surface."""
+
 
 @wp.kernel(cuda_max_registers=RAY_REGISTERS)
 def trace_shadow_rays_kernel(
@@ -124,6 +127,14 @@ def filter_shadows_kernel(
 
 
 @wp.func
+def on_plane(gbuffer: GBuffer, coarse: CoarseGrid, view: int, row: int, column: int, plane: Plane, r: int, c: int) -> bool:
+    """Whether the coarse pixel (r, c) shows the surface of the pixel (row, column), whose tangent plane is `plane`."""
+    pixel = middle_pixel(coarse, r, c)
+    distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, gbuffer.depth[view, pixel[0], pixel[1]])
+    return gbuffer.segment[view, pixel[0], pixel[1]] == plane.segment and distance <= PLANE_TOLERANCE * float(coarse.size) * plane.width
+
+
+@wp.func
 def upsample_shadow(
     gbuffer: GBuffer,
     visibility: wp.array3d[float],  # (view, shadow_row, shadow_column)
@@ -133,24 +144,38 @@ def upsample_shadow(
     column: int,
     plane: Plane,
 ) -> float:
-    """Sun visibility at a pixel by joint bilateral upsampling from the four nearest coarse pixels; `plane` is the pixel's tangent plane."""
+    """Sun visibility at a pixel by joint bilateral upsampling from the four nearest coarse pixels; `plane` is the pixel's tangent plane.
+
+    If all four are on other surfaces, the ring around them is searched too, as for visibility ratios: sunlight of another surface would
+    show as bright pixels along the edge.
+    """
     y = coarse_coordinate(coarse, row)
     x = coarse_coordinate(coarse, column)
     top = int(wp.floor(y))
     left = int(wp.floor(x))
-    tolerance = PLANE_TOLERANCE * float(coarse.size) * plane.width
     visible = float(0.0)
     total = float(0.0)
+    found = bool(False)
     for i in range(2):
         r = wp.clamp(top + i, 0, coarse.grid.height - 1)
         vertical = 1.0 - wp.abs(y - float(top + i))
         for j in range(2):
             c = wp.clamp(left + j, 0, coarse.grid.width - 1)
             weight = vertical * (1.0 - wp.abs(x - float(left + j))) + MIN_WEIGHT
-            pixel = middle_pixel(coarse, r, c)
-            distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, gbuffer.depth[view, pixel[0], pixel[1]])
-            if gbuffer.segment[view, pixel[0], pixel[1]] != plane.segment or distance > tolerance:
+            if on_plane(gbuffer, coarse, view, row, column, plane, r, c):
+                found = True
+            else:
                 weight *= MIN_WEIGHT
             visible += weight * visibility[view, r, c]
             total += weight
+    if not found:
+        # Not unrolled: few pixels come here.
+        ring = int(RING)
+        for i in range(-ring, 2 + ring):
+            r = wp.clamp(top + i, 0, coarse.grid.height - 1)
+            for j in range(-ring, 2 + ring):
+                c = wp.clamp(left + j, 0, coarse.grid.width - 1)
+                if on_plane(gbuffer, coarse, view, row, column, plane, r, c):
+                    visible += visibility[view, r, c]
+                    total += 1.0
     return visible / total
