@@ -87,11 +87,16 @@ def encode_mask_png(runs: Runs, height: int, width: int) -> bytes:
     stream = Deflater(-isal_zlib.MAX_WBITS)
     middle = stream.compress(canvas[: rows * stride]) + stream.flush(isal_zlib.Z_FULL_FLUSH)
     canvas[begins] = canvas[ends] = 0
+    # Sums of positions in the window. A run that ends at the image's bottom sets no byte below it.
+    begin_sum = int(begins.sum())
+    end_sum, end_count = begin_sum + stride * runs.count, count
     if runs.bottom == height:
-        ends = ends[runs.past < height]
-    total = _UP * rows + 255 * count + ends.size
-    moment = _UP * stride * (rows * runs.top + rows * (rows - 1) // 2) + skipped * (255 * count + ends.size)
-    moment += 255 * int(begins.sum()) + int(ends.sum())
+        outside = ends[runs.past == height]
+        end_sum, end_count = end_sum - int(outside.sum()), count - outside.size
+    total = 255 * count + end_count
+    moment = 255 * begin_sum + end_sum + skipped * total
+    moment += _UP * stride * (rows * runs.top + rows * (rows - 1) // 2)
+    total += _UP * rows
     above, below = _blank_rows(runs.top, stride), _blank_rows(height - runs.top - rows, stride)
     data = b"".join((_ZLIB_HEADER, above, middle, below, _FINAL_BLOCK, _adler32(height * stride, total, moment)))
     return _assemble(width, height, 8, _GREY, data)

@@ -94,7 +94,7 @@ class RunBoundaries:
     def _make_keys(self, instance: np.ndarray, place: np.ndarray) -> np.ndarray:
         """Keys in the order of instances and positions, from both (M): 32 bits if these are enough, which NumPy sorts in half the time."""
         kind = np.uint32 if MAX_INSTANCES * self._places < 1 << 32 else np.uint64
-        return instance.astype(kind) * kind(self._places) + place.astype(kind)
+        return instance.astype(kind, copy=False) * kind(self._places) + place.astype(kind, copy=False)
 
     @property
     def _places(self) -> int:
@@ -104,7 +104,7 @@ class RunBoundaries:
     def _list_values(self, values: np.ndarray) -> np.ndarray:
         """List the boundaries beside which a value (N) denotes an instance, as sorted keys (M)."""
         # Of unsigned integers, 0 - 1 is the largest.
-        instance = values.astype(np.uint32) - np.uint32(1)
+        instance = values.astype(np.uint32, copy=False) - np.uint32(1)
         listed = np.flatnonzero(instance < MAX_INSTANCES)
         return np.sort(self._make_keys(instance[listed], self.place[listed]))
 
@@ -112,7 +112,7 @@ class RunBoundaries:
         """List the boundaries beside which a bit is set in a word (N), each once for each bit, as sorted keys (M)."""
         keys: list[np.ndarray] = []
         listed = np.flatnonzero(words != 0)
-        words, place = words[listed].astype(np.uint32), self.place[listed]
+        words, place = words[listed].astype(np.uint32, copy=False), self.place[listed]
         while words.size or not keys:
             # Take the lowest bit of each word, and go on with the few words that have another.
             others = words & (words - np.uint32(1))
