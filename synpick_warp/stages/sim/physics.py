@@ -148,36 +148,50 @@ class Physics:
     ) -> Iterator[None]:
         """Advance all worlds by one tick, `steps_per_tick` x `substeps` substeps: a generator that yields after each substep.
 
-        On a GPU each substep is captured once as a CUDA graph.
+        On a GPU the first substeps of the first tick run eagerly: they load the kernels and trigger Newton's late allocations. Then a CUDA
+        graph per substep is captured. Without a watcher all steps launch the same, so that the graphs of one step serve for all.
 
-        Hooks and watcher are captured once, so they must launch the same kernels on the same arrays every time.
+        Hooks and watcher are captured once, so they must launch the same kernels on the same arrays in every tick, hooks in every step.
 
         Args:
             before_step: Launches kernels that write the control's forces from a state; runs before each step.
             after_collide: Launches kernels that edit `contacts` before the solver reads them.
             watcher: Launches kernels that record the steps.
         """
-        if self._graphs:
-            for graph in self._graphs:
-                wp.capture_launch(graph)
-                yield
-            return
-        # On a GPU the first tick runs eagerly: it loads the kernels and triggers Newton's late allocations.
-        yield from self._run_substeps(before_step, after_collide, watcher)
-        if self.device.is_cuda:
-            self._capture(self._run_substeps(before_step, after_collide, watcher))
+        eager = 0
+        if not self._graphs:
+            eager = self._period(watcher)
+            yield from itertools.islice(self._run_substeps(before_step, after_collide, watcher), eager)
+            if not self.device.is_cuda:
+                return
+            self._capture(itertools.islice(self._run_substeps(before_step, after_collide, watcher), eager))
+        for graph in self._graphs[eager:]:
+            wp.capture_launch(graph)
+            yield
+
+    def _period(self, watcher: Watcher | None) -> int:
+        """Number of substeps after which their launches repeat: whole steps after which the two states have their roles again; at most,
+        and with a watcher or on the CPU always, those of a tick."""
+        count = self.settings.steps_per_tick * self.settings.substeps
+        period = math.lcm(2, self.settings.substeps)
+        return period if watcher is None and self.device.is_cuda and count % period == 0 else count
 
     def _capture(self, substeps: Iterator[None]) -> None:
-        """Capture a CUDA graph per substep: a tick is enqueued in parts, and CUDA would spread one graph of a tick over 66 streams."""
+        """Capture a CUDA graph per substep, and repeat them for a tick.
+
+        A tick is enqueued in parts, and CUDA would spread one graph of a tick over 66 streams.
+        """
+        graphs: list[wp.Graph] = []
         busy = True
         while busy:
             with wp.ScopedCapture(device=self.device) as capture:
                 busy = next(substeps, ENDED) is not ENDED
             if busy:
-                self._graphs.append(capture.graph)
+                graphs.append(capture.graph)
+        self._graphs = graphs * (self.settings.steps_per_tick * self.settings.substeps // len(graphs))
 
     def clear_graphs(self) -> None:
-        """Drop the captured graphs; the next tick runs eagerly, and captures them anew."""
+        """Drop the captured graphs; the next tick begins eagerly, and captures them anew."""
         self._graphs = []
 
     def flag_lost_pairs(self) -> None:
