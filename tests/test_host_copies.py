@@ -27,10 +27,11 @@ def test_a_wait_pauses_until_the_copy_is_done(monkeypatch, questions, pauses):
     synchronized, slept = [], []
     monkeypatch.setattr(wp, "synchronize_event", synchronized.append)
     monkeypatch.setattr(host_copies.time, "sleep", slept.append)
+    monkeypatch.setattr(host_copies.time, "monotonic", lambda: 7.0)
     copy = HostCopy([wp.zeros(1, dtype=float, device="cpu")])
     copy.done = FakeEvent(questions)
     assert copy.wait()[0].tolist() == [0.0]
-    assert slept == [host_copies.POLL_SECONDS] * pauses
+    assert slept == [host_copies.PAUSE_SECONDS] * pauses
     assert synchronized == [copy.done]
 
 
@@ -39,7 +40,7 @@ def test_a_failed_copy_is_reported_though_its_event_is_never_complete(monkeypatc
         raise RuntimeError("Failed to synchronize event")
 
     monkeypatch.setattr(wp, "synchronize_event", fail)
-    monkeypatch.setattr(host_copies, "MAX_POLL_SECONDS", 0.01)
+    monkeypatch.setattr(host_copies, "MAX_PAUSED_SECONDS", 0.01)
     copy = HostCopy([wp.zeros(1, dtype=float, device="cpu")])
     copy.done = FakeEvent(10**9)
     with pytest.raises(RuntimeError, match="Failed"):
