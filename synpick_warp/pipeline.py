@@ -103,6 +103,7 @@ def build_factory(
     records_physics: bool = False,
     needs_images: bool = True,
     processes: int = 1,
+    longest_first: bool = False,
 ) -> Factory:
     """Load assets and build the stages on the device.
 
@@ -110,9 +111,9 @@ def build_factory(
         config: All settings.
         progress: Observer.
         episodes: Indices of the episodes to simulate; None: all.
-        records_physics: Whether ticks are recorded with their physics.
-        needs_images: Whether all images are copied to the host; see `Exporter`.
+        records_physics, needs_images: Whether ticks are recorded with their physics, and all images copied to the host; see `Exporter`.
         processes: Processes of the bake, which share the host's memory.
+        longest_first: Whether the episodes are reordered by `order_longest_first`.
 
     Raises:
         SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
@@ -124,16 +125,11 @@ def build_factory(
     check_memory(config, device, writers, processes)
     renders = any(kind.needs_views for kind in load_exporter_classes(config.bake.formats))
     compile_if_cold(config, device, progress, records_physics, needs_images, renders)
-    return _assemble(config, device, progress, episodes, records_physics, needs_images)
+    return _assemble(config, device, progress, episodes, records_physics, needs_images, longest_first)
 
 
 def compile_if_cold(
-    config: Config,
-    device: wp.Device,
-    progress: Progress,
-    records_physics: bool = False,
-    needs_images: bool = True,
-    renders: bool = True,
+    config: Config, device: wp.Device, progress: Progress, records_physics: bool = False, needs_images: bool = True, renders: bool = True
 ) -> None:
     """Compile the kernels of a bake in parallel if the kernel cache is cold, with a minimal factory that is freed again.
 
@@ -158,10 +154,16 @@ def build_smallest(config: Config, device: wp.Device, progress: Progress, record
 
 
 def _assemble(
-    config: Config, device: wp.Device, progress: Progress, episodes: Sequence[int] | None, records_physics: bool, needs_images: bool
+    config: Config,
+    device: wp.Device,
+    progress: Progress,
+    episodes: Sequence[int] | None,
+    records_physics: bool,
+    needs_images: bool,
+    longest_first: bool = False,
 ) -> Factory:
     """Build the stages; arguments as of `build_factory`, for settings by `fit_to_device`."""
-    stages = build_stages(config, device, progress, episodes, records_physics)
+    stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
     depth_files = any(kind.writes_depth for kind in load_exporter_classes(config.bake.formats))
     host = host_images(config, device, needs_images, depth_files)
     table, tick_time = stages.light_table, stages.tick_time
@@ -172,7 +174,12 @@ def _assemble(
 
 @collection_paused()
 def build_stages(
-    config: Config, device: wp.Device, progress: Progress, episodes: Sequence[int] | None = None, records_physics: bool = False
+    config: Config,
+    device: wp.Device,
+    progress: Progress,
+    episodes: Sequence[int] | None = None,
+    records_physics: bool = False,
+    longest_first: bool = False,
 ) -> Stages:
     """Load assets and build worlds and renderer; arguments and errors as of `build_factory`, for settings by `fit_to_device`."""
     progress.stage("loading objects and lights")
@@ -180,6 +187,8 @@ def build_stages(
     fixtures = make_fixtures(config.tote, config.gripper)
     catalog = load_catalog(config, report=progress.note)
     lights = load_lights(config.bake.lights)
+    if longest_first and episodes is not None:
+        episodes = order_longest_first(config, catalog, episodes, device)
     progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
     scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
     simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
@@ -265,8 +274,7 @@ def _fill(
         bake_on_devices(config, output, kinds, names, _DEVICE_PROGRAM, summary, progress)
     elif output.remaining:
         with scope("build"):
-            episodes = order_longest_first(config, output.remaining, pick_device(config.bake.device))
-            factory = build_factory(config, progress, episodes, *_needs(kinds))
+            factory = build_factory(config, progress, output.remaining, *_needs(kinds), longest_first=True)
     with WriterPool(count_writers(config), slot_bytes(kinds, config), output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:

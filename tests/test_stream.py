@@ -340,7 +340,7 @@ def test_run_boundaries_are_those_of_the_batchs_own_images(device):
             for which, image in enumerate((made["instance"][view], made["amodal"][view])):
                 count = made["boundary_count"][view, which]
                 boundaries = unpack_run_boundaries(made["boundaries"][view, which, :, :count], len(image))
-                assert len(boundaries.column) == 2 * image.shape[1]
+                assert len(boundaries.place) == 2 * image.shape[1]
                 for name, values in vars(find_run_boundaries(image)).items():
                     np.testing.assert_array_equal(getattr(boundaries, name), values)
 

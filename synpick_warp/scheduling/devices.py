@@ -251,7 +251,7 @@ def bake_on_devices(
             with aborting(pool, exporters):
                 output.prepare(exporters, digest_inputs(catalog, lights), pool)
                 exporters.close()
-        dealt = deal_episodes(order_longest_first(config, output.remaining, pick_device("cpu")), len(names))
+        dealt = deal_episodes(order_longest_first(config, catalog, output.remaining, pick_device("cpu")), len(names))
         writers = deal_writers(count_writers(config), len(names))
         shares = [
             Share(output.out, replace(config, bake=replace(config.bake, device=name, writers=count)), episodes, len(names))

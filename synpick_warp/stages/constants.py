@@ -72,7 +72,7 @@ def make_scene_data(config: Config, catalog: Catalog, built: build.BuiltModel, l
     return SceneData(
         _layout_data(built.layout),
         _catalog_data(catalog, built, device),
-        _drop_data(config, lights),
+        drop_data(config, lights),
         _settle_data(config.settle, physics.step * physics.steps_per_tick),
         mode_data(mode_rows(config), device),
         _move_data(config.move, config.tote, gripper, physics),
@@ -147,7 +147,7 @@ def mode_rows(config: Config) -> list[tuple[int, float, float, int]]:
     return rows
 
 
-def _drop_data(config: Config, lights: int) -> structs.DropData:
+def drop_data(config: Config, lights: int) -> structs.DropData:
     tote = config.tote
     return fill(
         structs.DropData,

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import signal
+import subprocess
 import time
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
 import pytest
+import warp as wp
 
 from synpick_warp.dataset.manifest import episode_entry
 from synpick_warp.errors import DatasetError
@@ -21,7 +24,7 @@ from tests.tools.test_tools import FEW_STEPS, SHORT_EPISODES, SMALL_IMAGES
 from tools.bench import __main__ as bench
 from tools.bench import growth, meter, physics, steady, whole
 from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
-from tools.bench.usage import Usage
+from tools.bench.usage import Usage, measure_usage
 
 TINY = ("--worlds", "2", "--resolution", "32x18", *FEW_STEPS, *SMALL_IMAGES, *SHORT_EPISODES)
 SHARED = ("train", "deep/shared")
@@ -109,6 +112,38 @@ def test_slices_are_between_readings_and_the_rest_is_left_out():
     readings = [reading(seconds, count) for seconds, count in ((0, 0), (1, 5), (2, 20), (3, 21), (4.5, 45), (5, 99))]
     assert meter.slice_rates(readings, 2.0) == [10.0, 10.0]
     assert meter.slice_rates(readings[:1], 2.0) == []
+
+
+def test_several_devices_are_steady_when_all_of_them_are(tmp_path):
+    found = meter.SteadyMeter(1e9, tmp_path, 8.0, 4, wp.get_device("cpu"), devices=2)
+    counts = itertools.accumulate([9, 0, 9, 2, 9, 8, *[9] * 6])
+    measured = []
+    for views in counts:
+        found.update(episodes_done=0, episodes=100, worlds_active=8, views=views, views_per_s=0.0, seconds_left=None)
+        measured.append(len(found.readings))
+    # Both devices deliver in the fifth and sixth tick together; then two ticks of each lead in.
+    assert measured == [0] * 9 + [1, 2, 3]
+    row = {row.name: row.value for row in meter.summarize_rates("steady", "view", found)}
+    assert row["views to disk"] * row["a tick"] == pytest.approx(1e3 * 18)
+
+
+def test_descendants_of_the_benchmark_are_counted_and_other_processes_are_not():
+    child = subprocess.Popen(["sh", "-c", "sleep 60 & echo $!; wait"], stdout=subprocess.PIPE, text=True)
+    try:
+        grandchild = int(child.stdout.readline())
+        usages = measure_usage()
+        assert {os.getpid(), child.pid, grandchild} <= usages.keys()
+        assert os.getppid() not in usages
+        assert usages[os.getpid()].resident > 0
+    finally:
+        os.kill(grandchild, signal.SIGKILL)
+        child.wait()
+        child.stdout.close()
+
+
+def test_devices_that_do_not_exist_are_one_line(capsys):
+    assert bench.main([*TINY, "--parts", "steady", "--devices", "cuda:98,cuda:99"]) == 2
+    assert "cuda:98" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_damage_ends_a_steady_bake_with_one_line(monkeypatch, capsys):

@@ -87,7 +87,7 @@ def main(arguments: list[str] | None = None) -> int:
         for name, value in machine.items():
             console.print(f"{name:20} {value}")
         measured_peers = measure_peers(config, options.compare, options.seconds)
-        parts = measure(config, options.parts, options.seconds, traces, options.episodes, options.markdown)
+        parts = measure(config, options.parts, options.seconds, traces, options.episodes, options.markdown, options.devices)
         for row in itertools.chain(parts, measured_peers):
             rows.append(row)
             console.print(f"{row.part:11} {row.name:52} {row.value:14,.3f} {row.unit}", soft_wrap=True)
@@ -114,6 +114,8 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--episodes", type=_positive, default=WHOLE_EPISODES, help=f"episodes of the part whole (default: {WHOLE_EPISODES})"
     )
+    devices_help = "several devices of the part steady, as of bake: cuda:0,cuda:1 or all; --worlds is the number of each"
+    parser.add_argument("--devices", type=lambda text: tuple(text.split(",")), default=(), help=devices_help)
     parser.add_argument("--seconds", type=float, default=2.0, help="minimum time of a measurement [s] (default: 2)")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="table of the part growth")
     options = parser.parse_args(arguments)
@@ -146,7 +148,13 @@ def _config(options: argparse.Namespace) -> Config:
 
 
 def measure(
-    config: Config, parts: tuple[str, ...], min_seconds: float, traces: dict[str, Any], episodes: int, markdown: Path | None
+    config: Config,
+    parts: tuple[str, ...],
+    min_seconds: float,
+    traces: dict[str, Any],
+    episodes: int,
+    markdown: Path | None,
+    devices: tuple[str, ...] = (),
 ) -> Iterator[Row]:
     """Measure the parts; yields rows as they arrive.
 
@@ -157,6 +165,7 @@ def measure(
         traces: Receives what changes during a measurement, by part.
         episodes: Episodes of the part whole.
         markdown: File for the table of the part growth; None: none.
+        devices: Devices of the part steady; empty: that of the settings.
     """
     if set(parts) - OWN_WORLDS:
         started = time.perf_counter()
@@ -184,7 +193,7 @@ def measure(
         yield from _measure_bake(config)
     steady_rate = 0.0
     if "steady" in parts:
-        for row in measure_steady(config, min_seconds):
+        for row in measure_steady(config, min_seconds, devices):
             steady_rate = row.value if row.name == "views to disk" else steady_rate
             yield row
     if "whole" in parts:

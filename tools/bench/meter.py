@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
@@ -42,7 +43,7 @@ class Reading:
     main: Usage
     """Of the main process."""
     writers: Usage
-    """Of the writers."""
+    """Of the writers; with several devices, of the devices' processes as well."""
     cleaner: Usage
     """Of the process that verifies and deletes."""
     tally: Tally
@@ -68,20 +69,23 @@ class SteadyMeter(SilentProgress):
         device: wp.Device,
         cleaner: Cleaner | None = None,
         counter: Callable[[], int] | None = None,
+        devices: int = 1,
     ) -> None:
         """
         Args:
             seconds: Time to measure [s].
             folder: Where the bake writes.
-            steady_count: Steady-state threshold: views, or frames, of a tick.
-            worlds: Worlds of the bake.
-            device: Device of the bake.
+            steady_count: Steady-state threshold: views, or frames, of a device's tick.
+            worlds: Worlds of a device.
+            device: First device of the bake.
             cleaner: Process that verifies and deletes; None: there is none.
             counter: Function that returns the number of frames so far; None: views are counted.
+            devices: Devices of the bake, with a process each if there are several.
         """
         self.seconds, self.folder, self.steady_count, self.worlds = seconds, folder, steady_count, worlds
-        self.device, self.cleaner, self.counter = device, cleaner, counter
-        self.ticks, self.last_count = 0, 0
+        self.device, self.cleaner, self.counter, self.devices = device, cleaner, counter, devices
+        self.ticks = 0
+        self._counts = deque([0], maxlen=devices)
         self.started = time.perf_counter()
         self.first_count = 0.0
         self.initial_disk = shutil.disk_usage(folder).used
@@ -96,12 +100,13 @@ class SteadyMeter(SilentProgress):
         tally = self.cleaner.poll() if self.cleaner else Tally()
         if count:
             self.first_count = self.first_count or time.perf_counter() - self.started
-            self.ticks += int(self.ticks > 0 or count - self.last_count >= self.steady_count)
-            self.last_count = count
-            if self.ticks > LEAD_TICKS and not self.is_stopped:
+            # Ticks of several devices take turns: as many of them as there are devices are counted together.
+            self.ticks += int(self.ticks > 0 or count - self._counts[0] >= self.devices * self.steady_count)
+            self._counts.append(count)
+            if self.ticks > LEAD_TICKS * self.devices and not self.is_stopped:
                 self.readings.append(self._read(count, episodes_done, tally))
         measured = len(self.readings) > 1 and self.readings[-1].time - self.readings[0].time >= self.seconds
-        if measured or tally.problem or episodes_done >= episodes - self.worlds:
+        if measured or tally.problem or episodes_done >= episodes - self.worlds * self.devices:
             self._stop()
 
     def raise_interruption(self, summary: BakeSummary) -> None:
@@ -144,13 +149,14 @@ def summarize_rates(part: str, unit: str, meter: SteadyMeter) -> Iterator[Row]:
     count, seconds = last.count - first.count, last.time - first.time
     yield Row(part, f"time to the first {unit}s", meter.first_count, "s")
     yield Row(part, "measured", seconds, "s")
-    yield Row(part, "a tick", 1e3 * seconds / (len(meter.readings) - 1), "ms")
+    yield Row(part, "a tick", 1e3 * meter.devices * seconds / (len(meter.readings) - 1), "ms")
     yield Row(part, f"{unit}s to disk", count / seconds, "1/s")
     rates = slice_rates(meter.readings, SLICE_SECONDS)
     if rates:
         yield Row(part, f"{unit}s to disk, slowest {SLICE_SECONDS:.0f} s", min(rates), "1/s")
         yield Row(part, f"{unit}s to disk, fastest {SLICE_SECONDS:.0f} s", max(rates), "1/s")
-    spent = {"writers": last.writers.cpu - first.writers.cpu, "main process": last.main.cpu - first.main.cpu}
+    workers = "writers" if meter.devices == 1 else "writers and devices' processes"
+    spent = {workers: last.writers.cpu - first.writers.cpu, "main process": last.main.cpu - first.main.cpu}
     if meter.cleaner:
         spent["verification and deletion"] = last.cleaner.cpu - first.cleaner.cpu
     for name, value in spent.items():
@@ -158,6 +164,6 @@ def summarize_rates(part: str, unit: str, meter: SteadyMeter) -> Iterator[Row]:
     yield Row(part, "cores busy", sum(spent.values()) / seconds, "")
     for when, reading in (("at the beginning", first), ("at the end", last)):
         yield Row(part, f"resident memory of the main process, {when}", reading.main.resident / GIB, "GiB")
-        yield Row(part, f"resident memory of all writers, {when}", reading.writers.resident / GIB, "GiB")
+        yield Row(part, f"resident memory of all {workers}, {when}", reading.writers.resident / GIB, "GiB")
     if meter.device.is_cuda:
-        yield Row(part, "device memory in use by all processes", last.device / GIB, "GiB")
+        yield Row(part, "device memory in use by all processes, first device", last.device / GIB, "GiB")

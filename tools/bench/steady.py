@@ -8,14 +8,14 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.pipeline import run_bake
-from synpick_warp.system.device import pick_device
+from synpick_warp.system.device import pick_device, pick_devices
 from tools.bench.cleaner import Assignment, Cleaner
 from tools.bench.meter import LIVE_FRACTION, SteadyMeter, summarize_rates
 from tools.bench.physics import Row
@@ -24,9 +24,10 @@ SPARE_EPISODES = 16
 """Episodes planned for each world, so that none runs out of them in the measurement."""
 
 
-def plan_spare_episodes(config: Config) -> Config:
-    """Settings with SPARE_EPISODES episodes for each world."""
-    return dataclasses.replace(config, bake=dataclasses.replace(config.bake, episodes=SPARE_EPISODES * config.bake.worlds))
+def plan_spare_episodes(config: Config, devices: int = 1) -> Config:
+    """Settings with SPARE_EPISODES episodes for each world of each device."""
+    episodes = SPARE_EPISODES * config.bake.worlds * devices
+    return dataclasses.replace(config, bake=dataclasses.replace(config.bake, episodes=episodes))
 
 
 @contextlib.contextmanager
@@ -44,13 +45,20 @@ def clean_up_behind(config: Config, out: Path, suffixes: tuple[str, ...] = ()) -
         raise DatasetError(tally.problem)
 
 
-def measure_steady(config: Config, min_seconds: float) -> Iterator[Row]:
-    """Bake to the temporary folder (TMPDIR) until the steady state is measured for `min_seconds` [s]; the files are removed."""
-    config, device = plan_spare_episodes(config), pick_device(config.bake.device)
+def measure_steady(config: Config, min_seconds: float, devices: Sequence[str] = ()) -> Iterator[Row]:
+    """Bake to the temporary folder (TMPDIR) until the steady state is measured; the files are removed.
+
+    Args:
+        config: All settings; each device simulates `bake.worlds` worlds.
+        min_seconds: Time to measure [s].
+        devices: Devices with a process each, see `run_bake`; empty: `bake.device` alone.
+    """
+    names = pick_devices(devices) if devices else (config.bake.device,)
+    config, device = plan_spare_episodes(config, len(names)), pick_device(names[0])
     live_views = LIVE_FRACTION * config.bake.worlds * len(config.cameras.positions)
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out") as cleaner:
-        meter = SteadyMeter(min_seconds, Path(folder), live_views, config.bake.worlds, device, cleaner)
-        summary = run_bake(config, Path(folder) / "out", meter)
+        meter = SteadyMeter(min_seconds, Path(folder), live_views, config.bake.worlds, device, cleaner, devices=len(names))
+        summary = run_bake(config, Path(folder) / "out", meter, devices=devices)
     if len(meter.readings) > 1:
         yield from _summarize(config, meter)
     meter.raise_interruption(summary)

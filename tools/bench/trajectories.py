@@ -14,13 +14,12 @@ from unittest import mock
 
 import numpy as np
 
-from synpick_warp.codes import Mode
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import Exporters
 from synpick_warp.frames import TickBatch
 from synpick_warp.pipeline import run_bake
-from synpick_warp.scheduling.order import EXPECTED_FRAMES
-from synpick_warp.stages.sim.arrange import sample_modes_of
+from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scheduling.order import predict_frames
 from synpick_warp.system.device import pick_device
 from tools.bench.meter import LIVE_FRACTION, SteadyMeter, summarize_rates
 from tools.bench.physics import Row
@@ -64,8 +63,7 @@ def _summarize(config: Config, meter: SteadyMeter) -> Iterator[Row]:
     first, last, physics = meter.readings[0], meter.readings[-1], config.physics
     seconds, ticks, frames = last.time - first.time, len(meter.readings) - 1, last.count - first.count
     rate = ticks * physics.steps_per_tick * config.bake.worlds / seconds
-    modes = sample_modes_of(config, np.arange(config.bake.episodes, dtype=np.int32), meter.device)
-    mean = float(np.mean([EXPECTED_FRAMES[Mode(mode)] for mode in modes.tolist()]))
+    mean = float(np.mean(predict_frames(config, load_catalog(config), np.arange(config.bake.episodes, dtype=np.int32), meter.device)))
     yield Row("trajectories", "world-steps", rate, "1/s")
     yield Row("trajectories", "simulated time: multiple of real time", rate * physics.step, "")
     yield Row("trajectories", "worlds with a frame in a tick", 100.0 * frames / (ticks * config.bake.worlds), "%")

@@ -1,4 +1,4 @@
-"""CPU time and resident memory of a benchmark and of its child processes, from /proc."""
+"""CPU time and resident memory of a benchmark and of its descendant processes, from /proc."""
 
 from __future__ import annotations
 
@@ -25,16 +25,23 @@ class Usage(NamedTuple):
 
 
 def measure_usage() -> dict[int, Usage]:
-    """Resources of this process and of its running child processes, by process id."""
+    """Resources of this process and of its running descendants, by process id."""
     usages: dict[int, Usage] = {}
-    ours = os.getpid()
+    parents: dict[int, int] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
             try:
                 values = (entry / "stat").read_text().rpartition(")")[2].split()
             except OSError:
                 continue
-            if int(entry.name) == ours or int(values[_PARENT]) == ours:
-                cpu = (int(values[_USER]) + int(values[_SYSTEM])) / os.sysconf("SC_CLK_TCK")
-                usages[int(entry.name)] = Usage(cpu, int(values[_RESIDENT]) * os.sysconf("SC_PAGE_SIZE"))
-    return usages
+            cpu = (int(values[_USER]) + int(values[_SYSTEM])) / os.sysconf("SC_CLK_TCK")
+            usages[int(entry.name)] = Usage(cpu, int(values[_RESIDENT]) * os.sysconf("SC_PAGE_SIZE"))
+            parents[int(entry.name)] = int(values[_PARENT])
+    return {pid: usage for pid, usage in usages.items() if _descends(pid, os.getpid(), parents)}
+
+
+def _descends(pid: int, ancestor: int, parents: dict[int, int]) -> bool:
+    """True if a process is the ancestor or one of its descendants."""
+    while pid in parents and pid != ancestor:
+        pid = parents[pid]
+    return pid == ancestor

@@ -23,6 +23,7 @@ from synpick_warp.kernels.render.lighting.history import (
     update_frame,
     usable_paths,
 )
+from synpick_warp.kernels.render.lighting.path_lists import PathLists, append_pixel, listed_pixel
 from synpick_warp.kernels.render.lighting.path_tracing import (
     TERMINATED,
     PathContext,
@@ -35,9 +36,9 @@ from synpick_warp.kernels.render.lighting.path_tracing import (
 )
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, read_hit
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, ViewBodies, read_hit
 from synpick_warp.kernels.rng import stream_key
-from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS
+from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS, RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -172,6 +173,86 @@ def store_light(out: CoarseLight, view: int, row: int, column: int, light: Split
     out.unoccluded_specular[view, row, column] = pack_half3(unoccluded.specular)
 
 
+@wp.struct
+class CoarseSurface:
+    """Surface at the middle pixel of a coarse pixel."""
+
+    hit: Hit
+    position: wp.vec3
+    """[m]"""
+    outgoing: wp.vec3
+    """Unit vector to the camera."""
+    width: float
+    """Width of the coarse pixel across the ray [m]."""
+
+
+@wp.func
+def coarse_surface(cameras: Cameras, coarse: CoarseGrid, gbuffer: GBuffer, view: int, camera: int, row: int, column: int) -> CoarseSurface:
+    """Read a coarse pixel's surface from the G-buffer."""
+    pixel = middle_pixel(coarse, row, column)
+    ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
+    surface = CoarseSurface()
+    surface.hit = read_hit(gbuffer, view, pixel[0], pixel[1])
+    surface.position = hit_position(cameras, camera, ray, surface.hit.depth)
+    surface.outgoing = -wp.normalize(cameras.to_world[camera] * ray)
+    surface.width = float(coarse.size) * surface.hit.depth / cameras.intrinsics[camera][0]
+    return surface
+
+
+@wp.func
+def write_guide(guide: Guide, to_world: wp.mat33, view: int, row: int, column: int, depth: float, normal: wp.vec3):
+    """Write the guide image of a coarse pixel that shows a surface, except its segmentation id; `normal` is in the world."""
+    guide.normal[view, row, column] = wp.transpose(to_world) * normal
+    guide.depth[view, row, column] = depth
+
+
+@wp.kernel(cuda_max_registers=RAY_REGISTERS)
+def reuse_histories_kernel(
+    # Scene:
+    scene: PathScene,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    # State: worlds
+    light: wp.array[int],  # (world)
+    light_yaw: wp.array[float],  # (world) [rad]
+    # In:
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    views: Views,
+    moving: MovingBodies,
+    history: LightHistory,
+    first: int,
+    # Out:
+    lists_inout: PathLists,
+    guide_out: Guide,
+    coarse_light_out: CoarseLight,
+):
+    """Temporal reuse: the history's light for coarse pixels that trace no path in this frame, see `period_bits`; the others are listed.
+
+    Of coarse pixels that are listed only the segmentation id is written; `variance` never is.
+    """
+    index = wp.tid() + first
+    view, row, column = interleaved_pixel(coarse, index)
+    if not in_image(coarse.grid, row, column):
+        return
+    camera, world = views.camera[view], views.world[view]
+    surface = coarse_surface(cameras, coarse, gbuffer, view, camera, row, column)
+    guide_out.segment[view, row, column] = wp.uint8(surface.hit.segment)
+    if surface.hit.segment == Segment.NOTHING:
+        return
+    limit = lag_limit(scene.meshes, history, moving, views, view, row, column, surface.hit.segment, surface.position)
+    slot = world * history.cameras + camera
+    known, bits = usable_paths(history, slot, row, column, limit)
+    if bits == 0 or update_frame(row, column, bits) == history.frame[slot] % (1 << bits):
+        append_pixel(lists_inout, view, index, known, bits)
+        return
+    vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
+    unoccluded = unoccluded_light(scene.lights, light[world], light_yaw[world], vertex.brdf)
+    exposure = scene.lights.exposure[light[world]]
+    store_light(coarse_light_out, view, row, column, read_history(history, slot, row, column), scale_light(unoccluded, exposure))
+    write_guide(guide_out, cameras.to_world[camera], view, row, column, surface.hit.depth, vertex.brdf.normal)
+
+
 @wp.kernel(cuda_max_registers=COARSE_PATH_REGISTERS)
 def trace_coarse_paths_kernel(
     # Scene:
@@ -186,7 +267,7 @@ def trace_coarse_paths_kernel(
     bodies: ViewBodies,
     gbuffer: GBuffer,
     views: Views,
-    moving: MovingBodies,
+    lists: PathLists,
     rules: PathRules,
     firefly_clamp: float,
     first: int,
@@ -197,38 +278,32 @@ def trace_coarse_paths_kernel(
 ):
     """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
-    A coarse pixel without a usable history traces `rules.samples` paths. With one it traces a single path and blends it in, or none in
-    frames that its update period skips, see `period_bits`. The sun's direct light is left out, see `shadows`; `variance` is not written.
+    With a history only those in `lists` do. A coarse pixel without a usable history traces `rules.samples` paths; with one it traces a
+    single path and blends it in. The sun's direct light is left out, see `shadows`; `variance` is not written.
     """
-    view, row, column = interleaved_pixel(coarse, wp.tid() + first)
+    index = wp.tid() + first
+    known, bits = int(0), int(0)
+    if history_inout.max_paths > 0:
+        index, known, bits = listed_pixel(lists, index)
+        if index < 0:
+            return
+    view, row, column = interleaved_pixel(coarse, index)
     if not in_image(coarse.grid, row, column):
         return
-    pixel = middle_pixel(coarse, row, column)
-    hit = read_hit(gbuffer, view, pixel[0], pixel[1])
-    guide_out.segment[view, row, column] = wp.uint8(hit.segment)
-    if hit.segment == Segment.NOTHING:
-        return
     camera, world = views.camera[view], views.world[view]
-    ray = camera_ray(cameras.intrinsics[camera], pixel[0], pixel[1], wp.vec2(0.0, 0.0))
-    outgoing = -wp.normalize(cameras.to_world[camera] * ray)
-    position = hit_position(cameras, camera, ray, hit.depth)
-    width = float(coarse.size) * hit.depth / cameras.intrinsics[camera][0]
-    vertex = make_vertex(scene, bodies, view, views.instances, hit, position, outgoing, width, 0.0)
+    surface = coarse_surface(cameras, coarse, gbuffer, view, camera, row, column)
+    guide_out.segment[view, row, column] = wp.uint8(surface.hit.segment)
+    if surface.hit.segment == Segment.NOTHING:
+        return
+    vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
     context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
     unoccluded = unoccluded_light(scene.lights, context.light, context.yaw, vertex.brdf)
-    limit = lag_limit(scene.meshes, history_inout, moving, views, view, row, column, hit.segment, position)
     slot = world * history_inout.cameras + camera
-    known, bits = usable_paths(history_inout, slot, row, column, limit)
     frame = history_frame(history_inout, slot, known)
+    samples = wp.where(known > 0, 1, rules.samples)
+    number = first_path_index(rules.samples, row, column, path_number(frame, bits), known > 0)
+    paths = average_paths(scene, bodies, rules, context, number, samples, vertex, surface.width, unoccluded, firefly_clamp)
     exposure = scene.lights.exposure[context.light]
-    mean = SplitRadiance()
-    if bits > 0 and update_frame(row, column, bits) != frame % (1 << bits):
-        mean = read_history(history_inout, slot, row, column)
-    else:
-        samples = wp.where(known > 0, 1, rules.samples)
-        index = first_path_index(rules.samples, row, column, path_number(frame, bits), known > 0)
-        paths = average_paths(scene, bodies, rules, context, index, samples, vertex, width, unoccluded, firefly_clamp)
-        mean = accumulate(history_inout, slot, row, column, hit.segment, scale_light(paths, exposure), known, samples)
+    mean = accumulate(history_inout, slot, row, column, surface.hit.segment, scale_light(paths, exposure), known, samples)
     store_light(coarse_light_out, view, row, column, mean, scale_light(unoccluded, exposure))
-    guide_out.normal[view, row, column] = wp.transpose(cameras.to_world[camera]) * vertex.brdf.normal
-    guide_out.depth[view, row, column] = hit.depth
+    write_guide(guide_out, cameras.to_world[camera], view, row, column, surface.hit.depth, vertex.brdf.normal)

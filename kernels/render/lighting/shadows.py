@@ -21,6 +21,8 @@ from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
+RING = wp.constant(1)
+"""Upsampling fallback: the four nearest coarse pixels are widened by this many on each side if none of them is on the surface."""
 VISIBILITY_BITS = wp.constant(16)
 """Bits of a packed sun visibility."""
 VISIBILITY_MASK = wp.constant((1 << 16) - 1)
@@ -162,6 +164,14 @@ def filter_shadows_kernel(
 
 
 @wp.func
+def on_plane(packed: wp.uint64, coarse: CoarseGrid, row: int, column: int, plane: Plane, r: int, c: int) -> bool:
+    """Whether the coarse pixel (r, c), packed, shows the surface of the pixel (row, column), whose tangent plane is `plane`."""
+    pixel = middle_pixel(coarse, r, c)
+    distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, packed_depth(packed))
+    return packed_segment(packed) == plane.segment and distance <= PLANE_TOLERANCE * float(coarse.size) * plane.width
+
+
+@wp.func
 def upsample_shadow(
     visibility: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
     coarse: CoarseGrid,
@@ -170,25 +180,40 @@ def upsample_shadow(
     column: int,
     plane: Plane,
 ) -> float:
-    """Sun visibility at a pixel by joint bilateral upsampling from the four nearest coarse pixels; `plane` is the pixel's tangent plane."""
+    """Sun visibility at a pixel by joint bilateral upsampling from the four nearest coarse pixels; `plane` is the pixel's tangent plane.
+
+    If all four are on other surfaces, the ring around them is searched too, as for visibility ratios: sunlight of another surface would
+    show as bright pixels along the edge.
+    """
     y = coarse_coordinate(coarse, row)
     x = coarse_coordinate(coarse, column)
     top = int(wp.floor(y))
     left = int(wp.floor(x))
-    tolerance = PLANE_TOLERANCE * float(coarse.size) * plane.width
     visible = float(0.0)
     total = float(0.0)
+    found = bool(False)
     for i in range(2):
         r = clamp_index(top + i, coarse.grid.height)
         vertical = 1.0 - wp.abs(y - float(top + i))
         for j in range(2):
             c = clamp_index(left + j, coarse.grid.width)
             weight = vertical * (1.0 - wp.abs(x - float(left + j))) + MIN_WEIGHT
-            pixel = middle_pixel(coarse, r, c)
             packed = visibility[view, r, c]
-            distance = plane_distance(plane, pixel[0] - row, pixel[1] - column, packed_depth(packed))
-            if packed_segment(packed) != plane.segment or distance > tolerance:
+            if on_plane(packed, coarse, row, column, plane, r, c):
+                found = True
+            else:
                 weight *= MIN_WEIGHT
             visible += weight * packed_visibility(packed)
             total += weight
+    if not found:
+        # Not unrolled: few pixels come here.
+        ring = int(RING)
+        for i in range(-ring, 2 + ring):
+            r = clamp_index(top + i, coarse.grid.height)
+            for j in range(-ring, 2 + ring):
+                c = clamp_index(left + j, coarse.grid.width)
+                packed = visibility[view, r, c]
+                if on_plane(packed, coarse, row, column, plane, r, c):
+                    visible += packed_visibility(packed)
+                    total += 1.0
     return visible / total

@@ -186,7 +186,8 @@ def extract_masks(visible_source: np.ndarray, amodal_source: np.ndarray, truth: 
         unpack_run_boundaries(source, height) if truth.listed else find_run_boundaries(source, truth.top, truth.left)
         for source in (visible_source, amodal_source)
     )
-    return [Masks(amodal.runs_with(index), visible.runs_of(1 + index)) for index in truth.instance_id.tolist()]
+    instances = truth.instance_id.tolist()
+    return [Masks(*pair) for pair in zip(amodal.split_by_bit(instances), visible.split_by_value(instances), strict=True)]
 
 
 def write_view(

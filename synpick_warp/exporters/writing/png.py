@@ -26,6 +26,8 @@ _ZLIB_HEADER = b"\x78\x01"
 """Header of a zlib stream (RFC 1950, section 2.2): deflate, window of 32 kB, fastest compression."""
 _FINAL_BLOCK = b"\x03\x00"
 """Empty final deflate block with fixed Huffman codes (RFC 1951, section 3.2.6)."""
+_CACHED_HEIGHTS = 4096
+"""Heights of blank rows whose compressed form is cached, at most: those of full HD take 1.3 MB in all."""
 _STRIP_BYTES = 1 << 18
 """Approximate size of a strip of rows that is filtered and compressed at once [B]: input and output fit in a core's cache."""
 
@@ -70,35 +72,48 @@ def encode_mask_png(runs: Runs, height: int, width: int) -> bytes:
     set, and only the rows that hold any are compressed; the compressed form of blank rows is cached.
     """
     stride = 1 + width
-    ended = runs.past < height
-    begins = runs.first * stride + 1 + runs.column
-    ends = (runs.past * stride + 1 + runs.column)[ended]
-    if not begins.size:
-        data = _ZLIB_HEADER + _blank_rows(height, stride) + _FINAL_BLOCK + _adler32(height * stride, 0, 0)
-        return _assemble(width, height, 8, _GREY, data)
-    top, bottom = int(runs.first.min()), int(runs.past.max())
-    rows = min(bottom + 1, height) - top
+    count = runs.column.size
+    if not count:
+        data = (_ZLIB_HEADER, _blank_rows(height, stride), _FINAL_BLOCK, _adler32(height * stride, 0, 0))
+        return _assemble(width, height, 8, _GREY, b"".join(data))
+    rows = min(runs.bottom + 1, height) - runs.top
     canvas = _canvas(height, width)
-    begins_here, ends_here = begins - top * stride, ends - top * stride
-    canvas[begins_here], canvas[ends_here] = 255, 1
+    skipped = runs.top * stride
+    begins = runs.first * stride
+    begins += runs.column
+    begins += 1 - skipped
+    ends = begins + (runs.past - runs.first) * stride
+    canvas[begins], canvas[ends] = 255, 1
     stream = Deflater(-isal_zlib.MAX_WBITS)
     middle = stream.compress(canvas[: rows * stride]) + stream.flush(isal_zlib.Z_FULL_FLUSH)
-    canvas[begins_here] = canvas[ends_here] = 0
-    total = _UP * rows + 255 * begins.size + ends.size
-    moment = _UP * stride * (rows * top + rows * (rows - 1) // 2) + 255 * int(begins.sum()) + int(ends.sum())
-    above, below = _blank_rows(top, stride), _blank_rows(height - top - rows, stride)
+    canvas[begins] = canvas[ends] = 0
+    # Sums of positions in the window. A run that ends at the image's bottom sets no byte below it.
+    begin_sum = int(begins.sum())
+    end_sum, end_count = begin_sum + stride * runs.count, count
+    if runs.bottom == height:
+        outside = ends[runs.past == height]
+        end_sum, end_count = end_sum - int(outside.sum()), count - outside.size
+    total = 255 * count + end_count
+    moment = 255 * begin_sum + end_sum + skipped * total
+    moment += _UP * stride * (rows * runs.top + rows * (rows - 1) // 2)
+    total += _UP * rows
+    above, below = _blank_rows(runs.top, stride), _blank_rows(height - runs.top - rows, stride)
     data = b"".join((_ZLIB_HEADER, above, middle, below, _FINAL_BLOCK, _adler32(height * stride, total, moment)))
     return _assemble(width, height, 8, _GREY, data)
 
 
 @functools.cache
 def _canvas(height: int, width: int) -> np.ndarray:
-    """Scratch buffer: filtered rows of an empty mask, each with its filter byte. A caller that changes it restores it."""
-    canvas = np.zeros((height, 1 + width), np.uint8)
+    """Scratch buffer: filtered rows of an empty mask, each with its filter byte. A caller that changes it restores it.
+
+    One row more than the image takes the ends of runs at the image's bottom.
+    """
+    canvas = np.zeros((height + 1, 1 + width), np.uint8)
     canvas[:, 0] = _UP
     return canvas.ravel()
 
 
+@functools.lru_cache(_CACHED_HEIGHTS)
 def _blank_rows(rows: int, stride: int) -> bytes:
     """Raw deflate of `rows` rows of zero bytes, byte-aligned at both ends; concatenated from cached powers of two."""
     return b"".join(_zero_rows(1 << bit, stride) for bit in range(rows.bit_length()) if rows >> bit & 1)
@@ -117,9 +132,18 @@ def _adler32(count: int, total: int, moment: int) -> bytes:
 
 
 def _assemble(width: int, height: int, bits: int, color_type: int, data: Buffer) -> bytes:
-    header = struct.pack(">IIBBBBB", width, height, bits, color_type, 0, 0, 0)
-    return b"".join((_SIGNATURE, *_chunk(b"IHDR", header), *_chunk(b"IDAT", data), *_chunk(b"IEND", b"")))
+    return b"".join((_head(width, height, bits, color_type), *_chunk(b"IDAT", data), _END))
+
+
+@functools.cache
+def _head(width: int, height: int, bits: int, color_type: int) -> bytes:
+    """Signature and header chunk."""
+    return b"".join((_SIGNATURE, *_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, color_type, 0, 0, 0))))
 
 
 def _chunk(kind: bytes, data: Buffer) -> tuple[bytes, bytes, Buffer, bytes]:
     return struct.pack(">I", len(data)), kind, data, struct.pack(">I", isal_zlib.crc32(data, isal_zlib.crc32(kind)))
+
+
+_END = b"".join(_chunk(b"IEND", b""))
+"""Last chunk of a file."""

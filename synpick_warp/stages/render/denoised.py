@@ -11,7 +11,7 @@ from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_
 from synpick_warp.configs.schema import Render
 from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, find_footprints_kernel, resolve_footprints_kernel
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
-from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, trace_coarse_paths_kernel
+from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, reuse_histories_kernel, trace_coarse_paths_kernel
 from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
 from synpick_warp.kernels.render.lighting.history import (
     NEVER,
@@ -20,13 +20,14 @@ from synpick_warp.kernels.render.lighting.history import (
     advance_history_kernel,
     find_moving_bodies_kernel,
 )
+from synpick_warp.kernels.render.lighting.path_lists import REGION_PIXELS, PathLists
 from synpick_warp.kernels.render.lighting.shading import shade_kernel
 from synpick_warp.kernels.render.lighting.shadows import filter_shadows_kernel, trace_shadow_rays_kernel
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.tuning import FOOTPRINT_THREADS, LANE_COLUMNS, LANE_STRIDE, PIXEL_BLOCK, VIEW_BLOCK
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
-from synpick_warp.stages.launch import launch_pixels
+from synpick_warp.stages.launch import launch_pixels, launch_views
 from synpick_warp.stages.render.reference import make_path_rules
 from synpick_warp.stages.render.scene import RenderScene, build_grid
 from synpick_warp.stages.timing import scope
@@ -54,6 +55,7 @@ GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column", units={"depth": 
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
 LIGHT_HISTORY = struct_arrays(LightHistory, "world_camera", "cell_row", "cell_column", episode=("world_camera",), frame=("world_camera",))
 MOVING_BODIES = struct_arrays(MovingBodies, "view", "body", holds=("view",), count=("view",), units={"to_body": "m"})
+PATH_LISTS = struct_arrays(PathLists, "view", "region", "rank", count=("view", "region", "path_kind"))
 RATIO_IMAGES = struct_arrays(RatioImages, "view", "cell_row", "cell_column")
 
 
@@ -77,7 +79,7 @@ class FootprintLists:
     """Footprints in each list."""
 
 
-DENOISED_SCRATCH = ((GUIDE, 1), (COARSE_LIGHT, 2), (RATIO_IMAGES, 2), (ShadowArrays, 1), (FootprintLists, 1))
+DENOISED_SCRATCH = ((GUIDE, 1), (PATH_LISTS, 1), (COARSE_LIGHT, 2), (RATIO_IMAGES, 2), (ShadowArrays, 1), (FootprintLists, 1))
 """Arrays that `DenoisedRenderer` allocates, and how many of each."""
 
 
@@ -96,9 +98,13 @@ def scratch_sizes(render: Render, width: int, height: int) -> dict[str, int]:
     size = coarse_size(render, width)
     shadow = max(1, size // 2)
     chunks = -(-footprint_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
+    columns, rows = -(-width // size), -(-height // size)
     return {
-        "cell_row": -(-height // size),
-        "cell_column": -(-width // size),
+        "cell_row": rows,
+        "cell_column": columns,
+        "region": interleaved_threads(columns, rows) // int(REGION_PIXELS) if render.history else 0,
+        "rank": int(REGION_PIXELS),
+        "path_kind": 2,
         "shadow_row": -(-height // shadow),
         "shadow_column": -(-width // shadow),
         "chunk": chunks,
@@ -126,10 +132,10 @@ def footprint_grid(width: int, height: int) -> Any:
     return build_grid(width + 1, height + 1)
 
 
-def interleaved_threads(coarse: Any) -> int:
-    """Threads per view of a kernel in interleaved order; see `interleaved_pixel`."""
+def interleaved_threads(columns: int, rows: int) -> int:
+    """Threads per view of a kernel in interleaved order, over `columns` x `rows` coarse pixels; see `interleaved_pixel`."""
     across, down = int(LANE_STRIDE) * int(LANE_COLUMNS), int(LANE_STRIDE) * int(TILE_PIXELS) // int(LANE_COLUMNS)
-    return -(-coarse.grid.width // across) * -(-coarse.grid.height // down) * across * down
+    return -(-columns // across) * -(-rows // down) * across * down
 
 
 class DenoisedRenderer:
@@ -160,6 +166,7 @@ class DenoisedRenderer:
         self.history.frame.fill_(int(NEVER))
         self.moving = allocate_struct(MOVING_BODIES, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
         self.guide = allocate_struct(GUIDE, sizes, scene.device)
+        self.path_lists = allocate_struct(PATH_LISTS, sizes, scene.device)
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, scene.device) for _ in range(2))
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, scene.device) for _ in range(2))
         self.shadows = allocate(ShadowArrays, sizes, scene.device)
@@ -205,11 +212,17 @@ class DenoisedRenderer:
 
     def trace_coarse_paths(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
         """Coarse path pass: guide image and light of coarse pixels."""
-        scene = self.scene
+        scene, threads = self.scene, interleaved_threads(self.coarse.grid.width, self.coarse.grid.height)
+        if self.history.max_paths > 0:
+            self.path_lists.count.zero_()
+            inputs = [scene.paths, scene.cameras, self.coarse, snapshot.light, snapshot.light_yaw]
+            inputs += [bodies, gbuffer, views, self.moving, self.history]
+            outputs = [self.path_lists, self.guide, self.coarse_light]
+            launch_views(reuse_histories_kernel, views.count, threads, inputs, outputs, scene.device)
         inputs = [scene.paths, scene.cameras, self.coarse, snapshot.episode, snapshot.light, snapshot.light_yaw]
-        inputs += [bodies, gbuffer, views, self.moving, self.rules, self.firefly_clamp]
+        inputs += [bodies, gbuffer, views, self.path_lists, self.rules, self.firefly_clamp]
         outputs = [self.history, self.guide, self.coarse_light]
-        launch_pixels(trace_coarse_paths_kernel, views.count * interleaved_threads(self.coarse), inputs, outputs, scene.device)
+        launch_pixels(trace_coarse_paths_kernel, views.count * threads, inputs, outputs, scene.device)
 
     def denoise(self, views: Any) -> None:
         """Filter visibility ratios: block means, choice of the kernel's width, smoothing."""

@@ -7,8 +7,10 @@ import warp as wp
 
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
+from synpick_warp.kernels import structs
 from synpick_warp.kernels.sim import arrangement, endings, rest
-from synpick_warp.stages.constants import SceneData, mode_data, mode_rows
+from synpick_warp.scenes.types import Catalog
+from synpick_warp.stages.constants import SceneData, drop_data, mode_data, mode_rows
 from synpick_warp.stages.perception.arrays import Observation
 from synpick_warp.stages.sim.physics import Physics
 from synpick_warp.stages.sim.worlds import AttemptState, WorldState
@@ -50,23 +52,44 @@ def sample_objects(scene: SceneData, state: WorldState, seed: int) -> None:
     )
 
 
-def sample_modes_of(config: Config, episodes: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Sample the modes of episodes ahead of their start: `Mode` (episode) int32 of indices (episode) int32. Waits for the device."""
-    identity = np.stack([episodes, np.zeros_like(episodes)], axis=1)
-    mode = wp.empty(len(episodes), dtype=wp.int32, device=device)
+def sample_episodes_ahead(config: Config, catalog: Catalog, episodes: np.ndarray, device: wp.Device) -> tuple[np.ndarray, np.ndarray]:
+    """Sample modes and objects of episodes ahead of their start. Waits for the device.
+
+    Args:
+        config: All settings.
+        catalog: The objects.
+        episodes: Indices (episode) int32.
+        device: Device that samples.
+
+    Returns:
+        `Mode` (episode) int32, and number of objects in the first arrangement (episode) int64. A world's slots may suffice for fewer.
+    """
+    count, seed = len(episodes), wp.uint64(config.bake.seed)
+    identity = wp.array(np.stack([episodes, np.zeros_like(episodes)], axis=1), dtype=wp.vec2i, device=device)
+    mode, ending = (wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2))
+    phase = wp.full(count, int(Phase.START), dtype=wp.int32, device=device)
     wp.launch(
         arrangement.sample_modes_kernel,
-        dim=len(episodes),
-        inputs=[
-            wp.uint64(config.bake.seed),
-            mode_data(mode_rows(config), device),
-            wp.array(identity, dtype=wp.vec2i, device=device),
-            wp.full(len(episodes), int(Phase.START), dtype=wp.int32, device=device),
-        ],
+        dim=count,
+        inputs=[seed, mode_data(mode_rows(config), device), identity, phase],
         outputs=[mode],
         device=device,
     )
-    return mode.numpy()
+    layout, objects = structs.LayoutData(), structs.CatalogData()
+    layout.instances = layout.single_slots = config.arrangement.max_objects
+    layout.slots = 2 * layout.instances
+    objects.count = len(catalog)
+    objects.volume = wp.array([entry.volume for entry in catalog.entries], dtype=float, device=device)
+    objects.compound = wp.zeros(len(catalog), dtype=int, device=device)
+    index, slot = (wp.empty((count, layout.instances), dtype=wp.int32, device=device) for _ in range(2))
+    wp.launch(
+        arrangement.sample_objects_kernel,
+        dim=count,
+        inputs=[seed, layout, objects, drop_data(config, 1), identity, mode, phase, ending],
+        outputs=[index, slot],
+        device=device,
+    )
+    return mode.numpy(), np.count_nonzero(index.numpy() >= 0, axis=1)
 
 
 def drop_objects(scene: SceneData, state: WorldState, physics: Physics, seed: int) -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from pycocotools import mask as coco
 
-from synpick_warp.exporters.writing.rle import Runs, find_run_boundaries
+from synpick_warp.exporters.writing.rle import RunBoundaries, Runs, find_run_boundaries
 
 SIDE = st.integers(1, 12)
 
@@ -103,3 +103,31 @@ def test_pycocotools_decodes_and_encodes_the_same_run_lengths(mask):
     np.testing.assert_array_equal(coco.decode(theirs), mask)
     assert coco.encode(np.asfortranarray(mask, np.uint8)) == theirs
     assert coco.area(theirs) == runs.count
+
+
+def assert_same_runs(found: Runs, expected: Runs) -> None:
+    for name in ("column", "first", "past"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+        assert getattr(found, name).dtype == np.int64
+    assert (found.count, found.top, found.bottom) == (expected.count, expected.top, expected.bottom)
+
+
+@given(hnp.arrays(np.uint8, st.tuples(SIDE, SIDE), elements=st.sampled_from([0, 1, 2, 32, 33, 255])), st.data())
+def test_all_values_at_once_give_the_runs_of_each(image, data):
+    boundaries = find_run_boundaries(*place_randomly(image, data)[:3])
+    for index, runs in zip((0, 1, 7, 31), boundaries.split_by_value((0, 1, 7, 31)), strict=True):
+        assert_same_runs(runs, boundaries.runs_of(1 + index))
+
+
+@given(hnp.arrays(np.uint32, st.tuples(SIDE, SIDE), elements=st.sampled_from([0, 1, 5, 7, 2**31, 2**32 - 1])), st.data())
+def test_all_bits_at_once_give_the_runs_of_each(bits, data):
+    boundaries = find_run_boundaries(*place_randomly(bits, data)[:3])
+    for index, runs in enumerate(boundaries.split_by_bit(range(32))):
+        assert_same_runs(runs, boundaries.runs_with(index))
+
+
+def test_images_with_more_positions_than_32_bits_are_split():
+    place = np.array([5, 2**12, 2**35, 2**35 + 1], np.uint64)
+    boundaries = RunBoundaries(place, 2**13, np.array([0, 9, 0, 9], np.uint32), np.array([9, 0, 9, 0], np.uint32))
+    assert_same_runs(boundaries.split_by_value([8])[0], boundaries.runs_of(9))
+    assert_same_runs(boundaries.split_by_bit([3])[0], boundaries.runs_with(3))

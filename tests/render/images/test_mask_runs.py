@@ -53,7 +53,7 @@ def test_device_lists_the_same_boundaries_as_numpy(device, shape):
         for which, image in enumerate(images):
             packed = boundaries[view, which, :, : counts[view, which]]
             expected, found = find_run_boundaries(image[view]), unpack_run_boundaries(packed, shape[0])
-            for name in ("column", "row", "above", "below"):
+            for name in ("place", "span", "above", "below"):
                 np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 

@@ -225,6 +225,24 @@ def test_sun_shadow_has_its_geometric_outline(device, yaw):
     np.testing.assert_allclose((value[ground] < middle).sum(), (ground & (inside > 0.0)).sum(), rtol=0.12)
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.15])
+def test_shadow_at_the_edge_of_a_sunlit_surface_stays_dark(device, turn):
+    """A sunlit sheet floats 16 px above its shadow. Shadowed pixels beside it: some have no shadow ray on their surface near."""
+    view = camera(160, 160, 400.0, (0.0, 0.0, 2.0))
+    pose = (0.0, 0.0, 0.08, 0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2))
+    objects = [(sheet(2.0, 2.0), surface(HALF)), (sheet(0.4, 0.4), surface(WHITE), pose)]
+    light = sun((1.0, 0.0, 1.0), rows=256, strength=6000.0)
+    config = settings(coarse_pixel=4, coarse_paths=4, antialias=False)
+    picture = render_objects(device, *objects, lights=(light,), view=view, config=config)
+    ground, value = picture.instance[0] == 1, picture.radiance[0, ..., 0]
+    strip = np.zeros_like(ground)
+    for shift in (1, 2):
+        strip[60:100, :-shift] |= ground[60:100, :-shift] & ~ground[60:100, shift:]
+    strip[:, 80:] = False
+    assert strip.sum() >= 40 * 2
+    assert value[strip].max() < 1.4 * np.median(value[strip])
+
+
 def test_scratch_has_the_size_of_the_scenes_images(device):
     config = replace(settings(coarse_pixel=4), cameras=replace(Config().cameras, resolution=(8, 8)))
     scene = build_render_scene(

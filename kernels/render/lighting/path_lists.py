@@ -1,0 +1,68 @@
+"""Stream compaction of the coarse path pass: lists of the coarse pixels that trace paths in a frame, so that warps are full of them.
+
+A region is the coarse pixels of LANE_STRIDE² warps in interleaved order. It has a list of its own: paths of its neighbours stay nearly
+parallel, and the atomic operations of few threads meet.
+"""
+
+import warp as wp
+
+from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
+from synpick_warp.kernels.tuning import LANE_STRIDE
+
+wp.set_module_options({"enable_backward": False})
+
+REGION_PIXELS = wp.constant(int(LANE_STRIDE) * int(LANE_STRIDE) * int(TILE_PIXELS))
+"""Coarse pixels of a region."""
+FRESH, AGED = wp.constant(0), wp.constant(1)
+"""Coarse pixels without a usable history, which trace `PathRules.samples` paths, and those with one, which trace one."""
+_KNOWN_BITS = wp.constant(8)
+"""Bits of an entry for the paths of a history: `LightHistory.paths` is 8 bits wide."""
+_PERIOD_BITS = wp.constant(2)
+"""Bits of an entry for `period_bits`, which is at most 3."""
+
+
+@wp.struct
+class PathLists:
+    """Coarse pixels that trace paths, listed by region. Scratch."""
+
+    count: wp.array3d[int]
+    """(view, region, path_kind): number of FRESH and of AGED coarse pixels."""
+    entry: wp.array3d[int]
+    """(view, region, rank): see `pack_entry`. FRESH ones from the front, AGED ones from the back, so that most warps hold one kind."""
+
+
+@wp.func
+def pack_entry(offset: int, known: int, bits: int) -> int:
+    """Entry of a coarse pixel: its place in the region, and `usable_paths` of its history."""
+    return (((offset << _KNOWN_BITS) | known) << _PERIOD_BITS) | bits
+
+
+@wp.func
+def unpack_entry(entry: int) -> tuple[int, int, int]:
+    """(offset, known, bits) of `pack_entry`."""
+    offset = entry >> (_KNOWN_BITS + _PERIOD_BITS)
+    known = (entry >> _PERIOD_BITS) & ((1 << _KNOWN_BITS) - 1)
+    return offset, known, entry & ((1 << _PERIOD_BITS) - 1)
+
+
+@wp.func
+def append_pixel(lists: PathLists, view: int, index: int, known: int, bits: int):
+    """List the coarse pixel of thread `index` in interleaved order. Which rank it gets may vary; its paths do not depend on it."""
+    region = (index // REGION_PIXELS) % lists.count.shape[1]
+    if known == 0:
+        rank = wp.atomic_add(lists.count, view, region, FRESH, 1)
+    else:
+        rank = REGION_PIXELS - 1 - wp.atomic_add(lists.count, view, region, AGED, 1)
+    lists.entry[view, region, rank] = pack_entry(index % REGION_PIXELS, known, bits)
+
+
+@wp.func
+def listed_pixel(lists: PathLists, index: int) -> tuple[int, int, int]:
+    """(thread index in interleaved order, known, bits) of the coarse pixel that thread `index` traces; -1 as the first: none."""
+    rank = index % REGION_PIXELS
+    region = (index // REGION_PIXELS) % lists.count.shape[1]
+    view = index // (REGION_PIXELS * lists.count.shape[1])
+    if rank >= lists.count[view, region, FRESH] and REGION_PIXELS - 1 - rank >= lists.count[view, region, AGED]:
+        return -1, 0, 0
+    offset, known, bits = unpack_entry(lists.entry[view, region, rank])
+    return index - rank + offset, known, bits
