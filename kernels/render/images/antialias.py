@@ -158,12 +158,20 @@ def has_discontinuity(
         return False
     fx = intrinsics[0]
     fy = intrinsics[1]
+    bends = False
     if left < right:
-        if has_crease(gbuffer, grid, fx, view, top, left, 0, 1) or has_crease(gbuffer, grid, fx, view, bottom, left, 0, 1):
-            return True
-    if top < bottom:
-        return has_crease(gbuffer, grid, fy, view, top, left, 1, 0) or has_crease(gbuffer, grid, fy, view, top, right, 1, 0)
-    return False
+        bends = has_crease(gbuffer, grid, fx, view, top, left, 0, 1) or has_crease(gbuffer, grid, fx, view, bottom, left, 0, 1)
+    if top < bottom and not bends:
+        bends = has_crease(gbuffer, grid, fy, view, top, left, 1, 0) or has_crease(gbuffer, grid, fy, view, top, right, 1, 0)
+    if not bends:
+        return False
+    # Beside a crease, one triangle may fill the footprint.
+    triangle = gbuffer.triangle[view, top, left]
+    return (
+        gbuffer.triangle[view, top, right] != triangle
+        or gbuffer.triangle[view, bottom, left] != triangle
+        or gbuffer.triangle[view, bottom, right] != triangle
+    )
 
 
 @wp.kernel

@@ -80,15 +80,18 @@ def interleaved_pixel(coarse: CoarseGrid, index: int) -> tuple[int, int, int]:
     The threads of a warp take coarse pixels LANE_STRIDE apart, whose sample points are close together: their rays are nearly parallel and
     visit the same BVH nodes.
     """
-    across = LANE_STRIDE * LANE_COLUMNS
-    down = LANE_STRIDE * (TILE_PIXELS // LANE_COLUMNS)
-    regions_across = (coarse.grid.width + across - 1) // across
-    regions = regions_across * ((coarse.grid.height + down - 1) // down)
-    lane = index % TILE_PIXELS
-    offset = (index // TILE_PIXELS) % (LANE_STRIDE * LANE_STRIDE)
-    region = index // (TILE_PIXELS * LANE_STRIDE * LANE_STRIDE)
+    # Unsigned, as in `tile_pixel`.
+    lanes, stride, columns = wp.uint32(TILE_PIXELS), wp.uint32(LANE_STRIDE), wp.uint32(LANE_COLUMNS)
+    across = stride * columns
+    down = stride * (lanes // columns)
+    regions_across = (wp.uint32(coarse.grid.width) + across - wp.uint32(1)) // across
+    regions = regions_across * ((wp.uint32(coarse.grid.height) + down - wp.uint32(1)) // down)
+    flat = wp.uint32(index)
+    lane = flat % lanes
+    offset = (flat // lanes) % (stride * stride)
+    region = flat // (lanes * stride * stride)
     view = region // regions
-    region = region - view * regions
-    row = (region // regions_across) * down + (lane // LANE_COLUMNS) * LANE_STRIDE + offset // LANE_STRIDE
-    column = (region % regions_across) * across + (lane % LANE_COLUMNS) * LANE_STRIDE + offset % LANE_STRIDE
-    return view, row, column
+    region = region % regions
+    row = (region // regions_across) * down + (lane // columns) * stride + offset // stride
+    column = (region % regions_across) * across + (lane % columns) * stride + offset % stride
+    return int(view), int(row), int(column)

@@ -40,8 +40,10 @@ def pack_half3(color: wp.vec3) -> wp.uint64:
 @wp.func
 def unpack_half3(packed: wp.uint64) -> wp.vec3:
     """Unpack the values of `pack_half3`."""
-    halves = wp.cast(packed, wp.vec4h)
-    return wp.vec3(float(halves[0]), float(halves[1]), float(halves[2]))
+    # Two words: shorter than shifts of 64 bits.
+    lower = wp.cast(wp.uint32(packed), wp.vec2h)
+    upper = wp.cast(wp.uint32(packed >> wp.uint64(32)), wp.vec2h)
+    return wp.vec3(float(lower[0]), float(lower[1]), float(upper[0]))
 
 
 @wp.func

@@ -77,12 +77,12 @@ def shade_kernel(
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
     normal = wp.transpose(cameras.to_world[camera]) * surface.face_normal
     plane = tangent_plane(intrinsics, row, column, gbuffer.segment[view, row, column], depth, normal)
-    pixel_ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
-    pixel_ratios.indirect = pixel_ratios.indirect / scene.lights.exposure[which]
     sun = float(0.0)
     if wp.max(scene.lights.sun_irradiance[which]) > 0.0:
         if wp.dot(surface.face_normal, rotate_z(scene.lights.sun_direction[which], yaw)) > 0.0:
             sun = upsample_shadow(sun_visibility, shadow_grid, view, row, column, plane)
+    pixel_ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
+    pixel_ratios.indirect = pixel_ratios.indirect / scene.lights.exposure[which]
     color = sample_base_color(scene.surfaces, surface)
     metallic = scene.surfaces.metallic[surface.row]
     roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
