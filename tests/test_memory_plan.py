@@ -138,7 +138,7 @@ def test_episodes_that_the_memory_cannot_list_are_refused_before_they_are_listed
 def test_memory_that_runs_out_later_is_one_line_too(error, tmp_path, monkeypatch):
     """The plan is a lower bound, and other programs may take memory at any time."""
 
-    def build_factory(*_: object) -> None:
+    def build_factory(*_: object, **__: object) -> None:
         raise error
 
     monkeypatch.setattr(pipeline, "build_factory", build_factory)
@@ -150,7 +150,7 @@ def test_memory_that_runs_out_later_is_one_line_too(error, tmp_path, monkeypatch
 
 
 def test_other_runtime_errors_stay_what_they_are(tmp_path, monkeypatch):
-    def build_factory(*_: object) -> None:
+    def build_factory(*_: object, **__: object) -> None:
         raise RuntimeError("a fault")
 
     monkeypatch.setattr(pipeline, "build_factory", build_factory)
