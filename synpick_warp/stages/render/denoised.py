@@ -206,7 +206,7 @@ class DenoisedRenderer:
         wp.launch(advance_history_kernel, inputs=inputs, outputs=[self.history, self.moving], **options)
         inputs = [self.scene.meshes, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, snapshot.fixture_visible]
         inputs += [snapshot.last_catalog_index, snapshot.last_pose, snapshot.last_fixture_pose, snapshot.last_fixture_visible]
-        inputs += [views, self.moving.rests.shape[1]]
+        inputs += [views, self.moving.mesh.shape[1]]
         wp.launch(find_moving_bodies_kernel, inputs=inputs, outputs=[self.moving], **options)
 
     def trace_coarse_paths(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:

@@ -12,13 +12,13 @@ import warp as wp
 
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.kernels.render.lighting.coarse_paths import SEQUENCE_FRAMES
-from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS, LightHistory
+from synpick_warp.kernels.render.lighting.history import LIGHT_CHANGE, MAX_DRIFT, MAX_PERIOD_BITS, MAX_TRAVEL, LightHistory
 from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
-from tests.harness.history_probe import schedule_kernel, usable_paths_kernel
+from tests.harness.history_probe import lag_frames_kernel, schedule_kernel, usable_paths_kernel
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot
 
 PATHS = 16
@@ -167,6 +167,38 @@ def test_a_body_that_moves_is_forgotten_and_dims_the_memory_around_it(renderer, 
     assert moving.count.numpy()[0] == 1
     # 2 cm of a ball whose box has a mean projected area of 1.5 x 6 cm x 6 cm.
     np.testing.assert_allclose(moving.change.numpy()[0, 0], 0.02 / np.sqrt(1.5 * 0.06**2), rtol=1e-3)
+
+
+def test_frames_that_the_lag_allows(renderer, device):
+    """Against bisection, for two moving bodies: never more frames than allowed, and nearly as many; far away any number."""
+    moved = ToyScene(
+        toy().entries, [[(0, (0.0, 0.0, 0.0, *UPRIGHT)), (1, (0.063, 0.0, 0.03, *UPRIGHT)), (2, (-0.03, 0.0, 0.08, *UPRIGHT))]], (VIEW,)
+    )
+    list(show(renderer, [(0, toy()), (1, replace(moved, lights=(LIGHT,), config=settings()))], device))
+    moving = renderer.shading.moving  # type: ignore[union-attr]
+    assert moving.count.numpy()[0] == 2
+    points = np.array([[x, 0.0, 0.0] for x in (-0.1, 0.0, 0.1, 0.2, 0.4, 2.0)], dtype=np.float32)
+    frames, covered = wp.empty(6, dtype=float, device=device), wp.empty((6, 2), dtype=float, device=device)
+    inputs = [renderer.scene.meshes, moving, wp.array(points, dtype=wp.vec3, device=device), 1e9]
+    wp.launch(lag_frames_kernel, dim=6, inputs=inputs, outputs=[frames, covered], device=device)
+    travel = np.geomspace(1e-2, 1e4, 100_000)[:, None] * moving.change.numpy()[0, :2]
+    change = np.minimum(travel, float(MAX_TRAVEL)) @ covered.numpy().T
+    allowed = np.array([np.searchsorted(column, float(LIGHT_CHANGE)) for column in change.T])
+    expected = np.append(np.geomspace(1e-2, 1e4, 100_000), np.inf)[allowed]
+    assert (frames.numpy() <= 1.001 * expected).all()
+    assert (frames.numpy() >= 0.9 * np.minimum(expected, 1e3)).all()
+    assert expected[0] < 10.0
+    assert np.isinf(expected[-1])
+
+
+def test_a_creeping_body_keeps_the_history_of_its_drift(renderer, device):
+    """0.4 mm a frame: 10 frames, of which 5 of its paths are kept and one is added. 5 mm a frame: none."""
+    assert float(MAX_DRIFT) / 4e-4 == pytest.approx(10.0)
+    frames = [*((index, toy(0.08 + 4e-4 * index)) for index in range(24)), (24, toy(0.0945))]
+    guide = renderer.shading.guide  # type: ignore[union-attr]
+    paths = [remembered(renderer)[guide.segment.numpy()[0] == 3] for _ in show(renderer, frames, device)]
+    assert paths[-2].max() in (5, 6)
+    assert set(np.unique(paths[-1])) == {1}
 
 
 @pytest.mark.parametrize(("before", "after"), [(None, 0.08), (0.08, None)])
