@@ -26,7 +26,7 @@ LAG_STEPS = wp.constant(3)
 """Newton steps of `lag_frames`; each takes at least one more of the bodies that travel fastest for saturated."""
 MIN_CHANGE = wp.constant(1.0e-6)
 """Change of a point's light below which it counts as unchanged: histories are far shorter than LIGHT_CHANGE / MIN_CHANGE."""
-MIN_SKIP_PATHS = wp.constant(4)
+MIN_SKIP_PATHS = wp.constant(2)
 """Shortest history [paths] that is updated in only some of the frames."""
 MAX_PERIOD_BITS = wp.constant(3)
 """Binary logarithm of the longest update period [frames]."""
@@ -248,7 +248,7 @@ def lag_limit(
 
 @wp.func
 def period_bits(paths: int, limit: int) -> int:
-    """Binary logarithm of a coarse pixel's update period: with 4, 8, 16 paths it traces one every 2, 4, 8 frames; 0: every frame.
+    """Binary logarithm of a coarse pixel's update period: with 2, 4, 8 paths it traces one every 2, 4, 8 frames; 0: every frame.
 
     The period is shortened until MIN_SKIP_PATHS periods fit into `limit` frames, see `lag_limit`.
     """
