@@ -20,7 +20,9 @@ def test_interleaved_order_visits_each_coarse_pixel_once(width, height, size, vi
     coarse = build_coarse_grid(build_grid(width, height), size, 1)
     assert (coarse.grid.width, coarse.grid.height) == (-(-width // size), -(-height // size))
     visits = wp.zeros((views, coarse.grid.height, coarse.grid.width), dtype=wp.int32, device=default_device())
-    wp.launch(count_visits_kernel, views * interleaved_threads(coarse), [coarse], [visits], device=default_device())
+    wp.launch(
+        count_visits_kernel, views * interleaved_threads(coarse.grid.width, coarse.grid.height), [coarse], [visits], device=default_device()
+    )
     assert (visits.numpy() == 1).all()
 
 
