@@ -237,10 +237,12 @@ def _images(config: Config, device: wp.Device, written: bool = True) -> Iterator
     if has_lens_filter(config.effects):
         groups += [(LensArrays, views, 1)]
     if config.render.mode == FAST:
-        groups += [(kind, views | scratch_sizes(config.render, width, height), copies) for kind, copies in DENOISED_SCRATCH]
+        histories = config.bake.worlds * len(config.cameras.positions)
+        scratch = views | scratch_sizes(config.render, width, height, histories)
+        groups += [(kind, scratch, copies) for kind, copies in DENOISED_SCRATCH]
         groups += [(MOVING_BODIES, views, 1)]
-        histories = history_sizes(config.render, width, height, config.bake.worlds * len(config.cameras.positions))
-        yield _term("light averaged over frames", _HISTORY, [(LIGHT_HISTORY, histories, 1)])
+        sizes = history_sizes(config.render, width, height, histories)
+        yield _term("light averaged over frames", _HISTORY, [(LIGHT_HISTORY, sizes, 1)])
     if written and _host_images(config, device).jpeg_quality:
         files = jpeg_sizes(views["view"], width, height)
         groups += [(JpegBuffers, files, ring), (JpegScratch, files, 1)]

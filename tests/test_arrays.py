@@ -176,6 +176,19 @@ def test_paths_per_coarse_pixel_depend_on_the_resolution(cell, width, paths):
     assert paths_per_coarse_pixel(settings(render__coarse_pixel=cell, render__coarse_paths=5).render, width) == 5
 
 
+@pytest.mark.parametrize(
+    ("cell", "width", "histories", "columns", "paths"),
+    [(0, 1920, 3, 480, 1), (0, 1920, 0, 384, 2), (0, 960, 3, 480, 2), (0, 640, 3, 640, 1), (0, 320, 3, 320, 2), (5, 1920, 3, 384, 2)],
+)
+def test_histories_narrow_coarse_pixels(cell, width, histories, columns, paths):
+    render = settings(render__coarse_pixel=cell).render
+    assert scratch_sizes(render, width, 6, histories)["cell_column"] == columns
+    assert paths_per_coarse_pixel(render, width, histories) == paths
+    # Without accumulation they are those of single views.
+    alone = settings(render__coarse_pixel=cell, render__history=0).render
+    assert scratch_sizes(alone, width, 6, histories) == scratch_sizes(render, width, 6)
+
+
 def test_the_path_traced_reference_has_no_coarse_grid():
     names = {name.split(".")[0] for name, *_ in describe_arrays(settings(render__mode="reference"))}
     assert "ShadedImage" in names

@@ -2,7 +2,17 @@
 
 import warp as wp
 
-from synpick_warp.kernels.render.lighting.history import LightHistory, path_number, period_bits, update_frame, usable_paths
+from synpick_warp.kernels.render.lighting.history import (
+    LightHistory,
+    MovingBodies,
+    covered_fraction,
+    lag_frames,
+    path_number,
+    period_bits,
+    update_frame,
+    usable_paths,
+)
+from synpick_warp.kernels.render.visibility.gbuffer import Meshes
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,3 +48,22 @@ def schedule_kernel(
             number_out[paths] = path_number(frame, bits)
             paths += 1
         frame += 1
+
+
+@wp.kernel
+def lag_frames_kernel(
+    # Scene:
+    meshes: Meshes,
+    # In:
+    moving: MovingBodies,
+    point: wp.array[wp.vec3],  # (point) [m]
+    enough: float,
+    # Out:
+    frames_out: wp.array[float],  # (point)
+    covered_out: wp.array2d[float],  # (point, rank)
+):
+    """Frames until the moving bodies of view 0 have changed the light of each point, and the fraction of its sphere that each covers."""
+    i = wp.tid()
+    frames_out[i] = lag_frames(meshes, moving, 0, point[i], enough)
+    for rank in range(moving.count[0]):
+        covered_out[i, rank] = covered_fraction(meshes, moving, 0, rank, point[i])

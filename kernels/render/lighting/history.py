@@ -1,7 +1,7 @@
 """Temporal accumulation of coarse light: an exponential moving average over the frames of an episode (after Schied et al., 2017, SVGF).
 
-Cameras do not move, so a resting surface stays at its pixel and nothing is reprojected. A coarse pixel forgets its history when its body
-moves, and keeps less of it the more the bodies that move near it can change its light.
+Cameras do not move, so a resting surface stays at its pixel and nothing is reprojected. A coarse pixel keeps less of its history the
+farther its body moves, and the more other bodies that move near it can change its light.
 """
 
 import warp as wp
@@ -15,13 +15,18 @@ from synpick_warp.kernels.render.visibility.gbuffer import Meshes, body_of
 wp.set_module_options({"enable_backward": False})
 
 REST_DISPLACEMENT = wp.constant(2.5e-4)
-"""Rest threshold: a body rests if none of its points is displaced by more in a frame [m]. Over the 16 frames that an average remembers,
-that is at most two coarse pixels in full HD."""
+"""Rest threshold: a body that displaces none of its points by more in a frame does not change the light of others [m]."""
+MAX_DRIFT = wp.constant(4.0e-3)
+"""Displacement of a body over the frames of its own histories [m]: at most two coarse pixels in full HD."""
 LIGHT_CHANGE = wp.constant(0.05)
-"""Temporal lag that an average may have, as a fraction of the light: remembered paths times the change in a frame (`light_change`)."""
+"""Temporal lag that an average may have, as a fraction of the light; see `lag_frames`."""
+MAX_TRAVEL = wp.constant(2.0)
+"""Travel of a body [sizes] beyond which its lag grows no more: the light that it covered, and that which it covers now."""
+LAG_STEPS = wp.constant(3)
+"""Newton steps of `lag_frames`; each takes at least one more of the bodies that travel fastest for saturated."""
 MIN_CHANGE = wp.constant(1.0e-6)
 """Change of a point's light below which it counts as unchanged: histories are far shorter than LIGHT_CHANGE / MIN_CHANGE."""
-MIN_SKIP_PATHS = wp.constant(4)
+MIN_SKIP_PATHS = wp.constant(2)
 """Shortest history [paths] that is updated in only some of the frames."""
 MAX_PERIOD_BITS = wp.constant(3)
 """Binary logarithm of the longest update period [frames]."""
@@ -29,6 +34,8 @@ BAYER_BITS = wp.constant(4)
 """Bits of a threshold of the 4 x 4 Bayer matrix."""
 PERIOD_PATHS = wp.constant(16)
 """Part of the sample sequence of each update period [paths]: most paths that a history counts by default."""
+MAX_FRAMES = wp.constant(1 << 20)
+"""Maximum history length where nothing changes [frames]: longer than any history."""
 NEVER = wp.constant(-2)
 """Frame index of an empty history, which no frame continues."""
 
@@ -61,8 +68,8 @@ class MovingBodies:
 
     holds: wp.array[int]
     """(view): 1: the history contains the previous frame of the same episode."""
-    rests: wp.array2d[int]
-    """(view, body): 1: the body is at rest."""
+    drift_frames: wp.array2d[int]
+    """(view, body): maximum history length on the body itself, MAX_DRIFT over its displacement in a frame."""
     count: wp.array[int]
     """(view): number of bodies that moved, appeared or disappeared."""
     mesh: wp.array2d[int]
@@ -108,9 +115,8 @@ def advance_history_kernel(
 
 
 @wp.func
-def displacement_fraction(meshes: Meshes, mesh: int, now: wp.transformf, then: wp.transformf) -> float:
-    """Displacement of a body's points as a fraction of its size, at most 1; 0: it rests."""
-    displacement = max_displacement(now, then, meshes.center[mesh], meshes.radius[mesh])
+def displacement_fraction(meshes: Meshes, mesh: int, displacement: float) -> float:
+    """Displacement of a body's points [m] as a fraction of its size, at most 1; 0: it rests."""
     if displacement <= REST_DISPLACEMENT:
         return 0.0
     return wp.min(displacement / wp.sqrt(mean_projected_area(meshes.upper[mesh] - meshes.lower[mesh])), 1.0)
@@ -158,9 +164,12 @@ def find_moving_bodies_kernel(
             now = fixture_pose[world, fixture]
             then = last_fixture_pose[world, fixture]
         change = float(mesh != last_mesh)
+        drift_frames = wp.where(mesh != last_mesh, 0, MAX_FRAMES)
         if mesh == last_mesh and mesh >= 0:
-            change = displacement_fraction(meshes, mesh, now, then)
-        moving_inout.rests[view, body] = int(change == 0.0)
+            displacement = max_displacement(now, then, meshes.center[mesh], meshes.radius[mesh])
+            change = displacement_fraction(meshes, mesh, displacement)
+            drift_frames = int(MAX_DRIFT / wp.max(displacement, MAX_DRIFT / float(MAX_FRAMES)))
+        moving_inout.drift_frames[view, body] = drift_frames
         if change > 0.0:
             moving_inout.mesh[view, count] = wp.where(mesh >= 0, mesh, last_mesh)
             moving_inout.to_body[view, count] = wp.transform_inverse(wp.where(mesh >= 0, now, then))
@@ -170,22 +179,41 @@ def find_moving_bodies_kernel(
 
 
 @wp.func
-def light_change(meshes: Meshes, moving: MovingBodies, view: int, point: wp.vec3) -> float:
-    """Estimate of the fraction of a point's light that the moving bodies change in a frame.
+def covered_fraction(meshes: Meshes, moving: MovingBodies, view: int, rank: int, point: wp.vec3) -> float:
+    """Fraction of the full sphere around a point that a moving body covers: its mean projected area at the distance of its box."""
+    mesh = moving.mesh[view, rank]
+    local = wp.transform_point(moving.to_body[view, rank], point)
+    lower = meshes.lower[mesh]
+    upper = meshes.upper[mesh]
+    away = local - wp.max(lower, wp.min(local, upper))
+    area = mean_projected_area(upper - lower)
+    return area / (4.0 * wp.PI * wp.dot(away, away) + area)
 
-    Sum over them: fraction of the full sphere that the body covers (solid angle of its mean projected area at the distance of its box)
-    times its displacement in sizes.
+
+@wp.func
+def lag_frames(meshes: Meshes, moving: MovingBodies, view: int, point: wp.vec3, enough: float) -> float:
+    """Number of frames n over which the moving bodies change a point's light by LIGHT_CHANGE, or `enough` or more if they change less.
+
+    The change is estimated as the sum over them of the `covered_fraction` times min(n · displacement in sizes, MAX_TRAVEL): however far
+    a body goes, it changes no more than the light that it covered and covers. It is concave in n, so Newton's method from n = 0
+    approaches the solution from below.
     """
-    total = float(0.0)
-    for rank in range(moving.count[view]):
-        mesh = moving.mesh[view, rank]
-        local = wp.transform_point(moving.to_body[view, rank], point)
-        lower = meshes.lower[mesh]
-        upper = meshes.upper[mesh]
-        away = local - wp.max(lower, wp.min(local, upper))
-        area = mean_projected_area(upper - lower)
-        total += moving.change[view, rank] * area / (4.0 * wp.PI * wp.dot(away, away) + area)
-    return total
+    frames = float(0.0)
+    step = int(0)
+    while step < LAG_STEPS and frames < enough:
+        change = float(0.0)
+        slope = float(0.0)
+        for rank in range(moving.count[view]):
+            covered = covered_fraction(meshes, moving, view, rank, point)
+            travel = frames * moving.change[view, rank]
+            if travel < MAX_TRAVEL:
+                change += travel * covered
+                slope += moving.change[view, rank] * covered
+            else:
+                change += MAX_TRAVEL * covered
+        frames += (LIGHT_CHANGE - change) / wp.max(slope, MIN_CHANGE)
+        step += 1
+    return frames
 
 
 @wp.func
@@ -200,24 +228,27 @@ def lag_limit(
     segment: int,
     point: wp.vec3,
 ) -> int:
-    """Maximum history length of a coarse pixel [frames], from the estimated change of its light: LIGHT_CHANGE / `light_change`.
+    """Maximum history length of a coarse pixel [frames], from the body's displacement and the change of its light (`lag_frames`).
 
-    0 rejects the history: another segmentation id was visible, the body moved, or the previous frame is missing.
+    0 rejects the history: another segmentation id was visible, the body moved too far, or the previous frame is missing.
     """
     if history.max_paths == 0 or moving.holds[view] == 0:
         return 0
     slot = views.world[view] * history.cameras + views.camera[view]
     if int(history.segment[slot, row, column]) != segment:
         return 0
+    frames = int(MAX_FRAMES)
     if segment != Segment.TABLE:
-        if moving.rests[view, body_of(segment, views.instances)] == 0:
-            return 0
-    return int(LIGHT_CHANGE / wp.max(light_change(meshes, moving, view, point), MIN_CHANGE))
+        frames = moving.drift_frames[view, body_of(segment, views.instances)]
+    if frames == 0:
+        return 0
+    enough = float(history.max_paths << MAX_PERIOD_BITS)
+    return wp.min(frames, int(wp.min(lag_frames(meshes, moving, view, point, enough), float(MAX_FRAMES))))
 
 
 @wp.func
 def period_bits(paths: int, limit: int) -> int:
-    """Binary logarithm of a coarse pixel's update period: with 4, 8, 16 paths it traces one every 2, 4, 8 frames; 0: every frame.
+    """Binary logarithm of a coarse pixel's update period: with 2, 4, 8 paths it traces one every 2, 4, 8 frames; 0: every frame.
 
     The period is shortened until MIN_SKIP_PATHS periods fit into `limit` frames, see `lag_limit`.
     """

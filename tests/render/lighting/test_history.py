@@ -12,19 +12,19 @@ import warp as wp
 
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.kernels.render.lighting.coarse_paths import SEQUENCE_FRAMES
-from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS, LightHistory
+from synpick_warp.kernels.render.lighting.history import LIGHT_CHANGE, MAX_DRIFT, MAX_PERIOD_BITS, MAX_TRAVEL, LightHistory
 from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
-from tests.harness.history_probe import schedule_kernel, usable_paths_kernel
+from tests.harness.history_probe import lag_frames_kernel, schedule_kernel, usable_paths_kernel
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot
 
 PATHS = 16
 LONGEST_PERIOD = 1 << int(MAX_PERIOD_BITS)
-FILLED = 4 + 4 * 2 + 8 * 4
-"""Frames until the history of a still scene is full: 4 paths in each frame, 4 in every second, 8 in every fourth."""
+FILLED = 2 + 2 * 2 + 4 * 4 + 8 * 8
+"""Frames until the history of a still scene is full: 2 paths in each frame, 2 in every second, 4 in every fourth, 8 in every eighth."""
 VIEW = camera(64, 48, 300.0, (0.0, 0.0, 1.5))
 LIGHT = EnvironmentMap("gradient", even_light(1.0, 32).radiance * np.linspace(3.0, 0.1, 64, dtype=np.float32)[None, :, None])
 
@@ -84,27 +84,30 @@ def remembered(renderer: Renderer) -> np.ndarray:
 
 def test_a_still_scene_is_remembered_up_to_the_limit(renderer, device):
     counts = [np.unique(remembered(renderer)).tolist() for _ in show(renderer, [(frame, toy()) for frame in range(FILLED + 4)], device)]
-    assert counts[:4] == [[1], [2], [3], [4]]
-    assert [counts[frame - 1] for frame in (4 + 2, 4 + 8, 4 + 8 + 32)] == [[5], [8], [PATHS]]
+    assert counts[:2] == [[1], [2]]
+    assert [counts[frame - 1][0] for frame in (2 + 2, 2 + 2 * 2, 2 + 2 * 2 + 4 * 4)] == [3, 4, 8]
     assert counts[FILLED:] == [[PATHS]] * 4
 
 
 @pytest.mark.parametrize(
     ("paths", "limit", "kept", "period"),
     [
-        (3, 99, 3, 1),
-        (4, 99, 4, 2),
-        (7, 99, 7, 2),
-        (8, 99, 8, 4),
+        (1, 99, 1, 1),
+        (2, 99, 2, 2),
+        (3, 99, 3, 2),
+        (4, 99, 4, 4),
+        (7, 99, 7, 4),
+        (8, 99, 8, 8),
         (16, 99, 12, 8),
         (16, 128, 16, 8),
-        (16, 31, 7, 4),
-        (16, 8, 4, 2),
-        (16, 7, 7, 1),
+        (16, 31, 3, 8),
+        (16, 8, 2, 4),
+        (16, 7, 3, 2),
+        (16, 3, 3, 1),
     ],
 )
 def test_averages_span_no_more_frames_than_the_lag_allows(device, paths, limit, kept, period):
-    """Paths and the frames between them, by known cases: 4 paths trace in every second frame, if 8 frames are allowed, and so on."""
+    """Paths and the frames between them, by known cases: 2 paths trace in every second frame, if 4 frames are allowed, and so on."""
     assert usable(paths, limit, device) == (kept, period)
     assert kept * period <= limit
 
@@ -167,6 +170,38 @@ def test_a_body_that_moves_is_forgotten_and_dims_the_memory_around_it(renderer, 
     assert moving.count.numpy()[0] == 1
     # 2 cm of a ball whose box has a mean projected area of 1.5 x 6 cm x 6 cm.
     np.testing.assert_allclose(moving.change.numpy()[0, 0], 0.02 / np.sqrt(1.5 * 0.06**2), rtol=1e-3)
+
+
+def test_frames_that_the_lag_allows(renderer, device):
+    """Against bisection, for two moving bodies: never more frames than allowed, and nearly as many; far away any number."""
+    moved = ToyScene(
+        toy().entries, [[(0, (0.0, 0.0, 0.0, *UPRIGHT)), (1, (0.063, 0.0, 0.03, *UPRIGHT)), (2, (-0.03, 0.0, 0.08, *UPRIGHT))]], (VIEW,)
+    )
+    list(show(renderer, [(0, toy()), (1, replace(moved, lights=(LIGHT,), config=settings()))], device))
+    moving = renderer.shading.moving  # type: ignore[union-attr]
+    assert moving.count.numpy()[0] == 2
+    points = np.array([[x, 0.0, 0.0] for x in (-0.1, 0.0, 0.1, 0.2, 0.4, 2.0)], dtype=np.float32)
+    frames, covered = wp.empty(6, dtype=float, device=device), wp.empty((6, 2), dtype=float, device=device)
+    inputs = [renderer.scene.meshes, moving, wp.array(points, dtype=wp.vec3, device=device), 1e9]
+    wp.launch(lag_frames_kernel, dim=6, inputs=inputs, outputs=[frames, covered], device=device)
+    travel = np.geomspace(1e-2, 1e4, 100_000)[:, None] * moving.change.numpy()[0, :2]
+    change = np.minimum(travel, float(MAX_TRAVEL)) @ covered.numpy().T
+    allowed = np.array([np.searchsorted(column, float(LIGHT_CHANGE)) for column in change.T])
+    expected = np.append(np.geomspace(1e-2, 1e4, 100_000), np.inf)[allowed]
+    assert (frames.numpy() <= 1.001 * expected).all()
+    assert (frames.numpy() >= 0.9 * np.minimum(expected, 1e3)).all()
+    assert expected[0] < 10.0
+    assert np.isinf(expected[-1])
+
+
+def test_a_creeping_body_keeps_the_history_of_its_drift(renderer, device):
+    """0.4 mm a frame: 10 frames, of which up to 4 paths are kept. 5 mm a frame: none."""
+    assert float(MAX_DRIFT) / 4e-4 == pytest.approx(10.0)
+    frames = [*((index, toy(0.08 + 4e-4 * index)) for index in range(24)), (24, toy(0.0945))]
+    guide = renderer.shading.guide  # type: ignore[union-attr]
+    paths = [remembered(renderer)[guide.segment.numpy()[0] == 3] for _ in show(renderer, frames, device)]
+    assert paths[-2].max() in (3, 4)
+    assert set(np.unique(paths[-1])) == {1}
 
 
 @pytest.mark.parametrize(("before", "after"), [(None, 0.08), (0.08, None)])
