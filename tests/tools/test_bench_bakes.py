@@ -235,7 +235,7 @@ def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):
     assert rows["worlds"] == 2
     assert 0.0 < rows["worlds with a frame in a tick"] <= 100.0
     assert rows["world-steps"] > 0.0
-    assert rows["episodes, if of 502 frames as in tools/README.md"] > 0.0
+    assert next(value for name, value in rows.items() if name.startswith("episodes, if of ")) > 0.0
 
 
 # ---- growth ----

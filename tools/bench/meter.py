@@ -86,6 +86,8 @@ class SteadyMeter(SilentProgress):
         self.device, self.cleaner, self.counter, self.devices = device, cleaner, counter, devices
         self.ticks = 0
         self._counts = deque([0], maxlen=devices)
+        # Devices with processes of their own leave this one without a CUDA context; each query of free memory would make one, for seconds.
+        _ = device.context
         self.started = time.perf_counter()
         self.first_count = 0.0
         self.initial_disk = shutil.disk_usage(folder).used
