@@ -50,10 +50,9 @@ def order_longest_first(config: Config, catalog: Catalog, episodes: Sequence[int
     indices = np.sort(np.asarray(episodes, np.int32))
     if not len(indices):
         return []
-    frames = predict_frames(config, catalog, indices, device, DEVIATIONS)
-    first = max(0, len(indices) - SORTED_EPISODES)
-    order = np.concatenate([np.arange(first), first + np.argsort(-frames[first:], kind="stable")])
-    return indices[order].tolist()
+    first, last = indices[:-SORTED_EPISODES], indices[-SORTED_EPISODES:]
+    frames = predict_frames(config, catalog, last, device, DEVIATIONS)
+    return [*first.tolist(), *last[np.argsort(-frames, kind="stable")].tolist()]
 
 
 def deal_episodes(ordered: Sequence[int], devices: int) -> list[list[int]]:
