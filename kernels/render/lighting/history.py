@@ -32,8 +32,8 @@ MAX_PERIOD_BITS = wp.constant(3)
 """Binary logarithm of the longest update period [frames]."""
 BAYER_BITS = wp.constant(4)
 """Bits of a threshold of the 4 x 4 Bayer matrix."""
-PERIOD_PATHS = wp.constant(16)
-"""Part of the sample sequence of each update period [paths]: most paths that a history counts by default."""
+PERIOD_PATHS = wp.constant(64)
+"""Part of the sample sequence of each update period, which repeats after it [paths]: four times as many as a history counts by default."""
 MAX_FRAMES = wp.constant(1 << 20)
 """Maximum history length where nothing changes [frames]: longer than any history."""
 NEVER = wp.constant(-2)
@@ -270,8 +270,11 @@ def usable_paths(history: LightHistory, slot: int, row: int, column: int, limit:
 
 @wp.func
 def path_number(frame: int, bits: int) -> int:
-    """Index of a coarse pixel's path in its sequence, distinct within a history: paths of each update period have a part of their own."""
-    return (frame >> bits) + PERIOD_PATHS * bits
+    """Index of a coarse pixel's path in its sequence, distinct within a history of default length that begins in any frame.
+
+    Each update period has a part of the sequence of its own, PERIOD_PATHS long, and takes its paths in order.
+    """
+    return (frame >> bits) % PERIOD_PATHS + PERIOD_PATHS * bits
 
 
 @wp.func
