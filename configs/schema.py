@@ -256,14 +256,14 @@ class Render:
     coarse_pixel: int = setting(
         0,
         "px",
-        "Mode fast: width of a coarse pixel, at whose centre paths start; 0: leaves at least 384 per row, 480 with history.",
+        "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history`.",
         low=0,
         high=64,
     )
     coarse_paths: int = setting(
         0,
         "",
-        "Mode fast: paths per coarse pixel; powers of two are best; 0: 2, or 1 if over 480 per row or narrowed by history.",
+        "Mode fast: paths per coarse pixel, best a power of two; 0: 2, or 1 with over 480 per row or where `history` narrows them.",
         low=0,
         high=1024,
     )

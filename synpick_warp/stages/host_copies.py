@@ -12,11 +12,11 @@ from synpick_warp.configs.schema import Config
 
 # Image height from which the largest lists of run boundaries are no larger than the images [px].
 MIN_LISTED_ROWS = 288
-# Pause between two looks at whether a copy is done: seconds, or a fraction of the wait so far, if that is longer. On an H200 a batch of
-# 50 full-HD views takes 80 ms, and the next one is queued meanwhile.
+# Pause between two queries of a copy's event: seconds, or a fraction of the wait so far, if that is longer. On an H200 a batch of 50
+# full-HD views takes 80 ms, and the next one is queued meanwhile.
 PAUSE_SECONDS, PAUSE_FRACTION = 5e-4, 1 / 32
-# Longest wait with pauses [s]. Warp tells no failed copy from one that is not done, and prints a line for each look at it;
-# synchronising, which comes next, raises the error.
+# Longest wait with pauses [s]. A query does not tell a failed copy from an unfinished one, and Warp prints a line for each that fails;
+# the synchronisation that comes next raises the error.
 MAX_PAUSED_SECONDS = 0.5
 
 

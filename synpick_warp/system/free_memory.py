@@ -19,7 +19,7 @@ _GROUPS = Path("/sys/fs/cgroup")
 
 def free_device_memory(device: wp.Device) -> int:
     """Free memory of a GPU [bytes], with what this process's memory pool holds but does not use."""
-    with contextlib.suppress(RuntimeError):  # Out of memory: the queries say so.
+    with contextlib.suppress(RuntimeError):  # If memory is too short for a context, the queries below raise.
         _ = device.context  # Warp keeps it; without it each query would create a CUDA context and destroy it, which takes 0.9 s.
     free = device.free_memory
     if device.is_mempool_supported:

@@ -37,15 +37,16 @@ def schedule_kernel(
     row: int,
     column: int,
     # Out:
-    number_out: wp.array[int],  # (path)
+    number_out: wp.array2d[int],  # (first, path)
 ):
-    """Numbers of the paths that one coarse pixel of a still scene traces, until the array is full."""
+    """Numbers of the paths that a coarse pixel of a still scene traces until the array is full; its history begins in frame `first`."""
+    first = wp.tid()
     paths = wp.int32(0)
-    frame = wp.int32(0)
-    while paths < number_out.shape[0]:
+    frame = first
+    while paths < number_out.shape[1]:
         bits = period_bits(wp.min(paths, 16), 1000)
         if bits == 0 or update_frame(row, column, bits) == frame % (1 << bits):
-            number_out[paths] = path_number(frame, bits)
+            number_out[first, paths] = path_number(frame, bits)
             paths += 1
         frame += 1
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.codes import Mode
 from synpick_warp.configs.load import load_config
+from synpick_warp.scheduling import order
 from synpick_warp.scheduling.order import DEVIATIONS, FRAMES_OF_MODE, SORTED_EPISODES, deal_episodes, deal_writers, order_longest_first
 from tests.twins.arrangement import sample_modes, sample_objects
 from tests.worlds.small_worlds import ANGLE, BOX, CUBE, catalog
@@ -40,22 +41,36 @@ def predicted_frames(config, episodes, modes) -> np.ndarray:
 
 def test_the_episodes_that_may_be_longest_come_first(device):
     config = load_config("smoke", {"bake.mode": "mixed", "bake.mix": [2.0, 1.0, 1.0], "bake.seed": SEED, "pick.repeats": True})
-    order = order_longest_first(config, OBJECTS, range(60), device)
+    found = order_longest_first(config, OBJECTS, range(60), device)
     modes = sample_modes(SEED, np.arange(60), (2.0, 1.0, 1.0))
     frames = predicted_frames(config, range(60), modes)
     assert set(modes) == set(Mode)
     assert len(set(frames.tolist())) > len(Mode)
-    assert order == np.argsort(-frames, kind="stable").tolist()
+    assert found == np.argsort(-frames, kind="stable").tolist()
 
 
 def test_many_episodes_stay_mixed_but_for_the_last(device):
     config, count = load_config("smoke", {"bake.mode": "cycle", "bake.seed": SEED}), SORTED_EPISODES + 30
-    order = order_longest_first(config, OBJECTS, range(count), device)
-    assert order[:30] == list(range(30))
-    assert sorted(order[30:]) == list(range(30, count))
+    found = order_longest_first(config, OBJECTS, range(count), device)
+    assert found[:30] == list(range(30))
+    assert sorted(found[30:]) == list(range(30, count))
     modes = np.array([Mode.PICK, Mode.TARGET, Mode.MOVE])[np.arange(count) % 3]
-    frames = predicted_frames(config, range(count), modes)[order[30:]]
+    frames = predicted_frames(config, range(count), modes)[found[30:]]
     assert (np.diff(frames) <= 0).all()
+
+
+def test_only_the_episodes_that_are_sorted_are_sampled(device, monkeypatch):
+    """A million episodes times their objects would take seconds, and more memory than is planned."""
+    sampled = []
+
+    def sample(config, catalog, episodes, device):
+        sampled.extend(episodes.tolist())
+        return np.full(len(episodes), Mode.MOVE), np.zeros(len(episodes))
+
+    monkeypatch.setattr(order, "sample_episodes_ahead", sample)
+    found = order_longest_first(load_config("smoke", {}), OBJECTS, range(10**6), device)
+    assert found == list(range(10**6))
+    assert sampled == found[-SORTED_EPISODES:]
 
 
 def test_episodes_of_equal_length_stay_in_order(device):

@@ -29,8 +29,8 @@ CHUNK_TILES = wp.constant(32)
 CREASE_SLOPE = wp.constant(1.5)
 """Change of a body's slope [m/m] across a footprint from which it counts as a crease: at a box's edge that points here it is 2."""
 CREASE_TURN = wp.constant(0.36)
-"""Tangent of the angle by which one of a crease's sides must turn, too: 20°. Where a surface is seen at a grazing angle, its slope changes
-much with small turns that no picture shows: a third of the rays went there."""
+"""Tangent of the smallest angle of a crease, 20°, between the surface across the footprint and that before or behind it. At grazing view
+angles slopes change much where a surface hardly turns: without this test a third of the coverage rays were traced there."""
 FLAT_SLOPE = wp.constant(0.1)
 JUMP_SLOPE = wp.constant(8.0)
 """A surface whose slope seems to change by more than JUMP_SLOPE [m/m], but seen from one side of a footprint by less than FLAT_SLOPE, ends

@@ -48,8 +48,6 @@ aligned power-of-two sub-tile holds a contiguous, well-stratified part of it."""
 INDIRECT_CLAMP = wp.constant(4.0)
 """Firefly clamp of indirect light: at most this many times the radiance of a white surface that faces the sun, on top of the clamp for
 unoccluded light. Few paths find sunlit surfaces, so each of them has a large weight."""
-SEQUENCE_FRAMES = wp.constant(64)
-"""Paths until accumulated paths repeat their random numbers: four times as many as an average remembers by default, see `path_number`."""
 SHIFT_RANGE = wp.constant(1.0)
 """Range of the Cranley-Patterson rotation of the first dimension over the image: a slow gradient keeps neighbouring pixels stratified
 within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
@@ -155,11 +153,11 @@ def first_path_index(samples: int, row: int, column: int, number: int, accumulat
     """Sobol' index of a coarse pixel's first path, in the sequence of its tile of SEQUENCE_PERIOD² coarse pixels.
 
     Without accumulation each frame has the first `samples` points of every coarse pixel. With it, `number`, see `path_number`, selects
-    another point of the coarse pixel, modulo SEQUENCE_FRAMES.
+    another point of the coarse pixel.
     """
     index = morton_index(SEQUENCE_PERIOD, row, column)
     if accumulates:
-        return index + SEQUENCE_PERIOD * SEQUENCE_PERIOD * (samples + number % SEQUENCE_FRAMES)
+        return index + SEQUENCE_PERIOD * SEQUENCE_PERIOD * (samples + number)
     return index * samples
 
 

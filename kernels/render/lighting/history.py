@@ -17,13 +17,15 @@ wp.set_module_options({"enable_backward": False})
 REST_DISPLACEMENT = wp.constant(2.5e-4)
 """Rest threshold: a body that displaces none of its points by more in a frame does not change the light of others [m]."""
 MAX_DRIFT = wp.constant(4.0e-3)
-"""Displacement of a body over the frames of its own histories [m]: at most two coarse pixels in full HD."""
+"""Maximum displacement of a body over the frames that its own histories average [m]: at most two coarse pixels in full HD."""
 LIGHT_CHANGE = wp.constant(0.05)
 """Temporal lag that an average may have, as a fraction of the light; see `lag_frames`."""
 MAX_TRAVEL = wp.constant(2.0)
-"""Travel of a body [sizes] beyond which its lag grows no more: the light that it covered, and that which it covers now."""
+"""Displacement of a body [sizes] from which on it changes no more of a point's light: it has uncovered all that it covered, and covers as
+much elsewhere."""
 LAG_STEPS = wp.constant(3)
-"""Newton steps of `lag_frames`; each takes at least one more of the bodies that travel fastest for saturated."""
+"""Newton iterations of `lag_frames`: each that does not reach the solution brings at least one more body, the fastest first, to
+MAX_TRAVEL."""
 MIN_CHANGE = wp.constant(1.0e-6)
 """Change of a point's light below which it counts as unchanged: histories are far shorter than LIGHT_CHANGE / MIN_CHANGE."""
 MIN_SKIP_PATHS = wp.constant(2)
@@ -32,8 +34,8 @@ MAX_PERIOD_BITS = wp.constant(3)
 """Binary logarithm of the longest update period [frames]."""
 BAYER_BITS = wp.constant(4)
 """Bits of a threshold of the 4 x 4 Bayer matrix."""
-PERIOD_PATHS = wp.constant(16)
-"""Part of the sample sequence of each update period [paths]: most paths that a history counts by default."""
+PERIOD_PATHS = wp.constant(64)
+"""Part of the sample sequence of each update period, which repeats after it [paths]: four times as many as a history counts by default."""
 MAX_FRAMES = wp.constant(1 << 20)
 """Maximum history length where nothing changes [frames]: longer than any history."""
 NEVER = wp.constant(-2)
@@ -192,11 +194,10 @@ def covered_fraction(meshes: Meshes, moving: MovingBodies, view: int, rank: int,
 
 @wp.func
 def lag_frames(meshes: Meshes, moving: MovingBodies, view: int, point: wp.vec3, enough: float) -> float:
-    """Number of frames n over which the moving bodies change a point's light by LIGHT_CHANGE, or `enough` or more if they change less.
+    """Number of frames n after which the moving bodies have changed a point's light by LIGHT_CHANGE; iterations end at `enough`.
 
-    The change is estimated as the sum over them of the `covered_fraction` times min(n · displacement in sizes, MAX_TRAVEL): however far
-    a body goes, it changes no more than the light that it covered and covers. It is concave in n, so Newton's method from n = 0
-    approaches the solution from below.
+    The change is estimated as the sum over the bodies of the `covered_fraction` times min(n · displacement in sizes, MAX_TRAVEL). It is
+    concave in n, so Newton's method from n = 0 approaches the solution from below.
     """
     frames = float(0.0)
     step = int(0)
@@ -270,16 +271,19 @@ def usable_paths(history: LightHistory, slot: int, row: int, column: int, limit:
 
 @wp.func
 def path_number(frame: int, bits: int) -> int:
-    """Index of a coarse pixel's path in its sequence, distinct within a history: paths of each update period have a part of their own."""
-    return (frame >> bits) + PERIOD_PATHS * bits
+    """Index of a coarse pixel's path in its sequence, distinct within a history of default length that begins in any frame.
+
+    Each update period has a part of the sequence of its own, PERIOD_PATHS long, and takes its paths in order.
+    """
+    return (frame >> bits) % PERIOD_PATHS + PERIOD_PATHS * bits
 
 
 @wp.func
 def update_frame(row: int, column: int, bits: int) -> int:
     """Frame of the update period, 0 to 2^bits - 1, in which a coarse pixel traces its path: 4 x 4 ordered dithering (Bayer, 1973).
 
-    Coarse pixels that trace in the same frame are spread evenly. The pattern repeats every LANE_STRIDE, so that all threads of a warp
-    trace, or none does.
+    Coarse pixels that trace in the same frame are spread evenly. The pattern repeats every LANE_STRIDE coarse pixels, so that threads of
+    a warp with the same update period trace in the same frame.
     """
     other = row ^ column
     threshold = ((other & 1) << 3) | ((row & 1) << 2) | (other & 2) | ((row & 2) >> 1)

@@ -1,7 +1,7 @@
 """Stream compaction of the coarse path pass: lists of the coarse pixels that trace paths in a frame, so that warps are full of them.
 
-A region is the coarse pixels of LANE_STRIDE² warps in interleaved order. It has a list of its own: paths of its neighbours stay nearly
-parallel, and the atomic operations of few threads meet.
+A region is the coarse pixels of LANE_STRIDE² warps in interleaved order. Each region has a list of its own: neighbours in a list are
+neighbours in the image, so that their rays stay nearly parallel, and few threads contend for a counter.
 """
 
 import warp as wp
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
 REGION_PIXELS = wp.constant(int(LANE_STRIDE) * int(LANE_STRIDE) * int(TILE_PIXELS))
 """Coarse pixels of a region."""
 FRESH, AGED = wp.constant(0), wp.constant(1)
-"""Coarse pixels without a usable history, which trace `PathRules.samples` paths, and those with one, which trace one."""
+"""Kinds of listed coarse pixels: without a usable history (`PathRules.samples` paths each), and with one (one path each)."""
 _KNOWN_BITS = wp.constant(8)
 """Bits of an entry for the paths of a history: `LightHistory.paths` is 8 bits wide."""
 _PERIOD_BITS = wp.constant(2)

@@ -67,7 +67,7 @@ class RunBoundaries:
     place: np.ndarray
     """Position column · `span` + row of the pixel below the boundary, in increasing order (N) unsigned integers."""
     span: int
-    """Positions of a column: more than its rows."""
+    """Positions per column: greater than the number of rows, since a boundary may lie below the last one."""
     above: np.ndarray
     """Value of the pixel above the boundary (N)."""
     below: np.ndarray
@@ -92,13 +92,13 @@ class RunBoundaries:
         return self._split(self._list_bits(changed & self.below), self._list_bits(changed & self.above), instances)
 
     def _make_keys(self, instance: np.ndarray, place: np.ndarray) -> np.ndarray:
-        """Keys in the order of instances and positions, from both (M): 32 bits if these are enough, which NumPy sorts in half the time."""
+        """Sort keys, by instance and then by position (M): of 32 bits if they suffice, which NumPy sorts in half the time."""
         kind = np.uint32 if MAX_INSTANCES * self._places < 1 << 32 else np.uint64
         return instance.astype(kind, copy=False) * kind(self._places) + place.astype(kind, copy=False)
 
     @property
     def _places(self) -> int:
-        """Number of positions, at least."""
+        """Number of positions up to the last boundary: the range of keys that an instance takes."""
         return 1 + int(self.place[-1]) if self.place.size else 1
 
     def _list_values(self, values: np.ndarray) -> np.ndarray:

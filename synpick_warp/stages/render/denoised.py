@@ -36,8 +36,8 @@ MIN_COARSE_COLUMNS = 384
 """Default size of coarse pixels: an image's width has at least this many, and fewer than twice as many. At full HD they are 1.9 mm wide at
 the bottom of the tote. In narrower images coarse pixels are pixels."""
 MIN_HISTORY_COLUMNS = 480
-"""The same where histories accumulate: paths are traced mostly where light is fresh, so coarse pixels may be narrower, with a path each. At
-full HD, 4 px and one path had 35.3 dB, 5 px and two paths 34.5 dB (mean of the frames 0, 8 and 30 of a pick)."""
+"""The same where histories accumulate: most coarse pixels then trace no path in a frame, so they may be narrower, with a path each. At full
+HD, 4 px and one path had 35.3 dB, 5 px and two paths 34.5 dB (mean of the frames 0, 8 and 30 of a pick; tools/README.md, "Pictures")."""
 MAX_COLUMNS_TWO_PATHS = 480
 """Default number of paths: two per coarse pixel if an image's width has at most this many, else one. At 640x360, where coarse pixels are
 pixels, ten piles have a PSNR of 32.5 dB with one path and 33.6 dB with two, in 1.5 times the time."""

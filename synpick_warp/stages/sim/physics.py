@@ -148,8 +148,8 @@ class Physics:
     ) -> Iterator[None]:
         """Advance all worlds by one tick, `steps_per_tick` x `substeps` substeps: a generator that yields after each substep.
 
-        On a GPU the first substeps of the first tick run eagerly: they load the kernels and trigger Newton's late allocations. Then a CUDA
-        graph per substep is captured. Without a watcher all steps launch the same, so that the graphs of one step serve for all.
+        On a GPU the first period of the first tick (see `_period`) runs eagerly: it loads the kernels and triggers Newton's late
+        allocations. Then a CUDA graph for each of its substeps is captured, and these graphs are launched for all further ones.
 
         Hooks and watcher are captured once, so they must launch the same kernels on the same arrays in every tick, hooks in every step.
 
@@ -170,16 +170,18 @@ class Physics:
             yield
 
     def _period(self, watcher: Watcher | None) -> int:
-        """Number of substeps after which their launches repeat: whole steps after which the two states have their roles again; at most,
-        and with a watcher or on the CPU always, those of a tick."""
+        """Period of the launches [substeps]: the fewest whole steps after which the two states have swapped back.
+
+        A whole tick on the CPU, with a watcher, whose launches differ between steps, or if a tick has no whole number of periods.
+        """
         count = self.settings.steps_per_tick * self.settings.substeps
         period = math.lcm(2, self.settings.substeps)
         return period if watcher is None and self.device.is_cuda and count % period == 0 else count
 
     def _capture(self, substeps: Iterator[None]) -> None:
-        """Capture a CUDA graph per substep, and repeat them for a tick.
+        """Capture a CUDA graph for each substep of a period, and list them as often as a tick has periods.
 
-        A tick is enqueued in parts, and CUDA would spread one graph of a tick over 66 streams.
+        A single graph of a whole tick could not be enqueued in parts, and CUDA would spread it over 66 streams.
         """
         graphs: list[wp.Graph] = []
         busy = True

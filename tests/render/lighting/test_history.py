@@ -11,7 +11,6 @@ import pytest
 import warp as wp
 
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
-from synpick_warp.kernels.render.lighting.coarse_paths import SEQUENCE_FRAMES
 from synpick_warp.kernels.render.lighting.history import LIGHT_CHANGE, MAX_DRIFT, MAX_PERIOD_BITS, MAX_TRAVEL, LightHistory
 from synpick_warp.pipeline import make_renderer
 from synpick_warp.scenes.types import EnvironmentMap
@@ -25,6 +24,8 @@ PATHS = 16
 LONGEST_PERIOD = 1 << int(MAX_PERIOD_BITS)
 FILLED = 2 + 2 * 2 + 4 * 4 + 8 * 8
 """Frames until the history of a still scene is full: 2 paths in each frame, 2 in every second, 4 in every fourth, 8 in every eighth."""
+FIRST_FRAMES = 600
+"""Frames in which a history may begin: more than the schedule repeats after."""
 VIEW = camera(64, 48, 300.0, (0.0, 0.0, 1.5))
 LIGHT = EnvironmentMap("gradient", even_light(1.0, 32).radiance * np.linspace(3.0, 0.1, 64, dtype=np.float32)[None, :, None])
 
@@ -115,9 +116,11 @@ def test_averages_span_no_more_frames_than_the_lag_allows(device, paths, limit, 
 @pytest.mark.parametrize("row", range(4))
 @pytest.mark.parametrize("column", range(4))
 def test_the_paths_of_a_history_have_distinct_samples(device, row, column):
-    numbers = wp.empty(PATHS, dtype=wp.int32, device=device)
-    wp.launch(schedule_kernel, dim=1, inputs=[row, column], outputs=[numbers], device=device)
-    assert len(set((numbers.numpy() % SEQUENCE_FRAMES).tolist())) == PATHS
+    """In whichever frame of an episode the history begins, and as it forgets: any PATHS paths in a row."""
+    numbers = wp.empty((FIRST_FRAMES, 3 * PATHS), dtype=wp.int32, device=device)
+    wp.launch(schedule_kernel, dim=FIRST_FRAMES, inputs=[row, column], outputs=[numbers], device=device)
+    ordered = np.sort(np.lib.stride_tricks.sliding_window_view(numbers.numpy(), PATHS, axis=1), axis=-1)
+    assert (np.diff(ordered) > 0).all()
 
 
 def test_full_histories_take_turns(renderer, device):

@@ -1,0 +1,37 @@
+"""Kernels that list coarse pixels and read the lists, alone."""
+
+import warp as wp
+
+from synpick_warp.kernels.render.lighting.path_lists import PathLists, append_pixel, listed_pixel
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def append_kernel(
+    # In:
+    known: wp.array[int],  # (thread)
+    bits: wp.array[int],  # (thread)
+    threads: int,
+    # Out:
+    lists_inout: PathLists,
+):
+    """List the coarse pixel of each thread, of `threads` a view, if its history counts 0 or more paths."""
+    index = wp.tid()
+    if known[index] >= 0:
+        append_pixel(lists_inout, index // threads, index, known[index], bits[index])
+
+
+@wp.kernel
+def read_kernel(
+    # In:
+    lists: PathLists,
+    # Out:
+    listed_out: wp.array2d[int],  # (thread, 3)
+):
+    """`listed_pixel` of each thread."""
+    index = wp.tid()
+    pixel, known, bits = listed_pixel(lists, index)
+    listed_out[index, 0] = pixel
+    listed_out[index, 1] = known
+    listed_out[index, 2] = bits
