@@ -127,6 +127,13 @@ def test_several_devices_are_steady_when_all_of_them_are(tmp_path):
     assert row["views to disk"] * row["a tick"] == pytest.approx(1e3 * 18)
 
 
+def test_several_devices_without_the_part_steady_are_refused(capsys):
+    with pytest.raises(SystemExit) as ended:
+        bench.main([*TINY, "--parts", "render", "--devices", "cpu,cpu"])
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.splitlines()[-1].endswith("--devices needs the part steady, the only one that uses several")
+
+
 def test_descendants_of_the_benchmark_are_counted_and_other_processes_are_not():
     child = subprocess.Popen(["sh", "-c", "sleep 60 & echo $!; wait"], stdout=subprocess.PIPE, text=True)
     try:

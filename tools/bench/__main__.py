@@ -115,7 +115,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         "--episodes", type=_positive, default=WHOLE_EPISODES, help=f"episodes of the part whole (default: {WHOLE_EPISODES})"
     )
     devices_help = "several devices of the part steady, as of bake: cuda:0,cuda:1 or all; --worlds is the number of each"
-    parser.add_argument("--devices", type=lambda text: tuple(text.split(",")), default=(), help=devices_help)
+    parser.add_argument("--devices", default="", help=devices_help)
     parser.add_argument("--seconds", type=float, default=2.0, help="minimum time of a measurement [s] (default: 2)")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="table of the part growth")
     options = parser.parse_args(arguments)
@@ -123,6 +123,9 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         parser.error(f"--markdown: there is no folder {options.markdown.parent}")
     if options.parts is None:
         options.parts = () if options.compare else DEFAULT_PARTS
+    options.devices = tuple(name.strip() for name in options.devices.split(",")) if options.devices else ()
+    if options.devices and "steady" not in options.parts:
+        parser.error("--devices needs the part steady, the only one that uses several")
     return options
 
 
