@@ -90,11 +90,9 @@ def test_other_bodies_and_other_depths_do_not_mix():
     for name in ("unoccluded_diffuse", "unoccluded_specular"):
         flat.assign(name, np.ones((32, 32)))
     left = np.arange(32)[None] * np.ones((32, 1)) < 16
-    segment = np.where(left, 1, 2).astype(np.uint8)
-    flat.guide.segment.assign(segment[None])
+    flat.show(np.where(left, 1, 2), np.ones((32, 32)))
     flat.assign("diffuse", np.where(left, 0.2, 0.9))
     np.testing.assert_allclose(flat.run()["diffuse"][..., 0], np.where(left, 0.2, 0.9), rtol=HALF_ROUNDING)
     # The same body in another plane counts little: SAME_BODY_WEIGHT.
-    flat.guide.segment.fill_(1)
-    flat.guide.depth.assign(np.where(left, 1.0, 1.5)[None].astype(np.float32))
+    flat.show(np.ones((32, 32)), np.where(left, 1.0, 1.5))
     np.testing.assert_allclose(flat.run()["diffuse"][..., 0], np.where(left, 0.2, 0.9), atol=0.05)
