@@ -6,7 +6,17 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate_struct
-from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, interleaved_pixel, morton_index
+from synpick_warp.kernels.render.lighting.coarse_grid import (
+    CoarseGrid,
+    interleaved_pixel,
+    morton_index,
+    pack_surface,
+    read_record,
+    surface_depth,
+    surface_normal,
+    surface_segment,
+    write_record,
+)
 from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE
 from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, shrink, smooth_ratios_kernel
 from synpick_warp.kernels.render.lighting.sampling import scrambled_point, sobol_point
@@ -82,6 +92,27 @@ def shrink_kernel(
     """Shrinkage estimates from the means of a wide and a narrow kernel."""
     i = wp.tid()
     value_out[i] = shrink(wide[i], narrow[i], variance[i])
+
+
+@wp.kernel
+def surface_kernel(
+    # In:
+    segment: wp.array[int],  # (sample)
+    depth: wp.array[float],  # (sample) [m]
+    normal: wp.array[wp.vec3],  # (sample)
+    # Out:
+    record_out: wp.array3d[wp.vec4],  # (one, one, sample)
+    segment_out: wp.array[int],  # (sample)
+    depth_out: wp.array[float],  # (sample) [m]
+    normal_out: wp.array[wp.vec3],  # (sample)
+):
+    """Pack surfaces, write and read them, and unpack them."""
+    i = wp.tid()
+    write_record(record_out, i, pack_surface(segment[i], depth[i], normal[i]))
+    surface = read_record(record_out, i)
+    segment_out[i] = int(surface_segment(surface))
+    depth_out[i] = surface_depth(surface)
+    normal_out[i] = surface_normal(surface)
 
 
 class FlatDenoiser:
