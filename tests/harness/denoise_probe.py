@@ -1,10 +1,23 @@
 """Test kernels for coarse pixels and sample points, and the denoiser on synthetic input."""
 
+from typing import Any
+
 import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate_struct
-from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, interleaved_pixel, morton_index
+from synpick_warp.kernels.render.lighting.coarse_grid import (
+    CoarseGrid,
+    interleaved_pixel,
+    morton_index,
+    pack_surface,
+    read_record,
+    surface_depth,
+    surface_normal,
+    surface_segment,
+    write_record,
+)
+from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE
 from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, shrink, smooth_ratios_kernel
 from synpick_warp.kernels.render.lighting.sampling import scrambled_point, sobol_point
 from synpick_warp.kernels.render.visibility.camera import in_image
@@ -81,6 +94,27 @@ def shrink_kernel(
     value_out[i] = shrink(wide[i], narrow[i], variance[i])
 
 
+@wp.kernel
+def surface_kernel(
+    # In:
+    segment: wp.array[int],  # (sample)
+    depth: wp.array[float],  # (sample) [m]
+    normal: wp.array[wp.vec3],  # (sample)
+    # Out:
+    record_out: wp.array3d[wp.vec4],  # (one, one, sample)
+    segment_out: wp.array[int],  # (sample)
+    depth_out: wp.array[float],  # (sample) [m]
+    normal_out: wp.array[wp.vec3],  # (sample)
+):
+    """Pack surfaces, write and read them, and unpack them."""
+    i = wp.tid()
+    write_record(record_out, i, pack_surface(segment[i], depth[i], normal[i]))
+    surface = read_record(record_out, i)
+    segment_out[i] = int(surface_segment(surface))
+    depth_out[i] = surface_depth(surface)
+    normal_out[i] = surface_normal(surface)
+
+
 class FlatDenoiser:
     """The denoiser on coarse pixels of 1 px that all show one plane, which faces the camera at a depth of 1 m."""
 
@@ -93,19 +127,27 @@ class FlatDenoiser:
         zero = wp.zeros(1, dtype=wp.int32, device=device)
         self.views = make_views(zero, zero, 1, 1)
         self.guide = allocate_struct(GUIDE, sizes, device)
-        self.guide.segment.fill_(1)
-        self.guide.depth.fill_(1.0)
-        self.guide.normal.fill_(wp.vec3(0.0, 0.0, -1.0))
+        self.show(np.ones((height, width)), np.ones((height, width)))
         self.coarse_light, self.blocks = (allocate_struct(COARSE_LIGHT, sizes, device) for _ in range(2))
         self.chosen, self.ratios = (allocate_struct(RATIO_IMAGES, sizes, device) for _ in range(2))
+        names = ("diffuse", "specular", "unoccluded_diffuse", "unoccluded_specular", "indirect")
+        self.light = {name: np.zeros((height, width, 3)) for name in names}
+
+    def show(self, segment: np.ndarray, depth: np.ndarray) -> None:
+        """Set the guide image: segmentation ids and depth [m] (row, column) of surfaces that face the camera."""
+        zero = np.zeros(segment.shape)
+        self.guide.surface.assign(np.stack([zero, zero, depth, segment], axis=-1)[None].astype(np.float32))
 
     def assign(self, name: str, values: np.ndarray) -> None:
-        """Set an array of `CoarseLight`: (row, column) grey, or (row, column, 3)."""
-        rgb = values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
-        getattr(self.coarse_light, name).assign(rgb[None].astype(np.float32) if name == "variance" else pack_half3_array(rgb[None]))
+        """Set light: (row, column) grey, or (row, column, 3)."""
+        self.light[name] = values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2)
 
     def run(self, variance_scale: float = 1.0) -> dict[str, np.ndarray]:
         """Denoise: arrays (row, column, 3) by the names of `Ratios` after smoothing, and with the prefix "chosen_" before."""
+        for name in ("diffuse", "specular"):
+            records = pack_light_array(self.light[name], self.light[f"unoccluded_{name}"])
+            getattr(self.coarse_light, name).assign(records[None])
+        self.coarse_light.indirect.assign(pack_half3_array(self.light["indirect"][None]))
         shared = [self.cameras, self.coarse, self.guide]
         for kernel, source, rules, out in (
             (filter_blocks_kernel, self.coarse_light, (), self.blocks),
@@ -122,6 +164,20 @@ class FlatDenoiser:
 def unpack_ratio_records(records: np.ndarray) -> dict[str, np.ndarray]:
     """Light (..., 3) float32 in `RatioImages.record` (..., 3) uint64, by the names of `Ratios`."""
     return {name: unpack_half3_array(records[..., index]) for index, name in enumerate(("diffuse", "specular", "indirect"))}
+
+
+def pack_light_array(light: np.ndarray, unoccluded: np.ndarray) -> np.ndarray:
+    """Light and unoccluded light (..., 3) in (..., 4) float32, with their ratio: the kernels' `pack_light`."""
+    records = np.zeros((*light.shape[:-1], 4), np.float32)
+    records.view(np.float16)[..., :6] = np.concatenate([light, unoccluded], axis=-1)
+    luminance = np.array([0.2126, 0.7152, 0.0722])
+    records[..., 3] = (light @ luminance) / np.maximum(unoccluded @ luminance, float(MIN_RADIANCE))
+    return records
+
+
+def guide_segments(guide: Any) -> np.ndarray:
+    """Segmentation ids (view, row, column) in the struct `Guide`."""
+    return np.abs(guide.surface.numpy()[..., 3]).astype(np.uint8)
 
 
 def unpack_half3_array(packed: np.ndarray) -> np.ndarray:

@@ -33,12 +33,78 @@ class CoarseGrid:
 class Guide:
     """Guide image of the joint bilateral filters: a G-buffer at coarse resolution. Scratch."""
 
-    normal: wp.array3d[wp.vec3]
-    """(view, cell_row, cell_column): shading normal in camera space."""
-    depth: wp.array3d[float]
-    """(view, cell_row, cell_column): planar depth [m]."""
-    segment: wp.array3d[wp.uint8]
-    """(view, cell_row, cell_column): segmentation id, as in `GBuffer`."""
+    surface: wp.array3d[wp.vec4]
+    """(view, cell_row, cell_column): packed by `pack_surface`; zero, and so of no body, where nothing is visible."""
+
+
+@wp.func
+def flat_index(grid: ImageGrid, view: int, row: int, column: int) -> int:
+    """Index of an element in a contiguous array (view, row, column) over `grid`."""
+    return (view * grid.height + row) * grid.width + column
+
+
+@wp.func_native("""
+    struct alignas(16) Aligned { float x, y, z, w; };
+    const Aligned record = reinterpret_cast<const Aligned*>(records.data)[index];
+    return wp::vec4(record.x, record.y, record.z, record.w);
+""")
+def read_record(records: wp.array3d[wp.vec4], index: int) -> wp.vec4:
+    """Read the element of a contiguous array at a `flat_index` by one load: Warp's own look-up assumes no alignment, and takes four."""
+    ...
+
+
+@wp.func_native("""
+    struct alignas(16) Aligned { float x, y, z, w; };
+    const Aligned aligned = { record[0], record[1], record[2], record[3] };
+    reinterpret_cast<Aligned*>(records.data)[index] = aligned;
+""")
+def write_record(records: wp.array3d[wp.vec4], index: int, record: wp.vec4):
+    """Write the element of a contiguous array at a `flat_index` by one store."""
+    ...
+
+
+@wp.func_native("""
+    return words.data[index];
+""")
+def read_word(words: wp.array3d[wp.uint64], index: int) -> wp.uint64:
+    """Read the element of a contiguous array at a `flat_index`."""
+    ...
+
+
+@wp.func_native("""
+    words.data[index] = word;
+""")
+def write_word(words: wp.array3d[wp.uint64], index: int, word: wp.uint64):
+    """Write the element of a contiguous array at a `flat_index`."""
+    ...
+
+
+@wp.func
+def pack_surface(segment: int, depth: float, normal: wp.vec3) -> wp.vec4:
+    """Pack a surface: x and y of its shading normal in camera space, planar depth [m], and segmentation id.
+
+    The id is negative where the normal points away from the camera; so z of the normal, a unit vector, follows from x and y.
+    """
+    return wp.vec4(normal[0], normal[1], depth, wp.where(normal[2] > 0.0, -float(segment), float(segment)))
+
+
+@wp.func
+def surface_segment(surface: wp.vec4) -> wp.uint8:
+    """Segmentation id of a packed surface, as in `GBuffer`."""
+    return wp.uint8(int(wp.abs(surface[3])))
+
+
+@wp.func
+def surface_depth(surface: wp.vec4) -> float:
+    """Planar depth of a packed surface [m]."""
+    return surface[2]
+
+
+@wp.func
+def surface_normal(surface: wp.vec4) -> wp.vec3:
+    """Shading normal of a packed surface in camera space."""
+    z = wp.sqrt(wp.max(1.0 - surface[0] * surface[0] - surface[1] * surface[1], 0.0))
+    return wp.vec3(surface[0], surface[1], wp.where(surface[3] < 0.0, z, -z))
 
 
 @wp.func

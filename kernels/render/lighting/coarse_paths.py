@@ -9,8 +9,18 @@ import warp as wp
 
 from synpick_warp.codes import Segment, Stream
 from synpick_warp.kernels.render.lighting.brdf import SplitRadiance, specular_albedo
-from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide, interleaved_pixel, middle_pixel, morton_index
-from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE, pack_half3
+from synpick_warp.kernels.render.lighting.coarse_grid import (
+    CoarseGrid,
+    Guide,
+    flat_index,
+    interleaved_pixel,
+    middle_pixel,
+    morton_index,
+    pack_surface,
+    write_record,
+    write_word,
+)
+from synpick_warp.kernels.render.lighting.color import MAX_HALF, MIN_RADIANCE, luminance, pack_half3
 from synpick_warp.kernels.render.lighting.history import (
     LightHistory,
     MovingBodies,
@@ -57,21 +67,16 @@ within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
 class CoarseLight:
     """Reflected light of the coarse pixels; diffuse light is demodulated (without the surface's colour). Scratch.
 
-    All arrays are (view, cell_row, cell_column). Light is exposed: radiance times the map's exposure, about 1, and packed by `pack_half3`.
+    All arrays are (view, cell_row, cell_column). Light is exposed: radiance times the map's exposure, about 1.
     """
 
-    diffuse: wp.array3d[wp.uint64]
-    """Diffuse reflection of the environment map without its sun."""
-    specular: wp.array3d[wp.uint64]
-    """Specular reflection of the environment map without its sun, and of light from other surfaces."""
-    unoccluded_diffuse: wp.array3d[wp.uint64]
-    """`diffuse` if nothing blocked the map."""
-    unoccluded_specular: wp.array3d[wp.uint64]
-    """`specular` if nothing blocked the map."""
+    diffuse: wp.array3d[wp.vec4]
+    """Diffuse reflection of the environment map without its sun: with what blocks the map, and without. Packed by `pack_light`."""
+    specular: wp.array3d[wp.vec4]
+    """Specular reflection of the environment map without its sun, likewise; light from other surfaces counts as what is not blocked."""
     indirect: wp.array3d[wp.uint64]
-    """Indirect diffuse: diffuse reflection of light from other surfaces. It varies slowly, but few paths carry much of it."""
-    variance: wp.array3d[wp.vec2]
-    """Variance of the visibility ratios of `diffuse` and `specular`, in luminance; of filtered means, not of single paths."""
+    """Indirect diffuse: diffuse reflection of light from other surfaces. It varies slowly, but few paths carry much of it. Packed by
+    `pack_half3`."""
 
 
 @wp.func
@@ -162,13 +167,41 @@ def first_path_index(samples: int, row: int, column: int, number: int, accumulat
 
 
 @wp.func
-def store_light(out: CoarseLight, view: int, row: int, column: int, light: SplitRadiance, unoccluded: SplitRadiance):
-    """Write a coarse pixel; `light` and `unoccluded` are exposed, see `CoarseLight`."""
-    out.diffuse[view, row, column] = pack_half3(light.diffuse)
-    out.indirect[view, row, column] = pack_half3(light.indirect)
-    out.specular[view, row, column] = pack_half3(light.specular)
-    out.unoccluded_diffuse[view, row, column] = pack_half3(unoccluded.diffuse)
-    out.unoccluded_specular[view, row, column] = pack_half3(unoccluded.specular)
+def pack_half2(a: float, b: float) -> float:
+    """Pack two non-negative values in half precision, clamped to its range, in the bits of a float that is only moved."""
+    return wp.cast(wp.vec2h(wp.float16(wp.min(a, MAX_HALF)), wp.float16(wp.min(b, MAX_HALF))), wp.float32)
+
+
+@wp.func
+def unpack_half2(packed: float) -> wp.vec2:
+    """Unpack the values of `pack_half2`."""
+    halves = wp.cast(packed, wp.vec2h)
+    return wp.vec2(float(halves[0]), float(halves[1]))
+
+
+@wp.func
+def pack_light(light: wp.vec3, unoccluded: wp.vec3, statistic: float) -> wp.vec4:
+    """Pack light and unoccluded light in half precision, and a `statistic` of their visibility ratio in luminance.
+
+    That is the ratio itself in light of single coarse pixels, and the variance of its mean in light of blocks.
+    """
+    return wp.vec4(pack_half2(light[0], light[1]), pack_half2(light[2], unoccluded[0]), pack_half2(unoccluded[1], unoccluded[2]), statistic)
+
+
+@wp.func
+def luminance_ratio(light: wp.vec3, unoccluded: wp.vec3) -> float:
+    """Ratio of luminances; unoccluded light is 0 only if the whole map is black."""
+    return luminance(light) / wp.max(luminance(unoccluded), MIN_RADIANCE)
+
+
+@wp.func
+def store_light(out: CoarseLight, index: int, light: SplitRadiance, unoccluded: SplitRadiance):
+    """Write a coarse pixel by its `flat_index`; `light` and `unoccluded` are exposed, see `CoarseLight`."""
+    diffuse = luminance_ratio(light.diffuse, unoccluded.diffuse)
+    specular = luminance_ratio(light.specular, unoccluded.specular)
+    write_record(out.diffuse, index, pack_light(light.diffuse, unoccluded.diffuse, diffuse))
+    write_record(out.specular, index, pack_light(light.specular, unoccluded.specular, specular))
+    write_word(out.indirect, index, pack_half3(light.indirect))
 
 
 @wp.struct
@@ -198,10 +231,9 @@ def coarse_surface(cameras: Cameras, coarse: CoarseGrid, gbuffer: GBuffer, view:
 
 
 @wp.func
-def write_guide(guide: Guide, to_world: wp.mat33, view: int, row: int, column: int, depth: float, normal: wp.vec3):
-    """Write the guide image of a coarse pixel that shows a surface, except its segmentation id; `normal` is in the world."""
-    guide.normal[view, row, column] = wp.transpose(to_world) * normal
-    guide.depth[view, row, column] = depth
+def write_guide(guide: Guide, to_world: wp.mat33, index: int, hit: Hit, normal: wp.vec3):
+    """Write the guide image of a coarse pixel that shows a surface, by its `flat_index`; `normal` is in the world."""
+    write_record(guide.surface, index, pack_surface(hit.segment, hit.depth, wp.transpose(to_world) * normal))
 
 
 @wp.kernel(cuda_max_registers=RAY_REGISTERS)
@@ -227,16 +259,17 @@ def reuse_histories_kernel(
 ):
     """Temporal reuse: the history's light for coarse pixels that trace no path in this frame, see `period_bits`; the others are listed.
 
-    Of coarse pixels that are listed only the segmentation id is written; `variance` never is.
+    Of coarse pixels that are listed nothing is written.
     """
     index = wp.tid() + first
     view, row, column = interleaved_pixel(coarse, index)
     if not in_image(coarse.grid, row, column):
         return
+    cell = flat_index(coarse.grid, view, row, column)
     camera, world = views.camera[view], views.world[view]
     surface = coarse_surface(cameras, coarse, gbuffer, view, camera, row, column)
-    guide_out.segment[view, row, column] = wp.uint8(surface.hit.segment)
     if surface.hit.segment == Segment.NOTHING:
+        write_record(guide_out.surface, cell, wp.vec4())
         return
     limit = lag_limit(scene.meshes, history, moving, views, view, row, column, surface.hit.segment, surface.position)
     slot = world * history.cameras + camera
@@ -247,8 +280,8 @@ def reuse_histories_kernel(
     vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
     unoccluded = unoccluded_light(scene.lights, light[world], light_yaw[world], vertex.brdf)
     exposure = scene.lights.exposure[light[world]]
-    store_light(coarse_light_out, view, row, column, read_history(history, slot, row, column), scale_light(unoccluded, exposure))
-    write_guide(guide_out, cameras.to_world[camera], view, row, column, surface.hit.depth, vertex.brdf.normal)
+    store_light(coarse_light_out, cell, read_history(history, slot, row, column), scale_light(unoccluded, exposure))
+    write_guide(guide_out, cameras.to_world[camera], cell, surface.hit, vertex.brdf.normal)
 
 
 @wp.kernel(cuda_max_registers=COARSE_PATH_REGISTERS)
@@ -277,7 +310,7 @@ def trace_coarse_paths_kernel(
     """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
     With a history only those in `lists` do. A coarse pixel without a usable history traces `rules.samples` paths; with one it traces a
-    single path and blends it in. The sun's direct light is left out, see `shadows`; `variance` is not written.
+    single path and blends it in. The sun's direct light is left out, see `shadows`.
     """
     index = wp.tid() + first
     known, bits = int(0), int(0)
@@ -288,10 +321,11 @@ def trace_coarse_paths_kernel(
     view, row, column = interleaved_pixel(coarse, index)
     if not in_image(coarse.grid, row, column):
         return
+    cell = flat_index(coarse.grid, view, row, column)
     camera, world = views.camera[view], views.world[view]
     surface = coarse_surface(cameras, coarse, gbuffer, view, camera, row, column)
-    guide_out.segment[view, row, column] = wp.uint8(surface.hit.segment)
     if surface.hit.segment == Segment.NOTHING:
+        write_record(guide_out.surface, cell, wp.vec4())
         return
     vertex = make_vertex(scene, bodies, view, views.instances, surface.hit, surface.position, surface.outgoing, surface.width, 0.0)
     context = make_context(scene, coarse, rules, views, view, row, column, episode[world], light[world], light_yaw[world])
@@ -303,5 +337,5 @@ def trace_coarse_paths_kernel(
     paths = average_paths(scene, bodies, rules, context, number, samples, vertex, surface.width, unoccluded, firefly_clamp)
     exposure = scene.lights.exposure[context.light]
     mean = accumulate(history_inout, slot, row, column, surface.hit.segment, scale_light(paths, exposure), known, samples)
-    store_light(coarse_light_out, view, row, column, mean, scale_light(unoccluded, exposure))
-    write_guide(guide_out, cameras.to_world[camera], view, row, column, surface.hit.depth, vertex.brdf.normal)
+    store_light(coarse_light_out, cell, mean, scale_light(unoccluded, exposure))
+    write_guide(guide_out, cameras.to_world[camera], cell, surface.hit, vertex.brdf.normal)

@@ -7,13 +7,26 @@ It filters visibility ratios (see `coarse_paths`) in three passes: joint bilater
 import warp as wp
 
 from synpick_warp.codes import Segment
-from synpick_warp.kernels.render.lighting.coarse_grid import PLANE_TOLERANCE, CoarseGrid, Guide, middle_pixel
-from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight
-from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE, luminance, pack_half3, unpack_half3
+from synpick_warp.kernels.render.lighting.coarse_grid import (
+    PLANE_TOLERANCE,
+    CoarseGrid,
+    Guide,
+    flat_index,
+    middle_pixel,
+    read_record,
+    read_word,
+    surface_depth,
+    surface_normal,
+    surface_segment,
+    write_record,
+    write_word,
+)
+from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, pack_light, unpack_half2
+from synpick_warp.kernels.render.lighting.color import luminance, pack_half3, unpack_half3
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
-from synpick_warp.kernels.render.visibility.camera import Cameras, Views, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, clamp_index, in_image, tile_pixel
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -21,18 +34,26 @@ BLOCK = wp.constant(4)
 """Width of the narrow kernel, a block [coarse pixels]."""
 BLOCKS = wp.constant(4)
 """Width of the wide kernel [blocks]."""
+BLOCK_START = wp.constant(-int(BLOCK) // 2)
+"""Offset of the first coarse pixel of a block [coarse pixels]."""
+BLOCKS_START = wp.constant(-(int(BLOCK) * (int(BLOCKS) - 1) // 2))
+"""Offset of the first block of the wide kernel [coarse pixels]."""
 MEDIUM_BLOCKS = wp.constant(4.0)
 """Blocks of the medium kernel: 2 x 2."""
 SAME_BODY_WEIGHT = wp.constant(0.02)
 """Bilateral weight of a coarse pixel on the same body but on another surface: it reduces noise where few pixels are similar."""
+FILTER_REGISTERS = 80
+"""Register limit of the block filter: the least without spills, so that more threads are resident (from ptxas for sm_90, not timed)."""
+CHOICE_REGISTERS = 72
+"""The same of the choice of widths."""
 
 
 @wp.func
-def coarse_plane(coarse: CoarseGrid, guide: Guide, intrinsics: wp.vec4, view: int, row: int, column: int) -> Plane:
-    """Tangent plane at a coarse pixel, whose `down`, `right` and `width` are per coarse pixel."""
+def coarse_plane(coarse: CoarseGrid, surface: wp.vec4, intrinsics: wp.vec4, row: int, column: int) -> Plane:
+    """Tangent plane at a coarse pixel of packed `surface`, whose `down`, `right` and `width` are per coarse pixel."""
     pixel = middle_pixel(coarse, row, column)
-    depth = guide.depth[view, row, column]
-    plane = tangent_plane(intrinsics, pixel[0], pixel[1], guide.segment[view, row, column], depth, guide.normal[view, row, column])
+    depth = surface_depth(surface)
+    plane = tangent_plane(intrinsics, pixel[0], pixel[1], surface_segment(surface), depth, surface_normal(surface))
     size = float(coarse.size)
     plane.down = size * plane.down
     plane.right = size * plane.right
@@ -41,20 +62,18 @@ def coarse_plane(coarse: CoarseGrid, guide: Guide, intrinsics: wp.vec4, view: in
 
 
 @wp.func
-def bilateral_weight(guide: Guide, plane: Plane, view: int, row: int, column: int, down: int, right: int, stride: int) -> float:
-    """Bilateral weight of the coarse pixel at (row, column), at offset (down, right) from the plane's own: body, plane distance, normal.
+def bilateral_weight(surface: wp.vec4, plane: Plane, down: int, right: int, stride: int) -> float:
+    """Bilateral weight of a coarse pixel of packed `surface`, at offset (down, right) from the plane's own: body, plane distance, normal.
 
     0 on another body; SAME_BODY_WEIGHT off the plane; else that plus the 8th power of the normals' cosine. The tolerance of the plane
-    distance grows with the filter's `stride` [coarse pixels].
+    distance grows with the filter's `stride` [coarse pixels]. Without branches, so that loads of several coarse pixels overlap.
     """
-    if guide.segment[view, row, column] != plane.segment:
-        return 0.0
-    weight = SAME_BODY_WEIGHT
-    if plane_distance(plane, down, right, guide.depth[view, row, column]) < PLANE_TOLERANCE * plane.width * float(stride):
-        cosine = wp.max(wp.dot(guide.normal[view, row, column], plane.normal), 0.0)
-        square = cosine * cosine
-        weight += square * square * square * square
-    return weight
+    distance = plane_distance(plane, down, right, surface_depth(surface))
+    cosine = wp.max(wp.dot(surface_normal(surface), plane.normal), 0.0)
+    square = cosine * cosine
+    fourth = square * square
+    weight = SAME_BODY_WEIGHT + wp.where(distance < PLANE_TOLERANCE * plane.width * float(stride), fourth * fourth, 0.0)
+    return wp.where(wp.abs(surface[3]) == float(plane.segment), weight, 0.0)
 
 
 @wp.struct
@@ -66,18 +85,25 @@ class KernelSum:
     unoccluded_diffuse: wp.vec3
     unoccluded_specular: wp.vec3
     indirect: wp.vec3
+    statistic: wp.vec2
+    """Of the visibility ratios of diffuse and specular light, see `pack_light`."""
     weight: float
 
 
 @wp.func
-def read_light(light: CoarseLight, view: int, row: int, column: int) -> KernelSum:
-    """One coarse pixel, with weight 1."""
+def read_light(light: CoarseLight, index: int) -> KernelSum:
+    """One coarse pixel by its `flat_index`, with weight 1."""
+    diffuse = read_record(light.diffuse, index)
+    specular = read_record(light.specular, index)
+    a, b, c = unpack_half2(diffuse[0]), unpack_half2(diffuse[1]), unpack_half2(diffuse[2])
+    d, e, f = unpack_half2(specular[0]), unpack_half2(specular[1]), unpack_half2(specular[2])
     result = KernelSum()
-    result.diffuse = unpack_half3(light.diffuse[view, row, column])
-    result.specular = unpack_half3(light.specular[view, row, column])
-    result.unoccluded_diffuse = unpack_half3(light.unoccluded_diffuse[view, row, column])
-    result.unoccluded_specular = unpack_half3(light.unoccluded_specular[view, row, column])
-    result.indirect = unpack_half3(light.indirect[view, row, column])
+    result.diffuse = wp.vec3(a[0], a[1], b[0])
+    result.unoccluded_diffuse = wp.vec3(b[1], c[0], c[1])
+    result.specular = wp.vec3(d[0], d[1], e[0])
+    result.unoccluded_specular = wp.vec3(e[1], f[0], f[1])
+    result.indirect = unpack_half3(read_word(light.indirect, index))
+    result.statistic = wp.vec2(diffuse[3], specular[3])
     result.weight = 1.0
     return result
 
@@ -91,17 +117,30 @@ def add_light(total: KernelSum, one: KernelSum, weight: float) -> KernelSum:
     result.unoccluded_diffuse = total.unoccluded_diffuse + weight * one.unoccluded_diffuse
     result.unoccluded_specular = total.unoccluded_specular + weight * one.unoccluded_specular
     result.indirect = total.indirect + weight * one.indirect
+    result.statistic = total.statistic + weight * one.statistic
     result.weight = total.weight + weight
     return result
 
 
 @wp.func
-def luminance_ratio(light: wp.vec3, unoccluded: wp.vec3) -> float:
-    """Ratio of luminances; unoccluded light is 0 only if the whole map is black."""
-    return luminance(light) / wp.max(luminance(unoccluded), MIN_RADIANCE)
+def row_weights(guide: Guide, plane: Plane, grid: ImageGrid, view: int, row: int, column: int, r: int, start: int, stride: int) -> wp.vec4:
+    """Bilateral weights of four coarse pixels in row `r`, `stride` apart from offset `start` on; 0 outside the image.
+
+    `row` and `column` are the plane's own.
+    """
+    weights = wp.vec4()
+    if r < 0 or r >= grid.height:
+        return weights
+    left = flat_index(grid, view, r, 0)
+    for j in range(BLOCK):
+        right = start + j * stride
+        c = column + right
+        weight = bilateral_weight(read_record(guide.surface, left + clamp_index(c, grid.width)), plane, r - row, right, stride)
+        weights[j] = wp.where(c >= 0 and c < grid.width, weight, 0.0)
+    return weights
 
 
-@wp.kernel
+@wp.kernel(cuda_max_registers=FILTER_REGISTERS)
 def filter_blocks_kernel(
     # Scene:
     cameras: Cameras,
@@ -121,40 +160,36 @@ def filter_blocks_kernel(
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    if int(guide.segment[view, row, column]) == Segment.NOTHING:
+    index = flat_index(coarse.grid, view, row, column)
+    surface = read_record(guide.surface, index)
+    if int(surface_segment(surface)) == Segment.NOTHING:
         return
-    plane = coarse_plane(coarse, guide, cameras.intrinsics[views.camera[view]], view, row, column)
+    plane = coarse_plane(coarse, surface, cameras.intrinsics[views.camera[view]], row, column)
     sums = KernelSum()
-    mean = wp.vec2(0.0, 0.0)
     square = wp.vec2(0.0, 0.0)
     squared_weight = float(0.0)
-    for i in range(BLOCK):
-        down = i - BLOCK // 2
-        r = row + down
-        if r >= 0 and r < coarse.grid.height:
-            for j in range(BLOCK):
-                right = j - BLOCK // 2
-                c = column + right
-                if c >= 0 and c < coarse.grid.width:
-                    weight = bilateral_weight(guide, plane, view, r, c, down, right, 1)
-                    if weight > 0.0:
-                        one = read_light(coarse_light, view, r, c)
-                        sums = add_light(sums, one, weight)
-                        d = luminance_ratio(one.diffuse, one.unoccluded_diffuse)
-                        s = luminance_ratio(one.specular, one.unoccluded_specular)
-                        mean += weight * wp.vec2(d, s)
-                        square += weight * wp.vec2(d * d, s * s)
-                        squared_weight += weight * weight
-    total = sums.weight
-    blocks_out.diffuse[view, row, column] = pack_half3(sums.diffuse / total)
-    blocks_out.specular[view, row, column] = pack_half3(sums.specular / total)
-    blocks_out.unoccluded_diffuse[view, row, column] = pack_half3(sums.unoccluded_diffuse / total)
-    blocks_out.unoccluded_specular[view, row, column] = pack_half3(sums.unoccluded_specular / total)
-    blocks_out.indirect[view, row, column] = pack_half3(sums.indirect / total)
-    mean = mean / total
-    variance = square / total - wp.cw_mul(mean, mean)
-    count = total * total / squared_weight
-    blocks_out.variance[view, row, column] = wp.vec2(wp.max(variance[0], 0.0), wp.max(variance[1], 0.0)) / count
+    # Not unrolled: few registers, so that many threads are resident.
+    start = int(BLOCK_START)
+    for down in range(start, start + BLOCK):
+        weights = row_weights(guide, plane, coarse.grid, view, row, column, row + down, BLOCK_START, 1)
+        left = index + down * coarse.grid.width + BLOCK_START
+        for j in range(BLOCK):
+            weight = weights[j]
+            if weight > 0.0:
+                one = read_light(coarse_light, left + j)
+                sums = add_light(sums, one, weight)
+                square += weight * wp.cw_mul(one.statistic, one.statistic)
+                squared_weight += weight * weight
+    scale = 1.0 / sums.weight
+    mean = scale * sums.statistic
+    # Over the effective number of samples.
+    share = squared_weight * scale * scale
+    variance = share * (scale * square - wp.cw_mul(mean, mean))
+    diffuse = pack_light(scale * sums.diffuse, scale * sums.unoccluded_diffuse, wp.max(variance[0], 0.0))
+    specular = pack_light(scale * sums.specular, scale * sums.unoccluded_specular, wp.max(variance[1], 0.0))
+    write_record(blocks_out.diffuse, index, diffuse)
+    write_record(blocks_out.specular, index, specular)
+    write_word(blocks_out.indirect, index, pack_half3(scale * sums.indirect))
 
 
 @wp.func
@@ -167,7 +202,29 @@ def shrink(wide: wp.vec3, narrow: wp.vec3, variance: float) -> wp.vec3:
     return wide + (1.0 - variance / square) * (narrow - wide)
 
 
-@wp.kernel
+@wp.func
+def choose_ratio(wide: wp.vec3, medium: wp.vec3, medium_weight: float, narrow: wp.vec3, variance: float) -> wp.vec3:
+    """Visibility ratio of the widest kernel that agrees with the narrower ones; `variance` is that of the narrow one.
+
+    The medium kernel is left out where its weight is 0.
+    """
+    result = wide
+    if medium_weight > 0.0:
+        result = shrink(result, medium, variance / MEDIUM_BLOCKS)
+    return shrink(result, narrow, variance)
+
+
+@wp.func
+def add_blocks(total: KernelSum, blocks: CoarseLight, middle: int, weights: wp.vec4) -> KernelSum:
+    """Add a row of four blocks of the wide kernel to the sums, those whose weight is not 0; `middle`: `flat_index` of the row's middle."""
+    result = total
+    for j in range(BLOCKS):
+        if weights[j] > 0.0:
+            result = add_light(result, read_light(blocks, middle + BLOCKS_START + j * BLOCK), weights[j])
+    return result
+
+
+@wp.kernel(cuda_max_registers=CHOICE_REGISTERS)
 def choose_widths_kernel(
     # Scene:
     cameras: Cameras,
@@ -189,45 +246,43 @@ def choose_widths_kernel(
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    segment = guide.segment[view, row, column]
+    index = flat_index(coarse.grid, view, row, column)
+    surface = read_record(guide.surface, index)
+    segment = surface_segment(surface)
     if int(segment) == Segment.NOTHING:
         return
-    depth = guide.depth[view, row, column]
-    plane = coarse_plane(coarse, guide, cameras.intrinsics[views.camera[view]], view, row, column)
-    wide = KernelSum()
-    medium = KernelSum()
-    variance = wp.vec2(0.0, 0.0)
-    for i in range(BLOCKS):
-        down = i * BLOCK - BLOCK * (BLOCKS - 1) // 2
-        r = row + down
-        if r >= 0 and r < coarse.grid.height:
-            for j in range(BLOCKS):
-                right = j * BLOCK - BLOCK * (BLOCKS - 1) // 2
-                c = column + right
-                if c >= 0 and c < coarse.grid.width:
-                    weight = bilateral_weight(guide, plane, view, r, c, down, right, BLOCK)
-                    if weight > 0.0:
-                        block = read_light(blocks, view, r, c)
-                        wide = add_light(wide, block, weight)
-                        variance += weight * blocks.variance[view, r, c]
-                        if (i == 1 or i == 2) and (j == 1 or j == 2):
-                            medium = add_light(medium, block, weight)
-    narrow = read_light(blocks, view, row, column)
-    narrow_diffuse = visibility_ratio(narrow.diffuse, narrow.unoccluded_diffuse)
-    narrow_specular = visibility_ratio(narrow.specular, narrow.unoccluded_specular)
-    if wide.weight <= 0.0:
+    plane = coarse_plane(coarse, surface, cameras.intrinsics[views.camera[view]], row, column)
+    # First the middle rows, of which the middle is the medium kernel. Not unrolled, as in `filter_blocks_kernel`.
+    sums = KernelSum()
+    sides = wp.vec4()
+    middle = int(BLOCKS_START) + BLOCK
+    for down in range(middle, middle + 2 * BLOCK, BLOCK):
+        weights = row_weights(guide, plane, coarse.grid, view, row, column, row + down, BLOCKS_START, BLOCK)
+        sums = add_blocks(sums, blocks, index + down * coarse.grid.width, wp.vec4(0.0, weights[1], weights[2], 0.0))
+        sides = wp.vec4(sides[2], sides[3], weights[0], weights[3])
+    medium_weight = sums.weight
+    medium_diffuse = visibility_ratio(sums.diffuse, sums.unoccluded_diffuse)
+    medium_specular = visibility_ratio(sums.specular, sums.unoccluded_specular)
+    for down in range(middle, middle + 2 * BLOCK, BLOCK):
+        sums = add_blocks(sums, blocks, index + down * coarse.grid.width, wp.vec4(sides[0], 0.0, 0.0, sides[1]))
+        sides = wp.vec4(sides[2], sides[3], 0.0, 0.0)
+    for down in range(int(BLOCKS_START), 1 - BLOCKS_START, -2 * BLOCKS_START):
+        weights = row_weights(guide, plane, coarse.grid, view, row, column, row + down, BLOCKS_START, BLOCK)
+        sums = add_blocks(sums, blocks, index + down * coarse.grid.width, weights)
+    narrow = read_light(blocks, index)
+    diffuse = visibility_ratio(narrow.diffuse, narrow.unoccluded_diffuse)
+    specular = visibility_ratio(narrow.specular, narrow.unoccluded_specular)
+    if sums.weight <= 0.0:
         # The middles of all blocks may lie off the body.
-        ratios_out.record[view, row, column] = pack_ratios(narrow_diffuse, narrow_specular, narrow.indirect, depth, segment)
+        ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, narrow.indirect, surface_depth(surface), segment)
         return
-    variance = variance_scale * variance / wide.weight
-    diffuse = visibility_ratio(wide.diffuse, wide.unoccluded_diffuse)
-    specular = visibility_ratio(wide.specular, wide.unoccluded_specular)
-    if medium.weight > 0.0:
-        diffuse = shrink(diffuse, visibility_ratio(medium.diffuse, medium.unoccluded_diffuse), variance[0] / MEDIUM_BLOCKS)
-        specular = shrink(specular, visibility_ratio(medium.specular, medium.unoccluded_specular), variance[1] / MEDIUM_BLOCKS)
-    diffuse = shrink(diffuse, narrow_diffuse, variance[0])
-    specular = shrink(specular, narrow_specular, variance[1])
-    ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, wide.indirect / wide.weight, depth, segment)
+    scale = 1.0 / sums.weight
+    variance = (variance_scale * scale) * sums.statistic
+    wide_diffuse = visibility_ratio(sums.diffuse, sums.unoccluded_diffuse)
+    wide_specular = visibility_ratio(sums.specular, sums.unoccluded_specular)
+    diffuse = choose_ratio(wide_diffuse, medium_diffuse, medium_weight, diffuse, variance[0])
+    specular = choose_ratio(wide_specular, medium_specular, medium_weight, specular, variance[1])
+    ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, scale * sums.indirect, surface_depth(surface), segment)
 
 
 @wp.kernel
@@ -247,11 +302,13 @@ def smooth_ratios_kernel(
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
         return
-    segment = guide.segment[view, row, column]
+    index = flat_index(coarse.grid, view, row, column)
+    surface = read_record(guide.surface, index)
+    segment = surface_segment(surface)
     if int(segment) == Segment.NOTHING:
         ratios_out.record[view, row, column] = RatioRecord()
         return
-    plane = coarse_plane(coarse, guide, cameras.intrinsics[views.camera[view]], view, row, column)
+    plane = coarse_plane(coarse, surface, cameras.intrinsics[views.camera[view]], row, column)
     sums = Ratios()
     total = float(0.0)
     for down in range(-1, 2):
@@ -260,8 +317,10 @@ def smooth_ratios_kernel(
             for right in range(-1, 2):
                 c = column + right
                 if c >= 0 and c < coarse.grid.width:
-                    weight = bilateral_weight(guide, plane, view, r, c, down, right, 1)
+                    weight = bilateral_weight(read_record(guide.surface, flat_index(coarse.grid, view, r, c)), plane, down, right, 1)
                     sums = add_ratios(sums, ratios.record[view, r, c], weight)
                     total += weight
-    depth = guide.depth[view, row, column]
-    ratios_out.record[view, row, column] = pack_ratios(sums.diffuse / total, sums.specular / total, sums.indirect / total, depth, segment)
+    scale = 1.0 / total
+    ratios_out.record[view, row, column] = pack_ratios(
+        scale * sums.diffuse, scale * sums.specular, scale * sums.indirect, surface_depth(surface), segment
+    )

@@ -54,7 +54,7 @@ surfaces is added to the limit. Twice as much is 0.5 % brighter and 0.1 dB farth
 ROULETTE = 1
 """First bounce with Russian roulette: few paths are long, since many neighbours share them."""
 
-GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column", units={"depth": "m"})
+GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
 LIGHT_HISTORY = struct_arrays(LightHistory, "world_camera", "cell_row", "cell_column", episode=("world_camera",), frame=("world_camera",))
 MOVING_BODIES = struct_arrays(MovingBodies, "view", "body", holds=("view",), count=("view",), units={"to_body": "m"})

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.system.device import pick_device
-from tests.harness.denoise_probe import FlatDenoiser, shrink_kernel
+from tests.harness.denoise_probe import FlatDenoiser, shrink_kernel, surface_kernel
 from tests.harness.devices import default_device
 
 colors = st.tuples(*[st.floats(0.0, 10.0)] * 3)
@@ -33,6 +33,24 @@ def test_shrinkage_follows_the_narrow_kernel_beyond_its_variance(wide, narrow, v
         np.testing.assert_allclose(result.numpy()[0], expected, rtol=1e-3, atol=1e-3)
     if variance == 0.0 and square > 1e-3:
         np.testing.assert_allclose(result.numpy()[0], narrow, rtol=1e-5, atol=1e-5)
+
+
+def test_packed_surfaces_keep_id_depth_and_normal(device):
+    """Towards the camera and away from it, along the axes too."""
+    normal = np.concatenate([np.random.default_rng(0).normal(size=(250, 3)), np.eye(3), -np.eye(3)])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    segment, depth = np.arange(256), np.linspace(0.3, 3.0, 256, dtype=np.float32)
+    inputs = [
+        wp.array(segment, dtype=wp.int32, device=device),
+        wp.array(depth, device=device),
+        wp.array(normal, dtype=wp.vec3, device=device),
+    ]
+    out = [wp.empty((1, 1, 256), dtype=wp.vec4, device=device), *(wp.empty_like(array) for array in inputs)]
+    wp.launch(surface_kernel, 256, inputs, out, device=device)
+    np.testing.assert_array_equal(out[1].numpy(), segment)
+    np.testing.assert_array_equal(out[2].numpy(), depth)
+    # Near z = 0, the root of a rounding error; id 0 has no side.
+    np.testing.assert_allclose(out[3].numpy()[1:], normal[1:], atol=5e-4)
 
 
 @settings(max_examples=10)
@@ -90,11 +108,9 @@ def test_other_bodies_and_other_depths_do_not_mix():
     for name in ("unoccluded_diffuse", "unoccluded_specular"):
         flat.assign(name, np.ones((32, 32)))
     left = np.arange(32)[None] * np.ones((32, 1)) < 16
-    segment = np.where(left, 1, 2).astype(np.uint8)
-    flat.guide.segment.assign(segment[None])
+    flat.show(np.where(left, 1, 2), np.ones((32, 32)))
     flat.assign("diffuse", np.where(left, 0.2, 0.9))
     np.testing.assert_allclose(flat.run()["diffuse"][..., 0], np.where(left, 0.2, 0.9), rtol=HALF_ROUNDING)
     # The same body in another plane counts little: SAME_BODY_WEIGHT.
-    flat.guide.segment.fill_(1)
-    flat.guide.depth.assign(np.where(left, 1.0, 1.5)[None].astype(np.float32))
+    flat.show(np.ones((32, 32)), np.where(left, 1.0, 1.5))
     np.testing.assert_allclose(flat.run()["diffuse"][..., 0], np.where(left, 0.2, 0.9), atol=0.05)

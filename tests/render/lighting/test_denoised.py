@@ -249,7 +249,7 @@ def test_scratch_has_the_size_of_the_scenes_images(device):
         config.render, config.tote, Catalog((entry(sheet(0.1, 0.1)),)), ToyScene([], [], ()).fixtures, (VIEW,), (EVEN,), device
     )
     shading = make_renderer(config, scene, 1, 2).shading
-    assert shading.guide.segment.shape == shading.ratios.record.shape == (2, 12, 16)
+    assert shading.guide.surface.shape == shading.ratios.record.shape == (2, 12, 16)
     assert shading.shadows.filtered.shape == (2, 24, 32)
 
 

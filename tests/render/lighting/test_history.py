@@ -17,6 +17,7 @@ from synpick_warp.scenes.types import EnvironmentMap
 from synpick_warp.stages.buffers import Snapshot, allocate_view_buffers
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
+from tests.harness.denoise_probe import guide_segments
 from tests.harness.history_probe import lag_frames_kernel, schedule_kernel, usable_paths_kernel
 from tests.worlds.toy_scene import UPRIGHT, ToyScene, ball, box, build_scene, camera, entry, even_light, sheet, snapshot
 
@@ -164,7 +165,7 @@ def test_without_the_frame_before_nothing_is_remembered(renderer, device, frame,
 def test_a_body_that_moves_is_forgotten_and_dims_the_memory_around_it(renderer, device):
     frames = [(index, toy()) for index in range(PATHS)] + [(PATHS, toy(0.1))]
     list(show(renderer, frames, device))
-    count, segment = remembered(renderer), renderer.shading.guide.segment.numpy()[0]  # type: ignore[union-attr]
+    count, segment = remembered(renderer), guide_segments(renderer.shading.guide)[0]  # type: ignore[union-attr]
     assert set(np.unique(count[segment == 3])) == {1}
     distance = np.hypot(*(np.argwhere(segment == 1) - np.argwhere(segment == 3).mean(axis=0)).T)
     near, far = (count[segment == 1][part].mean() for part in (distance < 8, distance > 16))
@@ -202,7 +203,7 @@ def test_a_creeping_body_keeps_the_history_of_its_drift(renderer, device):
     assert float(MAX_DRIFT) / 4e-4 == pytest.approx(10.0)
     frames = [*((index, toy(0.08 + 4e-4 * index)) for index in range(24)), (24, toy(0.0945))]
     guide = renderer.shading.guide  # type: ignore[union-attr]
-    paths = [remembered(renderer)[guide.segment.numpy()[0] == 3] for _ in show(renderer, frames, device)]
+    paths = [remembered(renderer)[guide_segments(guide)[0] == 3] for _ in show(renderer, frames, device)]
     assert paths[-2].max() in (3, 4)
     assert set(np.unique(paths[-1])) == {1}
 
