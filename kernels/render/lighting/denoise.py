@@ -203,15 +203,22 @@ def shrink(wide: wp.vec3, narrow: wp.vec3, variance: float) -> wp.vec3:
 
 
 @wp.func
-def choose_ratio(wide: wp.vec3, medium: wp.vec3, medium_weight: float, narrow: wp.vec3, variance: float) -> wp.vec3:
-    """Visibility ratio of the widest kernel that agrees with the narrower ones; `variance` is that of the narrow one.
+def choose_ratio(
+    wide: wp.vec3, medium: wp.vec3, narrow: wp.vec3, medium_weight: float, pooled: float, medium_sum: float, narrow_variance: float
+) -> wp.vec3:
+    """Visibility ratio of the widest kernel that agrees with the narrower ones; the medium kernel is left out where its weight is 0.
 
-    The medium kernel is left out where its weight is 0.
+    Args:
+        wide, medium, narrow: Ratios of the three kernels.
+        medium_weight: Sum of the weights of the medium kernel's blocks.
+        pooled: Variance of a block's ratio, the mean over the wide kernel.
+        medium_sum: Sum of the medium kernel's variances, weighted.
+        narrow_variance: Variance of the narrow kernel's ratio.
     """
     result = wide
     if medium_weight > 0.0:
-        result = shrink(result, medium, variance / MEDIUM_BLOCKS)
-    return shrink(result, narrow, variance)
+        result = shrink(result, medium, wp.max(pooled, medium_sum / medium_weight) / MEDIUM_BLOCKS)
+    return shrink(result, narrow, wp.max(pooled, narrow_variance))
 
 
 @wp.func
@@ -240,8 +247,9 @@ def choose_widths_kernel(
 ):
     """Choose the filter width: visibility ratios of the widest kernel (4 x 4, 2 x 2 or 1 block) that agrees with the narrower ones.
 
-    Blocks of a kernel do not overlap, so a mean over n of them has 1/n of a block's variance. That is the estimated variance times
-    `variance_scale`. Indirect light always takes the wide kernel. All members of `ratios_out` are written.
+    Blocks of a kernel do not overlap, so a mean over n of them has 1/n of a block's variance. That is the estimated one, pooled over the
+    wide kernel, or over the narrower one if it is larger there: a lone bright path (firefly) raises a block's mean and its variance.
+    `variance_scale` multiplies it. Indirect light always takes the wide kernel. All members of `ratios_out` are written.
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
@@ -263,6 +271,7 @@ def choose_widths_kernel(
     medium_weight = sums.weight
     medium_diffuse = visibility_ratio(sums.diffuse, sums.unoccluded_diffuse)
     medium_specular = visibility_ratio(sums.specular, sums.unoccluded_specular)
+    medium_sum = variance_scale * sums.statistic
     for down in range(middle, middle + 2 * BLOCK, BLOCK):
         sums = add_blocks(sums, blocks, index + down * coarse.grid.width, wp.vec4(sides[0], 0.0, 0.0, sides[1]))
         sides = wp.vec4(sides[2], sides[3], 0.0, 0.0)
@@ -277,11 +286,11 @@ def choose_widths_kernel(
         ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, narrow.indirect, surface_depth(surface), segment)
         return
     scale = 1.0 / sums.weight
-    variance = (variance_scale * scale) * sums.statistic
-    wide_diffuse = visibility_ratio(sums.diffuse, sums.unoccluded_diffuse)
-    wide_specular = visibility_ratio(sums.specular, sums.unoccluded_specular)
-    diffuse = choose_ratio(wide_diffuse, medium_diffuse, medium_weight, diffuse, variance[0])
-    specular = choose_ratio(wide_specular, medium_specular, medium_weight, specular, variance[1])
+    pooled, variance = (variance_scale * scale) * sums.statistic, variance_scale * narrow.statistic
+    wide = visibility_ratio(sums.diffuse, sums.unoccluded_diffuse)
+    diffuse = choose_ratio(wide, medium_diffuse, diffuse, medium_weight, pooled[0], medium_sum[0], variance[0])
+    wide = visibility_ratio(sums.specular, sums.unoccluded_specular)
+    specular = choose_ratio(wide, medium_specular, specular, medium_weight, pooled[1], medium_sum[1], variance[1])
     ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, scale * sums.indirect, surface_depth(surface), segment)
 
 

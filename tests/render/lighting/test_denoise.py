@@ -103,6 +103,21 @@ def test_larger_variance_scale_widens_the_kernel():
     assert deviation[0] > 3.0 * deviation[-1]
 
 
+def test_one_bright_path_is_spread_over_the_wide_kernel():
+    """A firefly has its whole block's variance, so that the block's mean is no evidence of a feature."""
+    flat = FlatDenoiser(64, 48, pick_device(default_device()))
+    for name in ("unoccluded_diffuse", "unoccluded_specular"):
+        flat.assign(name, np.ones((48, 64)))
+    firefly = np.full((48, 64), 0.5)
+    firefly[24, 32] = 20.0
+    for name in ("diffuse", "specular"):
+        flat.assign(name, firefly)
+    result = flat.run()
+    for name in ("diffuse", "specular"):
+        # A 256th of it in the wide kernel; a block alone would have a 16th.
+        assert result[name][..., 0].max() < 0.5 + 2.0 * 20.0 / 256.0
+
+
 def test_other_bodies_and_other_depths_do_not_mix():
     flat = FlatDenoiser(32, 32, pick_device(default_device()))
     for name in ("unoccluded_diffuse", "unoccluded_specular"):
