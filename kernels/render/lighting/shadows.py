@@ -14,6 +14,7 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
 from synpick_warp.kernels.render.lighting.environment import Lights, rotate_z
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.lighting.sampling import rotate_to_axis, sobol_point
+from synpick_warp.kernels.render.lighting.upsampling import RING
 from synpick_warp.kernels.render.visibility.bvh_rays import RAY_OFFSET, is_blocked
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, clamp_index, hit_position, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, GBuffer, Meshes, Table, ViewBodies, face_normal, read_hit
@@ -21,8 +22,6 @@ from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-RING = wp.constant(1)
-"""Upsampling fallback: the four nearest coarse pixels are widened by this many on each side if none of them is on the surface."""
 VISIBILITY_BITS = wp.constant(16)
 """Bits of a packed sun visibility."""
 VISIBILITY_MASK = wp.constant((1 << 16) - 1)
