@@ -1,7 +1,7 @@
 """Sizes of a bake that its settings leave open (0): worlds and batches of a device, and writer processes, from what the machine has free.
 
-No output depends on them. Worlds follow from the number of episodes; where memory is short, batches and worlds are halved until the memory
-plan and its headroom fit.
+No output depends on them. Worlds follow from the number of episodes; where memory is short, batches are halved, and worlds reduced by a
+quarter, until the memory plan and its headroom fit.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
                 (key for key in is_open if is_open[key] and key in term.settings and _amount(config, key, device) > _least(key, device)), ""
             )
             if key:
-                config = _halve(config, key, device)
+                config = _reduce(config, key, device)
                 break
         else:
             return config
@@ -96,10 +96,12 @@ def _least(key: str, device: wp.Device) -> int:
     return MIN_GPU_WORLDS if key == "bake.worlds" and device.is_cuda else 1
 
 
-def _halve(config: Config, key: str, device: wp.Device) -> Config:
+def _reduce(config: Config, key: str, device: wp.Device) -> Config:
+    """Settings with half the views of a batch, or three quarters of the worlds, but at least `_least`."""
     section, _, name = key.partition(".")
-    half = max(_least(key, device), -(-_amount(config, key, device) // 2))
-    return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **{name: half})})
+    amount = _amount(config, key, device)
+    kept = amount - max(1, amount // 4) if key == "bake.worlds" else -(-amount // 2)
+    return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **{name: max(_least(key, device), kept)})})
 
 
 def _value(config: Config, key: str) -> int:

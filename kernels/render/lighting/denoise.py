@@ -203,6 +203,17 @@ def shrink(wide: wp.vec3, narrow: wp.vec3, variance: float) -> wp.vec3:
 
 
 @wp.func
+def firefly_variance(wide: wp.vec3, narrow: wp.vec3, pooled: float, own: float) -> float:
+    """Variance by which `narrow` is judged: its own, if that is larger, where it is brighter than `wide`.
+
+    A lone bright path (firefly) raises a block's mean and its variance. Darker blocks are mostly contact shadows.
+    """
+    if luminance(narrow) > luminance(wide):
+        return wp.max(pooled, own)
+    return pooled
+
+
+@wp.func
 def choose_ratio(
     wide: wp.vec3, medium: wp.vec3, narrow: wp.vec3, medium_weight: float, pooled: float, medium_sum: float, narrow_variance: float
 ) -> wp.vec3:
@@ -217,8 +228,8 @@ def choose_ratio(
     """
     result = wide
     if medium_weight > 0.0:
-        result = shrink(result, medium, wp.max(pooled, medium_sum / medium_weight) / MEDIUM_BLOCKS)
-    return shrink(result, narrow, wp.max(pooled, narrow_variance))
+        result = shrink(result, medium, firefly_variance(result, medium, pooled, medium_sum / medium_weight) / MEDIUM_BLOCKS)
+    return shrink(result, narrow, firefly_variance(result, narrow, pooled, narrow_variance))
 
 
 @wp.func
@@ -247,9 +258,8 @@ def choose_widths_kernel(
 ):
     """Choose the filter width: visibility ratios of the widest kernel (4 x 4, 2 x 2 or 1 block) that agrees with the narrower ones.
 
-    Blocks of a kernel do not overlap, so a mean over n of them has 1/n of a block's variance. That is the estimated one, pooled over the
-    wide kernel, or over the narrower one if it is larger there: a lone bright path (firefly) raises a block's mean and its variance.
-    `variance_scale` multiplies it. Indirect light always takes the wide kernel. All members of `ratios_out` are written.
+    Blocks of a kernel do not overlap, so a mean over n of them has 1/n of a block's variance. That is the estimated variance times
+    `variance_scale`, see `firefly_variance`. Indirect light always takes the wide kernel. All members of `ratios_out` are written.
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):

@@ -189,5 +189,4 @@ def test_resolved_pixels_are_closer_to_the_reference(device):
     antialiased, aliased, reference = (render_image(device, *bodies, config=config, lights=(even_light(),)) for config in configs)
     resolved = antialiased.resolve[0] != 0
     errors = [np.square(picture.color[0].astype(float) - reference.color[0])[resolved].mean() for picture in (antialiased, aliased)]
-    # Measured 0.31; both pictures share the denoised light, whose error is a part of both.
-    assert errors[0] < 0.33 * errors[1]
+    assert errors[0] < 0.3 * errors[1]
