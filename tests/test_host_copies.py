@@ -12,24 +12,24 @@ from synpick_warp.stages.host_copies import HostCopy
 
 
 class FakeEvent:
-    """An event that is complete after a number of questions."""
+    """Stand-in for a CUDA event that is complete after a number of queries."""
 
-    def __init__(self, questions: int) -> None:
-        self.answers = itertools.chain(itertools.repeat(False, questions), itertools.repeat(True))
+    def __init__(self, queries: int) -> None:
+        self.results = itertools.chain(itertools.repeat(False, queries), itertools.repeat(True))
 
     @property
     def is_complete(self) -> bool:
-        return next(self.answers)
+        return next(self.results)
 
 
-@pytest.mark.parametrize(("questions", "pauses"), [(0, 0), (3, 3)])
-def test_a_wait_pauses_until_the_copy_is_done(monkeypatch, questions, pauses):
+@pytest.mark.parametrize(("queries", "pauses"), [(0, 0), (3, 3)])
+def test_a_wait_pauses_until_the_copy_is_done(monkeypatch, queries, pauses):
     synchronized, slept = [], []
     monkeypatch.setattr(wp, "synchronize_event", synchronized.append)
     monkeypatch.setattr(host_copies.time, "sleep", slept.append)
     monkeypatch.setattr(host_copies.time, "monotonic", lambda: 7.0)
     copy = HostCopy([wp.zeros(1, dtype=float, device="cpu")])
-    copy.done = FakeEvent(questions)
+    copy.done = FakeEvent(queries)
     assert copy.wait()[0].tolist() == [0.0]
     assert slept == [host_copies.PAUSE_SECONDS] * pauses
     assert synchronized == [copy.done]

@@ -7,10 +7,10 @@ import pytest
 import warp as wp
 
 from synpick_warp.scenes import build
-from synpick_warp.stages.sim.physics import Physics
-from tests.worlds.small_worlds import CUBE, catalog, settings
+from tests.worlds.cubes import place_cubes
+from tests.worlds.small_worlds import settings
 
-WORLDS, TICKS, HOVER = 8, 5, 1.0
+WORLDS, TICKS = 8, 5
 
 
 def fall(device: wp.Device, replays: bool, steps: int, substeps: int) -> list[np.ndarray]:
@@ -23,18 +23,10 @@ def fall(device: wp.Device, replays: bool, steps: int, substeps: int) -> list[np
         physics__guide_height=0.2,
         physics__deterministic=True,
     )
-    built = build.build_model(config, catalog(CUBE), device)
-    physics, first = Physics(config.physics, built), build.GRIPPER_DOFS
-    coordinates = physics.state.joint_q.numpy().reshape(WORLDS, -1)
-    coordinates[:, 2] = HOVER
     turn = np.array([0.3, 0.2, -0.1, 0.927])
-    coordinates[:, first : first + 7] = (0.1, -0.05, 0.06, *turn / np.linalg.norm(turn))
-    coordinates[:, first] += np.linspace(0.0, 0.01, WORLDS)
-    physics.state.joint_q.assign(coordinates.reshape(-1))
-    variant = np.full((WORLDS, built.layout.bodies_per_world), -1, np.int32)
-    variant[:, build.GRIPPER_BODIES] = built.variant[0]
-    restarted = wp.array(np.ones(WORLDS + 1, bool), dtype=bool, device=device)
-    physics.load(wp.array(variant.reshape(-1), dtype=wp.int32, device=device), restarted)
+    pose = np.tile((0.1, -0.05, 0.06, *turn / np.linalg.norm(turn)), (WORLDS, 1))
+    pose[:, 0] += np.linspace(0.0, 0.01, WORLDS)
+    physics = place_cubes(config, device, pose)
     found = []
     for _ in range(TICKS):
         if not replays:

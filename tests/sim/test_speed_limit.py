@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import warp as wp
 
 from synpick_warp.scenes import build
-from synpick_warp.stages.sim.physics import VELOCITY_LIMIT_FRACTION, Physics
+from synpick_warp.stages.sim.physics import VELOCITY_LIMIT_FRACTION
+from tests.worlds.cubes import place_cubes
 from tests.worlds.hanging import COARSE
-from tests.worlds.small_worlds import CUBE, catalog, settings
+from tests.worlds.small_worlds import settings
 
 LIMIT = 4.0
 # Velocities at the start [m/s]: without rows, with idle rows, beyond the limit in one axis and in two.
 VELOCITIES = np.array([[1.0, 0.5, -0.7], [0.0, 3.0, 0.0], [9.0, 0.0, 1.0], [0.0, -7.0, 6.0]])
-PLACE = (0.1, -0.2, 3.0)
-HOVER = 1.0
+POSE = (0.1, -0.2, 3.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -29,19 +28,8 @@ def thrown(device) -> np.ndarray:
         physics__max_speed=LIMIT,
         **COARSE,
     )
-    built = build.build_model(config, catalog(CUBE), device)
-    physics, worlds = Physics(config.physics, built), len(VELOCITIES)
-    first = build.GRIPPER_DOFS
-    coordinates, velocities = (array.numpy().reshape(worlds, -1) for array in (physics.state.joint_q, physics.state.joint_qd))
-    coordinates[:, 2] = HOVER
-    coordinates[:, first : first + 7] = (*PLACE, 0.0, 0.0, 0.0, 1.0)
-    velocities[:, first : first + 3] = VELOCITIES
-    physics.state.joint_q.assign(coordinates.reshape(-1))
-    physics.state.joint_qd.assign(velocities.reshape(-1))
-    variant = np.full((worlds, built.layout.bodies_per_world), -1, np.int32)
-    variant[:, build.GRIPPER_BODIES] = built.variant[0]
-    restarted = wp.array(np.ones(worlds + 1, bool), dtype=bool, device=device)
-    physics.load(wp.array(variant.reshape(-1), dtype=wp.int32, device=device), restarted)
+    worlds, first = len(VELOCITIES), build.GRIPPER_DOFS
+    physics = place_cubes(config, device, np.tile(POSE, (worlds, 1)), VELOCITIES)
     found = []
     for _ in range(2):
         physics.tick(lambda current: None)

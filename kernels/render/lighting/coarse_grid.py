@@ -34,7 +34,7 @@ class Guide:
     """Guide image of the joint bilateral filters: a G-buffer at coarse resolution. Scratch."""
 
     surface: wp.array3d[wp.vec4]
-    """(view, cell_row, cell_column): packed by `pack_surface`; zero, and so of no body, where nothing is visible."""
+    """(view, cell_row, cell_column): packed by `pack_surface`; 0, with the segmentation id NOTHING, where no surface is visible."""
 
 
 @wp.func

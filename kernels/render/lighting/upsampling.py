@@ -28,7 +28,7 @@ class RatioImages:
     """Denoised light of coarse pixels. Scratch."""
 
     record: wp.array3d[RatioRecord]
-    """(view, cell_row, cell_column): zero, and so of no body, where nothing is visible."""
+    """(view, cell_row, cell_column): 0, with the segmentation id NOTHING, where no surface is visible."""
 
 
 @wp.struct
