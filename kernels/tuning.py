@@ -13,6 +13,11 @@ COARSE_PATH_REGISTERS = 56
 """The same of kernels that trace whole paths, for which slightly fewer are better still."""
 SHADE_REGISTERS = 80
 """Register limit of the shading kernel: it waits less than one that traces rays, and keeps more values."""
+FILTER_REGISTERS = 80
+"""Register limit of the denoiser's block filter: the least without spills, so that more threads are resident (from ptxas for sm_90, not
+timed)."""
+CHOICE_REGISTERS = 72
+"""The same of the denoiser's choice of filter widths."""
 PIXEL_BLOCK = 128
 """Block size of kernels with a thread a pixel: four tiles of 8 x 4 pixels."""
 LANE_STRIDE = wp.constant(4)

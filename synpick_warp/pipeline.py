@@ -355,7 +355,7 @@ class _Run:
         self.summary.stopped = 0 if done else stop.number
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
-        """Hand a tick's frames to the exporters, launch its views, and hand over those that are ready, with the ends of episodes.
+        """Export a tick: write its frames, launch the rendering of its views, and write the views and episode ends that are ready.
 
         Between batches the next tick is enqueued.
         """

@@ -46,9 +46,9 @@ class TickLoop:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Drop the parts that are not enqueued, and wait for the rest: another stream frees the arrays of the tick simulated ahead.
+        """Discard the parts of the tick that are not yet enqueued, and wait for its stream, before other streams free the tick's arrays.
 
-        The simulation may be within a tick then, and cannot go on.
+        The simulation may stop in the middle of a tick, and cannot be continued.
         """
         self._parts = iter(())
         if self.stream is not None:

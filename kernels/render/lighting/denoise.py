@@ -27,6 +27,7 @@ from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_dis
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, clamp_index, in_image, tile_pixel
+from synpick_warp.kernels.tuning import CHOICE_REGISTERS, FILTER_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
@@ -42,10 +43,6 @@ MEDIUM_BLOCKS = wp.constant(4.0)
 """Blocks of the medium kernel: 2 x 2."""
 SAME_BODY_WEIGHT = wp.constant(0.02)
 """Bilateral weight of a coarse pixel on the same body but on another surface: it reduces noise where few pixels are similar."""
-FILTER_REGISTERS = 80
-"""Register limit of the block filter: the least without spills, so that more threads are resident (from ptxas for sm_90, not timed)."""
-CHOICE_REGISTERS = 72
-"""The same of the choice of widths."""
 
 
 @wp.func

@@ -129,7 +129,7 @@ def interpolate_surface(
 
 @wp.func
 def decode_texel(surfaces: Surfaces, index: int) -> wp.vec3:
-    """Linear colour of a texel over TEXEL_SCALE."""
+    """Decode a texel: its linear colour divided by TEXEL_SCALE."""
     texel = int(surfaces.texel[index])
     red = float(texel & TEXEL_MASK)
     green = float((texel >> TEXEL_BITS) & TEXEL_MASK)
@@ -139,7 +139,7 @@ def decode_texel(surfaces: Surfaces, index: int) -> wp.vec3:
 
 @wp.func
 def sample_mip_level(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> wp.vec3:
-    """Bilinear look-up in one mip level of a repeating texture: linear colour over TEXEL_SCALE.
+    """Bilinear look-up in one mip level of a repeating texture: linear colour divided by TEXEL_SCALE.
 
     v grows upward, row 0 is the image's top; `row` is that of `Surfaces`.
     """

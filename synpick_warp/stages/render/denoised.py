@@ -93,7 +93,7 @@ def coarse_size(render: Render, width: int, histories: int = 0) -> int:
 
 
 def paths_per_coarse_pixel(render: Render, width: int, histories: int = 0) -> int:
-    """Paths per coarse pixel in images of `width` px: one where `histories` narrow the coarse pixels."""
+    """Number of paths per coarse pixel in images of `width` px: 1 if coarse pixels are narrower because of histories."""
     size = coarse_size(render, width, histories)
     few = size < coarse_size(render, width) or width > MAX_COLUMNS_TWO_PATHS * size
     return render.coarse_paths or (1 if few else 2)
