@@ -3,6 +3,7 @@
 Measurements follow a warm-up and are medians of synchronised repetitions. Physics, perception and rendering use the same worlds, in
 mode pick; with `--set bake.mode=move`, piles are stirred instead. Writers get the same views repeatedly. Files are written to the
 system's temporary folder (TMPDIR) and removed. The part sensor renders the same views with Newton's SensorCamera for comparison.
+The part render renders one tick repeatedly; the part pictures renders successive ticks, with light histories as in a bake.
 --compare measures other simulators and renderers beside ours, without any part unless --parts names some.
 
     python -m tools.bench --device cuda:0 --worlds 512 --models DIR --lights DIR --json bench.json
@@ -46,6 +47,7 @@ from tools.bench.compare.peers import PEERS, check_installed, measure_peers
 from tools.bench.encode import measure_encoding
 from tools.bench.growth import measure_growth
 from tools.bench.physics import BURST, Row, measure_simulation, seconds_per_call
+from tools.bench.pictures import measure_pictures
 from tools.bench.sensor import measure_sensor
 from tools.bench.steady import measure_steady
 from tools.bench.stream import measure_stream
@@ -55,8 +57,8 @@ from tools.bench.write import measure_writing
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
 
 DEFAULT_PARTS = ("physics", "perception", "render", "encode", "sensor", "write", "stream", "bake", "steady")
-PARTS = (*DEFAULT_PARTS, "whole", "trajectories", "growth")
-OWN_WORLDS = {"bake", "steady", "whole", "trajectories", "growth"}
+PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth")
+OWN_WORLDS = {"bake", "pictures", "steady", "whole", "trajectories", "growth"}
 """Parts that build worlds of their own."""
 STREAM_BATCHES = 12
 """Batches rendered and copied in a row."""
@@ -194,6 +196,8 @@ def measure(
         yield _memory_in_use(factory.simulation.device)
     if "bake" in parts:
         yield from _measure_bake(config)
+    if "pictures" in parts:
+        yield from measure_pictures(config)
     steady_rate = 0.0
     if "steady" in parts:
         for row in measure_steady(config, min_seconds, devices):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -18,6 +19,7 @@ from synpick_warp.pipeline import Factory, Stages
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
+from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.stream import TickReport, view_sizes
 from synpick_warp.stages.ticks import PARTS_PER_BATCH, TickLoop
@@ -90,24 +92,29 @@ def _compare(sources: dict[str, Iterator[int]], device: wp.Device, min_seconds: 
 
 def _render_loop(stages: Stages, ring: BatchRing, report: TickReport) -> Iterator[int]:
     """Render the views of one tick repeatedly into one buffer; yields the number of views of each batch."""
-    snapshot, (world, camera) = stages.simulation.records[0].snapshot, _select(stages, report)
+    snapshot, (world, camera) = stages.simulation.records[0].snapshot, select_views(report, len(stages.cameras))
     while True:
         yield from _render_all(stages, ring, snapshot, world, camera)
 
 
 def _render_all(stages: Stages, ring: BatchRing, snapshot: Snapshot, world: np.ndarray, camera: np.ndarray) -> Iterator[int]:
     slot = ring.slots[0]
-    for first in range(0, len(world), ring.views):
-        rows = [wp.array(values[first : first + ring.views], dtype=wp.int32, device=ring.device) for values in (world, camera)]
-        views = make_views(rows[0], rows[1], len(rows[0]), ring.instances)
+    for views in batch_views(world, camera, ring.views, stages.renderer):
         stages.renderer.render(snapshot, views, slot.images, slot.layers)
         yield views.count
 
 
-def _select(stages: Stages, report: TickReport) -> tuple[np.ndarray, np.ndarray]:
-    """World and camera of each view of a tick."""
-    live, cameras = np.flatnonzero(report.column("live")), len(stages.cameras)
+def select_views(report: TickReport, cameras: int) -> tuple[np.ndarray, np.ndarray]:
+    """World and camera of each view of a tick (view) int32: world by world and camera by camera."""
+    live = np.flatnonzero(report.column("live"))
     return np.repeat(live, cameras).astype(np.int32), np.tile(np.arange(cameras, dtype=np.int32), len(live))
+
+
+def batch_views(world: np.ndarray, camera: np.ndarray, size: int, renderer: Renderer) -> Iterator[Any]:
+    """Yield the structs `Views` of batches of at most `size` views, from the world and camera of each view (view) int32."""
+    for first in range(0, len(world), size):
+        rows = [wp.array(values[first : first + size], dtype=wp.int32, device=renderer.scene.device) for values in (world, camera)]
+        yield make_views(rows[0], rows[1], len(rows[0]), renderer.instances)
 
 
 def _consumer(device: wp.Device) -> Callable[[ViewBatch], int]:
@@ -147,7 +154,7 @@ def _tick_loop(stages: Stages, ring: BatchRing) -> Iterator[int]:
             report, snapshot = ticks.advance()
             if (report.column("phase") == Phase.IDLE).all():
                 return
-            world, camera = _select(stages, report)
+            world, camera = select_views(report, len(stages.cameras))
             for views in _render_all(stages, ring, snapshot, world, camera):
                 ticks.enqueue(PARTS_PER_BATCH)
                 yield views

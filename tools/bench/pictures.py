@@ -1,0 +1,166 @@
+"""Benchmark of pictures alone: views per second of all stages of the renderer over successive ticks, with light histories as in a bake.
+
+The worlds act as at the beginning of the part steady. First HISTORY_TICKS ticks are simulated and rendered, so that the histories
+(`render.history`) are as long as a bake's; then KEPT_TICKS ticks are simulated and kept. Each pass renders the kept ticks in order, in the
+batches of a bake, and the device is synchronised at both ends only. Before the clock starts, the histories are restored to those before the
+first kept tick, so that every pass does the same work: its first tick, too, continues histories. Physics, encoders, copies to the host and
+writers do not run meanwhile. The size of a pass is fixed: `--seconds` has no part in it.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import warp as wp
+
+from synpick_warp.codes import Phase
+from synpick_warp.configs.schema import Config
+from synpick_warp.exporters.registry import load_exporter_classes
+from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS
+from synpick_warp.pipeline import Factory, build_factory, make_renderer
+from synpick_warp.progress import SilentProgress
+from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.render.denoised import LIGHT_HISTORY, DenoisedRenderer
+from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.stream import FrameStream, TickReader, TickReport
+from tools.bench.meter import LIVE_FRACTION
+from tools.bench.physics import Row
+from tools.bench.steady import plan_spare_episodes
+from tools.bench.stream import batch_views, select_views
+
+HISTORY_TICKS = 24
+"""Ticks rendered before the measurement. Where nothing moves, a history has 8 paths after 1 + 2 * 2 + 4 * 4 = 21 frames and from there on
+traces a path in every 8th frame, the longest update period."""
+KEPT_TICKS = 1 << int(MAX_PERIOD_BITS)
+"""Ticks of a pass: the longest update period, in which each coarse pixel traces at least one path."""
+ROUNDS = 5
+"""Passes of each renderer; the renderers take turns."""
+
+
+@dataclass(frozen=True, eq=False)
+class KeptTick:
+    """Copy of a tick that stays valid while the simulation goes on."""
+
+    snapshot: Snapshot
+    batches: list[Any]
+    """The structs `Views` of its frames, in the order of a bake."""
+
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return sum(batch.count for batch in self.batches)
+
+
+class SavedHistory:
+    """Copy of a renderer's light histories on the device; empty if it keeps none."""
+
+    def __init__(self, renderer: Renderer) -> None:
+        history = light_history(renderer)
+        arrays = [] if history is None else [getattr(history, name) for name in LIGHT_HISTORY.specs]
+        self._pairs = [(array, wp.clone(array)) for array in arrays]
+
+    def restore(self) -> None:
+        """Write the copy back to the renderer."""
+        for array, saved in self._pairs:
+            wp.copy(array, saved)
+
+
+def light_history(renderer: Renderer) -> Any:
+    """The struct `LightHistory` of a renderer; None: it keeps none."""
+    shading = renderer.shading
+    return shading.history if isinstance(shading, DenoisedRenderer) and shading.history.max_paths > 0 else None
+
+
+def measure_pictures(config: Config) -> Iterator[Row]:
+    """Simulate, keep and render ticks: rows of counts, and of the rates with the history of the settings and without any.
+
+    Args:
+        config: All settings. Beside the memory of a bake the device holds a copy of the histories, and scratch of a second renderer.
+    """
+    started = time.perf_counter()
+    config = plan_spare_episodes(config)
+    kinds = load_exporter_classes(config.bake.formats)
+    factory = build_factory(config, SilentProgress(), needs_images=any(kind.needs_images for kind in kinds))
+    stream, device = factory.stream, factory.simulation.device
+    start_acting(factory)
+    for _ in range(HISTORY_TICKS):
+        render_ticks(stream, stream.renderer, [keep_tick(factory)])
+    ticks = [keep_tick(factory) for _ in range(KEPT_TICKS)]
+    views = sum(tick.views for tick in ticks)
+    wp.synchronize_device(device)
+    yield Row("pictures", f"load, settle, and render {HISTORY_TICKS} ticks first", time.perf_counter() - started, "s")
+    yield Row("pictures", "ticks in a pass", len(ticks), "")
+    yield Row("pictures", "views in a pass", views, "")
+    yield Row("pictures", "views in a batch", stream.batch, "")
+    if views == 0:
+        return  # All episodes have ended.
+    renderers = {"all stages": stream.renderer}
+    history = light_history(stream.renderer)
+    if history is not None:
+        live = history.paths.numpy()[history.frame.numpy() >= 0]
+        yield Row("pictures", "paths in a history before a pass, mean", float(live.mean()), "")
+        other = replace(config, render=replace(config.render, history=0))
+        renderers["all stages, render.history=0"] = make_renderer(other, stream.renderer.scene, stream.instances, stream.batch)
+    megapixels = 1e-6 * config.cameras.resolution[0] * config.cameras.resolution[1]
+    for name, times in _time_passes(stream, renderers, ticks).items():
+        rate = views / statistics.median(times)
+        yield Row("pictures", f"{name}: views, median of {len(times)} passes", rate, "1/s")
+        yield Row("pictures", f"{name}: views, slowest pass", views / max(times), "1/s")
+        yield Row("pictures", f"{name}: views, fastest pass", views / min(times), "1/s")
+        yield Row("pictures", f"{name}: pixels", megapixels * rate, "Mpx/s")
+        yield Row("pictures", f"{name}: a view", 1e3 / rate, "ms")
+
+
+def start_acting(factory: Factory) -> None:
+    """Simulate until LIVE_FRACTION of the worlds have a frame, or all episodes have ended."""
+    while True:
+        report = _tick(factory)
+        if report.column("live").mean() >= LIVE_FRACTION or (report.column("phase") == Phase.IDLE).all():
+            return
+
+
+def keep_tick(factory: Factory) -> KeptTick:
+    """Simulate a tick, and copy what its rendering needs: the simulation overwrites its records."""
+    world, camera = select_views(_tick(factory), len(factory.cameras))
+    snapshot = factory.simulation.records[0].snapshot
+    copy = Snapshot(**{item.name: wp.clone(getattr(snapshot, item.name)) for item in fields(snapshot)})
+    return KeptTick(copy, list(batch_views(world, camera, factory.stream.batch, factory.stream.renderer)))
+
+
+def _tick(factory: Factory) -> TickReport:
+    """Simulate a tick into the first record, and wait for its report."""
+    record = factory.simulation.records[0]
+    factory.simulation.tick(record)
+    reader = TickReader(record)
+    reader.start()
+    return reader.wait()
+
+
+def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick]) -> None:
+    """Render all views of some ticks in order, batch by batch, into the ring of buffers of a bake; launches only."""
+    slot = 0
+    for tick in ticks:
+        for views in tick.batches:
+            renderer.render(tick.snapshot, views, stream.buffers[slot], stream.layer_buffers[slot])
+            slot = (slot + 1) % len(stream.buffers)
+
+
+def _time_passes(stream: FrameStream, renderers: dict[str, Renderer], ticks: list[KeptTick]) -> dict[str, list[float]]:
+    """Times of ROUNDS passes of each renderer [s], by its name, after a warm-up pass over the first tick."""
+    saved = {name: SavedHistory(renderer) for name, renderer in renderers.items()}
+    times: dict[str, list[float]] = {name: [] for name in renderers}
+    for renderer in renderers.values():
+        render_ticks(stream, renderer, ticks[:1])
+    for _ in range(ROUNDS):
+        for name, renderer in renderers.items():
+            saved[name].restore()
+            wp.synchronize_device(stream.device)
+            started = time.perf_counter()
+            render_ticks(stream, renderer, ticks)
+            wp.synchronize_device(stream.device)
+            times[name].append(time.perf_counter() - started)
+    return times
