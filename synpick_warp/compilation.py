@@ -36,9 +36,9 @@ def compile_launches(simulation: Simulation, stream: FrameStream | None, progres
 
 def launch_all(simulation: Simulation, stream: FrameStream | None) -> None:
     """Launch every kernel of simulation, perception, renderer and encoders once."""
-    record = simulation.records[0]
+    record = simulation.record
     for _ in range(2):  # On a GPU the first tick launches kernels one by one and captures graphs; the second launches the graphs.
-        simulation.tick(record)
+        simulation.tick()
     if simulation.perception is not None:
         simulation.perception.load_kernels(record.snapshot)
     reader = TickReader(record)

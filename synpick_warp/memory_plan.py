@@ -38,10 +38,10 @@ from synpick_warp.stages.render.raster import VISIBILITY_BUFFER, visibility_size
 from synpick_warp.stages.render.renderer import SHADED_IMAGE
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes
 from synpick_warp.stages.sim.physics import with_enough_worlds
-from synpick_warp.stages.sim.simulate import RECORDS
 from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.stream import RING, view_sizes
+from synpick_warp.stages.tick_queue import queue_lead
 from synpick_warp.system.device import pick_device
 from synpick_warp.system.free_memory import free_device_memory, free_host_memory
 
@@ -64,6 +64,8 @@ _CAMERAS = ("cameras.resolution", "cameras.positions")
 _HISTORY = ("bake.worlds", "cameras.resolution", "render.history", "cameras.positions")
 _WORLDS = ("bake.worlds", "arrangement.max_objects", "move.rounds")
 _STEPS = ("bake.worlds", "physics.steps_per_tick", "arrangement.max_objects")
+_RECORD = (Snapshot, WorldStatus, Observation, Plan)
+"""Declarations of a tick's record, besides physics."""
 _PERCEPTION = ("perception.resolution", "perception.contour_points", "perception.views", "bake.worlds")
 
 
@@ -96,10 +98,10 @@ def plan_memory(config: Config, device: wp.Device, writers: int = 1) -> list[Ter
         writers: Writer processes; 0: nothing is written, views stay on the device.
     """
     config = with_enough_worlds(config, device)
-    terms = [*_simulation(config, device), *_images(config, device, writers > 0), *_perception(config, device)]
+    terms = [*_simulation(config), *_queue(config, device), *_images(config, device, writers > 0), *_perception(config, device)]
     if not device.is_cuda:
         terms = [Term(term.name, term.rows, term.settings, False, term.indexed) for term in terms]
-    return [*terms, *_newton(config, device), *(_host(config, device, writers) if writers else ())]
+    return [*terms, *_queued_reports(config, device), *_newton(config, device), *(_host(config, device, writers) if writers else ())]
 
 
 def free_memory(device: wp.Device | None) -> int:
@@ -199,7 +201,7 @@ def describe_arrays(config: Config) -> list[Row]:
     """
     device = pick_device(config.bake.device)
     config = with_enough_worlds(config, device)
-    terms = [*_simulation(config, device), *_images(config, device), *_perception(config, device)]
+    terms = [*_simulation(config), *_queue(config, device), *_images(config, device), *_perception(config, device)]
     return [row for term in terms for row in term.rows]
 
 
@@ -208,16 +210,45 @@ def _term(name: str, settings: tuple[str, ...], groups: list[tuple[Any, dict[str
     return Term(name, tuple(row for kind, sizes, copies in groups for row in memory_table(kind, sizes) for _ in range(copies)), settings)
 
 
-def _simulation(config: Config, device: wp.Device) -> Iterator[Term]:
-    """State, records and step logs of the worlds."""
+def _world_sizes(config: Config) -> dict[str, int]:
+    """Extents of the dimensions of state and records."""
     worlds = world_sizes(config, build.GRIPPER_BODIES + 2 * config.arrangement.max_objects)
-    groups: list[tuple[Any, dict[str, int], int]] = [(kind, worlds, 1) for kind in (WorldState, AttemptState, SealState, LastFrame)]
-    groups += [(kind, worlds, 1 + RECORDS) for kind in (Observation, Plan)]
-    groups += [(WorldStatus, worlds, RECORDS), (Snapshot, worlds, RECORDS)]
-    yield _term(f"the state of {config.bake.worlds:,} worlds", _WORLDS, groups)
-    if any(kind.needs_physics for kind in load_exporter_classes(config.bake.formats)):
-        sizes = record_sizes(worlds, config.physics.steps_per_tick)
-        yield _term("records of physics steps", _STEPS, [(kind, sizes, 1 + RECORDS) for kind in record_kinds(config.trajectory)])
+    return record_sizes(worlds, config.physics.steps_per_tick)
+
+
+def _physics_kinds(config: Config) -> tuple[type, ...]:
+    """Declarations of a tick's physics, if a format needs it."""
+    needed = any(kind.needs_physics for kind in load_exporter_classes(config.bake.formats))
+    return record_kinds(config.trajectory) if needed else ()
+
+
+def _simulation(config: Config) -> Iterator[Term]:
+    """State, record and step logs of the worlds."""
+    sizes = _world_sizes(config)
+    kinds = (WorldState, AttemptState, SealState, LastFrame, *_RECORD)
+    yield _term(f"the state of {config.bake.worlds:,} worlds", _WORLDS, [(kind, sizes, 1) for kind in kinds])
+    if recorded := _physics_kinds(config):
+        yield _term("records of physics steps", _STEPS, [(kind, sizes, 2) for kind in recorded])
+
+
+def queue_slots(config: Config, device: wp.Device) -> int:
+    """Ticks in the queue between physics and renderer, as `TickLoop` chooses them."""
+    rows = (row for kind in (*_RECORD, *_physics_kinds(config)) for row in memory_table(kind, _world_sizes(config)))
+    return 1 + queue_lead(sum(row[3] for row in rows), device)
+
+
+def _queue(config: Config, device: wp.Device) -> Iterator[Term]:
+    """Snapshots of the queued ticks."""
+    slots = queue_slots(config, device)
+    yield _term(f"a queue of {slots:,} ticks", _WORLDS, [(Snapshot, _world_sizes(config), slots)])
+
+
+def _queued_reports(config: Config, device: wp.Device) -> Iterator[Term]:
+    """Reports of the queued ticks, on the host."""
+    slots, sizes = queue_slots(config, device), _world_sizes(config)
+    kinds = (WorldStatus, Observation, Plan, *_physics_kinds(config))
+    rows = [(f"copy of {name}", shape, unit, size) for kind in kinds for name, shape, unit, size in memory_table(kind, sizes)]
+    yield Term(f"reports of {slots:,} ticks", tuple(slots * rows), _STEPS if _physics_kinds(config) else _WORLDS, False)
 
 
 def _images(config: Config, device: wp.Device, written: bool = True) -> Iterator[Term]:

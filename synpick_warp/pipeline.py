@@ -47,7 +47,7 @@ from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import RenderScene, build_render_scene
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, LightTable, TickReport, name_lights, tick_batch, view_sizes
-from synpick_warp.stages.ticks import PARTS_PER_BATCH, TickLoop
+from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope
 from synpick_warp.system.device import pick_device, pick_devices
 from synpick_warp.system.garbage import collection_paused
@@ -367,7 +367,7 @@ class _Run:
         records = self.factory.log.update(report)
         if self.exporters.needs_views:
             for views in self.factory.stream.advance(snapshot, report, partial(self._end_episodes, report, records)):
-                ticks.enqueue(PARTS_PER_BATCH)
+                ticks.enqueue()
                 self._write(views)
         else:
             self._end_episodes(report, records)

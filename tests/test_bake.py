@@ -98,8 +98,8 @@ def test_the_same_settings_give_the_same_bytes_with_a_profile_too(baked, tmp_pat
     assert len(again.files()) > 100
     calls = {path[-1]: stage.calls for path, stage in recorder.times.items()}
     assert calls["end episode"] >= EPISODES
-    # A tick is enqueued in parts.
-    assert calls["simulate"] > calls["arrange"] == calls["wait for tick"] + 1
+    # A tick is enqueued in parts; on a GPU some are simulated ahead.
+    assert calls["simulate"] > calls["arrange"] >= calls["wait for tick"]
     # One batch has the views of a world's frame.
     assert calls["render"] == calls["wait for images"] == calls["hand over views"] == again.summary.views // CAMERAS
     assert recorder.times["simulate",].host < recorder.wall

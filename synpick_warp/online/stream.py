@@ -30,7 +30,7 @@ from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.stream import TickReport, describe_views
-from synpick_warp.stages.ticks import PARTS_PER_BATCH, TickLoop
+from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.device import pick_device
 
 DEVICE_ONLY = 0
@@ -139,7 +139,7 @@ class Producer:
             while True:
                 report, snapshot = ticks.advance()
                 for batch in self.render(report, snapshot):
-                    ticks.enqueue(PARTS_PER_BATCH)
+                    ticks.enqueue()
                     yield batch
                 self._end_episodes(report)
                 if (report.column("phase") == Phase.IDLE).all():

@@ -70,15 +70,27 @@ def host_images(config: Config, device: wp.Device, needs_images: bool, depth_fil
 class HostCopy:
     """Host mirror of device arrays: pinned memory and asynchronous copies on CUDA, the arrays themselves on the CPU."""
 
-    def __init__(self, arrays: list[wp.array]) -> None:
+    def __init__(self, arrays: list[wp.array], target: list[wp.array] | None = None) -> None:
+        """
+        Args:
+            arrays: Arrays of one device.
+            target: Arrays on the host that they are copied to, pinned for a GPU; None: as above.
+        """
         self.source = arrays
         self.device = arrays[0].device
-        self.target = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays] if self.device.is_cuda else arrays
+        if target is None:
+            is_cuda = self.device.is_cuda
+            target = [wp.empty(a.shape, dtype=a.dtype, device="cpu", pinned=True) for a in arrays] if is_cuda else arrays
+        self.target = target
         self.done = wp.Event(self.device) if self.device.is_cuda else None
 
     def start(self, stream: wp.Stream | None) -> None:
         """Begin to copy on `stream`, after the work queued on the current stream; None: on the current stream."""
+        if self.target is self.source:
+            return
         if self.done is None:
+            for target, source in zip(self.target, self.source, strict=True):
+                wp.copy(target, source)
             return
         if stream is None:
             stream = self.device.stream
@@ -87,6 +99,11 @@ class HostCopy:
         for target, source in zip(self.target, self.source, strict=True):
             wp.copy(target, source, stream=stream)
         stream.record_event(self.done)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the copies that were started are done."""
+        return self.done is None or self.done.is_complete
 
     def wait(self) -> list[np.ndarray]:
         """Wait for the copies and return them as NumPy arrays (views, no further copy)."""

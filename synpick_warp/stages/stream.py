@@ -111,16 +111,30 @@ def name_lights(names: list[str], lights: Any) -> LightTable:
 class TickReader:
     """Copies the results of a tick to the host, except images: some kilobytes a world."""
 
-    def __init__(self, record: TickRecord) -> None:
-        first = [record.status.table, record.status.measures, record.snapshot.catalog_index, record.snapshot.pose]
-        self.parts = [(part, [item.name for item in fields(part)]) for part in (record.observation, record.plan)]
-        self.parts.append((record.snapshot, list(_SNAPSHOT)))
+    def __init__(self, record: TickRecord, target: list[wp.array] | None = None) -> None:
+        """
+        Args:
+            record: What a tick is written into.
+            target: Arrays on the host for copies of `reported`; None: the reader's own.
+        """
+        self.parts = _reported_parts(record)
         self.physics = record_arrays(record.physics) if record.physics is not None else []
-        self.copy = HostCopy(first + [getattr(part, name) for part, names in self.parts for name in names] + self.physics)
+        self.copy = HostCopy(self.reported(record), target)
+
+    @staticmethod
+    def reported(record: TickRecord) -> list[wp.array]:
+        """Arrays of a record that a report copies."""
+        first = [record.status.table, record.status.measures, record.snapshot.catalog_index, record.snapshot.pose]
+        arrays = first + [getattr(part, name) for part, names in _reported_parts(record) for name in names]
+        return arrays + (record_arrays(record.physics) if record.physics is not None else [])
 
     def start(self) -> None:
         """Begin to copy the results of the tick."""
         self.copy.start(None)
+
+    def phase(self) -> np.ndarray | None:
+        """Phases of the worlds (world) int32, valid until the next copy begins; None: the copy is not done."""
+        return self.copy.target[0].numpy()[:, column_names(Status)["phase"]] if self.copy.is_done else None
 
     def wait(self) -> TickReport:
         """Wait for the copy and return the report. It owns its arrays, except `tick` and `steps`: valid until the record is reused."""
@@ -135,6 +149,12 @@ class TickReader:
         columns = dict(zip(column_names(Status), report.status.T, strict=True))
         columns |= dict(zip(column_names(Measure), report.measures.T, strict=True))
         return replace(report, tick=tick | tick_measures(columns, report.catalog_index.shape[1]), steps=steps)
+
+
+def _reported_parts(record: TickRecord) -> list[tuple[Any, list[str]]]:
+    """Parts of a record that a report has as namespaces, with the names of their arrays."""
+    parts: list[tuple[Any, list[str]]] = [(part, [item.name for item in fields(part)]) for part in (record.observation, record.plan)]
+    return [*parts, (record.snapshot, list(_SNAPSHOT))]
 
 
 def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> TickBatch:

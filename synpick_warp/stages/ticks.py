@@ -1,84 +1,128 @@
-"""Double-buffered tick loop: the device simulates tick t + 1 while tick t is rendered, copied and read."""
+"""Tick loop with a bounded lead: the device simulates following ticks while earlier ones are rendered, copied and read."""
 
 from __future__ import annotations
 
 import contextlib
-import itertools
+from collections import deque
 from collections.abc import Iterator
 from types import TracebackType
 from typing import Self
 
 import warp as wp
 
+from synpick_warp.codes import Phase
 from synpick_warp.stages.buffers import Snapshot
-from synpick_warp.stages.sim.simulate import RECORDS, Simulation
-from synpick_warp.stages.stream import TickReader, TickReport
+from synpick_warp.stages.sim.physics import ENDED
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.stream import TickReport
+from synpick_warp.stages.tick_queue import TickQueue, queue_lead, record_bytes
 from synpick_warp.stages.timing import scope
 
 HIGH_PRIORITY = -1
 """CUDA stream priority of physics: its 25,000 short kernels a tick wait for each other, and should not also wait for the renderer's."""
 PARTS_AHEAD = 24
-"""Parts of the next tick, mostly substeps, that are enqueued before waiting for the report of this one. On an H200 some 40 of 66 parts
-fill a stream's queue, and further launches block the host: with all parts at once the renderer idled for 0.25 s a tick."""
-PARTS_PER_BATCH = 4
-"""Parts of a tick to enqueue per batch of views: beside a renderer they take about as long as the batch."""
+"""Parts of ticks, mostly substeps, that the device has to do before more are enqueued. On an H200 some 40 parts fill a stream's queue, and
+further launches block the host: with all 66 parts of a tick at once the renderer idled for 0.25 s a tick."""
 
 
 class TickLoop:
-    """Tick loop of a simulation, one tick ahead; a context manager, which starts the first tick and at its end waits for the last.
+    """Tick loop of a simulation that is ahead of its renderer; a context manager, which starts the first tick and at its end waits for the
+    last.
 
-    On a GPU physics has its own CUDA stream. Each tick waits for all work that was queued on the device's current stream when the tick
-    began, so that no record is overwritten while it is rendered. Work on other streams that reads a record must be awaited by the
-    current stream before the next `advance`.
+    On a GPU physics has its own CUDA stream, and is one tick ahead as long as episodes wait for worlds. Then worlds fall idle one by one,
+    a tick has fewer views to render, but physics takes nearly as long; so from there on it may be ahead by all of the queue, and the
+    renderer has ticks in store when physics becomes the slower of the two. On a CPU they take turns.
+
+    Work on other streams that reads a snapshot must be awaited by the device's current stream before the next `advance`.
     """
 
-    def __init__(self, simulation: Simulation) -> None:
-        self.simulation = simulation
-        self.readers = [TickReader(record) for record in simulation.records]
-        device = simulation.device
-        self.stream = wp.Stream(device, priority=HIGH_PRIORITY) if device.is_cuda else None
-        self._current = 0
-        self._parts: Iterator[None] = iter(())
-        """What is left to enqueue of the latest tick."""
+    def __init__(self, simulation: Simulation, lead: int | None = None) -> None:
+        """Allocate the queue.
+
+        Args:
+            simulation: The worlds.
+            lead: Most ticks that physics may be ahead; None: by `queue_lead`.
+        """
+        self.simulation, self.device = simulation, simulation.device
+        self.max_lead = queue_lead(record_bytes(simulation.record), self.device) if lead is None else lead
+        self.lead = min(1, self.max_lead)
+        if len(simulation.episodes) <= simulation.layout.worlds:
+            self.lead = self.max_lead
+        self.queue = TickQueue(simulation.record, self.max_lead + 1)
+        self.stream = wp.Stream(self.device, priority=HIGH_PRIORITY) if self.device.is_cuda else None
+        self._parts: Iterator[None] | None = None
+        """What is left to enqueue of the tick begun last; None: nothing."""
+        self._enqueued = self._simulated = self._taken = 0
+        """Ticks that are enqueued as a whole, that the device was seen to have done, and that `advance` has returned."""
+        self._is_over = False
+        """Whether all worlds were idle in the last simulated tick."""
+        self._running: deque[wp.Event] = deque()
+        """Ends of the parts that the device may not have done, oldest first."""
+        self._spare: list[wp.Event] = []
 
     def __enter__(self) -> Self:
-        self._begin(self._current)
+        if self.stream is not None:
+            self.stream.wait_stream(self.device.stream)  # It clears the arrays.
+        self.enqueue()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        """Discard the parts of the tick that are not yet enqueued, and wait for its stream, before other streams free the tick's arrays.
+        """Discard the parts that are not yet enqueued, and wait for physics' stream, before other streams free its arrays.
 
         The simulation may stop in the middle of a tick, and cannot be continued.
         """
-        self._parts = iter(())
+        self._parts = None
         if self.stream is not None:
             with contextlib.suppress(RuntimeError):  # A failed device; the error that ends the loop tells it.
                 wp.synchronize_stream(self.stream)
 
     def advance(self) -> tuple[TickReport, Snapshot]:
-        """Begin tick t + 1, wait for tick t, and return its report and snapshot; the snapshot is valid until the next call."""
+        """Wait for the next tick, and return its report and snapshot, which are valid until the next call."""
+        if self._taken:
+            self.queue.release(self._taken - 1)
+        self._taken += 1
+        with self._scope():
+            while self._enqueued < self._taken:
+                self._enqueue_part()
         self.enqueue()
-        current = self._current
-        self._current = (current + 1) % RECORDS
-        self._begin(self._current)
         with scope("wait for tick"):
-            report = self.readers[current].wait()
-        return report, self.simulation.records[current].snapshot
+            return self.queue.get(self._taken - 1)
 
-    def enqueue(self, parts: int | None = None) -> None:
-        """Enqueue the next `parts` parts of the tick that `advance` began, None: all. Call it between batches, while rendering tick t."""
-        with wp.ScopedStream(self.stream, sync_enter=False), scope("simulate", self.simulation.device):
-            for _ in itertools.islice(self._parts, parts):
-                pass
+    def enqueue(self) -> None:
+        """Keep the device busy with the following ticks. Call it between batches, while rendering this one."""
+        while self._running and self._running[0].is_complete:
+            self._spare.append(self._running.popleft())
+        self._look_ahead()
+        with self._scope():
+            while len(self._running) < PARTS_AHEAD and (self._parts is not None or self._may_begin()):
+                self._enqueue_part()
 
-    def _begin(self, record: int) -> None:
-        """Begin a tick: enqueue its first parts."""
+    def _look_ahead(self) -> None:
+        """Look at the phases of the ticks that the device has done meanwhile."""
+        while self._simulated < self._enqueued and (phase := self.queue.phase(self._simulated)) is not None:
+            self._simulated += 1
+            is_idle = phase == Phase.IDLE
+            self._is_over = bool(is_idle.all())
+            if is_idle.any():
+                self.lead = self.max_lead
+
+    def _may_begin(self) -> bool:
+        """Whether a further tick may begin before `advance` asks for it."""
+        return not self._is_over and self._enqueued < self._taken + self.lead
+
+    @contextlib.contextmanager
+    def _scope(self) -> Iterator[None]:
+        """Make physics' stream the current one."""
+        with wp.ScopedStream(self.stream, sync_enter=False), scope("simulate", self.device):
+            yield
+
+    def _enqueue_part(self) -> None:
+        """Enqueue the next part; with the last one of a tick, its copy into the queue."""
+        self._parts = self._parts or self.simulation.tick_parts()
+        if next(self._parts, ENDED) is ENDED:
+            self.queue.put(self._enqueued)
+            self._parts = None
+            self._enqueued += 1
         if self.stream is not None:
-            self.stream.wait_stream(self.simulation.device.stream)
-        self._parts = self._run_tick(record)
-        self.enqueue(PARTS_AHEAD)
-
-    def _run_tick(self, record: int) -> Iterator[None]:
-        """Enqueue a tick and the copy of its report, in parts."""
-        yield from self.simulation.tick_parts(self.simulation.records[record])
-        self.readers[record].start()
+            event = self._spare.pop() if self._spare else wp.Event(self.device)
+            self._running.append(self.stream.record_event(event))

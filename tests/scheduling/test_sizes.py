@@ -43,7 +43,7 @@ def test_rounds_are_balanced(episodes, limit, worlds):
 
 @pytest.mark.parametrize(
     ("machine", "episodes", "worlds"),
-    [(GPU, 150, 100), (GPU, 60, 48), (GPU, 600, 300), (GPU, 2000, 500), (GPU, 3, 8), (CPU, 3, 3), (CPU, 6, 3), (CPU, 150, 4)],
+    [(GPU, 150, 150), (GPU, 60, 60), (GPU, 600, 300), (GPU, 2000, 500), (GPU, 3, 8), (CPU, 3, 3), (CPU, 6, 3), (CPU, 150, 4)],
 )
 def test_worlds_follow_from_the_number_of_episodes(give, machine, episodes, worlds):
     config = load_config("synpick", {"bake.mode": "mixed"})

@@ -32,9 +32,8 @@ def track(device, worlds: int, disturb=None, episodes: int = EPISODES) -> dict[t
     for tick in range(LONGEST):
         if disturb:
             disturb(simulation, tick)
-        record = simulation.records[tick % 2]
-        simulation.tick(record)
-        seen, snapshot = report(record), record.snapshot
+        simulation.tick()
+        seen, snapshot = report(simulation.record), simulation.record.snapshot
         fixtures, light, turn = snapshot.fixture_pose.numpy(), snapshot.light.numpy(), snapshot.light_yaw.numpy()
         exposure = snapshot.light_exposure.numpy()
         for world in range(worlds):
@@ -202,8 +201,8 @@ def test_the_gripper_waits_outside_and_then_stands_above_the_first_corner(device
     simulation = Simulation(config, catalog(CUBE), 1, device)
     seen = []
     for _ in range(LONGEST):
-        simulation.tick(simulation.records[0])
-        seen.append((report(simulation.records[0]), simulation.records[0].snapshot.fixture_pose.numpy()[0].copy()))
+        simulation.tick()
+        seen.append((report(simulation.record), simulation.record.snapshot.fixture_pose.numpy()[0].copy()))
         if seen[-1][0].column("phase")[0] == Phase.IDLE:
             break
     live = [bool(row.column("live")[0]) for row, _ in seen]

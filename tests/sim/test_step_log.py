@@ -28,11 +28,11 @@ class Log:
         self.reports: list[TickReport] = []
         self.steps: list[dict[str, np.ndarray]] = []
         self.ticks: list[dict[str, np.ndarray]] = []
-        readers = [TickReader(row) for row in simulation.records]
-        for number in range(ticks):
-            simulation.tick(simulation.records[number % 2])
-            readers[number % 2].start()
-            made = readers[number % 2].wait()
+        reader = TickReader(simulation.record)
+        for _ in range(ticks):
+            simulation.tick()
+            reader.start()
+            made = reader.wait()
             self.reports.append(made)
             self.steps.append({name: values.copy() for name, values in made.steps.items()})
             self.ticks.append({name: values.copy() for name, values in made.tick.items()})
@@ -226,9 +226,9 @@ def episodes(device, worlds: int, recorded: bool) -> dict[tuple[int, int], bytes
     """Results of each live tick of each episode in a number of worlds."""
     config = settings(bake__worlds=worlds, bake__episodes=3, **COARSE)
     simulation = Simulation(config, catalog(), 1, device, records_physics=recorded)
-    reader, made = TickReader(simulation.records[0]), {}
+    reader, made = TickReader(simulation.record), {}
     for _ in range(LONGEST):
-        simulation.tick(simulation.records[0])
+        simulation.tick()
         reader.start()
         row = reader.wait()
         batch = tick_batch(row, np.array([1, 2, 3], np.int32), 0.064)

@@ -45,9 +45,9 @@ def measured(tmp_path_factory):
             )
         )
 
-    def watch_tick(self: Simulation, record) -> None:
-        tick(self, record)
-        simulations.append((self, record.snapshot.frame.numpy().copy()))
+    def watch_tick(self: Simulation) -> None:
+        tick(self)
+        simulations.append((self, self.record.snapshot.frame.numpy().copy()))
 
     with (
         mock.patch.multiple(pictures, HISTORY_TICKS=HISTORY_TICKS, KEPT_TICKS=KEPT_TICKS, ROUNDS=ROUNDS),
@@ -94,14 +94,14 @@ def test_each_pass_renders_each_view_of_each_kept_tick_once(measured):
 
 
 def test_kept_snapshots_are_copies(measured):
-    """They hold successive frames, though the simulation has overwritten its records since."""
+    """They hold successive frames, though the simulation has overwritten its record since."""
     _, passes = split_passes(measured)
     snapshots = list(dict.fromkeys(batch.snapshot for batch in next(iter(passes.values()))[0]))
     assert len(snapshots) == KEPT_TICKS
     simulated = [frame for _, frame in measured.ticks[-KEPT_TICKS:]]
     assert [snapshot.frame.numpy().tolist() for snapshot in snapshots] == [frame.tolist() for frame in simulated]
     simulation = measured.ticks[0][0]
-    taken = {getattr(record.snapshot, name).ptr for record in simulation.records for name in vars(record.snapshot)}
+    taken = {array.ptr for array in vars(simulation.record.snapshot).values()}
     kept = [getattr(snapshot, name).ptr for snapshot in snapshots for name in vars(snapshot)]
     assert len(set(kept)) == len(kept)
     assert not taken & set(kept)

@@ -99,6 +99,6 @@ def run_ticks(simulation: Simulation, ticks: int) -> list[TickReport]:
     """Run ticks; return their reports."""
     reports = []
     for _ in range(ticks):
-        simulation.tick(simulation.records[0])
-        reports.append(report(simulation.records[0]))
+        simulation.tick()
+        reports.append(report(simulation.record))
     return reports

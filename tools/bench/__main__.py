@@ -219,7 +219,7 @@ def _measure_worlds(config: Config, factory: Factory, min_seconds: float, parts:
     if "encode" in parts:
         count = min(factory.stream.batch, factory.simulation.layout.worlds * len(factory.cameras))
         images = factory.stream.buffers[0]
-        factory.stream.renderer.render(factory.simulation.records[0].snapshot, _first_views(factory, count), images)
+        factory.stream.renderer.render(factory.simulation.record.snapshot, _first_views(factory, count), images)
         yield from measure_encoding(images, count, config.bop.jpeg_quality, factory.simulation.device, min_seconds)
     if "sensor" in parts:
         yield from measure_sensor(config, factory, min_seconds)
@@ -245,7 +245,7 @@ def _memory_in_use(device: wp.Device) -> Row:
 
 def _mark_live(simulation: Simulation, worlds: int) -> TickReport:
     """Report of the last tick, marked as a frame of the first `worlds` worlds alone."""
-    reader = TickReader(simulation.records[0])
+    reader = TickReader(simulation.record)
     reader.start()
     report = reader.wait()
     report.status[:, Status.LIVE] = np.arange(simulation.layout.worlds) < worlds
@@ -261,7 +261,7 @@ def _measure_rendering(config: Config, factory: Factory, min_seconds: float) -> 
     views, out, renderer = _first_views(factory, count), stream.buffers[0], stream.renderer
 
     def render() -> None:
-        renderer.render(simulation.records[0].snapshot, views, out)
+        renderer.render(simulation.record.snapshot, views, out)
 
     spent = {name: seconds / count for name, seconds in _time_passes(render, device, min_seconds).items()}
     spent["all"] = seconds_per_call(render, device, min_seconds / 4, BURST) / count
@@ -281,7 +281,7 @@ def _measure_rendering(config: Config, factory: Factory, min_seconds: float) -> 
         yield Row("render", "views copied to the host", stream.batch / seconds, "1/s")
     worlds = min(simulation.layout.worlds, -(-STREAM_BATCHES * stream.batch // cameras))
     report = _mark_live(simulation, worlds)
-    seconds = seconds_per_call(lambda: [len(batch) for batch in stream.render(simulation.records[0].snapshot, report)], device, min_seconds)
+    seconds = seconds_per_call(lambda: [len(batch) for batch in stream.render(simulation.record.snapshot, report)], device, min_seconds)
     yield Row("render", "views, all stages and copies", worlds * cameras / seconds, "1/s")
 
 

@@ -6,7 +6,6 @@ pictures show these piles.
 
 from __future__ import annotations
 
-import functools
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -86,11 +85,11 @@ class Assets:
         """Drop piles and time ticks of their physics."""
         simulation = Simulation(config, self.catalog, len(self.lights), self.device, scene, range(config.bake.worlds))
         simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = FOREVER
-        tick = functools.partial(simulation.tick, simulation.records[0])
+        tick = simulation.tick
         for _ in range(DROP_TICKS):
             tick()
         seconds = seconds_per_call(tick, self.device, self.min_seconds, BURST)
-        snapshot = simulation.records[0].snapshot
+        snapshot = simulation.record.snapshot
         return Pile(snapshot, float((snapshot.catalog_index.numpy() >= 0).sum(axis=1).mean()), seconds)
 
     def time_view(self, config: Config, scene: RenderScene, pile: Pile) -> float:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import statistics
 import time
 from collections import defaultdict
@@ -118,7 +117,7 @@ def measure_simulation(factory: Factory, min_seconds: float, parts: tuple[str, .
         parts: Parts to measure: "physics": ticks; "perception": perception.
     """
     simulation = factory.simulation
-    tick = functools.partial(simulation.tick, simulation.records[0])
+    tick = simulation.tick
     settle = simulation.scene.settle
     rest_ticks, settle.rest_ticks, settle.max_ticks = settle.rest_ticks, FOREVER, FOREVER
     simulation.scene.move.start_height = START_HEIGHT
@@ -226,13 +225,13 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Ro
         pile_seconds: Time of a tick's steps with the pile alone, for comparison [s]; 0: not measured.
     """
     device, perception, worlds = simulation.device, simulation.perception, simulation.layout.worlds
-    reader, watch = TickReader(simulation.records[0]), Stopwatch(device)
+    reader, watch = TickReader(simulation.record), Stopwatch(device)
     perceptions, attached, acting = 0, 0, 0
     wp.synchronize_device(device)
     started = time.perf_counter()
     with watch.time_generator(simulation.physics, "tick_parts", "steps"), watch.time_method(perception, "perceive", "perception"):
         for _ in range(PICK_TICKS):
-            simulation.tick(simulation.records[0])
+            simulation.tick()
             reader.start()
             report = reader.wait()
             act = report.column("phase") == Phase.ACT
@@ -255,7 +254,7 @@ def _measure_picking(simulation: Simulation, pile_seconds: float) -> Iterator[Ro
 
 def _measure_perception(simulation: Simulation, min_seconds: float) -> Iterator[Row]:
     """Benchmark of perception and planning by stage, in full batches."""
-    perception, snapshot = simulation.perception, simulation.records[0].snapshot
+    perception, snapshot = simulation.perception, simulation.record.snapshot
     assert perception is not None  # The mode has worlds that pick.
     simulation.state.phase.fill_(Phase.ACT)
     simulation.attempts.task.fill_(Task.LOOK)

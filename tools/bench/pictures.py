@@ -124,18 +124,17 @@ def start_acting(factory: Factory) -> None:
 
 
 def keep_tick(factory: Factory) -> KeptTick:
-    """Simulate a tick, and copy what its rendering needs: the simulation overwrites its records."""
+    """Simulate a tick, and copy what its rendering needs: the simulation overwrites its record."""
     world, camera = select_views(_tick(factory), len(factory.cameras))
-    snapshot = factory.simulation.records[0].snapshot
+    snapshot = factory.simulation.record.snapshot
     copy = Snapshot(**{item.name: wp.clone(getattr(snapshot, item.name)) for item in fields(snapshot)})
     return KeptTick(copy, list(batch_views(world, camera, factory.stream.batch, factory.stream.renderer)))
 
 
 def _tick(factory: Factory) -> TickReport:
-    """Simulate a tick into the first record, and wait for its report."""
-    record = factory.simulation.records[0]
-    factory.simulation.tick(record)
-    reader = TickReader(record)
+    """Simulate a tick, and wait for its report."""
+    factory.simulation.tick()
+    reader = TickReader(factory.simulation.record)
     reader.start()
     return reader.wait()
 

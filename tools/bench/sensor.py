@@ -216,7 +216,7 @@ def measure_sensor(config: Config, factory: Factory, min_seconds: float) -> Iter
     sensor has no light maps, amodal bits, counts, boxes, or texture minification.
     """
     simulation, renderer = factory.simulation, factory.stream.renderer
-    device, snapshot = simulation.device, simulation.records[0].snapshot
+    device, snapshot = simulation.device, simulation.record.snapshot
     count = min(factory.stream.batch, simulation.layout.worlds * len(factory.cameras))
     started = time.perf_counter()
     fixtures = make_fixtures(config.tote, config.gripper)
@@ -264,7 +264,7 @@ class _OurRenderer:
 
     def __init__(self, config: Config, factory: Factory, count: int) -> None:
         self.renderer, self.out = factory.stream.renderer, factory.stream.buffers[0]
-        self.snapshot = factory.simulation.records[0].snapshot
+        self.snapshot = factory.simulation.record.snapshot
         scene, cameras, view = self.renderer.scene, len(factory.cameras), np.arange(count, dtype=np.int32)
         world, camera = (wp.array(v, dtype=wp.int32, device=scene.device) for v in (view // cameras, view % cameras))
         self.views = make_views(world, camera, count, self.renderer.instances)

@@ -22,7 +22,7 @@ from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views
 from synpick_warp.stages.stream import TickReport, view_sizes
-from synpick_warp.stages.ticks import PARTS_PER_BATCH, TickLoop
+from synpick_warp.stages.ticks import TickLoop
 from tools.bench.physics import Row
 
 ROUNDS = 5
@@ -38,7 +38,7 @@ class _StillProducer(Producer):
 
     def batches(self) -> Iterator[ViewBatch]:
         while True:
-            yield from self.render(self.still, self.stages.simulation.records[0].snapshot)
+            yield from self.render(self.still, self.stages.simulation.record.snapshot)
 
 
 def measure_stream(config: Config, factory: Factory, report: TickReport, min_seconds: float) -> Iterator[Row]:
@@ -92,7 +92,7 @@ def _compare(sources: dict[str, Iterator[int]], device: wp.Device, min_seconds: 
 
 def _render_loop(stages: Stages, ring: BatchRing, report: TickReport) -> Iterator[int]:
     """Render the views of one tick repeatedly into one buffer; yields the number of views of each batch."""
-    snapshot, (world, camera) = stages.simulation.records[0].snapshot, select_views(report, len(stages.cameras))
+    snapshot, (world, camera) = stages.simulation.record.snapshot, select_views(report, len(stages.cameras))
     while True:
         yield from _render_all(stages, ring, snapshot, world, camera)
 
@@ -156,5 +156,5 @@ def _tick_loop(stages: Stages, ring: BatchRing) -> Iterator[int]:
                 return
             world, camera = select_views(report, len(stages.cameras))
             for views in _render_all(stages, ring, snapshot, world, camera):
-                ticks.enqueue(PARTS_PER_BATCH)
+                ticks.enqueue()
                 yield views

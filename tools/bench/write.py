@@ -62,7 +62,7 @@ def measure_writing(config: Config, factory: Factory, report: TickReport, min_se
         report: Selects the worlds whose views are written.
         min_seconds: Time of a measurement, at least [s].
     """
-    snapshot = factory.simulation.records[0].snapshot
+    snapshot = factory.simulation.record.snapshot
     batches = [_copy(batch) for batch in factory.stream.render(snapshot, report)]
     layers = {name: np.concatenate([batch.layers[name] for batch in batches]) for name in batches[0].layers}
     names = [name for name, array in vars(batches[0]).items() if isinstance(array, np.ndarray)]

@@ -126,13 +126,12 @@ def simulate(config: Config, worlds: int, max_ticks: int, records: bool = False)
     """Simulate all episodes; returns the state after each tick, and the median time of a tick [ms]."""
     config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, worlds=worlds))
     simulation = build_factory(config, SilentProgress(), records_physics=records).simulation
-    readers = [TickReader(record) for record in simulation.records]
+    reader = TickReader(simulation.record)
     ticks: Ticks = defaultdict(list)
     times = []
-    for index in range(max_ticks):
-        record, reader = simulation.records[index % len(readers)], readers[index % len(readers)]
+    for _ in range(max_ticks):
         started = time.perf_counter()
-        simulation.tick(record)
+        simulation.tick()
         wp.synchronize_device(simulation.device)
         times.append(1e3 * (time.perf_counter() - started))
         if _append_tick(reader, ticks):

@@ -30,8 +30,8 @@ from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import HostCopy
 from synpick_warp.stages.render.view_setup import make_views
-from synpick_warp.stages.sim.simulate import RECORDS
-from synpick_warp.stages.stream import TickReader, TickReport
+from synpick_warp.stages.stream import TickReport
+from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.device import pick_device
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, print_machine, write_json
 from tools.reports.pick_tally import MODES, PAPER, ModeRow, Tally, report, sum_visibility
@@ -189,29 +189,21 @@ class Meter:
 def simulate(factory: Factory, visibility: VisibilityCounter | None, tally: Tally) -> Iterator[None]:
     """Simulate until all selected sequences have ended; yields after each tick.
 
-    The device simulates the next tick while the host evaluates this one, as in a bake.
+    A GPU simulates the next tick while the host evaluates this one, as in a bake.
     """
-    simulation = factory.simulation
-    readers = [TickReader(record) for record in simulation.records]
-    simulation.tick(simulation.records[0])
-    readers[0].start()
     pending: TickReport | None = None
-    ticks = 0
-    while not tally.complete():
-        current, following = ticks % RECORDS, (ticks + 1) % RECORDS
-        simulation.tick(simulation.records[following])
-        readers[following].start()
-        now = readers[current].wait()
-        if pending is not None:
-            tally.add_tick(pending, visibility.wait() if visibility is not None else {})
-        if visibility is not None:
-            visibility.start(simulation.records[current].snapshot, now)
-        pending = now
-        ticks += 1
-        yield
-        if (now.column("phase") == Phase.IDLE).all():
-            tally.add_tick(now, visibility.wait() if visibility is not None else {})
-            return
+    with TickLoop(factory.simulation) as ticks:
+        while not tally.complete():
+            now, snapshot = ticks.advance()
+            if pending is not None:
+                tally.add_tick(pending, visibility.wait() if visibility is not None else {})
+            if visibility is not None:
+                visibility.start(snapshot, now)
+            pending = now
+            yield
+            if (now.column("phase") == Phase.IDLE).all():
+                tally.add_tick(now, visibility.wait() if visibility is not None else {})
+                return
 
 
 def print_report(console: Console, machine: list[tuple[str, str]], rows: list[ModeRow], tally: Tally, rates: dict[str, float]) -> None:

@@ -154,10 +154,10 @@ def settle_piles(config: Config, catalog: Catalog, lights: int, device: Any) -> 
     count = config.bake.worlds
     config = with_enough_worlds(config, device)
     simulation = Simulation(config, catalog, lights, device)
-    record = simulation.records[0]
+    record = simulation.record
     piles: dict[int, dict[str, np.ndarray]] = {}
     for _ in range(MAX_TICKS):
-        simulation.tick(record)
+        simulation.tick()
         host = {item.name: getattr(record.snapshot, item.name).numpy() for item in fields(Snapshot)}
         for world in np.flatnonzero(simulation.state.phase.numpy() == Phase.ACT):
             piles.setdefault(int(world), {name: array[world].copy() for name, array in host.items()})

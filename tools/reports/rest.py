@@ -139,11 +139,11 @@ def settle(simulation: Simulation, catalog: Catalog, results: Results, report_pr
     """Simulate until every arrangement is at rest or has failed, and add the measured values to `results`."""
     config = simulation.config
     reported = time.perf_counter()
-    record = simulation.records[0]
+    record = simulation.record
     reader = TickReader(record)
     before: TickReport | None = None
     while True:
-        simulation.tick(record)
+        simulation.tick()
         reader.start()
         report = reader.wait()
         phase = report.column("phase")

@@ -29,11 +29,6 @@ JOINT_LIMIT_GAP = 0.2
 VELOCITY_LIMIT_FRACTION = 0.5
 # On an H200, models of one and two worlds round differently from those of 8, 64 and 512, which agree bit by bit.
 MIN_GPU_WORLDS = 8
-# Automatic number of worlds on a GPU: at most this fraction of the episodes, so that worlds whose episodes end early start others while
-# long ones run; but enough for BUSY_VIEWS views a tick, which an H200 renders in the time of a tick of physics in few worlds, 0.2 s.
-# Monte Carlo of list scheduling with measured lengths and times; mean rate of a whole bake over the rate with 300 worlds:
-# 150 episodes: 0.72 in 150 worlds, 0.78 in 100. 300 episodes: 0.81 in 300, 0.88 in 200. 600 episodes: 0.93 in 150 to 300.
-GPU_WORLDS_PER_EPISODE, BUSY_VIEWS = 2.0 / 3.0, 144
 # Maximum worlds if `bake.worlds` is 0. On a GPU more worlds need memory and hide more of the latency of physics, which pictures hide as
 # well; on a CPU worlds are simulated one after the other, so that more of them gain nothing.
 MAX_GPU_WORLDS, MAX_CPU_WORLDS = 512, 4
@@ -47,8 +42,9 @@ def balance_worlds(episodes: int, limit: int) -> int:
 def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None = None) -> Config:
     """Resolve `bake.worlds`: as set, or if 0 from the number of episodes; on a GPU at least MIN_GPU_WORLDS.
 
-    Automatic: balanced rounds (`balance_worlds`), on a GPU limited by GPU_WORLDS_PER_EPISODE. The minimum keeps episodes independent of
-    the number of worlds; surplus worlds idle.
+    Automatic: balanced rounds (`balance_worlds`). Where all episodes fit, they run at once: the longest one decides when physics ends, and
+    the renderer has ticks in store until then (`TickLoop`). The minimum keeps episodes independent of the number of worlds; surplus
+    worlds idle.
 
     Args:
         config: All settings.
@@ -59,9 +55,6 @@ def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None =
     if not worlds:
         count = sum(map(len, plan_episodes(config))) if episodes is None else episodes
         worlds = balance_worlds(count, MAX_GPU_WORLDS if device.is_cuda else MAX_CPU_WORLDS)
-        if device.is_cuda:
-            busy = math.ceil(BUSY_VIEWS / len(config.cameras.positions))
-            worlds = min(worlds, max(busy, math.ceil(GPU_WORLDS_PER_EPISODE * count)))
     worlds = max(worlds, MIN_GPU_WORLDS) if device.is_cuda else worlds
     return config if worlds == config.bake.worlds else replace(config, bake=replace(config.bake, worlds=worlds))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import newton
@@ -29,13 +29,10 @@ from synpick_warp.stages.sim.suction import Suction
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.timing import scope
 
-# Ring size of tick records: one is written while the host reads the previous one.
-RECORDS = 2
-
 
 @dataclass(frozen=True, eq=False)
 class TickRecord:
-    """Output of one tick, for rendering and for the host."""
+    """Output of the last tick, for rendering and for the host; the next tick overwrites it."""
 
     snapshot: Snapshot
     status: WorldStatus
@@ -93,7 +90,9 @@ class Simulation:
             self.recorder = Recorder(
                 config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
             )
-        self.records = tuple(self._make_record(sizes) for _ in range(RECORDS))
+        physics = self.recorder.new_record() if self.recorder is not None else None
+        snapshot, status = allocate(Snapshot, sizes, device), allocate(WorldStatus, sizes, device)
+        self.record = TickRecord(snapshot, status, self.observation, self.plan, physics)
         self.suction: Suction | None = None
         self.perception: Perception | None = None
         if may_pick(config):
@@ -103,16 +102,12 @@ class Simulation:
             state = (self.scene, self.state, self.attempts, self.observation, self.plan)
             self.perception = Perception(config.perception, config.cameras, config.bake.seed, render_scene, *state)
 
-    def _make_record(self, sizes: dict[str, int]) -> TickRecord:
-        physics = self.recorder.new_record() if self.recorder is not None else None
-        return TickRecord(*(allocate(kind, sizes, self.device) for kind in (Snapshot, WorldStatus, Observation, Plan)), physics=physics)
-
-    def tick(self, record: TickRecord) -> None:
-        """Advance all worlds by one tick and write the result to `record`, one of `records`."""
-        for _ in self.tick_parts(record):
+    def tick(self) -> None:
+        """Advance all worlds by one tick; `record` has its output."""
+        for _ in self.tick_parts():
             pass
 
-    def tick_parts(self, record: TickRecord) -> Iterator[None]:
+    def tick_parts(self) -> Iterator[None]:
         """Advance all worlds by one tick: a generator that yields after episodes are started and after each substep of physics.
 
         The caller can enqueue other work on other streams between.
@@ -131,15 +126,13 @@ class Simulation:
         with scope("judge", self.device):
             self._judge()
         with scope("snapshot", self.device):
-            self._take_snapshot(record)
-            if self.recorder is not None and record.physics is not None:
-                self.recorder.take(record.physics)
+            self._take_snapshot()
+            if self.recorder is not None and self.record.physics is not None:
+                self.recorder.take(self.record.physics)
         if self.perception is not None:
             with scope("perceive", self.device):
-                self.perception.perceive(record.snapshot)
+                self.perception.perceive(self.record.snapshot)
                 gripper.begin_attempts(self.scene, self.state, self.attempts, self.plan, self.physics)
-                _copy(record.observation, self.observation)
-                _copy(record.plan, self.plan)
 
     def clear_graphs(self) -> None:
         """Drop captured graphs: the next tick launches all kernels one by one, and captures them anew."""
@@ -188,8 +181,8 @@ class Simulation:
         if self.suction is not None:
             self.suction.ignore_attached_contacts(self.scene, self.state, self.seals, self.physics)
 
-    def _take_snapshot(self, record: TickRecord) -> None:
-        state, attempts, snapshot, status = self.state, self.attempts, record.snapshot, record.status
+    def _take_snapshot(self) -> None:
+        state, attempts, snapshot, status = self.state, self.attempts, self.record.snapshot, self.record.status
         device = self.device
         wp.launch(
             pack.take_snapshot_kernel,
@@ -249,8 +242,3 @@ class Simulation:
 def _frame_poses(arrays: Snapshot | LastFrame) -> Any:
     """Fill the struct `FramePoses` from arrays of the same names."""
     return fill(pack.FramePoses, arrays)
-
-
-def _copy(target: Observation | Plan, source: Observation | Plan) -> None:
-    for item in fields(source):
-        wp.copy(getattr(target, item.name), getattr(source, item.name))

@@ -56,7 +56,7 @@ def measure_peers(config: Config, peers: tuple[str, ...], min_seconds: float) ->
     few = replace(config, bake=replace(config.bake, worlds=min(config.bake.worlds, PILE_WORLDS)))
     factory = build_factory(few, SilentProgress())
     _settle(factory.simulation)
-    pile = pick_pile(factory.catalog, factory.simulation.records[0].snapshot)
+    pile = pick_pile(factory.catalog, factory.simulation.record.snapshot)
     yield Row("setup", f"build and settle {few.bake.worlds} worlds", time.perf_counter() - started, "s")
     if "sensor-camera" in peers:
         yield from _guard("sensor", partial(measure_sensor, few, factory, min_seconds))
@@ -70,7 +70,7 @@ def _settle(simulation: Simulation) -> None:
     """Let new worlds drop their piles and come to rest."""
     simulation.scene.settle.rest_ticks = simulation.scene.settle.max_ticks = physics.FOREVER
     for _ in range(physics.FALL_TICKS + physics.SETTLE_TICKS):
-        simulation.tick(simulation.records[0])
+        simulation.tick()
 
 
 def _measure_physics(config: Config, pile: Pile, peers: tuple[str, ...], device: wp.Device) -> Iterator[Row]:

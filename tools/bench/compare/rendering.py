@@ -42,7 +42,7 @@ def measure_rendering(config: Config, factory: Factory, min_seconds: float) -> I
 def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: float) -> Iterator[Row]:
     """Benchmark of both renderers with images of `cameras.resolution` in `worlds` worlds."""
     cameras, device, scene = make_cameras(config.cameras), factory.simulation.device, factory.stream.renderer.scene
-    snapshot = tile_snapshot(factory.simulation.records[0].snapshot, worlds, device)
+    snapshot = tile_snapshot(factory.simulation.record.snapshot, worlds, device)
     count, pixels = worlds * len(cameras), cameras[0].width * cameras[0].height
     size = f"{cameras[0].width}x{cameras[0].height}, {worlds:,} world{'' if worlds == 1 else 's'}"
     yield Row(PART, f"{size}: views in a batch", count, "")
