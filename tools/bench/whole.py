@@ -49,11 +49,16 @@ class Stretch(NamedTuple):
 
 
 class _Trace(SilentProgress):
-    """Progress observer that records a point after each tick."""
+    """Progress observer that records a point after each tick, and when each stage begins."""
 
     def __init__(self) -> None:
         self.started = time.perf_counter()
         self.points: list[TracePoint] = []
+        self.stages: list[tuple[str, float]] = []
+
+    def stage(self, text: str) -> None:
+        """Record when a stage begins."""
+        self.stages.append((text, time.perf_counter() - self.started))
 
     def update(
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
@@ -79,6 +84,8 @@ def measure_whole(config: Config, episodes: int, steady_rate: float, traces: dic
     cameras = len(config.cameras.positions)
     traces["whole"] = describe_trace(trace.points, cameras)
     yield from summarize(trace.points, cameras, whole, steady_rate)
+    for text, seconds in trace.stages:
+        yield Row("whole", f"begin of: {text}", seconds, "s")
     if summary.stopped:
         raise KeyboardInterrupt
 
