@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import statistics
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +28,7 @@ part."""
 LEAD_TICKS = 2
 """Warm-up: ticks above LIVE_FRACTION before the measurement, which fill the writers' queues."""
 SLICE_SECONDS = 20.0
-"""Time over which the slowest and the fastest rate are taken [s]."""
+"""Length of the slices whose median, slowest and fastest rates are reported [s]."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,7 @@ def summarize_rates(part: str, unit: str, meter: SteadyMeter) -> Iterator[Row]:
     yield Row(part, f"{unit}s to disk", count / seconds, "1/s")
     rates = slice_rates(meter.readings, SLICE_SECONDS)
     if rates:
+        yield Row(part, f"{unit}s to disk, median of {len(rates)} times {SLICE_SECONDS:.0f} s", statistics.median(rates), "1/s")
         yield Row(part, f"{unit}s to disk, slowest {SLICE_SECONDS:.0f} s", min(rates), "1/s")
         yield Row(part, f"{unit}s to disk, fastest {SLICE_SECONDS:.0f} s", max(rates), "1/s")
     workers = "writers" if meter.devices == 1 else "writers and devices' processes"
