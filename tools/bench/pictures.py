@@ -1,10 +1,11 @@
-"""Benchmark of pictures alone: views per second of all stages of the renderer over successive ticks, with light histories as in a bake.
+"""Render-only benchmark: views per second of all stages of the renderer over successive ticks, with light histories as in a bake.
 
-The worlds act as at the beginning of the part steady. First HISTORY_TICKS ticks are simulated and rendered, so that the histories
-(`render.history`) are as long as a bake's; then KEPT_TICKS ticks are simulated and kept. Each pass renders the kept ticks in order, in the
-batches of a bake, and the device is synchronised at both ends only. Before the clock starts, the histories are restored to those before the
-first kept tick, so that every pass does the same work: its first tick, too, continues histories. Physics, encoders, copies to the host and
-writers do not run meanwhile. The size of a pass is fixed: `--seconds` has no part in it.
+Light histories (`render.history`) are the temporally accumulated light of coarse pixels. The worlds are simulated until most of them
+deliver frames, as for the benchmark part `steady`. Then HISTORY_TICKS ticks are simulated and rendered, so that the histories hold as many
+paths as in a bake; then KEPT_TICKS ticks are simulated and kept. Each pass renders the kept ticks in order, in the batches of a bake, and
+the device is synchronised at both ends only. Before each pass, outside the measured time, the histories are restored to those before the
+first kept tick, so that every pass does the same work, and even its first tick continues histories. Physics, encoders, copies to the host
+and writers do not run. The size of a pass is fixed: `--seconds` is ignored.
 """
 
 from __future__ import annotations
@@ -33,12 +34,13 @@ from tools.bench.steady import plan_spare_episodes
 from tools.bench.stream import batch_views, select_views
 
 HISTORY_TICKS = 24
-"""Ticks rendered before the measurement. Where nothing moves, a history has 8 paths after 1 + 2 * 2 + 4 * 4 = 21 frames and from there on
-traces a path in every 8th frame, the longest update period."""
+"""Ticks rendered before the measurement. Where nothing moves, a coarse pixel traces its 2nd path in the next frame, 2 more in every second
+frame and 4 more in every fourth: it has accumulated 8 after 1 + 2 * 2 + 4 * 4 = 21 frames, and then traces one in every 8th, its longest
+update period."""
 KEPT_TICKS = 1 << int(MAX_PERIOD_BITS)
 """Ticks of a pass: the longest update period, in which each coarse pixel traces at least one path."""
 ROUNDS = 5
-"""Passes of each renderer; the renderers take turns."""
+"""Passes of each renderer; the renderers alternate, so that changes of the device's clock affect both."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,7 @@ class KeptTick:
 
     snapshot: Snapshot
     batches: list[Any]
-    """The structs `Views` of its frames, in the order of a bake."""
+    """Its views in the batches of a bake, each a struct `Views`."""
 
     @property
     def views(self) -> int:
@@ -76,23 +78,24 @@ def light_history(renderer: Renderer) -> Any:
 
 
 def measure_pictures(config: Config) -> Iterator[Row]:
-    """Simulate, keep and render ticks: rows of counts, and of the rates with the history of the settings and without any.
+    """Simulate, keep and render ticks: rows of counts, and of the rates with `render.history` as set, and with 0.
 
     Args:
-        config: All settings. Beside the memory of a bake the device holds a copy of the histories, and scratch of a second renderer.
+        config: All settings. More device memory is needed than for a bake: for a copy of the histories, the kept snapshots, and the scratch
+            arrays of a second renderer.
     """
     started = time.perf_counter()
     config = plan_spare_episodes(config)
     kinds = load_exporter_classes(config.bake.formats)
     factory = build_factory(config, SilentProgress(), needs_images=any(kind.needs_images for kind in kinds))
     stream, device = factory.stream, factory.simulation.device
-    start_acting(factory)
+    simulate_until_live(factory)
     for _ in range(HISTORY_TICKS):
         render_ticks(stream, stream.renderer, [keep_tick(factory)])
     ticks = [keep_tick(factory) for _ in range(KEPT_TICKS)]
     views = sum(tick.views for tick in ticks)
     wp.synchronize_device(device)
-    yield Row("pictures", f"load, settle, and render {HISTORY_TICKS} ticks first", time.perf_counter() - started, "s")
+    yield Row("pictures", f"setup: load, drop objects, render {HISTORY_TICKS} ticks", time.perf_counter() - started, "s")
     yield Row("pictures", "ticks in a pass", len(ticks), "")
     yield Row("pictures", "views in a pass", views, "")
     yield Row("pictures", "views in a batch", stream.batch, "")
@@ -101,10 +104,10 @@ def measure_pictures(config: Config) -> Iterator[Row]:
     renderers = {"all stages": stream.renderer}
     history = light_history(stream.renderer)
     if history is not None:
-        live = history.paths.numpy()[history.frame.numpy() >= 0]
-        yield Row("pictures", "paths in a history before a pass, mean", float(live.mean()), "")
-        other = replace(config, render=replace(config.render, history=0))
-        renderers["all stages, render.history=0"] = make_renderer(other, stream.renderer.scene, stream.instances, stream.batch)
+        paths = history.paths.numpy()[history.frame.numpy() >= 0]  # NEVER, a negative index: no frame yet.
+        yield Row("pictures", "paths in a history before a pass, mean", float(paths.mean()), "")
+        without = replace(config, render=replace(config.render, history=0))
+        renderers["all stages, render.history=0"] = make_renderer(without, stream.renderer.scene, stream.instances, stream.batch)
     megapixels = 1e-6 * config.cameras.resolution[0] * config.cameras.resolution[1]
     for name, times in _time_passes(stream, renderers, ticks).items():
         rate = views / statistics.median(times)
@@ -115,8 +118,8 @@ def measure_pictures(config: Config) -> Iterator[Row]:
         yield Row("pictures", f"{name}: a view", 1e3 / rate, "ms")
 
 
-def start_acting(factory: Factory) -> None:
-    """Simulate until LIVE_FRACTION of the worlds have a frame, or all episodes have ended."""
+def simulate_until_live(factory: Factory) -> None:
+    """Simulate until LIVE_FRACTION of the worlds deliver frames, or all episodes have ended."""
     while True:
         report = _tick(factory)
         if report.column("live").mean() >= LIVE_FRACTION or (report.column("phase") == Phase.IDLE).all():
@@ -140,7 +143,7 @@ def _tick(factory: Factory) -> TickReport:
 
 
 def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick]) -> None:
-    """Render all views of some ticks in order, batch by batch, into the ring of buffers of a bake; launches only."""
+    """Render all views of some ticks in order, batch by batch, into the ring of buffers of a bake; does not synchronise."""
     slot = 0
     for tick in ticks:
         for views in tick.batches:
