@@ -30,8 +30,10 @@ from synpick_warp.stages.timing import scope
 BATCH_BYTES = 512 << 20
 # Size of color, depth, segmentation id and amodal bits of one pixel [bytes].
 PIXEL_BYTES = 3 + 2 + 1 + 4
-# Arrays of a snapshot that a report copies, besides catalog indices and poses.
+# Arrays of a snapshot in `TickReport.snapshot`.
 _SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
+# Arrays of a snapshot that a report copies.
+REPORTED_SNAPSHOT = ("catalog_index", "pose", *_SNAPSHOT)
 # Ring size of view batches: one is read while another is copied and a third is rendered.
 RING = 3
 

@@ -90,7 +90,7 @@ class Simulation:
             self.recorder = Recorder(
                 config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
             )
-        physics = self.recorder.new_record() if self.recorder is not None else None
+        physics = self.recorder.record if self.recorder is not None else None
         snapshot, status = allocate(Snapshot, sizes, device), allocate(WorldStatus, sizes, device)
         self.record = TickRecord(snapshot, status, self.observation, self.plan, physics)
         self.suction: Suction | None = None
@@ -127,8 +127,8 @@ class Simulation:
             self._judge()
         with scope("snapshot", self.device):
             self._take_snapshot()
-            if self.recorder is not None and self.record.physics is not None:
-                self.recorder.take(self.record.physics)
+            if self.recorder is not None:
+                self.recorder.end_tick()
         if self.perception is not None:
             with scope("perceive", self.device):
                 self.perception.perceive(self.record.snapshot)
