@@ -108,11 +108,11 @@ class HostCopy:
     def wait(self) -> list[np.ndarray]:
         """Wait for the copies and return them as NumPy arrays (views, no further copy)."""
         if self.done is not None:
-            _wait_idle(self.done)
+            wait_event(self.done)
         return [array.numpy() for array in self.target]
 
 
-def _wait_idle(event: wp.Event) -> None:
+def wait_event(event: wp.Event) -> None:
     """Wait for an event with pauses: `wp.synchronize_event` alone keeps a core busy, since CUDA asks the device without a pause."""
     started = time.monotonic()
     while not event.is_complete and (waited := time.monotonic() - started) < MAX_PAUSED_SECONDS:
