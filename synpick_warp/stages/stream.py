@@ -116,8 +116,8 @@ class TickReader:
     def __init__(self, record: TickRecord, target: list[wp.array] | None = None) -> None:
         """
         Args:
-            record: What a tick is written into.
-            target: Arrays on the host for copies of `reported`; None: the reader's own.
+            record: Record of each tick.
+            target: Arrays on the host for copies of `reported`; None: on a GPU the reader's own, on a CPU the record's.
         """
         self.parts = _reported_parts(record)
         self.physics = record_arrays(record.physics) if record.physics is not None else []
@@ -139,7 +139,8 @@ class TickReader:
         return self.copy.target[0].numpy()[:, column_names(Status)["phase"]] if self.copy.is_done else None
 
     def wait(self) -> TickReport:
-        """Wait for the copy and return the report. It owns its arrays, except `tick` and `steps`: valid until the record is reused."""
+        """Wait for the copy and return the report. It owns its arrays, except `tick` and `steps`: valid until the next copy begins, and on
+        a CPU without `target` until the next tick."""
         copied = self.copy.wait()
         last = len(copied) - len(self.physics)
         arrays = iter([array.copy() for array in copied[:last]])
