@@ -97,53 +97,6 @@ def test_without_waiting_episodes_physics_is_ahead_from_the_start(device):
         assert simulation.count == 3
 
 
-class FakeEvent:
-    """Stand-in for a CUDA event of a stream that never finishes by itself."""
-
-    def __init__(self, _: object) -> None:
-        self.is_complete = False
-
-
-class FakeStream:
-    """Stand-in for a CUDA stream."""
-
-    def wait_stream(self, stream: object) -> None:
-        pass
-
-    def record_event(self, event: FakeEvent) -> FakeEvent:
-        event.is_complete = False
-        return event
-
-
-@pytest.mark.parametrize("lead", [1, 5])
-def test_while_the_host_waits_for_a_tick_parts_of_the_next_are_enqueued(monkeypatch, lead):
-    """Else a GPU would be idle from the end of each tick until the host, which hands it over, asks for the next.
-
-    The stand-in for a GPU does one part whenever the host waits.
-    """
-    simulation = NumberingSimulation(wp.get_device("cpu"))
-    for name, value in (("Event", FakeEvent), ("ScopedStream", lambda *_, **__: contextlib.nullcontext()), ("synchronize_stream", id)):
-        monkeypatch.setattr(wp, name, value)
-    loop = ticks.TickLoop(simulation, lead)
-    loop.device, loop.stream = SimpleNamespace(stream=None), FakeStream()
-    done, get_phase = [], loop.queue.phase
-
-    def do_part(event: FakeEvent) -> None:
-        assert event is loop._running[0]
-        event.is_complete = True
-        done.append(event)
-
-    monkeypatch.setattr(ticks, "wait_event", do_part)
-    monkeypatch.setattr(loop.queue, "phase", lambda tick: get_phase(tick) if len(done) >= (tick + 1) * PARTS else None)
-    with loop:
-        for number in range(ALL_IDLE):
-            report, _ = loop.advance()
-            assert set(report.plan.target.tolist()) == {number}
-            assert len(done) == (number + 1) * PARTS
-            assert simulation.count == number + 2
-            assert len(loop._running) == ticks.PARTS_AHEAD
-
-
 def test_a_cpu_simulates_only_what_is_asked_for():
     simulation = NumberingSimulation(wp.get_device("cpu"))
     with ticks.TickLoop(simulation) as loop:
