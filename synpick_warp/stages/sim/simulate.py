@@ -32,7 +32,8 @@ from synpick_warp.stages.timing import scope
 
 @dataclass(frozen=True, eq=False)
 class TickRecord:
-    """Output of the last tick, for rendering and for the host; the next tick overwrites it."""
+    """Output of the last tick, for rendering and for the host; the next tick overwrites it. `observation` and `plan` are those of the
+    simulation itself."""
 
     snapshot: Snapshot
     status: WorldStatus
