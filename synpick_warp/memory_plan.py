@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -40,7 +40,7 @@ from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_siz
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.step_log import record_kinds, record_sizes
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
-from synpick_warp.stages.stream import RING, view_sizes
+from synpick_warp.stages.stream import REPORTED_SNAPSHOT, RING, view_sizes
 from synpick_warp.stages.tick_queue import queue_lead
 from synpick_warp.system.device import pick_device
 from synpick_warp.system.free_memory import free_device_memory, free_host_memory
@@ -223,12 +223,12 @@ def _physics_kinds(config: Config) -> tuple[type, ...]:
 
 
 def _simulation(config: Config) -> Iterator[Term]:
-    """State, record and step logs of the worlds."""
+    """State and record of the worlds."""
     sizes = _world_sizes(config)
     kinds = (WorldState, AttemptState, SealState, LastFrame, *_RECORD)
     yield _term(f"the state of {config.bake.worlds:,} worlds", _WORLDS, [(kind, sizes, 1) for kind in kinds])
     if recorded := _physics_kinds(config):
-        yield _term("records of physics steps", _STEPS, [(kind, sizes, 2) for kind in recorded])
+        yield _term("the record of physics steps", _STEPS, [(kind, sizes, 1) for kind in recorded])
 
 
 def queue_slots(config: Config, device: wp.Device) -> int:
@@ -238,17 +238,25 @@ def queue_slots(config: Config, device: wp.Device) -> int:
 
 
 def _queue(config: Config, device: wp.Device) -> Iterator[Term]:
-    """Snapshots of the queued ticks."""
+    """Snapshots of the queued ticks: arrays of all slots. Kernels index the part of a slot."""
     slots = queue_slots(config, device)
-    yield _term(f"a queue of {slots:,} ticks", _WORLDS, [(Snapshot, _world_sizes(config), slots)])
+    rows = _ring_rows("queued", Snapshot, _world_sizes(config), slots)
+    yield Term(f"a queue of {slots:,} ticks", tuple(rows), _WORLDS, indexed=False)
 
 
 def _queued_reports(config: Config, device: wp.Device) -> Iterator[Term]:
     """Reports of the queued ticks, on the host."""
-    slots, sizes = queue_slots(config, device), _world_sizes(config)
-    kinds = (WorldStatus, Observation, Plan, *_physics_kinds(config))
-    rows = [(f"copy of {name}", shape, unit, size) for kind in kinds for name, shape, unit, size in memory_table(kind, sizes)]
-    yield Term(f"reports of {slots:,} ticks", tuple(slots * rows), _STEPS if _physics_kinds(config) else _WORLDS, False)
+    slots, sizes, recorded = queue_slots(config, device), _world_sizes(config), _physics_kinds(config)
+    rows = _ring_rows("reported", Snapshot, sizes, slots, REPORTED_SNAPSHOT)
+    for kind in (WorldStatus, Observation, Plan, *recorded):
+        rows += _ring_rows("reported", kind, sizes, slots)
+    yield Term(f"reports of {slots:,} ticks", tuple(rows), _STEPS if recorded else _WORLDS, on_device=False, indexed=False)
+
+
+def _ring_rows(prefix: str, kind: type, sizes: dict[str, int], slots: int, only: Collection[str] | None = None) -> list[Row]:
+    """Rows of arrays that hold those of all slots of a queue, as `allocate_rings` makes them; `only`: these fields, None: all."""
+    rows = memory_table(kind, sizes | {"world": slots * sizes["world"]}, only)
+    return [(f"{prefix} {name}", shape, unit, size) for name, shape, unit, size in rows]
 
 
 def _images(config: Config, device: wp.Device, written: bool = True) -> Iterator[Term]:

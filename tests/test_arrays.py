@@ -8,7 +8,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import StructArrays, allocate, allocate_struct, device_array, memory_table, struct_arrays
-from synpick_warp.memory_plan import describe_arrays, queue_slots
+from synpick_warp.memory_plan import Row, describe_arrays, queue_slots
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
 from synpick_warp.stages.encoding.jpeg import JpegBuffers, JpegScratch
 from synpick_warp.stages.encoding.png import DEPTH_SCRATCH, DepthBuffers
@@ -145,17 +145,23 @@ def test_dimensions_that_contradict_the_struct_are_an_error(shape, others, messa
         struct_arrays(SampleStruct, *shape, **others)
 
 
+def kinds_of(rows: list[Row]) -> set[str]:
+    """Names of the declarations that a table lists."""
+    return {name.removeprefix("queued ").split(".")[0] for name, *_ in rows}
+
+
 def test_a_bakes_table_lists_every_array_with_its_copies():
     config = settings(bake__worlds=WORLDS, cameras__resolution=[8, 6], render__views_per_batch=3)
     rows = describe_arrays(config)
     names = [name for name, *_ in rows]
-    assert {name.split(".")[0] for name in names} == {kind.__name__ for kind in BASE}
+    assert kinds_of(rows) == {kind.__name__ for kind in BASE}
     assert names.count("Observation.votes") == names.count("Plan.target") == names.count("WorldStatus.table") == 1
-    assert names.count("Snapshot.pose") == 1 + queue_slots(config, pick_device(config.bake.device))
-    assert names.count("WorldState.phase") == 1
+    assert names.count("Snapshot.pose") == names.count("queued Snapshot.pose") == names.count("WorldState.phase") == 1
     assert names.count("ViewBuffers.color") == (RING if pick_device(config.bake.device).is_cuda else 1)
     by_name = {name: (shape, unit, size) for name, shape, unit, size in rows}
     assert by_name["Snapshot.pose"] == ((WORLDS, config.arrangement.max_objects), "m", 28 * WORLDS * config.arrangement.max_objects)
+    queued = queue_slots(config, pick_device(config.bake.device)) * WORLDS
+    assert by_name["queued Snapshot.pose"][0] == (queued, config.arrangement.max_objects)
     assert by_name["ViewBuffers.color"] == ((3, 6, 8), "", 3 * 6 * 8 * 3)
 
 
@@ -201,7 +207,7 @@ def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
     room = config.arrangement.max_objects
     looks = count_views(config.perception, config.bake.worlds, room, pick_device(config.bake.device))
     rows = describe_arrays(config)
-    assert {name.split(".")[0] for name, *_ in rows} == {kind.__name__ for kind in BASE + PERCEPTION}
+    assert kinds_of(rows) == {kind.__name__ for kind in BASE + PERCEPTION}
     shapes = {name: shape for name, shape, _, _ in rows if name.split(".")[0] in {kind.__name__ for kind in PERCEPTION}}
     assert shapes["PerceptionArrays.component"] == shapes["SegmentationScratch.gap"] == (looks, 48, 64)
     assert shapes["VoteArrays.count"] == (looks, room, room, 2)
@@ -210,7 +216,7 @@ def test_a_bake_that_may_pick_has_the_arrays_of_perception(mode):
 
 def test_a_mixture_without_picking_has_no_arrays_of_perception():
     config = settings(bake__mode="mixed", bake__mix=[0, 0, 1])
-    assert {name.split(".")[0] for name, *_ in describe_arrays(config)} == {kind.__name__ for kind in BASE}
+    assert kinds_of(describe_arrays(config)) == {kind.__name__ for kind in BASE}
 
 
 def test_fields_left_out_are_neither_allocated_nor_counted(device):

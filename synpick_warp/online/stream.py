@@ -40,8 +40,8 @@ DEVICE_ONLY = 0
 class ViewStream:
     """Iterator over batches of views. Each batch is valid until the next one is requested.
 
-    On a GPU the batch after the one handed out is queued already, and the next tick of all worlds, on a stream of its own beside the
-    rendering, so that the GPU is busy while the consumer works; nothing else is made ahead. On the CPU a batch is made on request.
+    On a GPU the batch after the one handed out is queued already, and physics is ahead as `TickLoop` has it, on a stream of its own beside
+    the rendering, so that the GPU is busy while the consumer works; nothing else is made ahead. On the CPU a batch is made on request.
 
     A stream that is left early, by `break`, an error or `close`, frees its worlds and buffers; arrays that another library has imported
     live on as long as that library keeps them.
@@ -133,7 +133,7 @@ class Producer:
     def batches(self) -> Iterator[ViewBatch]:
         """Yield batches until no episode remains; each must have expired before the ring reuses its slot.
 
-        The next tick is simulated while this one is rendered.
+        A GPU simulates the following ticks while this one is rendered.
         """
         with TickLoop(self.stages.simulation) as ticks:
             while True:

@@ -68,13 +68,13 @@ def host_images(config: Config, device: wp.Device, needs_images: bool, depth_fil
 
 
 class HostCopy:
-    """Host mirror of device arrays: pinned memory and asynchronous copies on CUDA, the arrays themselves on the CPU."""
+    """Host mirror of device arrays; on CUDA with asynchronous copies."""
 
     def __init__(self, arrays: list[wp.array], target: list[wp.array] | None = None) -> None:
         """
         Args:
             arrays: Arrays of one device.
-            target: Arrays on the host that they are copied to, pinned for a GPU; None: as above.
+            target: Arrays on the host that they are copied to, pinned for a GPU; None: new ones for a GPU, on a CPU the arrays themselves.
         """
         self.source = arrays
         self.device = arrays[0].device
@@ -85,7 +85,7 @@ class HostCopy:
         self.done = wp.Event(self.device) if self.device.is_cuda else None
 
     def start(self, stream: wp.Stream | None) -> None:
-        """Begin to copy on `stream`, after the work queued on the current stream; None: on the current stream."""
+        """Begin to copy on `stream`, after the work queued on the current stream; None: on the current stream. A CPU copies at once."""
         if self.target is self.source:
             return
         if self.done is None:
@@ -108,11 +108,11 @@ class HostCopy:
     def wait(self) -> list[np.ndarray]:
         """Wait for the copies and return them as NumPy arrays (views, no further copy)."""
         if self.done is not None:
-            _wait_idle(self.done)
+            wait_event(self.done)
         return [array.numpy() for array in self.target]
 
 
-def _wait_idle(event: wp.Event) -> None:
+def wait_event(event: wp.Event) -> None:
     """Wait for an event with pauses: `wp.synchronize_event` alone keeps a core busy, since CUDA asks the device without a pause."""
     started = time.monotonic()
     while not event.is_complete and (waited := time.monotonic() - started) < MAX_PAUSED_SECONDS:

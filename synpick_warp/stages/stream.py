@@ -30,8 +30,10 @@ from synpick_warp.stages.timing import scope
 BATCH_BYTES = 512 << 20
 # Size of color, depth, segmentation id and amodal bits of one pixel [bytes].
 PIXEL_BYTES = 3 + 2 + 1 + 4
-# Arrays of a snapshot that a report copies, besides catalog indices and poses.
+# Arrays of a snapshot in `TickReport.snapshot`.
 _SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
+# Arrays of a snapshot that a report copies.
+REPORTED_SNAPSHOT = ("catalog_index", "pose", *_SNAPSHOT)
 # Ring size of view batches: one is read while another is copied and a third is rendered.
 RING = 3
 
@@ -114,8 +116,8 @@ class TickReader:
     def __init__(self, record: TickRecord, target: list[wp.array] | None = None) -> None:
         """
         Args:
-            record: What a tick is written into.
-            target: Arrays on the host for copies of `reported`; None: the reader's own.
+            record: Record of each tick.
+            target: Arrays on the host for copies of `reported`; None: on a GPU the reader's own, on a CPU the record's.
         """
         self.parts = _reported_parts(record)
         self.physics = record_arrays(record.physics) if record.physics is not None else []
@@ -137,7 +139,8 @@ class TickReader:
         return self.copy.target[0].numpy()[:, column_names(Status)["phase"]] if self.copy.is_done else None
 
     def wait(self) -> TickReport:
-        """Wait for the copy and return the report. It owns its arrays, except `tick` and `steps`: valid until the record is reused."""
+        """Wait for the copy and return the report. It owns its arrays, except `tick` and `steps`: valid until the next copy begins, and on
+        a CPU without `target` until the next tick."""
         copied = self.copy.wait()
         last = len(copied) - len(self.physics)
         arrays = iter([array.copy() for array in copied[:last]])

@@ -22,9 +22,9 @@ QUEUE_BYTES = 512 << 20
 
 
 def queue_lead(tick_bytes: int, device: wp.Device) -> int:
-    """Ticks that physics may be ahead of the renderer: as many as QUEUE_BYTES has room for, at least one; 0 on a CPU.
+    """Most ticks that physics may be ahead of the renderer: as many as QUEUE_BYTES has room for, at least one, at most MAX_LEAD.
 
-    A CPU simulates and renders in turns, so that it gains nothing.
+    0 on a CPU, which does one thing at a time and would gain nothing.
 
     Args:
         tick_bytes: Size of a `TickRecord` [bytes].
@@ -52,10 +52,10 @@ class TickQueue:
         """Allocate the ring.
 
         Args:
-            record: What the simulation writes each tick into.
+            record: Record of the simulation, which each tick overwrites.
             slots: Ticks in the queue, including the one that is rendered.
         """
-        self.record, self.slots = record, slots
+        self.slots = slots
         self._device = device = record.snapshot.live.device
         self._source = [getattr(record.snapshot, item.name) for item in fields(Snapshot)]
         self._copies = allocate_rings(self._source, slots, device)

@@ -12,6 +12,7 @@ import warp as wp
 
 from synpick_warp.codes import Phase
 from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.host_copies import wait_event
 from synpick_warp.stages.sim.physics import ENDED
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReport
@@ -26,8 +27,7 @@ further launches block the host: with all 66 parts of a tick at once the rendere
 
 
 class TickLoop:
-    """Tick loop of a simulation that is ahead of its renderer; a context manager, which starts the first tick and at its end waits for the
-    last.
+    """Tick loop of a simulation that is ahead of its renderer; a context manager, which at its end waits for the last tick begun.
 
     On a GPU physics has its own CUDA stream, and is one tick ahead as long as episodes wait for worlds. Then worlds fall idle one by one,
     a tick has fewer views to render, but physics takes nearly as long; so from there on it may be ahead by all of the queue, and the
@@ -63,7 +63,6 @@ class TickLoop:
     def __enter__(self) -> Self:
         if self.stream is not None:
             self.stream.wait_stream(self.device.stream)  # It clears the arrays.
-        self.enqueue()
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -77,19 +76,27 @@ class TickLoop:
                 wp.synchronize_stream(self.stream)
 
     def advance(self) -> tuple[TickReport, Snapshot]:
-        """Wait for the next tick, and return its report and snapshot, which are valid until the next call."""
-        if self._taken:
-            self.queue.release(self._taken - 1)
+        """Wait for the next tick, and return its report and snapshot, which are valid until the next call.
+
+        While it waits, it enqueues parts of the following ticks, so that the device also has work until the next call.
+        """
+        tick = self._taken
+        if tick:
+            self.queue.release(tick - 1)
         self._taken += 1
         with self._scope():
-            while self._enqueued < self._taken:
+            while self._enqueued <= tick:
                 self._enqueue_part()
         self.enqueue()
+        while self._running and self.queue.phase(tick) is None:
+            with scope("wait for part"):
+                wait_event(self._running[0])
+            self.enqueue()
         with scope("wait for tick"):
-            return self.queue.get(self._taken - 1)
+            return self.queue.get(tick)
 
     def enqueue(self) -> None:
-        """Keep the device busy with the following ticks. Call it between batches, while rendering this one."""
+        """Enqueue parts of the following ticks, as many as keep the device busy. Call it between batches, while rendering this one."""
         while self._running and self._running[0].is_complete:
             self._spare.append(self._running.popleft())
         self._look_ahead()

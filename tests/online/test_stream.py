@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import weakref
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,7 @@ from synpick_warp.configs.schema import LAYERS
 from synpick_warp.errors import ConfigError
 from synpick_warp.layer_codec import decode_layer, encode_layer
 from synpick_warp.online import stream as online
-from synpick_warp.stages.sim.simulate import Simulation, TickRecord
+from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader
 from tests.harness.environment import checkout_environment
 from tests.online.conftest import LAYERED, tiny
@@ -202,16 +203,16 @@ def test_nothing_is_left_of_a_stream(end):
 
 def test_worlds_are_freed_where_a_traceback_holds_the_frames(monkeypatch):
     """As Warp's code generation leaves them: exceptions in cycles with the frames that caught them, whose callers are the tick loop."""
-    tick = Simulation.tick
+    tick_parts = Simulation.tick_parts
 
-    def compile_and_tick(simulation: Simulation, record: TickRecord) -> None:
+    def compile_and_tick(simulation: Simulation) -> Iterator[None]:
         try:
             raise KeyError("a name to be looked up elsewhere")
         except KeyError as error:
             kept = error  # noqa: F841  # The error's traceback holds this frame, whose variable holds the error.
-        tick(simulation, record)
+        return tick_parts(simulation)
 
-    monkeypatch.setattr(Simulation, "tick", compile_and_tick)
+    monkeypatch.setattr(Simulation, "tick_parts", compile_and_tick)
     gc.collect()
     gc.disable()
     try:

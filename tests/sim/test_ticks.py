@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from types import SimpleNamespace
 
 import pytest
 import warp as wp
 
+from synpick_warp import memory_plan
 from synpick_warp.arrays import allocate
 from synpick_warp.codes import Phase, Status, column_names
-from synpick_warp.stages import ticks
+from synpick_warp.stages import tick_queue, ticks
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.perception.arrays import Observation, Plan
-from synpick_warp.stages.sim.simulate import TickRecord
+from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.sim.worlds import WorldStatus, world_sizes
+from synpick_warp.stages.stream import TickReader
 from synpick_warp.stages.tick_queue import MAX_LEAD, QUEUE_BYTES, TickQueue, queue_lead, record_bytes
 from tests.harness.spin import SPINS, spin_kernel
-from tests.worlds.small_worlds import settings
+from tests.worlds.small_worlds import catalog, settings
 
 TICKS, WORLDS = 24, 64
 PARTS = 2 * ticks.PARTS_AHEAD + 3
@@ -157,4 +159,25 @@ def test_the_queue_fits_its_memory_and_has_no_lead_on_a_cpu():
     assert queue_lead(1000, cpu) == 0
     record = new_record(wp.get_device("cpu"))
     arrays = [array for part in vars(record).values() if part is not None for array in vars(part).values()]
-    assert record_bytes(record) == sum(array.numpy().nbytes for array in arrays)
+    assert record_bytes(record) == size_of(arrays)
+
+
+@pytest.mark.parametrize("formats", [["bop"], ["zarr"]])
+def test_the_memory_plan_counts_the_queue(device, monkeypatch, formats):
+    """A queue of 200 ticks, to the byte: with another size of a record it would have fewer or more."""
+    config = settings(bake__worlds=8, bake__formats=formats)
+    record = Simulation(config, catalog(), 1, device, records_physics=formats == ["zarr"]).record
+    monkeypatch.setattr(tick_queue, "QUEUE_BYTES", 200 * record_bytes(record))
+    gpu = SimpleNamespace(is_cuda=True)
+    assert memory_plan.queue_slots(config, gpu) == 200
+    monkeypatch.setattr(tick_queue, "QUEUE_BYTES", 200 * record_bytes(record) - 1)
+    assert memory_plan.queue_slots(config, gpu) == 199
+    slots = memory_plan.queue_slots(config, device)
+    planned = {term.name: term.size for term in memory_plan.plan_memory(config, device)}
+    assert planned[f"a queue of {slots} ticks"] == slots * size_of(vars(record.snapshot).values())
+    assert planned[f"reports of {slots} ticks"] == slots * size_of(TickReader.reported(record))
+
+
+def size_of(arrays: Iterable[wp.array]) -> int:
+    """Size of arrays [bytes]."""
+    return sum(array.numpy().nbytes for array in arrays)

@@ -32,7 +32,8 @@ from synpick_warp.stages.timing import scope
 
 @dataclass(frozen=True, eq=False)
 class TickRecord:
-    """Output of the last tick, for rendering and for the host; the next tick overwrites it."""
+    """Output of the last tick, for rendering and for the host; the next tick overwrites it. `observation` and `plan` are those of the
+    simulation itself."""
 
     snapshot: Snapshot
     status: WorldStatus
@@ -90,7 +91,7 @@ class Simulation:
             self.recorder = Recorder(
                 config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
             )
-        physics = self.recorder.new_record() if self.recorder is not None else None
+        physics = self.recorder.record if self.recorder is not None else None
         snapshot, status = allocate(Snapshot, sizes, device), allocate(WorldStatus, sizes, device)
         self.record = TickRecord(snapshot, status, self.observation, self.plan, physics)
         self.suction: Suction | None = None
@@ -127,8 +128,8 @@ class Simulation:
             self._judge()
         with scope("snapshot", self.device):
             self._take_snapshot()
-            if self.recorder is not None and self.record.physics is not None:
-                self.recorder.take(self.record.physics)
+            if self.recorder is not None:
+                self.recorder.end_tick()
         if self.perception is not None:
             with scope("perceive", self.device):
                 self.perception.perceive(self.record.snapshot)

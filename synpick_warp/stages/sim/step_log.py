@@ -74,7 +74,11 @@ def record_kinds(settings: Trajectory) -> tuple[type, ...]:
 
 
 class Recorder:
-    """Watcher that records the steps of a tick. Its launches never change, because `Physics.tick` captures them in a graph."""
+    """Watcher that records the steps of a tick. Its launches never change, because `Physics.tick` captures them in a graph.
+
+    Attributes:
+        record: Physics of the last tick, once `end_tick` was called; the next tick overwrites it.
+    """
 
     def __init__(
         self,
@@ -87,7 +91,7 @@ class Recorder:
         physics: Physics,
         sizes: dict[str, int],
     ) -> None:
-        """Allocate the current record and scratch.
+        """Allocate the record and scratch.
 
         Args:
             settings: Settings of trajectories; `steps` selects whether steps are recorded.
@@ -103,16 +107,12 @@ class Recorder:
         self._device = state.phase.device
         self._sizes = record_sizes(sizes, physics.settings.steps_per_tick)
         self._steps = settings.steps
-        self._current = self.new_record()
+        steps = allocate(StepArrays, self._sizes, self._device) if settings.steps else None
+        self.record = PhysicsRecord(steps, allocate(DropArrays, self._sizes, self._device))
         self._substep_fraction = 1.0 / physics.settings.substeps
         self._weight = (gripper.finger_mass + gripper.cup_mass) * physics.settings.gravity
         self._total = wp.zeros((sizes["body"], int(step_log.MAGNITUDE) + 1), dtype=wp.int64, device=self._device)
         self._force = wp.zeros(sizes["world"], dtype=wp.vec3, device=self._device)
-
-    def new_record(self) -> PhysicsRecord:
-        """Allocate a record of one tick."""
-        steps = allocate(StepArrays, self._sizes, self._device) if self._steps else None
-        return PhysicsRecord(steps, allocate(DropArrays, self._sizes, self._device))
 
     def save_drop_poses(self) -> None:
         """Save the drop poses of objects that have just been dropped."""
@@ -121,7 +121,7 @@ class Recorder:
             step_log.save_drop_poses_kernel,
             dim=state.catalog_index.shape,
             inputs=[self._scene.layout, state.phase, state.progress, state.catalog_index, state.body_slot, self._physics.state.body_q],
-            outputs=[self._current.drops.drop_pose],
+            outputs=[self.record.drops.drop_pose],
             device=self._device,
         )
 
@@ -159,7 +159,7 @@ class Recorder:
 
     def end_step(self, step: int, current: newton.State) -> None:
         """Record step `step` of the tick from the state at its end."""
-        scene, state, seals, log = self._scene, self._state, self._seals, self._current.steps
+        scene, state, seals, log = self._scene, self._state, self._seals, self.record.steps
         if log is None:
             return
         places = (self._sizes["world"], self._sizes["place"])
@@ -194,13 +194,9 @@ class Recorder:
             device=self._device,
         )
 
-    def take(self, target: PhysicsRecord) -> None:
-        """Copy the current record to `target`, on the device."""
-        wp.copy(self._current.drops.progress, self._state.progress)
-        for source, destination in ((self._current.steps, target.steps), (self._current.drops, target.drops)):
-            if source is not None:
-                for item in fields(source):
-                    wp.copy(getattr(destination, item.name), getattr(source, item.name))
+    def end_tick(self) -> None:
+        """Complete the record at the end of a tick."""
+        wp.copy(self.record.drops.progress, self._state.progress)
 
 
 def record_arrays(record: PhysicsRecord) -> list[wp.array]:

@@ -1,0 +1,139 @@
+"""Order of physics, renderer and host in a tick loop, in a model of a GPU: whatever the device does first, all read the tick they mean."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from synpick_warp.codes import Phase
+from synpick_warp.stages import host_copies, tick_queue, ticks
+from synpick_warp.stages.buffers import Snapshot
+from tests.harness.cuda_model import ModelArray, ModelDevice
+
+NAMES = [item.name for item in fields(Snapshot)]
+UNFINISHED = -1
+"""Value of all arrays of a record while a tick is simulated."""
+TRIALS = 150
+
+
+class ModelReader:
+    """`TickReader` of a record whose only reported array is a pair: the tick's number, and the phases of the worlds."""
+
+    def __init__(self, record: SimpleNamespace, target: list[ModelArray]) -> None:
+        self.copy = host_copies.HostCopy(self.reported(record), target)
+
+    @staticmethod
+    def reported(record: SimpleNamespace) -> list[Any]:
+        return [record.status]
+
+    def start(self) -> None:
+        self.copy.start(None)
+
+    def phase(self) -> np.ndarray | None:
+        return self.copy.target[0].numpy()[1] if self.copy.is_done else None
+
+    def wait(self) -> Any:
+        return self.copy.wait()[0]
+
+
+class ModelSimulation:
+    """Writes the number of each tick, from 0 on, into all arrays of its record; world w is idle from tick `ends[w]` on."""
+
+    def __init__(self, device: ModelDevice, ends: list[int], waiting: int, parts: int) -> None:
+        self.device, self.ends, self.parts, self.count = device, np.array(ends), parts, 0
+        self.episodes, self.layout = range(len(ends) + waiting), SimpleNamespace(worlds=len(ends))
+        snapshot = SimpleNamespace(**{name: ModelArray(device) for name in NAMES})
+        self.record = SimpleNamespace(snapshot=snapshot, status=ModelArray(device))
+
+    def phases(self, tick: int) -> np.ndarray:
+        return np.where(tick < self.ends, Phase.ACT, Phase.IDLE)
+
+    def tick_parts(self) -> Iterator[None]:
+        tick = self.count
+        self.count += 1
+        for _ in range(self.parts - 1):
+            self.device.stream.enqueue(lambda: self._write(UNFINISHED))
+            yield
+        self.device.stream.enqueue(lambda: self._write(tick))
+
+    def _write(self, tick: int) -> None:
+        for array in vars(self.record.snapshot).values():
+            array.value = tick
+        self.record.status.value = tick, self.phases(tick)
+
+
+@pytest.fixture
+def make_device(monkeypatch) -> Callable[[int], ModelDevice]:
+    """Puts a model in the place of Warp; when the host pauses, the device goes on."""
+
+    def make(seed: int) -> ModelDevice:
+        device = ModelDevice(random.Random(seed))
+        clock = itertools.count(step=host_copies.PAUSE_SECONDS)
+        time = SimpleNamespace(sleep=lambda _: device.run(device.chance.choice((0, 1, 3, 30))), monotonic=lambda: next(clock))
+        for module in (ticks, tick_queue, host_copies):
+            monkeypatch.setattr(module, "wp", device.wp)
+        monkeypatch.setattr(host_copies, "time", time)
+        monkeypatch.setattr(tick_queue, "TickReader", ModelReader)
+        monkeypatch.setattr(tick_queue, "allocate_rings", partial(allocate_rings, device))
+        return device
+
+    return make
+
+
+def allocate_rings(device: ModelDevice, arrays: list[ModelArray], slots: int, *_: object, **__: object) -> list[list[ModelArray]]:
+    return [[ModelArray(device) for _ in arrays] for _ in range(slots)]
+
+
+def test_renderer_and_host_read_whole_ticks_in_order_whatever_the_device_does_first(make_device):
+    for seed in range(TRIALS):
+        run_trial(make_device(seed))
+
+
+def run_trial(device: ModelDevice) -> None:
+    """Random worlds, lengths of episodes, leads, parts of a tick, batches, and rates of the streams."""
+    chance = device.chance
+    ends = [chance.randint(1, 30) for _ in range(chance.randint(1, 6))]
+    simulation = ModelSimulation(device, ends, chance.choice((0, 3)), chance.choice((1, 2, 5, 66)))
+    lead, rendered = chance.choice((0, 1, 2, 7, 50)), []
+    with ticks.TickLoop(simulation, lead) as loop:
+        for tick in range(max(ends) + 1):
+            (number, phases), snapshot = loop.advance()
+            assert number == tick
+            assert (phases == simulation.phases(tick)).all()
+            assert simulation.count <= tick + 1 + lead
+            for _ in range(chance.randint(0, 3)):
+                for _ in range(chance.choice((0, 5, 50))):
+                    device.stream.enqueue(lambda: None)
+                device.stream.enqueue(lambda tick=tick, snapshot=snapshot: rendered.append((tick, values(snapshot))))
+                loop.enqueue()
+                device.run(chance.choice((0, 10, 100)))
+    while device.run(1):
+        pass
+    assert not any(stream.queue for stream in device.streams)
+    assert rendered == [(tick, {tick}) for tick, _ in rendered]
+
+
+def values(snapshot: Snapshot) -> set[int]:
+    """Values of all arrays of a snapshot."""
+    return {getattr(snapshot, name).value for name in NAMES}
+
+
+@pytest.mark.parametrize("lead", [1, 5])
+def test_while_the_host_waits_for_a_tick_parts_of_the_next_are_enqueued(make_device, lead):
+    """Else a GPU would be idle from the end of each tick until the host, which hands it over, asks for the next."""
+    device = make_device(0)
+    simulation = ModelSimulation(device, [20], 0, 2 * ticks.PARTS_AHEAD + 3)
+    host_copies.time.sleep = lambda _: device.run(1)
+    with ticks.TickLoop(simulation, lead) as loop:
+        for tick in range(15):
+            loop.advance()
+            assert simulation.count == tick + 2
+            assert len(loop.stream.queue) >= ticks.PARTS_AHEAD
