@@ -254,7 +254,7 @@ def _queued_reports(config: Config, device: wp.Device) -> Iterator[Term]:
 
 
 def _ring_rows(prefix: str, kind: type, sizes: dict[str, int], slots: int, only: Collection[str] | None = None) -> list[Row]:
-    """Rows of arrays that hold those of all slots of a queue, as `allocate_rings` makes them; `only`: these fields, None: all."""
+    """Rows of arrays that hold those of all slots of a queue, as `allocate_slots` makes them; `only`: these fields, None: all."""
     rows = memory_table(kind, sizes | {"world": slots * sizes["world"]}, only)
     return [(f"{prefix} {name}", shape, unit, size) for name, shape, unit, size in rows]
 

@@ -15,10 +15,11 @@ from synpick_warp.stages.sim.step_log import record_arrays
 from synpick_warp.stages.stream import TickReader, TickReport
 
 MAX_LEAD = 256
-"""Most ticks that physics may be ahead of the renderer. Monte Carlo of 150 and 300 episodes with measured times: 256 ticks shorten the end
-of a bake as much as 512 do, within 0.2 %."""
+"""Most ticks that physics may be ahead of the renderer. In Monte Carlo simulations of bakes of 150 and of 300 episodes, with measured
+times of ticks, 512 shorten a bake by 0.2 % more."""
 QUEUE_BYTES = 512 << 20
-"""Most memory of the queue's reports, and of its snapshots [bytes]: 256 ticks of 360 worlds; 15 of 512 worlds whose steps are recorded."""
+"""Largest size of a ring of records, unless a lead of one tick needs more [bytes]. It holds MAX_LEAD ticks of 360 worlds, or 15 ticks of
+512 worlds whose steps are recorded."""
 
 
 def queue_lead(tick_bytes: int, device: wp.Device) -> int:
@@ -43,9 +44,10 @@ def record_bytes(record: TickRecord) -> int:
 
 
 class TickQueue:
-    """Ring buffer of ticks by number, filled on the stream of physics.
+    """Ring buffer indexed by tick number, filled on the stream of physics.
 
-    On a GPU, the stream that puts a tick waits for the work that was queued on the renderer's stream when its slot was released.
+    On a GPU, before a tick overwrites a slot, the stream that puts it waits for all work that was on the releasing stream, the renderer's,
+    when the slot was released.
     """
 
     def __init__(self, record: TickRecord, slots: int) -> None:
@@ -53,19 +55,19 @@ class TickQueue:
 
         Args:
             record: Record of the simulation, which each tick overwrites.
-            slots: Ticks in the queue, including the one that is rendered.
+            slots: Capacity [ticks], including the tick that is rendered.
         """
         self.slots = slots
         self._device = device = record.snapshot.live.device
         self._source = [getattr(record.snapshot, item.name) for item in fields(Snapshot)]
-        self._copies = allocate_rings(self._source, slots, device)
+        self._copies = allocate_slots(self._source, slots, device)
         self._snapshots = [Snapshot(*arrays) for arrays in self._copies]
-        targets = allocate_rings(TickReader.reported(record), slots, wp.get_device("cpu"), pinned=device.is_cuda)
+        targets = allocate_slots(TickReader.reported(record), slots, wp.get_device("cpu"), pinned=device.is_cuda)
         self._readers = [TickReader(record, arrays) for arrays in targets]
         self._released = [wp.Event(device) for _ in range(slots)] if device.is_cuda else []
 
     def put(self, tick: int) -> None:
-        """Copy the record into the slot of a tick, in the order of the current stream."""
+        """Copy the record into the slot of a tick, asynchronously on the current stream."""
         slot = tick % self.slots
         if self._released:
             self._device.stream.wait_event(self._released[slot])
@@ -79,23 +81,23 @@ class TickQueue:
         return self._readers[slot].wait(), self._snapshots[slot]
 
     def phase(self, tick: int) -> np.ndarray | None:
-        """Phases of the worlds after a tick that was put (world) int32; None: the device has not done it yet."""
+        """Phase of each world after a tick (world) int32; None: the device has not done it yet. The tick must have been put."""
         return self._readers[tick % self.slots].phase()
 
     def release(self, tick: int) -> None:
-        """Free the slot of a tick, once the work that is queued on the current stream is done."""
+        """Free the slot of a tick as soon as the work now queued on the current stream is done; returns at once."""
         if self._released:
             self._device.stream.record_event(self._released[tick % self.slots])
 
 
-def allocate_rings(arrays: Sequence[wp.array], slots: int, device: wp.Device, pinned: bool = False) -> list[list[wp.array]]:
-    """Arrays of the shapes and types of others for each slot of a ring; all slots of an array are parts of one allocation, zeroed.
+def allocate_slots(arrays: Sequence[wp.array], slots: int, device: wp.Device, pinned: bool = False) -> list[list[wp.array]]:
+    """For each slot of a ring, zeroed arrays of the shapes and types of the given ones; the slots of an array share one allocation.
 
     Args:
-        arrays: Arrays to imitate.
+        arrays: Templates.
         slots: Number of slots.
         device: Where to allocate.
-        pinned: Whether memory of the host is pinned.
+        pinned: Whether to pin memory of the host.
     """
     rows = [array.shape[0] for array in arrays]
     shapes = [(slots * array.shape[0], *array.shape[1:]) for array in arrays]

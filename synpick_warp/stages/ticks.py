@@ -20,31 +20,32 @@ from synpick_warp.stages.tick_queue import TickQueue, queue_lead, record_bytes
 from synpick_warp.stages.timing import scope
 
 HIGH_PRIORITY = -1
-"""CUDA stream priority of physics: its 25,000 short kernels a tick wait for each other, and should not also wait for the renderer's."""
-PARTS_AHEAD = 24
-"""Parts of ticks, mostly substeps, that the device has to do before more are enqueued. On an H200 some 40 parts fill a stream's queue, and
-further launches block the host: with all 66 parts of a tick at once the renderer idled for 0.25 s a tick."""
+"""CUDA stream priority of physics: its 25,000 short kernels a tick depend on one another, and should not also wait for the renderer's."""
+PARTS_IN_FLIGHT = 24
+"""Most parts of ticks, mostly substeps, that are enqueued and not yet done. On an H200 some 40 parts fill the launch queue of a CUDA
+stream, and further launches block the host: with all 66 parts of a tick at once it launched no rendering for 0.25 s a tick."""
 
 
 class TickLoop:
-    """Tick loop of a simulation that is ahead of its renderer; a context manager, which at its end waits for the last tick begun.
+    """Producer of ticks that runs ahead of its renderer; a context manager, whose exit waits for the parts that are enqueued.
 
-    On a GPU physics has its own CUDA stream, and is one tick ahead as long as episodes wait for worlds. Then worlds fall idle one by one,
-    a tick has fewer views to render, but physics takes nearly as long; so from there on it may be ahead by all of the queue, and the
-    renderer has ticks in store when physics becomes the slower of the two. On a CPU they take turns.
+    On a GPU physics has its own CUDA stream. While episodes wait for a free world it is at most one tick ahead, which suffices to overlap
+    the two. Then worlds fall idle one by one, and a tick has fewer views to render, but physics takes nearly as long: from there on it may
+    be ahead by up to `max_lead` ticks, so that the renderer has a backlog when physics becomes the slower of the two. On a CPU physics and
+    renderer alternate.
 
-    Work on other streams that reads a snapshot must be awaited by the device's current stream before the next `advance`.
+    Before the next `advance`, make the device's current stream wait for every other stream that still reads the snapshot.
     """
 
-    def __init__(self, simulation: Simulation, lead: int | None = None) -> None:
+    def __init__(self, simulation: Simulation, max_lead: int | None = None) -> None:
         """Allocate the queue.
 
         Args:
             simulation: The worlds.
-            lead: Most ticks that physics may be ahead; None: by `queue_lead`.
+            max_lead: Most ticks that physics may ever be ahead; None: by `queue_lead`.
         """
         self.simulation, self.device = simulation, simulation.device
-        self.max_lead = queue_lead(record_bytes(simulation.record), self.device) if lead is None else lead
+        self.max_lead = queue_lead(record_bytes(simulation.record), self.device) if max_lead is None else max_lead
         self.lead = min(1, self.max_lead)
         if len(simulation.episodes) <= simulation.layout.worlds:
             self.lead = self.max_lead
@@ -53,16 +54,16 @@ class TickLoop:
         self._parts: Iterator[None] | None = None
         """What is left to enqueue of the tick begun last; None: nothing."""
         self._enqueued = self._simulated = self._taken = 0
-        """Ticks that are enqueued as a whole, that the device was seen to have done, and that `advance` has returned."""
-        self._is_over = False
-        """Whether all worlds were idle in the last simulated tick."""
+        """Ticks that are enqueued as a whole, that were observed to be done, and that `advance` has returned."""
+        self._all_idle = False
+        """Whether all worlds were idle in the last tick observed to be done."""
         self._running: deque[wp.Event] = deque()
-        """Ends of the parts that the device may not have done, oldest first."""
+        """Events at the ends of the parts that may still be running, oldest first."""
         self._spare: list[wp.Event] = []
 
     def __enter__(self) -> Self:
         if self.stream is not None:
-            self.stream.wait_stream(self.device.stream)  # It clears the arrays.
+            self.stream.wait_stream(self.device.stream)  # That one zero-fills the arrays.
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -72,7 +73,7 @@ class TickLoop:
         """
         self._parts = None
         if self.stream is not None:
-            with contextlib.suppress(RuntimeError):  # A failed device; the error that ends the loop tells it.
+            with contextlib.suppress(RuntimeError):  # A failed device; the next call to it raises the error.
                 wp.synchronize_stream(self.stream)
 
     def advance(self) -> tuple[TickReport, Snapshot]:
@@ -84,7 +85,7 @@ class TickLoop:
         if tick:
             self.queue.release(tick - 1)
         self._taken += 1
-        with self._scope():
+        with self._physics_scope():
             while self._enqueued <= tick:
                 self._enqueue_part()
         self.enqueue()
@@ -96,35 +97,35 @@ class TickLoop:
             return self.queue.get(tick)
 
     def enqueue(self) -> None:
-        """Enqueue parts of the following ticks, as many as keep the device busy. Call it between batches, while rendering this one."""
+        """Enqueue parts of the following ticks, as many as keep the device busy. Call it between batches of views."""
         while self._running and self._running[0].is_complete:
             self._spare.append(self._running.popleft())
-        self._look_ahead()
-        with self._scope():
-            while len(self._running) < PARTS_AHEAD and (self._parts is not None or self._may_begin()):
+        self._poll_finished_ticks()
+        with self._physics_scope():
+            while len(self._running) < PARTS_IN_FLIGHT and (self._parts is not None or self._may_begin()):
                 self._enqueue_part()
 
-    def _look_ahead(self) -> None:
-        """Look at the phases of the ticks that the device has done meanwhile."""
+    def _poll_finished_ticks(self) -> None:
+        """Read the phases of the ticks that the device has done since the last call."""
         while self._simulated < self._enqueued and (phase := self.queue.phase(self._simulated)) is not None:
             self._simulated += 1
             is_idle = phase == Phase.IDLE
-            self._is_over = bool(is_idle.all())
+            self._all_idle = bool(is_idle.all())
             if is_idle.any():
                 self.lead = self.max_lead
 
     def _may_begin(self) -> bool:
         """Whether a further tick may begin before `advance` asks for it."""
-        return not self._is_over and self._enqueued < self._taken + self.lead
+        return not self._all_idle and self._enqueued < self._taken + self.lead
 
     @contextlib.contextmanager
-    def _scope(self) -> Iterator[None]:
-        """Make physics' stream the current one."""
+    def _physics_scope(self) -> Iterator[None]:
+        """Make physics' stream the current one, and profile what is enqueued on it."""
         with wp.ScopedStream(self.stream, sync_enter=False), scope("simulate", self.device):
             yield
 
     def _enqueue_part(self) -> None:
-        """Enqueue the next part; with the last one of a tick, its copy into the queue."""
+        """Enqueue the next part; with the last one of a tick, also the copy of the record into the queue."""
         self._parts = self._parts or self.simulation.tick_parts()
         if next(self._parts, ENDED) is ENDED:
             self.queue.put(self._enqueued)

@@ -82,13 +82,13 @@ def make_device(monkeypatch) -> Callable[[int], ModelDevice]:
             monkeypatch.setattr(module, "wp", device.wp)
         monkeypatch.setattr(host_copies, "time", time)
         monkeypatch.setattr(tick_queue, "TickReader", ModelReader)
-        monkeypatch.setattr(tick_queue, "allocate_rings", partial(allocate_rings, device))
+        monkeypatch.setattr(tick_queue, "allocate_slots", partial(allocate_slots, device))
         return device
 
     return make
 
 
-def allocate_rings(device: ModelDevice, arrays: list[ModelArray], slots: int, *_: object, **__: object) -> list[list[ModelArray]]:
+def allocate_slots(device: ModelDevice, arrays: list[ModelArray], slots: int, *_: object, **__: object) -> list[list[ModelArray]]:
     return [[ModelArray(device) for _ in arrays] for _ in range(slots)]
 
 
@@ -130,10 +130,10 @@ def values(snapshot: Snapshot) -> set[int]:
 def test_while_the_host_waits_for_a_tick_parts_of_the_next_are_enqueued(make_device, lead):
     """Else a GPU would be idle from the end of each tick until the host, which hands it over, asks for the next."""
     device = make_device(0)
-    simulation = ModelSimulation(device, [20], 0, 2 * ticks.PARTS_AHEAD + 3)
+    simulation = ModelSimulation(device, [20], 0, 2 * ticks.PARTS_IN_FLIGHT + 3)
     host_copies.time.sleep = lambda _: device.run(1)
     with ticks.TickLoop(simulation, lead) as loop:
         for tick in range(15):
             loop.advance()
             assert simulation.count == tick + 2
-            assert len(loop.stream.queue) >= ticks.PARTS_AHEAD
+            assert len(loop.stream.queue) >= ticks.PARTS_IN_FLIGHT

@@ -23,7 +23,7 @@ from tests.harness.spin import SPINS, spin_kernel
 from tests.worlds.small_worlds import catalog, settings
 
 TICKS, WORLDS = 24, 64
-PARTS = 2 * ticks.PARTS_AHEAD + 3
+PARTS = 2 * ticks.PARTS_IN_FLIGHT + 3
 """Parts of a tick: more than are enqueued ahead."""
 PHASE = column_names(Status)["phase"]
 SOME_IDLE, ALL_IDLE = 8, 16
@@ -90,7 +90,7 @@ def test_physics_is_one_tick_ahead_until_a_world_is_idle_then_by_the_queue_and_s
 
 def test_without_waiting_episodes_physics_is_ahead_from_the_start(device):
     simulation = NumberingSimulation(device, episodes=WORLDS)
-    with ticks.TickLoop(simulation, lead=3) as loop:
+    with ticks.TickLoop(simulation, max_lead=3) as loop:
         for _ in range(3 * PARTS):
             wp.synchronize_device(device)
             loop.enqueue()
@@ -112,7 +112,7 @@ def test_a_slow_renderer_reads_each_snapshot_whole(simulation):
     busy = wp.zeros(1, dtype=float, device=device)
     wp.launch(spin_kernel, dim=1, inputs=[busy, 1], device=device)  # Loads it.
     pictures = [wp.zeros(WORLDS, dtype=wp.int32, device=device) for _ in range(TICKS)]
-    with ticks.TickLoop(simulation, lead=2) as loop:
+    with ticks.TickLoop(simulation, max_lead=2) as loop:
         for picture in pictures:
             _, snapshot = loop.advance()
             wp.launch(spin_kernel, dim=1, inputs=[busy, SPINS], device=device)
