@@ -29,6 +29,7 @@ from synpick_warp.progress import Progress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
+from synpick_warp.stages.render.view_setup import pair_views
 from synpick_warp.stages.stream import TickReport, describe_views
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.device import pick_device
@@ -149,8 +150,7 @@ class Producer:
         """Render the selected views of a tick, world by world and camera by camera."""
         stages, cameras = self.stages, np.asarray(self.selection.cameras, np.int32)
         shown = report.column("live").astype(bool) & (report.column("frame") % self.selection.stride == 0)
-        live = np.flatnonzero(shown).astype(np.int32)
-        world, camera = np.repeat(live, len(cameras)), np.tile(cameras, len(live))
+        world, camera = pair_views(np.flatnonzero(shown), cameras)
         for first in range(0, len(world), self.ring.views):
             part = slice(first, first + self.ring.views)
             host = describe_views(report, world[part], camera[part], stages.tick_time, self.object_ids, stages.light_table)

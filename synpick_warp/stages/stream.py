@@ -21,7 +21,7 @@ from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_s
 from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import make_views, pair_views
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
 from synpick_warp.stages.timing import scope
@@ -30,9 +30,9 @@ from synpick_warp.stages.timing import scope
 BATCH_BYTES = 512 << 20
 # Size of color, depth, segmentation id and amodal bits of one pixel [bytes].
 PIXEL_BYTES = 3 + 2 + 1 + 4
-# Arrays of a snapshot in `TickReport.snapshot`.
+# Names of the snapshot's arrays that are copied to `TickReport.snapshot`.
 _SNAPSHOT = ("fixture_pose", "fixture_visible", "light", "light_yaw", "light_exposure")
-# Arrays of a snapshot that a report copies.
+# Names of all arrays of a snapshot that are copied to a report.
 REPORTED_SNAPSHOT = ("catalog_index", "pose", *_SNAPSHOT)
 # Ring size of view batches: one is read while another is copied and a third is rendered.
 RING = 3
@@ -155,7 +155,7 @@ class TickReader:
 
 
 def _reported_parts(record: TickRecord) -> list[tuple[Any, list[str]]]:
-    """Parts of a record that a report has as namespaces, with the names of their arrays."""
+    """Parts of a record that become namespaces of a report, each with the names of the arrays that are copied."""
     parts: list[tuple[Any, list[str]]] = [(part, [item.name for item in fields(part)]) for part in (record.observation, record.plan)]
     return [*parts, (record.snapshot, list(_SNAPSHOT))]
 
@@ -304,8 +304,7 @@ class FrameStream:
             finished: Called once the consumer is done with the tick's last batch (it requests the next one); ticks finish in order.
         """
         live = np.flatnonzero(report.column("live"))
-        world = np.repeat(live, self.cameras).astype(np.int32)
-        camera = np.tile(np.arange(self.cameras, dtype=np.int32), len(live))
+        world, camera = pair_views(live, np.arange(self.cameras))
         ahead = 0
         for first in range(0, len(world), self.batch):
             if len(self.in_flight) == len(self.buffers):

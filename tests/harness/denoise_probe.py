@@ -21,6 +21,7 @@ from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE
 from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, shrink, smooth_ratios_kernel
 from synpick_warp.kernels.render.lighting.sampling import scrambled_point, sobol_point
 from synpick_warp.kernels.render.visibility.camera import in_image
+from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.render.denoised import COARSE_LIGHT, GUIDE, RATIO_IMAGES, build_coarse_grid
 from synpick_warp.stages.render.scene import build_cameras, build_grid, pack_half3_array
@@ -106,7 +107,7 @@ def surface_kernel(
     depth_out: wp.array[float],  # (sample) [m]
     normal_out: wp.array[wp.vec3],  # (sample)
 ):
-    """Pack surfaces, write and read them, and unpack them."""
+    """Round trip of surfaces through the guide image: pack, store, load and unpack."""
     i = wp.tid()
     write_record(record_out, i, pack_surface(segment[i], depth[i], normal[i]))
     surface = read_record(record_out, i)
@@ -167,11 +168,10 @@ def unpack_ratio_records(records: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def pack_light_array(light: np.ndarray, unoccluded: np.ndarray) -> np.ndarray:
-    """Light and unoccluded light (..., 3) in (..., 4) float32, with their ratio: the kernels' `pack_light`."""
+    """NumPy twin of the kernels' `pack_light` for single coarse pixels: occluded and unoccluded light (..., 3) in (..., 4) float32."""
     records = np.zeros((*light.shape[:-1], 4), np.float32)
     records.view(np.float16)[..., :6] = np.concatenate([light, unoccluded], axis=-1)
-    luminance = np.array([0.2126, 0.7152, 0.0722])
-    records[..., 3] = (light @ luminance) / np.maximum(unoccluded @ luminance, float(MIN_RADIANCE))
+    records[..., 3] = (light @ LUMINANCE) / np.maximum(unoccluded @ LUMINANCE, float(MIN_RADIANCE))
     return records
 
 

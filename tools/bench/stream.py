@@ -20,7 +20,7 @@ from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.online.batches import BatchRing, ViewBatch
 from synpick_warp.stages.render.renderer import Renderer
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import make_views, pair_views
 from synpick_warp.stages.stream import TickReport, view_sizes
 from synpick_warp.stages.ticks import TickLoop
 from tools.bench.physics import Row
@@ -105,13 +105,12 @@ def _render_all(stages: Stages, ring: BatchRing, snapshot: Snapshot, world: np.n
 
 
 def select_views(report: TickReport, cameras: int) -> tuple[np.ndarray, np.ndarray]:
-    """World and camera of each view of a tick (view) int32: world by world and camera by camera."""
-    live = np.flatnonzero(report.column("live"))
-    return np.repeat(live, cameras).astype(np.int32), np.tile(np.arange(cameras, dtype=np.int32), len(live))
+    """World and camera of each view of a tick, as of `pair_views`."""
+    return pair_views(np.flatnonzero(report.column("live")), np.arange(cameras))
 
 
 def batch_views(world: np.ndarray, camera: np.ndarray, size: int, renderer: Renderer) -> Iterator[Any]:
-    """Yield the structs `Views` of batches of at most `size` views, from the world and camera of each view (view) int32."""
+    """Split views into batches of at most `size`; yields a struct `Views` for each. `world` and `camera` are (view) int32."""
     for first in range(0, len(world), size):
         rows = [wp.array(values[first : first + size], dtype=wp.int32, device=renderer.scene.device) for values in (world, camera)]
         yield make_views(rows[0], rows[1], len(rows[0]), renderer.instances)

@@ -29,7 +29,7 @@ from synpick_warp.pipeline import Factory, build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import HostCopy
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import make_views, pair_views
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.system.device import pick_device
@@ -134,9 +134,9 @@ class VisibilityCounter:
 
     def start(self, snapshot: Snapshot, report: TickReport) -> None:
         """Begin to count the pixels of a tick's views."""
-        self.world = np.repeat(np.flatnonzero(report.column("live")), self.cameras).astype(np.int32)
-        for target, values in zip(self.lists, (self.world, np.arange(len(self.world)) % self.cameras), strict=True):
-            target.assign(np.pad(values, (0, target.shape[0] - len(values))).astype(np.int32))
+        self.world, camera = pair_views(np.flatnonzero(report.column("live")), np.arange(self.cameras))
+        for target, values in zip(self.lists, (self.world, camera), strict=True):
+            target.assign(np.pad(values, (0, target.shape[0] - len(values))))
         for first in range(0, len(self.world), self.batch):
             count = min(self.batch, len(self.world) - first)
             world, camera = (_slice(values, first, count) for values in self.lists)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import struct_arrays
@@ -24,6 +25,11 @@ VIEW_BODIES = struct_arrays(
 )
 VIEWS = struct_arrays(Views, "view")
 GBUFFER = struct_arrays(GBuffer, "view", "row", "column", units={"depth": "m"})
+
+
+def pair_views(worlds: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """World and camera of each view (view) int32 of all cameras in all worlds: world by world, and camera by camera in each."""
+    return np.repeat(worlds, len(cameras)).astype(np.int32), np.tile(cameras, len(worlds)).astype(np.int32)
 
 
 def make_views(world: wp.array, camera: wp.array, count: int, instances: int) -> Any:

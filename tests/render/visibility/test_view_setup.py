@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.stages.render.view_setup import make_views
+from synpick_warp.stages.render.view_setup import make_views, pair_views
 from tests.worlds.toy_scene import ToyScene, ball, box, camera, entry, render_gbuffer, sheet
 
 
@@ -22,6 +22,14 @@ def pile(rng, count: int) -> ToyScene:
         position = rng.uniform(-0.4, 0.4, 3) * min(index, 1)
         placed.append((int(rng.integers(len(meshes))), (*position, *(quaternion / np.linalg.norm(quaternion)))))
     return ToyScene([entry(mesh) for mesh in meshes], [placed], (view,), instances=count + 2)
+
+
+def test_views_are_listed_world_by_world_and_camera_by_camera():
+    world, camera = pair_views(np.array([1, 4]), np.array([0, 2, 5]))
+    assert (world.tolist(), camera.tolist()) == ([1, 1, 1, 4, 4, 4], [0, 2, 5, 0, 2, 5])
+    assert world.dtype == camera.dtype == np.int32
+    none = pair_views(np.array([], np.int64), np.array([0, 2]))
+    assert [len(values) for values in none] == [0, 0]
 
 
 @pytest.mark.parametrize("seed", range(12))
