@@ -10,14 +10,14 @@ RAY_REGISTERS = 64
 """Register limit of kernels that trace rays. With more, too few threads are resident to hide the latency of BVH nodes; from 56 to 64 is
 best, fewer and more are slower."""
 COARSE_PATH_REGISTERS = 56
-"""The same of kernels that trace whole paths, for which slightly fewer are better still."""
+"""Register limit of kernels that trace whole paths, which are fastest with slightly fewer."""
 SHADE_REGISTERS = 80
-"""Register limit of the shading kernel: it waits less than one that traces rays, and keeps more values."""
+"""Register limit of the shading kernel, which waits for memory less than ray tracing does, and keeps more values live."""
 FILTER_REGISTERS = 80
-"""Register limit of the denoiser's block filter: the least without spills, so that more threads are resident (from ptxas for sm_90, not
-timed)."""
+"""Register limit of the denoiser's block filter: the smallest without spills, for the highest occupancy (from ptxas for sm_90; other limits
+were not timed)."""
 CHOICE_REGISTERS = 72
-"""The same of the denoiser's choice of filter widths."""
+"""Register limit of the denoiser's choice of filter widths, found in the same way."""
 PIXEL_BLOCK = 128
 """Block size of kernels with a thread a pixel: four tiles of 8 x 4 pixels."""
 LANE_STRIDE = wp.constant(4)

@@ -108,7 +108,7 @@ def test_the_same_settings_give_the_same_bytes_with_a_profile_too(baked, tmp_pat
 
 @pytest.mark.parametrize(("worlds", "lead"), [(1, 0), (2, 5), (4, 5)])
 def test_neither_the_number_of_worlds_nor_the_lead_of_physics_changes_a_scene(baked, tmp_path, monkeypatch, worlds, lead):
-    """In two worlds an episode waits, and physics may be ahead once a world is idle; in four from the start."""
+    """Two worlds are fewer than the episodes, so physics leads only once a world is idle; with four it leads from the start."""
     leads, may_begin = set(), TickLoop._may_begin
     monkeypatch.setattr(ticks, "queue_lead", lambda *_: lead)
     monkeypatch.setattr(TickLoop, "_may_begin", lambda loop: leads.add(loop._enqueued - loop._taken) or may_begin(loop))

@@ -97,7 +97,7 @@ def _least(key: str, device: wp.Device) -> int:
 
 
 def _reduce(config: Config, key: str, device: wp.Device) -> Config:
-    """Settings with half the views of a batch, or three quarters of the worlds, but at least `_least`."""
+    """Reduce one setting: the views of a batch to a half, the worlds to three quarters, never below `_least`."""
     section, _, name = key.partition(".")
     amount = _amount(config, key, device)
     kept = amount - max(1, amount // 4) if key == "bake.worlds" else -(-amount // 2)

@@ -91,7 +91,7 @@ class TickQueue:
 
 
 def allocate_slots(arrays: Sequence[wp.array], slots: int, device: wp.Device, pinned: bool = False) -> list[list[wp.array]]:
-    """For each slot of a ring, zeroed arrays of the shapes and types of the given ones; the slots of an array share one allocation.
+    """Allocate a ring buffer: for each slot, zeroed arrays with the shapes and types of `arrays`, which are parts of one allocation each.
 
     Args:
         arrays: Templates.

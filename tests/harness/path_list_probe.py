@@ -1,4 +1,4 @@
-"""Kernels that list coarse pixels and read the lists, alone."""
+"""Probe kernels of the path lists: append coarse pixels, and read the lists back."""
 
 import warp as wp
 
@@ -16,7 +16,7 @@ def append_kernel(
     # Out:
     lists_inout: PathLists,
 ):
-    """List the coarse pixel of each thread, of `threads` a view, if its history counts 0 or more paths."""
+    """Append the coarse pixel of each thread to its view's lists if `known` is not negative; a view has `threads` threads."""
     index = wp.tid()
     if known[index] >= 0:
         append_pixel(lists_inout, index // threads, index, known[index], bits[index])
@@ -29,7 +29,7 @@ def read_kernel(
     # Out:
     listed_out: wp.array2d[int],  # (thread, 3)
 ):
-    """`listed_pixel` of each thread."""
+    """Read the list entry of each thread: coarse pixel, paths of its history, and bits of its update period."""
     index = wp.tid()
     pixel, known, bits = listed_pixel(lists, index)
     listed_out[index, 0] = pixel

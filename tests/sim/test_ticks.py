@@ -27,7 +27,7 @@ PARTS = 2 * ticks.PARTS_IN_FLIGHT + 3
 """Parts of a tick: more than are enqueued ahead."""
 PHASE = column_names(Status)["phase"]
 SOME_IDLE, ALL_IDLE = 8, 16
-"""Ticks after which some worlds are idle, and all."""
+"""First tick at whose end a world is idle, and first at whose end all are."""
 
 
 def new_record(device: wp.Device) -> TickRecord:

@@ -143,7 +143,7 @@ def _tick(factory: Factory) -> TickReport:
 
 
 def render_ticks(stream: FrameStream, renderer: Renderer, ticks: list[KeptTick]) -> None:
-    """Render all views of some ticks in order, batch by batch, into the ring of buffers of a bake; does not synchronise."""
+    """Enqueue the rendering of all views of `ticks`, in the order, batches and buffers of a bake; does not wait for the device."""
     slot = 0
     for tick in ticks:
         for views in tick.batches:

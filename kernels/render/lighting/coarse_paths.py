@@ -67,16 +67,17 @@ within a filter kernel, and a range of 1 leaves the image's mean unbiased."""
 class CoarseLight:
     """Reflected light of the coarse pixels; diffuse light is demodulated (without the surface's colour). Scratch.
 
-    All arrays are (view, cell_row, cell_column). Light is exposed: radiance times the map's exposure, about 1.
+    All arrays are (view, cell_row, cell_column). Light is pre-exposed: radiance multiplied by the map's exposure, so
+    that typical values are about 1.
     """
 
     diffuse: wp.array3d[wp.vec4]
-    """Diffuse reflection of the environment map without its sun: with what blocks the map, and without. Packed by `pack_light`."""
+    """Diffuse reflection of the environment map without its sun, occluded and unoccluded; packed by `pack_light`."""
     specular: wp.array3d[wp.vec4]
-    """Specular reflection of the environment map without its sun, likewise; light from other surfaces counts as what is not blocked."""
+    """Specular reflection, likewise; the occluded value includes light from other surfaces."""
     indirect: wp.array3d[wp.uint64]
-    """Indirect diffuse: diffuse reflection of light from other surfaces. It varies slowly, but few paths carry much of it. Packed by
-    `pack_half3`."""
+    """Indirect diffuse light: diffuse reflection of light from other surfaces, packed by `pack_half3`. It varies slowly in the image, but
+    few paths carry much of it."""
 
 
 @wp.func
@@ -168,7 +169,7 @@ def first_path_index(samples: int, row: int, column: int, number: int, accumulat
 
 @wp.func
 def pack_half2(a: float, b: float) -> float:
-    """Pack two non-negative values in half precision, clamped to its range, in the bits of a float that is only moved."""
+    """Pack two non-negative values in half precision, clamped to its range, into the bits of a float that takes no part in arithmetic."""
     return wp.cast(wp.vec2h(wp.float16(wp.min(a, MAX_HALF)), wp.float16(wp.min(b, MAX_HALF))), wp.float32)
 
 
@@ -181,22 +182,22 @@ def unpack_half2(packed: float) -> wp.vec2:
 
 @wp.func
 def pack_light(light: wp.vec3, unoccluded: wp.vec3, statistic: float) -> wp.vec4:
-    """Pack light and unoccluded light in half precision, and a `statistic` of their visibility ratio in luminance.
+    """Pack occluded and unoccluded light in half precision, and a `statistic` of the luminance of their visibility ratio.
 
-    That is the ratio itself in light of single coarse pixels, and the variance of its mean in light of blocks.
+    For single coarse pixels the statistic is the ratio itself, for blocks the variance of the mean ratio.
     """
     return wp.vec4(pack_half2(light[0], light[1]), pack_half2(light[2], unoccluded[0]), pack_half2(unoccluded[1], unoccluded[2]), statistic)
 
 
 @wp.func
 def luminance_ratio(light: wp.vec3, unoccluded: wp.vec3) -> float:
-    """Ratio of luminances; unoccluded light is 0 only if the whole map is black."""
+    """Luminance of the visibility ratio. Unoccluded light is 0 only if the whole map is black."""
     return luminance(light) / wp.max(luminance(unoccluded), MIN_RADIANCE)
 
 
 @wp.func
 def store_light(out: CoarseLight, index: int, light: SplitRadiance, unoccluded: SplitRadiance):
-    """Write a coarse pixel by its `flat_index`; `light` and `unoccluded` are exposed, see `CoarseLight`."""
+    """Write a coarse pixel by its `flat_index`; `light` and `unoccluded` are pre-exposed, see `CoarseLight`."""
     diffuse = luminance_ratio(light.diffuse, unoccluded.diffuse)
     specular = luminance_ratio(light.specular, unoccluded.specular)
     write_record(out.diffuse, index, pack_light(light.diffuse, unoccluded.diffuse, diffuse))

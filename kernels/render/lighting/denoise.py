@@ -83,13 +83,13 @@ class KernelSum:
     unoccluded_specular: wp.vec3
     indirect: wp.vec3
     statistic: wp.vec2
-    """Of the visibility ratios of diffuse and specular light, see `pack_light`."""
+    """Weighted sums of the statistics in `pack_light`, of the diffuse and the specular visibility ratio."""
     weight: float
 
 
 @wp.func
 def read_light(light: CoarseLight, index: int) -> KernelSum:
-    """One coarse pixel by its `flat_index`, with weight 1."""
+    """Read a coarse pixel by its `flat_index`, as sums of weight 1."""
     diffuse = read_record(light.diffuse, index)
     specular = read_record(light.specular, index)
     a, b, c = unpack_half2(diffuse[0]), unpack_half2(diffuse[1]), unpack_half2(diffuse[2])
@@ -107,7 +107,7 @@ def read_light(light: CoarseLight, index: int) -> KernelSum:
 
 @wp.func
 def add_light(total: KernelSum, one: KernelSum, weight: float) -> KernelSum:
-    """Add one coarse pixel to the sums."""
+    """Add a coarse pixel to weighted sums."""
     result = KernelSum()
     result.diffuse = total.diffuse + weight * one.diffuse
     result.specular = total.specular + weight * one.specular
@@ -121,9 +121,9 @@ def add_light(total: KernelSum, one: KernelSum, weight: float) -> KernelSum:
 
 @wp.func
 def row_weights(guide: Guide, plane: Plane, grid: ImageGrid, view: int, row: int, column: int, r: int, start: int, stride: int) -> wp.vec4:
-    """Bilateral weights of four coarse pixels in row `r`, `stride` apart from offset `start` on; 0 outside the image.
+    """Bilateral weights of four coarse pixels in row `r`, at column offsets `start`, `start + stride`, ...; 0 outside the image.
 
-    `row` and `column` are the plane's own.
+    `row` and `column` are those of the plane's own coarse pixel.
     """
     weights = wp.vec4()
     if r < 0 or r >= grid.height:
@@ -165,7 +165,7 @@ def filter_blocks_kernel(
     sums = KernelSum()
     square = wp.vec2(0.0, 0.0)
     squared_weight = float(0.0)
-    # Not unrolled: few registers, so that many threads are resident.
+    # This loop is not unrolled, which saves registers and raises occupancy.
     start = int(BLOCK_START)
     for down in range(start, start + BLOCK):
         weights = row_weights(guide, plane, coarse.grid, view, row, column, row + down, BLOCK_START, 1)
@@ -179,7 +179,7 @@ def filter_blocks_kernel(
                 squared_weight += weight * weight
     scale = 1.0 / sums.weight
     mean = scale * sums.statistic
-    # Over the effective number of samples.
+    # Divided by the effective number of samples.
     share = squared_weight * scale * scale
     variance = share * (scale * square - wp.cw_mul(mean, mean))
     diffuse = pack_light(scale * sums.diffuse, scale * sums.unoccluded_diffuse, wp.max(variance[0], 0.0))
@@ -191,7 +191,10 @@ def filter_blocks_kernel(
 
 @wp.func
 def shrink(wide: wp.vec3, narrow: wp.vec3, variance: float) -> wp.vec3:
-    """Shrinkage estimator: `wide`, moved towards `narrow` as far as their squared difference exceeds the `variance` of `narrow`."""
+    """Shrinkage estimator (James and Stein, 1961): interpolates from `wide` to `narrow` where their squared difference exceeds `variance`.
+
+    `variance` is that of `narrow`; the larger the difference is relative to it, the closer is the result to `narrow`.
+    """
     difference = luminance(narrow) - luminance(wide)
     square = difference * difference
     if square <= variance:
@@ -201,9 +204,10 @@ def shrink(wide: wp.vec3, narrow: wp.vec3, variance: float) -> wp.vec3:
 
 @wp.func
 def firefly_variance(wide: wp.vec3, narrow: wp.vec3, pooled: float, own: float) -> float:
-    """Variance by which `narrow` is judged: its own, if that is larger, where it is brighter than `wide`.
+    """Variance of `narrow` for the shrinkage estimator: `pooled`, or its `own` if that is larger and `narrow` is brighter than `wide`.
 
-    A lone bright path (firefly) raises a block's mean and its variance. Darker blocks are mostly contact shadows.
+    This suppresses fireflies: a single bright path raises the mean of its block and the block's own variance. Blocks that are darker than
+    their neighbours are mostly contact shadows, and keep the pooled variance.
     """
     if luminance(narrow) > luminance(wide):
         return wp.max(pooled, own)
@@ -214,13 +218,13 @@ def firefly_variance(wide: wp.vec3, narrow: wp.vec3, pooled: float, own: float) 
 def choose_ratio(
     wide: wp.vec3, medium: wp.vec3, narrow: wp.vec3, medium_weight: float, pooled: float, medium_sum: float, narrow_variance: float
 ) -> wp.vec3:
-    """Visibility ratio of the widest kernel that agrees with the narrower ones; the medium kernel is left out where its weight is 0.
+    """Visibility ratio of the widest kernel that agrees with the narrower ones; the medium kernel is skipped where its weight is 0.
 
     Args:
         wide, medium, narrow: Ratios of the three kernels.
         medium_weight: Sum of the weights of the medium kernel's blocks.
-        pooled: Variance of a block's ratio, the mean over the wide kernel.
-        medium_sum: Sum of the medium kernel's variances, weighted.
+        pooled: Mean variance of a block's ratio over the wide kernel.
+        medium_sum: Weighted sum of the variances of the medium kernel's blocks.
         narrow_variance: Variance of the narrow kernel's ratio.
     """
     result = wide
@@ -231,7 +235,7 @@ def choose_ratio(
 
 @wp.func
 def add_blocks(total: KernelSum, blocks: CoarseLight, middle: int, weights: wp.vec4) -> KernelSum:
-    """Add a row of four blocks of the wide kernel to the sums, those whose weight is not 0; `middle`: `flat_index` of the row's middle."""
+    """Add a row of four blocks of the wide kernel to weighted sums; `middle` is the `flat_index` of the row's centre."""
     result = total
     for j in range(BLOCKS):
         if weights[j] > 0.0:
@@ -255,8 +259,8 @@ def choose_widths_kernel(
 ):
     """Choose the filter width: visibility ratios of the widest kernel (4 x 4, 2 x 2 or 1 block) that agrees with the narrower ones.
 
-    Blocks of a kernel do not overlap, so a mean over n of them has 1/n of a block's variance. That is the estimated variance times
-    `variance_scale`, see `firefly_variance`. Indirect light always takes the wide kernel. All members of `ratios_out` are written.
+    Blocks of a kernel do not overlap, so the mean of n blocks has 1/n of a block's variance. A block's variance is its estimate, see
+    `firefly_variance`, times `variance_scale`. Indirect light always takes the wide kernel. All members of `ratios_out` are written.
     """
     view, row, column = tile_pixel(coarse.grid, wp.tid() + first)
     if not in_image(coarse.grid, row, column):
@@ -267,7 +271,7 @@ def choose_widths_kernel(
     if int(segment) == Segment.NOTHING:
         return
     plane = coarse_plane(coarse, surface, cameras.intrinsics[views.camera[view]], row, column)
-    # First the middle rows, of which the middle is the medium kernel. Not unrolled, as in `filter_blocks_kernel`.
+    # The two middle rows come first: their inner blocks are the medium kernel. The loops are not unrolled, see `filter_blocks_kernel`.
     sums = KernelSum()
     sides = wp.vec4()
     middle = int(BLOCKS_START) + BLOCK
@@ -289,7 +293,7 @@ def choose_widths_kernel(
     diffuse = visibility_ratio(narrow.diffuse, narrow.unoccluded_diffuse)
     specular = visibility_ratio(narrow.specular, narrow.unoccluded_specular)
     if sums.weight <= 0.0:
-        # The middles of all blocks may lie off the body.
+        # The centres of all blocks lie on other bodies.
         ratios_out.record[view, row, column] = pack_ratios(diffuse, specular, narrow.indirect, surface_depth(surface), segment)
         return
     scale = 1.0 / sums.weight

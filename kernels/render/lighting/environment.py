@@ -109,7 +109,7 @@ def environment_radiance(lights: Lights, light: int, direction: wp.vec3) -> wp.v
 
 @wp.func
 def prefiltered_level(lights: Lights, light: int, level: int, taps: BilinearTaps) -> wp.vec3:
-    """One level of the prefiltered specular map, bilinear; exposed."""
+    """Bilinear look-up in one level of the prefiltered specular map; pre-exposed, see `CoarseLight`."""
     return bilinear(
         taps,
         unpack_half3(lights.prefiltered[light, level, taps.upper, taps.west]),

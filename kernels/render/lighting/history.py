@@ -347,7 +347,7 @@ def accumulate(
     """Add the light of new paths to a coarse pixel's history, and return the new average.
 
     Args:
-        light: Mean of the new paths, exposed.
+        light: Mean of the new paths, pre-exposed.
         known: Paths of the history that are kept; 0: it is replaced.
         samples: Number of new paths; 1 if `known` is above 0, so that the new path has the weight 1 / (known + 1).
     """

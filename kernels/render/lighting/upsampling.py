@@ -38,7 +38,7 @@ class Ratios:
     diffuse: wp.vec3
     """Visibility ratio of diffuse light: a pixel multiplies its own unoccluded light by it."""
     indirect: wp.vec3
-    """Demodulated indirect diffuse light, exposed as in `CoarseLight`; not a ratio."""
+    """Demodulated indirect diffuse light, pre-exposed as in `CoarseLight`; not a ratio."""
     specular: wp.vec3
     """Visibility ratio of specular light."""
 

@@ -42,9 +42,8 @@ def balance_worlds(episodes: int, limit: int) -> int:
 def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None = None) -> Config:
     """Resolve `bake.worlds`: as set, or if 0 from the number of episodes; on a GPU at least MIN_GPU_WORLDS.
 
-    Automatic: balanced rounds (`balance_worlds`). Where all episodes fit, they run at once: the longest one decides when physics ends, and
-    the renderer has ticks in store until then (`TickLoop`). The minimum keeps episodes independent of the number of worlds; surplus
-    worlds idle.
+    Automatic: balanced rounds (`balance_worlds`). If all episodes fit, they run at once: physics ends with the longest of them, and may be
+    ahead of the renderer from the start (`TickLoop`). The minimum keeps episodes independent of the number of worlds; surplus worlds idle.
 
     Args:
         config: All settings.
@@ -172,7 +171,7 @@ class Physics:
         return period if watcher is None and self.device.is_cuda and count % period == 0 else count
 
     def _capture(self, substeps: Iterator[None]) -> None:
-        """Capture a CUDA graph for each substep of a period, and list them as often as a tick has periods.
+        """Capture a CUDA graph for each substep of a period; `_graphs` repeats them for all substeps of a tick.
 
         A single graph of a whole tick could not be enqueued in parts, and CUDA would spread it over 66 streams.
         """
