@@ -17,6 +17,7 @@ from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
+from synpick_warp.stages.sim.fused_solver import FusedSteel
 
 # Sentinel: default of `next` for an exhausted iterator.
 ENDED = object()
@@ -241,7 +242,7 @@ def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.Collisi
 
 def make_solver(physics: PhysicsConfig, model: newton.Model, slots: int) -> newton.solvers.SolverSteel:
     """Rigid-body solver of all worlds of a model with `slots` free bodies a world."""
-    return newton.solvers.SolverSteel(
+    return FusedSteel(
         model,
         iterations=physics.iterations,
         contact_warmstart=True,
@@ -266,6 +267,7 @@ def _sweep(physics: PhysicsConfig, slots: int, parallel: bool) -> dict[str, Any]
     return {
         "solve_mode": "colored",
         "articulated_contact_response": "propagation",
+        "propagation_cached_response": False,
         "propagation_constraint_max": physics.rows_per_world,
         "free_body_constraint_max": build.FREE_DOFS * slots,
         "deterministic": wp.DeterministicMode.RUN_TO_RUN if physics.deterministic else wp.DeterministicMode.NOT_GUARANTEED,

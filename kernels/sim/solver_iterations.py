@@ -1,0 +1,242 @@
+"""Projected Gauss-Seidel (PGS) iterations of Newton's SolverSteel in one kernel: a warp runs all iterations of its world.
+
+The device functions of an iteration are the solver's own, and `stages.sim.fused_solver` passes them in. This module has the arrays that
+they share, under the names of their parameters, and calls them in the order in which the solver launches them. Frames and units are the
+solver's; twists are at centers of mass.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+# Threads of a warp. A block is one warp, which owns one world, so that a barrier of the warp orders the functions of an iteration.
+WARP = wp.constant(32)
+# Values of the solver's `row_phase`: the rows that a sweep over joint rows visits.
+INTERNAL_ROWS = wp.constant(3)
+CONTACT_ROWS = wp.constant(4)
+VELOCITY_LIMITS = wp.constant(5)
+
+
+@wp.struct
+class JointRowData:
+    """Constraint rows that act on joint velocities: limits of the gripper's joints (`world_...`), speed limits of free bodies (`mf_...`).
+
+    Arrays are (world, row), Jacobians J, responses Y and M⁻¹Jᵀ (world, row, dof); suffixes a, b: first and second body of a row.
+    """
+
+    world_constraint_count: wp.array[int]
+    world_dof_indices: wp.array2d[int]
+    rhs_bias: wp.array2d[float]
+    world_diag: wp.array2d[float]
+    world_impulses: wp.array2d[float]
+    J_world: wp.array3d[float]
+    Y_world: wp.array3d[float]
+    world_row_type: wp.array2d[int]
+    world_row_parent: wp.array2d[int]
+    world_row_mu: wp.array2d[float]
+    world_drive_target_vel_bias: wp.array2d[float]
+    world_drive_vel_multiplier: wp.array2d[float]
+    world_drive_impulse_multiplier: wp.array2d[float]
+    world_drive_max_impulse: wp.array2d[float]
+    world_drive_vel_limit: wp.array2d[float]
+    mf_constraint_count: wp.array[int]
+    mf_contact_rows_end: wp.array[int]
+    mf_meta: wp.array2d[int]
+    mf_impulses: wp.array2d[float]
+    mf_J_a: wp.array3d[float]
+    mf_J_b: wp.array3d[float]
+    mf_MiJt_a: wp.array3d[float]
+    mf_MiJt_b: wp.array3d[float]
+    mf_row_mu: wp.array2d[float]
+    world_row_w: wp.array2d[float]
+    mf_row_w: wp.array2d[float]
+    world_torsion_group: wp.array2d[int]
+    torsion_row_radius: wp.array2d[float]
+    compliance_dense_gamma: wp.array2d[float]
+    compliance_mf_gamma: wp.array2d[float]
+
+
+@wp.struct
+class ContactRowData:
+    """Constraint rows of contacts, which act on twists, and their graph coloring.
+
+    Arrays are (world, row), Jacobians and responses (world, row, 6); units are contacts with their friction rows, sorted by color.
+    """
+
+    propagation_constraint_count: wp.array[int]
+    propagation_body_a: wp.array2d[int]
+    propagation_body_b: wp.array2d[int]
+    propagation_MiJt_a: wp.array3d[float]
+    propagation_MiJt_b: wp.array3d[float]
+    propagation_J_a: wp.array3d[float]
+    propagation_J_b: wp.array3d[float]
+    propagation_eff_mass_inv: wp.array2d[float]
+    propagation_rhs: wp.array2d[float]
+    propagation_row_w: wp.array2d[float]
+    propagation_row_type: wp.array2d[int]
+    propagation_row_parent: wp.array2d[int]
+    propagation_row_mu: wp.array2d[float]
+    propagation_torsion_first: wp.array2d[int]
+    propagation_torsion_next: wp.array2d[int]
+    propagation_torsion_row_radius: wp.array2d[float]
+    compliance_gamma: wp.array2d[float]
+    world_row_order: wp.array[int]
+    world_color_offsets: wp.array[int]
+    propagation_body_list: wp.array2d[int]
+    propagation_body_count: wp.array[int]
+    propagation_body_local_slot: wp.array[int]
+    propagation_unit_meta: wp.array[int]
+    propagation_unit_friction_setup: wp.array[float]
+    propagation_unit_payload: wp.array[float]
+    propagation_ring_overflow: wp.array[int]
+    propagation_impulses: wp.array2d[float]
+
+
+@wp.struct
+class BodyData:
+    """The gripper, a tree of joints (articulation) in each world, and the free bodies; arrays are (joint), (dof) or (body)."""
+
+    group_to_art: wp.array[int]
+    articulation_active: wp.array[int]
+    art_to_world: wp.array[int]
+    dense_contact_world_flag: wp.array[int]
+    cache_world_flag: wp.array[int]
+    articulation_start: wp.array[int]
+    joint_parent: wp.array[int]
+    joint_child: wp.array[int]
+    joint_qd_start: wp.array[int]
+    joint_parent_slot: wp.array[int]
+    propagation_joint_S_flat: wp.array2d[float]
+    propagation_body_com_rel: wp.array2d[float]
+    propagation_tree_U: wp.array2d[float]
+    propagation_tree_D_inv: wp.array3d[float]
+    free_body_dofs: wp.array2d[int]
+    """First degree of freedom of each free body (world, free body)."""
+    free_bodies: wp.array2d[int]
+    """Body index of each free body (world, free body)."""
+
+
+@wp.struct
+class IterationSettings:
+    """Settings of the iterations, as the solver's methods take them."""
+
+    iterations: int
+    omega: float
+    """Relaxation factor."""
+    regularize: int
+    freeze_drive_rows: int
+    friction_start_iteration: int
+    iteration_offset: int
+    internal_rows: int
+    """1: the model can have joint limits."""
+    velocity_limits: int
+    """1: the model can have velocity limits."""
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+""")
+def synchronize_warp():
+    """Barrier of the threads of a warp: each sees what the others have written to memory."""
+    ...
+
+
+def compose_iterations(
+    sweep_joint_rows: wp.Function, refresh_tree: wp.Function, sweep_contacts: wp.Function, propagate: wp.Function
+) -> wp.Kernel:
+    """Create the kernel of the iterations from the solver's device functions, each of which works on one world with one warp.
+
+    Args:
+        sweep_joint_rows: Gauss-Seidel sweep over the rows of `JointRowData` that a row phase names.
+        refresh_tree: Twists of the gripper's bodies from its joint velocities.
+        sweep_contacts: Gauss-Seidel sweep over the contact rows, color by color, which changes twists and gathers impulses.
+        propagate: Joint velocities and twists of the gripper from the impulses gathered on its bodies (articulated-body algorithm).
+    """
+
+    @wp.func
+    def sweep_rows(world: int, row_phase: int, iteration: int, settings: IterationSettings, rows: JointRowData, v_inout: wp.array[float]):
+        """Sweep a world once over the joint rows of a row phase."""
+        sweep_joint_rows(
+            world, rows.world_constraint_count, rows.world_dof_indices, rows.rhs_bias, rows.world_diag, rows.world_impulses,
+            rows.J_world, rows.Y_world, rows.world_row_type, rows.world_row_parent, rows.world_row_mu, rows.world_drive_target_vel_bias,
+            rows.world_drive_vel_multiplier, rows.world_drive_impulse_multiplier, rows.world_drive_max_impulse, rows.world_drive_vel_limit,
+            rows.mf_constraint_count, rows.mf_contact_rows_end, rows.mf_meta, rows.mf_impulses, rows.mf_J_a, rows.mf_J_b, rows.mf_MiJt_a,
+            rows.mf_MiJt_b, rows.mf_row_mu, rows.world_row_w, rows.mf_row_w, rows.world_torsion_group, rows.torsion_row_radius,
+            rows.compliance_dense_gamma, rows.compliance_mf_gamma, 1, settings.omega, settings.regularize, settings.freeze_drive_rows,
+            row_phase, settings.friction_start_iteration, iteration, v_inout,
+        )  # fmt: skip
+        synchronize_warp()
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def solver_iterations_kernel(
+        # Scene:
+        settings: IterationSettings,
+        bodies: BodyData,
+        # State:
+        joint_rows: JointRowData,
+        contacts: ContactRowData,
+        twist_inout: wp.array2d[float],  # (body, 6) [m/s, rad/s]
+        impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
+        v_inout: wp.array[float],  # (dof) [m/s, rad/s]
+    ):
+        """Projected Gauss-Seidel (PGS) iterations of a world: joint limits, contacts, their effect on the gripper, velocity limits.
+
+        One warp a world. Sweeps without rows are skipped. Sweeps over contacts change twists, those over joint rows joint velocities `v`.
+        Where the latter can change free bodies, their velocities are copied in each iteration, otherwise before the first and after the
+        last one.
+        """
+        world, lane = wp.tid()
+        has_limits = settings.internal_rows != 0 and joint_rows.world_constraint_count[world] > 0
+        free_contacts = joint_rows.mf_contact_rows_end[world]
+        has_contacts = bodies.dense_contact_world_flag[world] != 0 or free_contacts > 0
+        has_velocity_limits = settings.velocity_limits != 0 and joint_rows.mf_constraint_count[world] > free_contacts
+        last = settings.iterations - 1
+        for step in range(settings.iterations):
+            iteration = settings.iteration_offset + step
+            if has_limits:
+                sweep_rows(world, INTERNAL_ROWS, iteration, settings, joint_rows, v_inout)
+            if has_contacts:
+                sweep_rows(world, CONTACT_ROWS, iteration, settings, joint_rows, v_inout)
+            refresh_tree(
+                world, bodies.group_to_art, bodies.articulation_active, bodies.art_to_world, bodies.dense_contact_world_flag,
+                1, bodies.articulation_start, bodies.joint_parent, bodies.joint_child, bodies.joint_qd_start, bodies.joint_parent_slot,
+                bodies.propagation_joint_S_flat, bodies.propagation_body_com_rel, v_inout, twist_inout,
+            )  # fmt: skip
+            if step == 0 or has_contacts or has_velocity_limits:
+                for element in range(lane, bodies.free_bodies.shape[1] * 6, WARP):
+                    free = element // 6
+                    axis = element - 6 * free
+                    twist_inout[bodies.free_bodies[world, free], axis] = v_inout[bodies.free_body_dofs[world, free] + axis]
+            synchronize_warp()
+            sweep_contacts(
+                world, bodies.free_bodies.shape[0], contacts.propagation_constraint_count, contacts.propagation_body_a,
+                contacts.propagation_body_b, contacts.propagation_MiJt_a, contacts.propagation_MiJt_b, contacts.propagation_J_a,
+                contacts.propagation_J_b, contacts.propagation_eff_mass_inv, contacts.propagation_rhs, contacts.propagation_row_w,
+                contacts.propagation_row_type, contacts.propagation_row_parent, contacts.propagation_row_mu,
+                contacts.propagation_torsion_first, contacts.propagation_torsion_next, contacts.propagation_torsion_row_radius,
+                contacts.compliance_gamma, contacts.world_row_order, contacts.world_color_offsets, contacts.propagation_body_list,
+                contacts.propagation_body_count, contacts.propagation_body_local_slot, contacts.propagation_unit_meta,
+                contacts.propagation_unit_friction_setup, contacts.propagation_unit_payload, contacts.propagation_ring_overflow,
+                settings.omega, settings.regularize, settings.friction_start_iteration, iteration, contacts.propagation_impulses,
+                twist_inout, impulse_inout,
+            )  # fmt: skip
+            synchronize_warp()
+            propagate(
+                world, bodies.group_to_art, bodies.articulation_active, bodies.art_to_world, bodies.cache_world_flag,
+                bodies.articulation_start, bodies.joint_parent, bodies.joint_child, bodies.joint_qd_start, bodies.joint_parent_slot,
+                bodies.propagation_joint_S_flat, bodies.propagation_body_com_rel, bodies.propagation_tree_U, bodies.propagation_tree_D_inv,
+                impulse_inout, twist_inout, v_inout,
+            )  # fmt: skip
+            if step == last or has_contacts or has_velocity_limits:
+                for element in range(lane, bodies.free_bodies.shape[1] * 6, WARP):
+                    free = element // 6
+                    axis = element - 6 * free
+                    v_inout[bodies.free_body_dofs[world, free] + axis] = twist_inout[bodies.free_bodies[world, free], axis]
+                    impulse_inout[bodies.free_bodies[world, free], axis] = 0.0
+            synchronize_warp()
+            if has_velocity_limits:
+                sweep_rows(world, VELOCITY_LIMITS, iteration, settings, joint_rows, v_inout)
+
+    return solver_iterations_kernel

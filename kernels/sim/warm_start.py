@@ -1,0 +1,47 @@
+"""Warm start of the contact solver: the impulses of the last substep as a first guess, and the velocities that follow from them."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def apply_warm_start_kernel(
+    # State:
+    row_count: wp.array[int],  # (world)
+    body_count: wp.array[int],  # (world)
+    body_list: wp.array2d[int],  # (world, slot)
+    body_a: wp.array2d[int],  # (world, row)
+    body_b: wp.array2d[int],  # (world, row)
+    jacobian_a: wp.array3d[float],  # (world, row, 6)
+    jacobian_b: wp.array3d[float],  # (world, row, 6)
+    response_a: wp.array3d[float],  # (world, row, 6) [1/kg, 1/(kg m²)]
+    response_b: wp.array3d[float],  # (world, row, 6) [1/kg, 1/(kg m²)]
+    impulse: wp.array2d[float],  # (world, row) [N s]
+    twist_inout: wp.array2d[float],  # (body, 6) [m/s, rad/s]
+    body_impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
+):
+    """Apply all contact impulses λ to each body: M⁻¹Jᵀλ is added to its twist and Jᵀλ to its impulse, in the order of the rows.
+
+    One thread a world, body with contacts, and twist component. The solver has one a world and component, which walks all rows and waits
+    for each sum; the order of summation, and so each bit, is the same.
+    """
+    world, slot, axis = wp.tid()
+    if slot >= body_count[world]:
+        return
+    body = body_list[world, slot]
+    velocity = twist_inout[body, axis]
+    total = body_impulse_inout[body, axis]
+    for row in range(wp.min(row_count[world], impulse.shape[1])):
+        strength = impulse[world, row]
+        a = body_a[world, row]
+        b = body_b[world, row]
+        if strength != 0.0:
+            if a == body:
+                velocity = velocity + response_a[world, row, axis] * strength
+                total = total + jacobian_a[world, row, axis] * strength
+            if b == body:
+                velocity = velocity + response_b[world, row, axis] * strength
+                total = total + jacobian_b[world, row, axis] * strength
+    twist_inout[body, axis] = velocity
+    body_impulse_inout[body, axis] = total

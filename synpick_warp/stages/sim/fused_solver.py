@@ -1,0 +1,226 @@
+"""Kernel fusion for Newton's SolverSteel: the iterations of a substep in one kernel instead of ten kernels an iteration."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from collections.abc import Iterable
+from functools import cache, cached_property
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from synpick_warp.kernels.sim import solver_iterations, warm_start
+
+PACKED_WORLDS = 256
+"""Most worlds for which contact rows are packed into records of 384 bytes. On an H200 a tick of 64 worlds takes 0.180 instead of 0.189 s,
+one of 512 worlds 0.272 instead of 0.274 s, for 300 MB."""
+FUSED_VERSION = "1.8.0"
+"""Version of Newton whose private parts `FusedSteel` knows. With any other one the solver launches its own kernels: the same, slower."""
+
+steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
+"""The solver's module, with the factories of its kernels."""
+
+
+class FusedSteel(newton.solvers.SolverSteel):
+    """SolverSteel whose projected Gauss-Seidel iterations run in one kernel, a warp a world. Results are the same bit by bit.
+
+    The solver launches ten kernels an iteration, 160 of the 364 of a substep, each of which waits for the one before it: for microseconds
+    on an idle GPU, and longer beside a renderer. `solver_iterations` calls the same device functions one after the other. The warm start
+    of the contacts has more threads.
+
+    It needs the colored sweep, one articulation a world besides the free bodies, and no cached responses. On a CPU, and with a version of
+    Newton other than FUSED_VERSION, the solver's own launches run.
+    """
+
+    def _launch_propagation_solve(
+        self,
+        rhs: wp.array,
+        propagation_rhs: wp.array,
+        iterations: int,
+        *,
+        regularize: bool,
+        freeze_drive_rows: bool = False,
+        friction_start_iteration: int = 0,
+        iteration_offset: int = 0,
+    ) -> None:
+        """Run the iterations of a solve; arguments as of the solver's own method."""
+        options = {
+            "regularize": regularize,
+            "freeze_drive_rows": freeze_drive_rows,
+            "friction_start_iteration": friction_start_iteration,
+            "iteration_offset": iteration_offset,
+        }
+        if not self._is_fused:
+            super()._launch_propagation_solve(rhs, propagation_rhs, iterations, **options)
+            return
+        if self._color_unit_meta_stale:
+            self._color_unit_meta_stale = False
+            self._launch_gather_unit_meta()
+        internal_rows, velocity_limits = self._internal_row_phases()
+        settings = solver_iterations.IterationSettings()
+        settings.iterations, settings.omega = iterations, self.relaxation
+        settings.internal_rows, settings.velocity_limits = int(internal_rows), int(velocity_limits)
+        for name, value in options.items():
+            setattr(settings, name, int(value))
+        wp.launch_tiled(
+            self._iterations_kernel(),
+            dim=[self._world_count],
+            inputs=[settings, self._bodies(), self._joint_rows(rhs), self._contact_rows(propagation_rhs)],
+            outputs=[self._propagation_body_qd, self._propagation_body_impulses, self._v_out],
+            block_dim=int(solver_iterations.WARP),
+            device=self.model.device,
+        )
+
+    def _init_colored_kernels(self, model: newton.Model) -> None:
+        """Choose the variant of the sweep over contacts: from packed records, also in more worlds than the solver would."""
+        super()._init_colored_kernels(model)
+        if self._is_fused and self._color_unit_payload is None and self._world_count <= PACKED_WORLDS:
+            words = self._world_count * self._propagation_max_constraints * steel.PROPAGATION_UNIT_PAYLOAD
+            self._color_unit_payload = wp.zeros(words, dtype=wp.float32, device=model.device)
+
+    def _apply_propagation_warmstart_velocity(self) -> None:
+        """Turn the impulses of the warm start into velocities, with a thread for each component of each body instead of each world."""
+        if not self._is_fused or not self._ordered_rows:
+            super()._apply_propagation_warmstart_velocity()
+            return
+        wp.launch(
+            warm_start.apply_warm_start_kernel,
+            dim=(self._world_count, self._max_propagation_bodies, 6),
+            inputs=[
+                self._propagation_constraint_count,
+                self._propagation_body_count,
+                self._propagation_body_list,
+                self._propagation_body_a,
+                self._propagation_body_b,
+                self._propagation_J_a,
+                self._propagation_J_b,
+                self._propagation_MiJt_a,
+                self._propagation_MiJt_b,
+                self._propagation_impulses,
+            ],
+            outputs=[self._propagation_body_qd, self._propagation_body_impulses],
+            device=self.model.device,
+        )
+        self._propagation_propagate_impulses()
+
+    @property
+    def _is_fused(self) -> bool:
+        """Whether our kernels replace the solver's."""
+        return self.model.device.is_cuda and newton.__version__ == FUSED_VERSION
+
+    def _iterations_kernel(self) -> wp.Kernel:
+        """Kernel of the iterations, made of the device functions of the solver's own kernels."""
+        size = self._propagation_tree_sizes[0]
+        sweep_contacts = steel._get_pgs_solve_propagation_colored_warp_kernel(
+            self._propagation_max_constraints,
+            steel.PROPAGATION_COLOR_TAIL + 2,
+            self._max_propagation_bodies,
+            1,
+            self.model.device.arch,
+            packed=self._color_unit_payload is not None,
+        )
+        return compose_kernel(
+            self._pgs_solve_mf_gs_kernel_for_phase(),
+            self._propagation_refresh_kernels[size],
+            sweep_contacts,
+            self._propagation_propagate_kernels[size],
+        )
+
+    def _joint_rows(self, rhs: wp.array) -> Any:
+        """Rows in joint space and of free bodies."""
+        return fill(solver_iterations.JointRowData(), self._mf_gs_inputs(rhs))
+
+    def _contact_rows(self, rhs: wp.array) -> Any:
+        """Contact rows with their coloring."""
+        return fill(
+            solver_iterations.ContactRowData(),
+            [
+                self._propagation_constraint_count,
+                self._propagation_body_a,
+                self._propagation_body_b,
+                self._propagation_MiJt_a,
+                self._propagation_MiJt_b,
+                self._propagation_J_a,
+                self._propagation_J_b,
+                self._propagation_eff_mass_inv,
+                rhs,
+                self._propagation_row_w,
+                self._propagation_row_type,
+                self._propagation_row_parent,
+                self._propagation_row_mu,
+                self._propagation_torsion_first,
+                self._propagation_torsion_next,
+                self._propagation_torsion_row_radius,
+                self._compliance_off_gamma,
+                self._color_world_row_order,
+                self._color_world_offsets,
+                self._propagation_body_list,
+                self._propagation_body_count,
+                self._propagation_body_local_slot,
+                self._color_unit_meta,
+                self._color_unit_friction_setup,
+                self._color_unit_payload if self._color_unit_payload is not None else self._color_unit_friction_setup,
+                self._color_ring_overflow,
+                self._propagation_impulses,
+            ],
+        )
+
+    def _bodies(self) -> Any:
+        """The gripper's tree and the free bodies of all worlds."""
+        model = self.model
+        return fill(
+            solver_iterations.BodyData(),
+            [
+                self._propagation_tree_arts[self._propagation_tree_sizes[0]],
+                self._propagation_tree_activity,
+                self._art_to_world,
+                self._dense_contact_world_flag,
+                self._propagation_cache_guard_off,
+                model.articulation_start,
+                model.joint_parent,
+                model.joint_child,
+                model.joint_qd_start,
+                self._propagation_joint_parent_slot,
+                self._propagation_joint_S_flat,
+                self._propagation_body_com_rel,
+                self._propagation_tree_U,
+                self._propagation_tree_D_inv,
+                *self._free_bodies,
+            ],
+        )
+
+    @cached_property
+    def _free_bodies(self) -> tuple[wp.array, wp.array]:
+        """First degree of freedom and body index of each free body (world, free body) int32."""
+        arrays: list[Any] = [self._free_rigid_body_indices, self.model.body_world, self._art_to_world]
+        arrays += [self._propagation_tree_arts[self._propagation_tree_sizes[0]], self._articulation_dof_start, self._body_to_articulation]
+        free, world_of_body, world_of_tree, tree, first_dof, tree_of_body = (array.numpy() for array in arrays)
+        bodies = free.reshape(self._world_count, -1)
+        worlds, trees = world_of_body[bodies], world_of_tree[tree]
+        if (worlds != np.arange(self._world_count)[:, None]).any() or (trees != np.arange(self._world_count)).any():
+            raise ValueError("The worlds of the model are not in order, or differ in their numbers of bodies.")
+        dofs = first_dof[tree_of_body[bodies]]
+        first, second = (wp.array(values, dtype=wp.int32, device=self.model.device) for values in (dofs, bodies))
+        return first, second
+
+
+def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:
+    """`struct` with `values` in the order of its fields; None: an empty array."""
+    for name, value in zip(struct._cls.vars, values, strict=True):
+        setattr(struct, name, value)
+    return struct
+
+
+@cache
+def compose_kernel(*kernels: wp.Kernel) -> wp.Kernel:
+    """Kernel of the iterations from kernels of the solver, each of which calls one device function."""
+    return solver_iterations.compose_iterations(*map(device_function, kernels))
+
+
+def device_function(kernel: wp.Kernel) -> wp.Function:
+    """The device function that a kernel of the solver wraps."""
+    (function,) = (value for value in inspect.getclosurevars(kernel.func).nonlocals.values() if isinstance(value, wp.Function))
+    return function

@@ -1,0 +1,92 @@
+"""Fused solver: bit by bit the results of Newton's own launches."""
+
+from __future__ import annotations
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from newton._src.solvers.steel import solver_steel as steel
+from newton._src.solvers.steel.kernels import accumulate_propagation_warmstart_body_impulses_ordered
+
+from synpick_warp.codes import Phase
+from synpick_warp.kernels.sim.warm_start import apply_warm_start_kernel
+from synpick_warp.stages.sim import fused_solver
+from synpick_warp.stages.sim.simulate import Simulation
+from tests.worlds.small_worlds import catalog, settings
+
+WORLDS, TICKS = 8, 30
+ARCHITECTURE, DOFS, BODIES, ROWS = 90, 16, 5, 96
+"""CUDA architecture, and sizes of a small world, for which the kernel is compiled."""
+
+
+def test_the_installed_version_of_newton_is_fused():
+    assert newton.__version__ == fused_solver.FUSED_VERSION
+
+
+def test_the_kernel_of_the_iterations_compiles(tmp_path):
+    """Its calls fit the solver's device functions; compiled for a GPU, also where there is none."""
+    joint_rows = steel._get_pgs_solve_mf_gs_kernel(
+        ROWS, ROWS, DOFS, ARCHITECTURE, has_dense_velocity_limit_rows=False, shared_metadata=True, row_phases=True
+    )
+    refresh = steel._get_refresh_propagation_tree_body_qd_warp_kernel(4, 2, ARCHITECTURE)
+    contacts = steel._get_pgs_solve_propagation_colored_warp_kernel(
+        ROWS, steel.PROPAGATION_COLOR_TAIL + 2, BODIES, 1, ARCHITECTURE, packed=True
+    )
+    propagate = steel._get_propagate_tree_impulses_revolute_kernel(4, 2, ARCHITECTURE, has_free_root=True)
+    kernel = fused_solver.compose_kernel(joint_rows, refresh, contacts, propagate)
+    wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=True)
+    (program,) = tmp_path.glob("*.ptx")
+    assert b"solver_iterations_kernel" in program.read_bytes()
+
+
+def test_warm_start_sums_impulses_as_newton_does(device):
+    """Random rows between bodies of a world and with static bodies (-1), some without an impulse; bodies are listed in any order."""
+    random = np.random.default_rng(4)
+    worlds, bodies, rows = 3, 7, 64
+    count = np.array([rows, 40, 0])
+    pairs = (
+        np.array([[random.permutation(bodies)[:2] for _ in range(rows)] for _ in range(worlds)]) + bodies * np.arange(worlds)[:, None, None]
+    )
+    pairs[:, ::5, 1] = -1
+    pairs[:, 2::7, 0] = -1
+    impulse = random.normal(size=(worlds, rows)) * (random.random((worlds, rows)) > 0.2)
+    listed = np.array([random.permutation(bodies) + bodies * world for world in range(worlds)])
+    jacobians = random.normal(size=(4, worlds, rows, 6)).astype(np.float32)
+
+    def run(kernel: wp.Kernel, dim: tuple[int, ...], *lists: np.ndarray, last: tuple[int, ...] = ()) -> tuple[np.ndarray, np.ndarray]:
+        out = [wp.array(np.linspace(-1.0, 1.0, worlds * bodies * 6).reshape(-1, 6), dtype=float, device=device) for _ in range(2)]
+        ints = [
+            wp.array(np.ascontiguousarray(values), dtype=int, device=device) for values in (count, *lists, pairs[..., 0], pairs[..., 1])
+        ]
+        floats = [wp.array(values, dtype=float, device=device) for values in (*jacobians, impulse)]
+        wp.launch(kernel, dim=dim, inputs=[*ints, *floats, *last], outputs=out, device=device)
+        return out[0].numpy(), out[1].numpy()
+
+    found = run(apply_warm_start_kernel, (worlds, bodies, 6), np.full(worlds, bodies), listed)
+    expected = run(accumulate_propagation_warmstart_body_impulses_ordered, (worlds, 6), last=(rows,))
+    np.testing.assert_array_equal(found, expected)
+    assert not np.array_equal(found[0], found[1])
+
+
+@pytest.mark.parametrize("max_speed", [0.3, 4.0])
+def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, max_speed):
+    """Piles fall, rest and are stirred; at the lower speed limit, what falls has velocity limit rows."""
+    if not device.is_cuda:
+        pytest.skip("on a CPU the solver's own launches run")
+    config = settings(
+        bake__worlds=WORLDS, bake__episodes=WORLDS, bake__mode="move", physics__max_speed=max_speed, physics__deterministic=True
+    )
+    found, phases = {}, set()
+    for version in (fused_solver.FUSED_VERSION, "another"):
+        monkeypatch.setattr(fused_solver, "FUSED_VERSION", version)
+        simulation = Simulation(config, catalog(), 2, device)
+        found[version] = []
+        for _ in range(TICKS):
+            simulation.tick()
+            found[version].append(simulation.physics.state.joint_q.numpy())
+            phases |= set(simulation.state.phase.numpy().tolist())
+        assert simulation.physics.solver._is_fused == (version != "another")
+    fused, launched = found.values()
+    np.testing.assert_array_equal(fused, launched)
+    assert Phase.ACT in phases
