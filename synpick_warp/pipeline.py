@@ -357,7 +357,7 @@ class _Run:
     def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
         """Export a tick: write its frames, launch the rendering of its views, and write the views and episode ends that are ready.
 
-        Between batches the next tick is enqueued.
+        Between batches the next tick is enqueued. Where physics limits the rate, the renderer leaves it a part of the GPU.
         """
         physics = self.config.physics
         batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
@@ -366,6 +366,7 @@ class _Run:
                 self.exporters.write_ticks(batch)
         records = self.factory.log.update(report)
         if self.exporters.needs_views:
+            self.factory.stream.confine(ticks.reserved_share)
             for views in self.factory.stream.advance(snapshot, report, partial(self._end_episodes, report, records)):
                 ticks.enqueue()
                 self._write(views)

@@ -137,3 +137,38 @@ def test_while_the_host_waits_for_a_tick_parts_of_the_next_are_enqueued(make_dev
             loop.advance()
             assert simulation.count == tick + 2
             assert len(loop.stream.queue) >= ticks.PARTS_IN_FLIGHT
+
+
+@pytest.mark.parametrize(("waiting", "max_lead"), [(3, 1), (0, 10), (0, 200)])
+def test_physics_gets_a_share_of_the_device_while_the_renderer_waits_or_the_lead_is_short(make_device, waiting, max_lead):
+    """First physics is slower: the device does nothing before the host waits. Then it does all that is enqueued between two ticks."""
+    device = make_device(0)
+    host_copies.time.sleep = lambda _: device.run(1)
+    simulation = ModelSimulation(device, [2000], waiting, 5)
+    with ticks.TickLoop(simulation, max_lead) as loop:
+        for _ in range(5):
+            loop.advance()
+            assert loop.reserved_share == ticks.PHYSICS_SHARE
+        shares = []
+        for _ in range(150):
+            for _ in range(5):
+                while device.run(1):
+                    pass
+                loop.enqueue()
+            loop.advance()
+            shares.append(loop.reserved_share)
+    assert shares == sorted(shares, reverse=True)
+    assert shares[-1] == 0.0
+    assert shares.count(ticks.PHYSICS_SHARE) <= 1 + min(ticks.SAFE_LEAD, loop.lead // 2)
+    assert (shares.count(ticks.PHYSICS_SHARE) > 1) == (loop.lead > 100)
+
+
+def test_physics_that_has_nothing_left_to_do_gets_no_share(make_device):
+    device = make_device(0)
+    with ticks.TickLoop(ModelSimulation(device, [3], 0, 2), 10) as loop:
+        shares = []
+        for _ in range(4):
+            loop.advance()
+            shares.append(loop.reserved_share)
+    assert shares[0] == ticks.PHYSICS_SHARE
+    assert shares[-1] == 0.0

@@ -1,0 +1,86 @@
+"""Partition of a GPU's multiprocessors by a CUDA green context: a stream whose kernels leave some of them free."""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cache
+
+import warp as wp
+
+from synpick_warp.errors import DeviceError
+
+_SM_RESOURCE = 1
+"""CU_DEV_RESOURCE_TYPE_SM"""
+_DEFAULT_STREAM = 1
+"""CU_GREEN_CTX_DEFAULT_STREAM, which cuGreenCtxCreate demands."""
+_NON_BLOCKING = 1
+"""CU_STREAM_NON_BLOCKING"""
+
+
+class _Resource(ctypes.Structure):
+    """CUdevResource. CUDA 13 has 152 bytes; here are more, since later drivers may write more."""
+
+    _fields_ = (("type", ctypes.c_uint), ("padding", ctypes.c_ubyte * 92), ("sm_count", ctypes.c_uint), ("more", ctypes.c_ubyte * 412))
+
+
+class SmPartition:
+    """A part of a GPU's multiprocessors (SMs), as a green context: kernels on its streams run on these alone, all others on all.
+
+    Green context and streams live as long as the process.
+    """
+
+    def __init__(self, device: wp.Device, reserved: int) -> None:
+        """Split the multiprocessors of a GPU.
+
+        Args:
+            device: A GPU.
+            reserved: Multiprocessors outside the partition; CUDA rounds up, with compute capability 9 to a multiple of 8.
+
+        Raises:
+            DeviceError: The driver has no green contexts (before CUDA 12.4), or the device has too few multiprocessors.
+        """
+        self.device = device
+        self._driver = _load_driver()
+        ordinal, groups = ctypes.c_int(), ctypes.c_uint(1)
+        whole, outside, inside = _Resource(), _Resource(), _Resource()
+        description, self._context = ctypes.c_void_p(), ctypes.c_void_p()
+        to = ctypes.byref
+        self._call("cuDeviceGet", to(ordinal), device.ordinal)
+        self._call("cuDeviceGetDevResource", ordinal, to(whole), _SM_RESOURCE)
+        self._call("cuDevSmResourceSplitByCount", to(outside), to(groups), to(whole), to(inside), 0, reserved)
+        self._call("cuDevResourceGenerateDesc", to(description), to(inside), 1)
+        self._call("cuGreenCtxCreate", to(self._context), description, ordinal, _DEFAULT_STREAM)
+        self.size, self.reserved = inside.sm_count, outside.sm_count
+        """Multiprocessors inside and outside the partition."""
+
+    @classmethod
+    def leaving(cls, device: wp.Device, fraction: float) -> SmPartition | None:
+        """Partition that leaves about `fraction` of the multiprocessors free; None: driver or device cannot be divided."""
+        try:
+            return cls(device, max(1, round(fraction * device.sm_count)))
+        except DeviceError:
+            return None
+
+    def make_stream(self) -> wp.Stream:
+        """Create a stream whose kernels run inside the partition."""
+        stream = ctypes.c_void_p()
+        self._call("cuGreenCtxStreamCreate", ctypes.byref(stream), self._context, _NON_BLOCKING, 0)
+        return wp.Stream(self.device, cuda_stream=stream.value)
+
+    def _call(self, name: str, *arguments: object) -> None:
+        """Call a function of the driver; a result other than 0 is an error."""
+        function = getattr(self._driver, name, None)
+        if function is None:
+            raise DeviceError(f"{self.device.alias}: the driver has no {name}: green contexts need CUDA 12.4")
+        result = function(*arguments)
+        if result != 0:
+            raise DeviceError(f"{self.device.alias}: {name} failed with CUDA error {result}")
+
+
+@cache
+def _load_driver() -> ctypes.CDLL:
+    """The driver's library, which Warp has loaded before."""
+    try:
+        return ctypes.CDLL("libcuda.so.1")
+    except OSError as error:
+        raise DeviceError("the NVIDIA driver's library libcuda.so.1 was not found") from error
