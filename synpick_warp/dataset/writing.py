@@ -16,6 +16,7 @@ import re
 import shutil
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from synpick_warp.configs.load import load_config
@@ -44,7 +45,7 @@ from synpick_warp.dataset.manifest import (
 from synpick_warp.errors import ConfigError, DatasetError, OutputError
 from synpick_warp.exporters.base import Exporter, SharedFiles
 from synpick_warp.exporters.registry import Exporters, finalize, load_exporter_classes, shared_files
-from synpick_warp.exporters.writing.checksums import write_manifest_entry
+from synpick_warp.exporters.writing.checksums import join_manifest_entry, name_parts, write_checksums, write_manifest_entry
 from synpick_warp.exporters.writing.files import PARTIAL, check_output_folder, output_error, sync_folder, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd
@@ -250,10 +251,19 @@ class OutputFolder:
 
 
 def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: EpisodeEnd) -> None:
-    """Commit an episode whose files are all in place: a writer computes their checksums and writes the manifest entry."""
+    """Commit an episode whose files are all in place: writers compute their checksums, each of one folder; the last writes the entry."""
     content = {"episode": end.episode, "row": dict(end.row), "attempts": [json.loads(line) for line in end.attempts]}
-    entry = episode_entry(end.episode)
-    pool.submit(write_manifest_entry, (), (out, entry, exporters.files(end.episode), content), path=out / entry)
+    entry, paths = episode_entry(end.episode), exporters.files(end.episode)
+    parts = name_parts(out, entry, len(paths))
+    missing = set(parts)
+
+    def join(part: Path) -> None:
+        missing.remove(part)
+        if not missing:
+            pool.submit(join_manifest_entry, (), (out, entry, parts, content), path=out / entry)
+
+    for path, part in zip(paths, parts, strict=True):
+        pool.submit(write_checksums, (), (out, path, part), path=out / entry, on_done=partial(join, part))
 
 
 def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:

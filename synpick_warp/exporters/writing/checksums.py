@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -12,17 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing.files import write_atomically
+from synpick_warp.exporters.writing.files import PARTIAL, write_atomically
 from synpick_warp.inputs.paths import path_inside
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 """Line of a checksum list: digest and name."""
 _RESERVED = ("manifest.json", "manifest", "config.toml", ".partial")
 """First parts of names that no list has: the data set's own records."""
+_WHOLE = 1 << 22
+"""Largest file that is read at once [bytes]."""
 _FLAGS = os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY | os.O_NOFOLLOW
 
 
-def open_regular(path: Path) -> int:
+def open_regular(path: Path | str) -> int:
     """Open a regular file for reading, no symbolic link, pipe or device; returns the handle.
 
     Raises:
@@ -32,7 +35,7 @@ def open_regular(path: Path) -> int:
     try:
         handle = os.open(path, _FLAGS)
     except OSError as error:
-        if path.is_symlink():
+        if os.path.islink(path):
             raise OSError(error.errno, "it is a symbolic link", str(path)) from None
         raise
     if not stat.S_ISREG(os.fstat(handle).st_mode):
@@ -43,8 +46,7 @@ def open_regular(path: Path) -> int:
 
 def checksum(path: Path) -> str:
     """SHA-256 of a regular file, in hexadecimal. Raises as `open_regular`."""
-    with open(open_regular(path), "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    return _hash_file(path)[0]
 
 
 def parse_checksums(lines: bytes, folder: Path, source: Path, advice: str) -> dict[str, str]:
@@ -84,19 +86,58 @@ def parse_checksums(lines: bytes, folder: Path, source: Path, advice: str) -> di
 
 def list_files(out: Path, paths: Sequence[Path]) -> list[Path]:
     """Expand files and folders into the files they hold, each once, relative to the data set, sorted by name."""
-    files: set[Path] = set()
-    for path in paths:
-        absolute = out / path
-        files.update((file.relative_to(out) for file in _walk(absolute)) if absolute.is_dir() else (path,))
-    return sorted(files, key=str)
+    return [Path(name) for name in _list_names(out, paths)]
 
 
-def _walk(folder: Path) -> Iterator[Path]:
-    for path in folder.iterdir():
-        if path.is_dir():
-            yield from _walk(path)
-        else:
-            yield path
+def _list_names(out: Path, paths: Sequence[Path]) -> list[str]:
+    """The same as strings: an episode has 100,000 files."""
+    names: set[str] = set()
+    for path in map(str, paths):
+        names.update(_walk(f"{out}/{path}", path) if os.path.isdir(f"{out}/{path}") else (path,))
+    return sorted(names)
+
+
+def _walk(folder: str, name: str) -> Iterator[str]:
+    """Names of the files in a folder, which is called `name`, and in its subfolders."""
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if entry.is_dir():
+                yield from _walk(entry.path, f"{name}/{entry.name}")
+            else:
+                yield f"{name}/{entry.name}"
+
+
+def _hash_file(path: Path | str) -> tuple[str, int]:
+    """SHA-256, in hexadecimal, and size [bytes] of a regular file."""
+    with open(open_regular(path), "rb", buffering=0) as file:
+        size = os.fstat(file.fileno()).st_size
+        digest = hashlib.sha256(file.read()) if size <= _WHOLE else hashlib.file_digest(file, "sha256")
+        return digest.hexdigest(), size
+
+
+def _list_checksums(out: Path, paths: Sequence[Path]) -> tuple[list[str], int]:
+    """Lines of the checksum list of files, or of folders' files, and their size [bytes]."""
+    lines, total = [], 0
+    for name in _list_names(out, paths):
+        digest, size = _hash_file(f"{out}/{name}")
+        lines.append(f"{digest}  {name}\n")
+        total += size
+    return lines, total
+
+
+def write_checksums(out: Path, path: Path, part: Path) -> None:
+    """Task: write the checksum list of a file, or of a folder's files, to `part`, below a line with their size [bytes]."""
+    lines, total = _list_checksums(out, (path,))
+    part.write_text("".join((f"{total}\n", *lines)))
+
+
+def join_manifest_entry(out: Path, place: Path, parts: Sequence[Path], content: dict[str, Any]) -> None:
+    """Task: commit the files whose checksums `write_checksums` has written to `parts`; removes these. See `write_manifest_entry`."""
+    lists = [part.read_text().splitlines(keepends=True) for part in parts]
+    lines = list(itertools.chain.from_iterable(known[1:] for known in lists))
+    _write_entry(out, place, lines, sum(int(known[0]) for known in lists), content)
+    for part in parts:
+        part.unlink()
 
 
 def write_manifest_entry(out: Path, place: Path, paths: Sequence[Path], content: dict[str, Any]) -> None:
@@ -108,9 +149,17 @@ def write_manifest_entry(out: Path, place: Path, paths: Sequence[Path], content:
         paths: Files, or folders that hold nothing else, relative to the data set.
         content: Further keys of the entry, besides file count, size and the SHA-256 of the checksum list.
     """
-    files = list_files(out, paths)
-    lines = "".join(f"{checksum(out / path)}  {path}\n" for path in files).encode()
-    size = sum((out / path).stat().st_size for path in files)
-    entry = {**content, "files": len(files), "bytes": size, "checksum": hashlib.sha256(lines).hexdigest()}
-    write_atomically(out / f"{place}.sha256", lines)
+    _write_entry(out, place, *_list_checksums(out, paths), content)
+
+
+def _write_entry(out: Path, place: Path, lines: list[str], size: int, content: dict[str, Any]) -> None:
+    lines.sort(key=lambda line: line.partition("  ")[2].removesuffix("\n"))
+    text = "".join(lines).encode()
+    entry = {**content, "files": len(lines), "bytes": size, "checksum": hashlib.sha256(text).hexdigest()}
+    write_atomically(out / f"{place}.sha256", text)
     write_atomically(out / f"{place}.json", (json.dumps(entry, allow_nan=False) + "\n").encode())
+
+
+def name_parts(out: Path, place: Path, count: int) -> list[Path]:
+    """Places for `count` parts of the checksum list of a manifest entry."""
+    return [out / PARTIAL / f"{place.name}-{index}.sha256" for index in range(count)]
