@@ -357,8 +357,7 @@ class _Run:
     def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
         """Export a tick: write its frames, launch the rendering of its views, and write the views and episode ends that are ready.
 
-        Between batches the next tick is enqueued. Where physics limits the rate, the renderer leaves it a part of the GPU.
-        """
+        Between batches the next tick is enqueued. Where physics limits the rate, it gets a part of the GPU for itself."""
         physics = self.config.physics
         batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
         if len(batch):

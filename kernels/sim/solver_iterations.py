@@ -143,22 +143,35 @@ def synchronize_warp():
     ...
 
 
-def compose_iterations(
-    sweep_joint_rows: wp.Function, refresh_tree: wp.Function, sweep_contacts: wp.Function, propagate: wp.Function
-) -> wp.Kernel:
-    """Create the kernel of the iterations from the solver's device functions, each of which works on one world with one warp.
+@wp.func
+def load_free_twists(world: int, lane: int, bodies: BodyData, v: wp.array[float], twist_inout: wp.array2d[float]):
+    """Copy the velocities of the free bodies of a world from joint velocities to twists; a warp together."""
+    for element in range(lane, bodies.free_bodies.shape[1] * 6, WARP):
+        free = element // 6
+        axis = element - 6 * free
+        twist_inout[bodies.free_bodies[world, free], axis] = v[bodies.free_body_dofs[world, free] + axis]
 
-    Args:
-        sweep_joint_rows: Gauss-Seidel sweep over the rows of `JointRowData` that a row phase names.
-        refresh_tree: Twists of the gripper's bodies from its joint velocities.
-        sweep_contacts: Gauss-Seidel sweep over the contact rows, color by color, which changes twists and gathers impulses.
-        propagate: Joint velocities and twists of the gripper from the impulses gathered on its bodies (articulated-body algorithm).
-    """
+
+@wp.func
+def store_free_twists(
+    world: int, lane: int, bodies: BodyData, twist: wp.array2d[float], impulse_inout: wp.array2d[float], v_inout: wp.array[float]
+):
+    """Copy the twists of the free bodies of a world to joint velocities, and clear their impulses; a warp together."""
+    for element in range(lane, bodies.free_bodies.shape[1] * 6, WARP):
+        free = element // 6
+        axis = element - 6 * free
+        body = bodies.free_bodies[world, free]
+        v_inout[bodies.free_body_dofs[world, free] + axis] = twist[body, axis]
+        impulse_inout[body, axis] = 0.0
+
+
+def bind_row_sweep(function: wp.Function) -> wp.Function:
+    """Wrap the solver's Gauss-Seidel sweep over the rows of `JointRowData` that a row phase names."""
 
     @wp.func
     def sweep_rows(world: int, row_phase: int, iteration: int, settings: IterationSettings, rows: JointRowData, v_inout: wp.array[float]):
-        """Sweep a world once over the joint rows of a row phase."""
-        sweep_joint_rows(
+        """Sweep a world once over the rows of a row phase."""
+        function(
             world, rows.world_constraint_count, rows.world_dof_indices, rows.rhs_bias, rows.world_diag, rows.world_impulses,
             rows.J_world, rows.Y_world, rows.world_row_type, rows.world_row_parent, rows.world_row_mu, rows.world_drive_target_vel_bias,
             rows.world_drive_vel_multiplier, rows.world_drive_impulse_multiplier, rows.world_drive_max_impulse, rows.world_drive_vel_limit,
@@ -169,13 +182,81 @@ def compose_iterations(
         )  # fmt: skip
         synchronize_warp()
 
+    return sweep_rows
+
+
+def bind_contact_sweep(function: wp.Function) -> wp.Function:
+    """Wrap the solver's Gauss-Seidel sweep over contact rows, color by color, which changes twists and gathers impulses on bodies."""
+
+    @wp.func
+    def sweep_contacts(
+        world: int,
+        worlds: int,
+        iteration: int,
+        settings: IterationSettings,
+        rows: ContactRowData,
+        twist_inout: wp.array2d[float],
+        impulse_inout: wp.array2d[float],
+    ):
+        """Sweep a world once over its contacts."""
+        function(
+            world, worlds, rows.propagation_constraint_count, rows.propagation_body_a, rows.propagation_body_b, rows.propagation_MiJt_a,
+            rows.propagation_MiJt_b, rows.propagation_J_a, rows.propagation_J_b, rows.propagation_eff_mass_inv, rows.propagation_rhs,
+            rows.propagation_row_w, rows.propagation_row_type, rows.propagation_row_parent, rows.propagation_row_mu,
+            rows.propagation_torsion_first, rows.propagation_torsion_next, rows.propagation_torsion_row_radius, rows.compliance_gamma,
+            rows.world_row_order, rows.world_color_offsets, rows.propagation_body_list, rows.propagation_body_count,
+            rows.propagation_body_local_slot, rows.propagation_unit_meta, rows.propagation_unit_friction_setup,
+            rows.propagation_unit_payload, rows.propagation_ring_overflow, settings.omega, settings.regularize,
+            settings.friction_start_iteration, iteration, rows.propagation_impulses, twist_inout, impulse_inout,
+        )  # fmt: skip
+        synchronize_warp()
+
+    return sweep_contacts
+
+
+def bind_tree_refresh(function: wp.Function) -> wp.Function:
+    """Wrap the solver's forward pass over the gripper's joints: twists of its bodies from joint velocities."""
+
+    @wp.func
+    def refresh_tree(world: int, bodies: BodyData, v: wp.array[float], twist_inout: wp.array2d[float]):
+        """Compute the twists of a gripper's bodies."""
+        function(
+            world, bodies.group_to_art, bodies.articulation_active, bodies.art_to_world, bodies.dense_contact_world_flag, 1,
+            bodies.articulation_start, bodies.joint_parent, bodies.joint_child, bodies.joint_qd_start, bodies.joint_parent_slot,
+            bodies.propagation_joint_S_flat, bodies.propagation_body_com_rel, v, twist_inout,
+        )  # fmt: skip
+
+    return refresh_tree
+
+
+def bind_propagation(function: wp.Function) -> wp.Function:
+    """Wrap the solver's articulated-body algorithm (Featherstone 2008): joint velocities and twists from the impulses on the gripper."""
+
+    @wp.func
+    def propagate(world: int, bodies: BodyData, impulse_inout: wp.array2d[float], twist_inout: wp.array2d[float], v_inout: wp.array[float]):
+        """Propagate the impulses on a gripper's bodies through its joints, and clear them."""
+        function(
+            world, bodies.group_to_art, bodies.articulation_active, bodies.art_to_world, bodies.cache_world_flag,
+            bodies.articulation_start, bodies.joint_parent, bodies.joint_child, bodies.joint_qd_start, bodies.joint_parent_slot,
+            bodies.propagation_joint_S_flat, bodies.propagation_body_com_rel, bodies.propagation_tree_U, bodies.propagation_tree_D_inv,
+            impulse_inout, twist_inout, v_inout,
+        )  # fmt: skip
+
+    return propagate
+
+
+def compose_iterations(
+    sweep_rows: wp.Function, refresh_tree: wp.Function, sweep_contacts: wp.Function, propagate: wp.Function
+) -> wp.Kernel:
+    """Create the kernel of the iterations from the solver's device functions, wrapped by the functions above."""
+
     @wp.kernel(enable_backward=False, module="unique")
     def solver_iterations_kernel(
         # Scene:
         settings: IterationSettings,
         bodies: BodyData,
         # State:
-        joint_rows: JointRowData,
+        rows: JointRowData,
         contacts: ContactRowData,
         twist_inout: wp.array2d[float],  # (body, 6) [m/s, rad/s]
         impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
@@ -188,55 +269,27 @@ def compose_iterations(
         last one.
         """
         world, lane = wp.tid()
-        has_limits = settings.internal_rows != 0 and joint_rows.world_constraint_count[world] > 0
-        free_contacts = joint_rows.mf_contact_rows_end[world]
+        has_limits = settings.internal_rows != 0 and rows.world_constraint_count[world] > 0
+        free_contacts = rows.mf_contact_rows_end[world]
         has_contacts = bodies.dense_contact_world_flag[world] != 0 or free_contacts > 0
-        has_velocity_limits = settings.velocity_limits != 0 and joint_rows.mf_constraint_count[world] > free_contacts
+        has_velocity_limits = settings.velocity_limits != 0 and rows.mf_constraint_count[world] > free_contacts
         last = settings.iterations - 1
         for step in range(settings.iterations):
             iteration = settings.iteration_offset + step
             if has_limits:
-                sweep_rows(world, INTERNAL_ROWS, iteration, settings, joint_rows, v_inout)
+                sweep_rows(world, INTERNAL_ROWS, iteration, settings, rows, v_inout)
             if has_contacts:
-                sweep_rows(world, CONTACT_ROWS, iteration, settings, joint_rows, v_inout)
-            refresh_tree(
-                world, bodies.group_to_art, bodies.articulation_active, bodies.art_to_world, bodies.dense_contact_world_flag,
-                1, bodies.articulation_start, bodies.joint_parent, bodies.joint_child, bodies.joint_qd_start, bodies.joint_parent_slot,
-                bodies.propagation_joint_S_flat, bodies.propagation_body_com_rel, v_inout, twist_inout,
-            )  # fmt: skip
+                sweep_rows(world, CONTACT_ROWS, iteration, settings, rows, v_inout)
+            refresh_tree(world, bodies, v_inout, twist_inout)
             if step == 0 or has_contacts or has_velocity_limits:
-                for element in range(lane, bodies.free_bodies.shape[1] * 6, WARP):
-                    free = element // 6
-                    axis = element - 6 * free
-                    twist_inout[bodies.free_bodies[world, free], axis] = v_inout[bodies.free_body_dofs[world, free] + axis]
+                load_free_twists(world, lane, bodies, v_inout, twist_inout)
             synchronize_warp()
-            sweep_contacts(
-                world, bodies.free_bodies.shape[0], contacts.propagation_constraint_count, contacts.propagation_body_a,
-                contacts.propagation_body_b, contacts.propagation_MiJt_a, contacts.propagation_MiJt_b, contacts.propagation_J_a,
-                contacts.propagation_J_b, contacts.propagation_eff_mass_inv, contacts.propagation_rhs, contacts.propagation_row_w,
-                contacts.propagation_row_type, contacts.propagation_row_parent, contacts.propagation_row_mu,
-                contacts.propagation_torsion_first, contacts.propagation_torsion_next, contacts.propagation_torsion_row_radius,
-                contacts.compliance_gamma, contacts.world_row_order, contacts.world_color_offsets, contacts.propagation_body_list,
-                contacts.propagation_body_count, contacts.propagation_body_local_slot, contacts.propagation_unit_meta,
-                contacts.propagation_unit_friction_setup, contacts.propagation_unit_payload, contacts.propagation_ring_overflow,
-                settings.omega, settings.regularize, settings.friction_start_iteration, iteration, contacts.propagation_impulses,
-                twist_inout, impulse_inout,
-            )  # fmt: skip
-            synchronize_warp()
-            propagate(
-                world, bodies.group_to_art, bodies.articulation_active, bodies.art_to_world, bodies.cache_world_flag,
-                bodies.articulation_start, bodies.joint_parent, bodies.joint_child, bodies.joint_qd_start, bodies.joint_parent_slot,
-                bodies.propagation_joint_S_flat, bodies.propagation_body_com_rel, bodies.propagation_tree_U, bodies.propagation_tree_D_inv,
-                impulse_inout, twist_inout, v_inout,
-            )  # fmt: skip
+            sweep_contacts(world, bodies.free_bodies.shape[0], iteration, settings, contacts, twist_inout, impulse_inout)
+            propagate(world, bodies, impulse_inout, twist_inout, v_inout)
             if step == last or has_contacts or has_velocity_limits:
-                for element in range(lane, bodies.free_bodies.shape[1] * 6, WARP):
-                    free = element // 6
-                    axis = element - 6 * free
-                    v_inout[bodies.free_body_dofs[world, free] + axis] = twist_inout[bodies.free_bodies[world, free], axis]
-                    impulse_inout[bodies.free_bodies[world, free], axis] = 0.0
+                store_free_twists(world, lane, bodies, twist_inout, impulse_inout, v_inout)
             synchronize_warp()
             if has_velocity_limits:
-                sweep_rows(world, VELOCITY_LIMITS, iteration, settings, joint_rows, v_inout)
+                sweep_rows(world, VELOCITY_LIMITS, iteration, settings, rows, v_inout)
 
     return solver_iterations_kernel

@@ -215,9 +215,14 @@ def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:
 
 
 @cache
-def compose_kernel(*kernels: wp.Kernel) -> wp.Kernel:
+def compose_kernel(rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Kernel, propagation: wp.Kernel) -> wp.Kernel:
     """Kernel of the iterations from kernels of the solver, each of which calls one device function."""
-    return solver_iterations.compose_iterations(*map(device_function, kernels))
+    return solver_iterations.compose_iterations(
+        solver_iterations.bind_row_sweep(device_function(rows)),
+        solver_iterations.bind_tree_refresh(device_function(refresh)),
+        solver_iterations.bind_contact_sweep(device_function(contacts)),
+        solver_iterations.bind_propagation(device_function(propagation)),
+    )
 
 
 def device_function(kernel: wp.Kernel) -> wp.Function:
