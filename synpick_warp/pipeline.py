@@ -343,7 +343,7 @@ class _Run:
         """Tick until no episode remains or a signal requests a stop."""
         self.progress.stage("loading kernels, dropping objects")
         done = False
-        with self.stop as stop, TickLoop(self.factory.simulation) as ticks:
+        with self.stop as stop, self.factory.stream.streams, TickLoop(self.factory.simulation) as ticks:
             while not (done or stop.number):
                 report, snapshot = ticks.advance()
                 self._hand_over(report, snapshot, ticks)
@@ -365,7 +365,7 @@ class _Run:
                 self.exporters.write_ticks(batch)
         records = self.factory.log.update(report)
         if self.exporters.needs_views:
-            self.factory.stream.confine(ticks.reserved_share)
+            self.factory.stream.streams.confine(ticks.reserved_share)
             for views in self.factory.stream.advance(snapshot, report, partial(self._end_episodes, report, records)):
                 ticks.enqueue()
                 self._write(views)

@@ -118,11 +118,12 @@ def test_live_views_come_world_by_world_and_camera_by_camera(device, live, batch
 
 @pytest.mark.parametrize("reserved", [[0.2, 0.2, 0.2], [0.2, 0.0, 0.1, 0.2], [0.0, 0.0, 0.1]])
 def test_batches_are_the_same_on_a_part_of_the_multiprocessors(device, reserved):
-    frames, views = frame_stream(config_of(render__views_per_batch=2), FakeRenderer([]), device), []
-    for share in reserved:
-        frames.confine(share)
-        views += [copied(batch) for batch in frames.advance("snapshot", report_of([0, 1, 0, 0, 1]))]
-    np.testing.assert_equal(views + [copied(batch) for batch in frames.drain()], rendered(device, [0, 1, 0, 0, 1], 2)[0] * len(reserved))
+    frames, views, expected = frame_stream(config_of(render__views_per_batch=2), FakeRenderer([]), device), [], []
+    for tick, share in enumerate(reserved):
+        frames.streams.confine(share)
+        views += [copied(batch) for batch in frames.advance("snapshot", report_of([tick % 2, 1, 0, tick // 2, 1]))]
+        expected += rendered(device, [tick % 2, 1, 0, tick // 2, 1], 2)[0]
+    np.testing.assert_equal(views + [copied(batch) for batch in frames.drain()], expected)
 
 
 def test_layers_come_if_they_are_asked_for_each_with_its_views(device):

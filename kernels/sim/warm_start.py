@@ -23,8 +23,8 @@ def apply_warm_start_kernel(
 ):
     """Apply all contact impulses λ to each body: M⁻¹Jᵀλ is added to its twist and Jᵀλ to its impulse, in the order of the rows.
 
-    One thread a world, body with contacts, and twist component. The solver has one a world and component, which walks all rows and waits
-    for each sum; the order of summation, and so each bit, is the same.
+    One thread for each world, body with contacts, and twist component. The solver's own kernel has one for each world and component,
+    which walks all rows and waits for each sum; the order of summation, and so each bit, is the same.
     """
     world, slot, axis = wp.tid()
     if slot >= body_count[world]:

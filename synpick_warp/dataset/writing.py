@@ -251,19 +251,27 @@ class OutputFolder:
 
 
 def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: EpisodeEnd) -> None:
-    """Commit an episode whose files are all in place: writers compute their checksums, each of one folder; the last writes the entry."""
+    """Commit an episode whose files are all in place.
+
+    Writers compute their checksums, with a task for each file or folder that the formats name; a last task writes the manifest entry.
+    """
     content = {"episode": end.episode, "row": dict(end.row), "attempts": [json.loads(line) for line in end.attempts]}
     entry, paths = episode_entry(end.episode), exporters.files(end.episode)
     parts = name_parts(out, entry, len(paths))
     missing = set(parts)
 
-    def join(part: Path) -> None:
+    def join() -> None:
+        pool.submit(join_manifest_entry, (), (out, entry, parts, content), path=out / entry)
+
+    def finish(part: Path) -> None:
         missing.remove(part)
         if not missing:
-            pool.submit(join_manifest_entry, (), (out, entry, parts, content), path=out / entry)
+            join()
 
     for path, part in zip(paths, parts, strict=True):
-        pool.submit(write_checksums, (), (out, path, part), path=out / entry, on_done=partial(join, part))
+        pool.submit(write_checksums, (), (out, path, part), path=out / entry, on_done=partial(finish, part))
+    if not parts:  # An episode that was given up has no files.
+        join()
 
 
 def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:

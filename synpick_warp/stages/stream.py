@@ -22,10 +22,10 @@ from synpick_warp.stages.host_copies import DeviceImages, HostCopy, HostImages
 from synpick_warp.stages.render.mask_runs import BoundaryBuffers, BoundaryScratch, boundary_sizes, list_boundaries
 from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.view_setup import make_views, pair_views
+from synpick_warp.stages.render_streams import RenderStreams
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import host_record, record_arrays, tick_measures
 from synpick_warp.stages.timing import scope
-from synpick_warp.system.green_contexts import SmPartition
 
 # Size of one batch's images on a GPU [bytes]: large enough to fill the GPU, small enough for several batches in flight.
 BATCH_BYTES = 512 << 20
@@ -262,12 +262,7 @@ class FrameStream:
         self.tick_time = tick_time
         self.batch, self.instances = sizes["view"], sizes["instance"]
         self.device = device
-        self.copy_stream = wp.Stream(device) if device.is_cuda else None
-        self._reserved = 0.0
-        self._render_stream: wp.Stream | None = None
-        """Stream of the renderer; None: the device's current stream."""
-        self._streams: dict[float, tuple[wp.Stream | None, wp.Stream | None]] = {0.0: (None, self.copy_stream)}
-        """Streams of renderer and encoders, by the fraction of the multiprocessors that they leave free."""
+        self.streams = RenderStreams(device)
         self.layers = [item.name for item in fields(LayerBuffers) if item.name in layers]
         ring = range(RING if device.is_cuda else 1)
         self.buffers = [allocate(ViewBuffers, sizes, device) for _ in ring]
@@ -328,26 +323,6 @@ class FrameStream:
         if not len(world):
             finished()
 
-    def confine(self, reserved: float) -> None:
-        """Choose where the following batches are rendered and encoded: on all multiprocessors of a GPU but a fraction `reserved`.
-
-        Without effect on a CPU, and where the driver cannot divide a GPU.
-        """
-        if self.copy_stream is None or reserved == self._reserved:
-            return
-        before = self.copy_stream
-        self._reserved = reserved
-        self._render_stream, self.copy_stream = self._streams.get(reserved) or self._make_streams(reserved)
-        if self.copy_stream is not None and self.copy_stream is not before:
-            self.copy_stream.wait_stream(before)  # Batches share scratch arrays.
-
-    def _make_streams(self, reserved: float) -> tuple[wp.Stream | None, wp.Stream | None]:
-        """Streams of renderer and encoders on a part of the device."""
-        partition = SmPartition.leaving(self.device, reserved)
-        whole = self._streams[0.0]
-        self._streams[reserved] = whole if partition is None else (partition.make_stream(), partition.make_stream())
-        return self._streams[reserved]
-
     def drain(self) -> Iterator[FrameBatch]:
         """Yield the batches that are still in flight."""
         while self.in_flight:
@@ -366,12 +341,12 @@ class FrameStream:
         padded[:, : len(world)] = world, camera
         rows.assign(padded)
         views = make_views(rows[0], rows[1], len(world), self.instances)
-        with wp.ScopedStream(self._render_stream, sync_exit=True), scope("render", self.device):
+        with wp.ScopedStream(self.streams.render, sync_exit=True), scope("render", self.device):
             self.renderer.render(snapshot, views, self.buffers[slot], self.layer_buffers[slot])
-        with wp.ScopedStream(self.copy_stream):
+        with wp.ScopedStream(self.streams.copy):
             with scope("encode", self.device):
                 self._encode(slot, len(world))
-            self.copies[slot].start(self.copy_stream)
+            self.copies[slot].start(self.streams.copy)
 
     def _encode(self, slot: int, count: int) -> None:
         """Encode `count` views: run boundaries and files, which are copied instead of images.

@@ -37,7 +37,7 @@ class SmPartition:
             reserved: Multiprocessors outside the partition; CUDA rounds up, with compute capability 9 to a multiple of 8.
 
         Raises:
-            DeviceError: The driver has no green contexts (before CUDA 12.4), or the device has too few multiprocessors.
+            DeviceError: The driver has no green contexts (before CUDA 12.5), or the device has too few multiprocessors.
         """
         self.device = device
         self._driver = _load_driver()
@@ -53,14 +53,6 @@ class SmPartition:
         self.size, self.reserved = inside.sm_count, outside.sm_count
         """Multiprocessors inside and outside the partition."""
 
-    @classmethod
-    def leaving(cls, device: wp.Device, fraction: float) -> SmPartition | None:
-        """Partition that leaves about `fraction` of the multiprocessors free; None: driver or device cannot be divided."""
-        try:
-            return cls(device, max(1, round(fraction * device.sm_count)))
-        except DeviceError:
-            return None
-
     def make_stream(self) -> wp.Stream:
         """Create a stream whose kernels run inside the partition."""
         stream = ctypes.c_void_p()
@@ -71,7 +63,7 @@ class SmPartition:
         """Call a function of the driver; a result other than 0 is an error."""
         function = getattr(self._driver, name, None)
         if function is None:
-            raise DeviceError(f"{self.device.alias}: the driver has no {name}: green contexts need CUDA 12.4")
+            raise DeviceError(f"{self.device.alias}: the driver has no {name}: green contexts with streams need CUDA 12.5")
         result = function(*arguments)
         if result != 0:
             raise DeviceError(f"{self.device.alias}: {name} failed with CUDA error {result}")

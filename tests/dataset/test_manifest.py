@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from synpick_warp.codes import Ending
 from synpick_warp.configs.load import load_config, settings_of
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset import manifest
 from synpick_warp.dataset.digests import digest_inputs
+from synpick_warp.dataset.writing import commit_episode
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import list_files, write_manifest_entry
+from synpick_warp.exporters.writing.files import PARTIAL
+from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.frames import EpisodeEnd
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import CatalogEntry, ConvexPiece, EnvironmentMap, Material, Sun, TriangleMesh
 from tests.harness.entries import episode_content
@@ -156,6 +163,28 @@ def test_a_record_has_every_file_once_and_is_whole_while_they_are_there(tmp_path
     assert not manifest.is_complete(tmp_path, place)
     (tmp_path / "a/one").unlink()
     assert not manifest.is_complete(tmp_path, place)
+
+
+@pytest.mark.parametrize("names", [[], ["a"], ["b", "a", "a/one"]])
+@pytest.mark.parametrize("writers", [0, 2])
+def test_an_episode_is_committed_whatever_files_it_has(tmp_path, names, writers):
+    """In a task for each file or folder, and without files, as of an episode that was given up. What is named twice counts once."""
+    for folder in ("a", "manifest", PARTIAL):
+        (tmp_path / folder).mkdir()
+    for name in ("a/two", "a/one", "b"):
+        (tmp_path / name).write_text(name)
+    exporters = SimpleNamespace(files=lambda _: [manifest.Path(name) for name in names])
+    content = episode_content(7)
+    with WriterPool(writers, 1) as pool:
+        commit_episode(tmp_path, exporters, pool, EpisodeEnd(7, 0, 3, Ending.FINISHED, content["row"]))  # type: ignore[arg-type]
+        pool.wait()
+    files = {name: name for name in ("a/one", "a/two", "b") if name in names or ("a" in names and name.startswith("a/"))}
+    known = manifest.read_checksums(tmp_path, manifest.episode_entry(7))
+    assert known == {name: hashlib.sha256(text.encode()).hexdigest() for name, text in files.items()}
+    record = manifest.read_entry(tmp_path, manifest.episode_entry(7))
+    assert record is not None
+    assert (record["files"], record["bytes"]) == (len(files), sum(map(len, files)))
+    assert list((tmp_path / PARTIAL).iterdir()) == []
 
 
 def test_a_list_that_does_not_fit_its_record(tmp_path):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import newton
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from synpick_warp.stages.sim import fused_solver
 from synpick_warp.stages.sim.simulate import Simulation
 from tests.worlds.small_worlds import catalog, settings
 
-WORLDS, TICKS = 8, 30
+TICKS = 30
 ARCHITECTURE, DOFS, BODIES, ROWS = 90, 16, 5, 96
 """CUDA architecture, and sizes of a small world, for which the kernel is compiled."""
 
@@ -24,20 +26,49 @@ def test_the_installed_version_of_newton_is_fused():
     assert newton.__version__ == fused_solver.FUSED_VERSION
 
 
-def test_the_kernel_of_the_iterations_compiles(tmp_path):
+@pytest.mark.parametrize("packed", [True, False])
+def test_the_kernel_of_the_iterations_compiles(tmp_path, packed):
     """Its calls fit the solver's device functions; compiled for a GPU, also where there is none."""
     joint_rows = steel._get_pgs_solve_mf_gs_kernel(
         ROWS, ROWS, DOFS, ARCHITECTURE, has_dense_velocity_limit_rows=False, shared_metadata=True, row_phases=True
     )
     refresh = steel._get_refresh_propagation_tree_body_qd_warp_kernel(4, 2, ARCHITECTURE)
     contacts = steel._get_pgs_solve_propagation_colored_warp_kernel(
-        ROWS, steel.PROPAGATION_COLOR_TAIL + 2, BODIES, 1, ARCHITECTURE, packed=True
+        ROWS, steel.PROPAGATION_COLOR_TAIL + 2, BODIES, 1, ARCHITECTURE, packed=packed
     )
     propagate = steel._get_propagate_tree_impulses_revolute_kernel(4, 2, ARCHITECTURE, has_free_root=True)
     kernel = fused_solver.compose_kernel(joint_rows, refresh, contacts, propagate)
     wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=True)
     (program,) = tmp_path.glob("*.ptx")
     assert b"solver_iterations_kernel" in program.read_bytes()
+
+
+def test_options_that_the_kernel_does_not_know_are_refused():
+    """By the private settings of a solver, as `FusedSteel` reads them after construction."""
+    known = {
+        "_propagation_colored": True,
+        "_row_schedule": "interleaved",
+        "_friction_mode": "fixed_normal",
+        "_contact_compliance": False,
+        "_contact_torsion_enabled": False,
+        "_has_drive_rows": False,
+        "_enable_joint_velocity_limits": False,
+        "_propagation_cached_warps": {},
+        "_propagation_tree_sizes": [4],
+        "_internal_row_phases": lambda: (True, False),
+    }
+    others = [False, "phased", "bisection", True, True, True, True, {4: 1}, [4, 7], lambda: (False, False)]
+    assert fused_solver.find_unknown_options(SimpleNamespace(**known)) == []
+    for name, value in zip(known, others, strict=True):
+        assert len(fused_solver.find_unknown_options(SimpleNamespace(**known | {name: value}))) == 1
+
+
+def test_a_cpu_and_other_versions_run_the_solver_of_newton(monkeypatch):
+    gpu = SimpleNamespace(is_cuda=True)
+    assert fused_solver.choose_solver(gpu) is fused_solver.FusedSteel
+    assert fused_solver.choose_solver(SimpleNamespace(is_cuda=False)) is newton.solvers.SolverSteel
+    monkeypatch.setattr(newton, "__version__", "1.8.1")
+    assert fused_solver.choose_solver(gpu) is newton.solvers.SolverSteel
 
 
 def test_warm_start_sums_impulses_as_newton_does(device):
@@ -69,14 +100,15 @@ def test_warm_start_sums_impulses_as_newton_does(device):
     assert not np.array_equal(found[0], found[1])
 
 
-@pytest.mark.parametrize("max_speed", [0.3, 4.0])
-def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, max_speed):
-    """Piles fall, rest and are stirred; at the lower speed limit, what falls has velocity limit rows."""
+@pytest.mark.parametrize(("worlds", "packed", "max_speed"), [(8, 256, 0.3), (8, 256, 4.0), (24, 256, 4.0), (24, 0, 4.0)])
+def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, packed, max_speed):
+    """Piles fall, rest and are stirred; at the lower speed limit, what falls has velocity limit rows. Newton packs up to 16 worlds."""
     if not device.is_cuda:
         pytest.skip("on a CPU the solver's own launches run")
     config = settings(
-        bake__worlds=WORLDS, bake__episodes=WORLDS, bake__mode="move", physics__max_speed=max_speed, physics__deterministic=True
+        bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__max_speed=max_speed, physics__deterministic=True
     )
+    monkeypatch.setattr(fused_solver, "PACKED_WORLDS", packed)
     found, phases = {}, set()
     for version in (fused_solver.FUSED_VERSION, "another"):
         monkeypatch.setattr(fused_solver, "FUSED_VERSION", version)
@@ -86,7 +118,7 @@ def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, max_spe
             simulation.tick()
             found[version].append(simulation.physics.state.joint_q.numpy())
             phases |= set(simulation.state.phase.numpy().tolist())
-        assert simulation.physics.solver._is_fused == (version != "another")
+        assert isinstance(simulation.physics.solver, fused_solver.FusedSteel) == (version != "another")
     fused, launched = found.values()
     np.testing.assert_array_equal(fused, launched)
     assert Phase.ACT in phases

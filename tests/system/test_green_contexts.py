@@ -61,18 +61,44 @@ def test_more_multiprocessors_than_there_are_cannot_be_reserved(device):
         SmPartition(device, 2 * device.sm_count)
 
 
-def test_an_old_driver_has_no_partitions(monkeypatch):
-    monkeypatch.setattr(green_contexts, "_load_driver", lambda: SimpleNamespace(cuDeviceGet=lambda *_: 0))
-    with pytest.raises(DeviceError, match=r"cuda:0: the driver has no cuDeviceGetDevResource: green contexts need CUDA 12\.4"):
+SPLIT = ("cuDeviceGet", "cuDeviceGetDevResource", "cuDevSmResourceSplitByCount", "cuDevResourceGenerateDesc", "cuGreenCtxCreate")
+"""Functions that make a partition, in the order of their calls."""
+
+
+@pytest.fixture
+def drive(monkeypatch):
+    """Puts a driver in the place of CUDA's that has the first functions of SPLIT; the last of them returns a code. Keeps its calls."""
+
+    def install(functions: int, code: int = 0) -> list[tuple[str, tuple]]:
+        calls: list[tuple[str, tuple]] = []
+        names = SPLIT[:functions]
+        driver = {
+            name: lambda *arguments, name=name: calls.append((name, arguments)) or code * (name == names[-1])  # type: ignore[func-returns-value]
+            for name in names
+        }
+        monkeypatch.setattr(green_contexts, "_load_driver", lambda: SimpleNamespace(**driver))
+        return calls
+
+    return install
+
+
+@pytest.mark.parametrize("functions", range(1, len(SPLIT)))
+def test_an_old_driver_has_no_partitions(drive, functions):
+    drive(functions)
+    expected = rf"cuda:0: the driver has no {SPLIT[functions]}: green contexts with streams need CUDA 12\.5"
+    with pytest.raises(DeviceError, match=expected):
         SmPartition(GPU, 8)
-    assert SmPartition.leaving(GPU, 0.2) is None
 
 
-def test_a_device_that_cannot_be_divided_has_no_partitions(monkeypatch):
-    calls = []
-    names = ("cuDeviceGet", "cuDeviceGetDevResource", "cuDevSmResourceSplitByCount")
-    driver = {name: lambda *arguments, name=name: calls.append((name, arguments)) or 801 * (name == names[2]) for name in names}
-    monkeypatch.setattr(green_contexts, "_load_driver", lambda: SimpleNamespace(**driver))
-    assert SmPartition.leaving(GPU, 2.0 / 11.0) is None
-    assert [name for name, _ in calls] == list(names)
+def test_a_driver_of_cuda_12_4_has_partitions_without_streams(drive):
+    drive(len(SPLIT))
+    with pytest.raises(DeviceError, match="the driver has no cuGreenCtxStreamCreate"):
+        SmPartition(GPU, 8).make_stream()
+
+
+def test_a_device_that_cannot_be_divided_is_an_error_of_one_line(drive):
+    calls = drive(3, code=801)
+    with pytest.raises(DeviceError, match=r"^cuda:0: cuDevSmResourceSplitByCount failed with CUDA error 801$"):
+        SmPartition(GPU, 24)
+    assert [name for name, _ in calls] == list(SPLIT[:3])
     assert calls[-1][1][-1] == 24

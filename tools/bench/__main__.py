@@ -273,7 +273,7 @@ def _measure_rendering(config: Config, factory: Factory, min_seconds: float) -> 
         size = sum(array.capacity for array in stream.copies[0].source)
 
         def copy() -> None:
-            stream.copies[0].start(stream.copy_stream)
+            stream.copies[0].start(stream.streams.copy)
             stream.copies[0].wait()
 
         seconds = seconds_per_call(copy, device, min_seconds / 4)

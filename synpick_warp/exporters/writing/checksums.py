@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 import os
 import re
@@ -90,7 +89,7 @@ def list_files(out: Path, paths: Sequence[Path]) -> list[Path]:
 
 
 def _list_names(out: Path, paths: Sequence[Path]) -> list[str]:
-    """The same as strings: an episode has 100,000 files."""
+    """`list_files` as names: an episode has 100,000 files, and a `Path` costs as much as the checksum of a small file."""
     names: set[str] = set()
     for path in map(str, paths):
         names.update(_walk(f"{out}/{path}", path) if os.path.isdir(f"{out}/{path}") else (path,))
@@ -115,27 +114,19 @@ def _hash_file(path: Path | str) -> tuple[str, int]:
         return digest.hexdigest(), size
 
 
-def _list_checksums(out: Path, paths: Sequence[Path]) -> tuple[list[str], int]:
-    """Lines of the checksum list of files, or of folders' files, and their size [bytes]."""
-    lines, total = [], 0
-    for name in _list_names(out, paths):
-        digest, size = _hash_file(f"{out}/{name}")
-        lines.append(f"{digest}  {name}\n")
-        total += size
-    return lines, total
-
-
 def write_checksums(out: Path, path: Path, part: Path) -> None:
-    """Task: write the checksum list of a file, or of a folder's files, to `part`, below a line with their size [bytes]."""
-    lines, total = _list_checksums(out, (path,))
-    part.write_text("".join((f"{total}\n", *lines)))
+    """Task: write SHA-256, size [bytes] and name of a file, or of each of a folder's files, to the list `part`."""
+    part.write_text("".join(f"{digest} {size} {name}\n" for name, (digest, size) in _hash_files(out, (path,)).items()))
 
 
 def join_manifest_entry(out: Path, place: Path, parts: Sequence[Path], content: dict[str, Any]) -> None:
     """Task: commit the files whose checksums `write_checksums` has written to `parts`; removes these. See `write_manifest_entry`."""
-    lists = [part.read_text().splitlines(keepends=True) for part in parts]
-    lines = list(itertools.chain.from_iterable(known[1:] for known in lists))
-    _write_entry(out, place, lines, sum(int(known[0]) for known in lists), content)
+    known: dict[str, tuple[str, int]] = {}
+    for part in parts:
+        for line in part.read_text().splitlines():
+            digest, size, name = line.split(" ", 2)
+            known[name] = digest, int(size)
+    _write_entry(out, place, known, content)
     for part in parts:
         part.unlink()
 
@@ -149,14 +140,20 @@ def write_manifest_entry(out: Path, place: Path, paths: Sequence[Path], content:
         paths: Files, or folders that hold nothing else, relative to the data set.
         content: Further keys of the entry, besides file count, size and the SHA-256 of the checksum list.
     """
-    _write_entry(out, place, *_list_checksums(out, paths), content)
+    _write_entry(out, place, _hash_files(out, paths), content)
 
 
-def _write_entry(out: Path, place: Path, lines: list[str], size: int, content: dict[str, Any]) -> None:
-    lines.sort(key=lambda line: line.partition("  ")[2].removesuffix("\n"))
-    text = "".join(lines).encode()
-    entry = {**content, "files": len(lines), "bytes": size, "checksum": hashlib.sha256(text).hexdigest()}
-    write_atomically(out / f"{place}.sha256", text)
+def _hash_files(out: Path, paths: Sequence[Path]) -> dict[str, tuple[str, int]]:
+    """SHA-256 and size [bytes] of files, and of all files in folders, by name."""
+    return {name: _hash_file(f"{out}/{name}") for name in _list_names(out, paths)}
+
+
+def _write_entry(out: Path, place: Path, known: dict[str, tuple[str, int]], content: dict[str, Any]) -> None:
+    """Write the checksum list and then the entry of files whose SHA-256 and size [bytes] are known."""
+    lines = "".join(f"{known[name][0]}  {name}\n" for name in sorted(known)).encode()
+    size = sum(size for _, size in known.values())
+    entry = {**content, "files": len(known), "bytes": size, "checksum": hashlib.sha256(lines).hexdigest()}
+    write_atomically(out / f"{place}.sha256", lines)
     write_atomically(out / f"{place}.json", (json.dumps(entry, allow_nan=False) + "\n").encode())
 
 

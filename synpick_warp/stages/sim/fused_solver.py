@@ -18,7 +18,7 @@ PACKED_WORLDS = 256
 """Most worlds for which contact rows are packed into records of 384 bytes. On an H200 a tick of 64 worlds takes 0.180 instead of 0.189 s,
 one of 512 worlds 0.272 instead of 0.274 s, for 300 MB."""
 FUSED_VERSION = "1.8.0"
-"""Version of Newton whose private parts `FusedSteel` knows. With any other one the solver launches its own kernels: the same, slower."""
+"""Version of Newton whose private parts `FusedSteel` knows. With another one Newton's own solver runs: the same results, slower."""
 
 steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
 """The solver's module, with the factories of its kernels."""
@@ -31,9 +31,19 @@ class FusedSteel(newton.solvers.SolverSteel):
     on an idle GPU, and longer beside a renderer. `solver_iterations` calls the same device functions one after the other. The warm start
     of the contacts has more threads.
 
-    It needs the colored sweep, one articulation a world besides the free bodies, and no cached responses. On a CPU, and with a version of
-    Newton other than FUSED_VERSION, the solver's own launches run.
+    For models whose worlds are alike, each with one articulation besides its free bodies, and for the options that `make_solver` sets.
     """
+
+    def __init__(self, model: newton.Model, **options: Any) -> None:
+        """Create a solver; arguments as of SolverSteel.
+
+        Raises:
+            ValueError: The kernels do not know an option.
+        """
+        super().__init__(model, **options)
+        unknown = find_unknown_options(self)
+        if unknown:
+            raise ValueError(f"FusedSteel does not know {', '.join(unknown)}: use SolverSteel")
 
     def _launch_propagation_solve(
         self,
@@ -53,9 +63,6 @@ class FusedSteel(newton.solvers.SolverSteel):
             "friction_start_iteration": friction_start_iteration,
             "iteration_offset": iteration_offset,
         }
-        if not self._is_fused:
-            super()._launch_propagation_solve(rhs, propagation_rhs, iterations, **options)
-            return
         if self._color_unit_meta_stale:
             self._color_unit_meta_stale = False
             self._launch_gather_unit_meta()
@@ -77,13 +84,13 @@ class FusedSteel(newton.solvers.SolverSteel):
     def _init_colored_kernels(self, model: newton.Model) -> None:
         """Choose the variant of the sweep over contacts: from packed records, also in more worlds than the solver would."""
         super()._init_colored_kernels(model)
-        if self._is_fused and self._color_unit_payload is None and self._world_count <= PACKED_WORLDS:
+        if self._color_unit_payload is None and self._world_count <= PACKED_WORLDS:
             words = self._world_count * self._propagation_max_constraints * steel.PROPAGATION_UNIT_PAYLOAD
             self._color_unit_payload = wp.zeros(words, dtype=wp.float32, device=model.device)
 
     def _apply_propagation_warmstart_velocity(self) -> None:
         """Turn the impulses of the warm start into velocities, with a thread for each component of each body instead of each world."""
-        if not self._is_fused or not self._ordered_rows:
+        if not self._ordered_rows:
             super()._apply_propagation_warmstart_velocity()
             return
         wp.launch(
@@ -105,11 +112,6 @@ class FusedSteel(newton.solvers.SolverSteel):
             device=self.model.device,
         )
         self._propagation_propagate_impulses()
-
-    @property
-    def _is_fused(self) -> bool:
-        """Whether our kernels replace the solver's."""
-        return self.model.device.is_cuda and newton.__version__ == FUSED_VERSION
 
     def _iterations_kernel(self) -> wp.Kernel:
         """Kernel of the iterations, made of the device functions of the solver's own kernels."""
@@ -205,6 +207,28 @@ class FusedSteel(newton.solvers.SolverSteel):
         dofs = first_dof[tree_of_body[bodies]]
         first, second = (wp.array(values, dtype=wp.int32, device=self.model.device) for values in (dofs, bodies))
         return first, second
+
+
+def choose_solver(device: wp.Device) -> type[newton.solvers.SolverSteel]:
+    """The solver for a device: FusedSteel on a GPU with the version of Newton that it knows, else SolverSteel."""
+    return FusedSteel if device.is_cuda and newton.__version__ == FUSED_VERSION else newton.solvers.SolverSteel
+
+
+def find_unknown_options(solver: Any) -> list[str]:
+    """Names of the options of a SolverSteel with which its iterations differ from those of `solver_iterations`."""
+    differs = {
+        'solve_mode other than "colored"': not solver._propagation_colored,
+        "row_schedule": solver._row_schedule != "interleaved",
+        "friction_mode": solver._friction_mode != "fixed_normal",
+        "contact_compliance": solver._contact_compliance,
+        "contact torsion": solver._contact_torsion_enabled,
+        "drive_mode": solver._has_drive_rows,
+        "enable_joint_velocity_limits": solver._enable_joint_velocity_limits,
+        "propagation_cached_response": bool(solver._propagation_cached_warps),
+        "several kinds of articulations": len(solver._propagation_tree_sizes) != 1,
+        "models without joint limits and speed limits": not any(solver._internal_row_phases()),
+    }
+    return [name for name, unknown in differs.items() if unknown]
 
 
 def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:

@@ -17,7 +17,7 @@ from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
-from synpick_warp.stages.sim.fused_solver import FusedSteel
+from synpick_warp.stages.sim.fused_solver import choose_solver
 
 # Sentinel: default of `next` for an exhausted iterator.
 ENDED = object()
@@ -242,7 +242,7 @@ def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.Collisi
 
 def make_solver(physics: PhysicsConfig, model: newton.Model, slots: int) -> newton.solvers.SolverSteel:
     """Rigid-body solver of all worlds of a model with `slots` free bodies a world."""
-    return FusedSteel(
+    return choose_solver(model.device)(
         model,
         iterations=physics.iterations,
         contact_warmstart=True,

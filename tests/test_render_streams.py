@@ -1,0 +1,99 @@
+"""Streams of renderer and encoders: which are current, what waits for what, and what happens where a GPU cannot be divided."""
+
+from __future__ import annotations
+
+import random
+from functools import partial
+from typing import ClassVar
+
+import pytest
+
+from synpick_warp.errors import DeviceError
+from synpick_warp.stages import render_streams
+from synpick_warp.stages.render_streams import RenderStreams
+from tests.harness.cuda_model import ModelDevice, ModelStream
+
+
+class Partition:
+    """Partition of a model of a GPU; remembers what was reserved."""
+
+    reserved: ClassVar[list[int]] = []
+
+    def __init__(self, device: ModelDevice, reserved: int) -> None:
+        self.device = device
+        self.reserved.append(reserved)
+
+    def make_stream(self) -> ModelStream:
+        return ModelStream(self.device)
+
+
+class NoStreams(Partition):
+    """Partition of a driver that cannot make streams on it."""
+
+    def make_stream(self) -> ModelStream:
+        raise DeviceError("no streams")
+
+
+@pytest.fixture
+def make_streams(monkeypatch):
+    """Streams of a model of a GPU with 132 multiprocessors, divided by a kind of partition."""
+
+    def make(kind: type[Partition], seed: int = 0) -> tuple[RenderStreams, ModelDevice]:
+        device = ModelDevice(random.Random(seed))
+        device.sm_count = 132  # type: ignore[attr-defined]
+        monkeypatch.setattr(render_streams, "wp", device.wp)
+        monkeypatch.setattr(render_streams, "SmPartition", kind)
+        monkeypatch.setattr(Partition, "reserved", [])
+        return RenderStreams(device), device  # type: ignore[arg-type]
+
+    return make
+
+
+def test_each_share_has_a_pair_of_streams_that_is_made_once(make_streams):
+    streams, _ = make_streams(Partition)
+    whole = streams.render, streams.copy
+    assert whole[0] is None
+    pairs = []
+    for reserved in (2 / 11, 2 / 33, 2 / 11, 0.0, 0.0, 2 / 33):
+        streams.confine(reserved)
+        pairs.append((streams.render, streams.copy))
+    assert pairs[0] == pairs[2]
+    assert pairs[1] == pairs[5]
+    assert pairs[3] == pairs[4] == whole
+    assert len({id(stream) for pair in (pairs[0], pairs[1]) for stream in pair} | {id(whole[1])}) == 5
+    assert Partition.reserved == [24, 8]
+
+
+def test_the_encoders_of_a_batch_wait_for_those_of_the_batch_before(make_streams):
+    """Whatever the device does first, batches that share scratch arrays are encoded one after the other."""
+    for seed in range(50):
+        streams, device = make_streams(Partition, seed)
+        order = []
+        for batch, reserved in enumerate((0.0, 0.2, 0.2, 0.1, 0.0, 0.2, 0.0)):
+            streams.confine(reserved)
+            for step in ("begin", "end"):
+                streams.copy.enqueue(partial(order.append, (batch, step)))
+            device.run(device.chance.choice((0, 1, 3)))
+        while device.run(1):
+            pass
+        assert order == [(batch, step) for batch in range(7) for step in ("begin", "end")]
+
+
+def test_a_gpu_that_cannot_be_divided_is_used_as_a_whole(make_streams):
+    streams, _ = make_streams(NoStreams)
+    whole = streams.copy
+    for reserved in (0.2, 0.0, 0.2):
+        streams.confine(reserved)
+        assert streams.render is None
+        assert streams.copy is whole
+    assert Partition.reserved == [26]
+
+
+def test_the_exit_waits_for_both_streams_whatever_ends_the_loop(make_streams, monkeypatch):
+    streams, _ = make_streams(Partition)
+    awaited = []
+    monkeypatch.setattr(render_streams.wp, "synchronize_stream", awaited.append, raising=False)
+    streams.confine(0.2)
+    with pytest.raises(ZeroDivisionError), streams:
+        raise ZeroDivisionError
+    assert awaited == [streams.render, streams.copy]
