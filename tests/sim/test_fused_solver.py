@@ -13,8 +13,10 @@ from newton._src.solvers.steel.kernels import accumulate_propagation_warmstart_b
 
 from synpick_warp.codes import Phase
 from synpick_warp.kernels.sim.warm_start import apply_warm_start_kernel
-from synpick_warp.stages.sim import fused_solver
+from synpick_warp.scenes import build
+from synpick_warp.stages.sim import fused_solver, physics
 from synpick_warp.stages.sim.simulate import Simulation
+from tests.worlds.cubes import place_cubes
 from tests.worlds.small_worlds import catalog, settings
 
 TICKS = 30
@@ -43,7 +45,7 @@ def test_the_kernel_of_the_iterations_compiles(tmp_path, packed):
     assert b"solver_iterations_kernel" in program.read_bytes()
 
 
-def test_options_that_the_kernel_does_not_know_are_refused():
+def test_solvers_that_differ_are_not_fused():
     """By the private settings of a solver, as `FusedSteel` reads them after construction."""
     known = {
         "_propagation_colored": True,
@@ -57,10 +59,25 @@ def test_options_that_the_kernel_does_not_know_are_refused():
         "_propagation_tree_sizes": [4],
         "_internal_row_phases": lambda: (True, False),
     }
-    others = [False, "phased", "bisection", True, True, True, True, {4: 1}, [4, 7], lambda: (False, False)]
-    assert fused_solver.find_unknown_options(SimpleNamespace(**known)) == []
+    others: list[object] = [False, "phased", "bisection", True, True, True, True, {4: 1}, [4, 7], lambda: (False, False)]
+    assert fused_solver.find_differences(SimpleNamespace(**known)) == []
     for name, value in zip(known, others, strict=True):
-        assert len(fused_solver.find_unknown_options(SimpleNamespace(**known | {name: value}))) == 1
+        assert len(fused_solver.find_differences(SimpleNamespace(**known | {name: value}))) == 1
+
+
+def test_a_solver_with_the_settings_of_a_gpu_differs_by_the_device_alone(monkeypatch):
+    """Its private parts are there; the arrays of its joint rows and bodies have the types that the kernel declares."""
+    choose = physics._sweep
+    monkeypatch.setattr(physics, "_sweep", lambda settings, slots, _: choose(settings, slots, True))
+    monkeypatch.setattr(physics, "choose_solver", lambda _: fused_solver.FusedSteel)
+    config = settings(bake__worlds=3, arrangement__max_objects=2)
+    with pytest.warns(newton.NewtonWarning, match="colored"):
+        solver = place_cubes(config, wp.get_device("cpu"), np.tile((0.1, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0), (3, 1))).solver
+    assert fused_solver.find_differences(solver) == ["solve_mode"]
+    bodies, rows = solver._bodies(), solver._joint_rows(solver._rhs)
+    assert bodies.free_bodies.shape == bodies.free_body_dofs.shape == (3, solver._free_rigid_body_count // 3)
+    assert (np.diff(bodies.free_body_dofs.numpy(), axis=1) == build.FREE_DOFS).all()
+    assert rows.world_constraint_count.shape == rows.mf_contact_rows_end.shape == (3,)
 
 
 def test_a_cpu_and_other_versions_run_the_solver_of_newton(monkeypatch):
@@ -118,7 +135,9 @@ def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds,
             simulation.tick()
             found[version].append(simulation.physics.state.joint_q.numpy())
             phases |= set(simulation.state.phase.numpy().tolist())
-        assert isinstance(simulation.physics.solver, fused_solver.FusedSteel) == (version != "another")
+        solver = simulation.physics.solver
+        assert isinstance(solver, fused_solver.FusedSteel) == (version != "another")
+        assert fused_solver.find_differences(solver) == []
     fused, launched = found.values()
     np.testing.assert_array_equal(fused, launched)
     assert Phase.ACT in phases

@@ -31,19 +31,9 @@ class FusedSteel(newton.solvers.SolverSteel):
     on an idle GPU, and longer beside a renderer. `solver_iterations` calls the same device functions one after the other. The warm start
     of the contacts has more threads.
 
-    For models whose worlds are alike, each with one articulation besides its free bodies, and for the options that `make_solver` sets.
+    Models whose worlds are alike, each with one articulation besides its free bodies, are fused, with the options that `make_solver` sets;
+    for others, such as piles without a gripper, the solver's own launches run.
     """
-
-    def __init__(self, model: newton.Model, **options: Any) -> None:
-        """Create a solver; arguments as of SolverSteel.
-
-        Raises:
-            ValueError: The kernels do not know an option.
-        """
-        super().__init__(model, **options)
-        unknown = find_unknown_options(self)
-        if unknown:
-            raise ValueError(f"FusedSteel does not know {', '.join(unknown)}: use SolverSteel")
 
     def _launch_propagation_solve(
         self,
@@ -63,6 +53,9 @@ class FusedSteel(newton.solvers.SolverSteel):
             "friction_start_iteration": friction_start_iteration,
             "iteration_offset": iteration_offset,
         }
+        if not self._is_fusable:
+            super()._launch_propagation_solve(rhs, propagation_rhs, iterations, **options)
+            return
         if self._color_unit_meta_stale:
             self._color_unit_meta_stale = False
             self._launch_gather_unit_meta()
@@ -112,6 +105,11 @@ class FusedSteel(newton.solvers.SolverSteel):
             device=self.model.device,
         )
         self._propagation_propagate_impulses()
+
+    @cached_property
+    def _is_fusable(self) -> bool:
+        """Whether the kernel of the iterations does what the solver does with this model and these options."""
+        return not find_differences(self)
 
     def _iterations_kernel(self) -> wp.Kernel:
         """Kernel of the iterations, made of the device functions of the solver's own kernels."""
@@ -214,10 +212,10 @@ def choose_solver(device: wp.Device) -> type[newton.solvers.SolverSteel]:
     return FusedSteel if device.is_cuda and newton.__version__ == FUSED_VERSION else newton.solvers.SolverSteel
 
 
-def find_unknown_options(solver: Any) -> list[str]:
-    """Names of the options of a SolverSteel with which its iterations differ from those of `solver_iterations`."""
+def find_differences(solver: Any) -> list[str]:
+    """Options of a SolverSteel, and properties of its model, for which its iterations are not those of `solver_iterations`; empty: none."""
     differs = {
-        'solve_mode other than "colored"': not solver._propagation_colored,
+        "solve_mode": not solver._propagation_colored,
         "row_schedule": solver._row_schedule != "interleaved",
         "friction_mode": solver._friction_mode != "fixed_normal",
         "contact_compliance": solver._contact_compliance,
@@ -225,10 +223,10 @@ def find_unknown_options(solver: Any) -> list[str]:
         "drive_mode": solver._has_drive_rows,
         "enable_joint_velocity_limits": solver._enable_joint_velocity_limits,
         "propagation_cached_response": bool(solver._propagation_cached_warps),
-        "several kinds of articulations": len(solver._propagation_tree_sizes) != 1,
-        "models without joint limits and speed limits": not any(solver._internal_row_phases()),
+        "no articulation, or several kinds": len(solver._propagation_tree_sizes) != 1,
+        "neither joint limits nor speed limits": not any(solver._internal_row_phases()),
     }
-    return [name for name, unknown in differs.items() if unknown]
+    return [name for name, is_different in differs.items() if is_different]
 
 
 def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:
