@@ -57,9 +57,10 @@ def test_solvers_that_differ_are_not_fused():
         "_enable_joint_velocity_limits": False,
         "_propagation_cached_warps": {},
         "_propagation_tree_sizes": [4],
+        "_pgs_solve_propagation_colored_warp_kernel": "kernel",
         "_internal_row_phases": lambda: (True, False),
     }
-    others: list[object] = [False, "phased", "bisection", True, True, True, True, {4: 1}, [4, 7], lambda: (False, False)]
+    others: list[object] = [False, "phased", "bisection", True, True, True, True, {4: 1}, [4, 7], None, lambda: (False, False)]
     assert fused_solver.find_differences(SimpleNamespace(**known)) == []
     for name, value in zip(known, others, strict=True):
         assert len(fused_solver.find_differences(SimpleNamespace(**known | {name: value}))) == 1
@@ -73,7 +74,7 @@ def test_a_solver_with_the_settings_of_a_gpu_differs_by_the_device_alone(monkeyp
     config = settings(bake__worlds=3, arrangement__max_objects=2)
     with pytest.warns(newton.NewtonWarning, match="colored"):
         solver = place_cubes(config, wp.get_device("cpu"), np.tile((0.1, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0), (3, 1))).solver
-    assert fused_solver.find_differences(solver) == ["solve_mode"]
+    assert fused_solver.find_differences(solver) == ["solve_mode", "too many bodies for shared memory"]
     bodies, rows = solver._bodies(), solver._joint_rows(solver._rhs)
     assert bodies.free_bodies.shape == bodies.free_body_dofs.shape == (3, solver._free_rigid_body_count // 3)
     assert (np.diff(bodies.free_body_dofs.numpy(), axis=1) == build.FREE_DOFS).all()

@@ -83,7 +83,7 @@ class FusedSteel(newton.solvers.SolverSteel):
 
     def _apply_propagation_warmstart_velocity(self) -> None:
         """Turn the impulses of the warm start into velocities, with a thread for each component of each body instead of each world."""
-        if not self._ordered_rows:
+        if not (self._is_fusable and self._ordered_rows):
             super()._apply_propagation_warmstart_velocity()
             return
         wp.launch(
@@ -224,6 +224,7 @@ def find_differences(solver: Any) -> list[str]:
         "enable_joint_velocity_limits": solver._enable_joint_velocity_limits,
         "propagation_cached_response": bool(solver._propagation_cached_warps),
         "no articulation, or several kinds": len(solver._propagation_tree_sizes) != 1,
+        "too many bodies for shared memory": solver._pgs_solve_propagation_colored_warp_kernel is None,
         "neither joint limits nor speed limits": not any(solver._internal_row_phases()),
     }
     return [name for name, is_different in differs.items() if is_different]
