@@ -7,7 +7,8 @@ from synpick_warp.kernels.pose.observation import CROP, Images, Observation, Tar
 from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Models, Sums, jacobian, tukey_weight
 from synpick_warp.kernels.pose.samples import PROTRUDING, VISIBLE, SampleView, has_color, interpolate_color, view_sample
 
-wp.set_module_options({"enable_backward": False})
+# With Warp's default flags LLVM's SLP vectorizer makes invalid code of this module for CPUs with AVX-512 FP16, and the process aborts.
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native -fno-slp-vectorize"})
 
 DEADBAND = wp.constant(0.75)
 """Distance from the mask that its sampling explains [crop px]."""

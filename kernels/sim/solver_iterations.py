@@ -1,4 +1,4 @@
-"""Projected Gauss-Seidel (PGS) iterations of Newton's SolverSteel in one kernel: a warp runs all iterations of its world.
+"""Fused projected Gauss-Seidel (PGS) solver: one kernel runs all iterations of SolverSteel, of the physics engine Newton, a warp a world.
 
 The device functions of an iteration are the solver's own, and `stages.sim.fused_solver` passes them in. This module has the arrays that
 they share, under the names of their parameters, and calls them in the order in which the solver launches them. Frames and units are the
@@ -19,9 +19,10 @@ VELOCITY_LIMITS = wp.constant(5)
 
 @wp.struct
 class JointRowData:
-    """Constraint rows that act on joint velocities: limits of the gripper's joints (`world_...`), speed limits of free bodies (`mf_...`).
+    """Constraint rows in generalized coordinates: joint limits of the gripper (`world_...`), rows of free bodies (`mf_...`, matrix-free).
 
-    Arrays are (world, row), Jacobians J, responses Y and M⁻¹Jᵀ (world, row, dof); suffixes a, b: first and second body of a row.
+    Free bodies have contacts up to `mf_contact_rows_end`, none here, and then speed limits. Counts are (world), other arrays (world, row);
+    Jacobians J and responses Y = M⁻¹Jᵀ are (world, row, dof), those of free bodies (world, row, 6). Suffixes a, b: the bodies of a row.
     """
 
     world_constraint_count: wp.array[int]
@@ -58,9 +59,11 @@ class JointRowData:
 
 @wp.struct
 class ContactRowData:
-    """Constraint rows of contacts, which act on twists, and their graph coloring.
+    """Constraint rows of contacts in the twists of bodies, and their graph coloring.
 
-    Arrays are (world, row), Jacobians and responses (world, row, 6); units are contacts with their friction rows, sorted by color.
+    A unit is one contact: its normal row and its friction rows. Units are sorted by color; those of one color share no body, and are solved
+    in parallel. Counts are (world), row arrays (world, row), Jacobians J and responses M⁻¹Jᵀ (world, row, 6); arrays named `world_...` and
+    `propagation_unit_...` are flat over all worlds.
     """
 
     propagation_constraint_count: wp.array[int]
@@ -94,7 +97,8 @@ class ContactRowData:
 
 @wp.struct
 class BodyData:
-    """The gripper, a tree of joints (articulation) in each world, and the free bodies; arrays are (joint), (dof) or (body)."""
+    """Bodies of all worlds: the gripper, an articulation (tree of joints) in each, with the factors S, U and D⁻¹ of its articulated-body
+    algorithm, and the free bodies. Arrays are (articulation), (world), (joint), (dof) or (body), as named."""
 
     group_to_art: wp.array[int]
     articulation_active: wp.array[int]
@@ -128,9 +132,9 @@ class IterationSettings:
     friction_start_iteration: int
     iteration_offset: int
     internal_rows: int
-    """1: the model can have joint limits."""
+    """1: the gripper has joint limits."""
     velocity_limits: int
-    """1: the model can have velocity limits."""
+    """1: free bodies have speed limits; limits of joint velocities are not supported."""
 
 
 @wp.func_native("""
@@ -145,7 +149,7 @@ def synchronize_warp():
 
 @wp.func
 def load_free_twists(world: int, lane: int, bodies: BodyData, v: wp.array[float], twist_inout: wp.array2d[float]):
-    """Copy the velocities of the free bodies of a world from joint velocities to twists; a warp together."""
+    """Copy the velocities of the free bodies of a world from generalized velocities to twists, by one warp."""
     for element in range(lane, bodies.free_bodies.shape[1] * 6, WARP):
         free = element // 6
         axis = element - 6 * free
@@ -156,7 +160,7 @@ def load_free_twists(world: int, lane: int, bodies: BodyData, v: wp.array[float]
 def store_free_twists(
     world: int, lane: int, bodies: BodyData, twist: wp.array2d[float], impulse_inout: wp.array2d[float], v_inout: wp.array[float]
 ):
-    """Copy the twists of the free bodies of a world to joint velocities, and clear their impulses; a warp together."""
+    """Copy the twists of the free bodies of a world to generalized velocities, and clear their impulses, by one warp."""
     for element in range(lane, bodies.free_bodies.shape[1] * 6, WARP):
         free = element // 6
         axis = element - 6 * free
@@ -262,10 +266,11 @@ def compose_iterations(
         impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
         v_inout: wp.array[float],  # (dof) [m/s, rad/s]
     ):
-        """Projected Gauss-Seidel (PGS) iterations of a world: joint limits, contacts, their effect on the gripper, velocity limits.
+        """Projected Gauss-Seidel (PGS) iterations of a world, by one warp.
 
-        One warp a world. Sweeps without rows are skipped. Sweeps over contacts change twists, those over joint rows joint velocities `v`.
-        Where the latter can change free bodies, their velocities are copied in each iteration, otherwise before the first and after the
+        An iteration sweeps joint limits, contacts in generalized coordinates, colored contacts, the response of the gripper to these, and
+        speed limits; sweeps without rows are skipped. Velocities of free bodies exist twice: in `v`, generalized velocities, and as twists.
+        They are copied between the two in every iteration if a sweep over `v` can change them, otherwise before the first and after the
         last one.
         """
         world, lane = wp.tid()

@@ -13,18 +13,18 @@ def apply_warm_start_kernel(
     body_list: wp.array2d[int],  # (world, slot)
     body_a: wp.array2d[int],  # (world, row)
     body_b: wp.array2d[int],  # (world, row)
-    jacobian_a: wp.array3d[float],  # (world, row, 6)
-    jacobian_b: wp.array3d[float],  # (world, row, 6)
-    response_a: wp.array3d[float],  # (world, row, 6) [1/kg, 1/(kg m²)]
-    response_b: wp.array3d[float],  # (world, row, 6) [1/kg, 1/(kg m²)]
+    jacobian_a: wp.array3d[float],  # (world, row, 6) [1, m]
+    jacobian_b: wp.array3d[float],  # (world, row, 6) [1, m]
+    response_a: wp.array3d[float],  # (world, row, 6) [1/kg, 1/(kg m)]
+    response_b: wp.array3d[float],  # (world, row, 6) [1/kg, 1/(kg m)]
     impulse: wp.array2d[float],  # (world, row) [N s]
     twist_inout: wp.array2d[float],  # (body, 6) [m/s, rad/s]
     body_impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
 ):
-    """Apply all contact impulses λ to each body: M⁻¹Jᵀλ is added to its twist and Jᵀλ to its impulse, in the order of the rows.
+    """Apply the impulses λ of the last substep: each body adds M⁻¹Jᵀλ of its rows to its twist and Jᵀλ to its impulse, in row order.
 
-    One thread for each world, body with contacts, and twist component. The solver's own kernel has one for each world and component,
-    which walks all rows and waits for each sum; the order of summation, and so each bit, is the same.
+    One thread for each world, body with contacts, and twist component. SolverSteel has one for each world and component, which walks all
+    rows and waits for each sum. Both sum in the same order, so that results are bitwise identical.
     """
     world, slot, axis = wp.tid()
     if slot >= body_count[world]:

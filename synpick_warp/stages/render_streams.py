@@ -11,23 +11,24 @@ import warp as wp
 from synpick_warp.errors import DeviceError
 from synpick_warp.system.green_contexts import SmPartition
 
-Pair = tuple[wp.Stream | None, wp.Stream | None]
-"""Streams of the renderer and of the encoders and copies; None for the renderer's: the device's current stream; on a CPU both are None."""
+StreamPair = tuple[wp.Stream | None, wp.Stream | None]
+"""Stream of rendering, None: the device's current stream; and stream of encoding and copying. On a CPU both are None."""
 
 
 class RenderStreams:
-    """Pair of streams that can change between batches; a context manager, whose exit waits for both, before arrays of theirs are freed.
+    """CUDA streams of rendering and of encoding and copying, on a part of the GPU that can change between batches.
 
-    Warp's memory pool does not wait for these streams, so that what runs on them must not allocate.
+    A context manager: its exit synchronizes the current two streams, so that their arrays can be freed. Warp's memory pool does not wait
+    for them, so that what runs on them must not allocate.
     """
 
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self.reserved = 0.0
-        """Fraction of the multiprocessors that the current pair leaves free."""
+        """Requested fraction of the multiprocessors to leave free; without effect if the GPU cannot be divided."""
         self.render: wp.Stream | None = None
         self.copy = wp.Stream(device) if device.is_cuda else None
-        self._pairs: dict[float, Pair] = {0.0: (self.render, self.copy)}
+        self._pairs: dict[float, StreamPair] = {0.0: (self.render, self.copy)}
 
     def __enter__(self) -> Self:
         return self
@@ -53,7 +54,7 @@ class RenderStreams:
         if self.copy is not None and self.copy is not before:
             self.copy.wait_stream(before)  # Batches share the encoders' scratch arrays.
 
-    def _make_pair(self, reserved: float) -> Pair:
+    def _make_pair(self, reserved: float) -> StreamPair:
         """Streams on a part of the GPU; those on the whole one if it cannot be divided."""
         try:
             partition = SmPartition(self.device, max(1, round(reserved * self.device.sm_count)))

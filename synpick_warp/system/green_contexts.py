@@ -24,8 +24,9 @@ class _Resource(ctypes.Structure):
 
 
 class SmPartition:
-    """A part of a GPU's multiprocessors (SMs), as a green context: kernels on its streams run on these alone, all others on all.
+    """CUDA green context on a subset of a GPU's streaming multiprocessors (SMs).
 
+    Kernels on its streams run on that subset alone; kernels on other streams may use every multiprocessor.
     Green context and streams live as long as the process.
     """
 
@@ -37,7 +38,7 @@ class SmPartition:
             reserved: Multiprocessors outside the partition; CUDA rounds up, with compute capability 9 to a multiple of 8.
 
         Raises:
-            DeviceError: The driver has no green contexts (before CUDA 12.5), or the device has too few multiprocessors.
+            DeviceError: The driver is missing or has no green contexts (before CUDA 12.4), or the device has too few multiprocessors.
         """
         self.device = device
         self._driver = _load_driver()
@@ -54,13 +55,17 @@ class SmPartition:
         """Multiprocessors inside and outside the partition."""
 
     def make_stream(self) -> wp.Stream:
-        """Create a stream whose kernels run inside the partition."""
+        """Create a stream whose kernels run inside the partition.
+
+        Raises:
+            DeviceError: The driver is older than CUDA 12.5, or a CUDA error.
+        """
         stream = ctypes.c_void_p()
         self._call("cuGreenCtxStreamCreate", ctypes.byref(stream), self._context, _NON_BLOCKING, 0)
         return wp.Stream(self.device, cuda_stream=stream.value)
 
     def _call(self, name: str, *arguments: object) -> None:
-        """Call a function of the driver; a result other than 0 is an error."""
+        """Call a function of the driver; a result other than 0 raises a DeviceError."""
         function = getattr(self._driver, name, None)
         if function is None:
             raise DeviceError(f"{self.device.alias}: the driver has no {name}: green contexts with streams need CUDA 12.5")

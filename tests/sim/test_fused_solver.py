@@ -45,7 +45,7 @@ def test_the_kernel_of_the_iterations_compiles(tmp_path, packed):
     assert b"solver_iterations_kernel" in program.read_bytes()
 
 
-def test_solvers_that_differ_are_not_fused():
+def test_what_the_kernel_does_not_support_is_found():
     """By the private settings of a solver, as `FusedSteel` reads them after construction."""
     known = {
         "_propagation_colored": True,
@@ -61,9 +61,9 @@ def test_solvers_that_differ_are_not_fused():
         "_internal_row_phases": lambda: (True, False),
     }
     others: list[object] = [False, "phased", "bisection", True, True, True, True, {4: 1}, [4, 7], None, lambda: (False, False)]
-    assert fused_solver.find_differences(SimpleNamespace(**known)) == []
+    assert fused_solver.find_unsupported(SimpleNamespace(**known)) == []
     for name, value in zip(known, others, strict=True):
-        assert len(fused_solver.find_differences(SimpleNamespace(**known | {name: value}))) == 1
+        assert len(fused_solver.find_unsupported(SimpleNamespace(**known | {name: value}))) == 1
 
 
 def test_a_solver_with_the_settings_of_a_gpu_differs_by_the_device_alone(monkeypatch):
@@ -74,7 +74,7 @@ def test_a_solver_with_the_settings_of_a_gpu_differs_by_the_device_alone(monkeyp
     config = settings(bake__worlds=3, arrangement__max_objects=2)
     with pytest.warns(newton.NewtonWarning, match="colored"):
         solver = place_cubes(config, wp.get_device("cpu"), np.tile((0.1, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0), (3, 1))).solver
-    assert fused_solver.find_differences(solver) == ["solve_mode", "too many bodies for shared memory"]
+    assert fused_solver.find_unsupported(solver) == ["solve_mode", "too many bodies for shared memory"]
     bodies, rows = solver._bodies(), solver._joint_rows(solver._rhs)
     assert bodies.free_bodies.shape == bodies.free_body_dofs.shape == (3, solver._free_rigid_body_count // 3)
     assert (np.diff(bodies.free_body_dofs.numpy(), axis=1) == build.FREE_DOFS).all()
@@ -138,7 +138,7 @@ def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds,
             phases |= set(simulation.state.phase.numpy().tolist())
         solver = simulation.physics.solver
         assert isinstance(solver, fused_solver.FusedSteel) == (version != "another")
-        assert fused_solver.find_differences(solver) == []
+        assert fused_solver.find_unsupported(solver) == []
     fused, launched = found.values()
     np.testing.assert_array_equal(fused, launched)
     assert Phase.ACT in phases

@@ -15,8 +15,8 @@ import warp as wp
 from synpick_warp.kernels.sim import solver_iterations, warm_start
 
 PACKED_WORLDS = 256
-"""Most worlds for which contact rows are packed into records of 384 bytes. On an H200 a tick of 64 worlds takes 0.180 instead of 0.189 s,
-one of 512 worlds 0.272 instead of 0.274 s, for 300 MB."""
+"""Maximum number of worlds for which contact rows are packed into records of 384 bytes, 0.6 MB a world; the solver packs up to 16 worlds.
+On an H200 a tick of 64 worlds takes 0.180 instead of 0.189 s, one of 512 worlds 0.272 instead of 0.274 s."""
 FUSED_VERSION = "1.8.0"
 """Version of Newton whose private parts `FusedSteel` knows. With another one Newton's own solver runs: the same results, slower."""
 
@@ -27,12 +27,12 @@ steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
 class FusedSteel(newton.solvers.SolverSteel):
     """SolverSteel whose projected Gauss-Seidel iterations run in one kernel, a warp a world. Results are the same bit by bit.
 
-    The solver launches ten kernels an iteration, 160 of the 364 of a substep, each of which waits for the one before it: for microseconds
-    on an idle GPU, and longer beside a renderer. `solver_iterations` calls the same device functions one after the other. The warm start
-    of the contacts has more threads.
+    SolverSteel launches ten kernels per iteration: with 16 iterations, 160 of the 364 launches of a substep. Each waits for the one before
+    it, for microseconds on an idle GPU, and longer beside a renderer. `solver_iterations` calls the same device functions one after the
+    other. The warm start of the contacts has more threads.
 
-    Models whose worlds are alike, each with one articulation besides its free bodies, are fused, with the options that `make_solver` sets;
-    for others, such as piles without a gripper, the solver's own launches run.
+    Models whose worlds are alike, each with one articulation besides its free bodies, are fused, with the options that
+    `physics.make_solver` sets; for others, such as piles without a gripper, the solver's own launches run.
     """
 
     def _launch_propagation_solve(
@@ -109,7 +109,7 @@ class FusedSteel(newton.solvers.SolverSteel):
     @cached_property
     def _is_fusable(self) -> bool:
         """Whether the kernel of the iterations does what the solver does with this model and these options."""
-        return not find_differences(self)
+        return not find_unsupported(self)
 
     def _iterations_kernel(self) -> wp.Kernel:
         """Kernel of the iterations, made of the device functions of the solver's own kernels."""
@@ -212,9 +212,9 @@ def choose_solver(device: wp.Device) -> type[newton.solvers.SolverSteel]:
     return FusedSteel if device.is_cuda and newton.__version__ == FUSED_VERSION else newton.solvers.SolverSteel
 
 
-def find_differences(solver: Any) -> list[str]:
-    """Options of a SolverSteel, and properties of its model, for which its iterations are not those of `solver_iterations`; empty: none."""
-    differs = {
+def find_unsupported(solver: Any) -> list[str]:
+    """Names of the options of a SolverSteel, and properties of its model, that the fused kernel does not support; empty: it can be used."""
+    unsupported = {
         "solve_mode": not solver._propagation_colored,
         "row_schedule": solver._row_schedule != "interleaved",
         "friction_mode": solver._friction_mode != "fixed_normal",
@@ -225,13 +225,14 @@ def find_differences(solver: Any) -> list[str]:
         "propagation_cached_response": bool(solver._propagation_cached_warps),
         "no articulation, or several kinds": len(solver._propagation_tree_sizes) != 1,
         "too many bodies for shared memory": solver._pgs_solve_propagation_colored_warp_kernel is None,
+        # Without limits the solver spares worlds without contacts in generalized coordinates a pass over the gripper.
         "neither joint limits nor speed limits": not any(solver._internal_row_phases()),
     }
-    return [name for name, is_different in differs.items() if is_different]
+    return [name for name, is_unsupported in unsupported.items() if is_unsupported]
 
 
 def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:
-    """`struct` with `values` in the order of its fields; None: an empty array."""
+    """Assign `values` to the fields of a struct in their order, None for an empty array; returns the struct."""
     for name, value in zip(struct._cls.vars, values, strict=True):
         setattr(struct, name, value)
     return struct
