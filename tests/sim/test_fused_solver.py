@@ -28,15 +28,14 @@ def test_the_installed_version_of_newton_is_fused():
     assert newton.__version__ == fused_solver.FUSED_VERSION
 
 
-@pytest.mark.parametrize("packed", [True, False])
-def test_the_kernel_of_the_iterations_compiles(tmp_path, packed):
+def test_the_kernel_of_the_iterations_compiles(tmp_path):
     """Its calls fit the solver's device functions; compiled for a GPU, also where there is none."""
     joint_rows = steel._get_pgs_solve_mf_gs_kernel(
         ROWS, ROWS, DOFS, ARCHITECTURE, has_dense_velocity_limit_rows=False, shared_metadata=True, row_phases=True
     )
     refresh = steel._get_refresh_propagation_tree_body_qd_warp_kernel(4, 2, ARCHITECTURE)
     contacts = steel._get_pgs_solve_propagation_colored_warp_kernel(
-        ROWS, steel.PROPAGATION_COLOR_TAIL + 2, BODIES, 1, ARCHITECTURE, packed=packed
+        ROWS, steel.PROPAGATION_COLOR_TAIL + 2, BODIES, 1, ARCHITECTURE, packed=False
     )
     propagate = steel._get_propagate_tree_impulses_revolute_kernel(4, 2, ARCHITECTURE, has_free_root=True)
     kernel = fused_solver.compose_kernel(joint_rows, refresh, contacts, propagate)
