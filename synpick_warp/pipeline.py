@@ -355,9 +355,7 @@ class _Run:
         self.summary.stopped = 0 if done else stop.number
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
-        """Export a tick: write its frames, launch the rendering of its views, and write the views and episode ends that are ready.
-
-        Between batches the next tick is enqueued. Where physics limits the rate, it gets a part of the GPU for itself."""
+        """Export a tick: write its frames, render its views, write finished views and episode ends; enqueue physics between batches."""
         physics = self.config.physics
         batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
         if len(batch):

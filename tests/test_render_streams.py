@@ -1,4 +1,4 @@
-"""Streams of renderer and encoders: which are current, what waits for what, and what happens where a GPU cannot be divided."""
+"""Streams of renderer and encoders: caching, synchronization when they switch, and fallback on GPUs without partitions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.harness.cuda_model import ModelDevice, ModelStream
 
 
 class Partition:
-    """Partition of a model of a GPU; remembers what was reserved."""
+    """Fake SM partition; records the numbers of reserved multiprocessors."""
 
     reserved: ClassVar[list[int]] = []
 
@@ -28,7 +28,7 @@ class Partition:
 
 
 class NoStreams(Partition):
-    """Partition of a driver that cannot make streams on it."""
+    """Fake SM partition of a driver without streams on green contexts."""
 
     def make_stream(self) -> ModelStream:
         raise DeviceError("no streams")
@@ -36,7 +36,7 @@ class NoStreams(Partition):
 
 @pytest.fixture
 def make_streams(monkeypatch):
-    """Streams of a model of a GPU with 132 multiprocessors, divided by a kind of partition."""
+    """Factory of `RenderStreams` on a fake GPU with 132 multiprocessors and a given class of partitions."""
 
     def make(kind: type[Partition], seed: int = 0) -> tuple[RenderStreams, ModelDevice]:
         device = ModelDevice(random.Random(seed))

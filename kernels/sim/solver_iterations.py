@@ -11,6 +11,8 @@ wp.set_module_options({"enable_backward": False})
 
 # Threads of a warp. A block is one warp, which owns one world, so that a barrier of the warp orders the functions of an iteration.
 WARP = wp.constant(32)
+# Components of a twist: linear and angular velocity.
+TWIST = wp.constant(6)
 # Values of the solver's `row_phase`: the rows that a sweep over joint rows visits.
 INTERNAL_ROWS = wp.constant(3)
 CONTACT_ROWS = wp.constant(4)
@@ -150,9 +152,9 @@ def synchronize_warp():
 @wp.func
 def load_free_twists(world: int, lane: int, bodies: BodyData, v: wp.array[float], twist_inout: wp.array2d[float]):
     """Copy the velocities of the free bodies of a world from generalized velocities to twists, by one warp."""
-    for element in range(lane, bodies.free_bodies.shape[1] * 6, WARP):
-        free = element // 6
-        axis = element - 6 * free
+    for element in range(lane, bodies.free_bodies.shape[1] * TWIST, WARP):
+        free = element // TWIST
+        axis = element - TWIST * free
         twist_inout[bodies.free_bodies[world, free], axis] = v[bodies.free_body_dofs[world, free] + axis]
 
 
@@ -161,9 +163,9 @@ def store_free_twists(
     world: int, lane: int, bodies: BodyData, twist: wp.array2d[float], impulse_inout: wp.array2d[float], v_inout: wp.array[float]
 ):
     """Copy the twists of the free bodies of a world to generalized velocities, and clear their impulses, by one warp."""
-    for element in range(lane, bodies.free_bodies.shape[1] * 6, WARP):
-        free = element // 6
-        axis = element - 6 * free
+    for element in range(lane, bodies.free_bodies.shape[1] * TWIST, WARP):
+        free = element // TWIST
+        axis = element - TWIST * free
         body = bodies.free_bodies[world, free]
         v_inout[bodies.free_body_dofs[world, free] + axis] = twist[body, axis]
         impulse_inout[body, axis] = 0.0

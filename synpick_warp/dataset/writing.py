@@ -251,9 +251,9 @@ class OutputFolder:
 
 
 def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: EpisodeEnd) -> None:
-    """Commit an episode whose files are all in place.
+    """Commit an episode whose files are all in place: writers hash them in parallel, then one of them writes the manifest entry.
 
-    Writers compute their checksums, with a task for each file or folder that the formats name; a last task writes the manifest entry.
+    There is one task for each file or folder that `Exporters.files` names, and one for the entry.
     """
     content = {"episode": end.episode, "row": dict(end.row), "attempts": [json.loads(line) for line in end.attempts]}
     entry, paths = episode_entry(end.episode), exporters.files(end.episode)

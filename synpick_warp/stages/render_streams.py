@@ -1,4 +1,4 @@
-"""CUDA streams of renderer and encoders: on all multiprocessors of a GPU, or on a part of them, so that physics has the others."""
+"""CUDA streams of the renderer and of the encoders, on all multiprocessors (SMs) of a GPU or on a subset that leaves SMs to physics."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from synpick_warp.errors import DeviceError
 from synpick_warp.system.green_contexts import SmPartition
 
 StreamPair = tuple[wp.Stream | None, wp.Stream | None]
-"""Stream of rendering, None: the device's current stream; and stream of encoding and copying. On a CPU both are None."""
+"""Render stream (None: the current stream of the device), and stream for encoding and copies to the host. Both are None on a CPU."""
 
 
 class RenderStreams:
-    """CUDA streams of rendering and of encoding and copying, on a part of the GPU that can change between batches.
+    """Pair of CUDA streams, for rendering and for encoding, whose SM partition can be switched between batches.
 
-    A context manager: its exit synchronizes the current two streams, so that their arrays can be freed. Warp's memory pool does not wait
-    for them, so that what runs on them must not allocate.
+    As a context manager it synchronizes the current pair on exit, so that arrays in use can be freed. Warp's memory pool does not order
+    frees after work on these streams: do not allocate on them.
     """
 
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self.reserved = 0.0
-        """Requested fraction of the multiprocessors to leave free; without effect if the GPU cannot be divided."""
+        """Fraction of the SMs requested to be left free; it has no effect if the GPU cannot be partitioned."""
         self.render: wp.Stream | None = None
         self.copy = wp.Stream(device) if device.is_cuda else None
         self._pairs: dict[float, StreamPair] = {0.0: (self.render, self.copy)}
@@ -40,9 +40,9 @@ class RenderStreams:
                     wp.synchronize_stream(stream)
 
     def confine(self, reserved: float) -> None:
-        """Choose where following batches are rendered and encoded: on all multiprocessors but a fraction `reserved`.
+        """Switch to the pair of streams that leaves a fraction `reserved` of the SMs free; 0: to the pair on the whole GPU.
 
-        Without effect on a CPU, and where the driver cannot divide the GPU.
+        Call it between batches. It does nothing on a CPU, or if the driver does not support partitions.
         """
         before = self.copy
         if before is None or reserved == self.reserved:
@@ -55,7 +55,7 @@ class RenderStreams:
             self.copy.wait_stream(before)  # Batches share the encoders' scratch arrays.
 
     def _make_pair(self, reserved: float) -> StreamPair:
-        """Streams on a part of the GPU; those on the whole one if it cannot be divided."""
+        """Create a pair of streams on a partition; if that is not supported, return the pair on the whole GPU."""
         try:
             partition = SmPartition(self.device, max(1, round(reserved * self.device.sm_count)))
             return partition.make_stream(), partition.make_stream()

@@ -44,10 +44,10 @@ def record_bytes(record: TickRecord) -> int:
 
 
 class TickQueue:
-    """Ring buffer indexed by tick number, filled on the stream of physics.
+    """Ring buffer of tick records, indexed by tick number: physics pushes on its stream, the renderer reads and releases on its own.
 
-    On a GPU, before a tick overwrites a slot, the stream that puts it waits for all work that was on the releasing stream, the renderer's,
-    when the slot was released.
+    On a GPU, `put` makes the stream of physics wait for the event that `release` recorded on the stream of the renderer, so that no slot is
+    overwritten while it is read.
     """
 
     def __init__(self, record: TickRecord, slots: int) -> None:
@@ -67,7 +67,7 @@ class TickQueue:
         self._released = [wp.Event(device) for _ in range(slots)] if device.is_cuda else []
 
     def put(self, tick: int) -> None:
-        """Copy the record into the slot of a tick, asynchronously on the current stream."""
+        """Copy the record of a tick into its slot, asynchronously on the current stream."""
         slot = tick % self.slots
         if self._released:
             self._device.stream.wait_event(self._released[slot])
@@ -76,22 +76,22 @@ class TickQueue:
         self._readers[slot].start()
 
     def get(self, tick: int) -> tuple[TickReport, Snapshot]:
-        """Wait for a tick, and return its report and snapshot, which are valid until its slot is released."""
+        """Wait until the copies of a tick are complete; returns its report and snapshot, valid until the slot is released."""
         slot = tick % self.slots
         return self._readers[slot].wait(), self._snapshots[slot]
 
     def phase(self, tick: int) -> np.ndarray | None:
-        """Phase of each world after a tick (world) int32; None: the device has not done it yet. The tick must have been put."""
+        """Poll for a tick that `put` has enqueued: phase of each world at its end (world) int32, or None while its copies are pending."""
         return self._readers[tick % self.slots].phase()
 
     def release(self, tick: int) -> None:
-        """Free the slot of a tick as soon as the work now queued on the current stream is done; returns at once."""
+        """Release the slot of a tick once all work now enqueued on the current stream is complete; does not block."""
         if self._released:
             self._device.stream.record_event(self._released[tick % self.slots])
 
 
 def allocate_slots(arrays: Sequence[wp.array], slots: int, device: wp.Device, pinned: bool = False) -> list[list[wp.array]]:
-    """Allocate a ring buffer: for each slot, zeroed arrays with the shapes and types of `arrays`, which are parts of one allocation each.
+    """Allocate a ring buffer: zeroed arrays with the shapes and types of `arrays` for each slot. The slots of an array share an allocation.
 
     Args:
         arrays: Templates.

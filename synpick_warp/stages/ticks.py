@@ -20,18 +20,18 @@ from synpick_warp.stages.tick_queue import TickQueue, queue_lead, record_bytes
 from synpick_warp.stages.timing import scope
 
 HIGH_PRIORITY = -1
-"""CUDA stream priority of physics: its 25,000 short kernels a tick depend on one another, and should not also wait for the renderer's."""
+"""CUDA stream priority of physics: its 13,000 short kernels per tick depend on one another, and should not also wait for the renderer's."""
 PARTS_IN_FLIGHT = 24
 """Most parts of ticks, mostly substeps, that are enqueued and not yet done. On an H200 some 40 parts fill the launch queue of a CUDA
 stream, and further launches block the host: with all 66 parts of a tick at once it launched no rendering for 0.25 s a tick."""
 
 PHYSICS_SHARE = 2.0 / 11.0
-"""Fraction of a GPU's multiprocessors that a renderer should leave to physics where physics limits the rate: 24 of 132. Kernels of physics
-are short, fill few multiprocessors and depend on one another, but beside a renderer that fills all of them each waits for a place. With 48
-worlds, which physics limits, an H200 makes 513 views/s in full HD with none to itself, 583 with 8, 614 with 16 and 641 with 24."""
+"""Fraction of a GPU's multiprocessors (SMs) reserved for physics while it is the bottleneck: 24 of 132. Its kernels are short and fill few
+SMs, but a renderer occupies all of them, so that each kernel waits for a free one. Measured on an H200 with 48 worlds in full HD: 513
+views/s without reserved SMs, 583 with 8, 614 with 16, 641 with 24."""
 SAFE_LEAD = 64
-"""Lead [ticks], or half of the largest one if that is less, below which physics limits the rate, or soon will: the fewer worlds are left,
-the cheaper they are to render, but not to simulate."""
+"""Lead of physics [ticks] below which it counts as the bottleneck; at most half of the maximum lead. As worlds fall idle, rendering becomes
+cheaper and a tick of physics hardly does, so that physics needs a reserve of ticks."""
 
 
 class TickLoop:
@@ -118,7 +118,7 @@ class TickLoop:
 
     @property
     def reserved_share(self) -> float:
-        """Fraction of the device's multiprocessors that the renderer should leave to physics: 0 where physics does not limit the rate."""
+        """Fraction of the multiprocessors to reserve for physics: PHYSICS_SHARE while physics is the bottleneck, else 0."""
         if self._all_idle:
             return 0.0
         is_short = self._simulated - self._taken < min(SAFE_LEAD, self.lead // 2)

@@ -1,4 +1,4 @@
-"""Model of a GPU's streams and events on the host: operations are done one by one, in a random order among those that CUDA allows."""
+"""Fake CUDA device for tests: executes the operations of its streams one by one, in a random order that CUDA's stream rules allow."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ def append_kernel(
     # Out:
     lists_inout: PathLists,
 ):
-    """Append the coarse pixel of each thread to its view's lists if `known` is not negative; a view has `threads` threads."""
+    """Append one coarse pixel per thread to the path lists of its view, unless `known` is negative. Each view has `threads` threads."""
     index = wp.tid()
     if known[index] >= 0:
         append_pixel(lists_inout, index // threads, index, known[index], bits[index])

@@ -1,4 +1,4 @@
-"""Fused solver: bit by bit the results of Newton's own launches."""
+"""Fused solver: results are bitwise identical to those of Newton's separate kernels."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class ModelSimulation:
 
 @pytest.fixture
 def make_device(monkeypatch) -> Callable[[int], ModelDevice]:
-    """Puts a model in the place of Warp; when the host pauses, the device goes on."""
+    """Factory that replaces Warp by the model of a GPU, which executes queued operations whenever the host sleeps."""
 
     def make(seed: int) -> ModelDevice:
         device = ModelDevice(random.Random(seed))

@@ -1,4 +1,4 @@
-"""Partitions of a GPU: where kernels run, and what happens where a GPU cannot be divided."""
+"""SM partitions of a GPU: placement of kernels, and errors of drivers that do not support them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def multiprocessor() -> int:
 
 @wp.kernel(enable_backward=False)
 def count_blocks_kernel(spins: int, blocks_out: wp.array[int]):
-    """Count the threads of each multiprocessor (multiprocessor); each thread takes a while."""
+    """Histogram of threads over multiprocessors (multiprocessor). Threads spin, so that the grid spreads over all that it may use."""
     x = float(wp.tid())
     for _ in range(spins):
         x = wp.sin(x) + 1.0
@@ -62,12 +62,12 @@ def test_more_multiprocessors_than_there_are_cannot_be_reserved(device):
 
 
 SPLIT = ("cuDeviceGet", "cuDeviceGetDevResource", "cuDevSmResourceSplitByCount", "cuDevResourceGenerateDesc", "cuGreenCtxCreate")
-"""Functions that make a partition, in the order of their calls."""
+"""Driver functions that create a partition, in call order."""
 
 
 @pytest.fixture
 def drive(monkeypatch):
-    """Puts a driver in the place of CUDA's that has the first functions of SPLIT; the last of them returns a code. Keeps its calls."""
+    """Factory that replaces the CUDA driver by a fake with the first functions of SPLIT; the last one returns `code`. Records all calls."""
 
     def install(functions: int, code: int = 0) -> list[tuple[str, tuple]]:
         calls: list[tuple[str, tuple]] = []

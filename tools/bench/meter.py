@@ -28,7 +28,7 @@ part."""
 LEAD_TICKS = 2
 """Warm-up: ticks above LIVE_FRACTION before the measurement, which fill the writers' queues."""
 SLICE_SECONDS = 20.0
-"""Length of the slices whose median, slowest and fastest rates are reported [s]."""
+"""Window length of the reported rates (median, minimum and maximum over windows) [s]."""
 
 
 @dataclass(frozen=True)

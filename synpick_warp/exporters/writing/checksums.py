@@ -83,13 +83,11 @@ def parse_checksums(lines: bytes, folder: Path, source: Path, advice: str) -> di
     return known
 
 
-def list_files(out: Path, paths: Sequence[Path]) -> list[Path]:
-    """Expand files and folders into the files they hold, each once, relative to the data set, sorted by name."""
-    return [Path(name) for name in _list_names(out, paths)]
+def list_files(out: Path, paths: Sequence[Path]) -> list[str]:
+    """Expand files and folders into the names of all files in them, relative to the data set, sorted and without duplicates.
 
-
-def _list_names(out: Path, paths: Sequence[Path]) -> list[str]:
-    """`list_files` as names: an episode has 100,000 files, and a `Path` costs as much as the checksum of a small file."""
+    Names are strings: an episode has 100,000 files, and to create a `Path` takes as long as to hash a small file.
+    """
     names: set[str] = set()
     for path in map(str, paths):
         names.update(_walk(f"{out}/{path}", path) if os.path.isdir(f"{out}/{path}") else (path,))
@@ -97,7 +95,7 @@ def _list_names(out: Path, paths: Sequence[Path]) -> list[str]:
 
 
 def _walk(folder: str, name: str) -> Iterator[str]:
-    """Names of the files in a folder, which is called `name`, and in its subfolders."""
+    """Yield the names of all files in a folder and its subfolders, with `name` in place of the folder's path."""
     with os.scandir(folder) as entries:
         for entry in entries:
             if entry.is_dir():
@@ -107,7 +105,7 @@ def _walk(folder: str, name: str) -> Iterator[str]:
 
 
 def _hash_file(path: Path | str) -> tuple[str, int]:
-    """SHA-256, in hexadecimal, and size [bytes] of a regular file."""
+    """Hash a regular file; returns its SHA-256 in hexadecimal and its size [bytes]."""
     with open(open_regular(path), "rb", buffering=0) as file:
         size = os.fstat(file.fileno()).st_size
         digest = hashlib.sha256(file.read()) if size <= _WHOLE else hashlib.file_digest(file, "sha256")
@@ -115,16 +113,16 @@ def _hash_file(path: Path | str) -> tuple[str, int]:
 
 
 def write_checksums(out: Path, path: Path, part: Path) -> None:
-    """Task: write SHA-256, size [bytes] and name of a file, or of each of a folder's files, to the list `part`."""
-    part.write_text("".join(f"{digest} {size} {name}\n" for name, (digest, size) in _hash_files(out, (path,)).items()))
+    """Task: hash a file, or all files of a folder, and write a line of SHA-256, size [bytes] and name for each to `part`."""
+    part.write_bytes("".join(f"{digest} {size} {name}\n" for name, (digest, size) in _hash_files(out, (path,)).items()).encode())
 
 
 def join_manifest_entry(out: Path, place: Path, parts: Sequence[Path], content: dict[str, Any]) -> None:
-    """Task: commit the files whose checksums `write_checksums` has written to `parts`; removes these. See `write_manifest_entry`."""
+    """Task: merge the lists of `write_checksums` into a manifest entry as of `write_manifest_entry`, and remove them."""
     known: dict[str, tuple[str, int]] = {}
     for part in parts:
-        for line in part.read_text().splitlines():
-            digest, size, name = line.split(" ", 2)
+        for line in part.read_bytes().splitlines():
+            digest, size, name = line.decode().split(" ", 2)
             known[name] = digest, int(size)
     _write_entry(out, place, known, content)
     for part in parts:
@@ -144,12 +142,17 @@ def write_manifest_entry(out: Path, place: Path, paths: Sequence[Path], content:
 
 
 def _hash_files(out: Path, paths: Sequence[Path]) -> dict[str, tuple[str, int]]:
-    """SHA-256 and size [bytes] of files, and of all files in folders, by name."""
-    return {name: _hash_file(f"{out}/{name}") for name in _list_names(out, paths)}
+    """Hash files, and all files in folders; returns SHA-256 and size [bytes] by name."""
+    return {name: _hash_file(f"{out}/{name}") for name in list_files(out, paths)}
 
 
 def _write_entry(out: Path, place: Path, known: dict[str, tuple[str, int]], content: dict[str, Any]) -> None:
-    """Write the checksum list and then the entry of files whose SHA-256 and size [bytes] are known."""
+    """Write a manifest entry: first the checksum list, then the JSON file.
+
+    Args:
+        out, place, content: As of `write_manifest_entry`.
+        known: Name -> SHA-256 and size [bytes] of each file.
+    """
     lines = "".join(f"{known[name][0]}  {name}\n" for name in sorted(known)).encode()
     size = sum(size for _, size in known.values())
     entry = {**content, "files": len(known), "bytes": size, "checksum": hashlib.sha256(lines).hexdigest()}
@@ -158,5 +161,5 @@ def _write_entry(out: Path, place: Path, known: dict[str, tuple[str, int]], cont
 
 
 def name_parts(out: Path, place: Path, count: int) -> list[Path]:
-    """Places for `count` parts of the checksum list of a manifest entry."""
+    """Paths of `count` temporary files for the partial checksum lists of a manifest entry."""
     return [out / PARTIAL / f"{place.name}-{index}.sha256" for index in range(count)]

@@ -88,7 +88,7 @@ class FusedSteel(newton.solvers.SolverSteel):
             return
         wp.launch(
             warm_start.apply_warm_start_kernel,
-            dim=(self._world_count, self._max_propagation_bodies, 6),
+            dim=(self._world_count, self._max_propagation_bodies, int(solver_iterations.TWIST)),
             inputs=[
                 self._propagation_constraint_count,
                 self._propagation_body_count,
