@@ -363,7 +363,9 @@ class _Run:
                 self.exporters.write_ticks(batch)
         records = self.factory.log.update(report)
         if self.exporters.needs_views:
-            self.factory.stream.streams.confine(ticks.reserved_share)
+            streams = self.factory.stream.streams
+            streams.confine(ticks.reserved_share)
+            self.factory.simulation.physics.solver_stream = streams.physics if len(batch) else None
             for views in self.factory.stream.advance(snapshot, report, partial(self._end_episodes, report, records)):
                 ticks.enqueue()
                 self._write(views)

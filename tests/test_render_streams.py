@@ -23,14 +23,14 @@ class Partition:
         self.device = device
         self.reserved.append(reserved)
 
-    def make_stream(self) -> ModelStream:
+    def make_stream(self, reserved: bool = False, priority: int = 0) -> ModelStream:
         return ModelStream(self.device)
 
 
 class NoStreams(Partition):
     """Fake SM partition of a driver without streams on green contexts."""
 
-    def make_stream(self) -> ModelStream:
+    def make_stream(self, reserved: bool = False, priority: int = 0) -> ModelStream:
         raise DeviceError("no streams")
 
 
@@ -49,19 +49,32 @@ def make_streams(monkeypatch):
     return make
 
 
-def test_each_share_has_a_pair_of_streams_that_is_made_once(make_streams):
+def test_each_share_has_streams_that_are_made_once(make_streams):
     streams, _ = make_streams(Partition)
-    whole = streams.render, streams.copy
-    assert whole[0] is None
-    pairs = []
+    whole = streams.render, streams.copy, streams.physics
+    assert whole[0] is whole[2] is None
+    found = []
     for reserved in (2 / 11, 2 / 33, 2 / 11, 0.0, 0.0, 2 / 33):
         streams.confine(reserved)
-        pairs.append((streams.render, streams.copy))
-    assert pairs[0] == pairs[2]
-    assert pairs[1] == pairs[5]
-    assert pairs[3] == pairs[4] == whole
-    assert len({id(stream) for pair in (pairs[0], pairs[1]) for stream in pair} | {id(whole[1])}) == 5
+        found.append((streams.render, streams.copy, streams.physics))
+    assert found[0] == found[2]
+    assert found[1] == found[5]
+    assert found[3] == found[4] == whole
+    assert len({id(stream) for each in (found[0], found[1]) for stream in each} | {id(whole[1])}) == 7
     assert Partition.reserved == [24, 8]
+
+
+def test_only_the_stream_of_physics_is_on_the_reserved_multiprocessors(make_streams, monkeypatch):
+    made: list[tuple[ModelStream, bool, int]] = []
+
+    def make_stream(partition: Partition, reserved: bool = False, priority: int = 0) -> ModelStream:
+        made.append((ModelStream(partition.device), reserved, priority))
+        return made[-1][0]
+
+    monkeypatch.setattr(Partition, "make_stream", make_stream)
+    streams, _ = make_streams(Partition)
+    streams.confine(0.2)
+    assert made == [(streams.render, False, 0), (streams.copy, False, 0), (streams.physics, True, render_streams.HIGH_PRIORITY)]
 
 
 def test_the_encoders_of_a_batch_wait_for_those_of_the_batch_before(make_streams):
@@ -86,6 +99,7 @@ def test_a_gpu_that_cannot_be_divided_is_used_as_a_whole(make_streams):
         streams.confine(reserved)
         assert streams.render is None
         assert streams.copy is whole
+        assert streams.physics is None
     assert Partition.reserved == [26]
 
 

@@ -15,9 +15,11 @@ from rich.table import Table
 from synpick_warp import __version__
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import plan_episodes
+from synpick_warp.errors import DeviceError
 from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.system.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
 from synpick_warp.system.device import pick_device
+from synpick_warp.system.green_contexts import SmPartition, count_reserved
 
 _PACKAGES = ("warp-lang", "newton", "numpy")
 MIB = 1024**2
@@ -79,10 +81,23 @@ def _device(device: wp.Device) -> list[tuple[str, str]]:
     if device.is_cuda:
         rows.append(("device memory", f"{device.free_memory / GIB:.1f} of {device.total_memory / GIB:.1f} GiB free"))
         rows.append(("compute capability", f"{device.arch / 10:.1f}"))
+        rows.append(("multiprocessors", f"{device.sm_count}, {_describe_partition(device)}"))
     toolkit = wp.get_cuda_toolkit_version()
     driver = wp.get_cuda_driver_version() if wp.is_cuda_available() else None
     rows.append(("CUDA", f"driver {_dotted(driver)}, Warp built with {_dotted(toolkit)}"))
     return rows
+
+
+def _describe_partition(device: wp.Device) -> str:
+    """How many multiprocessors of a GPU a bake can reserve for physics, or why none."""
+    from synpick_warp.stages.ticks import PHYSICS_SHARE
+
+    try:
+        partition = SmPartition(device, count_reserved(device, PHYSICS_SHARE))
+        partition.make_stream(reserved=True)
+    except DeviceError as error:
+        return f"none of which can be reserved for physics ({error})"
+    return f"{partition.reserved} of which can be reserved for physics"
 
 
 def _caches() -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""CUDA streams of the renderer and of the encoders, on all multiprocessors (SMs) of a GPU or on a subset that leaves SMs to physics."""
+"""CUDA streams of the renderer, of the encoders and of physics, on all multiprocessors (SMs) of a GPU or on disjoint subsets of them."""
 
 from __future__ import annotations
 
@@ -9,16 +9,20 @@ from typing import Self
 import warp as wp
 
 from synpick_warp.errors import DeviceError
-from synpick_warp.system.green_contexts import SmPartition
+from synpick_warp.system.green_contexts import SmPartition, count_reserved
 
-StreamPair = tuple[wp.Stream | None, wp.Stream | None]
-"""Render stream (None: the current stream of the device), and stream for encoding and copies to the host. Both are None on a CPU."""
+HIGH_PRIORITY = -1
+"""CUDA stream priority of physics: its 13,000 short kernels per tick depend on one another, and should not also wait for the renderer's."""
+
+Streams = tuple[wp.Stream | None, wp.Stream | None, wp.Stream | None]
+"""Render stream (None: the current stream of the device), stream for encoding and copies to the host, and stream on the SMs that both leave
+free (None: there are none). All are None on a CPU."""
 
 
 class RenderStreams:
-    """Pair of CUDA streams, for rendering and for encoding, whose SM partition can be switched between batches.
+    """CUDA streams for rendering and for encoding, whose SM partition can be switched between batches, and one on the SMs left to physics.
 
-    As a context manager it synchronizes the current pair on exit, so that arrays in use can be freed. Warp's memory pool does not order
+    As a context manager it synchronizes the first two on exit, so that arrays in use can be freed. Warp's memory pool does not order
     frees after work on these streams: do not allocate on them.
     """
 
@@ -28,7 +32,9 @@ class RenderStreams:
         """Fraction of the SMs requested to be left free; it has no effect if the GPU cannot be partitioned."""
         self.render: wp.Stream | None = None
         self.copy = wp.Stream(device) if device.is_cuda else None
-        self._pairs: dict[float, StreamPair] = {0.0: (self.render, self.copy)}
+        self.physics: wp.Stream | None = None
+        """Stream on the SMs that are left free; None: there are none."""
+        self._partitions: dict[float, Streams] = {0.0: (self.render, self.copy, self.physics)}
 
     def __enter__(self) -> Self:
         return self
@@ -40,24 +46,24 @@ class RenderStreams:
                     wp.synchronize_stream(stream)
 
     def confine(self, reserved: float) -> None:
-        """Switch to the pair of streams that leaves a fraction `reserved` of the SMs free; 0: to the pair on the whole GPU.
+        """Switch to the streams that leave a fraction `reserved` of the SMs free; 0: to those on the whole GPU.
 
         Call it between batches. It does nothing on a CPU, or if the driver does not support partitions.
         """
         before = self.copy
         if before is None or reserved == self.reserved:
             return
-        if reserved not in self._pairs:
-            self._pairs[reserved] = self._make_pair(reserved)
+        if reserved not in self._partitions:
+            self._partitions[reserved] = self._make_streams(reserved)
         self.reserved = reserved
-        self.render, self.copy = self._pairs[reserved]
+        self.render, self.copy, self.physics = self._partitions[reserved]
         if self.copy is not None and self.copy is not before:
             self.copy.wait_stream(before)  # Batches share the encoders' scratch arrays.
 
-    def _make_pair(self, reserved: float) -> StreamPair:
-        """Create a pair of streams on a partition; if that is not supported, return the pair on the whole GPU."""
+    def _make_streams(self, reserved: float) -> Streams:
+        """Create the streams of a partition; if that is not supported, return those on the whole GPU."""
         try:
-            partition = SmPartition(self.device, max(1, round(reserved * self.device.sm_count)))
-            return partition.make_stream(), partition.make_stream()
+            partition = SmPartition(self.device, count_reserved(self.device, reserved))
+            return partition.make_stream(), partition.make_stream(), partition.make_stream(reserved=True, priority=HIGH_PRIORITY)
         except DeviceError:
-            return self._pairs[0.0]
+            return self._partitions[0.0]

@@ -14,11 +14,10 @@ from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import record_arrays
 from synpick_warp.stages.stream import TickReader, TickReport
 
-MAX_LEAD = 256
-"""Most ticks that physics may be ahead of the renderer. In Monte Carlo simulations of bakes of 150 and of 300 episodes, with measured
-times of ticks, 512 shorten a bake by 0.2 % more."""
-QUEUE_BYTES = 512 << 20
-"""Largest size of a ring of records, unless a lead of one tick needs more [bytes]. It holds MAX_LEAD ticks of 360 worlds, or 15 ticks of
+MAX_LEAD = 1024
+"""Most ticks that physics may be ahead of the renderer, so that it is done with long episodes when the renderer comes to them."""
+QUEUE_BYTES = 1 << 30
+"""Largest size of a ring of records, unless a lead of one tick needs more [bytes]. It holds MAX_LEAD ticks of 180 worlds, or 30 ticks of
 512 worlds whose steps are recorded."""
 
 

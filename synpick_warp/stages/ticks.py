@@ -13,14 +13,13 @@ import warp as wp
 from synpick_warp.codes import Phase
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import wait_event
+from synpick_warp.stages.render_streams import HIGH_PRIORITY
 from synpick_warp.stages.sim.physics import ENDED
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.tick_queue import TickQueue, queue_lead, record_bytes
 from synpick_warp.stages.timing import scope
 
-HIGH_PRIORITY = -1
-"""CUDA stream priority of physics: its 13,000 short kernels per tick depend on one another, and should not also wait for the renderer's."""
 PARTS_IN_FLIGHT = 24
 """Most parts of ticks, mostly substeps, that are enqueued and not yet done. On an H200 some 40 parts fill the launch queue of a CUDA
 stream, and further launches block the host: with all 66 parts of a tick at once it launched no rendering for 0.25 s a tick."""
@@ -29,7 +28,7 @@ PHYSICS_SHARE = 2.0 / 11.0
 """Fraction of a GPU's multiprocessors (SMs) reserved for physics while it is the bottleneck: 24 of 132. Its kernels are short and fill few
 SMs, but a renderer occupies all of them, so that each kernel waits for a free one. Measured on an H200 with 48 worlds in full HD: 513
 views/s without reserved SMs, 583 with 8, 614 with 16, 641 with 24."""
-SAFE_LEAD = 64
+SAFE_LEAD = 512
 """Lead of physics [ticks] below which it counts as the bottleneck; at most half of the maximum lead. As worlds fall idle, rendering becomes
 cheaper and a tick of physics hardly does, so that physics needs a reserve of ticks."""
 

@@ -1,4 +1,4 @@
-"""Partition of a GPU's multiprocessors by a CUDA green context: a stream whose kernels leave some of them free."""
+"""Partition of a GPU's multiprocessors by CUDA green contexts: streams whose kernels run on some of them, or on the others."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class _Resource(ctypes.Structure):
 
 
 class SmPartition:
-    """CUDA green context on a subset of a GPU's streaming multiprocessors (SMs).
+    """CUDA green contexts on a subset of a GPU's streaming multiprocessors (SMs) and on the others, which are reserved.
 
-    Kernels on its streams run on that subset alone; kernels on other streams may use every multiprocessor.
-    Green context and streams live as long as the process.
+    Kernels on its streams run on one of the two subsets; kernels on other streams may use every multiprocessor.
+    Green contexts and streams live as long as the process.
     """
 
     def __init__(self, device: wp.Device, reserved: int) -> None:
@@ -44,25 +44,35 @@ class SmPartition:
         self._driver = _load_driver()
         ordinal, groups = ctypes.c_int(), ctypes.c_uint(1)
         whole, outside, inside = _Resource(), _Resource(), _Resource()
-        description, self._context = ctypes.c_void_p(), ctypes.c_void_p()
         to = ctypes.byref
         self._call("cuDeviceGet", to(ordinal), device.ordinal)
         self._call("cuDeviceGetDevResource", ordinal, to(whole), _SM_RESOURCE)
         self._call("cuDevSmResourceSplitByCount", to(outside), to(groups), to(whole), to(inside), 0, reserved)
-        self._call("cuDevResourceGenerateDesc", to(description), to(inside), 1)
-        self._call("cuGreenCtxCreate", to(self._context), description, ordinal, _DEFAULT_STREAM)
+        self._inside, self._outside = self._make_context(ordinal, inside), self._make_context(ordinal, outside)
         self.size, self.reserved = inside.sm_count, outside.sm_count
         """Multiprocessors inside and outside the partition."""
 
-    def make_stream(self) -> wp.Stream:
+    def make_stream(self, reserved: bool = False, priority: int = 0) -> wp.Stream:
         """Create a stream whose kernels run inside the partition.
+
+        Args:
+            reserved: Outside instead, on the reserved multiprocessors.
+            priority: CUDA stream priority; lower numbers first.
 
         Raises:
             DeviceError: The driver is older than CUDA 12.5, or a CUDA error.
         """
         stream = ctypes.c_void_p()
-        self._call("cuGreenCtxStreamCreate", ctypes.byref(stream), self._context, _NON_BLOCKING, 0)
+        context = self._outside if reserved else self._inside
+        self._call("cuGreenCtxStreamCreate", ctypes.byref(stream), context, _NON_BLOCKING, priority)
         return wp.Stream(self.device, cuda_stream=stream.value)
+
+    def _make_context(self, ordinal: ctypes.c_int, multiprocessors: _Resource) -> ctypes.c_void_p:
+        """Create the green context of a set of multiprocessors."""
+        description, context = ctypes.c_void_p(), ctypes.c_void_p()
+        self._call("cuDevResourceGenerateDesc", ctypes.byref(description), ctypes.byref(multiprocessors), 1)
+        self._call("cuGreenCtxCreate", ctypes.byref(context), description, ordinal, _DEFAULT_STREAM)
+        return context
 
     def _call(self, name: str, *arguments: object) -> None:
         """Call a function of the driver; a result other than 0 raises a DeviceError."""
@@ -72,6 +82,11 @@ class SmPartition:
         result = function(*arguments)
         if result != 0:
             raise DeviceError(f"{self.device.alias}: {name} failed with CUDA error {result}")
+
+
+def count_reserved(device: wp.Device, share: float) -> int:
+    """Number of multiprocessors that a share of those of a GPU stands for, at least one."""
+    return max(1, round(share * device.sm_count))
 
 
 @cache

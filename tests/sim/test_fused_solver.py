@@ -25,7 +25,7 @@ ARCHITECTURE, DOFS, BODIES, ROWS = 90, 16, 5, 96
 
 
 def test_the_installed_version_of_newton_is_fused():
-    assert newton.__version__ == fused_solver.FUSED_VERSION
+    assert newton.__version__ == fused_solver.KNOWN_NEWTON
 
 
 def test_the_kernel_of_the_iterations_compiles(tmp_path):
@@ -119,7 +119,8 @@ def test_warm_start_sums_impulses_as_newton_does(device):
 
 @pytest.mark.parametrize(("worlds", "packed", "max_speed"), [(8, 256, 0.3), (8, 256, 4.0), (24, 256, 4.0), (24, 0, 4.0)])
 def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, packed, max_speed):
-    """Piles fall, rest and are stirred; at the lower speed limit, what falls has velocity limit rows. Newton packs up to 16 worlds."""
+    """Piles fall, rest and are stirred; at the lower speed limit, what falls has velocity limit rows. Newton packs up to 16 worlds, and its
+    narrow phase has larger blocks."""
     if not device.is_cuda:
         pytest.skip("on a CPU the solver's own launches run")
     config = settings(
@@ -127,16 +128,18 @@ def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds,
     )
     monkeypatch.setattr(fused_solver, "PACKED_WORLDS", packed)
     found, phases = {}, set()
-    for version in (fused_solver.FUSED_VERSION, "another"):
-        monkeypatch.setattr(fused_solver, "FUSED_VERSION", version)
+    for version in (fused_solver.KNOWN_NEWTON, "another"):
+        for module in (fused_solver, physics):
+            monkeypatch.setattr(module, "KNOWN_NEWTON", version)
         simulation = Simulation(config, catalog(), 2, device)
         found[version] = []
         for _ in range(TICKS):
             simulation.tick()
             found[version].append(simulation.physics.state.joint_q.numpy())
             phases |= set(simulation.state.phase.numpy().tolist())
-        solver = simulation.physics.solver
+        solver, narrow_phase = simulation.physics.solver, simulation.physics.pipeline.narrow_phase
         assert isinstance(solver, fused_solver.FusedSteel) == (version != "another")
+        assert (narrow_phase.split_convex_block_dim == physics.NARROW_PHASE_BLOCK) == (version != "another")
         assert fused_solver.find_unsupported(solver) == []
     fused, launched = found.values()
     np.testing.assert_array_equal(fused, launched)

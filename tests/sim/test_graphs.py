@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 import warp as wp
 
 from synpick_warp.scenes import build
+from synpick_warp.system.green_contexts import SmPartition
 from tests.worlds.cubes import place_cubes
 from tests.worlds.small_worlds import settings
 
 WORLDS, TICKS = 8, 5
 
 
-def fall(device: wp.Device, replays: bool, steps: int, substeps: int) -> list[np.ndarray]:
-    """Joint coordinates after each tick of cubes that fall beside the gripper onto the floor, a different one in each world."""
+def fall(
+    device: wp.Device, replays: bool, steps: int, substeps: int, solver_streams: Sequence[wp.Stream | None] = (None,)
+) -> list[np.ndarray]:
+    """Joint coordinates after each tick of cubes that fall beside the gripper onto the floor, a different one in each world.
+
+    Ticks take turns with the solver streams.
+    """
     config = settings(
         bake__worlds=WORLDS,
         arrangement__max_objects=1,
@@ -28,7 +36,8 @@ def fall(device: wp.Device, replays: bool, steps: int, substeps: int) -> list[np
     pose[:, 0] += np.linspace(0.0, 0.01, WORLDS)
     physics = place_cubes(config, device, pose)
     found = []
-    for _ in range(TICKS):
+    for tick in range(TICKS):
+        physics.solver_stream = solver_streams[tick % len(solver_streams)]
         if not replays:
             physics.clear_graphs()
             physics._period = lambda watcher: steps * substeps  # type: ignore[method-assign]
@@ -46,3 +55,13 @@ def test_replayed_ticks_are_those_of_single_launches(device, steps, substeps):
     heights = np.array(launched).reshape(TICKS, WORLDS, -1)[:, :, build.GRIPPER_DOFS + 2]
     assert (np.diff(heights[:2], axis=0) < 0.0).all()
     assert heights[-1].min() > 0.02
+
+
+@pytest.mark.parametrize("period", [1, 2])
+def test_a_solver_on_few_multiprocessors_takes_the_same_steps(device, period):
+    """Its stream changes after each tick, or is that of the reserved multiprocessors from the first one on."""
+    if not device.is_cuda:
+        pytest.skip("a CPU has no multiprocessors")
+    stream = SmPartition(device, 8).make_stream(reserved=True)
+    confined = fall(device, True, 12, 2, (None, stream)[-period:])
+    np.testing.assert_array_equal(confined, fall(device, True, 12, 2))

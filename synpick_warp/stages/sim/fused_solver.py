@@ -17,8 +17,9 @@ from synpick_warp.kernels.sim import solver_iterations, warm_start
 PACKED_WORLDS = 256
 """Maximum number of worlds for which contact rows are packed into records of 384 bytes, 0.6 MB a world; the solver packs up to 16 worlds.
 On an H200 a tick of 64 worlds takes 0.180 instead of 0.189 s, one of 512 worlds 0.272 instead of 0.274 s."""
-FUSED_VERSION = "1.8.0"
-"""Version of Newton whose private parts `FusedSteel` knows. With another one Newton's own solver runs: the same results, slower."""
+KNOWN_NEWTON = "1.8.0"
+"""Version of Newton whose internals are tuned for GPUs: the solver by `FusedSteel`, and the blocks of the narrow phase. With another version
+Newton runs as it is: the same results, slower."""
 
 steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
 """The solver's module, with the factories of its kernels."""
@@ -209,7 +210,7 @@ class FusedSteel(newton.solvers.SolverSteel):
 
 def choose_solver(device: wp.Device) -> type[newton.solvers.SolverSteel]:
     """The solver for a device: FusedSteel on a GPU with the version of Newton that it knows, else SolverSteel."""
-    return FusedSteel if device.is_cuda and newton.__version__ == FUSED_VERSION else newton.solvers.SolverSteel
+    return FusedSteel if device.is_cuda and newton.__version__ == KNOWN_NEWTON else newton.solvers.SolverSteel
 
 
 def find_unsupported(solver: Any) -> list[str]:

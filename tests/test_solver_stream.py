@@ -1,0 +1,31 @@
+"""Stream of the solver in a bake: reserved multiprocessors for it while, and only while, views are rendered."""
+
+from __future__ import annotations
+
+from synpick_warp import pipeline
+from synpick_warp.pipeline import run_bake
+from synpick_warp.progress import SilentProgress
+from synpick_warp.stages.render_streams import RenderStreams
+from synpick_warp.stages.sim.physics import Physics
+from tests.test_bake import tiny
+from tests.worlds.small_worlds import catalog
+
+
+def test_the_solver_runs_on_the_reserved_multiprocessors_while_there_are_views(tmp_path, monkeypatch):
+    """A CPU has neither; the solver there does not use the stream that it is given."""
+    monkeypatch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+    monkeypatch.setattr(RenderStreams, "confine", lambda self, share: setattr(self, "physics", "reserved"))
+    tick_parts, given = Physics.tick_parts, []
+
+    def spy(self, *arguments):
+        given.append(self.solver_stream)
+        return tick_parts(self, *arguments)
+
+    monkeypatch.setattr(Physics, "tick_parts", spy)
+    summary = run_bake(tiny(bake__worlds=1, bake__episodes=1), tmp_path / "out", SilentProgress())
+    frames = summary.views // 3
+    assert len(given) > frames
+    first = given.index("reserved")
+    assert first > 1
+    assert given == [None] * first + ["reserved"] * (len(given) - first)
+    assert frames - 1 <= len(given) - first <= frames
