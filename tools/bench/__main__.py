@@ -52,7 +52,7 @@ from tools.bench.sensor import measure_sensor
 from tools.bench.steady import measure_steady
 from tools.bench.stream import measure_stream
 from tools.bench.trajectories import measure_trajectories
-from tools.bench.whole import measure_whole
+from tools.bench.whole import WholeBake, measure_whole
 from tools.bench.write import measure_writing
 from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
 
@@ -60,6 +60,8 @@ DEFAULT_PARTS = ("physics", "perception", "render", "encode", "sensor", "write",
 PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth")
 OWN_WORLDS = {"bake", "pictures", "steady", "whole", "trajectories", "growth"}
 """Parts that build worlds of their own."""
+WORLDS = 512
+"""Worlds of most parts, unless `--worlds` says otherwise."""
 STREAM_BATCHES = 12
 """Batches rendered and copied in a row."""
 WRITE_VIEWS = 12
@@ -89,7 +91,8 @@ def main(arguments: list[str] | None = None) -> int:
         for name, value in machine.items():
             console.print(f"{name:20} {value}")
         measured_peers = measure_peers(config, options.compare, options.seconds)
-        parts = measure(config, options.parts, options.seconds, traces, options.episodes, options.markdown, options.devices)
+        bake = WholeBake(options.episodes, options.worlds or 0)
+        parts = measure(config, options.parts, options.seconds, traces, bake, options.markdown, options.devices)
         for row in itertools.chain(parts, measured_peers):
             rows.append(row)
             console.print(f"{row.part:11} {row.name:52} {row.value:14,.3f} {row.unit}", soft_wrap=True)
@@ -106,7 +109,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = make_parser(__doc__, "device", "models", "lights", "set", "json")
-    parser.add_argument("--worlds", type=int, default=512, help="worlds simulated in parallel (default: 512)")
+    worlds_help = f"worlds simulated in parallel (default: {WORLDS}; the part whole: as many as a bake of --episodes chooses)"
+    parser.add_argument("--worlds", type=_positive, help=worlds_help)
     parser.add_argument("--resolution", default="1920x1080", help="WIDTHxHEIGHT [px] (default: 1920x1080)")
     more = ",".join(PARTS[len(DEFAULT_PARTS) :])
     parts_help = f"parts to measure, comma-separated (default: {','.join(DEFAULT_PARTS)}; and {more})"
@@ -134,7 +138,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
 def _positive(text: str) -> int:
     """Type of an option: a positive number."""
     if not text.isdecimal() or not 0 < int(text) <= INT32_MAX:
-        raise argparse.ArgumentTypeError(f"{text} is no number of episodes; allowed: 1 to {INT32_MAX}")
+        raise argparse.ArgumentTypeError(f"{text} is no count; allowed: 1 to {INT32_MAX}")
     return int(text)
 
 
@@ -145,8 +149,8 @@ def _to_record(row: Row) -> dict[str, Any]:
 
 def _config(options: argparse.Namespace) -> Config:
     fixed = {
-        "bake.worlds": options.worlds,
-        "bake.episodes": options.worlds,
+        "bake.worlds": options.worlds or WORLDS,
+        "bake.episodes": options.worlds or WORLDS,
         "cameras.resolution": parse_resolution(options.resolution),
     }
     return configure(options, fixed)
@@ -157,7 +161,7 @@ def measure(
     parts: tuple[str, ...],
     min_seconds: float,
     traces: dict[str, Any],
-    episodes: int,
+    bake: WholeBake,
     markdown: Path | None,
     devices: tuple[str, ...] = (),
 ) -> Iterator[Row]:
@@ -168,7 +172,7 @@ def measure(
         parts: Parts, in any order.
         min_seconds: Time for which a measurement is repeated, at least [s].
         traces: Receives what changes during a measurement, by part.
-        episodes: Episodes of the part whole.
+        bake: Size of the bake of the part whole.
         markdown: File for the table of the part growth; None: none.
         devices: Devices of the part steady; empty: that of the settings.
     """
@@ -204,7 +208,7 @@ def measure(
             steady_rate = row.value if row.name == "views to disk" else steady_rate
             yield row
     if "whole" in parts:
-        yield from measure_whole(config, episodes, steady_rate, traces)
+        yield from measure_whole(config, bake, steady_rate, traces)
     if "trajectories" in parts:
         yield from measure_trajectories(config, min_seconds)
     if "growth" in parts:

@@ -1,4 +1,4 @@
-"""Benchmark of a whole bake with automatic worlds: its mean rate from start to exit, and where the time goes.
+"""Benchmark of a whole bake: its mean rate from start to exit, and where the time goes.
 
 Verified images are deleted meanwhile, as those of 150 episodes may not fit on the disk; all other files stay, since the bake reads some
 of them at its end.
@@ -23,6 +23,14 @@ from tools.bench.steady import clean_up_behind
 
 PICTURES = (".jpg", ".png")
 """Suffixes of the files that are deleted."""
+
+
+class WholeBake(NamedTuple):
+    """Size of a bake."""
+
+    episodes: int
+    worlds: int = 0
+    """Worlds simulated in parallel; 0: as a bake chooses."""
 
 
 class TracePoint(NamedTuple):
@@ -67,16 +75,16 @@ class _Trace(SilentProgress):
         self.points.append(TracePoint(time.perf_counter() - self.started, views, worlds_active, episodes_done))
 
 
-def measure_whole(config: Config, episodes: int, steady_rate: float, traces: dict[str, Any]) -> Iterator[Row]:
-    """Bake `episodes` episodes to the temporary folder (TMPDIR), with worlds, batches and writers by default.
+def measure_whole(config: Config, bake: WholeBake, steady_rate: float, traces: dict[str, Any]) -> Iterator[Row]:
+    """Bake to the temporary folder (TMPDIR), with batches and writers by default.
 
     Args:
         config: All settings.
-        episodes: Number of episodes.
+        bake: Size of the bake.
         steady_rate: Views per second of the part steady, for comparison; 0: not measured.
         traces: Receives the trace of live worlds against time as "whole".
     """
-    config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, episodes=episodes, worlds=0))
+    config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, episodes=bake.episodes, worlds=bake.worlds))
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out", PICTURES):
         trace = _Trace()
         summary = run_bake(config, Path(folder) / "out", trace)
