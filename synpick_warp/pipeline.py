@@ -365,7 +365,7 @@ class _Run:
         if self.exporters.needs_views:
             streams = self.factory.stream.streams
             streams.confine(ticks.reserved_share)
-            self.factory.simulation.physics.solver_stream = streams.physics if len(batch) else None
+            ticks.confine_solver(streams.solver if len(batch) else None)
             for views in self.factory.stream.advance(snapshot, report, partial(self._end_episodes, report, records)):
                 ticks.enqueue()
                 self._write(views)

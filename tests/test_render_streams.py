@@ -23,14 +23,14 @@ class Partition:
         self.device = device
         self.reserved.append(reserved)
 
-    def make_stream(self, reserved: bool = False, priority: int = 0) -> ModelStream:
+    def make_stream(self, on_reserved: bool = False, priority: int = 0) -> ModelStream:
         return ModelStream(self.device)
 
 
 class NoStreams(Partition):
     """Fake SM partition of a driver without streams on green contexts."""
 
-    def make_stream(self, reserved: bool = False, priority: int = 0) -> ModelStream:
+    def make_stream(self, on_reserved: bool = False, priority: int = 0) -> ModelStream:
         raise DeviceError("no streams")
 
 
@@ -51,12 +51,12 @@ def make_streams(monkeypatch):
 
 def test_each_share_has_streams_that_are_made_once(make_streams):
     streams, _ = make_streams(Partition)
-    whole = streams.render, streams.copy, streams.physics
+    whole = streams.render, streams.copy, streams.solver
     assert whole[0] is whole[2] is None
     found = []
     for reserved in (2 / 11, 2 / 33, 2 / 11, 0.0, 0.0, 2 / 33):
         streams.confine(reserved)
-        found.append((streams.render, streams.copy, streams.physics))
+        found.append((streams.render, streams.copy, streams.solver))
     assert found[0] == found[2]
     assert found[1] == found[5]
     assert found[3] == found[4] == whole
@@ -64,17 +64,17 @@ def test_each_share_has_streams_that_are_made_once(make_streams):
     assert Partition.reserved == [24, 8]
 
 
-def test_only_the_stream_of_physics_is_on_the_reserved_multiprocessors(make_streams, monkeypatch):
+def test_only_the_stream_of_the_solver_is_on_the_reserved_multiprocessors(make_streams, monkeypatch):
     made: list[tuple[ModelStream, bool, int]] = []
 
-    def make_stream(partition: Partition, reserved: bool = False, priority: int = 0) -> ModelStream:
-        made.append((ModelStream(partition.device), reserved, priority))
+    def make_stream(partition: Partition, on_reserved: bool = False, priority: int = 0) -> ModelStream:
+        made.append((ModelStream(partition.device), on_reserved, priority))
         return made[-1][0]
 
     monkeypatch.setattr(Partition, "make_stream", make_stream)
     streams, _ = make_streams(Partition)
     streams.confine(0.2)
-    assert made == [(streams.render, False, 0), (streams.copy, False, 0), (streams.physics, True, render_streams.HIGH_PRIORITY)]
+    assert made == [(streams.render, False, 0), (streams.copy, False, 0), (streams.solver, True, render_streams.HIGH_PRIORITY)]
 
 
 def test_the_encoders_of_a_batch_wait_for_those_of_the_batch_before(make_streams):
@@ -99,7 +99,7 @@ def test_a_gpu_that_cannot_be_divided_is_used_as_a_whole(make_streams):
         streams.confine(reserved)
         assert streams.render is None
         assert streams.copy is whole
-        assert streams.physics is None
+        assert streams.solver is None
     assert Partition.reserved == [26]
 
 

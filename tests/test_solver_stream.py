@@ -1,4 +1,4 @@
-"""Stream of the solver in a bake: reserved multiprocessors for it while, and only while, views are rendered."""
+"""Stream of the solver in a bake: the solver uses the reserved multiprocessors exactly while views are rendered."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tests.worlds.small_worlds import catalog
 
 
 def test_the_solver_runs_on_the_reserved_multiprocessors_while_there_are_views(tmp_path, monkeypatch):
-    """A CPU has neither; the solver there does not use the stream that it is given."""
+    """On a CPU: `confine` is replaced to provide a marker as stream, which the solver ignores there."""
     monkeypatch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
-    monkeypatch.setattr(RenderStreams, "confine", lambda self, share: setattr(self, "physics", "reserved"))
+    monkeypatch.setattr(RenderStreams, "confine", lambda self, share: setattr(self, "solver", "reserved"))
     tick_parts, given = Physics.tick_parts, []
 
     def spy(self, *arguments):
@@ -22,7 +22,7 @@ def test_the_solver_runs_on_the_reserved_multiprocessors_while_there_are_views(t
         return tick_parts(self, *arguments)
 
     monkeypatch.setattr(Physics, "tick_parts", spy)
-    summary = run_bake(tiny(bake__worlds=1, bake__episodes=1), tmp_path / "out", SilentProgress())
+    summary = run_bake(tiny(bake__worlds=1, bake__episodes=1, bake__device="cpu"), tmp_path / "out", SilentProgress())
     frames = summary.views // 3
     assert len(given) > frames
     first = given.index("reserved")

@@ -94,7 +94,7 @@ def _describe_partition(device: wp.Device) -> str:
 
     try:
         partition = SmPartition(device, count_reserved(device, PHYSICS_SHARE))
-        partition.make_stream(reserved=True)
+        partition.make_stream(on_reserved=True)
     except DeviceError as error:
         return f"none of which can be reserved for physics ({error})"
     return f"{partition.reserved} of which can be reserved for physics"

@@ -1,4 +1,4 @@
-"""CUDA streams of the renderer, of the encoders and of physics, on all multiprocessors (SMs) of a GPU or on disjoint subsets of them."""
+"""CUDA streams of the renderer, the encoders and the solver: on all multiprocessors (SMs) of a GPU, or on disjoint sets of them."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ HIGH_PRIORITY = -1
 """CUDA stream priority of physics: its 13,000 short kernels per tick depend on one another, and should not also wait for the renderer's."""
 
 Streams = tuple[wp.Stream | None, wp.Stream | None, wp.Stream | None]
-"""Render stream (None: the current stream of the device), stream for encoding and copies to the host, and stream on the SMs that both leave
-free (None: there are none). All are None on a CPU."""
+"""Streams (render, copy, solver), all None on a CPU. Render: None for the device's current stream. Copy: for encoding and for copies to the
+host. Solver: on the reserved SMs, None if none are reserved."""
 
 
 class RenderStreams:
-    """CUDA streams for rendering and for encoding, whose SM partition can be switched between batches, and one on the SMs left to physics.
+    """CUDA streams for rendering, for encoding and for the solver of physics, which can be restricted to disjoint sets of SMs and back.
 
-    As a context manager it synchronizes the first two on exit, so that arrays in use can be freed. Warp's memory pool does not order
-    frees after work on these streams: do not allocate on them.
+    Physics runs on a stream of its own on all SMs (see `TickLoop`). While SMs are reserved, its solver runs on them alone, and renderer and
+    encoders run on the others. Exiting the context waits for the render and copy streams, so that arrays in use can be freed. Do not
+    allocate on these streams: Warp's memory pool may reuse memory before their work is complete.
     """
 
     def __init__(self, device: wp.Device) -> None:
         self.device = device
         self.reserved = 0.0
-        """Fraction of the SMs requested to be left free; it has no effect if the GPU cannot be partitioned."""
+        """Fraction of the SMs that are to be reserved; it has no effect if the GPU cannot be partitioned."""
         self.render: wp.Stream | None = None
         self.copy = wp.Stream(device) if device.is_cuda else None
-        self.physics: wp.Stream | None = None
-        """Stream on the SMs that are left free; None: there are none."""
-        self._partitions: dict[float, Streams] = {0.0: (self.render, self.copy, self.physics)}
+        self.solver: wp.Stream | None = None
+        self._partitions: dict[float, Streams] = {0.0: (self.render, self.copy, self.solver)}
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        with contextlib.suppress(RuntimeError):  # A failed device; the next call to it raises the error.
+        with contextlib.suppress(RuntimeError):  # The device failed; the next call to it raises the error.
             for stream in (self.render, self.copy):
                 if stream is not None:
                     wp.synchronize_stream(stream)
 
     def confine(self, reserved: float) -> None:
-        """Switch to the streams that leave a fraction `reserved` of the SMs free; 0: to those on the whole GPU.
+        """Switch to the streams of a partition with a fraction `reserved` of the SMs for the solver; 0: to those on the whole GPU.
 
         Call it between batches. It does nothing on a CPU, or if the driver does not support partitions.
         """
@@ -56,7 +56,7 @@ class RenderStreams:
         if reserved not in self._partitions:
             self._partitions[reserved] = self._make_streams(reserved)
         self.reserved = reserved
-        self.render, self.copy, self.physics = self._partitions[reserved]
+        self.render, self.copy, self.solver = self._partitions[reserved]
         if self.copy is not None and self.copy is not before:
             self.copy.wait_stream(before)  # Batches share the encoders' scratch arrays.
 
@@ -64,6 +64,6 @@ class RenderStreams:
         """Create the streams of a partition; if that is not supported, return those on the whole GPU."""
         try:
             partition = SmPartition(self.device, count_reserved(self.device, reserved))
-            return partition.make_stream(), partition.make_stream(), partition.make_stream(reserved=True, priority=HIGH_PRIORITY)
+            return partition.make_stream(), partition.make_stream(), partition.make_stream(on_reserved=True, priority=HIGH_PRIORITY)
         except DeviceError:
             return self._partitions[0.0]

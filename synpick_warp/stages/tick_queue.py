@@ -13,19 +13,20 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.sim.simulate import TickRecord
 from synpick_warp.stages.sim.step_log import record_arrays
 from synpick_warp.stages.stream import TickReader, TickReport
+from synpick_warp.system.garbage import collection_paused
 
 MAX_LEAD = 1024
-"""Most ticks that physics may be ahead of the renderer. With 256, physics was the bottleneck in the last 65 of 314 s that a bake of 150
-episodes took on an H200; with 1,024 the bake took 276 s."""
+"""Maximum number of ticks by which physics may be ahead of the renderer. With 256, physics was the bottleneck in the last quarter of a bake
+of 150 episodes on an H200; tools/README.md has the figures."""
 QUEUE_BYTES = 1 << 30
-"""Largest size of a ring of records, unless a lead of one tick needs more [bytes]. It holds MAX_LEAD ticks of 180 worlds, or 30 ticks of
+"""Memory budget of the ring of records [bytes], exceeded only if two slots need more. It holds MAX_LEAD ticks of 180 worlds, or 30 ticks of
 512 worlds whose steps are recorded."""
 
 
 def queue_lead(tick_bytes: int, device: wp.Device) -> int:
-    """Most ticks that physics may be ahead of the renderer: as many as QUEUE_BYTES has room for, at least one, at most MAX_LEAD.
+    """Maximum lead of physics: as many ticks as QUEUE_BYTES has room for beside the one being rendered, at least one, at most MAX_LEAD.
 
-    0 on a CPU, which does one thing at a time and would gain nothing.
+    0 on a CPU, where physics and renderer do not overlap.
 
     Args:
         tick_bytes: Size of a `TickRecord` [bytes].
@@ -50,12 +51,13 @@ class TickQueue:
     overwritten while it is read.
     """
 
+    @collection_paused()
     def __init__(self, record: TickRecord, slots: int) -> None:
         """Allocate the ring.
 
         Args:
             record: Record of the simulation, which each tick overwrites.
-            slots: Capacity [ticks], including the tick that is rendered.
+            slots: Capacity [ticks], including the tick being rendered.
         """
         self.slots = slots
         self._device = device = record.snapshot.live.device
@@ -81,7 +83,7 @@ class TickQueue:
         return self._readers[slot].wait(), self._snapshots[slot]
 
     def phase(self, tick: int) -> np.ndarray | None:
-        """Poll for a tick that `put` has enqueued: phase of each world at its end (world) int32, or None while its copies are pending."""
+        """Poll a tick that `put` has enqueued: phase of each world at its end (world) int32, or None while its copies are pending."""
         return self._readers[tick % self.slots].phase()
 
     def release(self, tick: int) -> None:
@@ -91,7 +93,7 @@ class TickQueue:
 
 
 def allocate_slots(arrays: Sequence[wp.array], slots: int, device: wp.Device, pinned: bool = False) -> list[list[wp.array]]:
-    """Allocate a ring buffer: zeroed arrays with the shapes and types of `arrays` for each slot. The slots of an array share an allocation.
+    """Allocate a ring buffer: zeroed arrays with the shapes and types of `arrays` for each slot, views of one allocation per array.
 
     Args:
         arrays: Templates.

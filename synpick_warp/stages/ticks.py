@@ -1,4 +1,4 @@
-"""Tick loop with a bounded lead: the device simulates following ticks while earlier ones are rendered, copied and read."""
+"""Tick loop with a bounded lead: the device simulates later ticks while earlier ones are rendered, copied and read."""
 
 from __future__ import annotations
 
@@ -19,30 +19,33 @@ from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReport
 from synpick_warp.stages.tick_queue import TickQueue, queue_lead, record_bytes
 from synpick_warp.stages.timing import scope
+from synpick_warp.system.green_contexts import count_reserved
 
 PARTS_IN_FLIGHT = 24
-"""Most parts of ticks, mostly substeps, that are enqueued and not yet done. On an H200 some 40 parts fill the launch queue of a CUDA
-stream, and further launches block the host: with all 66 parts of a tick at once it launched no rendering for 0.25 s a tick."""
+"""Maximum number of parts of ticks, usually substeps, that are enqueued and not yet done. On an H200 some 40 parts fill the launch queue of
+a CUDA stream, and further launches block the host: enqueuing all 66 parts of a tick at once kept it from launching rendering for 0.25 s."""
 
 PHYSICS_SHARE = 2.0 / 11.0
-"""Fraction of a GPU's multiprocessors (SMs) reserved for physics while it is the bottleneck: 24 of 132. Its kernels are short and fill few
-SMs, but a renderer occupies all of them, so that each kernel waits for a free one and shares its caches. Measured on an H200 in a bake of
-150 worlds in full HD, views/s at ticks/s of physics that runs ahead freely: 1,020 at 2.40 without reserved SMs, 1,036 at 2.31 with 8, 977
-at 3.15 with 16, 929 at 3.64 with 24; 1,146 without physics."""
+"""Fraction of a GPU's multiprocessors (SMs) reserved for the solver while physics is the bottleneck: 24 of 132. Its kernels are short and
+small, but the renderer occupies all SMs: each kernel waits for a free one, and competes for its caches. tools/README.md has the figures."""
 SAFE_LEAD = 512
-"""Lead of physics [ticks] below which it counts as the bottleneck; at most half of the maximum lead. As worlds fall idle, rendering becomes
-cheaper and a tick of physics hardly does, so that physics needs a reserve of ticks."""
+"""Physics counts as the bottleneck while its lead is smaller than this [ticks], or than half of the permitted lead if that is less. As
+worlds become idle, rendering a tick gets faster but simulating one hardly does, so that the renderer needs a backlog."""
+SOLVER_WORLDS = 8
+"""Maximum number of worlds per reserved SM for which the solver is restricted to these SMs. On an H200 a tick of 64, 150, 512 worlds takes
+0.178, 0.225, 0.458 s with the solver on 24 SMs, 0.168, 0.201, 0.254 s with it on all; beside a renderer 150 worlds gain."""
 
 
 class TickLoop:
-    """Producer of ticks that runs ahead of its renderer; a context manager, whose exit waits for the parts that are enqueued.
+    """Runs physics ahead of the renderer. Use it as a context manager; exiting waits for the work that is enqueued.
 
     On a GPU physics has its own CUDA stream. While episodes wait for a free world it is at most one tick ahead, which suffices to overlap
-    the two. Then worlds fall idle one by one, and a tick has fewer views to render, but physics takes nearly as long: from there on it may
-    be ahead by up to `max_lead` ticks, so that the renderer has a backlog when physics becomes the slower of the two. On a CPU physics and
-    renderer alternate.
+    the two. Once none waits and a world is idle, or from the start if all episodes fit, it may be ahead by up to `max_lead` ticks: worlds
+    fall idle one by one, and a tick has fewer views to render, but takes physics nearly as long, so that the renderer needs a backlog. On
+    a CPU physics and renderer alternate.
 
-    Before the next `advance`, make the device's current stream wait for every other stream that still reads the snapshot.
+    Before the next `advance`, which releases the snapshot on the device's current stream, make that stream wait for every other stream that
+    still reads it.
     """
 
     def __init__(self, simulation: Simulation, max_lead: int | None = None) -> None:
@@ -50,7 +53,7 @@ class TickLoop:
 
         Args:
             simulation: The worlds.
-            max_lead: Most ticks that physics may ever be ahead; None: by `queue_lead`.
+            max_lead: Maximum number of ticks by which physics may ever be ahead; None: by `queue_lead`.
         """
         self.simulation, self.device = simulation, simulation.device
         self.max_lead = queue_lead(record_bytes(simulation.record), self.device) if max_lead is None else max_lead
@@ -60,20 +63,21 @@ class TickLoop:
         self.queue = TickQueue(simulation.record, self.max_lead + 1)
         self.stream = wp.Stream(self.device, priority=HIGH_PRIORITY) if self.device.is_cuda else None
         self._parts: Iterator[None] | None = None
-        """What is left to enqueue of the tick begun last; None: nothing."""
+        """Remaining parts of the tick that is being enqueued, or None."""
         self._enqueued = self._simulated = self._taken = 0
-        """Ticks that are enqueued as a whole, that were observed to be done, and that `advance` has returned."""
-        self._all_idle = False
-        """Whether all worlds were idle in the last tick observed to be done."""
+        """Numbers of ticks: fully enqueued, observed to be done, and requested by `advance`."""
+        self._busy_worlds = simulation.layout.worlds
+        """Worlds that were not idle in the last tick observed to be done."""
         self._has_waited = False
         """Whether the last `advance` had to wait for physics."""
         self._running: deque[wp.Event] = deque()
         """Events at the ends of the parts that may still be running, oldest first."""
         self._spare: list[wp.Event] = []
+        """Events for reuse."""
 
     def __enter__(self) -> Self:
         if self.stream is not None:
-            self.stream.wait_stream(self.device.stream)  # That one zero-fills the arrays.
+            self.stream.wait_stream(self.device.stream)  # The current stream zero-fills the arrays.
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -83,13 +87,13 @@ class TickLoop:
         """
         self._parts = None
         if self.stream is not None:
-            with contextlib.suppress(RuntimeError):  # A failed device; the next call to it raises the error.
+            with contextlib.suppress(RuntimeError):  # The device failed; the next call to it raises the error.
                 wp.synchronize_stream(self.stream)
 
     def advance(self) -> tuple[TickReport, Snapshot]:
         """Wait for the next tick, and return its report and snapshot, which are valid until the next call.
 
-        While it waits, it enqueues parts of the following ticks, so that the device also has work until the next call.
+        While it waits, it enqueues parts of the following ticks, which keep the device busy until the next call.
         """
         tick = self._taken
         if tick:
@@ -118,24 +122,34 @@ class TickLoop:
 
     @property
     def reserved_share(self) -> float:
-        """Fraction of the multiprocessors to reserve for physics: PHYSICS_SHARE while physics is the bottleneck, else 0."""
-        if self._all_idle:
+        """Fraction of the multiprocessors to reserve for the solver: PHYSICS_SHARE while physics is the bottleneck, else 0."""
+        if not self._busy_worlds:
             return 0.0
         is_short = self._simulated - self._taken < min(SAFE_LEAD, self.lead // 2)
         return PHYSICS_SHARE if self._has_waited or is_short else 0.0
+
+    def confine_solver(self, stream: wp.Stream | None) -> None:
+        """Restrict the solver to the SMs of a stream in the ticks that begin from now on.
+
+        Args:
+            stream: Stream on reserved SMs; None, or more than SOLVER_WORLDS busy worlds per reserved SM: the solver may use all SMs.
+        """
+        if stream is not None and self._busy_worlds > SOLVER_WORLDS * count_reserved(self.device, PHYSICS_SHARE):
+            stream = None
+        self.simulation.physics.solver_stream = stream
 
     def _poll_finished_ticks(self) -> None:
         """Read the phases of the ticks that the device has done since the last call."""
         while self._simulated < self._enqueued and (phase := self.queue.phase(self._simulated)) is not None:
             self._simulated += 1
             is_idle = phase == Phase.IDLE
-            self._all_idle = bool(is_idle.all())
+            self._busy_worlds = int((~is_idle).sum())
             if is_idle.any():
                 self.lead = self.max_lead
 
     def _may_begin(self) -> bool:
         """Whether a further tick may begin before `advance` asks for it."""
-        return not self._all_idle and self._enqueued < self._taken + self.lead
+        return self._busy_worlds > 0 and self._enqueued < self._taken + self.lead
 
     @contextlib.contextmanager
     def _physics_scope(self) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""Partition of a GPU's multiprocessors by CUDA green contexts: streams whose kernels run on some of them, or on the others."""
+"""Spatial partitioning of a GPU with CUDA green contexts: streams restricted to disjoint sets of multiprocessors (SMs)."""
 
 from __future__ import annotations
 
@@ -12,65 +12,65 @@ from synpick_warp.errors import DeviceError
 _SM_RESOURCE = 1
 """CU_DEV_RESOURCE_TYPE_SM"""
 _DEFAULT_STREAM = 1
-"""CU_GREEN_CTX_DEFAULT_STREAM, which cuGreenCtxCreate demands."""
+"""CU_GREEN_CTX_DEFAULT_STREAM, required by cuGreenCtxCreate."""
 _NON_BLOCKING = 1
 """CU_STREAM_NON_BLOCKING"""
 
 
 class _Resource(ctypes.Structure):
-    """CUdevResource. CUDA 13 has 152 bytes; here are more, since later drivers may write more."""
+    """CUdevResource. It has 152 bytes in CUDA 13, and is larger here, since newer drivers may write more."""
 
     _fields_ = (("type", ctypes.c_uint), ("padding", ctypes.c_ubyte * 92), ("sm_count", ctypes.c_uint), ("more", ctypes.c_ubyte * 412))
 
 
 class SmPartition:
-    """CUDA green contexts on a subset of a GPU's streaming multiprocessors (SMs) and on the others, which are reserved.
+    """Split of a GPU's SMs into a main and a reserved set, with a green context for each.
 
-    Kernels on its streams run on one of the two subsets; kernels on other streams may use every multiprocessor.
-    Green contexts and streams live as long as the process.
+    Kernels on its streams run on one of the two sets; kernels on other streams may use every SM. Green contexts and streams live as long as
+    the process. Streams need a driver of CUDA 12.5 or newer.
     """
 
     def __init__(self, device: wp.Device, reserved: int) -> None:
-        """Split the multiprocessors of a GPU.
+        """Split the SMs of a GPU.
 
         Args:
             device: A GPU.
-            reserved: Multiprocessors outside the partition; CUDA rounds up, with compute capability 9 to a multiple of 8.
+            reserved: Number of reserved SMs; CUDA rounds up, with compute capability 9 to a multiple of 8.
 
         Raises:
-            DeviceError: The driver is missing or has no green contexts (before CUDA 12.4), or the device has too few multiprocessors.
+            DeviceError: The driver is missing or too old, or the device has too few SMs.
         """
         self.device = device
         self._driver = _load_driver()
         ordinal, groups = ctypes.c_int(), ctypes.c_uint(1)
-        whole, outside, inside = _Resource(), _Resource(), _Resource()
+        whole, kept, main = _Resource(), _Resource(), _Resource()
         to = ctypes.byref
         self._call("cuDeviceGet", to(ordinal), device.ordinal)
         self._call("cuDeviceGetDevResource", ordinal, to(whole), _SM_RESOURCE)
-        self._call("cuDevSmResourceSplitByCount", to(outside), to(groups), to(whole), to(inside), 0, reserved)
-        self._inside, self._outside = self._make_context(ordinal, inside), self._make_context(ordinal, outside)
-        self.size, self.reserved = inside.sm_count, outside.sm_count
-        """Multiprocessors inside and outside the partition."""
+        self._call("cuDevSmResourceSplitByCount", to(kept), to(groups), to(whole), to(main), 0, reserved)
+        self._main, self._reserved = self._make_context(ordinal, main), self._make_context(ordinal, kept)
+        self.size, self.reserved = main.sm_count, kept.sm_count
+        """Numbers of main and of reserved SMs."""
 
-    def make_stream(self, reserved: bool = False, priority: int = 0) -> wp.Stream:
-        """Create a stream whose kernels run inside the partition.
+    def make_stream(self, on_reserved: bool = False, priority: int = 0) -> wp.Stream:
+        """Create a stream on one of the two sets of SMs.
 
         Args:
-            reserved: Outside instead, on the reserved multiprocessors.
-            priority: CUDA stream priority; lower numbers first.
+            on_reserved: Whether to use the reserved SMs instead of the main ones.
+            priority: CUDA stream priority; lower values have higher priority.
 
         Raises:
-            DeviceError: The driver is older than CUDA 12.5, or a CUDA error.
+            DeviceError: The driver is too old, or a CUDA call failed.
         """
         stream = ctypes.c_void_p()
-        context = self._outside if reserved else self._inside
+        context = self._reserved if on_reserved else self._main
         self._call("cuGreenCtxStreamCreate", ctypes.byref(stream), context, _NON_BLOCKING, priority)
         return wp.Stream(self.device, cuda_stream=stream.value)
 
-    def _make_context(self, ordinal: ctypes.c_int, multiprocessors: _Resource) -> ctypes.c_void_p:
-        """Create the green context of a set of multiprocessors."""
+    def _make_context(self, ordinal: ctypes.c_int, resource: _Resource) -> ctypes.c_void_p:
+        """Create the green context of a set of SMs."""
         description, context = ctypes.c_void_p(), ctypes.c_void_p()
-        self._call("cuDevResourceGenerateDesc", ctypes.byref(description), ctypes.byref(multiprocessors), 1)
+        self._call("cuDevResourceGenerateDesc", ctypes.byref(description), ctypes.byref(resource), 1)
         self._call("cuGreenCtxCreate", ctypes.byref(context), description, ordinal, _DEFAULT_STREAM)
         return context
 
@@ -84,14 +84,14 @@ class SmPartition:
             raise DeviceError(f"{self.device.alias}: {name} failed with CUDA error {result}")
 
 
-def count_reserved(device: wp.Device, share: float) -> int:
-    """Number of multiprocessors that a share of those of a GPU stands for, at least one."""
-    return max(1, round(share * device.sm_count))
+def count_reserved(device: wp.Device, fraction: float) -> int:
+    """Convert a fraction of a GPU's SMs to a number of SMs, at least one."""
+    return max(1, round(fraction * device.sm_count))
 
 
 @cache
 def _load_driver() -> ctypes.CDLL:
-    """The driver's library, which Warp has loaded before."""
+    """The driver's library, already loaded by Warp."""
     try:
         return ctypes.CDLL("libcuda.so.1")
     except OSError as error:

@@ -15,11 +15,12 @@ import trimesh
 import warp as wp
 
 from synpick_warp import __version__
+from synpick_warp.cli import doctor
 from synpick_warp.cli.commands import main
 from synpick_warp.codes import Ending
 from synpick_warp.configs.load import load_config
 from synpick_warp.episodes import BakeSummary, EpisodeRow
-from synpick_warp.errors import OutputError
+from synpick_warp.errors import DeviceError, OutputError
 from synpick_warp.stages import timing
 
 
@@ -295,6 +296,24 @@ def test_doctor(capsys, bakes):
     text = capsys.readouterr().out
     assert all(word in text for word in ("newton", "numpy", "warp-lang", "CPU cores", "kernel cache"))
     assert all(word in text for word in ("16 worlds, 640x360", "Snapshot.pose", "16 x 24", "2.00"))
+
+
+def test_doctor_says_how_many_multiprocessors_can_be_reserved_or_why_none(monkeypatch):
+    gpu = types.SimpleNamespace(alias="cuda:0", sm_count=132)
+
+    class Partition:
+        def __init__(self, device: types.SimpleNamespace, reserved: int) -> None:
+            self.reserved = reserved
+
+        def make_stream(self, on_reserved: bool) -> None:
+            if failure:
+                raise DeviceError(failure)
+
+    monkeypatch.setattr(doctor, "SmPartition", Partition)
+    failure = ""
+    assert doctor._describe_partition(gpu) == "24 of which can be reserved for physics"
+    failure = "cuda:0: the driver has no cuGreenCtxStreamCreate"
+    assert doctor._describe_partition(gpu) == f"none of which can be reserved for physics ({failure})"
 
 
 COMMAND = [sys.executable, "-m", "synpick_warp"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -62,6 +63,31 @@ def test_a_solver_on_few_multiprocessors_takes_the_same_steps(device, period):
     """Its stream changes after each tick, or is that of the reserved multiprocessors from the first one on."""
     if not device.is_cuda:
         pytest.skip("a CPU has no multiprocessors")
-    stream = SmPartition(device, 8).make_stream(reserved=True)
+    stream = SmPartition(device, 8).make_stream(on_reserved=True)
     confined = fall(device, True, 12, 2, (None, stream)[-period:])
     np.testing.assert_array_equal(confined, fall(device, True, 12, 2))
+
+
+def test_each_solver_stream_is_captured_once_and_only_the_first_period_is_eager(monkeypatch):
+    """Two ticks of 4 substeps on the current stream, two on another, one more on the first; then graphs are dropped."""
+    physics = place_cubes(settings(physics__steps_per_tick=4, physics__substeps=1), wp.get_device("cpu"), np.eye(7)[[6]])
+    calls: list[object] = []
+    monkeypatch.setattr(physics, "device", SimpleNamespace(is_cuda=True))
+    monkeypatch.setattr(physics, "_run_substeps", lambda *hooks: (calls.append(("run", *hooks[3:])) for _ in range(4)))
+    monkeypatch.setattr(physics, "_capture", lambda substeps: calls.append(("capture", len(list(substeps)))) or [f"graph{len(calls)}"] * 4)
+    monkeypatch.setattr(wp, "capture_launch", calls.append)
+
+    def tick(stream: str | None) -> list[object]:
+        calls.clear()
+        physics.solver_stream = stream  # type: ignore[assignment]
+        assert len(list(physics.tick_parts(lambda current: None))) == 4
+        return calls.copy()
+
+    run, capture = [("run",)] * 2, [("run", None)] * 2 + [("capture", 2)]
+    assert tick(None) == [*run, *capture, "graph5", "graph5"]
+    assert tick(None) == ["graph5"] * 4
+    assert tick("reserved") == [("run", "reserved")] * 2 + [("capture", 2)] + ["graph3"] * 4
+    assert tick("reserved") == ["graph3"] * 4
+    assert tick(None) == ["graph5"] * 4
+    physics.clear_graphs()
+    assert tick(None)[:2] == run

@@ -139,9 +139,12 @@ def test_while_the_host_waits_for_a_tick_parts_of_the_next_are_enqueued(make_dev
             assert len(loop.stream.queue) >= ticks.PARTS_IN_FLIGHT
 
 
-@pytest.mark.parametrize(("waiting", "max_lead"), [(3, 1), (0, 10), (0, 200)])
-def test_physics_gets_a_share_of_the_device_while_the_renderer_waits_or_the_lead_is_short(make_device, waiting, max_lead):
+@pytest.mark.parametrize(("waiting", "max_lead", "safe_lead"), [(3, 1, 512), (0, 10, 512), (0, 200, 512), (0, 200, 60)])
+def test_physics_gets_a_share_of_the_device_while_the_renderer_waits_or_the_lead_is_short(
+    make_device, monkeypatch, waiting, max_lead, safe_lead
+):
     """First physics is slower: the device does nothing before the host waits. Then it does all that is enqueued between two ticks."""
+    monkeypatch.setattr(ticks, "SAFE_LEAD", safe_lead)
     device = make_device(0)
     host_copies.time.sleep = lambda _: device.run(1)
     simulation = ModelSimulation(device, [2000], waiting, 5)
@@ -149,7 +152,7 @@ def test_physics_gets_a_share_of_the_device_while_the_renderer_waits_or_the_lead
         for _ in range(5):
             loop.advance()
             assert loop.reserved_share == ticks.PHYSICS_SHARE
-        shares = []
+        shares, leads = [], []
         for _ in range(150):
             for _ in range(5):
                 while device.run(1):
@@ -157,9 +160,11 @@ def test_physics_gets_a_share_of_the_device_while_the_renderer_waits_or_the_lead
                 loop.enqueue()
             loop.advance()
             shares.append(loop.reserved_share)
+            leads.append(loop._simulated - loop._taken)
     assert shares == sorted(shares, reverse=True)
     assert shares[-1] == 0.0
-    assert shares.count(ticks.PHYSICS_SHARE) <= 1 + min(ticks.SAFE_LEAD, loop.lead // 2)
+    threshold = min(safe_lead, loop.lead // 2)
+    assert [share > 0.0 for share in shares] == [lead < threshold for lead in leads]
     assert (shares.count(ticks.PHYSICS_SHARE) > 1) == (loop.lead > 100)
 
 
@@ -172,3 +177,22 @@ def test_physics_that_has_nothing_left_to_do_gets_no_share(make_device):
             shares.append(loop.reserved_share)
     assert shares[0] == ticks.PHYSICS_SHARE
     assert shares[-1] == 0.0
+
+
+@pytest.mark.parametrize(("busy", "is_confined"), [(16, True), (17, False)])
+def test_the_solver_is_restricted_to_reserved_multiprocessors_if_few_worlds_are_busy(make_device, busy, is_confined):
+    """A GPU with 11 multiprocessors reserves 2, of 8 worlds each; a third of the worlds is idle."""
+    device = make_device(0)
+    device.sm_count = 11
+    host_copies.time.sleep = lambda _: device.run(1)
+    simulation = ModelSimulation(device, [50] * busy + [0] * (busy // 2), 0, 2)
+    simulation.physics = SimpleNamespace(solver_stream=None)
+    with ticks.TickLoop(simulation, 10) as loop:
+        loop.confine_solver("reserved")
+        assert simulation.physics.solver_stream is None
+        for _ in range(3):
+            loop.advance()
+        loop.confine_solver("reserved")
+        assert simulation.physics.solver_stream == ("reserved" if is_confined else None)
+        loop.confine_solver(None)
+        assert simulation.physics.solver_stream is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import warp as wp
 
@@ -37,6 +38,26 @@ def count_blocks_kernel(spins: int, blocks_out: wp.array[int]):
     wp.atomic_add(blocks_out, multiprocessor() + wp.min(0, int(x)), 1)
 
 
+def find_multiprocessors(device: wp.Device, stream: wp.Stream, captured: bool = False) -> set[int]:
+    """Multiprocessors that the blocks of a kernel on `stream` run on, or of a graph in which another stream forks to it and joins it."""
+    blocks = wp.zeros(2 * device.sm_count, dtype=int, device=device)
+
+    def launch() -> None:
+        with wp.ScopedStream(stream, sync_exit=True):
+            wp.launch(count_blocks_kernel, dim=32 * BLOCKS, inputs=[SPINS], outputs=[blocks], block_dim=32, device=device)
+
+    launch()
+    if captured:
+        with wp.ScopedStream(wp.Stream(device), sync_exit=True):
+            with wp.ScopedCapture(device) as capture:
+                launch()
+            blocks.zero_()
+            wp.capture_launch(capture.graph)
+    found = blocks.numpy()
+    assert int(found.sum()) == 32 * BLOCKS
+    return set(np.flatnonzero(found).tolist())
+
+
 @pytest.mark.parametrize("reserved", [8, 24])
 def test_kernels_on_a_stream_of_a_partition_leave_the_other_multiprocessors_free(device, reserved):
     if not device.is_cuda:
@@ -44,14 +65,11 @@ def test_kernels_on_a_stream_of_a_partition_leave_the_other_multiprocessors_free
     partition = SmPartition(device, reserved)
     assert partition.size + partition.reserved == device.sm_count
     assert partition.reserved >= reserved
-    blocks = wp.zeros(2 * device.sm_count, dtype=int, device=device)
-    with wp.ScopedStream(partition.make_stream(), sync_exit=True):
-        wp.launch(count_blocks_kernel, dim=32 * BLOCKS, inputs=[SPINS], outputs=[blocks], block_dim=32, device=device)
-    used = int((blocks.numpy() > 0).sum())
-    assert int(blocks.numpy().sum()) == 32 * BLOCKS
-    assert used == partition.size
-    wp.launch(count_blocks_kernel, dim=32 * BLOCKS, inputs=[SPINS], outputs=[blocks], block_dim=32, device=device)
-    assert int((blocks.numpy() > 0).sum()) == device.sm_count
+    main, kept = (find_multiprocessors(device, partition.make_stream(on_reserved)) for on_reserved in (False, True))
+    assert (len(main), len(kept)) == (partition.size, partition.reserved)
+    assert not main & kept
+    assert find_multiprocessors(device, wp.Stream(device)) == main | kept
+    assert find_multiprocessors(device, partition.make_stream(on_reserved=True), captured=True) == kept
 
 
 def test_more_multiprocessors_than_there_are_cannot_be_reserved(device):

@@ -212,7 +212,7 @@ def _measure_pile_steps(simulation: Simulation, min_seconds: float) -> float:
         """Leave the forces of the last step."""
 
     # The captured graph contains the gripper's kernels, so steps without them need a graph of their own.
-    with mock.patch.object(simulation.physics, "_graphs", []):
+    with mock.patch.object(simulation.physics, "_graphs", {}):
         simulation.physics.tick(keep_forces)
         return seconds_per_call(lambda: simulation.physics.tick(keep_forces), simulation.device, min_seconds, BURST)
 

@@ -1,7 +1,7 @@
 """Benchmark of a whole bake: its mean rate from start to exit, and where the time goes.
 
-Verified images are deleted meanwhile, as those of 150 episodes may not fit on the disk; all other files stay, since the bake reads some
-of them at its end.
+Images are deleted once verified, since those of 150 episodes may not fit on the disk; other files are kept, because the bake reads some of
+them at its end.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class WholeBake(NamedTuple):
 
     episodes: int
     worlds: int = 0
-    """Worlds simulated in parallel; 0: as a bake chooses."""
+    """Worlds simulated in parallel; 0: automatic."""
 
 
 class TracePoint(NamedTuple):
@@ -40,7 +40,7 @@ class TracePoint(NamedTuple):
     """Time since the start [s]."""
     views: int
     active: int
-    """Worlds that settle or act."""
+    """Worlds that are settling or acting."""
     episodes: int
     """Episodes that have ended."""
 
@@ -52,7 +52,7 @@ class Stretch(NamedTuple):
     views: int = 0
 
     def plus(self, seconds: float, views: int) -> Stretch:
-        """Sum with a tick."""
+        """Return the sum with one tick."""
         return Stretch(self.seconds + seconds, self.views + views)
 
 
@@ -76,13 +76,13 @@ class _Trace(SilentProgress):
 
 
 def measure_whole(config: Config, bake: WholeBake, steady_rate: float, traces: dict[str, Any]) -> Iterator[Row]:
-    """Bake to the temporary folder (TMPDIR), with batches and writers by default.
+    """Bake to the temporary folder (TMPDIR), with default batches and writers.
 
     Args:
         config: All settings.
         bake: Size of the bake.
-        steady_rate: Views per second of the part steady, for comparison; 0: not measured.
-        traces: Receives the trace of live worlds against time as "whole".
+        steady_rate: Views per second of the benchmark part `steady`, for comparison; 0: not measured.
+        traces: Receives the columns of `describe_trace` under the key "whole".
     """
     config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, episodes=bake.episodes, worlds=bake.worlds))
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out", PICTURES):
@@ -116,7 +116,8 @@ def describe_trace(points: Sequence[TracePoint], cameras: int) -> dict[str, list
 
 
 def split_stretches(points: Sequence[TracePoint], cameras: int, whole: Stretch) -> dict[str, Stretch]:
-    """Split a bake into consecutive parts, which add up to the whole; steady are ticks in which LIVE_FRACTION of all worlds are live.
+    """Assign each tick to a stretch of the bake; stretches add up to the whole. A tick is steady if at least LIVE_FRACTION of the largest
+    number of active worlds are live; without such ticks, all from the first views on are settling.
 
     Args:
         points: State after each tick.
@@ -145,7 +146,7 @@ def split_stretches(points: Sequence[TracePoint], cameras: int, whole: Stretch) 
 
 
 def summarize(points: Sequence[TracePoint], cameras: int, whole: Stretch, steady_rate: float) -> Iterator[Row]:
-    """Rows of a whole bake; arguments as of `split_stretches` and `measure_whole`."""
+    """Rows of a whole bake; arguments as in `split_stretches` and `measure_whole`."""
     stretches, mean = split_stretches(points, cameras, whole), whole.views / whole.seconds
     many = f"{100 * LIVE_FRACTION:.0f} % of worlds"
     titles = {
@@ -154,16 +155,16 @@ def summarize(points: Sequence[TracePoint], cameras: int, whole: Stretch, steady
         "steady": f"ticks with {many} live",
         "between": f"ticks between these with fewer than {many} live",
         "tail": f"tail: after the last tick with {many} live",
-        "finishing": "finishing: waiting for writers, lists",
+        "finishing": "finishing: last files, indices",
     }
     yield Row("whole", "worlds", max((point.active for point in points), default=0), "")
     yield Row("whole", "ticks", len(points), "")
     yield Row("whole", "views", whole.views, "")
     yield Row("whole", "start to exit", whole.seconds, "s")
-    for name, phase in stretches.items():
-        yield Row("whole", titles[name], phase.seconds, "s")
-        if phase.views:
-            yield Row("whole", f"{name}: views", phase.views / phase.seconds, "1/s")
+    for name, stretch in stretches.items():
+        yield Row("whole", titles[name], stretch.seconds, "s")
+        if stretch.views:
+            yield Row("whole", f"{name}: views", stretch.views / stretch.seconds, "1/s")
     yield Row("whole", "mean of the whole: views", mean, "1/s")
     steady = stretches["steady"]
     if steady.views:

@@ -18,8 +18,8 @@ PACKED_WORLDS = 256
 """Maximum number of worlds for which contact rows are packed into records of 384 bytes, 0.6 MB a world; the solver packs up to 16 worlds.
 On an H200 a tick of 64 worlds takes 0.180 instead of 0.189 s, one of 512 worlds 0.272 instead of 0.274 s."""
 KNOWN_NEWTON = "1.8.0"
-"""Version of Newton whose internals are tuned for GPUs: the solver by `FusedSteel`, and the blocks of the narrow phase. Other versions are
-used as they are: the same results, slower."""
+"""Version of Newton of which private parts are replaced or tuned on a GPU: the solver by `FusedSteel`, and the blocks of the narrow phase.
+Other versions are used as they are: the same results, slower."""
 
 steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
 """The solver's module, with the factories of its kernels."""

@@ -29,10 +29,10 @@ JOINT_LIMIT_GAP = 0.2
 # swept 162 idle rows a world one after the other, a third of the solver's time on a GPU.
 VELOCITY_LIMIT_FRACTION = 0.5
 # Blocks of the narrow phase: one warp each, 8 for each multiprocessor of a GPU or one for each world, whichever is more. Newton has four
-# warps a block, 4 blocks a multiprocessor. A thread tests a pair of shapes for as long as it takes, and a block holds the registers of
-# all its threads until the last one is done. On an H200 a tick of 16, 64, 150 worlds takes 0.131, 0.168, 0.201 instead of 0.141, 0.177,
-# 0.208 s; 512 worlds 0.254 instead of 0.269, in a second run 0.261 and 0.260; 2,048 worlds 0.657 s in 1,056 blocks, 0.599 in 2,112, 0.616
-# in Newton's.
+# warps a block (one warp, if a hull has 256 or more vertices), 4 blocks a multiprocessor. A thread tests a pair of shapes for as long as it
+# takes, and a block holds the registers of all its threads until the last one is done. On an H200 a tick of 16, 64, 150 worlds takes 0.131,
+# 0.168, 0.201 instead of 0.141, 0.177, 0.208 s; 512 worlds 0.254 instead of 0.269, in a second run 0.261 and 0.260; 2,048 worlds 0.657 s in
+# 1,056 blocks, 0.599 in 2,112, 0.616 in Newton's.
 NARROW_PHASE_BLOCK, NARROW_PHASE_BLOCKS = 32, 8
 # On an H200, models of one and two worlds round differently from those of 8, 64 and 512, which agree bit by bit.
 MIN_GPU_WORLDS = 8
@@ -66,7 +66,7 @@ def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None =
 
 
 class Watcher(Protocol):
-    """Observer of the steps of a tick. On a GPU its launches are captured once in graphs, as those of the hooks of `Physics.tick`."""
+    """Observer of the steps of a tick. On a GPU its launches are captured in graphs, as those of the hooks of `Physics.tick`."""
 
     def begin_step(self) -> None:
         """Called before a step."""
@@ -151,10 +151,10 @@ class Physics:
         """Advance all worlds by one tick, `steps_per_tick` x `substeps` substeps: a generator that yields after each substep.
 
         On a GPU the first period of the first tick (see `_period`) runs eagerly: it loads the kernels and triggers Newton's late
-        allocations. Then a CUDA graph for each of its substeps is captured, and these graphs are launched for all further ones. Each
-        `solver_stream` has graphs of its own.
+        allocations, all on the current stream. Then a CUDA graph for each of its substeps is captured, and these graphs are launched for
+        all further ones. Each `solver_stream` has graphs of its own.
 
-        Hooks and watcher are captured once, so they must launch the same kernels on the same arrays in every tick, hooks in every step.
+        Hooks and watcher run for captures only, so they must launch the same kernels on the same arrays in every tick, hooks in every step.
 
         Args:
             before_step: Launches kernels that write the control's forces from a state; runs before each step.
