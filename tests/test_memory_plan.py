@@ -23,7 +23,7 @@ from tests.worlds.small_worlds import settings
 
 GIB = 1024**3
 CPU = SimpleNamespace(is_cuda=False, alias="cpu")
-GPU = SimpleNamespace(is_cuda=True, alias="cuda:0")
+GPU = SimpleNamespace(is_cuda=True, alias="cuda:0", total_memory=64 << 30)
 """Stand-ins for devices: the plan asks for no more."""
 
 

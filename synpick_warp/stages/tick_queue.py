@@ -18,13 +18,13 @@ from synpick_warp.system.garbage import collection_paused
 MAX_LEAD = 1024
 """Maximum number of ticks by which physics may be ahead of the renderer. With 256, physics was the bottleneck in the last quarter of a bake
 of 150 episodes on an H200; tools/README.md has the figures."""
-QUEUE_BYTES = 1 << 30
-"""Memory budget of the ring of records [bytes], exceeded only if two slots need more. It holds MAX_LEAD ticks of 180 worlds, or 30 ticks of
-512 worlds whose steps are recorded."""
+QUEUE_BYTES, QUEUE_PART = 1 << 30, 64
+"""Memory budget of the ring of records: the device's memory divided by QUEUE_PART, at most QUEUE_BYTES, exceeded only if two slots need
+more. 1 GiB holds MAX_LEAD ticks of 180 worlds, or 30 ticks of 512 worlds whose steps are recorded."""
 
 
 def queue_lead(tick_bytes: int, device: wp.Device) -> int:
-    """Maximum lead of physics: as many ticks as QUEUE_BYTES has room for beside the one being rendered, at least one, at most MAX_LEAD.
+    """Maximum lead of physics: as many ticks as the budget has room for beside the one being rendered, at least one, at most MAX_LEAD.
 
     0 on a CPU, where physics and renderer do not overlap.
 
@@ -32,7 +32,10 @@ def queue_lead(tick_bytes: int, device: wp.Device) -> int:
         tick_bytes: Size of a `TickRecord` [bytes].
         device: Device of the simulation.
     """
-    return max(1, min(MAX_LEAD, QUEUE_BYTES // tick_bytes - 1)) if device.is_cuda else 0
+    if not device.is_cuda:
+        return 0
+    budget = min(QUEUE_BYTES, device.total_memory // QUEUE_PART)
+    return max(1, min(MAX_LEAD, budget // tick_bytes - 1))
 
 
 def record_bytes(record: TickRecord) -> int:

@@ -17,15 +17,16 @@ from synpick_warp.stages.stream import views_per_batch
 
 GIB = 1024**3
 CPU = SimpleNamespace(is_cuda=False, alias="cpu")
-GPU = SimpleNamespace(is_cuda=True, alias="cuda:0")
+GPU = SimpleNamespace(is_cuda=True, alias="cuda:0", total_memory=64 * GIB)
 """Stand-ins for devices."""
 
 
 @pytest.fixture
 def give(monkeypatch):
-    """Set the free memory of GPU and host [GiB]."""
+    """Set the memory of GPU and host, all of it free [GiB]."""
 
     def give(gpu: float = 140.0, host: float = 128.0) -> None:
+        monkeypatch.setattr(GPU, "total_memory", int(gpu * GIB))
         monkeypatch.setattr(memory_plan, "free_device_memory", lambda device: int(gpu * GIB))
         monkeypatch.setattr(memory_plan, "free_host_memory", lambda: int(host * GIB))
 

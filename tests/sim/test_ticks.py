@@ -18,7 +18,7 @@ from synpick_warp.stages.perception.arrays import Observation, Plan
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.sim.worlds import WorldStatus, world_sizes
 from synpick_warp.stages.stream import TickReader
-from synpick_warp.stages.tick_queue import MAX_LEAD, QUEUE_BYTES, TickQueue, queue_lead, record_bytes
+from synpick_warp.stages.tick_queue import MAX_LEAD, QUEUE_BYTES, QUEUE_PART, TickQueue, queue_lead, record_bytes
 from tests.harness.spin import SPINS, spin_kernel
 from tests.worlds.small_worlds import catalog, settings
 
@@ -152,10 +152,13 @@ def test_queued_ticks_keep_their_arrays_while_others_are_put(device):
 
 
 def test_the_queue_fits_its_memory_and_has_no_lead_on_a_cpu():
-    cuda, cpu = SimpleNamespace(is_cuda=True), SimpleNamespace(is_cuda=False)
+    cuda, cpu = SimpleNamespace(is_cuda=True, total_memory=QUEUE_PART * QUEUE_BYTES), SimpleNamespace(is_cuda=False)
     assert queue_lead(1000, cuda) == MAX_LEAD
     assert queue_lead(QUEUE_BYTES // 10, cuda) == 9
     assert queue_lead(10 * QUEUE_BYTES, cuda) == 1
+    larger, smaller = (SimpleNamespace(is_cuda=True, total_memory=int(factor * cuda.total_memory)) for factor in (2, 0.5))
+    assert queue_lead(QUEUE_BYTES // 10, larger) == 9
+    assert queue_lead(QUEUE_BYTES // 10, smaller) == 4
     assert queue_lead(1000, cpu) == 0
     record = new_record(wp.get_device("cpu"))
     arrays = [array for part in vars(record).values() if part is not None for array in vars(part).values()]
@@ -167,8 +170,9 @@ def test_the_memory_plan_counts_the_queue(device, monkeypatch, formats):
     """A queue of 200 ticks, to the byte: with another size of a record it would have fewer or more."""
     config = settings(bake__worlds=8, bake__formats=formats)
     record = Simulation(config, catalog(), 1, device, records_physics=formats == ["zarr"]).record
+    monkeypatch.setattr(tick_queue, "QUEUE_PART", 1)
     monkeypatch.setattr(tick_queue, "QUEUE_BYTES", 200 * record_bytes(record))
-    gpu = SimpleNamespace(is_cuda=True)
+    gpu = SimpleNamespace(is_cuda=True, total_memory=QUEUE_BYTES)
     assert memory_plan.queue_slots(config, gpu) == 200
     monkeypatch.setattr(tick_queue, "QUEUE_BYTES", 200 * record_bytes(record) - 1)
     assert memory_plan.queue_slots(config, gpu) == 199
