@@ -1,4 +1,4 @@
-"""Streams of renderer and encoders: caching, synchronization when they switch, and fallback on GPUs without partitions."""
+"""CUDA streams of renderer, encoders and solver: caching, synchronization at a switch, and fallback on GPUs without partitions."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_only_the_stream_of_the_solver_is_on_the_reserved_multiprocessors(make_s
 
 
 def test_the_encoders_of_a_batch_wait_for_those_of_the_batch_before(make_streams):
-    """Whatever the device does first, batches that share scratch arrays are encoded one after the other."""
+    """Batches that share scratch arrays are encoded one after the other, in whichever order the device executes its streams."""
     for seed in range(50):
         streams, device = make_streams(Partition, seed)
         order = []

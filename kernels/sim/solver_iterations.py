@@ -1,4 +1,4 @@
-"""Fused projected Gauss-Seidel (PGS) solver: one kernel runs all iterations of SolverSteel, of the physics engine Newton, a warp a world.
+"""Fused projected Gauss-Seidel (PGS) solver: one kernel runs all iterations of Newton's SolverSteel, with one warp per world.
 
 The device functions of an iteration are the solver's own, and `stages.sim.fused_solver` passes them in. This module has the arrays that
 they share, under the names of their parameters, and calls them in the order in which the solver launches them. Frames and units are the
@@ -268,7 +268,7 @@ def compose_iterations(
         impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
         v_inout: wp.array[float],  # (dof) [m/s, rad/s]
     ):
-        """Projected Gauss-Seidel (PGS) iterations of a world, by one warp.
+        """Run the projected Gauss-Seidel (PGS) iterations of each world, with one warp per world.
 
         An iteration sweeps joint limits, contacts in generalized coordinates, colored contacts, the response of the gripper to these, and
         speed limits; sweeps without rows are skipped. Velocities of free bodies exist twice: in `v`, generalized velocities, and as twists.

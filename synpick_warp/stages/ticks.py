@@ -112,7 +112,7 @@ class TickLoop:
             return self.queue.get(tick)
 
     def enqueue(self) -> None:
-        """Enqueue parts of the following ticks, as many as keep the device busy. Call it between batches of views."""
+        """Enqueue further parts, up to PARTS_IN_FLIGHT, without blocking. Call it between batches of views."""
         while self._running and self._running[0].is_complete:
             self._spare.append(self._running.popleft())
         self._poll_finished_ticks()
@@ -129,17 +129,17 @@ class TickLoop:
         return PHYSICS_SHARE if self._has_waited or is_short else 0.0
 
     def confine_solver(self, stream: wp.Stream | None) -> None:
-        """Restrict the solver to the SMs of a stream in the ticks that begin from now on.
+        """Set the SMs of the solver, from the next tick on: the reserved ones, or all.
 
         Args:
-            stream: Stream on reserved SMs; None, or more than SOLVER_WORLDS busy worlds per reserved SM: the solver may use all SMs.
+            stream: CUDA stream on the reserved SMs; None: all SMs, as also while more than SOLVER_WORLDS worlds per reserved SM are busy.
         """
         if stream is not None and self._busy_worlds > SOLVER_WORLDS * count_reserved(self.device, PHYSICS_SHARE):
             stream = None
         self.simulation.physics.solver_stream = stream
 
     def _poll_finished_ticks(self) -> None:
-        """Read the phases of the ticks that the device has done since the last call."""
+        """Update the counters and the lead from the ticks that the device has completed since the last call."""
         while self._simulated < self._enqueued and (phase := self.queue.phase(self._simulated)) is not None:
             self._simulated += 1
             is_idle = phase == Phase.IDLE
@@ -148,17 +148,17 @@ class TickLoop:
                 self.lead = self.max_lead
 
     def _may_begin(self) -> bool:
-        """Whether a further tick may begin before `advance` asks for it."""
+        """Whether physics may begin another tick within its lead."""
         return self._busy_worlds > 0 and self._enqueued < self._taken + self.lead
 
     @contextlib.contextmanager
     def _physics_scope(self) -> Iterator[None]:
-        """Make physics' stream the current one, and profile what is enqueued on it."""
+        """Context manager: physics' stream is the current stream, and its work is profiled."""
         with wp.ScopedStream(self.stream, sync_enter=False), scope("simulate", self.device):
             yield
 
     def _enqueue_part(self) -> None:
-        """Enqueue the next part; with the last one of a tick, also the copy of the record into the queue."""
+        """Enqueue the next part of a tick; after the last part, also the copy of its record into the queue."""
         self._parts = self._parts or self.simulation.tick_parts()
         if next(self._parts, ENDED) is ENDED:
             self.queue.put(self._enqueued)

@@ -1,4 +1,4 @@
-"""What a data set says of its making: which settings bind, how differences are told, what counts as whole."""
+"""Manifest of a data set: settings that must match on resume, messages about differences, and completeness of entries."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tests.worlds.small_worlds import catalog, settings
 
 
 def changed(key: str) -> Config:
-    """Settings of which one is another than in `settings()`, whatever it is."""
+    """Settings that differ from `settings()` in one value."""
     config = settings()
     section, name = key.split(".")
     part = getattr(config, section)
@@ -168,7 +168,7 @@ def test_a_record_has_every_file_once_and_is_whole_while_they_are_there(tmp_path
 @pytest.mark.parametrize("names", [[], ["a"], ["b", "a", "a/one"]])
 @pytest.mark.parametrize("writers", [0, 2])
 def test_an_episode_is_committed_whatever_files_it_has(tmp_path, names, writers):
-    """In a task for each file or folder, and without files, as of an episode that was given up. What is named twice counts once."""
+    """Each file or folder has its own writer task. An episode that was given up has no files; a file named twice is listed once."""
     for folder in ("a", "manifest", PARTIAL):
         (tmp_path / folder).mkdir()
     for name in ("a/two", "a/one", "b"):

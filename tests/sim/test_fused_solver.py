@@ -21,7 +21,7 @@ from tests.worlds.small_worlds import catalog, settings
 
 TICKS = 30
 ARCHITECTURE, DOFS, BODIES, ROWS = 90, 16, 5, 96
-"""CUDA architecture, and sizes of a small world, for which the kernel is compiled."""
+"""CUDA architecture and capacities of a small world, for which the kernel is compiled."""
 
 
 def test_the_installed_version_of_newton_is_fused():
@@ -29,7 +29,7 @@ def test_the_installed_version_of_newton_is_fused():
 
 
 def test_the_kernel_of_the_iterations_compiles(tmp_path):
-    """Its calls fit the solver's device functions; compiled for a GPU, also where there is none."""
+    """Its calls match the signatures of the solver's device functions. Compilation for a GPU needs none."""
     joint_rows = steel._get_pgs_solve_mf_gs_kernel(
         ROWS, ROWS, DOFS, ARCHITECTURE, has_dense_velocity_limit_rows=False, shared_metadata=True, row_phases=True
     )
@@ -45,7 +45,7 @@ def test_the_kernel_of_the_iterations_compiles(tmp_path):
 
 
 def test_what_the_kernel_does_not_support_is_found():
-    """By the private settings of a solver, as `FusedSteel` reads them after construction."""
+    """Each unsupported value of the private attributes that `FusedSteel` checks after construction is reported."""
     known = {
         "_propagation_colored": True,
         "_row_schedule": "interleaved",
@@ -66,7 +66,7 @@ def test_what_the_kernel_does_not_support_is_found():
 
 
 def test_a_solver_with_the_settings_of_a_gpu_differs_by_the_device_alone(monkeypatch):
-    """Its private parts are there; the arrays of its joint rows and bodies have the types that the kernel declares."""
+    """The private attributes that `FusedSteel` reads exist, and its arrays of rows and bodies match the types of the kernel's structs."""
     choose = physics._sweep
     monkeypatch.setattr(physics, "_sweep", lambda settings, slots, _: choose(settings, slots, True))
     monkeypatch.setattr(physics, "choose_solver", lambda _: fused_solver.FusedSteel)
@@ -119,8 +119,8 @@ def test_warm_start_sums_impulses_as_newton_does(device):
 
 @pytest.mark.parametrize(("worlds", "packed", "max_speed"), [(8, 256, 0.3), (8, 256, 4.0), (24, 256, 4.0), (24, 0, 4.0)])
 def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, packed, max_speed):
-    """Piles fall, rest and are stirred; at the lower speed limit, what falls has velocity limit rows. Newton packs up to 16 worlds, and its
-    narrow phase has larger blocks."""
+    """Piles fall, rest and are stirred; at the lower speed limit, falling bodies have velocity limit rows. Newton packs rows of up to 16
+    worlds only, and its narrow phase uses larger blocks."""
     if not device.is_cuda:
         pytest.skip("on a CPU the solver's own launches run")
     config = settings(

@@ -1,4 +1,4 @@
-"""Order of physics, renderer and host in a tick loop, in a model of a GPU: whatever the device does first, all read the tick they mean."""
+"""Synchronization of physics, renderer and host in a tick loop, on a model of a GPU that executes its streams in random order."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def values(snapshot: Snapshot) -> set[int]:
 
 @pytest.mark.parametrize("lead", [1, 5])
 def test_while_the_host_waits_for_a_tick_parts_of_the_next_are_enqueued(make_device, lead):
-    """Else a GPU would be idle from the end of each tick until the host, which hands it over, asks for the next."""
+    """Otherwise a GPU would be idle from the end of each tick until the host asks for the next one."""
     device = make_device(0)
     simulation = ModelSimulation(device, [20], 0, 2 * ticks.PARTS_IN_FLIGHT + 3)
     host_copies.time.sleep = lambda _: device.run(1)
@@ -143,7 +143,7 @@ def test_while_the_host_waits_for_a_tick_parts_of_the_next_are_enqueued(make_dev
 def test_physics_gets_a_share_of_the_device_while_the_renderer_waits_or_the_lead_is_short(
     make_device, monkeypatch, waiting, max_lead, safe_lead
 ):
-    """First physics is slower: the device does nothing before the host waits. Then it does all that is enqueued between two ticks."""
+    """First physics is the bottleneck: the device executes nothing until the host waits. Then it executes all work between two ticks."""
     monkeypatch.setattr(ticks, "SAFE_LEAD", safe_lead)
     device = make_device(0)
     host_copies.time.sleep = lambda _: device.run(1)
@@ -181,7 +181,7 @@ def test_physics_that_has_nothing_left_to_do_gets_no_share(make_device):
 
 @pytest.mark.parametrize(("busy", "is_confined"), [(16, True), (17, False)])
 def test_the_solver_is_restricted_to_reserved_multiprocessors_if_few_worlds_are_busy(make_device, busy, is_confined):
-    """A GPU with 11 multiprocessors reserves 2, of 8 worlds each; a third of the worlds is idle."""
+    """A GPU with 11 multiprocessors reserves 2, for 8 worlds each; a third of the worlds is idle."""
     device = make_device(0)
     device.sm_count = 11
     host_copies.time.sleep = lambda _: device.run(1)

@@ -61,15 +61,15 @@ PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth")
 OWN_WORLDS = {"bake", "pictures", "steady", "whole", "trajectories", "growth"}
 """Parts that build worlds of their own."""
 WORLDS = 512
-"""Worlds of most parts, unless `--worlds` says otherwise."""
+"""Default number of worlds of all parts but `whole`."""
 STREAM_BATCHES = 12
-"""Batches rendered and copied in a row."""
+"""Number of batches that are rendered and copied back to back."""
 WRITE_VIEWS = 12
-"""Views that the writers get repeatedly."""
+"""Number of views that are written over and over."""
 WHOLE_EPISODES = 150
-"""Episodes of a whole bake, unless `--episodes` says otherwise."""
+"""Default number of episodes of the part `whole`."""
 BAKE_WORLDS, BAKE_ROUNDS, BAKE_SPEED = 16, 1, 0.4
-"""Worlds of the small bake, at most; rounds and speed [m/s] of its gripper in mode move, for short episodes."""
+"""Limits of the part `bake`: maximum number of worlds; rounds and speed [m/s] of the gripper in mode move, for short episodes."""
 
 
 def main(arguments: list[str] | None = None) -> int:

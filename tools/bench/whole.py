@@ -22,7 +22,7 @@ from tools.bench.physics import Row
 from tools.bench.steady import clean_up_behind
 
 PICTURES = (".jpg", ".png")
-"""Suffixes of the files that are deleted."""
+"""Suffixes of the images, which are deleted once verified."""
 
 
 class WholeBake(NamedTuple):
@@ -146,7 +146,7 @@ def split_stretches(points: Sequence[TracePoint], cameras: int, whole: Stretch) 
 
 
 def summarize(points: Sequence[TracePoint], cameras: int, whole: Stretch, steady_rate: float) -> Iterator[Row]:
-    """Rows of a whole bake; arguments as in `split_stretches` and `measure_whole`."""
+    """Yield the result rows of a whole bake: counts, times and rates. Arguments as in `split_stretches` and `measure_whole`."""
     stretches, mean = split_stretches(points, cameras, whole), whole.views / whole.seconds
     many = f"{100 * LIVE_FRACTION:.0f} % of worlds"
     titles = {

@@ -113,12 +113,12 @@ def _hash_file(path: Path | str) -> tuple[str, int]:
 
 
 def write_checksums(out: Path, path: Path, part: Path) -> None:
-    """Task: hash a file, or all files of a folder, and write a line of SHA-256, size [bytes] and name for each to `part`."""
+    """Writer task: hash a file, or all files in a folder, and write their SHA-256, sizes [bytes] and names to `part`, one file per line."""
     part.write_bytes("".join(f"{digest} {size} {name}\n" for name, (digest, size) in _hash_files(out, (path,)).items()).encode())
 
 
 def join_manifest_entry(out: Path, place: Path, parts: Sequence[Path], content: dict[str, Any]) -> None:
-    """Task: merge the lists of `write_checksums` into a manifest entry as of `write_manifest_entry`, and remove them."""
+    """Writer task: merge the lists of `write_checksums` into a manifest entry like that of `write_manifest_entry`, and remove them."""
     known: dict[str, tuple[str, int]] = {}
     for part in parts:
         for line in part.read_bytes().splitlines():
@@ -147,11 +147,11 @@ def _hash_files(out: Path, paths: Sequence[Path]) -> dict[str, tuple[str, int]]:
 
 
 def _write_entry(out: Path, place: Path, known: dict[str, tuple[str, int]], content: dict[str, Any]) -> None:
-    """Write a manifest entry: first the checksum list, then the JSON file.
+    """Write a manifest entry: first the checksum list, then the JSON file, which marks the files as complete.
 
     Args:
-        out, place, content: As of `write_manifest_entry`.
-        known: Name -> SHA-256 and size [bytes] of each file.
+        out, place, content: As in `write_manifest_entry`.
+        known: SHA-256 and size [bytes] of each file, by name.
     """
     lines = "".join(f"{known[name][0]}  {name}\n" for name in sorted(known)).encode()
     size = sum(size for _, size in known.values())
@@ -161,5 +161,5 @@ def _write_entry(out: Path, place: Path, known: dict[str, tuple[str, int]], cont
 
 
 def name_parts(out: Path, place: Path, count: int) -> list[Path]:
-    """Paths of `count` temporary files for the partial checksum lists of a manifest entry."""
+    """Paths of the `count` temporary checksum lists that are merged into a manifest entry."""
     return [out / PARTIAL / f"{place.name}-{index}.sha256" for index in range(count)]

@@ -1,4 +1,4 @@
-"""Kernel fusion for Newton's SolverSteel: the iterations of a substep in one kernel instead of ten kernels an iteration."""
+"""Kernel fusion for Newton's SolverSteel: one kernel for all iterations of a substep instead of ten kernels per iteration."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import warp as wp
 from synpick_warp.kernels.sim import solver_iterations, warm_start
 
 PACKED_WORLDS = 256
-"""Maximum number of worlds for which contact rows are packed into records of 384 bytes, 0.6 MB a world; the solver packs up to 16 worlds.
+"""Maximum number of worlds for which contact rows are packed into records of 384 bytes, 0.6 MB per world; SolverSteel packs up to 16.
 On an H200 a tick of 64 worlds takes 0.180 instead of 0.189 s, one of 512 worlds 0.272 instead of 0.274 s."""
 KNOWN_NEWTON = "1.8.0"
 """Version of Newton of which private parts are replaced or tuned on a GPU: the solver by `FusedSteel`, and the blocks of the narrow phase.
@@ -26,14 +26,14 @@ steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
 
 
 class FusedSteel(newton.solvers.SolverSteel):
-    """SolverSteel whose projected Gauss-Seidel iterations run in one kernel, a warp a world. Results are the same bit by bit.
+    """SolverSteel whose projected Gauss-Seidel iterations run in one kernel, with one warp per world. Results are bitwise identical.
 
     SolverSteel launches ten kernels per iteration: with 16 iterations, 160 of the 364 launches of a substep. Each waits for the one before
     it, for microseconds on an idle GPU, and longer beside a renderer. `solver_iterations` calls the same device functions one after the
     other. The warm start of the contacts has more threads.
 
-    Models whose worlds are alike, each with one articulation besides its free bodies, are fused, with the options that
-    `physics.make_solver` sets; for others, such as piles without a gripper, the solver's own launches run.
+    Supported are models of identical worlds, each with one articulation besides its free bodies, and the options that
+    `physics.make_solver` sets. Others, such as piles without a gripper, run SolverSteel's own kernels.
     """
 
     def _launch_propagation_solve(
@@ -47,7 +47,7 @@ class FusedSteel(newton.solvers.SolverSteel):
         friction_start_iteration: int = 0,
         iteration_offset: int = 0,
     ) -> None:
-        """Run the iterations of a solve; arguments as of the solver's own method."""
+        """Run the iterations of a solve; arguments as in SolverSteel."""
         options = {
             "regularize": regularize,
             "freeze_drive_rows": freeze_drive_rows,
