@@ -260,8 +260,6 @@ def run_bake(
             if out.exists():
                 raise
             raise OutputError(f"{out} was removed while the bake wrote to it") from error
-        finally:
-            output.clean_up()
     return summary
 
 

@@ -54,15 +54,12 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         resumed = len(output.committed)
         if output.is_finished():
             return Converted(resumed, resumed)
-        try:
-            with WriterPool(processes or len(os.sched_getaffinity(0)), 0, output.lock) as pool:
-                converters = Converters(source, out, config, pool)
-                output.prepare(converters, source.inputs, pool)
-                _convert_episodes(source, output, converters, pool, report)
-                pool.wait()
-                finalize_data_set(out, config, classes, pool)
-        finally:
-            output.clean_up()
+        with WriterPool(processes or len(os.sched_getaffinity(0)), 0, output.lock) as pool:
+            converters = Converters(source, out, config, pool)
+            output.prepare(converters, source.inputs, pool)
+            _convert_episodes(source, output, converters, pool, report)
+            pool.wait()
+            finalize_data_set(out, config, classes, pool)
     return Converted(len(source.episodes), resumed)
 
 

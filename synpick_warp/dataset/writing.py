@@ -64,7 +64,7 @@ _ADVICE = "resume with the same, or name another folder with --out"
 
 
 class OutputFolder:
-    """Folder of a data set during a bake; a context manager that holds the folder's advisory lock (flock).
+    """Folder of a data set during a bake: a context manager that locks the folder (flock), and removes partial files at its end.
 
     The lock belongs to the open file description, so writer processes that inherit the handle hold it, too: no bake starts while a
     writer of a killed bake is still running.
@@ -106,7 +106,10 @@ class OutputFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        os.close(self.lock)
+        try:
+            self._clean_up()
+        finally:
+            os.close(self.lock)
 
     def _scan(self) -> None:
         """Compare settings, and sort episodes into committed, remaining and partial ones."""
@@ -218,11 +221,11 @@ class OutputFolder:
         """See `commit_episode`."""
         commit_episode(self.out, exporters, pool, end)
 
-    def clean_up(self) -> None:
+    def _clean_up(self) -> None:
         """Remove partial files, after success or an error; a data set without committed episodes is removed entirely.
 
-        Removed are names that the formats define, in a folder with our manifest: everything else, such as hidden files of the user's,
-        and folders that existed before, stay.
+        A finished data set has some, too, if its bake was killed after it had committed the indices. Removed are names that the formats
+        define, in a folder with our manifest: everything else, such as hidden files of the user's, and folders that existed before, stay.
         """
         with contextlib.suppress(OSError, DatasetError):
             if self._is_ours:

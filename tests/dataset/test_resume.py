@@ -11,7 +11,7 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,6 +25,7 @@ from synpick_warp.dataset.verify import verify
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import PARTIAL
 from tests.harness.bake_server import TINY, BakeServer
+from tests.harness.processes import children, wait_for
 
 KILLS = int(os.environ.get("SYNPICK_KILLS", 20))
 """Kills of the test at random times; the long form has 200."""
@@ -94,7 +95,7 @@ def kill_after(process: int, seconds: float, writer: bool) -> None:
 
 @pytest.fixture(scope="module")
 def changes(server, whole, tmp_path_factory) -> int:
-    """How often an undisturbed bake opens a file of its folder for writing, renames or removes one, or makes or removes a folder."""
+    """Number of changes to its folder by an undisturbed bake."""
     folder = tmp_path_factory.mktemp("counted")
     assert server.bake(folder / "set", alone=True, count=str(folder / "count")) == 0
     assert digests(folder / "set") == digests(whole)
@@ -108,6 +109,16 @@ def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected
     assert server.bake(out, alone=True, kill_at=1 + round(share * changes)) == -signal.SIGKILL
     server.bake(out, alone=True, kill_at=round((1.0 - share) * changes / 2))
     assert server.bake(out, alone=True) == 0
+    assert digests(out) == expected
+
+
+def test_a_finished_bake_killed_before_it_removed_its_partial_files(server, expected, changes, tmp_path):
+    out = tmp_path / "set"
+    # Three more follow: it is removed when it is empty, looked for again, and the data set's folder kept since it is not empty.
+    assert server.bake(out, alone=True, kill_at=changes - 3) == -signal.SIGKILL
+    assert verify(out).finished
+    assert digests(out) != expected
+    assert server.bake(out) == 0
     assert digests(out) == expected
 
 
@@ -326,18 +337,6 @@ def small_disk(whole, tmp_path) -> Iterator[Path]:
         pytest.skip("mounting needs root")
     yield folder
     subprocess.run(["umount", folder], check=True)
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-
-
-def children(process: int) -> list[int]:
-    """Numbers of a process's children."""
-    return [int(number) for number in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
 
 
 # ---- verify ----

@@ -35,7 +35,7 @@ TINY = {
     "settle.max_time": 3.0,
 }
 """Overrides on top of QUICK: an episode takes less than a second."""
-_EVENTS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir")
+_EVENTS = ("open", "os.rename", "os.mkdir", "os.remove", "os.rmdir", "shutil.rmtree")
 """Audit events of changes to a folder (sys.addaudithook)."""
 
 

@@ -1,10 +1,23 @@
-"""Processes that tests expect to end."""
+"""Processes that tests observe: their children, their end, and what they bring about."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+
+
+def wait_for(condition: Callable[[], bool], timeout: float = 60.0) -> None:
+    """Wait until a condition holds."""
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def children(process: int) -> list[int]:
+    """Ids of a process's children."""
+    return [int(pid) for pid in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
 
 
 def wait_until_gone(pids: Iterable[int], timeout: float = 30.0) -> None:

@@ -70,19 +70,16 @@ def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after:
             summary.take_record(read_entry(out, episode_entry(episode)) or {})
         if output.is_finished():
             return summary
-        try:
-            with WriterPool(0, slot_bytes(classes, config), output.lock) as pool:
-                exporters = Exporters(classes, ExportContext(out, config, box_views.catalog(), _LENSES, skies(), pool))
-                if output.remaining:
-                    output.prepare(exporters, INPUTS, pool)
-                for episode in output.remaining[:stop_after]:
-                    _write_episode(output, exporters, pool, episode)
-                pool.wait()
-                exporters.close()
-                if stop_after is None:
-                    finalize_data_set(out, config, classes, pool)
-        finally:
-            output.clean_up()
+        with WriterPool(0, slot_bytes(classes, config), output.lock) as pool:
+            exporters = Exporters(classes, ExportContext(out, config, box_views.catalog(), _LENSES, skies(), pool))
+            if output.remaining:
+                output.prepare(exporters, INPUTS, pool)
+            for episode in output.remaining[:stop_after]:
+                _write_episode(output, exporters, pool, episode)
+            pool.wait()
+            exporters.close()
+            if stop_after is None:
+                finalize_data_set(out, config, classes, pool)
     return summary
 
 

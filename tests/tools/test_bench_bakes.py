@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import time
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
@@ -20,6 +19,7 @@ from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.checksums import write_manifest_entry
 from synpick_warp.stages.render.renderer import Renderer
 from tests.harness.entries import episode_content
+from tests.harness.processes import wait_for
 from tests.tools.test_tools import FEW_STEPS, SHORT_EPISODES, SMALL_IMAGES
 from tools.bench import __main__ as bench
 from tools.bench import growth, meter, physics, steady, whole
@@ -39,14 +39,6 @@ def write_episode(out: Path, episode: int) -> list[Path]:
     (out / "manifest").mkdir(exist_ok=True)
     write_manifest_entry(out, episode_entry(episode), names, episode_content(episode))
     return [out / name for name in names]
-
-
-def wait_for(condition) -> None:
-    """Wait until a condition holds, at most 20 s."""
-    deadline = time.monotonic() + 20.0
-    while not condition() and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert condition()
 
 
 def reading(seconds: float, count: int) -> meter.Reading:
