@@ -8,8 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import ConvexHull
-from scipy.spatial.distance import cdist
 from trimesh.bounds import oriented_bounds
 
 from synpick_warp.configs.schema import Config, ObjectRow, Objects, Tote
@@ -19,10 +17,10 @@ from synpick_warp.scenes.assets.asset_files import check_file_name
 from synpick_warp.scenes.assets.meshes import SUFFIXES, read_mesh, signed_volume
 from synpick_warp.scenes.assets.models_info import ModelInfo, bop_files, read_models_info
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
-from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties
+from synpick_warp.scenes.collision.hulls import hull_size, mass_properties
 from synpick_warp.scenes.collision.shapes import collision_shapes, default_cache_dir
 from synpick_warp.scenes.embedded.objects import procedural_objects
-from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, Material, RawObject, TriangleMesh
+from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, HullSize, Material, RawObject, TriangleMesh
 
 _MILLIMETRE = 1e-3
 # Minimum diameter [m]: smaller bodies vanish in the contact margin, and come from files in another unit than expected.
@@ -56,20 +54,14 @@ def load_catalog(config: Config, cache_dir: Path | None = None, report: Callable
     folder = Path(config.bake.models).expanduser()
     raws = _read_folder(folder, config, report) if config.bake.models else procedural_objects()
     origins = [str(raw.source or raw.name) for raw in raws]
-    hulls = [_checked_hull_volume(raw, origin, config) for raw, origin in zip(raws, origins, strict=True)]
-    masses = [_checked_mass(raw, hull, origin, config) for raw, hull, origin in zip(raws, hulls, origins, strict=True)]
-    recipes = [_recipe(raw, hull, config.objects) for raw, hull in zip(raws, hulls, strict=True)]
+    for raw, origin in zip(raws, origins, strict=True):
+        _check_size(raw, origin, config.tote)
+    masses = [_checked_mass(raw, origin, config) for raw, origin in zip(raws, origins, strict=True)]
+    recipes = [_recipe(raw, config.objects) for raw in raws]
     shapes = collision_shapes([raw.name for raw in raws], [raw.mesh for raw in raws], recipes, cache_dir or default_cache_dir(), report)
     entries = [_entry(raw, pieces, mass) for raw, pieces, mass in zip(raws, shapes, masses, strict=True)]
     _report_undrawable(entries, config.arrangement.volume, report)
     return Catalog(tuple(sorted(entries, key=lambda entry: entry.obj_id)))
-
-
-def diameter(vertices: np.ndarray) -> float:
-    """Diameter of a point set (N, 3): the largest distance between two points [m]; they must span a volume."""
-    corners = vertices[ConvexHull(vertices.astype(np.float64)).vertices].astype(np.float64)
-    # In blocks, since fine round meshes have tens of thousands of hull vertices.
-    return max(float(cdist(corners[start : start + 1024], corners).max()) for start in range(0, len(corners), 1024))
 
 
 def _read_folder(folder: Path, config: Config, report: Callable[[str], None]) -> list[RawObject]:
@@ -99,26 +91,29 @@ def _read_folder(folder: Path, config: Config, report: Callable[[str], None]) ->
 def _read_bop(obj_id: int, file: Path, info: ModelInfo, config: Config) -> RawObject:
     """Read a model of a BOP folder, with the row of the object table that has its obj_id, if the diameter agrees."""
     mesh, material = read_mesh(file, _MILLIMETRE)
-    size = _diameter_or_zero(mesh)
+    hull = hull_size(mesh.vertices)
+    size = hull.diameter
     tolerance = config.objects.diameter_tolerance
     if info.diameter is not None and size > 0.0 and not _near(size, info.diameter, tolerance):
         raise CatalogError(
             f"{file}: diameter {size * 1e3:.4g} mm, but models_info.json says {info.diameter * 1e3:.4g}; both must be in millimetres"
         )
     row = next((row for row in config.object_rows if row.id == obj_id and _fits(row, size, tolerance)), None)
-    raw = _raw(obj_id, file, mesh, material, row, config.objects)
+    raw = _raw(obj_id, file, mesh, hull, material, row, config.objects)
     return replace(raw, symmetries_discrete=info.symmetries_discrete, symmetries_continuous=info.symmetries_continuous, source=file)
 
 
 def _read_own(obj_id: int, file: Path, config: Config) -> RawObject:
     """Read a mesh that is not a BOP model. Its obj_id is its position, so rows of the object table are matched by name and diameter."""
     mesh, material = read_mesh(file, 1.0)
-    size = _diameter_or_zero(mesh)
-    row = next((row for row in config.object_rows if row.name == file.stem and _fits(row, size, config.objects.diameter_tolerance)), None)
-    return _raw(obj_id, file, mesh, material, row, config.objects)
+    hull, tolerance = hull_size(mesh.vertices), config.objects.diameter_tolerance
+    row = next((row for row in config.object_rows if row.name == file.stem and _fits(row, hull.diameter, tolerance)), None)
+    return _raw(obj_id, file, mesh, hull, material, row, config.objects)
 
 
-def _raw(obj_id: int, file: Path, mesh: TriangleMesh, given: FileMaterial, row: ObjectRow | None, objects: Objects) -> RawObject:
+def _raw(
+    obj_id: int, file: Path, mesh: TriangleMesh, hull: HullSize, given: FileMaterial, row: ObjectRow | None, objects: Objects
+) -> RawObject:
     """Combine mesh file and row. Material properties of the file have priority over the row, the row over the section objects."""
     defaults = row or objects
     material = Material(
@@ -131,6 +126,7 @@ def _raw(obj_id: int, file: Path, mesh: TriangleMesh, given: FileMaterial, row: 
         obj_id=obj_id,
         name=row.name if row and row.name else file.stem,
         mesh=mesh,
+        hull=hull,
         material=material,
         mass=row.mass if row else None,
         concave=row.concave if row else None,
@@ -138,11 +134,6 @@ def _raw(obj_id: int, file: Path, mesh: TriangleMesh, given: FileMaterial, row: 
         symmetries_continuous=(),
         source=None,
     )
-
-
-def _diameter_or_zero(mesh: TriangleMesh) -> float:
-    """Diameter [m]; 0 for a flat mesh, which is refused later, with all wrong sizes."""
-    return diameter(mesh.vertices) if hull_volume(mesh.vertices) > 0.0 else 0.0
 
 
 def _near(value: float, expected: float, tolerance: float) -> bool:
@@ -154,21 +145,19 @@ def _fits(row: ObjectRow, size: float, tolerance: float) -> bool:
     return row.diameter == 0.0 or _near(size, row.diameter, tolerance)
 
 
-def _checked_hull_volume(raw: RawObject, origin: str, config: Config) -> float:
-    """Check an object's size and origin, and return the volume of its convex hull [m³]."""
-    volume = hull_volume(raw.mesh.vertices)
-    if volume == 0.0:
+def _check_size(raw: RawObject, origin: str, tote: Tote) -> None:
+    """Refuse an object that is flat, too small, too large for the tote, or far from its origin."""
+    if raw.hull.volume == 0.0:
         raise CatalogError(f"{origin}: all vertices lie in one plane; a body needs a volume")
-    size = diameter(raw.mesh.vertices)
+    size = raw.hull.diameter
     if size < _MIN_DIAMETER:
         raise CatalogError(f"{origin}: diameter {size:.4g} m; a body needs at least {_MIN_DIAMETER:g} m; {_UNITS}")
-    _check_fits_tote(raw.mesh.vertices, size, origin, config.tote)
+    _check_fits_tote(raw.mesh.vertices, size, origin, tote)
     radius = float(np.linalg.norm(raw.mesh.vertices, axis=1).max())
     if radius > _MAX_ORIGIN_DISTANCE * size:
         raise CatalogError(
             f"{origin}: a vertex lies {radius:.4g} m from the origin, but the body's diameter is {size:.4g} m; centre it on its origin"
         )
-    return volume
 
 
 def _check_fits_tote(vertices: np.ndarray, size: float, origin: str, tote: Tote) -> None:
@@ -195,9 +184,9 @@ def _by(sides: list[float]) -> str:
     return " x ".join(f"{side:.3g}" for side in sides)
 
 
-def _checked_mass(raw: RawObject, hull: float, origin: str, config: Config) -> float:
-    """Mass [kg]: the object's own, or density times hull volume [m³]."""
-    mass = config.objects.density * hull if raw.mass is None else raw.mass
+def _checked_mass(raw: RawObject, origin: str, config: Config) -> float:
+    """Mass [kg]: the object's own, or density times hull volume."""
+    mass = config.objects.density * raw.hull.volume if raw.mass is None else raw.mass
     if not _MASS_RANGE[0] <= mass <= _MASS_RANGE[1]:
         source = "by objects.density" if raw.mass is None else "in its row of the object table"
         raise CatalogError(f"{origin}: mass {mass:g} kg {source}; allowed: {_MASS_RANGE[0]:g} to {_MASS_RANGE[1]:g} kg")
@@ -212,10 +201,10 @@ def _report_undrawable(entries: list[CatalogEntry], budget: float, report: Calla
         report(f"never drawn, since larger than arrangement.volume, {budget:g} m³: {names}")
 
 
-def _recipe(raw: RawObject, hull: float, objects: Objects) -> ShapeRecipe:
+def _recipe(raw: RawObject, objects: Objects) -> ShapeRecipe:
     concave = raw.concave
     if concave is None:
-        concave = signed_volume(raw.mesh.vertices, raw.mesh.faces) < objects.concave_ratio * hull
+        concave = signed_volume(raw.mesh.vertices, raw.mesh.faces) < objects.concave_ratio * raw.hull.volume
     return ShapeRecipe(concave, objects.hull_vertices, objects.piece_vertices, objects.pieces, objects.concavity)
 
 
@@ -232,7 +221,7 @@ def _entry(raw: RawObject, pieces: tuple[ConvexPiece, ...], mass: float) -> Cata
         mass=mass,
         center_of_mass=properties.center_of_mass,
         inertia=mass * properties.unit_inertia,
-        diameter=diameter(raw.mesh.vertices),
+        diameter=raw.hull.diameter,
         symmetries_discrete=raw.symmetries_discrete,
         symmetries_continuous=raw.symmetries_continuous,
         source=raw.source,

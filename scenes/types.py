@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +37,15 @@ class Material:
     """Perceptual roughness, 0..1."""
 
 
+class HullSize(NamedTuple):
+    """Size of the convex hull of a point set; zeros if the points are coplanar."""
+
+    volume: float
+    """[m³]"""
+    diameter: float
+    """The largest distance between two points [m]."""
+
+
 @dataclass(frozen=True, eq=False)
 class RawObject:
     """An object as read from a file or made procedurally, before collision shape and mass properties are computed."""
@@ -44,6 +54,7 @@ class RawObject:
     """BOP's obj_id: class of the object."""
     name: str
     mesh: TriangleMesh
+    hull: HullSize
     material: Material
     mass: float | None
     """[kg]; None: by objects.density."""

@@ -1,4 +1,4 @@
-"""Convex hull simplification, and mass properties of convex polyhedra."""
+"""Convex hulls: size and simplification; mass properties of convex polyhedra."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import cdist
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.types import ConvexPiece
+from synpick_warp.scenes.types import ConvexPiece, HullSize
 
 # Smallest volume that another vertex must add, as a fraction of the full hull's.
 _MIN_GAIN = 1e-4
@@ -29,13 +30,30 @@ class MassProperties:
     """Inertia tensor about the centre of mass per mass (3, 3) float64 [m²]."""
 
 
+def hull_size(points: np.ndarray) -> HullSize:
+    """Volume and diameter of the convex hull of points (N, 3) [m]; zeros if they are coplanar."""
+    hull = _hull_of(points)
+    if hull is None:
+        return HullSize(0.0, 0.0)
+    corners = hull.points[hull.vertices]
+    # In blocks, since fine round meshes have tens of thousands of hull vertices.
+    diameter = max(float(cdist(corners[start : start + 1024], corners).max()) for start in range(0, len(corners), 1024))
+    return HullSize(float(hull.volume), diameter)
+
+
 def hull_volume(points: np.ndarray) -> float:
     """Volume of the convex hull of points (N, 3) [m³]; 0 if they are coplanar."""
+    hull = _hull_of(points)
+    return 0.0 if hull is None else float(hull.volume)
+
+
+def _hull_of(points: np.ndarray) -> ConvexHull | None:
+    """Convex hull of points (N, 3) in float64; None if they are coplanar."""
     try:
         hull = ConvexHull(points.astype(np.float64))
     except QhullError:
-        return 0.0
-    return float(hull.volume) if hull.volume > _FLAT * np.ptp(points, axis=0).max() ** 3 else 0.0
+        return None
+    return hull if hull.volume > _FLAT * np.ptp(points, axis=0).max() ** 3 else None
 
 
 def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:

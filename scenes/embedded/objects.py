@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.embedded import goods, tools, vessels
 from synpick_warp.scenes.embedded.meshes import make_mesh, rotation
 from synpick_warp.scenes.embedded.packs import Shape
@@ -83,11 +84,13 @@ def procedural_objects() -> list[RawObject]:
     objects = []
     for obj_id, row in enumerate(ROWS, start=1):
         patch, texture = row.make()
+        mesh = make_mesh(patch, centered=True)
         objects.append(
             RawObject(
                 obj_id=obj_id,
                 name=row.name,
-                mesh=make_mesh(patch, centered=True),
+                mesh=mesh,
+                hull=hull_size(mesh.vertices),
                 material=Material(color=(1.0, 1.0, 1.0), texture=texture, metallic=row.metallic, roughness=row.roughness),
                 mass=row.mass,
                 concave=row.concave,

@@ -16,7 +16,8 @@ from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Arrangement, Bake, Config, ObjectRow, Objects, Tote
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes import catalog
-from synpick_warp.scenes.catalog import diameter, load_catalog
+from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.types import CatalogEntry
 
@@ -308,7 +309,7 @@ def test_without_a_models_info_there_are_no_symmetries(tmp_path):
 def test_the_diameter_is_the_largest_distance(seed, count):
     points = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
     distances = np.linalg.norm(points[:, None].astype(np.float64) - points[None], axis=-1)
-    assert diameter(points) == pytest.approx(distances.max(), rel=1e-12)
+    assert hull_size(points).diameter == pytest.approx(distances.max(), rel=1e-12)
 
 
 def test_embedded_objects_need_no_folder_and_no_table(tmp_path, monkeypatch):

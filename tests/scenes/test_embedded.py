@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, cKDTree
 
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
-from synpick_warp.scenes.catalog import diameter
 from synpick_warp.scenes.embedded.meshes import (
     BOX_FACES,
     NO_TEXTURE,
@@ -138,7 +137,7 @@ def test_the_origin_is_the_middle_of_the_bounding_box(raw):
 
 
 def test_sizes_are_near_the_real_ones(raw):
-    assert diameter(raw.mesh.vertices) == pytest.approx(TABLE[raw.obj_id][1], rel=0.1)
+    assert raw.hull.diameter == pytest.approx(TABLE[raw.obj_id][1], rel=0.1)
     assert ConvexHull(raw.mesh.vertices).volume * 1000 == pytest.approx(HULL_LITRES[raw.obj_id - 1], rel=0.16)
 
 
