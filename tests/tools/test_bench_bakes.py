@@ -217,12 +217,26 @@ def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
     record = json.loads(file.read_text())
     rows = {row["name"]: row["value"] for row in record["rows"]}
     trace = record["traces"]["whole"]
+    assert record["machine"]["measured"] == "2 episodes, 2 worlds, 3 cameras, 32x18"
     assert rows["worlds"] == 2
     assert rows["ticks"] == len(trace["live"]) == len(trace["seconds"])
     assert rows["views"] >= trace["views"][-1] > 0
     assert trace["views"][-1] // 3 == sum(trace["live"])
     assert trace["episodes"][-1] == 2
     assert trace["seconds"] == sorted(trace["seconds"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--parts", "whole"], "150 episodes, automatic worlds"),
+        (["--parts", "whole,steady"], "512 worlds"),
+        (["--compare", "mujoco"], "512 worlds"),
+    ],
+)
+def test_the_setup_names_what_determines_the_worlds(arguments, expected):
+    options = bench._parse(arguments)
+    assert bench._describe_setup(bench._config(options), options) == f"{expected}, 3 cameras, 1920x1080"
 
 
 def test_trajectories_are_baked_without_rendering_views(tmp_path, monkeypatch):

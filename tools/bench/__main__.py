@@ -85,9 +85,7 @@ def main(arguments: list[str] | None = None) -> int:
         config = _config(options)
         device = pick_device(config.bake.device)
         config = with_enough_worlds(config, device)
-        width, height = config.cameras.resolution
-        measured = f"{config.bake.worlds} worlds, {len(config.cameras.positions)} cameras, {width}x{height}"
-        machine = dict([*describe_machine(device), ("measured", measured)])
+        machine = dict([*describe_machine(device), ("measured", _describe_setup(config, options))])
         for name, value in machine.items():
             console.print(f"{name:20} {value}")
         measured_peers = measure_peers(config, options.compare, options.seconds)
@@ -105,6 +103,15 @@ def main(arguments: list[str] | None = None) -> int:
         record = {"machine": machine, "real_objects": bool(options.models), "rows": [_to_record(row) for row in rows]}
         write_json(options.json, record | ({"traces": traces} if traces else {}))
     return code
+
+
+def _describe_setup(config: Config, options: argparse.Namespace) -> str:
+    """Numbers of worlds and cameras, and the resolution; the part `whole` alone has a number of episodes, and may choose that of worlds."""
+    worlds = f"{config.bake.worlds} worlds"
+    if tuple(options.parts) == ("whole",):
+        worlds = f"{options.episodes} episodes, " + (worlds if options.worlds else "automatic worlds")
+    width, height = config.cameras.resolution
+    return f"{worlds}, {len(config.cameras.positions)} cameras, {width}x{height}"
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
