@@ -31,7 +31,7 @@ class MassProperties:
 
 
 def hull_size(points: np.ndarray) -> HullSize:
-    """Volume and diameter of the convex hull of points (N, 3) [m]; zeros if they are coplanar."""
+    """Volume and diameter of the convex hull of points (N, 3) [m]; zeros if there is none."""
     hull = _hull_of(points)
     if hull is None:
         return HullSize(0.0, 0.0)
@@ -42,13 +42,13 @@ def hull_size(points: np.ndarray) -> HullSize:
 
 
 def hull_volume(points: np.ndarray) -> float:
-    """Volume of the convex hull of points (N, 3) [m³]; 0 if they are coplanar."""
+    """Volume of the convex hull of points (N, 3) [m³]; 0 if there is none."""
     hull = _hull_of(points)
     return 0.0 if hull is None else float(hull.volume)
 
 
 def _hull_of(points: np.ndarray) -> ConvexHull | None:
-    """Convex hull of points (N, 3) in float64; None if they are coplanar."""
+    """Convex hull of points (N, 3) in float64; None if they are coplanar or nearly so (_FLAT), fewer than four, or not finite."""
     try:
         hull = ConvexHull(points.astype(np.float64))
     except QhullError:

@@ -106,9 +106,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _describe_setup(config: Config, options: argparse.Namespace) -> str:
-    """Numbers of worlds and cameras, and the resolution; the part `whole` alone has a number of episodes, and may choose that of worlds."""
+    """Worlds, cameras and resolution. If `whole` is the only part: also its episodes, and the worlds may be automatic."""
     worlds = f"{config.bake.worlds} worlds"
-    if tuple(options.parts) == ("whole",):
+    if set(options.parts) == {"whole"} and not options.compare:
         worlds = f"{options.episodes} episodes, " + (worlds if options.worlds else "automatic worlds")
     width, height = config.cameras.resolution
     return f"{worlds}, {len(config.cameras.positions)} cameras, {width}x{height}"
