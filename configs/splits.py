@@ -53,6 +53,31 @@ def plan_episodes(config: Config, names: Sequence[str] = (), shard: tuple[int, i
     return [range(each.start + (index - each.start) % count, each.stop, count) for each in ranges]
 
 
+def check_shard(shard: tuple[int, int], name: str = "shard") -> None:
+    """Check that a shard (i, n) has 0 <= i < n; `name` names it in the message.
+
+    Raises:
+        ConfigError: It has not.
+    """
+    index, count = shard
+    if not 0 <= index < count:
+        raise ConfigError(f"{name} is {index}/{count}; allowed: i/n with i from 0 to n - 1, such as 0/4")
+
+
+def plan_shard(config: Config, names: Sequence[str], shard: tuple[int, int], name: str = "shard") -> list[range]:
+    """Episode indices of a shard, at least one; otherwise as `plan_episodes` and `check_shard`.
+
+    Raises:
+        ConfigError: There is no split of a name, or no such shard, or it has no episode.
+    """
+    check_shard(shard, name)
+    planned = plan_episodes(config, names, shard)
+    if not any(planned):
+        total = sum(map(len, plan_episodes(config, names)))
+        raise ConfigError(f"{name} {shard[0]}/{shard[1]} has none of {total} episodes; use fewer shards")
+    return planned
+
+
 def is_planned(config: Config, episode: int) -> bool:
     """Whether the settings plan an episode of this index."""
     return any(episode in each for each in plan_episodes(config))

@@ -19,7 +19,7 @@ from synpick_warp.attempts import AttemptLog, EpisodeRecord
 from synpick_warp.codes import Phase
 from synpick_warp.compilation import compile_launches, is_cache_warm
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import plan_episodes
+from synpick_warp.configs.splits import plan_episodes, plan_shard
 from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.manifest import episode_entry, read_entry
 from synpick_warp.dataset.writing import OutputFolder, commit_episode, finalize_data_set
@@ -36,7 +36,7 @@ from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
-from synpick_warp.scheduling.devices import Share, bake_on_devices
+from synpick_warp.scheduling.devices import Share, bake_on_devices, prepare_folder
 from synpick_warp.scheduling.meter import ThroughputMeter
 from synpick_warp.scheduling.order import order_longest_first
 from synpick_warp.scheduling.sizes import count_writers, fit_to_device, without_pictures
@@ -242,13 +242,13 @@ def run_bake(
     names = pick_devices(devices) if devices else (config.bake.device,)
     config = replace(config, bake=replace(config.bake, device=names[0]))
     kinds = load_exporter_classes(config.bake.formats)
-    planned = plan_episodes(config, splits, shard)
+    planned = plan_shard(config, splits, shard)
     check_episodes(sum(map(len, planned)), config)
     with OutputFolder(out, config, [episode for each in planned for episode in each]) as output:
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
             summary.take_record(read_entry(out, episode_entry(episode)) or {})
-        if output.is_finished():
+        if output.is_finished:
             progress.note("the data set is finished: nothing is left to do")
             return summary
         if output.committed:
@@ -273,6 +273,8 @@ def _fill(
     elif output.remaining:
         with scope("build"):
             factory = build_factory(config, progress, output.remaining, *_needs(kinds), longest_first=True)
+    else:
+        prepare_folder(output, kinds, load_catalog(config, report=progress.note), load_lights(config.bake.lights))
     with WriterPool(count_writers(config), slot_bytes(kinds, config), output.lock) as pool:
         started = time.perf_counter()
         if factory is not None:

@@ -77,6 +77,15 @@ def test_a_config_is_taken_as_it_is(tmp_path, calls):
         synpick_warp.bake(config, tmp_path, {"bake.mode": "move"})
 
 
+@pytest.mark.parametrize(
+    ("shard", "said"), [((2, 2), "shard is 2/2; allowed"), ((0, 0), "shard is 0/0"), ((5, 8), "shard 5/8 has none of 2 episodes")]
+)
+def test_a_shard_without_episodes_leaves_no_folder(tmp_path, shard, said):
+    with pytest.raises(synpick_warp.ConfigError, match=said):
+        synpick_warp.bake("smoke", tmp_path / "set", shard=shard)
+    assert not (tmp_path / "set").exists()
+
+
 def test_the_default_preset_and_a_file(tmp_path):
     (tmp_path / "my.toml").write_text('preset = "smoke"\n[bake]\nseed = 7\n')
     assert synpick_warp.load_config() == load_config(None, {})

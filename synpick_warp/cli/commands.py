@@ -23,7 +23,7 @@ from synpick_warp.cli.validate import validate
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import plan_episodes
+from synpick_warp.configs.splits import plan_shard
 from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickError
 from synpick_warp.system.garbage import collection_paused
@@ -136,8 +136,8 @@ def bake(
     several = parse_devices(devices, device, profile or profile_out is not None)
     names = parse_splits(split)
     resolved = _resolve(config, given, resolution, set_, splits=split is not None)
-    planned = plan_episodes(resolved, names)
-    part = parse_shard(shard, planned) if shard is not None else (0, 1)
+    part = parse_shard(shard) if shard is not None else (0, 1)
+    plan_shard(resolved, names, part, "--shard")
     if not profile and profile_out is None:
         return _bake(resolved, out, part, names, several)
     trace = profile_out or out.with_name(f"{out.name}-profile.json")

@@ -52,7 +52,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
     classes = load_exporter_classes(formats)
     with OutputFolder(out, config, source.episodes) as output:
         resumed = len(output.committed)
-        if output.is_finished():
+        if output.is_finished:
             return Converted(resumed, resumed)
         with WriterPool(processes or len(os.sched_getaffinity(0)), 0, output.lock) as pool:
             converters = Converters(source, out, config, pool)

@@ -64,7 +64,7 @@ _ADVICE = "resume with the same, or name another folder with --out"
 
 
 class OutputFolder:
-    """Folder of a data set during a bake: a context manager that locks the folder (flock), and removes partial files at its end.
+    """Folder of a data set during a bake: a context manager that locks the folder (flock), and removes the staging folder at its end.
 
     The lock belongs to the open file description, so writer processes that inherit the handle hold it, too: no bake starts while a
     writer of a killed bake is still running.
@@ -130,11 +130,9 @@ class OutputFolder:
         self._complete = {index for index in entries if is_complete(self.out, episode_entry(index))}
         self.committed = sorted(self._complete.intersection(self.episodes))
         self.remaining = sorted(set(self.episodes) - self._complete)
-
-    def is_finished(self) -> bool:
+        indices = read_entry(out, INDICES) or {}
+        self.is_finished = not self.remaining and indices.get("episodes") == entries and is_complete(out, INDICES)
         """Whether all episodes are committed and the indices cover them."""
-        indices = read_entry(self.out, INDICES) or {}
-        return not self.remaining and indices.get("episodes") == committed_episodes(self.out) and is_complete(self.out, INDICES)
 
     def prepare(self, exporters: Exporters, inputs: dict[str, str], pool: WriterPool) -> None:
         """Prepare the folder for the remaining episodes: manifest, settings, constants; remove partial episodes and stale indices.
@@ -222,10 +220,11 @@ class OutputFolder:
         commit_episode(self.out, exporters, pool, end)
 
     def _clean_up(self) -> None:
-        """Remove partial files, after success or an error; a data set without committed episodes is removed entirely.
+        """Remove the staging folder, after success or an error; a data set without committed episodes is removed entirely.
 
-        A finished data set has some, too, if its bake was killed after it had committed the indices. Removed are names that the formats
-        define, in a folder with our manifest: everything else, such as hidden files of the user's, and folders that existed before, stay.
+        A finished data set has one, too, if its bake was killed after it had committed the indices. Files of uncommitted episodes that are
+        in place already are removed by the next `prepare`. Removed are names that the formats define, in a folder with our manifest:
+        everything else, such as hidden files of the user's, and folders that existed before, stay.
         """
         with contextlib.suppress(OSError, DatasetError):
             if self._is_ours:
@@ -288,9 +287,10 @@ def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]]
         (out / PARTIAL).mkdir()
         paths = build_lists(out, config) + finalize(kinds, out, config, pool)
         write_manifest_entry(out, INDICES, paths, {"episodes": committed_episodes(out)})
-        shutil.rmtree(out / PARTIAL)
     except OSError as error:
         raise output_error(out, error) from error
+    finally:
+        shutil.rmtree(out / PARTIAL, ignore_errors=True)
 
 
 def build_lists(out: Path, config: Config) -> list[Path]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
-from synpick_warp.configs.splits import plan_episodes
+from synpick_warp.configs.splits import check_shard, plan_episodes
 from synpick_warp.errors import ConfigError
 
 
@@ -52,9 +52,8 @@ def choose_episodes(
     Raises:
         ConfigError: There is no such split, an index is out of range, or `episodes` are given beside splits.
     """
+    check_shard(shard)
     index, count = shard
-    if not (count >= 1 and 0 <= index < count):
-        raise ConfigError(f"shard is {index}/{count}; allowed: i/n with 0 <= i < n")
     if episodes is None:
         return config, [episode for each in plan_episodes(config, splits, shard) for episode in each]
     if splits or config.splits:

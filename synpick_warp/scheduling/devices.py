@@ -35,6 +35,7 @@ from synpick_warp.progress import Progress
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.scheduling.order import deal_episodes, deal_writers, order_longest_first
 from synpick_warp.scheduling.sizes import count_writers
 from synpick_warp.system.descriptors import duplicate_above_streams, open_standard_descriptors
@@ -216,6 +217,16 @@ def _wait_for_hangup(pipes: Sequence[int], timeout: float) -> None:
             left -= 1
 
 
+def prepare_folder(output: OutputFolder, kinds: tuple[type[Exporter], ...], catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> None:
+    """Prepare the folder of a bake that generates no episodes in this process; see `OutputFolder.prepare`."""
+    config = output.config
+    with WriterPool(1, slot_bytes(kinds, config), output.lock) as pool:
+        exporters = Exporters(kinds, ExportContext(output.out, config, catalog, make_cameras(config.cameras), lights, pool))
+        with aborting(pool, exporters):
+            output.prepare(exporters, digest_inputs(catalog, lights), pool)
+            exporters.close()
+
+
 def bake_on_devices(
     config: Config,
     output: OutputFolder,
@@ -246,11 +257,7 @@ def bake_on_devices(
         report = partial(processes.report_once, progress)
         report("stage", "loading objects and lights")
         catalog, lights = load_catalog(config, report=partial(report, "note")), load_lights(config.bake.lights)
-        with WriterPool(1, slot_bytes(kinds, config), output.lock) as pool:
-            exporters = Exporters(kinds, ExportContext(output.out, config, catalog, make_cameras(config.cameras), lights, pool))
-            with aborting(pool, exporters):
-                output.prepare(exporters, digest_inputs(catalog, lights), pool)
-                exporters.close()
+        prepare_folder(output, kinds, catalog, lights)
         dealt = deal_episodes(order_longest_first(config, catalog, output.remaining, pick_device("cpu")), len(names))
         writers = deal_writers(count_writers(config), len(names))
         shares = [

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from synpick_warp.cli.commands import main
 from synpick_warp.cli.options import MAX_LINE, one_line, parse_resolution, parse_shard
+from synpick_warp.configs.load import load_config
+from synpick_warp.configs.splits import plan_shard
 from synpick_warp.errors import ConfigError
 from tests.harness.fuzz import fuzz_examples
 
@@ -45,13 +47,14 @@ def test_whole_numbers_out_of_range_are_refused_by_their_setting(capsys, text, s
     assert capsys.readouterr().err.startswith(f"synpick-warp: error: {said}")
 
 
+SMOKE = load_config("smoke", {})
 TEXT = st.text(st.sampled_from("0123456789xX/.-+e_ ²٣\n")) | st.text(max_size=20)
 
 
 @settings(max_examples=fuzz_examples(100))
 @given(text=TEXT)
 def test_any_text_is_a_resolution_or_a_shard_or_one_line(text):
-    for parse in (parse_resolution, lambda shard: parse_shard(shard, [range(4)])):
+    for parse in (parse_resolution, lambda shard: plan_shard(SMOKE, (), parse_shard(shard), "--shard")):
         message = "accepted"
         try:
             parse(text)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
@@ -19,13 +18,13 @@ import pytest
 import synpick_warp
 from synpick_warp.cli.commands import EXIT_MISTAKE, main
 from synpick_warp.dataset import writing
-from synpick_warp.dataset.manifest import CONSTANTS, committed_episodes, episode_entry, read_checksums
+from synpick_warp.dataset.manifest import CONSTANTS, INDICES, committed_episodes, episode_entry, read_checksums
 from synpick_warp.dataset.merge import merge
 from synpick_warp.dataset.verify import verify
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import PARTIAL
 from tests.harness.bake_server import TINY, BakeServer
-from tests.harness.processes import children, wait_for
+from tests.harness.processes import children, kill_after, wait_for
 
 KILLS = int(os.environ.get("SYNPICK_KILLS", 20))
 """Kills of the test at random times; the long form has 200."""
@@ -83,16 +82,6 @@ def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_ba
             longest = min(longest, 2.0 * (time.monotonic() - started))
 
 
-def kill_after(process: int, seconds: float, writer: bool) -> None:
-    """Kill a process, or its writer if there is one yet; or see it end before."""
-    end = time.monotonic() + seconds
-    with contextlib.suppress(ProcessLookupError, FileNotFoundError):
-        while time.monotonic() < end:
-            os.kill(process, 0)
-            time.sleep(0.01)
-        os.kill(([process, *children(process)] if writer else [process])[-1], signal.SIGKILL)
-
-
 @pytest.fixture(scope="module")
 def changes(server, whole, tmp_path_factory) -> int:
     """Number of changes to its folder by an undisturbed bake."""
@@ -114,12 +103,23 @@ def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected
 
 def test_a_finished_bake_killed_before_it_removed_its_partial_files(server, expected, changes, tmp_path):
     out = tmp_path / "set"
-    # Three more follow: it is removed when it is empty, looked for again, and the data set's folder kept since it is not empty.
+    # Before `.partial` is emptied; three changes would follow: two attempts to remove it, and one to remove the data set's folder.
     assert server.bake(out, alone=True, kill_at=changes - 3) == -signal.SIGKILL
     assert verify(out).finished
     assert digests(out) != expected
     assert server.bake(out) == 0
     assert digests(out) == expected
+
+
+def test_a_shard_removes_the_uncommitted_files_of_others(server, whole, tmp_path):
+    """The bake of all episodes was killed when the shard's own were committed, and another one's files were in place."""
+    out = tmp_path / "set"
+    assert server.bake(out, arguments=["--shard", "0/2"]) == 0
+    shard = digests(out)
+    shutil.copytree(whole / "train/000003", out / "train/000003")
+    (out / f"{INDICES}.json").unlink()
+    assert server.bake(out, arguments=["--shard", "0/2"]) == 0
+    assert digests(out) == shard
 
 
 @pytest.fixture

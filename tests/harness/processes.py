@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import signal
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -18,6 +21,16 @@ def wait_for(condition: Callable[[], bool], timeout: float = 60.0) -> None:
 def children(process: int) -> list[int]:
     """Ids of a process's children."""
     return [int(pid) for pid in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
+
+
+def kill_after(process: int, seconds: float, writer: bool) -> None:
+    """Kill a process, or its writer if there is one yet; or see it end before."""
+    end = time.monotonic() + seconds
+    with contextlib.suppress(ProcessLookupError, FileNotFoundError):
+        while time.monotonic() < end:
+            os.kill(process, 0)
+            time.sleep(0.01)
+        os.kill(([process, *children(process)] if writer else [process])[-1], signal.SIGKILL)
 
 
 def wait_until_gone(pids: Iterable[int], timeout: float = 30.0) -> None:

@@ -68,12 +68,11 @@ def bake(out: Path, config: Config, shard: tuple[int, int] = (0, 1), stop_after:
         summary = BakeSummary(len(output.episodes))
         for episode in output.committed:
             summary.take_record(read_entry(out, episode_entry(episode)) or {})
-        if output.is_finished():
+        if output.is_finished:
             return summary
         with WriterPool(0, slot_bytes(classes, config), output.lock) as pool:
             exporters = Exporters(classes, ExportContext(out, config, box_views.catalog(), _LENSES, skies(), pool))
-            if output.remaining:
-                output.prepare(exporters, INPUTS, pool)
+            output.prepare(exporters, INPUTS, pool)
             for episode in output.remaining[:stop_after]:
                 _write_episode(output, exporters, pool, episode)
             pool.wait()
