@@ -1,6 +1,6 @@
 """Splits of a data set: which episodes each one has, and where its BOP scenes are.
 
-A data set numbers its episodes through: each split is a range of indices. Random streams are keyed by seed and episode index, so splits
+Episode indices are unique in a data set: each split is a range of them. Random streams are keyed by seed and episode index, so splits
 share none; scene ids follow from episode indices, so a scene id names one scene of the whole data set. Without splits there is one range,
 from 0 to `bake.episodes`, in the folder `bop.split`.
 """
@@ -20,7 +20,7 @@ def episode_range(split: Split) -> range:
 
 
 def choose_splits(config: Config, names: Sequence[str]) -> tuple[Split, ...]:
-    """Splits of these names; no names: all splits, which may be none.
+    """Splits with these names, in the order of the settings; no names: all splits, which may be none.
 
     Raises:
         ConfigError: There is no split of a name.
@@ -65,7 +65,7 @@ def check_shard(shard: tuple[int, int], name: str = "shard") -> None:
 
 
 def plan_shard(config: Config, names: Sequence[str], shard: tuple[int, int], name: str = "shard") -> list[range]:
-    """Episode indices of a shard, at least one; otherwise as `plan_episodes` and `check_shard`.
+    """Check a shard, and return its episode indices as `plan_episodes` does.
 
     Raises:
         ConfigError: There is no split of a name, or no such shard, or it has no episode.
@@ -84,17 +84,17 @@ def is_planned(config: Config, episode: int) -> bool:
 
 
 def episodes_end(config: Config) -> int:
-    """One more than the largest episode index."""
+    """End of the planned episode indices: one more than the largest, over all splits."""
     return max(each.stop for each in plan_episodes(config))
 
 
 def split_of(config: Config, episode: int) -> Split | None:
-    """Split of an episode, or for an index in a gap the split before it; None: there are no splits."""
+    """Last split that begins at or before an episode, or else the first one; None: there are no splits."""
     return next((split for split in reversed(config.splits) if split.first <= episode), config.splits[0] if config.splits else None)
 
 
 def bop_folder(config: Config, episode: int) -> str:
-    """Name of the folder of an episode's BOP scenes."""
+    """Name of the folder of a split, such as "train", that holds an episode's BOP scenes."""
     split = split_of(config, episode)
     return config.bop.split if split is None else split.folder
 
@@ -117,10 +117,10 @@ def sensor_name(camera: int) -> str:
 
 
 def bop_folders(config: Config) -> tuple[str, ...]:
-    """Names of the folders of all BOP scenes."""
+    """Names of the folders of all splits, which hold the BOP scenes."""
     return tuple(split.folder for split in config.splits) or (config.bop.split,)
 
 
 def split_kind(folder: str) -> str:
-    """What BOP calls a split's name: train, val or test; the rest of the folder's name is its type."""
+    """BOP's name of a split, from its folder: "train" of "train_pbr"."""
     return folder.partition("_")[0]

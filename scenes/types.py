@@ -38,7 +38,7 @@ class Material:
 
 
 class HullSize(NamedTuple):
-    """Size of the convex hull of a point set; zeros if there is none, since the points are coplanar or nearly so, or not finite."""
+    """Size of the convex hull of a point set; zeros if there is none: the points are coplanar or nearly so."""
 
     volume: float
     """[m³]"""

@@ -48,7 +48,7 @@ def hull_volume(points: np.ndarray) -> float:
 
 
 def _hull_of(points: np.ndarray) -> ConvexHull | None:
-    """Convex hull of points (N, 3) in float64; None if they are coplanar or nearly so (_FLAT), fewer than four, or not finite."""
+    """Convex hull of points (N, 3) in float64; None if they are coplanar or nearly so (_FLAT), or refused by Qhull."""
     try:
         hull = ConvexHull(points.astype(np.float64))
     except QhullError:
@@ -57,7 +57,9 @@ def _hull_of(points: np.ndarray) -> ConvexHull | None:
 
 
 def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
-    """Greedy convex hull simplification: at most `max_vertices` of the points, each chosen because it adds the most volume.
+    """Greedy convex hull simplification: at most `max_vertices` of the points.
+
+    It starts from `_extreme_points`, and adds the point that adds the most volume until that is less than `_MIN_GAIN`.
 
     The gain of a point p is exact: the pyramids over the faces visible from it, V = Σ max(0, n·p + d) A / 3.
 
@@ -89,7 +91,7 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
 
 
 def _extreme_points(points: np.ndarray) -> list[int]:
-    """Initial simplex: indices of four to six points that span a volume, among them the extreme points along the axes."""
+    """Vertices to start from: indices of four points that span a tetrahedron, then of extreme points along the axes, up to six in all."""
     chosen = {int(index) for axis in range(3) for index in (points[:, axis].argmin(), points[:, axis].argmax())}
     first = points[min(chosen)]
     far = int(np.linalg.norm(points - first, axis=1).argmax())

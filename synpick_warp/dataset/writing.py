@@ -1,8 +1,8 @@
-"""Output folder of a bake: lock, resume check, atomic commit of episodes, removal of partial files, indices over all episodes.
+"""Output folder of a bake: lock, resume check, atomic commit of episodes, removal of incomplete ones, indices over all episodes.
 
-An episode is committed when its manifest entry is written, after its files have been renamed into place; anything without entry is partial,
-and is removed when the bake is resumed. Only names that the formats define are removed, whatever lists in the folder say; the manifest
-marks the folder as ours: it is written first and removed last.
+Files are written in a staging folder, `PARTIAL`. An episode is committed when its manifest entry is written, after its files have been
+renamed into place; resuming deletes the files of planned episodes that are not complete. Paths to delete come from the formats, never from
+files in the folder. The manifest marks the folder as ours: it is written first and removed last.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ _ADVICE = "resume with the same, or name another folder with --out"
 
 
 class OutputFolder:
-    """Folder of a data set during a bake: a context manager that locks the folder (flock), and removes the staging folder at its end.
+    """Folder of a data set during a bake: a context manager that locks the folder (flock) and, on exit, removes the staging folder.
 
     The lock belongs to the open file description, so writer processes that inherit the handle hold it, too: no bake starts while a
     writer of a killed bake is still running.
@@ -112,7 +112,7 @@ class OutputFolder:
             os.close(self.lock)
 
     def _scan(self) -> None:
-        """Compare settings, and sort episodes into committed, remaining and partial ones."""
+        """Check an existing data set against the settings; find which of the episodes are complete and which remain."""
         out, config = self.out, self.config
         self._known = read_manifest(out) if os.path.lexists(out / MANIFEST_FILE) else None
         self._is_ours = self._known is not None
@@ -135,7 +135,9 @@ class OutputFolder:
         """Whether all episodes are committed and the indices cover them."""
 
     def prepare(self, exporters: Exporters, inputs: dict[str, str], pool: WriterPool) -> None:
-        """Prepare the folder for the remaining episodes: manifest, settings, constants; remove partial episodes and stale indices.
+        """Prepare the folder for the remaining episodes: remove incomplete ones and all indices; write manifest, settings and constants.
+
+        Complete constants stay as they are.
 
         Args:
             exporters: All exporters of the bake.
@@ -159,7 +161,7 @@ class OutputFolder:
             (self.out / ENTRIES).mkdir(exist_ok=True)
             self._remove_indices()
             if self._known:
-                self._remove_partial(max(episodes_end(self.config), _planned_end(self.out)))
+                self._remove_incomplete(max(episodes_end(self.config), _planned_end(self.out)))
             write_atomically(self.out / CONFIG_FILE, config_to_toml(self.config).encode())
             (self.out / PARTIAL).mkdir()
             if not is_complete(self.out, CONSTANTS):
@@ -193,8 +195,8 @@ class OutputFolder:
             with contextlib.suppress(OSError):
                 (self.out / name).rmdir()
 
-    def _remove_partial(self, end: int) -> None:
-        """Remove the files of all episodes below `end` that are not complete: names that the formats give to an episode."""
+    def _remove_incomplete(self, end: int) -> None:
+        """Delete entry and files of each incomplete episode with an index below `end`."""
         assert self._exporters is not None
         for episode in sorted(index for index in self._named_episodes() - self._complete if index < end):
             self._remove_entry(episode_entry(episode))
@@ -202,7 +204,7 @@ class OutputFolder:
                 _remove(self.out / path)
 
     def _named_episodes(self) -> set[int]:
-        """Episodes that may have files: the index in a file's name is an episode's or a scene's."""
+        """Superset of the episodes that have files: a number in a name counts as an episode index and as a BOP scene id."""
         cameras = len(self.config.cameras.positions)
         found: set[int] = set()
         for folder in (ENTRIES, *self._shared.folders):
@@ -222,9 +224,9 @@ class OutputFolder:
     def _clean_up(self) -> None:
         """Remove the staging folder, after success or an error; a data set without committed episodes is removed entirely.
 
-        A finished data set has one, too, if its bake was killed after it had committed the indices. Files of uncommitted episodes that are
-        in place already are removed by the next `prepare`. Removed are names that the formats define, in a folder with our manifest:
-        everything else, such as hidden files of the user's, and folders that existed before, stay.
+        Even a finished data set has a staging folder, if its bake was killed between the commit of the indices and its removal. Files of
+        uncommitted episodes that are in place already are removed by the next `prepare`. Removed are names that the formats define, in a
+        folder with our manifest: everything else, such as hidden files of the user's, and folders that existed before, stay.
         """
         with contextlib.suppress(OSError, DatasetError):
             if self._is_ours:
@@ -239,7 +241,7 @@ class OutputFolder:
         """Remove a data set without episodes. While anything of it stays, the manifest does, so that a bake can resume it."""
         self._complete = set()
         if self._exporters is not None:
-            self._remove_partial(episodes_end(self.config))
+            self._remove_incomplete(episodes_end(self.config))
         self._remove_indices()
         self._remove_constants()
         if any(os.path.lexists(self.out / folder) for folder in self._shared.folders):
@@ -253,7 +255,7 @@ class OutputFolder:
 
 
 def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: EpisodeEnd) -> None:
-    """Commit an episode whose files are all in place: writers hash them in parallel, then one of them writes the manifest entry.
+    """Queue the commit of an episode whose files are all in place: writers hash them in parallel, then one writes the manifest entry.
 
     There is one task for each file or folder that `Exporters.files` names, and one for the entry.
     """
@@ -262,18 +264,18 @@ def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: Episo
     parts = name_parts(out, entry, len(paths))
     missing = set(parts)
 
-    def join() -> None:
+    def submit_entry() -> None:
         pool.submit(join_manifest_entry, (), (out, entry, parts, content), path=out / entry)
 
-    def finish(part: Path) -> None:
+    def on_hashed(part: Path) -> None:
         missing.remove(part)
         if not missing:
-            join()
+            submit_entry()
 
     for path, part in zip(paths, parts, strict=True):
-        pool.submit(write_checksums, (), (out, path, part), path=out / entry, on_done=partial(finish, part))
+        pool.submit(write_checksums, (), (out, path, part), path=out / entry, on_done=partial(on_hashed, part))
     if not parts:  # An episode that was given up has no files.
-        join()
+        submit_entry()
 
 
 def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:
@@ -294,7 +296,10 @@ def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]]
 
 
 def build_lists(out: Path, config: Config) -> list[Path]:
-    """Write the lists of episodes and of attempts from the manifest entries, sorted by episode; returns both files."""
+    """Write the list of episodes, and if the bake may pick that of attempts, from the manifest entries, sorted by episode.
+
+    Returns their paths, relative to the data set.
+    """
     paths = [Path(name) for name in (EPISODES_FILE, *((ATTEMPTS_FILE,) if may_pick(config) else ()))]
     for path in paths:
         with (out / PARTIAL / path).open("w", encoding="ascii") as file:
@@ -312,7 +317,7 @@ def build_lists(out: Path, config: Config) -> list[Path]:
 
 
 def _planned_end(out: Path) -> int:
-    """One more than the largest episode index of the last bake of the folder; 0 if its settings cannot be read."""
+    """End of the episode indices that the settings in the folder plan; 0 if these cannot be read."""
     with contextlib.suppress(ConfigError, DatasetError):
         check_regular_file(out / CONFIG_FILE, MAX_TOML, DatasetError)
         return episodes_end(load_config(str(out / CONFIG_FILE), {}))
@@ -336,7 +341,11 @@ def _check_links(out: Path, shared: SharedFiles) -> None:
 
 
 def lock_folder(out: Path) -> int:
-    """Lock a folder by an open handle, which is returned; file systems without locks are used unlocked."""
+    """Lock a folder (flock); returns its open handle, which holds the lock. File systems without locks are used unlocked.
+
+    Raises:
+        OutputError: The folder stayed locked for LOCK_TIMEOUT.
+    """
     handle = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
     deadline = time.monotonic() + LOCK_TIMEOUT
     while True:
@@ -349,6 +358,7 @@ def lock_folder(out: Path) -> int:
             time.sleep(_LOCK_INTERVAL)
         except OSError as error:
             if error.errno not in (errno.ENOTSUP, errno.ENOLCK, errno.EBADF, errno.ENOSYS, errno.EINVAL):
+                os.close(handle)
                 raise
             return handle
         else:

@@ -33,7 +33,7 @@ WRITERS_KILLED = 0.25
 EPISODES = TINY["bake.episodes"]
 PAGE = os.sysconf("SC_PAGE_SIZE")
 FILES_OF_THE_MANIFEST = 2 + 2 * (EPISODES + 2)
-"""Settings, manifest and records have no checksum of their own."""
+"""Files without a checksum: settings, manifest, and two for each entry."""
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -61,7 +61,7 @@ def expected(whole) -> dict[str, str]:
 
 def test_killed_at_any_time_and_resumed_the_files_are_those_of_an_undisturbed_bake(server, expected, tmp_path):
     """The time of each kill is drawn anew, and whether it meets the bake or its writer; whenever a bake ends in between, another folder is
-    begun. The longest time to a kill follows the bakes that end: a machine may be busy while the first is timed."""
+    begun. The longest time to a kill is at most twice the time of any bake that ends: a machine may be busy while the first is timed."""
     numbers = random.Random(0)
     started = time.monotonic()
     assert server.bake(tmp_path / "timed") == 0
@@ -93,7 +93,7 @@ def changes(server, whole, tmp_path_factory) -> int:
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.4, 0.97, 0.995])
 def test_killed_before_some_change_of_its_folder_a_bake_goes_on(server, expected, changes, tmp_path, share):
-    """All files are written by the process that is killed, so that it is known where: at the beginning, amid files, amid lists."""
+    """Killed, resumed, killed again and resumed. One process writes all files (`alone`), so that the places are known."""
     out = tmp_path / "set"
     assert server.bake(out, alone=True, kill_at=1 + round(share * changes)) == -signal.SIGKILL
     server.bake(out, alone=True, kill_at=round((1.0 - share) * changes / 2))
@@ -112,7 +112,7 @@ def test_a_finished_bake_killed_before_it_removed_its_partial_files(server, expe
 
 
 def test_a_shard_removes_the_uncommitted_files_of_others(server, whole, tmp_path):
-    """The bake of all episodes was killed when the shard's own were committed, and another one's files were in place."""
+    """A whole bake was killed when the shard's episodes were committed, and files of another one were in place without an entry."""
     out = tmp_path / "set"
     assert server.bake(out, arguments=["--shard", "0/2"]) == 0
     shard = digests(out)

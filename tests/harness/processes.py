@@ -1,4 +1,4 @@
-"""Processes that tests observe: their children, their end, and what they bring about."""
+"""Helpers to wait for, inspect and kill processes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 
 def wait_for(condition: Callable[[], bool], timeout: float = 60.0) -> None:
-    """Wait until a condition holds."""
+    """Wait until a condition holds; fails after `timeout` seconds."""
     deadline = time.monotonic() + timeout
     while not condition():
         assert time.monotonic() < deadline
@@ -24,7 +24,7 @@ def children(process: int) -> list[int]:
 
 
 def kill_after(process: int, seconds: float, writer: bool) -> None:
-    """Kill a process, or its writer if there is one yet; or see it end before."""
+    """Kill a bake's process after a time, or `writer`: its last child, if it has one. Returns early if the process ends before."""
     end = time.monotonic() + seconds
     with contextlib.suppress(ProcessLookupError, FileNotFoundError):
         while time.monotonic() < end:
