@@ -20,10 +20,10 @@ def episode_range(split: Split) -> range:
 
 
 def choose_splits(config: Config, names: Sequence[str]) -> tuple[Split, ...]:
-    """Splits with these names, in the order of the settings; no names: all splits, which may be none.
+    """Return the splits with the given names, in the order of the settings, or all splits if `names` is empty.
 
     Raises:
-        ConfigError: There is no split of a name.
+        ConfigError: An unknown split.
     """
     if not names:
         return config.splits
@@ -45,7 +45,7 @@ def plan_episodes(config: Config, names: Sequence[str] = (), shard: tuple[int, i
         shard: (i, n): only indices with index % n == i.
 
     Raises:
-        ConfigError: There is no split of a name.
+        ConfigError: An unknown split.
     """
     index, count = shard
     splits = choose_splits(config, names)
@@ -54,10 +54,10 @@ def plan_episodes(config: Config, names: Sequence[str] = (), shard: tuple[int, i
 
 
 def check_shard(shard: tuple[int, int], name: str = "shard") -> None:
-    """Check that a shard (i, n) has 0 <= i < n; `name` names it in the message.
+    """Validate a shard (i, n); arguments as in `plan_shard`.
 
     Raises:
-        ConfigError: It has not.
+        ConfigError: Not 0 <= i < n.
     """
     index, count = shard
     if not 0 <= index < count:
@@ -65,10 +65,16 @@ def check_shard(shard: tuple[int, int], name: str = "shard") -> None:
 
 
 def plan_shard(config: Config, names: Sequence[str], shard: tuple[int, int], name: str = "shard") -> list[range]:
-    """Check a shard, and return its episode indices as `plan_episodes` does.
+    """Validate a shard and return its episode indices, ascending, one range per split.
+
+    Args:
+        config: All settings.
+        names: Splits; empty: all.
+        shard: (i, n): only indices with index % n == i.
+        name: Name of the shard in messages, such as that of the option.
 
     Raises:
-        ConfigError: There is no split of a name, or no such shard, or it has no episode.
+        ConfigError: An unknown split, an invalid shard, or a shard without episodes.
     """
     check_shard(shard, name)
     planned = plan_episodes(config, names, shard)
@@ -79,22 +85,25 @@ def plan_shard(config: Config, names: Sequence[str], shard: tuple[int, int], nam
 
 
 def is_planned(config: Config, episode: int) -> bool:
-    """Whether the settings plan an episode of this index."""
+    """Whether an episode index belongs to the planned episodes."""
     return any(episode in each for each in plan_episodes(config))
 
 
 def episodes_end(config: Config) -> int:
-    """End of the planned episode indices: one more than the largest, over all splits."""
+    """Exclusive upper bound of the planned episode indices, over all splits."""
     return max(each.stop for each in plan_episodes(config))
 
 
 def split_of(config: Config, episode: int) -> Split | None:
-    """Last split that begins at or before an episode, or else the first one; None: there are no splits."""
+    """Split of an episode index; None if there are no splits.
+
+    An index between two splits belongs to the earlier one, an index below all splits to the first.
+    """
     return next((split for split in reversed(config.splits) if split.first <= episode), config.splits[0] if config.splits else None)
 
 
 def bop_folder(config: Config, episode: int) -> str:
-    """Name of the folder of a split, such as "train", that holds an episode's BOP scenes."""
+    """Name of the split folder with an episode's BOP scenes, such as "train_pbr"."""
     split = split_of(config, episode)
     return config.bop.split if split is None else split.folder
 
@@ -117,10 +126,10 @@ def sensor_name(camera: int) -> str:
 
 
 def bop_folders(config: Config) -> tuple[str, ...]:
-    """Names of the folders of all splits, which hold the BOP scenes."""
+    """Names of all split folders."""
     return tuple(split.folder for split in config.splits) or (config.bop.split,)
 
 
 def split_kind(folder: str) -> str:
-    """BOP's name of a split, from its folder: "train" of "train_pbr"."""
+    """Name of a BOP split without its type: "train" for the folder "train_pbr"."""
     return folder.partition("_")[0]

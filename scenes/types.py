@@ -38,12 +38,12 @@ class Material:
 
 
 class HullSize(NamedTuple):
-    """Size of the convex hull of a point set; zeros if there is none: the points are coplanar or nearly so."""
+    """Volume and diameter of the convex hull of a point set; both are 0 for coplanar points."""
 
     volume: float
     """[m³]"""
     diameter: float
-    """The largest distance between two points [m]."""
+    """Maximum distance between two points [m]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,6 +16,8 @@ from synpick_warp.scenes.types import ConvexPiece, HullSize
 _MIN_GAIN = 1e-4
 # Points count as coplanar if their hull fills less than this fraction of the cube of their extent: 0.2 µm on a sheet of 0.2 m.
 _FLAT = 1e-6
+# Rows of the distance matrix that are computed at a time: fine round meshes have tens of thousands of hull vertices.
+_DISTANCE_ROWS = 1024
 
 
 @dataclass(frozen=True)
@@ -31,24 +33,23 @@ class MassProperties:
 
 
 def hull_size(points: np.ndarray) -> HullSize:
-    """Volume and diameter of the convex hull of points (N, 3) [m]; zeros if there is none."""
+    """Compute volume and diameter of the convex hull of points (N, 3) [m]; both are 0 for degenerate points."""
     hull = _hull_of(points)
     if hull is None:
         return HullSize(0.0, 0.0)
     corners = hull.points[hull.vertices]
-    # In blocks, since fine round meshes have tens of thousands of hull vertices.
-    diameter = max(float(cdist(corners[start : start + 1024], corners).max()) for start in range(0, len(corners), 1024))
-    return HullSize(float(hull.volume), diameter)
+    blocks = (corners[start : start + _DISTANCE_ROWS] for start in range(0, len(corners), _DISTANCE_ROWS))
+    return HullSize(float(hull.volume), max(float(cdist(block, corners).max()) for block in blocks))
 
 
 def hull_volume(points: np.ndarray) -> float:
-    """Volume of the convex hull of points (N, 3) [m³]; 0 if there is none."""
+    """Compute the volume of the convex hull of points (N, 3) [m³]; 0 for degenerate points."""
     hull = _hull_of(points)
     return 0.0 if hull is None else float(hull.volume)
 
 
 def _hull_of(points: np.ndarray) -> ConvexHull | None:
-    """Convex hull of points (N, 3) in float64; None if they are coplanar or nearly so (_FLAT), or refused by Qhull."""
+    """Compute the convex hull of points (N, 3) in float64; None for degenerate points: coplanar ones, by `_FLAT` or Qhull."""
     try:
         hull = ConvexHull(points.astype(np.float64))
     except QhullError:
@@ -57,15 +58,14 @@ def _hull_of(points: np.ndarray) -> ConvexHull | None:
 
 
 def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
-    """Greedy convex hull simplification: at most `max_vertices` of the points.
+    """Greedy convex hull simplification: select points whose convex hull has nearly the volume of the full hull.
 
-    It starts from `_extreme_points`, and adds the point that adds the most volume until that is less than `_MIN_GAIN`.
-
-    The gain of a point p is exact: the pyramids over the faces visible from it, V = Σ max(0, n·p + d) A / 3.
+    Starting from `_extreme_points`, the point with the largest volume gain is added until there are `max_vertices`, or the gain falls
+    below `_MIN_GAIN`. The gain of a point p is the volume of the pyramids over the faces visible from it, Σ max(0, n·p + d) A / 3.
 
     Args:
         points: (N, 3) [m].
-        max_vertices: At least 6.
+        max_vertices: Maximum number of vertices, at least 6.
 
     Raises:
         CatalogError: The points are coplanar.
@@ -91,7 +91,7 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
 
 
 def _extreme_points(points: np.ndarray) -> list[int]:
-    """Vertices to start from: indices of four points that span a tetrahedron, then of extreme points along the axes, up to six in all."""
+    """Initial vertices, at most six: indices of four points that span a tetrahedron, then of extreme points along the axes."""
     chosen = {int(index) for axis in range(3) for index in (points[:, axis].argmin(), points[:, axis].argmax())}
     first = points[min(chosen)]
     far = int(np.linalg.norm(points - first, axis=1).argmax())

@@ -112,7 +112,7 @@ class OutputFolder:
             os.close(self.lock)
 
     def _scan(self) -> None:
-        """Check an existing data set against the settings; find which of the episodes are complete and which remain."""
+        """Validate an existing data set against the settings, and determine its complete and remaining episodes."""
         out, config = self.out, self.config
         self._known = read_manifest(out) if os.path.lexists(out / MANIFEST_FILE) else None
         self._is_ours = self._known is not None
@@ -173,7 +173,7 @@ class OutputFolder:
             raise output_error(self.out, error) from error
 
     def _write_constants(self, exporters: Exporters) -> list[Path]:
-        """Have constants written; an error removes what was added."""
+        """Let the exporters write the constants; on an error, delete what was written."""
         try:
             return exporters.write_constants()
         except BaseException:
@@ -187,7 +187,7 @@ class OutputFolder:
         self._remove_entry(INDICES)
 
     def _remove_constants(self) -> None:
-        """Remove constants, and the folders of the formats that are then empty."""
+        """Delete the constants, and folders of formats if they are empty then."""
         self._remove_entry(CONSTANTS)
         for name in self._shared.constants:
             _remove(self.out / name)
@@ -196,7 +196,7 @@ class OutputFolder:
                 (self.out / name).rmdir()
 
     def _remove_incomplete(self, end: int) -> None:
-        """Delete entry and files of each incomplete episode with an index below `end`."""
+        """Delete the manifest entries and files of incomplete episodes with indices below `end`."""
         assert self._exporters is not None
         for episode in sorted(index for index in self._named_episodes() - self._complete if index < end):
             self._remove_entry(episode_entry(episode))
@@ -204,7 +204,7 @@ class OutputFolder:
                 _remove(self.out / path)
 
     def _named_episodes(self) -> set[int]:
-        """Superset of the episodes that have files: a number in a name counts as an episode index and as a BOP scene id."""
+        """Superset of the episodes with files: each number in a file name is taken as an episode index and as a BOP scene id."""
         cameras = len(self.config.cameras.positions)
         found: set[int] = set()
         for folder in (ENTRIES, *self._shared.folders):
@@ -224,9 +224,9 @@ class OutputFolder:
     def _clean_up(self) -> None:
         """Remove the staging folder, after success or an error; a data set without committed episodes is removed entirely.
 
-        Even a finished data set has a staging folder, if its bake was killed between the commit of the indices and its removal. Files of
-        uncommitted episodes that are in place already are removed by the next `prepare`. Removed are names that the formats define, in a
-        folder with our manifest: everything else, such as hidden files of the user's, and folders that existed before, stay.
+        A finished data set still has a staging folder if its bake was killed before deleting it. Uncommitted files outside of it are
+        deleted by the next `prepare`. Only names defined by the formats are deleted, and only in a folder with our manifest: other files,
+        such as hidden files of the user, and folders that existed before the bake stay.
         """
         with contextlib.suppress(OSError, DatasetError):
             if self._is_ours:
@@ -238,7 +238,7 @@ class OutputFolder:
                 folder.rmdir()
 
     def _remove_data_set(self) -> None:
-        """Remove a data set without episodes. While anything of it stays, the manifest does, so that a bake can resume it."""
+        """Delete a data set without episodes. Its manifest is deleted last, and stays if other files do, so that a bake can resume."""
         self._complete = set()
         if self._exporters is not None:
             self._remove_incomplete(episodes_end(self.config))
@@ -279,10 +279,10 @@ def commit_episode(out: Path, exporters: Exporters, pool: WriterPool, end: Episo
 
 
 def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]], pool: WriterPool) -> None:
-    """Build the indices over all committed episodes, and commit them.
+    """Write and commit the indices of the data set: lists of episodes, attempts and evaluation targets over all committed episodes.
 
     Raises:
-        OutputError: They cannot be written.
+        OutputError: A file cannot be written.
     """
     try:
         shutil.rmtree(out / PARTIAL, ignore_errors=True)
@@ -296,9 +296,10 @@ def finalize_data_set(out: Path, config: Config, kinds: Sequence[type[Exporter]]
 
 
 def build_lists(out: Path, config: Config) -> list[Path]:
-    """Write the list of episodes, and if the bake may pick that of attempts, from the manifest entries, sorted by episode.
+    """Write the list of episodes, and in modes with picking the list of attempts, from the manifest entries, sorted by episode.
 
-    Returns their paths, relative to the data set.
+    Returns:
+        Paths of the lists, relative to the data set.
     """
     paths = [Path(name) for name in (EPISODES_FILE, *((ATTEMPTS_FILE,) if may_pick(config) else ()))]
     for path in paths:
@@ -317,7 +318,7 @@ def build_lists(out: Path, config: Config) -> list[Path]:
 
 
 def _planned_end(out: Path) -> int:
-    """End of the episode indices that the settings in the folder plan; 0 if these cannot be read."""
+    """Exclusive upper bound of the episode indices planned by the folder's own settings; 0 if they cannot be read."""
     with contextlib.suppress(ConfigError, DatasetError):
         check_regular_file(out / CONFIG_FILE, MAX_TOML, DatasetError)
         return episodes_end(load_config(str(out / CONFIG_FILE), {}))
@@ -325,10 +326,10 @@ def _planned_end(out: Path) -> int:
 
 
 def _check_links(out: Path, shared: SharedFiles) -> None:
-    """Refuse symbolic links where a bake writes or removes files: they may lead out of the folder.
+    """Reject symbolic links at paths that a bake writes or deletes, because they may point outside of the folder.
 
     Raises:
-        OutputError: There is one.
+        OutputError: A path is a symbolic link.
     """
     names = [ENTRIES, PARTIAL, CONFIG_FILE, EPISODES_FILE, ATTEMPTS_FILE, *shared.constants, *shared.indices, *shared.folders]
     links = [out / name for name in names if (out / name).is_symlink()]

@@ -218,7 +218,7 @@ def _wait_for_hangup(pipes: Sequence[int], timeout: float) -> None:
 
 
 def prepare_folder(output: OutputFolder, kinds: tuple[type[Exporter], ...], catalog: Catalog, lights: tuple[EnvironmentMap, ...]) -> None:
-    """Prepare the folder of a bake that generates no episodes in this process; see `OutputFolder.prepare`."""
+    """Prepare the output folder (`OutputFolder.prepare`) in a process that generates no episodes itself."""
     config = output.config
     with WriterPool(1, slot_bytes(kinds, config), output.lock) as pool:
         exporters = Exporters(kinds, ExportContext(output.out, config, catalog, make_cameras(config.cameras), lights, pool))

@@ -21,7 +21,7 @@ from tests.worlds.small_worlds import catalog, settings
 
 TICKS = 30
 ARCHITECTURE, DOFS, BODIES, ROWS = 90, 16, 5, 96
-"""CUDA architecture and capacities of a small world, for which the kernel is compiled."""
+"""Compile-time constants of the kernel under test: CUDA compute capability, and capacities of a small world."""
 
 
 def test_the_installed_version_of_newton_is_fused():
