@@ -18,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe, decompose
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
+from synpick_warp.system.cores import count_cores
 
 _WORKER = "from synpick_warp.scenes.collision.parallel import main; main()"
 """Program of a process: imported, not run as `__main__`, so that pickled results name the modules' own classes."""
@@ -27,7 +28,7 @@ Job = tuple[str, TriangleMesh, ShapeRecipe]
 
 
 def decompose_all(jobs: Sequence[Job]) -> Iterator[tuple[ConvexPiece, ...]]:
-    """Decompose concave objects in as many processes as there are cores and jobs; a single one in this process.
+    """Decompose concave objects in one process per job, as many at a time as there are usable cores; a single job in this process.
 
     Yields:
         The pieces of each job, in order, each as soon as it and all before it are done.
@@ -39,7 +40,7 @@ def decompose_all(jobs: Sequence[Job]) -> Iterator[tuple[ConvexPiece, ...]]:
         yield from (decompose(mesh, recipe) for _, mesh, recipe in jobs)
         return
     workers = _Workers()
-    with ThreadPoolExecutor(min(len(jobs), os.cpu_count() or 1)) as threads:
+    with ThreadPoolExecutor(min(len(jobs), count_cores())) as threads:
         try:
             yield from threads.map(workers.run, jobs)
         finally:

@@ -18,6 +18,7 @@ from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.errors import DeviceError
 from synpick_warp.scenes.collision.shapes import default_cache_dir
 from synpick_warp.system.caches import KERNEL_VARIABLE, USER_VARIABLE, find_fault
+from synpick_warp.system.cores import count_cores
 from synpick_warp.system.device import pick_device
 from synpick_warp.system.green_contexts import SmPartition, count_reserved
 
@@ -69,8 +70,7 @@ def _software() -> list[tuple[str, str]]:
 
 
 def _host() -> list[tuple[str, str]]:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    rows = [("CPU cores", f"{usable} usable of {os.cpu_count()}")]
+    rows = [("CPU cores", f"{count_cores()} usable of {os.cpu_count()}")]
     if hasattr(os, "sysconf"):
         rows.append(("memory", f"{os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / GIB:.1f} GiB"))
     return rows

@@ -45,8 +45,9 @@ def show_statistics(
             raise ConfigError(f"--csv is {csv}, inside the data set {folder}; name a folder outside of it")
     from synpick_warp.cli.display import ViewCounter, make_console
     from synpick_warp.dataset.reading import open_data_set
-    from synpick_warp.statistics.collect import collect, count_cores
+    from synpick_warp.statistics.collect import collect
     from synpick_warp.statistics.compute import assemble
+    from synpick_warp.system.cores import count_cores
 
     data_set = open_data_set(folder)
     if not (folder / "config.toml").exists():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,6 +15,7 @@ from synpick_warp.dataset.writing import OutputFolder, finalize_data_set
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.system.cores import count_cores
 
 AHEAD = 2
 """Episodes in work for each process: enough to keep all busy, few enough to need little memory and disk space."""
@@ -54,7 +54,7 @@ def convert(folder: Path, out: Path, formats: Sequence[str], processes: int, rep
         resumed = len(output.committed)
         if output.is_finished:
             return Converted(resumed, resumed)
-        with WriterPool(processes or len(os.sched_getaffinity(0)), 0, output.lock) as pool:
+        with WriterPool(processes or count_cores(), 0, output.lock) as pool:
             converters = Converters(source, out, config, pool)
             output.prepare(converters, source.inputs, pool)
             _convert_episodes(source, output, converters, pool, report)

@@ -37,6 +37,7 @@ from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
 from synpick_warp.exporters.writing.checksums import open_regular
 from synpick_warp.exporters.writing.files import MANIFEST_FILE, check_output_folder, output_error, write_atomically
 from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.system.cores import count_cores
 
 MAX_EPISODES = 10_000_000
 """Most episodes of a merged data set: its missing ones are listed."""
@@ -165,7 +166,7 @@ def _fill(out: Path, sources: dict[Path, Path], config: Config, manifest: bytes)
         except BaseException:
             added.remove()
             raise
-        writers = config.bake.writers or len(os.sched_getaffinity(0))
+        writers = config.bake.writers or count_cores()
         with WriterPool(writers, slot_bytes(kinds, config), lock) as pool:
             finalize_data_set(out, config, kinds, pool)
     finally:

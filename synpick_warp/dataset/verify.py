@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
@@ -21,6 +20,7 @@ from synpick_warp.dataset.manifest import (
 )
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.checksums import checksum
+from synpick_warp.system.cores import count_cores
 
 _AHEAD = 4
 """Queued files per thread: enough to keep it busy."""
@@ -70,7 +70,7 @@ def verify(folder: Path) -> Verdict:
 
 def check_files(folder: Path, known: dict[str, str]) -> Iterator[tuple[str, str]]:
     """Yield (name, problem) of each file, in order; files are read in parallel, with bounded read-ahead."""
-    threads = len(os.sched_getaffinity(0))
+    threads = count_cores()
     with ThreadPoolExecutor(threads) as pool:
         names = iter(known)
         while batch := list(islice(names, _AHEAD * threads)):

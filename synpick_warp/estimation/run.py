@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +18,7 @@ from synpick_warp.estimation.scenes import Scene, ScenePlan, group_scenes, read_
 from synpick_warp.evaluation.poses import PoseTable
 from synpick_warp.evaluation.targets import Target, TargetList, count_targets
 from synpick_warp.stages.pose.batch import Estimates
+from synpick_warp.system.cores import count_cores
 from synpick_warp.system.free_memory import free_host_memory
 
 MAX_VIEWS = 128
@@ -42,7 +42,7 @@ class Options:
     """Of disturbed starts and mask errors."""
     views: int = 0
     """Views at a time; 0: automatic."""
-    threads: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
+    threads: int = field(default_factory=count_cores)
     """Processes that read scenes and images, or threads if there are few."""
 
 

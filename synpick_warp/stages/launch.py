@@ -11,12 +11,9 @@ import warp as wp
 
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.tuning import CPU_PIECE_PIXELS, CPU_PIECES, PIXEL_BLOCK
+from synpick_warp.system.cores import count_cores
 
-
-@functools.cache
-def _cores() -> int:
-    """CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_cores = functools.cache(count_cores)
 
 
 @functools.cache

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import resource
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -26,11 +25,6 @@ _AHEAD = 2
 """Unanswered messages per process: one is worked on, the other waits."""
 _KIBIBYTE = 1024
 """Unit of `ru_maxrss` on Linux."""
-
-
-def count_cores() -> int:
-    """Usable CPU cores."""
-    return len(os.sched_getaffinity(0))
 
 
 class SceneTask(NamedTuple):

@@ -11,13 +11,14 @@ from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError
 from synpick_warp.statistics.annotations import Annotations
 from synpick_warp.statistics.attempts import Episodes
-from synpick_warp.statistics.collect import Collected, Report, collect, count_cores
+from synpick_warp.statistics.collect import Collected, Report, collect
 from synpick_warp.statistics.counting import Group
 from synpick_warp.statistics.coverage import Coverage
 from synpick_warp.statistics.depth import Depth
 from synpick_warp.statistics.lights import Lights
 from synpick_warp.statistics.paper import Comparison, compare
 from synpick_warp.statistics.timeline import TimePoint
+from synpick_warp.system.cores import count_cores
 
 DEPTH_VIEWS = 64
 """Views whose depth image is read."""

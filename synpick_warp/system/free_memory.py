@@ -12,9 +12,15 @@ from pathlib import Path
 
 import warp as wp
 
+from synpick_warp.system.control_groups import list_control_groups, read_text
+
 _UNLIMITED = 1 << 60
 """Control groups without a limit report "max", or a number above this [bytes]."""
-_GROUPS = Path("/sys/fs/cgroup")
+_FILES = {
+    1: ("memory.limit_in_bytes", "memory.usage_in_bytes", ("total_inactive_file", "total_active_file")),
+    2: ("memory.max", "memory.current", ("inactive_file", "active_file", "slab_reclaimable")),
+}
+"""Files of a control group by version: limit, use, and the keys of memory.stat that count caches."""
 
 
 def free_device_memory(device: wp.Device) -> int:
@@ -43,36 +49,15 @@ def free_host_memory(root: Path = Path("/")) -> int:
 
 def _group_limits(root: Path) -> Iterator[int]:
     """Memory that each control group of this process leaves [bytes]; groups without a limit are left out."""
-    groups = root / _GROUPS.relative_to("/")
-    for line in _read(root / "proc/self/cgroup").splitlines():
-        _, controllers, path = [*line.split(":", 2), "", ""][:3]
-        if controllers == "":  # Version 2 has one hierarchy for all controllers.
-            yield from _walk(groups, path, "memory.max", "memory.current", ("inactive_file", "active_file", "slab_reclaimable"))
-        elif "memory" in controllers.split(","):
-            names = ("total_inactive_file", "total_active_file")
-            yield from _walk(groups / "memory", path, "memory.limit_in_bytes", "memory.usage_in_bytes", names)
-
-
-def _walk(folder: Path, path: str, limit_name: str, used_name: str, cached: tuple[str, ...]) -> Iterator[int]:
-    """Free memory that each limited control group leaves, from the given group up to the root [bytes]; a container sees its own as root."""
-    parts = [part for part in path.split("/") if part not in ("", "..")]
-    for depth in range(len(parts), -1, -1):
-        group = folder.joinpath(*parts[:depth])
-        limit, used = _read(group / limit_name).strip(), _read(group / used_name).strip()
-        if limit.isdigit() and used.isdigit() and int(limit) < _UNLIMITED:
+    for version, group in list_control_groups("memory", root):
+        limit_name, used_name, cached = _FILES[version]
+        limit, used = (read_text(group / name).strip() for name in (limit_name, used_name))
+        if limit.isdecimal() and used.isdecimal() and int(limit) < _UNLIMITED:
             table = _read_table(group / "memory.stat")
             yield max(0, int(limit) - int(used) + sum(table.get(name, 0) for name in cached))
 
 
 def _read_table(path: Path) -> dict[str, int]:
     """Numbers by name, of lines that begin with a name and a number."""
-    words = (line.split() for line in _read(path).splitlines())
-    return {parts[0]: int(parts[1]) for parts in words if len(parts) > 1 and parts[1].isdigit()}
-
-
-def _read(path: Path) -> str:
-    """Read a file of the kernel's interface (procfs, cgroupfs); empty text if it cannot be read."""
-    try:
-        return path.read_text()
-    except (OSError, UnicodeDecodeError):
-        return ""
+    words = (line.split() for line in read_text(path).splitlines())
+    return {parts[0]: int(parts[1]) for parts in words if len(parts) > 1 and parts[1].isdecimal()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 
 from synpick_warp.dataset.manifest import read_manifest, read_settings
 from synpick_warp.errors import DatasetError, SynpickError
+from synpick_warp.system.cores import count_cores
 from synpick_warp.validation.keyed import KeyedFolder
 from synpick_warp.validation.layout import Layout, SceneRef
 from synpick_warp.validation.model_files import ModelsFolder
@@ -39,7 +39,7 @@ class Options:
     """Views that are rendered again, spread over all views; None: all."""
     images: bool = True
     """Whether images are read; otherwise only files, annotations, models and lists are checked."""
-    threads: int = field(default_factory=lambda: len(os.sched_getaffinity(0)))
+    threads: int = field(default_factory=count_cores)
 
 
 @dataclass

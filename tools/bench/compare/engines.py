@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -14,6 +13,7 @@ import warp as wp
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.stages.sim.physics import make_pipeline, make_solver
+from synpick_warp.system.cores import count_cores
 from tools.bench.compare.piles import Pile, build_piles
 
 WARM_STEPS = 2
@@ -159,7 +159,7 @@ class MujocoEngine:
     def __init__(self, config: Config, pile: Pile, cone: str) -> None:
         self.mujoco, self.rollout = importlib.import_module("mujoco"), importlib.import_module("mujoco.rollout")
         self.config, self.cone = config, cone
-        self.threads = len(os.sched_getaffinity(0))
+        self.threads = count_cores()
         self.worlds = WORLDS_PER_THREAD * self.threads
         self.name = f"MuJoCo ({cone} cone, {CONES[cone]} iterations, {self.threads} threads)"
         self.state = np.zeros((self.worlds, 0))
