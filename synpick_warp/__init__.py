@@ -61,8 +61,8 @@ def bake(
         settings: Full key, such as "bake.mode", -> value; they override a preset or file.
         shard: (i, n): only episodes with index % n == i.
         splits: Only episodes of these splits of the settings, such as ("train",) of the preset "synpick"; empty: all.
-        devices: Devices with a process each: GPUs such as ("cuda:0", "cuda:1"), or ("all",), or "cpu" once per process. The bytes are those
-            of one device. Empty: `bake.device` alone.
+        devices: Devices with a process each: GPUs such as ("cuda:0", "cuda:1"), or "cpu" once per process, or ("all",): every GPU, or
+            without one a process per CPU core. The bytes are those of one device. Empty: `bake.device` alone.
         progress: Receives stages, counts and notes; None: silent. See `synpick_warp.progress`.
 
     Returns:

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp import pipeline
 from synpick_warp.cli import commands
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.configs.load import load_config
 from synpick_warp.errors import OutputError
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.writing.png import frame_depth_png
+from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import ticks, timing
@@ -53,7 +53,7 @@ def tiny(**overrides: object):
 def boxes():
     """All bakes here are of boxes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
         yield
 
 

@@ -15,6 +15,7 @@ from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.load import load_config, sections, settings_of
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import ConfigError, SynpickError
+from synpick_warp.factory import assembly
 from synpick_warp.memory_plan import check_memory, describe_memory, plan_memory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.system.free_memory import free_host_memory
@@ -40,7 +41,7 @@ def refusal(tmp_path: Path, monkeypatch, **overrides: object) -> str:
     def load_catalog(config: Config, report: object) -> None:
         raise AssertionError("models are loaded")
 
-    monkeypatch.setattr(pipeline, "load_catalog", load_catalog)
+    monkeypatch.setattr(assembly, "load_catalog", load_catalog)
     out = tmp_path / "out"
     with pytest.raises(ConfigError) as caught:
         pipeline.run_bake(settings(**{"bake__device": "cpu"} | overrides), out, SilentProgress())

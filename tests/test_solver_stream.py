@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from synpick_warp import pipeline
+from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.render_streams import RenderStreams
@@ -13,7 +13,7 @@ from tests.worlds.small_worlds import catalog
 
 def test_the_solver_runs_on_the_reserved_multiprocessors_while_there_are_views(tmp_path, monkeypatch):
     """On a CPU: `confine` is replaced to provide a marker as stream, which the solver ignores there."""
-    monkeypatch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+    monkeypatch.setattr(assembly, "load_catalog", lambda config, report: catalog())
     monkeypatch.setattr(RenderStreams, "confine", lambda self, share: setattr(self, "solver", "reserved"))
     tick_parts, given = Physics.tick_parts, []
 

@@ -14,11 +14,11 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import allocate
+from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.codes import Effect, Measure, Phase, Status
 from synpick_warp.configs.schema import LAYERS, Config
 from synpick_warp.exporters.writing.rle import find_run_boundaries, unpack_run_boundaries
 from synpick_warp.frames import FrameBatch
-from synpick_warp.jpeg import encode_jpeg
 from synpick_warp.stages import host_copies, stream
 from synpick_warp.stages.buffers import Snapshot, ViewBuffers
 from synpick_warp.stages.host_copies import HostCopy

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-from synpick_warp import pipeline, warmup
 from synpick_warp.cli.commands import main
-from synpick_warp.compilation import launch_all
+from synpick_warp.factory import assembly, warmup
+from synpick_warp.factory.compilation import launch_all
 from synpick_warp.progress import SilentProgress
 from synpick_warp.system.kernels import DryLaunches, ModuleBuild
 from tests.worlds.small_worlds import catalog, settings
@@ -17,7 +17,7 @@ from tests.worlds.small_worlds import catalog, settings
 
 @pytest.fixture(autouse=True)
 def boxes(monkeypatch):
-    monkeypatch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+    monkeypatch.setattr(assembly, "load_catalog", lambda config, report: catalog())
 
 
 def test_a_warm_up_loads_the_kernels_of_all_stages(monkeypatch):
@@ -40,7 +40,7 @@ def test_a_warm_up_loads_the_kernels_of_all_stages(monkeypatch):
 def test_dry_launches_find_all_that_a_warm_up_loads(device):
     """What launches for real load afterwards has been found before, whatever the cache holds."""
     config = settings(bake__mode="pick", cameras__resolution=[32, 18], perception__resolution=[64, 36])
-    factory = pipeline.build_smallest(config, device, SilentProgress(), False, True)
+    factory = assembly.build_smallest(config, device, SilentProgress(), False, True)
     found = []
     for _ in range(2):
         with DryLaunches() as dry:
@@ -56,12 +56,12 @@ def test_dry_launches_find_all_that_a_warm_up_loads(device):
 def test_a_cold_start_says_how_many_modules_it_compiles(monkeypatch):
     """The dry launches of a cold bake find modules to compile; here the compiler is not called."""
     stages = []
-    monkeypatch.setattr(pipeline, "is_cache_warm", lambda device: False)
+    monkeypatch.setattr(assembly, "is_cache_warm", lambda device: False)
     monkeypatch.setattr(ModuleBuild, "is_cached", lambda self: self.module.name != "synpick_warp.kernels.sim.snapshot")
     progress = SilentProgress()
     monkeypatch.setattr(progress, "stage", stages.append, raising=False)
     config = settings(cameras__resolution=[32, 18])
-    pipeline.build_factory(config, progress, [0])
+    assembly.build_factory(config, progress, [0])
     assert stages[:3] == ["compiling kernels of the assets", *(f"compiling kernels: {ready} of 1 modules" for ready in (0, 1))]
     assert stages[3] == "loading objects and lights"
 

@@ -75,8 +75,8 @@ ResolutionOption = Annotated[str | None, Parameter(help=_help("cameras.resolutio
 DevicesOption = Annotated[
     str | None,
     Parameter(
-        help="Several devices with a process each, joined by commas: GPUs such as cuda:0,cuda:1, or all, or cpu once per process. They "
-        "fill one data set, with the bytes of one device; it can be resumed on other devices."
+        help="Several devices with a process each, joined by commas: GPUs such as cuda:0,cuda:1, or cpu once per process, or all: every GPU, "
+        "or without one a process per CPU core. They fill one data set, with the bytes of one device; it can be resumed on other devices."
     ),
 ]
 DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]
@@ -261,7 +261,7 @@ def warmup(
     resolved = _resolve(config, given, resolution, set_)
     _check_inputs(resolved)
     from synpick_warp.cli.display import make_console, make_progress
-    from synpick_warp.warmup import warm_up
+    from synpick_warp.factory.warmup import warm_up
 
     with make_progress(make_console()) as progress:
         result = warm_up(resolved, progress)
@@ -377,7 +377,7 @@ def _bake(config: Config, out: Path, shard: tuple[int, int], splits: Sequence[st
         from synpick_warp.system.device import pick_device, pick_devices
 
     if devices:
-        devices = pick_devices(devices)
+        pick_devices(devices)
     else:
         pick_device(config.bake.device)
     _check_inputs(config)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, NamedTuple, Protocol
 
+from synpick_warp.codecs.depth_png import max_data_bytes
 from synpick_warp.configs.schema import Config
-from synpick_warp.depth_png import max_data_bytes
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
+
 import warp as wp
 
 from synpick_warp.codes import Status
@@ -9,12 +11,17 @@ from synpick_warp.kernels.sim.snapshot import take_snapshot_kernel
 from synpick_warp.progress import Progress
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import FrameStream, TickReader
-from synpick_warp.system.kernels import DryLaunches, build_of, compile_modules
+from synpick_warp.system.kernels import DryLaunches, build_of, compilation_lock, compile_modules
 
 
 def is_cache_warm(device: wp.Device) -> bool:
     """Whether the kernel cache is warm: it has a kernel that every bake launches. Other kernels may still be missing."""
     return build_of(take_snapshot_kernel, device).is_cached()
+
+
+def sole_compiler(progress: Progress) -> AbstractContextManager[None]:
+    """Lock under which one process at a time compiles; see `compilation_lock`."""
+    return compilation_lock(lambda: progress.stage("waiting for another process, which compiles kernels"))
 
 
 def compile_launches(simulation: Simulation, stream: FrameStream | None, progress: Progress) -> int:

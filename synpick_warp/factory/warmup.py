@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-from synpick_warp.compilation import compile_launches, launch_all
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import load_exporter_classes
-from synpick_warp.pipeline import build_smallest
+from synpick_warp.factory.assembly import build_smallest
+from synpick_warp.factory.compilation import compile_launches, launch_all, sole_compiler
 from synpick_warp.progress import Progress
 from synpick_warp.system.device import pick_device
 from synpick_warp.system.kernels import list_binaries
@@ -41,8 +41,9 @@ def warm_up(config: Config, progress: Progress) -> WarmUp:
     device = pick_device(config.bake.device)
     before = list_binaries()
     needs = [any(getattr(kind, name) for kind in kinds) for name in ("needs_physics", "needs_images")]
-    factory = build_smallest(config, device, progress, *needs)
-    stream = factory.stream if any(kind.needs_views for kind in kinds) else None
-    compile_launches(factory.simulation, stream, progress)
-    launch_all(factory.simulation, stream)
+    with sole_compiler(progress):
+        factory = build_smallest(config, device, progress, *needs)
+        stream = factory.stream if any(kind.needs_views for kind in kinds) else None
+        compile_launches(factory.simulation, stream, progress)
+        launch_all(factory.simulation, stream)
     return WarmUp(len(list_binaries() - before), time.perf_counter() - started)

@@ -22,9 +22,9 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.episodes import BakeSummary, episode_row, is_resampled, remedy
 from synpick_warp.errors import ConfigError
+from synpick_warp.factory.assembly import Stages, build_stages, compile_if_cold
 from synpick_warp.memory_plan import check_episodes, check_memory, explain_shortage
 from synpick_warp.online.selection import Selection, choose_episodes
-from synpick_warp.pipeline import Stages, build_stages, compile_if_cold
 from synpick_warp.progress import Progress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.buffers import Snapshot

@@ -7,7 +7,6 @@ quarter, until the memory plan and its headroom fit.
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Sequence
 
 import warp as wp
@@ -19,6 +18,8 @@ from synpick_warp.memory_plan import Term, free_memory, plan_memory
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import MIN_GPU_WORLDS, with_enough_worlds
 from synpick_warp.stages.stream import views_per_batch
+from synpick_warp.system.cores import count_cores
+from synpick_warp.system.device import ALL, pick_device, pick_devices
 
 HEADROOM = 1.5
 """Room for what a bake takes beyond its plan, which is a lower bound, as a multiple of it. tools/README.md has both measured."""
@@ -29,6 +30,8 @@ WRITER_BYTES = 100 << 20
 with bop and shards; the rest is headroom for formats with larger libraries."""
 WRITERS_FRACTION = 0.5
 """Fraction of the free host memory that writer processes may take if their number is chosen."""
+_OPEN_SIZES = ("render.views_per_batch", "perception.views", "bake.worlds")
+"""Settings that may be left open, besides the number of writers."""
 
 
 def without_pictures(config: Config) -> Config:
@@ -48,7 +51,7 @@ def fit_to_device(config: Config, device: wp.Device, episodes: int, writers: int
         writers: Writer processes of the device.
         processes: Processes that share the host's memory.
     """
-    is_open = {key: _value(config, key) == 0 for key in ("render.views_per_batch", "perception.views", "bake.worlds")}
+    is_open = {key: _value(config, key) == 0 for key in _OPEN_SIZES}
     config = with_enough_worlds(config, device, episodes)
     while terms := _short_terms(config, device, writers, processes):
         for term in sorted(terms, key=lambda term: -term.size):
@@ -69,7 +72,39 @@ def count_writers(config: Config) -> int:
         return config.bake.writers
     each = WRITER_BYTES + QUEUE_DEPTH * slot_bytes(load_exporter_classes(config.bake.formats), config)
     room = int(WRITERS_FRACTION * free_memory(None)) // each
-    return max(1, min(len(os.sched_getaffinity(0)), room))
+    return max(1, min(count_cores(), room))
+
+
+def pick_processes(config: Config, names: Sequence[str], episodes: int) -> tuple[str, ...]:
+    """Devices of a bake's processes: those named, by `pick_devices`, but no more than there are episodes.
+
+    For `ALL` without a GPU the CPU is repeated: once per usable core, since a process simulates on one, as far as the host's free memory
+    has room for each process with the fewest worlds and the smallest batches.
+
+    Raises:
+        DeviceError: As `pick_devices`.
+    """
+    picked = pick_devices(names)
+    if list(names) == [ALL] and picked == ("cpu",):
+        needed = sum(term.size for term in plan_memory(_with_least_sizes(config), pick_device("cpu")))
+        room = free_memory(None) // int(HEADROOM * needed + RUNTIME_BYTES)
+        picked *= max(1, min(count_cores(), room))
+    return picked[: max(1, episodes)]
+
+
+def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str:
+    """Advice for a bake in one process on a machine without a GPU, if `ALL` would start more; else empty. Arguments of `pick_processes`."""
+    if len(names) > 1 or pick_device(names[0]).is_cuda or pick_devices([ALL]) != ("cpu",):
+        return ""
+    processes = len(pick_processes(config, [ALL], episodes))
+    return f"one process simulates on one CPU core; --devices all starts {processes}, which write the same bytes" if processes > 1 else ""
+
+
+def _with_least_sizes(config: Config) -> Config:
+    """Settings with one world, and one view or world in each batch, where they leave the number open."""
+    for key in _OPEN_SIZES:
+        config = config if _value(config, key) else _replace(config, key, 1)
+    return config
 
 
 def _short_terms(config: Config, device: wp.Device, writers: int, processes: int) -> Sequence[Term]:
@@ -98,10 +133,14 @@ def _least(key: str, device: wp.Device) -> int:
 
 def _reduce(config: Config, key: str, device: wp.Device) -> Config:
     """Reduce one setting: the views of a batch to a half, the worlds to three quarters, never below `_least`."""
-    section, _, name = key.partition(".")
     amount = _amount(config, key, device)
     kept = amount - max(1, amount // 4) if key == "bake.worlds" else -(-amount // 2)
-    return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **{name: max(_least(key, device), kept)})})
+    return _replace(config, key, max(_least(key, device), kept))
+
+
+def _replace(config: Config, key: str, value: int) -> Config:
+    section, _, name = key.partition(".")
+    return dataclasses.replace(config, **{section: dataclasses.replace(getattr(config, section), **{name: value})})
 
 
 def _value(config: Config, key: str) -> int:

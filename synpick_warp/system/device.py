@@ -19,6 +19,8 @@ _CONNECTIONS = ("CUDA_DEVICE_MAX_CONNECTIONS", "32")
 """Hardware queues that CUDA maps streams to; its default is 8. A tick's captured physics graph spreads over some 60 streams. Where it
 shares queues with the renderer's stream, neither runs beside the other: a tick takes 1.34 instead of 1.17 s on an H200."""
 _CUDA = re.compile(r"cuda:([0-9]{1,9})")
+ALL = "all"
+"""Stands for every GPU, or the CPU if there is none."""
 _DEVICES = "allowed: all, or GPUs such as cuda:0,cuda:1, or cpu once per process"
 _NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"
 """Warp's native code prints this regardless of the log level; a machine without a GPU is not a fault."""
@@ -52,19 +54,19 @@ def pick_devices(names: Sequence[str]) -> tuple[str, ...]:
     """Select the devices of a bake with one process each; returns their names. Starts Warp, but touches no device.
 
     Args:
-        names: Different GPUs, or "cpu" once per process, since Warp runs a CPU's kernels on one core. "all" alone: every GPU, or the CPU if
-            there is none.
+        names: Different GPUs, or "cpu" once per process, since a process simulates on one core. `ALL` alone: every GPU, or the CPU if there
+            is none.
 
     Raises:
         DeviceError: There is no such device, a GPU is named twice, or the CPU beside a GPU.
     """
     if not names:
         raise DeviceError(f"--devices names none; {_DEVICES}")
-    if list(names) == ["all"]:
+    if list(names) == [ALL]:
         start_warp()
         return tuple(f"cuda:{index}" for index in range(wp.get_cuda_device_count())) or ("cpu",)
     for name in names:
-        if name in ("all", "auto"):
+        if name in (ALL, "auto"):
             raise DeviceError(f"--devices names {name} beside others; {_DEVICES}" if len(names) > 1 else f"--devices is {name}; {_DEVICES}")
     picked = [pick_device(name) for name in names]
     gpus = [device.alias for device in picked if device.is_cuda]

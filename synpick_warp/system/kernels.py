@@ -6,8 +6,10 @@ progress, and lets compilers run in parallel; Warp generates their source code u
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from types import TracebackType
@@ -15,8 +17,11 @@ from typing import Any, NamedTuple, Self
 
 import warp as wp
 
+from synpick_warp.system.cores import count_cores
+
 MAX_COMPILERS = 8
 """Maximum number of compiling threads: the longest module of a bake takes a quarter of all, so that more gain little."""
+_LOCK_FILE = ".synpick-warp.lock"
 BINARIES = ("*.cubin", "*.ptx", "*.o")
 """Compiled modules in Warp's kernel cache."""
 
@@ -38,6 +43,27 @@ class ModuleBuild(NamedTuple):
         """Whether the kernel cache has it."""
         name = self.module._get_compile_output_name(wp.get_device(self.device), block_dim=self.block)
         return Path(wp.config.kernel_cache_dir or "", self.module.get_module_identifier(self.block), name).exists()
+
+
+@contextlib.contextmanager
+def compilation_lock(wait: Callable[[], None]) -> Iterator[None]:
+    """Lock of Warp's kernel cache (flock): of several processes that start with a cold cache one compiles, and the others get its kernels.
+
+    File systems without locks are used unlocked.
+
+    Args:
+        wait: Called before waiting for another process.
+    """
+    with contextlib.ExitStack() as closing:
+        with contextlib.suppress(OSError):
+            handle = os.open(Path(wp.config.kernel_cache_dir or "", _LOCK_FILE), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o666)
+            closing.callback(os.close, handle)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                wait()
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
 
 
 def build_of(kernel: Any, device: wp.Device) -> ModuleBuild:
@@ -83,8 +109,7 @@ def compile_modules(builds: Collection[ModuleBuild], report: Callable[[int, int]
     missing = [build for build in builds if not build.is_cached()]
     if not missing:
         return 0
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with ThreadPoolExecutor(min(len(missing), cores, MAX_COMPILERS), thread_name_prefix="compile") as pool:
+    with ThreadPoolExecutor(min(len(missing), count_cores(), MAX_COMPILERS), thread_name_prefix="compile") as pool:
         report(0, len(missing))
         try:
             for ready, done in enumerate(as_completed([pool.submit(one.module.load, one.device, one.block) for one in missing]), 1):

@@ -19,7 +19,7 @@ from synpick_warp.arrays import allocate
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.pipeline import make_renderer
+from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.appearance import read_texture
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import MAX_RADIANCE

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from synpick_warp import pipeline
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.dataset.manifest import episode_entry, read_checksums
+from synpick_warp.factory import assembly
 from synpick_warp.layer_codec import read_layer
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
@@ -40,7 +40,7 @@ DEPTH_STEP = 1e-4
 def baked(out: Path, **overrides: object) -> Path:
     config = settings(**(TINY | overrides))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
         run_bake(config, out, SilentProgress())
     return out / config.bop.split
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp import jpeg
+from synpick_warp.codecs import jpeg
 from synpick_warp.kernels.encoding import huffman, stuffing
 from synpick_warp.kernels.encoding.dct import quantize
 from synpick_warp.stages.encoding.jpeg import upload_huffman

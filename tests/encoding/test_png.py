@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from synpick_warp import depth_png
 from synpick_warp.arrays import allocate
+from synpick_warp.codecs import depth_png
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.writing.png import frame_depth_png
 from synpick_warp.inputs.image_files import decode_image

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp import pipeline
 from synpick_warp.cli.commands import main
 from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
+from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from tests.harness.bake_server import TINY
@@ -23,7 +23,7 @@ def folder(request, tmp_path_factory):
     out = tmp_path_factory.mktemp("baked") / "set"
     overrides = TINY | {"bake.episodes": 2, "bake.formats": request.param.split(","), "render.layers": []}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
         run_bake(settings(**{key.replace(".", "__"): value for key, value in overrides.items()}), out, SilentProgress())
     return out
 

@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.codes import Ending
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import OutputError
@@ -21,7 +22,6 @@ from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.exporters.writing.pool import WriterPool
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
-from synpick_warp.jpeg import encode_jpeg
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.types import Camera
 from tests.worlds import box_views

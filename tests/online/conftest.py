@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from synpick_warp import pipeline
 from synpick_warp.configs.schema import LAYERS
+from synpick_warp.factory import assembly
 from tests.worlds.small_worlds import catalog, settings
 
 TINY = {
@@ -25,7 +25,7 @@ LAYERED = TINY | {"render__layers": list(LAYERS)}
 def boxes():
     """All objects here are boxes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
         yield
 
 

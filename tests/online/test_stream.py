@@ -16,9 +16,9 @@ import pytest
 import warp as wp
 
 import synpick_warp
-from synpick_warp import pipeline
 from synpick_warp.configs.schema import LAYERS
 from synpick_warp.errors import ConfigError
+from synpick_warp.factory import assembly
 from synpick_warp.layer_codec import decode_layer, encode_layer
 from synpick_warp.online import stream as online
 from synpick_warp.stages.sim.simulate import Simulation
@@ -119,7 +119,7 @@ def test_neither_worlds_nor_batches_change_a_view(streamed, worlds, batch):
 
 
 def test_kernels_that_are_compiled_ahead_change_nothing(streamed, monkeypatch):
-    monkeypatch.setattr(pipeline, "is_cache_warm", lambda device: False)
+    monkeypatch.setattr(assembly, "is_cache_warm", lambda device: False)
     equal(taken(synpick_warp.stream(settings(**LAYERED))), streamed[0])
 
 

@@ -10,7 +10,15 @@ from synpick_warp import memory_plan
 from synpick_warp.configs.load import load_config
 from synpick_warp.memory_plan import check_memory, plan_memory
 from synpick_warp.scheduling import sizes
-from synpick_warp.scheduling.sizes import HEADROOM, RUNTIME_BYTES, count_writers, fit_to_device, without_pictures
+from synpick_warp.scheduling.sizes import (
+    HEADROOM,
+    RUNTIME_BYTES,
+    advise_processes,
+    count_writers,
+    fit_to_device,
+    pick_processes,
+    without_pictures,
+)
 from synpick_warp.stages.perception.images import count_views
 from synpick_warp.stages.sim.physics import balance_worlds
 from synpick_warp.stages.stream import views_per_batch
@@ -95,8 +103,49 @@ def test_processes_share_the_hosts_memory(give):
     )
 
 
+@pytest.fixture
+def cores(monkeypatch):
+    """A machine of 16 cores and no GPU."""
+    monkeypatch.setattr(sizes, "count_cores", lambda: 16)
+    monkeypatch.setattr(sizes, "pick_devices", lambda names: ("cpu",) if list(names) == ["all"] else tuple(names))
+    monkeypatch.setattr(sizes, "pick_device", lambda name: CPU)
+
+
+def test_without_a_gpu_all_is_a_process_per_core_within_memory_and_episodes(give, cores):
+    config = load_config("synpick", {"bake.mode": "mixed"})
+    assert pick_processes(config, ["all"], 1000) == ("cpu",) * 16
+    assert pick_processes(config, ["all"], 5) == ("cpu",) * 5
+    assert pick_processes(config, ["all"], 0) == ("cpu",)
+    give(host=12.0)
+    few = pick_processes(config, ["all"], 1000)
+    assert 2 <= len(few) < 12
+    # What was chosen fits; one process more would not.
+    planned = sum(term.size for term in plan_memory(fit_to_device(config, CPU, 1000, processes=len(few)), CPU))
+    assert HEADROOM * planned + RUNTIME_BYTES <= 12 * GIB / len(few)
+    give(host=0.5)
+    assert pick_processes(config, ["all"], 1000) == ("cpu",)
+
+
+def test_named_processes_stay(give, cores):
+    give(host=0.5)
+    assert pick_processes(load_config("synpick", {}), ["cpu"] * 3, 1000) == ("cpu",) * 3
+
+
+def test_a_bake_on_one_of_several_cores_is_told_of_the_others(give, cores, monkeypatch):
+    config = load_config("synpick", {})
+    assert (
+        advise_processes(config, ["cpu"], 3) == "one process simulates on one CPU core; --devices all starts 3, which write the same bytes"
+    )
+    assert advise_processes(config, ["cpu"], 1) == ""
+    assert advise_processes(config, ["cpu", "cpu"], 3) == ""
+    monkeypatch.setattr(sizes, "pick_devices", lambda names: ("cuda:0",))
+    assert advise_processes(config, ["cpu"], 3) == ""
+    monkeypatch.setattr(sizes, "pick_device", lambda name: GPU)
+    assert advise_processes(config, ["auto"], 3) == ""
+
+
 def test_writers_are_as_many_as_cores_if_memory_suffices(give, monkeypatch):
-    monkeypatch.setattr(sizes.os, "sched_getaffinity", lambda _: set(range(64)))
+    monkeypatch.setattr(sizes, "count_cores", lambda: 64)
     config = load_config("synpick", {})
     assert count_writers(config) == 64
     give(host=8.0)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import warp as wp
 
 from synpick_warp.system import kernels
-from synpick_warp.system.kernels import DryLaunches, ModuleBuild, build_of, compile_modules
+from synpick_warp.system.kernels import DryLaunches, ModuleBuild, build_of, compilation_lock, compile_modules
 
 MODULES = 3
 
@@ -75,3 +78,35 @@ def test_a_compiler_that_fails_is_told(device, empty_cache, monkeypatch):
     monkeypatch.setattr(wp.Module, "load", fail)
     with pytest.raises(RuntimeError, match="no space left"):
         compile_modules(builds, lambda *_: None)
+
+
+HOLDER = """
+import sys, warp as wp
+from synpick_warp.system.kernels import compilation_lock
+wp.config.kernel_cache_dir = sys.argv[1]
+with compilation_lock(lambda: None):
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_one_process_compiles_and_the_others_wait_for_it(empty_cache):
+    """The other process ends, and with it its lock, when this one says that it waits."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(empty_cache)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdin
+        assert other.stdout
+        assert other.stdout.readline() == "locked\n"
+        waited = []
+        with compilation_lock(lambda: waited.append(other.stdin.close())):  # type: ignore[union-attr]
+            assert len(waited) == 1
+    with compilation_lock(lambda: waited.append(None)):
+        assert len(waited) == 1
+
+
+def test_a_cache_that_cannot_be_locked_is_used_unlocked(tmp_path, monkeypatch):
+    monkeypatch.setattr(wp.config, "kernel_cache_dir", str(tmp_path / "missing"))
+    with compilation_lock(lambda: pytest.fail("nobody holds it")):
+        pass
+    assert not (tmp_path / "missing").exists()

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import synpick_warp
-from synpick_warp import pipeline
 from synpick_warp.configs.load import load_config
+from synpick_warp.factory import assembly
 from synpick_warp.webdataset import decode_view
 from tests.worlds.sights import SHORT
 from tests.worlds.small_worlds import catalog, settings
@@ -38,7 +38,7 @@ TINY = SHORT | {
 def folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("examples") / "set"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
         synpick_warp.bake(settings(**TINY), folder)
     return folder
 

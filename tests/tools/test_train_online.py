@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from synpick_warp import pipeline
+from synpick_warp.factory import assembly
 from tests.online.conftest import TINY
 from tests.worlds.small_worlds import QUICK, catalog
 
@@ -13,7 +13,7 @@ train_online = pytest.importorskip("tools.examples.train_online", exc_type=Impor
 
 
 def test_a_network_learns_from_the_stream(monkeypatch, capsys):
-    monkeypatch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+    monkeypatch.setattr(assembly, "load_catalog", lambda config, report: catalog())
     given = QUICK | {key.replace("__", "."): value for key, value in TINY.items()} | {"bake.mode": "move", "arrangement.volume": 3e-4}
     assignments = [
         part for key, value in given.items() if key not in ("bake.device", "bake.worlds") for part in ("--set", f"{key}={value}")

@@ -35,7 +35,8 @@ from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import load_exporter_classes
-from synpick_warp.pipeline import Factory, build_factory, run_bake
+from synpick_warp.factory.assembly import Factory, build_factory
+from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import timing
 from synpick_warp.stages.render.view_setup import make_views

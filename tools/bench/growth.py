@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.schema import Cameras, Config
-from synpick_warp.pipeline import make_renderer
+from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures

@@ -14,7 +14,7 @@ import newton
 import warp as wp
 
 from synpick_warp.codes import Phase, Task
-from synpick_warp.pipeline import Factory
+from synpick_warp.factory.assembly import Factory
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader
 

@@ -21,8 +21,8 @@ import warp as wp
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import load_exporter_classes
+from synpick_warp.factory.assembly import Factory, build_factory, make_renderer
 from synpick_warp.kernels.render.lighting.history import MAX_PERIOD_BITS
-from synpick_warp.pipeline import Factory, build_factory, make_renderer
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.render.denoised import LIGHT_HISTORY, DenoisedRenderer

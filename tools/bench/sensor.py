@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.arrays import allocate
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import Config
-from synpick_warp.pipeline import Factory
+from synpick_warp.factory.assembly import Factory
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, Fixture, Material, TriangleMesh
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot

@@ -18,10 +18,11 @@ from synpick_warp.exporters.base import ExportContext, Exporter
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.exporters.writing.files import PARTIAL
 from synpick_warp.exporters.writing.pool import QUEUE_DEPTH, WriterPool
+from synpick_warp.factory.assembly import Factory
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
-from synpick_warp.pipeline import Factory
 from synpick_warp.stages.host_copies import DeviceImages
 from synpick_warp.stages.stream import TickReport, tick_batch
+from synpick_warp.system.cores import count_cores
 from tools.bench.physics import Row
 
 COPIES = 8
@@ -78,7 +79,7 @@ def measure_writing(config: Config, factory: Factory, report: TickReport, min_se
 def _measure_format(name: str, config: Config, factory: Factory, source: _Input, min_seconds: float, folder: Path) -> Iterator[Row]:
     """Benchmark of one format for 1, 2, 4, ... processes up to one per core; finishing episodes is measured with the last count."""
     (exporter_class,) = load_exporter_classes((name,))
-    cores = len(os.sched_getaffinity(0))
+    cores = count_cores()
     result = _Result(0.0, {}, 0.0, 0, 0.0, 0.0, 0.0)
     for processes in sorted({1, *(2**power for power in range(1, cores.bit_length())), cores}):
         result = _write(exporter_class, config, factory, source, processes, min_seconds, folder / str(processes))

@@ -22,7 +22,7 @@ from rich.table import Table
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, Config
 from synpick_warp.errors import SynpickError
-from synpick_warp.pipeline import make_renderer
+from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.fixtures import make_fixtures

@@ -26,7 +26,7 @@ from rich.table import Table
 from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
-from synpick_warp.pipeline import build_factory
+from synpick_warp.factory.assembly import build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.system.device import pick_device

@@ -25,7 +25,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import MIXED, Config
 from synpick_warp.configs.schema import MODES as MIX
 from synpick_warp.errors import SynpickError
-from synpick_warp.pipeline import Factory, build_factory
+from synpick_warp.factory.assembly import Factory, build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.host_copies import HostCopy

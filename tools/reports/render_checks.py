@@ -12,7 +12,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
-from synpick_warp.pipeline import make_renderer
+from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.fixtures import make_fixtures

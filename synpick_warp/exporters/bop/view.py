@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import orjson
 
+from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.codes import Effect, names
 from synpick_warp.exporters.base import PIXEL_BYTES
 from synpick_warp.exporters.bop.keypoints import MILLIMETERS, Keypoints, project_keypoints
@@ -21,7 +22,6 @@ from synpick_warp.exporters.writing.folder import Buffer, open_folder
 from synpick_warp.exporters.writing.png import encode_mask_png, encode_png, frame_depth_png
 from synpick_warp.exporters.writing.rle import Runs, find_run_boundaries, unpack_run_boundaries
 from synpick_warp.frames import FrameBatch
-from synpick_warp.jpeg import encode_jpeg
 from synpick_warp.layer_codec import encode_layer, layer_path
 from synpick_warp.scenes.types import Camera
 

@@ -1,4 +1,4 @@
-"""JPEG encoder on the device: baseline, 4:2:0, with restart intervals; the same files as libjpeg's, `synpick_warp.jpeg.encode_jpeg`.
+"""JPEG encoder on the device: baseline, 4:2:0, with restart intervals; the same files as libjpeg's, `synpick_warp.codecs.jpeg.encode_jpeg`.
 
 Only the files are copied to the host: at quality 95 a tenth of the pixels.
 """
@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
-from synpick_warp.jpeg import (
+from synpick_warp.codecs.jpeg import (
     AC_COUNTS,
     AC_SYMBOLS,
     DC_COUNTS,

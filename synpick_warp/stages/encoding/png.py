@@ -1,6 +1,6 @@
 """Depth PNG encoder on the device: compressed data (IDAT) of 16-bit greyscale PNG files, to which writers add the other chunks.
 
-See `synpick_warp.depth_png` for the format. The bytes depend on the image alone, not on the device: all arithmetic is in integers.
+See `synpick_warp.codecs.depth_png` for the format. The bytes depend on the image alone, not on the device: all arithmetic is in integers.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
-from synpick_warp.depth_png import (
+from synpick_warp.codecs.depth_png import (
     MAX_RUN,
     distance_codes,
     end_code,

@@ -16,7 +16,6 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import synpick_warp
-from synpick_warp import pipeline
 from synpick_warp.cli.commands import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.dataset.reading import DataSet
@@ -24,6 +23,7 @@ from synpick_warp.errors import SynpickError
 from synpick_warp.estimation import factories
 from synpick_warp.evaluation.results import write_results
 from synpick_warp.evaluation.truth import read_truth
+from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from tests.estimation.fakes import FakeEstimator
@@ -86,7 +86,7 @@ def sandbox(tmp_path_factory) -> Sandbox:
     folder = tmp_path_factory.mktemp("hostile")
     overrides = QUICK | {key.replace("__", "."): value for key, value in SHORT.items()} | TINY
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
         run_bake(load_config("smoke", overrides), folder / "set", SilentProgress())
     return Sandbox(folder / "set", folder)
 

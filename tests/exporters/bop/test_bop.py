@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from synpick_warp.codecs.jpeg import encode_jpeg
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.sensors import Effects
 from synpick_warp.errors import CatalogError, OutputError
@@ -27,7 +28,6 @@ from synpick_warp.exporters.bop.view import ANNOTATIONS, annotation_block
 from synpick_warp.exporters.writing.files import check_output_folder
 from synpick_warp.exporters.writing.folder import open_folder
 from synpick_warp.exporters.writing.png import encode_png
-from synpick_warp.jpeg import encode_jpeg
 from synpick_warp.scenes.types import Catalog
 from tests.exporters.writing.test_rle import decode
 from tests.harness.exporter_contract import ExporterContract, digests, export, export_context, exporting, feed, finish, with_files

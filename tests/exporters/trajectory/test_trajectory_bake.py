@@ -14,8 +14,9 @@ import pytest
 import zarr
 
 import synpick_warp
-from synpick_warp import memory_plan, pipeline
+from synpick_warp import memory_plan
 from synpick_warp.configs.schema import Config
+from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages import ticks
@@ -53,7 +54,7 @@ def out(tmp_path_factory, mixed) -> Path:
     """A finished bake of boxes; beside it the same with another number of worlds, and with physics ahead."""
     folder = tmp_path_factory.mktemp("bake") / "set"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
         # No format needs images.
         patch.setattr(FrameStream, "render", lambda *_: pytest.fail("views were rendered"))
         run_bake(mixed, folder, SilentProgress())

@@ -12,8 +12,8 @@ import pytest
 from pxr import Usd, UsdGeom
 from scipy.spatial import ConvexHull
 
-from synpick_warp import pipeline
 from synpick_warp.configs.schema import Config
+from synpick_warp.factory import assembly
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from tests.exporters.usd.test_usd import validation_errors
@@ -51,7 +51,7 @@ def out(tmp_path_factory, picking) -> Path:
     """A finished bake of boxes."""
     folder = tmp_path_factory.mktemp("bake") / "set"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "load_catalog", lambda config, report: catalog())
+        patch.setattr(assembly, "load_catalog", lambda config, report: catalog())
         run_bake(picking, folder, SilentProgress())
         again = replace(picking, bake=replace(picking.bake, worlds=2))
         run_bake(again, folder.with_name("again"), SilentProgress())

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
-from synpick_warp.pipeline import make_renderer
+from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.appearance import linear_to_srgb
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.pipeline import make_renderer
+from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.sun import extract_sun

@@ -13,7 +13,7 @@ import warp as wp
 
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
-from synpick_warp.pipeline import build_factory
+from synpick_warp.factory.assembly import build_factory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.stages.sim.simulate import Simulation
 from tools.bench import physics

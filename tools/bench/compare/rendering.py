@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.pipeline import Factory, make_renderer
+from synpick_warp.factory.assembly import Factory, make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera

@@ -1,0 +1,1 @@
+"""File formats that host and device encode to the same bytes: JPEG, and depth as PNG."""

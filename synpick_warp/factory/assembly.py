@@ -1,0 +1,197 @@
+"""Assembly of a bake's stages on a device: assets, worlds, renderer and encoders, from all settings.
+
+Besides the pipeline, the one module that passes the whole `Config` on; stages take what they need.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.attempts import AttemptLog
+from synpick_warp.configs.schema import Config
+from synpick_warp.configs.splits import plan_episodes
+from synpick_warp.exporters.registry import load_exporter_classes
+from synpick_warp.factory.compilation import compile_launches, is_cache_warm, sole_compiler
+from synpick_warp.memory_plan import check_memory
+from synpick_warp.progress import Progress, SilentProgress
+from synpick_warp.scenes.cameras import make_cameras
+from synpick_warp.scenes.catalog import load_catalog
+from synpick_warp.scenes.fixtures import make_fixtures
+from synpick_warp.scenes.lights import load_lights
+from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
+from synpick_warp.scheduling.order import order_longest_first
+from synpick_warp.scheduling.sizes import count_writers, fit_to_device, without_pictures
+from synpick_warp.stages.host_copies import host_images
+from synpick_warp.stages.render.renderer import Renderer
+from synpick_warp.stages.render.scene import RenderScene, build_render_scene
+from synpick_warp.stages.sim.simulate import Simulation
+from synpick_warp.stages.stream import FrameStream, LightTable, name_lights, view_sizes
+from synpick_warp.system.device import pick_device
+from synpick_warp.system.garbage import collection_paused
+
+
+@dataclass(frozen=True, eq=False)
+class Factory:
+    """Stages and assets of a bake, on the device."""
+
+    catalog: Catalog
+    cameras: tuple[Camera, ...]
+    lights: tuple[EnvironmentMap, ...]
+    simulation: Simulation
+    stream: FrameStream
+    log: AttemptLog
+
+
+@dataclass(frozen=True, eq=False)
+class Stages:
+    """What makes pictures, on the device: assets, worlds and renderer; a bake's `Factory` without its way to the host."""
+
+    config: Config
+    """The settings, with as many worlds as there are."""
+    catalog: Catalog
+    cameras: tuple[Camera, ...]
+    lights: tuple[EnvironmentMap, ...]
+    simulation: Simulation
+    renderer: Renderer
+    sizes: dict[str, int]
+    """Extents by `view_sizes`."""
+    object_ids: np.ndarray
+    """obj_id of each catalog entry (entry) int32."""
+    light_table: LightTable
+
+    @property
+    def tick_time(self) -> float:
+        """Time between two frames [s]."""
+        return self.config.physics.step * self.config.physics.steps_per_tick
+
+    def make_log(self) -> AttemptLog:
+        """A new attempt log."""
+        return AttemptLog(self.config.suction, self.config.perception.resolution, self.object_ids)
+
+
+def build_factory(
+    config: Config,
+    progress: Progress,
+    episodes: Sequence[int] | None = None,
+    records_physics: bool = False,
+    needs_images: bool = True,
+    processes: int = 1,
+    longest_first: bool = False,
+) -> Factory:
+    """Load assets and build the stages on the device.
+
+    Args:
+        config: All settings.
+        progress: Observer.
+        episodes: Indices of the episodes to simulate; None: all.
+        records_physics, needs_images: Whether ticks are recorded with their physics, and all images copied to the host; see `Exporter`.
+        processes: Processes of the bake, which share the host's memory.
+        longest_first: Whether the episodes are reordered by `order_longest_first`.
+
+    Raises:
+        SynpickError: The machine has too little memory, or device, models, lights, tote or cameras cannot be used.
+    """
+    device = pick_device(config.bake.device)
+    planned = sum(map(len, plan_episodes(config))) if episodes is None else len(episodes)
+    writers = count_writers(config)
+    config = fit_to_device(without_pictures(config), device, planned, writers, processes)
+    check_memory(config, device, writers, processes)
+    renders = any(kind.needs_views for kind in load_exporter_classes(config.bake.formats))
+    compile_if_cold(config, device, progress, records_physics, needs_images, renders)
+    return _assemble(config, device, progress, episodes, records_physics, needs_images, longest_first)
+
+
+def compile_if_cold(
+    config: Config, device: wp.Device, progress: Progress, records_physics: bool = False, needs_images: bool = True, renders: bool = True
+) -> None:
+    """Compile the kernels of a bake in parallel if the kernel cache is cold, with a minimal factory that is freed again.
+
+    Args:
+        config, device, progress, records_physics, needs_images: As of `build_factory`.
+        renders: Whether views are rendered.
+    """
+    with sole_compiler(progress):
+        if is_cache_warm(device):
+            return
+        progress.stage("compiling kernels of the assets")
+        factory = build_smallest(config, device, SilentProgress(), records_physics, needs_images)
+        compile_launches(factory.simulation, factory.stream if renders else None, progress)
+        del factory
+    gc.collect()  # Tracebacks that Warp's code generation leaves hold frames, and these its arrays.
+
+
+def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
+    """Build a minimal factory: the fewest worlds that the device simulates, one view a batch; arguments, errors as of `build_factory`."""
+    config = replace(config, bake=replace(config.bake, worlds=1), render=replace(config.render, views_per_batch=1))
+    config = fit_to_device(config, device, 1, count_writers(config))
+    return _assemble(config, device, progress, [0], records_physics, needs_images)
+
+
+def _assemble(
+    config: Config,
+    device: wp.Device,
+    progress: Progress,
+    episodes: Sequence[int] | None,
+    records_physics: bool,
+    needs_images: bool,
+    longest_first: bool = False,
+) -> Factory:
+    """Build the stages; arguments as of `build_factory`, for settings by `fit_to_device`."""
+    stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
+    depth_files = any(kind.writes_depth for kind in load_exporter_classes(config.bake.formats))
+    host = host_images(config, device, needs_images, depth_files)
+    table, tick_time = stages.light_table, stages.tick_time
+    layers, cameras, ids = config.render.layers, len(stages.cameras), stages.object_ids
+    stream = FrameStream(stages.sizes, layers, cameras, tick_time, stages.renderer, ids, table, device, host)
+    return Factory(stages.catalog, stages.cameras, stages.lights, stages.simulation, stream, stages.make_log())
+
+
+@collection_paused()
+def build_stages(
+    config: Config,
+    device: wp.Device,
+    progress: Progress,
+    episodes: Sequence[int] | None = None,
+    records_physics: bool = False,
+    longest_first: bool = False,
+) -> Stages:
+    """Load assets and build worlds and renderer; arguments and errors as of `build_factory`, for settings by `fit_to_device`."""
+    progress.stage("loading objects and lights")
+    cameras = make_cameras(config.cameras)
+    fixtures = make_fixtures(config.tote, config.gripper)
+    catalog = load_catalog(config, report=progress.note)
+    lights = load_lights(config.bake.lights)
+    if longest_first and episodes is not None:
+        episodes = order_longest_first(config, catalog, episodes, device)
+    progress.stage(f"building {config.bake.worlds} worlds of {len(catalog)} objects on {device.alias}")
+    scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
+    simulation = Simulation(config, catalog, len(lights), device, scene, episodes, records_physics)
+    sizes = view_sizes(config, device)
+    histories = simulation.layout.worlds * len(cameras)
+    renderer = make_renderer(config, scene, config.arrangement.max_objects, sizes["view"], histories)
+    object_ids = np.array([entry.obj_id for entry in catalog.entries], dtype=np.int32)
+    table = name_lights([light.name for light in lights], scene.lights)
+    return Stages(config, catalog, cameras, lights, simulation, renderer, sizes, object_ids, table)
+
+
+def make_renderer(config: Config, scene: RenderScene, instances: int, views: int, histories: int = 0) -> Renderer:
+    """The renderer of a bake: its sections of the settings, for `instances` instances of a world and at most `views` views of a batch.
+
+    `histories` as in `Renderer`.
+    """
+    return Renderer(
+        scene,
+        config.render,
+        config.effects,
+        config.depth_sensor,
+        seed=config.bake.seed,
+        depth_scale=config.bop.depth_scale,
+        instances=instances,
+        views=views,
+        histories=histories,
+    )
