@@ -12,6 +12,7 @@ from synpick_warp.configs.check import format_value
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import bake_modes
 from synpick_warp.configs.schema import FORMATS, MIXED, Config
+from synpick_warp.configs.splits import MAX_SHARD_SCENES, scenes_end
 
 DEPTH_COUNTS = 65535
 """Maximum value of a 16-bit depth image."""
@@ -138,6 +139,12 @@ def _bop(config: Config) -> Iterator[Conflict]:
             fitting = "png" if bop.color_format == "jpg" else "jpg"
             rule = "BOP's toolkit reads jpg from splits that end in _pbr, and png from all others"
             yield "bop.color_format", f"{fitting} with the split {folder}: {rule}"
+    if "shards" in config.bake.formats and scenes_end(config) > MAX_SHARD_SCENES:
+        key = f"splits.{config.splits[-1].name}.episodes" if config.splits else "bake.episodes"
+        yield (
+            key,
+            f"indices below {MAX_SHARD_SCENES // len(config.cameras.positions)} with the format shards, whose names hold no more scenes",
+        )
     far = max((math.dist(position, (0.0, 0.0, 0.0)) for position in config.cameras.positions), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
         yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote from {far:.3g} m [mm]"

@@ -24,7 +24,7 @@ class Move:
         0.75, "", "Position of the visited corners, as a fraction of half the inner floor's size (released).", above=0.0, high=1.0
     )
     height: float = setting(0.02, "m", "Height of the TCP above the floor at a corner (released).", low=0.0)
-    start_height: float = setting(0.35, "m", "Height of the TCP above the first corner in the first frame.", above=0.0)
+    start_height: float = setting(0.35, "m", "Height of the TCP above the floor in the first frame, over the first corner.", above=0.0)
     rounds: int = setting(
         2, "", "Rounds over all four corners (released: eight corners, drawn with replacement).", low=1, high=INT32_MAX // 4
     )

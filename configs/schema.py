@@ -176,7 +176,9 @@ class Arrangement:
         high=0.5,
     )
     clearance: float = setting(0.01, "m", "Gap between the bounding spheres of consecutive objects in the drop column.", low=0.0)
-    spread: float = setting(0.3, "", "Drop positions are uniform over this fraction of the free floor.", low=0.0, high=1.0)
+    spread: float = setting(
+        0.3, "", "Drop positions are uniform over this fraction of the tote's opening, less the object's radius.", low=0.0, high=1.0
+    )
 
 
 @dataclass(frozen=True)

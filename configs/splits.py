@@ -13,6 +13,9 @@ from synpick_warp.configs.check import format_value, suggest
 from synpick_warp.configs.schema import MULTISENSOR, Config, Split
 from synpick_warp.errors import ConfigError
 
+MAX_SHARD_SCENES = 1_000_000
+"""Scene ids that the names of shards (format shards) tell apart: part p of a scene is shard scene_id + p · this."""
+
 
 def episode_range(split: Split) -> range:
     """Episode indices of a split."""
@@ -92,6 +95,11 @@ def is_planned(config: Config, episode: int) -> bool:
 def episodes_end(config: Config) -> int:
     """Exclusive upper bound of the planned episode indices, over all splits."""
     return max(each.stop for each in plan_episodes(config))
+
+
+def scenes_end(config: Config) -> int:
+    """Exclusive upper bound of the planned scene ids of the format shards, which has a scene per episode and camera."""
+    return episodes_end(config) * len(config.cameras.positions)
 
 
 def split_of(config: Config, episode: int) -> Split | None:

@@ -37,7 +37,7 @@ def stream_key(seed: wp.uint64, episode: int, arrangement: int, stream: int) -> 
 
 @wp.func
 def view_key(seed: wp.uint64, episode: int, frame: int, camera: int, stream: int) -> wp.uint64:
-    """Key of the `Stream` of a view: frame and camera of an episode. Images do not depend on the arrangement index."""
+    """Key of the `Stream` of a view: frame and camera of an episode. The arrangement index is not part of it."""
     key = stream_key(seed, episode, 0, stream)
     key = mix((key ^ wp.uint64(frame)) + GAMMA)
     return mix((key ^ wp.uint64(camera)) + GAMMA)

@@ -150,7 +150,7 @@ class MoveData:
     corner: wp.vec3
     """TCP at the corner with positive x and y [m]."""
     start_height: float
-    """Height of the TCP above the first corner at the first frame [m]."""
+    """Height of the TCP above the floor in the first frame, over the first corner [m]."""
     waypoints: int
     """Corners to visit."""
     mass: float

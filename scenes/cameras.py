@@ -10,6 +10,8 @@ from synpick_warp.scenes.types import Camera
 
 PARALLEL = 1e-6
 """Sine of the angle below which `up` counts as parallel to the viewing direction."""
+_MIN_DISTANCE = 1e-6
+"""Minimum distance between a camera and its target [m]."""
 
 
 def make_cameras(cameras: Cameras) -> tuple[Camera, ...]:
@@ -43,7 +45,7 @@ def _look_at(index: int, position: np.ndarray, target: np.ndarray, up: np.ndarra
         raise ConfigError(f"cameras: camera {index} has a position, target or up that is not finite; give numbers")
     forward = target - position
     distance = np.linalg.norm(forward)
-    if distance < PARALLEL:
+    if distance < _MIN_DISTANCE:
         raise ConfigError(f"cameras.positions: camera {index} is at cameras.target {_plain(target)}; move one of them")
     forward = forward / distance
     right = np.cross(forward, up)

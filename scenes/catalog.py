@@ -161,7 +161,7 @@ def _check_size(raw: RawObject, origin: str, tote: Tote) -> None:
 
 
 def _check_fits_tote(vertices: np.ndarray, size: float, origin: str, tote: Tote) -> None:
-    """Refuse an object of this diameter [m] that fits neither through the tote's opening nor into the tote, in any orientation.
+    """Refuse an object of this diameter [m] that passes through the tote's opening in no orientation, or does not fit into the tote.
 
     It passes if the two smaller sides of a bounding box are no longer than the opening's. The axis-aligned box is tried first, since the
     minimum oriented bounding box takes long to compute for fine meshes.

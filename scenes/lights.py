@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import configparser
+import itertools
 import os
 from pathlib import Path
 
@@ -40,7 +41,7 @@ MAX_RADIANCE = 1e11
 MAX_GAMMA = 100.0
 """Maximum REFgamma; displays have 2.2."""
 MIN_RADIANCE = 1e-6
-"""Least radiance that a map's brightest texel must have: exposure ends at a white of 1e-9."""
+"""Least radiance that a map's brightest texel must have: the automatic exposure divides by the radiance of white, at least 1e-9."""
 
 
 def load_lights(folder: str) -> tuple[EnvironmentMap, ...]:
@@ -54,7 +55,8 @@ def load_lights(folder: str) -> tuple[EnvironmentMap, ...]:
         folder: The folder; empty: the embedded maps.
 
     Raises:
-        LightError: The folder does not exist or contains no map, a map cannot be read or is invalid, or a set refers to a missing file.
+        LightError: The folder does not exist or contains no map, a map cannot be read or is invalid, two have the same name, or a
+            set refers to a missing file.
     """
     if not folder:
         return skies()
@@ -68,7 +70,11 @@ def load_lights(folder: str) -> tuple[EnvironmentMap, ...]:
         raise LightError(f"lights folder {folder} cannot be read: {error.strerror}; check its permissions") from error
     if not maps:
         raise LightError(f"lights folder {folder} contains no environment map; add .hdr files or sIBL sets (.ibl with its maps)")
-    return tuple(sorted(maps, key=lambda light: light.name))
+    maps.sort(key=lambda light: light.name)
+    for first, second in itertools.pairwise(maps):
+        if first.name == second.name:  # The name is all that a data set says of a view's map.
+            raise LightError(f"lights folder {folder}: two maps have the name {first.name}; rename one of them")
+    return tuple(maps)
 
 
 def _read_folder(folder: Path) -> list[EnvironmentMap]:

@@ -44,7 +44,8 @@ def tote_fixture(tote: Tote) -> Fixture:
     """Build the visual mesh: a closed shell for the tote and one for each rib.
 
     Raises:
-        ConfigError: The rim does not fit into the outer size, or the floor is larger than the rim.
+        ConfigError: The rim does not fit into the outer size, the floor is larger than the rim or too small for its rounded corners, or the
+            tote is lower than three walls.
     """
     _check(tote)
     wall, top = tote.wall, rim_height(tote)

@@ -81,7 +81,7 @@ class Ending(_Described):
     FINISHED = "the gripper has been everywhere it was to go"
     EMPTIED = "no object is left in the tote"
     GAVE_UP = "too many attempts have failed"
-    UNSETTLED = "the objects did not come to rest in time, so the arrangement was resampled"
+    UNSETTLED = "the objects did not come to rest in time, or were dropped again too often, so the arrangement was resampled"
     ARRANGEMENT_OVERFLOW = "more objects of a kind were drawn than a world has body slots for, so the arrangement was resampled"
     SOLVER_OVERFLOW = "more contacts arose than the solver has capacity for, so the episode was resampled"
     NOT_FINITE = "a pose became infinite or not a number, so the episode was resampled"

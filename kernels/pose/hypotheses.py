@@ -1,4 +1,4 @@
-"""Pose hypotheses of a tracker: motion models, near-symmetries, their colour correlation, and the choice of the best."""
+"""Pose hypotheses of detector and tracker: motion models, near-symmetries, their colour correlation, and the choice of the best."""
 
 import warp as wp
 

@@ -190,8 +190,8 @@ def sample_lights_kernel(
 ):
     """Sample the environment map of starting episodes, its yaw [rad] and its exposure value [EV].
 
-    With the samples u_i of the stream (seed, episode, arrangement, Stream.LIGHT): map by u_0, yaw = 2π u_1, exposure = s (2 u_2 - 1) for
-    a spread s.
+    With the samples u_i of the stream (seed, episode, arrangement, Stream.LIGHT): map by u_0, yaw = 2π u_1 or, without `random_yaw`, 0,
+    exposure = s (2 u_2 - 1) for a spread s.
     """
     world = wp.tid()
     if phase[world] != Phase.START:

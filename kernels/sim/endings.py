@@ -74,8 +74,8 @@ def judge_episodes_kernel(
 ):
     """Move worlds whose episode has an ending to phase OVER; failures override the endings of `judge_tasks_kernel`.
 
-    Failures, each overriding those before it: not settled in time, an overflow of contour points in perception, an overflow of
-    contacts or constraint rows in the solver, a pose that is not finite.
+    Failures, each overriding those before it: not settled in time or within the allowed re-drops, an overflow of contour points in
+    perception, an overflow of contacts or constraint rows in the solver, a pose that is not finite.
     """
     world = wp.tid()
     phase = phase_inout[world]

@@ -114,8 +114,8 @@ def decode_texture(data: bytes, source: str) -> np.ndarray:
 def bake_vertex_colors(faces: np.ndarray, colors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bake vertex colours into a texture atlas with 2 x 2 texels for each triangle.
 
-    With corner colours a, b, c, three texels hold these and the fourth b + c - a: bilinear filtering then equals barycentric
-    interpolation over the triangle, and never reads another triangle's texels.
+    With corner colours a, b, c, three texels hold these and the fourth b + c - a, clipped to 0 .. 1: where nothing is clipped, bilinear
+    filtering equals barycentric interpolation over the triangle up to 8-bit rounding. It never reads another triangle's texels.
 
     Args:
         faces: Vertex indices (F, 3).

@@ -1,6 +1,7 @@
 """Asset files of users: size limits, file names, and the files that a model or a set of lights refers to.
 
-A model folder or light folder may come from anywhere. Its files are read whole, up to the limits here, and libraries get bytes, not paths.
+A model folder or light folder may come from anywhere. Its files are read whole, up to the limits here, and libraries get bytes; OpenCV
+alone opens environment maps by their path, once their headers are checked.
 """
 
 from __future__ import annotations

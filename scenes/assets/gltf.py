@@ -181,8 +181,9 @@ def _at(items: list[_Item], index: int, what: str, path: Path) -> _Item:
 def _check_sizes(gltf: _Gltf, path: Path) -> None:
     """Check what the reader would allocate: views and accessors in bytes, vertices and triangles of all meshes and of all nodes."""
     for name in ("buffers", "bufferViews", "accessors", "images", "textures", "materials", "meshes", "nodes"):
-        if len(getattr(gltf, name)) > (8 if name in ("bufferViews", "accessors") else 1) * MAX_PARTS:
-            raise CatalogError(f"{path}: {len(getattr(gltf, name))} {name}; allowed: {MAX_PARTS} parts; merge them")
+        limit = MAX_PARTS * (8 if name in ("bufferViews", "accessors") else 1)
+        if len(getattr(gltf, name)) > limit:
+            raise CatalogError(f"{path}: {len(getattr(gltf, name))} {name}; allowed: {limit}; merge the meshes' parts")
     viewed = sum(view.byteLength for view in gltf.bufferViews)
     stored = sum(each.count * _BYTES[each.componentType] * _WIDTHS[each.type] for each in gltf.accessors)
     if max(viewed, stored) > 2 * MAX_MESH_FILE:

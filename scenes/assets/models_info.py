@@ -127,7 +127,11 @@ def _depth(content: Any) -> int:
 def _info(entry: _Entry, place: str) -> ModelInfo:
     return ModelInfo(
         None if entry.diameter is None else entry.diameter * _MILLIMETRE,
-        tuple(_rigid(matrix, f"{place}: symmetries_discrete[{index}]") for index, matrix in enumerate(entry.symmetries_discrete)),
+        tuple(
+            matrix
+            for index, given in enumerate(entry.symmetries_discrete)
+            if not _is_identity(matrix := _rigid(given, f"{place}: symmetries_discrete[{index}]"))
+        ),
         tuple(_axis(axis, f"{place}: symmetries_continuous[{index}]") for index, axis in enumerate(entry.symmetries_continuous)),
     )
 
@@ -140,6 +144,11 @@ def _rigid(value: list[float], place: str) -> tuple[float, ...]:
         raise CatalogError(f"{place}: not a rotation and translation; needed: a rigid 4 x 4 matrix, row by row")
     matrix[:3, 3] *= _MILLIMETRE
     return tuple(float(value) for value in matrix.reshape(-1))
+
+
+def _is_identity(matrix: tuple[float, ...]) -> bool:
+    """Whether a transform leaves everything in place: some data sets list the identity, which makes no object symmetric."""
+    return bool(np.abs(np.reshape(matrix, (4, 4)) - np.eye(4)).max() < _ROTATION_TOLERANCE)
 
 
 def _axis(value: _Axis, place: str) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

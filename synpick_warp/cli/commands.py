@@ -75,8 +75,8 @@ ResolutionOption = Annotated[str | None, Parameter(help=_help("cameras.resolutio
 DevicesOption = Annotated[
     str | None,
     Parameter(
-        help="Several devices with a process each, joined by commas: GPUs such as cuda:0,cuda:1, or cpu once per process, or all: every GPU, "
-        "or without one a process per CPU core. They fill one data set, with the bytes of one device; it can be resumed on other devices."
+        help="Several devices with a process each, joined by commas: GPUs such as cuda:0,cuda:1, or cpu once per process, or all: every "
+        "GPU, or without one a process per CPU core. They fill one data set, with the bytes of one device; others can resume it."
     ),
 ]
 DeviceOption = Annotated[str | None, Parameter(help=_help("bake.device"))]

@@ -118,6 +118,7 @@ class StreamDataset(IterableDataset):
 
         Raises:
             ConfigError: A setting or field is unknown, or a value is not allowed.
+            TypeError: There is no argument of a name in `arguments`.
         """
         unknown = sorted(set(arguments) - set(ARGUMENTS))
         if unknown:
@@ -126,7 +127,7 @@ class StreamDataset(IterableDataset):
         for name in fields:
             if name not in FIELDS and name not in self.config.render.layers:
                 known = ", ".join((*FIELDS, *self.config.render.layers))
-                raise ConfigError(f"there is no field {name}; fields: {known}, and layers of render.layers")
+                raise ConfigError(f"there is no field {name}; fields: {known}; others are layers that render.layers names")
         if shuffle and batched:
             raise ConfigError(f"shuffle is {shuffle}, but whole batches are not shuffled; set batched=False")
         self.fields, self.batched, self.shuffle, self.transform = tuple(fields), batched, shuffle, transform

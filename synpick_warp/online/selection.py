@@ -13,7 +13,10 @@ from synpick_warp.errors import ConfigError
 
 @dataclass(frozen=True)
 class Selection:
-    """Cameras and frames of each episode; what is left out is not rendered, and changes nothing in the other views."""
+    """Cameras and frames of each episode; what is left out is not rendered.
+
+    The other views keep their poses, depth and masks. With a stride above 1 their light is not averaged over frames (`render.history`).
+    """
 
     cameras: tuple[int, ...] | None = None
     """Indices of the cameras; None: all."""

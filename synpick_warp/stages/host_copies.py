@@ -40,7 +40,7 @@ class HostImages:
     jpeg_quality: int = 0
     """Quality of the JPEG files that are copied instead of colour images; 0: there are none."""
     depth_files: bool = False
-    """Whether data of PNG files (IDAT) is copied instead of depth images."""
+    """Whether data of PNG files (IDAT) is copied: instead of depth images, or beside them if these are needed, too."""
 
 
 def host_images(config: Config, device: wp.Device, needs_images: bool, depth_files: bool) -> HostImages:

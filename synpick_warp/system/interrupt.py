@@ -20,7 +20,7 @@ _STANDARD_ERROR = 2
 class StopRequest:
     """Context manager that records the first of SIGNALS; after it the previous handlers are restored.
 
-    Outside of the main thread, which receives no signals, it does nothing.
+    In any thread but the main one it does nothing: Python allows signal handlers there alone.
     """
 
     def __init__(self) -> None:

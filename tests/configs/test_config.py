@@ -256,6 +256,10 @@ def test_a_bad_value_in_the_file_is_reported_even_if_the_command_line_replaces_i
             {"render.layers": ["flow", "nocs", "flow"]},
             r'render.layers is \["flow", "nocs", "flow"\] on .*; allowed: each layer once: \["flow", "nocs"\]',
         ),
+        (
+            {"bake.formats": ["shards"], "bake.episodes": 333_334},
+            "bake.episodes is 333334 on the command line; allowed: episode indices below 333333 with the format shards",
+        ),
         ({"bop.depth_scale": 0.01}, "bop.depth_scale is 0.01 on the command line; allowed: at least 0.03"),
     ],
 )

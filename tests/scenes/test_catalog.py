@@ -86,7 +86,7 @@ def test_a_bop_folder_in_millimetres(tmp_path):
         tmp_path,
         {
             "2": {"diameter": 173.2, "symmetries_continuous": [{"axis": [0, 0, 2], "offset": [0, 5, 0]}]},
-            "7": {"symmetries_discrete": [turn]},
+            "7": {"symmetries_discrete": [np.eye(4).ravel().tolist(), turn]},
             "9": {"diameter": -1},
         },
     )

@@ -127,6 +127,13 @@ def test_maps_come_sorted_from_folder_and_subfolders(tmp_path):
     assert [light.name for light in load_lights(str(tmp_path))] == ["a", "b", "c", "room"]
 
 
+def test_maps_of_one_name_are_refused_as_a_data_set_names_the_map_of_a_view(tmp_path):
+    for folder in (tmp_path / "first", tmp_path / "second"):
+        folder.mkdir()
+        save(folder / "sky.hdr", picture())
+    refused(tmp_path, "two maps have the name sky")
+
+
 def test_a_set_is_its_reflection_map_times_multi_without_gamma_for_linear_files(tmp_path):
     make_set(tmp_path / "set", multi="3.0", gamma="2.2")
     for place in (tmp_path, tmp_path / "set"):

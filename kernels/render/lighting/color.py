@@ -7,7 +7,7 @@ wp.set_module_options({"enable_backward": False})
 LUMINANCE_RED = wp.constant(0.2126)
 LUMINANCE_GREEN = wp.constant(0.7152)
 LUMINANCE_BLUE = wp.constant(0.0722)
-"""Rec. 709 luma coefficients, linear."""
+"""Rec. 709 luminance weights of linear RGB."""
 MIN_RADIANCE = wp.constant(1.0e-20)
 """Divisors that are radiances are at least this."""
 MAX_HALF = wp.constant(60000.0)

@@ -71,10 +71,7 @@ def complete_scene(scene: Path, settings: SceneSettings) -> None:
     """Write the JSON files of a staged scene from its annotation blocks, and sync its folders to disk."""
     with (scene / ANNOTATIONS).open("rb") as file:
         blocks = AnnotationBlocks(file)
-        if blocks.frames != list(range(settings.frames)):
-            raise OutputError(
-                f"{scene} has {len(blocks.frames)} of {settings.frames} frames; this is an error of synpick-warp, please report it"
-            )
+        blocks.check_frames(scene, settings.frames)
         names = ("scene_camera.json", "scene_gt.json", "scene_gt_info.json")
         for index, name in enumerate(names):
             _write_lines(scene / name, _format_keyed(blocks, index))
@@ -101,6 +98,15 @@ class AnnotationBlocks:
             self.frames.append(frame)
             file.seek(end)
         self.frames.sort()
+
+    def check_frames(self, scene: Path, frames: int) -> None:
+        """Check that there is one block of each frame.
+
+        Raises:
+            OutputError: There is not.
+        """
+        if self.frames != list(range(frames)):
+            raise OutputError(f"{scene} has {len(self.frames)} of {frames} frames; this is an error of synpick-warp, please report it")
 
     def read(self, frame: int, begin: int, end: int | None) -> Iterator[str]:
         """Read entries `begin` to `end`, exclusive, of a frame."""

@@ -1,4 +1,4 @@
-"""Base class of BOP exporters: one scene per camera and episode, one task per view, staged and committed as a whole."""
+"""Base class of BOP exporters: one staged scene per camera and episode, one task per view, staged and committed as a whole."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """One view in BOP format: image files, and annotations (camera, poses, pixel counts, boxes, COCO masks).
 
-Runs in writer processes, so it imports neither Warp nor Newton. Only the BOP exporter uses millimetres.
+Runs in writer processes, so it imports neither Warp nor Newton. Only BOP's formats (bop, shards, coco) use millimetres.
 """
 
 from __future__ import annotations

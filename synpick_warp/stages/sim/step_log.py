@@ -50,7 +50,7 @@ class DropArrays:
 
     drop_pose: wp.array = device_array("world", "instance", dtype=wp.transformf, unit="m")
     """Object to world at its first drop."""
-    progress: wp.array = device_array("world", dtype=wp.vec4i, unit="ticks")
+    progress: wp.array = device_array("world", dtype=wp.vec4i)
     """As `WorldState.progress`."""
 
 

@@ -29,8 +29,8 @@ class WorldState:
     """`Mode`."""
     next_episode: wp.array = device_array("one", dtype=wp.int32)
     """Position in the bake's list of episodes of the next one to start."""
-    progress: wp.array = device_array("world", dtype=wp.vec4i, unit="ticks")
-    """Ticks since the drop, ticks at rest, re-drops, whether the guide walls stand."""
+    progress: wp.array = device_array("world", dtype=wp.vec4i)
+    """Ticks since the drop, ticks at rest, number of re-drops, 1 while the guide walls stand."""
     catalog_index: wp.array = device_array("world", "instance", dtype=wp.int32)
     """Object of each instance; -1: none."""
     body_slot: wp.array = device_array("world", "instance", dtype=wp.int32)

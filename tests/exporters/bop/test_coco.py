@@ -15,8 +15,8 @@ from pycocotools.coco import COCO
 
 from synpick_warp.configs.schema import Split
 from synpick_warp.dataset.reading import COCO_PARTS
-from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS
+from synpick_warp.errors import DatasetError, OutputError
+from synpick_warp.exporters.bop.coco.annotation_files import CATEGORIES, IMAGES, PARTS, commit_scenes, write_image
 from synpick_warp.exporters.bop.coco.exporter import CocoExporter
 from synpick_warp.exporters.bop.exporter import BopExporter
 from tests.harness.exporter_contract import ExporterContract, export, exporting, finish
@@ -93,6 +93,20 @@ def test_every_split_has_an_annotation_file(tmp_path):
         assert found.dataset["info"]["description"] == f"synpick-warp, {split}"
     assert (len(read(out, "val_pbr").imgs), len(read(out, "val_pbr").cats)) == (0, 2)
     assert PARTS == COCO_PARTS
+
+
+def test_scenes_are_checked_for_completeness(tmp_path):
+    scene = tmp_path / "hidden"
+    scene.mkdir()
+    for frame in (2, 0):
+        write_image(scene, frame, ".jpg", b"image", [])
+    for name in (IMAGES, PARTS):
+        (tmp_path / name).mkdir(parents=True)
+    with pytest.raises(OutputError, match="has 2 of 3 frames"):
+        commit_scenes(((scene, 7),), tmp_path, 3)
+    write_image(scene, 1, ".jpg", b"image", [])
+    commit_scenes(((scene, 7),), tmp_path, 3)
+    assert sorted(path.name for path in (tmp_path / IMAGES / "000007").iterdir()) == ["000000.jpg", "000001.jpg", "000002.jpg"]
 
 
 def test_views_without_objects_have_no_annotations(tmp_path):

@@ -106,11 +106,16 @@ def write_image(scene: Path, frame: int, suffix: str, data: Any, annotations: It
         folder.append(ANNOTATIONS, annotation_block(frame, (to_json(list(annotations)),)))
 
 
-def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path) -> None:
-    """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations a frame, and rename all to their places."""
+def commit_scenes(scenes: tuple[tuple[Path, int], ...], out: Path, frames: int) -> None:
+    """Task: complete an episode's scenes, (staging folder, scene_id): a line of annotations per frame, and rename all to their places.
+
+    Raises:
+        OutputError: Fewer than `frames` frames of a scene have arrived.
+    """
     for scene, scene_id in scenes:
         with (scene / ANNOTATIONS).open("rb") as file:
             blocks = AnnotationBlocks(file)
+            blocks.check_frames(scene, frames)
             lines = [next(blocks.read(frame, 0, 1)) for frame in blocks.frames]
         part = scene.with_name(f"{scene.name}.part")
         write_synced(part, "".join(f"{line}\n" for line in lines).encode())

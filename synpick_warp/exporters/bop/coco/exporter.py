@@ -106,4 +106,4 @@ class CocoExporter(SceneExporter):
         raise NotImplementedError("COCO has no layers")
 
     def _commit_task(self, scenes: tuple[tuple[Path, int], ...], frames: int) -> tuple[Callable[..., None], tuple[Any, ...]]:
-        return commit_scenes, (scenes, self._out)
+        return commit_scenes, (scenes, self._out, frames)

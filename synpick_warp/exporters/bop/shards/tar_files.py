@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from synpick_warp.configs.splits import MAX_SHARD_SCENES
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.bop.view import (
     ViewSettings,
@@ -37,8 +38,6 @@ from synpick_warp.layer_codec import encode_layer
 
 MAX_SHARD_VIEWS = 1000
 """Maximum number of views in a shard, as in the toolkit (convert_imagewise_to_webdataset.py)."""
-SHARD_STRIDE = 1_000_000
-"""Index of a scene's shard p: scene_id + p · stride; a scene_id has six digits."""
 END_OF_ARCHIVE = bytes(2 * tarfile.BLOCKSIZE)
 """End-of-archive marker of a tar file (POSIX.1-1988, section 10.1.1)."""
 _SHARD = re.compile(r"shard-[0-9]{6,18}\.tar")
@@ -50,7 +49,7 @@ _COPY_BYTES = 1 << 20
 
 def shard_name(scene: int, part: int) -> str:
     """Name of the shard that holds a scene's views from `MAX_SHARD_VIEWS · part` on."""
-    return f"shard-{scene + SHARD_STRIDE * part:06d}.tar"
+    return f"shard-{scene + MAX_SHARD_SCENES * part:06d}.tar"
 
 
 def write_shard_view(
