@@ -141,10 +141,8 @@ def _bop(config: Config) -> Iterator[Conflict]:
             yield "bop.color_format", f"{fitting} with the split {folder}: {rule}"
     if "shards" in config.bake.formats and scenes_end(config) > MAX_SHARD_SCENES:
         key = f"splits.{config.splits[-1].name}.episodes" if config.splits else "bake.episodes"
-        yield (
-            key,
-            f"indices below {MAX_SHARD_SCENES // len(config.cameras.positions)} with the format shards, whose names hold no more scenes",
-        )
+        most = MAX_SHARD_SCENES // len(config.cameras.positions)
+        yield key, f"episode indices below {most} with the format shards, whose names hold no more scenes"
     far = max((math.dist(position, (0.0, 0.0, 0.0)) for position in config.cameras.positions), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:
         yield "bop.depth_scale", f"at least {far * 1e3 / DEPTH_COUNTS:.3g}, so that 16 bits reach the tote from {far:.3g} m [mm]"

@@ -33,8 +33,6 @@ class LayoutData:
     """Collision shapes of a world."""
     finger_shape: int
     """Index of the gripper shaft's shape in its world."""
-    cup_shape: int
-    """Index of the cup's shape in its world."""
 
 
 @wp.struct
@@ -201,18 +199,28 @@ class PickData:
 
 @wp.struct
 class PerceptionData:
-    """Parameters of perception and grasp planning, named as in configs.schema.Perception. Lengths in the image [px], heights [m]."""
+    """Parameters of perception and grasp planning, named as in configs.schema.Perception."""
 
     center_fraction: float
+    """Distance of centroid or midpoint to the contour, as a fraction of the pole's, from which it is the suction point."""
     heavy_mass: float
+    """Mass above which an object is grasped nearer to its centroid [kg]."""
     heavy_center_fraction: float
+    """`center_fraction` of heavy objects."""
     contour_offset: float
+    """Distance from the contour, inside and outside, at which the depths of neighbours are compared [px]."""
     deep_distance: float
+    """Depth below the suction point from which a neighbour's votes are down-weighted [m]."""
     deep_weight: float
+    """Weight of those votes."""
     min_votes: float
+    """Minimum occlusion votes for an edge of the clutter graph."""
     reach: float
+    """Maximum distance of a neighbour's contour from the compared pixel [bounding box diagonals]."""
     exact_cycle: int
+    """Maximum size of a cycle that is broken at minimum cost."""
     normal_window: int
+    """Half width of the window over which the surface normal is averaged [px]."""
 
 
 @wp.struct

@@ -5,6 +5,8 @@ The renderer samples the extracted sun with shadow rays of its own. If an sIBL s
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 
@@ -15,24 +17,33 @@ SUN_SEARCH_RADIUS = np.radians(15.0)
 """Texels within this angle of the brightest direction can belong to the sun [rad]."""
 SUN_CONTRAST = 4.0
 """The part of a texel's luminance above this multiple of the map's mean belongs to the sun."""
-MAX_SUN_ANGULAR_RADIUS = np.tan(np.radians(4.0))
-"""Largest angular radius of a sun with shadow rays of its own (tangent): penumbras of wider ones need none."""
+MAX_SUN_TANGENT = np.tan(np.radians(4.0))
+"""Tangent of the largest angular radius of a sun with shadow rays of its own: penumbras of wider ones need none."""
 MIN_SUN_HEIGHT = 0.15
 """Smallest z of the direction to the sun: a lower one does not reach a pile in a tote."""
-SOLAR_ANGULAR_RADIUS = np.tan(np.radians(0.267))
-"""Angular radius of the real sun (tangent): the minimum for an sIBL set's sun."""
+SOLAR_TANGENT = np.tan(np.radians(0.267))
+"""Tangent of the real sun's angular radius: the minimum for an sIBL set's sun."""
 
 
-def extract_sun(radiance: np.ndarray, direction: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+class ExtractedSun(NamedTuple):
+    """A map's dominant light, taken out of the map."""
+
+    rest: np.ndarray
+    """The map without it (rows, 2 rows, 3)."""
+    direction: np.ndarray
+    """Unit direction to it (3)."""
+    irradiance: np.ndarray
+    """Irradiance on a surface that faces it (3); zero if no light is dominant."""
+    radius_tangent: float
+    """Tangent of its angular radius."""
+
+
+def extract_sun(radiance: np.ndarray, direction: np.ndarray | None = None) -> ExtractedSun:
     """Split a map into its dominant light above the horizon and the rest.
 
     Args:
         radiance: (rows, 2 rows, 3).
         direction: Unit direction (3) to extract light around; None: that of the brightest place.
-
-    Returns:
-        The map without the sun, unit direction to the sun (3), its irradiance on a surface that faces it (3; zero if nothing
-        stands out), tangent of its angular radius.
     """
     directions, solid_angles = map_directions(radiance.shape[0])
     luminance = radiance @ LUMINANCE
@@ -41,11 +52,11 @@ def extract_sun(radiance: np.ndarray, direction: np.ndarray | None = None) -> tu
     fraction = sun_fraction(radiance, peak)
     weight = fraction * luminance * solid_angles
     if weight.sum() <= 0.0:
-        return radiance, np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0
+        return ExtractedSun(radiance, np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0)
     center = (weight[..., None] * directions).sum(axis=(0, 1))
     center /= np.linalg.norm(center)
     irradiance = (radiance * (fraction * solid_angles)[..., None]).sum(axis=(0, 1))
-    return radiance * (1.0 - fraction)[..., None], center, irradiance, disc_angular_radius(weight, center)
+    return ExtractedSun(radiance * (1.0 - fraction)[..., None], center, irradiance, disc_radius_tangent(weight, center))
 
 
 def sun_fraction(radiance: np.ndarray, direction: np.ndarray) -> np.ndarray:
@@ -57,15 +68,20 @@ def sun_fraction(radiance: np.ndarray, direction: np.ndarray) -> np.ndarray:
     return np.where(near, 1.0 - threshold / np.maximum(luminance, 1e-12), 0.0)
 
 
-def disc_angular_radius(weight: np.ndarray, direction: np.ndarray) -> float:
-    """Tangent of the angular radius of a uniform disc about a direction (3) with the second moment of texel weights (rows, 2 rows)."""
+def disc_radius_tangent(weight: np.ndarray, direction: np.ndarray) -> float:
+    """Tangent of the angular radius of a uniform disc about a direction (3) with the second moment of texel weights.
+
+    Args:
+        weight: Luminance times solid angle of each texel (rows, 2 rows).
+        direction: Unit direction (3).
+    """
     directions, _ = map_directions(len(weight))
     # The mean squared sine over a disc is half the squared sine of its radius.
     sine = np.sqrt(np.clip(2.0 * (weight * (1.0 - (directions @ direction) ** 2)).sum() / weight.sum(), 0.0, 0.25))
     return float(sine / np.sqrt(1.0 - sine**2))
 
 
-def replace_sun(radiance: np.ndarray, sun: Sun) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def replace_sun(radiance: np.ndarray, sun: Sun) -> ExtractedSun:
     """Replace the bright place of a map by the sun that its sIBL set names.
 
     The sun has the set's direction and colour, and the larger luminance of the set's sun and the light it replaces: a clipped map
@@ -75,16 +91,13 @@ def replace_sun(radiance: np.ndarray, sun: Sun) -> tuple[np.ndarray, np.ndarray,
     Args:
         radiance: (rows, 2 rows, 3).
         sun: The set's sun.
-
-    Returns:
-        As `extract_sun`.
     """
-    rest, _, taken, angular_radius = extract_sun(radiance, sun.direction)
-    gain = max(1.0, float(taken @ LUMINANCE) / float(sun.irradiance @ LUMINANCE))
-    return rest, sun.direction, gain * sun.irradiance, max(angular_radius, float(SOLAR_ANGULAR_RADIUS))
+    taken = extract_sun(radiance, sun.direction)
+    gain = max(1.0, float(taken.irradiance @ LUMINANCE) / float(sun.irradiance @ LUMINANCE))
+    return ExtractedSun(taken.rest, sun.direction, gain * sun.irradiance, max(taken.radius_tangent, float(SOLAR_TANGENT)))
 
 
-def draw_sun_disc(bright: np.ndarray, direction: np.ndarray, irradiance: np.ndarray, angular_radius: float) -> np.ndarray:
+def draw_sun_disc(bright: np.ndarray, direction: np.ndarray, irradiance: np.ndarray, radius_tangent: float) -> np.ndarray:
     """Render a sun as a uniform disc into a black map (rows, 2 rows, 3), with the given irradiance on a surface that faces it.
 
     Args:
@@ -92,11 +105,11 @@ def draw_sun_disc(bright: np.ndarray, direction: np.ndarray, irradiance: np.ndar
             hide them.
         direction: Unit direction (3) to the disc's centre, above the horizon.
         irradiance: (3).
-        angular_radius: Tangent of the disc's angular radius; the disc has at least one texel.
+        radius_tangent: Tangent of the disc's angular radius; the disc has at least one texel.
     """
     directions, solid_angles = map_directions(len(bright))
     cosine = np.where(directions[..., 2] > 0.0, directions @ direction, -1.0)
-    inside = cosine >= min(1.0 / np.sqrt(1.0 + angular_radius**2), cosine.max())
+    inside = cosine >= min(1.0 / np.sqrt(1.0 + radius_tangent**2), cosine.max())
     if (inside & bright).any():
         inside &= bright
     return inside[..., None] * irradiance / (cosine * solid_angles)[inside].sum()

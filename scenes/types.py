@@ -142,7 +142,7 @@ class Fixture:
     mesh: TriangleMesh
     material: Material
     interior: Interior | None = None
-    """The room in it, if it is a container."""
+    """Its empty interior, if it is a container."""
 
 
 @dataclass(frozen=True, eq=False)

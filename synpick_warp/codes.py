@@ -94,7 +94,7 @@ class Ending(_Described):
 
 
 class Outcome(_Described):
-    """Result of an attempt to pick."""
+    """Result of an attempt to pick. The failures come last; device code relies on it."""
 
     NONE = "no attempt has ended"
     TARGET_PICKED = "the target hung on the cup after the lift"

@@ -97,8 +97,9 @@ def bound_contours_kernel(
 ):
     """Bounding box of each contour, and reach of each instance.
 
-    extent[j] = max over the contour of (-column, -row, column, row), which must be NOWHERE at the start;
-    reach[j] = reach · diagonal_j · f_x / depth_j, unwritten for instances without a catalog entry, which are never visible.
+    extent_out[j] = max over the contour of (-column, -row, column, row), which must be NOWHERE at the start;
+    reach_out[j] = perception.reach · diagonal_j · f_x / depth_j [px], unwritten for instances without a catalog entry, which are never
+    visible.
     """
     view, instance, lane = wp.tid()
     world = views.world[view]

@@ -15,7 +15,7 @@ DEADBAND = wp.constant(0.75)
 
 
 @wp.struct
-class Way:
+class SilhouetteResidual:
     """Silhouette residual of a protruding sample: the shortest way back into the mask, at the sample's depth."""
 
     distance: float
@@ -25,14 +25,14 @@ class Way:
 
 
 @wp.func
-def way_to_mask(observation: Observation, instance: int, sample: SampleView, intrinsics: wp.vec4) -> Way:
-    """Way from a sample to the nearest crop pixel of the mask, by the feature transform, less the deadband."""
+def silhouette_residual(observation: Observation, instance: int, sample: SampleView, intrinsics: wp.vec4) -> SilhouetteResidual:
+    """SilhouetteResidual from a sample to the nearest crop pixel of the mask, by the feature transform, less the deadband."""
     column = wp.clamp(int(wp.round(sample.crop[0])), 0, CROP - 1)
     row = wp.clamp(int(wp.round(sample.crop[1])), 0, CROP - 1)
     target = observation.nearest[instance, row, column] + wp.vec2(float(column), float(row))
     offset = target - sample.crop
     pixels = wp.length(offset)
-    result = Way()
+    result = SilhouetteResidual()
     if pixels > DEADBAND:
         scale = observation.pitch[instance] * sample.position[2]
         offset = wp.vec2(scale * offset[0] / intrinsics[0], scale * offset[1] / intrinsics[1])
@@ -55,7 +55,7 @@ def intensity_gradient(across: float, down: float, intrinsics: wp.vec4, pitch: f
 def accumulate_samples_kernel(
     # Scene:
     models: Models,
-    cost: LossParameters,
+    loss: LossParameters,
     # In:
     images: Images,
     targets: Targets,
@@ -83,32 +83,32 @@ def accumulate_samples_kernel(
     samples = models.position.shape[1]
     if observation.points[instance] == 0:
         samples = 0
-    for k in range(lane * cost.step, samples, LANES * cost.step):
-        sample = view_sample(models, images, targets, observation, cost, instance, pose[index], k)
-        area = sample.area * float(cost.step)
+    for k in range(lane * loss.step, samples, LANES * loss.step):
+        sample = view_sample(models, images, targets, observation, loss, instance, pose[index], k)
+        area = sample.area * float(loss.step)
         if sample.state == PROTRUDING:
-            way = way_to_mask(observation, instance, sample, intrinsics)
-            total[0] += area * wp.min(way.distance / cost.truncation, 1.0)
-            if way.distance > 0.0:
-                weight = cost.silhouette * area * wp.min(1.0, cost.cutoff / way.distance)
-                line = jacobian(sample.position, origin, way.direction, radius)
+            residual = silhouette_residual(observation, instance, sample, intrinsics)
+            total[0] += area * wp.min(residual.distance / loss.truncation, 1.0)
+            if residual.distance > 0.0:
+                weight = loss.silhouette * area * wp.min(1.0, loss.cutoff / residual.distance)
+                line = jacobian(sample.position, origin, residual.direction, radius)
                 hessian += weight * wp.outer(line, line)
-                gradient += weight * way.distance * line
+                gradient += weight * residual.distance * line
         if sample.state == VISIBLE:
             total[1] += area
-            if cost.color > 0.0 and mean > 0.0 and has_color(observation, instance, sample.crop):
+            if loss.color > 0.0 and mean > 0.0 and has_color(observation, instance, sample.crop):
                 intensity, across, down = interpolate_color(observation, instance, sample.crop)
                 basis = harmonics(sample.normal)
                 total[3] += area
                 for channel in range(CHANNELS):
                     light = wp.max(wp.dot(lighting.coefficients[index, channel], basis), 0.0)
                     error = (intensity[channel] - models.color[model, k][channel] * light) / mean
-                    total[2] += area * wp.min(wp.abs(error) / cost.color_cutoff, 1.0) / float(CHANNELS)
+                    total[2] += area * wp.min(wp.abs(error) / loss.color_cutoff, 1.0) / float(CHANNELS)
                     change = intensity_gradient(across[channel], down[channel], intrinsics, observation.pitch[instance], sample.position)
-                    line = jacobian(sample.position, origin, cost.color / mean * change, radius)
-                    weight = area * tukey_weight(error, cost.color_cutoff) / float(CHANNELS)
+                    line = jacobian(sample.position, origin, loss.color / mean * change, radius)
+                    weight = area * tukey_weight(error, loss.color_cutoff) / float(CHANNELS)
                     hessian += weight * wp.outer(line, line)
-                    gradient -= weight * cost.color * error * line
+                    gradient -= weight * loss.color * error * line
     sums_inout.hessian[index, lane] = sums_inout.hessian[index, lane] + hessian
     sums_inout.gradient[index, lane] = sums_inout.gradient[index, lane] + gradient
     sums_inout.samples[index, lane] = total

@@ -45,10 +45,10 @@ class Track:
 
 @wp.struct
 class TrackPolicy:
-    """When a track takes an estimate over."""
+    """Policy of accepting estimates into tracks."""
 
     min_points: int
-    """Observed points with fewer than which an instance keeps its pose."""
+    """Minimum observed points; with fewer an instance keeps its pose."""
     surprise: float
     """Increase of the cost over its running mean above which an estimate is rejected."""
     patience: int
@@ -147,7 +147,7 @@ def correlate_symmetries_kernel(
     # Scene:
     models: Models,
     symmetries: Symmetries,
-    cost: LossParameters,
+    loss: LossParameters,
     # In:
     images: Images,
     targets: Targets,
@@ -166,7 +166,7 @@ def correlate_symmetries_kernel(
     squares = wp.vec4()
     if observation.points[instance] > 0 and index % capacity < symmetries.count[model]:
         for k in range(lane, models.position.shape[1], CORRELATION_LANES):
-            sample = view_sample(models, images, targets, observation, cost, instance, pose[index], k)
+            sample = view_sample(models, images, targets, observation, loss, instance, pose[index], k)
             if sample.state == VISIBLE and has_color(observation, instance, sample.crop):
                 intensity, across, down = interpolate_color(observation, instance, sample.crop)
                 base = models.color[model, k]
@@ -276,7 +276,7 @@ def update_tracks_kernel(
     # Out:
     track_out: Track,
 ):
-    """Take new estimates over; tracks that start get their start pose.
+    """Accept new estimates into tracks; tracks that start get their start pose.
 
     An instance keeps its pose, at rest, if it shows too few points, or if its estimate costs much more than its last ones: then its mask is
     probably another's. After a few such frames the estimate counts nevertheless.
@@ -300,7 +300,7 @@ def update_tracks_kernel(
     if observation.points[instance] < policy.min_points or (surprising and held < policy.patience):
         track_out.held[instance] = held + 1
         return
-    # What has moved during several frames tells no velocity.
+    # Motion over several frames is not the velocity of one.
     if held > 0:
         track_out.before[instance] = pose[instance]
     if surprising:

@@ -35,7 +35,7 @@ def harmonics(normal: wp.vec3) -> wp.vec4:
 def accumulate_lighting_kernel(
     # Scene:
     models: Models,
-    cost: LossParameters,
+    loss: LossParameters,
     # In:
     images: Images,
     targets: Targets,
@@ -56,8 +56,8 @@ def accumulate_lighting_kernel(
     green_product = wp.vec4()
     blue_product = wp.vec4()
     if observation.points[instance] > 0:
-        for k in range(lane * cost.step, models.position.shape[1], LANES * cost.step):
-            sample = view_sample(models, images, targets, observation, cost, instance, pose[index], k)
+        for k in range(lane * loss.step, models.position.shape[1], LANES * loss.step):
+            sample = view_sample(models, images, targets, observation, loss, instance, pose[index], k)
             if sample.state == VISIBLE and has_color(observation, instance, sample.crop):
                 intensity, across, down = interpolate_color(observation, instance, sample.crop)
                 base = models.color[model, k]

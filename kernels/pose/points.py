@@ -114,7 +114,7 @@ def sample_points_kernel(
     # Out:
     observation_out: Observation,
 ):
-    """Surface points: of n mask pixels in scanline order those whose rank r is the first with r min(n, capacity) // n."""
+    """Surface points, evenly subsampled: of n mask pixels in scanline order, the first with each value of rank · min(n, capacity) // n."""
     instance, row = wp.tid()
     rank = int(0)
     total = int(0)

@@ -39,7 +39,7 @@ def view_sample(
     images: Images,
     targets: Targets,
     observation: Observation,
-    cost: LossParameters,
+    loss: LossParameters,
     instance: int,
     pose: wp.transform,
     sample: int,
@@ -71,9 +71,9 @@ def view_sample(
     depth = read_depth(images, view, row, column)
     result.excess = depth - result.position[2]
     if int(images.label[view, row, column]) == targets.label[instance]:
-        if depth == 0.0 or result.excess > -cost.margin:
+        if depth == 0.0 or result.excess > -loss.margin:
             result.state = VISIBLE
-    elif depth > 0.0 and result.excess > cost.margin:
+    elif depth > 0.0 and result.excess > loss.margin:
         result.state = PROTRUDING
     return result
 

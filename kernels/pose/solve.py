@@ -134,7 +134,7 @@ def step_poses_kernel(
 @wp.kernel
 def score_poses_kernel(
     # Scene:
-    cost: LossParameters,
+    loss: LossParameters,
     # In:
     observation: Observation,
     sums: Sums,
@@ -144,7 +144,7 @@ def score_poses_kernel(
 ):
     """Cost of each hypothesis: truncated distances of points and protruding samples per observed area, + colour.
 
-    The colour term is between 0 and `color_cost`, which it is where too few samples show colour.
+    The colour term is between 0 and `color_cost`; where too few samples show colour it is `color_cost`.
     """
     index = wp.tid()
     if observation.points[index // hypotheses] == 0:
@@ -156,9 +156,9 @@ def score_poses_kernel(
         points += sums.points[index, lane]
         samples += sums.samples[index, lane]
     total = (points[0] + samples[0]) / points[1]
-    if cost.color > 0.0:
+    if loss.color > 0.0:
         share = float(1.0)
         if samples[3] > MIN_COLOR_AREA * samples[1]:
             share = samples[2] / samples[3]
-        total += cost.color_cost * share
+        total += loss.color_cost * share
     cost_out[index] = total

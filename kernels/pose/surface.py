@@ -67,7 +67,7 @@ def match_point(mesh: wp.uint64, local: wp.vec3, seen: wp.vec3, eye: wp.vec3, re
 def accumulate_points_kernel(
     # Scene:
     models: Models,
-    cost: LossParameters,
+    loss: LossParameters,
     # In:
     targets: Targets,
     observation: Observation,
@@ -84,19 +84,19 @@ def accumulate_points_kernel(
     inverse = wp.transform_inverse(pose[index])
     eye = wp.transform_get_translation(inverse)
     mesh = models.mesh[model]
-    area = observation.area[instance] * float(cost.step)
-    reach = wp.max(cost.cutoff, cost.truncation)
+    area = observation.area[instance] * float(loss.step)
+    reach = wp.max(loss.cutoff, loss.truncation)
     hessian = wp.spatial_matrix()
     gradient = wp.spatial_vector()
     total = wp.vec2(0.0, 0.0)
-    for k in range(lane * cost.step, observation.points[instance], LANES * cost.step):
+    for k in range(lane * loss.step, observation.points[instance], LANES * loss.step):
         local = wp.transform_point(inverse, observation.point[instance, k])
         seen = wp.transform_vector(inverse, observation.normal[instance, k])
         price = float(1.0)
         match = match_point(mesh, local, seen, eye, reach)
         if match.found:
-            price = wp.min(match.distance / cost.truncation, 1.0)
-            weight = area * tukey_weight(match.distance, cost.cutoff)
+            price = wp.min(match.distance / loss.truncation, 1.0)
+            weight = area * tukey_weight(match.distance, loss.cutoff)
             point = wp.transform_point(pose[index], match.point)
             row = jacobian(point, origin, wp.transform_vector(pose[index], match.direction), models.radius[model])
             hessian += weight * wp.outer(row, row)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.inputs.files import read_file
 from synpick_warp.scenes.assets.asset_files import describe_error, quiet_decoding
 
 MAX_TEXTURE_FILE = 2**27
@@ -68,21 +66,6 @@ def rgb8(image: Image.Image) -> np.ndarray:
     else:
         return np.ascontiguousarray(np.asarray(image.convert("RGB"), dtype=np.uint8))
     return np.repeat(np.rint(grey).astype(np.uint8)[:, :, None], 3, axis=2)
-
-
-def read_texture(path: Path, owner: str) -> np.ndarray:
-    """Read a texture file as (H, W, 3) uint8.
-
-    Args:
-        path: The image file.
-        owner: File that refers to the texture, for errors.
-
-    Raises:
-        CatalogError: The file is missing, or not a readable image.
-    """
-    if not path.exists():
-        raise CatalogError(f"{owner} refers to the texture {path.name!r}, but there is no file {path}; add it or remove the reference")
-    return decode_texture(read_file(path, MAX_TEXTURE_FILE, CatalogError), str(path))
 
 
 def decode_texture(data: bytes, source: str) -> np.ndarray:

@@ -60,7 +60,11 @@ def _decode(data: bytes) -> str:
 
 
 def _read_library(path: Path, name: str, table: FileTable, pixels: int) -> tuple[list[str], int]:
-    """Read a material library: names, diffuse colours and images, which are put into the table; and the images' pixels so far."""
+    """Read a material library: names, diffuse colours and images, which are put into the table.
+
+    Returns:
+        Its lines, and the number of pixels of all images so far.
+    """
     library, data = read_referred(path.parent, name, path, MAX_LIBRARY)
     lines: list[str] = []
     sizes: dict[Path, int] = {}

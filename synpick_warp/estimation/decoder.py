@@ -17,7 +17,7 @@ from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import SynpickError
 from synpick_warp.estimation.decoding import DecodeJob
 from synpick_warp.estimation.scenes import Scene, ScenePlan, read_scene
-from synpick_warp.stages.pose.batch import ViewBatch
+from synpick_warp.stages.pose.batch import RgbdBatch
 from synpick_warp.system.processes import serve
 
 
@@ -27,7 +27,7 @@ class Decoder:
     def __init__(self, link: Connection) -> None:
         self.link = link
         self.job: DecodeJob | None = None
-        self.batches: list[ViewBatch] = []
+        self.batches: list[RgbdBatch] = []
 
 
 class Message(Protocol):

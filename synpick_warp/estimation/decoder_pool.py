@@ -16,7 +16,7 @@ from typing import Any, NoReturn, Self
 
 from synpick_warp.estimation.decoder import Answer, Message, OpenJob
 from synpick_warp.estimation.decoding import DecodeJob
-from synpick_warp.stages.pose.batch import ViewBatch
+from synpick_warp.stages.pose.batch import RgbdBatch
 from synpick_warp.system.descriptors import open_standard_descriptors
 from synpick_warp.system.processes import ProcessError, WorkerProcess, send, start_process
 from synpick_warp.system.shared_memory import allocate_shared_memory
@@ -81,7 +81,7 @@ class DecoderPool:
         self._workers.clear()
         self._links.close()
 
-    def open_job(self, job: DecodeJob) -> tuple[list[ViewBatch], list[Future[Any]]]:
+    def open_job(self, job: DecodeJob) -> tuple[list[RgbdBatch], list[Future[Any]]]:
         """Open a job in all processes; later messages refer to it.
 
         Returns:

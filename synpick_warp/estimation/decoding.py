@@ -17,7 +17,7 @@ from synpick_warp.estimation.scenes import ABSENT, Scene
 from synpick_warp.inputs.files import read_file_if_present
 from synpick_warp.inputs.image_files import MAX_IMAGE_FILE
 from synpick_warp.inputs.png_crop import decode_grey_crop
-from synpick_warp.stages.pose.batch import ViewBatch
+from synpick_warp.stages.pose.batch import RgbdBatch
 from synpick_warp.system.shared_memory import SharedArray, shared_bytes
 
 _MARGIN = 2
@@ -45,18 +45,18 @@ class DecodeJob:
         """Size of the memory of all batches [B]."""
         return max(1, self.batches * self._batch_bytes())
 
-    def new_batches(self, memory: mmap.mmap) -> list[ViewBatch]:
+    def new_batches(self, memory: mmap.mmap) -> list[RgbdBatch]:
         """`map_batches` of a memory that is zero yet; cameras and depth scales become 1, so that they are valid in views never filled."""
         batches = self.map_batches(memory)
         for batch in batches:
             batch.intrinsics[:], batch.depth_scale[:] = 1, 1
         return batches
 
-    def map_batches(self, memory: mmap.mmap) -> list[ViewBatch]:
+    def map_batches(self, memory: mmap.mmap) -> list[RgbdBatch]:
         """The batches as views of a memory of `memory_bytes`."""
         return [self._map_batch(memory, index * self._batch_bytes()) for index in range(self.batches)]
 
-    def fill_view(self, batch: ViewBatch, view: int, step: int) -> None:
+    def fill_view(self, batch: RgbdBatch, view: int, step: int) -> None:
         """Decode the images of scene `view` in frame `step` into the batch; a scene that has ended is zero in all images.
 
         Raises:
@@ -77,12 +77,12 @@ class DecodeJob:
             disturb_labels(batch.label[view], scene.boxes[step], scene.instances, self.mask_seed, scene.plan.scene, frame)
         _hide(batch.label[view], np.flatnonzero((scene.index[step] != ABSENT) & ~scene.asked[step]))
 
-    def _map_batch(self, memory: mmap.mmap, offset: int) -> ViewBatch:
+    def _map_batch(self, memory: mmap.mmap, offset: int) -> RgbdBatch:
         arrays = {}
         for name, shape, dtype in self._layout():
             arrays[name] = SharedArray(offset, shape, dtype).map(memory)
             offset += shared_bytes((arrays[name].nbytes,))
-        return ViewBatch(**arrays)
+        return RgbdBatch(**arrays)
 
     def _batch_bytes(self) -> int:
         return shared_bytes(int(np.prod(shape)) * np.dtype(dtype).itemsize for _, shape, dtype in self._layout())

@@ -13,7 +13,7 @@ import trimesh
 
 from synpick_warp.errors import ConfigError
 from synpick_warp.estimation.methods import to_rotations, to_transforms
-from synpick_warp.stages.pose.batch import Estimates, InstanceTable, ObjectModel, ViewBatch
+from synpick_warp.stages.pose.batch import Estimates, InstanceTable, ObjectModel, RgbdBatch
 
 SPACING = 0.003
 """Grid that both clouds are thinned to [m]: some 1,000 points on a visible side of a can."""
@@ -65,7 +65,7 @@ class GicpEstimator:
         points = np.asarray(trimesh.sample.sample_surface(mesh, SAMPLES, seed=model.object_id)[0], np.float64)
         return self._gicp.preprocess_points(points, SPACING, NEIGHBORS, 1)
 
-    def refine(self, batch: ViewBatch, pose: np.ndarray) -> Estimates:
+    def refine(self, batch: RgbdBatch, pose: np.ndarray) -> Estimates:
         """See `Estimator`."""
         begin = time.perf_counter()
         rotations, count = to_rotations(pose), len(self._instances)
@@ -78,7 +78,7 @@ class GicpEstimator:
         seconds = np.full(count, (time.perf_counter() - begin) / max(1, len(batch)), np.float32)
         return Estimates(to_transforms(poses), np.maximum(scores, 0.0), scores >= 0.0, seconds)
 
-    def _align(self, batch: ViewBatch, row: int, start: np.ndarray) -> tuple[np.ndarray, float]:
+    def _align(self, batch: RgbdBatch, row: int, start: np.ndarray) -> tuple[np.ndarray, float]:
         """Refined pose (4, 4), and the fraction of points with a correspondence; -1: there are too few points."""
         points = observed_points(batch, int(self._instances.view[row]), int(self._instances.slot[row]))
         if len(points) < MIN_POINTS:
@@ -103,7 +103,7 @@ class GicpEstimator:
             return start, 0.0
         return matrix, result.num_inliers / max(1, source.size())
 
-    def estimate(self, batch: ViewBatch) -> Estimates:
+    def estimate(self, batch: RgbdBatch) -> Estimates:
         """GICP needs a start."""
         raise NotImplementedError
 
@@ -111,12 +111,12 @@ class GicpEstimator:
         """GICP does not track."""
         raise NotImplementedError
 
-    def track(self, batch: ViewBatch) -> Estimates:
+    def track(self, batch: RgbdBatch) -> Estimates:
         """GICP does not track."""
         raise NotImplementedError
 
 
-def observed_points(batch: ViewBatch, view: int, slot: int) -> np.ndarray:
+def observed_points(batch: RgbdBatch, view: int, slot: int) -> np.ndarray:
     """Depth pixels of an instance's mask as points in the camera's axes (P, 3) float64 [m]."""
     rows, columns = np.nonzero((batch.label[view] == 1 + slot) & (batch.depth[view] > 0))
     z = batch.depth[view][rows, columns] * np.float64(batch.depth_scale[view])

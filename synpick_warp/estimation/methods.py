@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.estimation.disturbance import disturb_poses
 from synpick_warp.estimation.scenes import ABSENT, Scene
-from synpick_warp.stages.pose.batch import Estimates, InstanceTable, ViewBatch
+from synpick_warp.stages.pose.batch import Estimates, InstanceTable, RgbdBatch
 
 SINGLE, REFINE, TRACK, GICP = "single", "refine", "track", "gicp"
 METHODS = (SINGLE, REFINE, TRACK, GICP)
@@ -26,11 +26,11 @@ SPARSE = 20
 class Estimator(Protocol):
     """Pose estimator of an `InstanceTable`: `estimate` serves single, `refine` refine and gicp, `start` and `track` track."""
 
-    def estimate(self, batch: ViewBatch) -> Estimates:
+    def estimate(self, batch: RgbdBatch) -> Estimates:
         """Estimate poses from one frame."""
         ...
 
-    def refine(self, batch: ViewBatch, pose: np.ndarray) -> Estimates:
+    def refine(self, batch: RgbdBatch, pose: np.ndarray) -> Estimates:
         """Refine poses (N, 7) float32 as in `Estimates`; rows of instances without a label are the identity."""
         ...
 
@@ -38,7 +38,7 @@ class Estimator(Protocol):
         """Set the poses (N, 7) float32 of the rows (N,) bool, in the frame of the next `track`; other tracks are unaffected."""
         ...
 
-    def track(self, batch: ViewBatch) -> Estimates:
+    def track(self, batch: RgbdBatch) -> Estimates:
         """Update all started tracks with the next frame."""
         ...
 
@@ -126,7 +126,7 @@ def ask(scene: Scene, method: str, min_visibility: float, objects: Sequence[froz
     return replace(scene, asked=asked)
 
 
-def estimate_frame(method: str, estimator: Estimator, batch: ViewBatch, group: Group, step: int, seed: int) -> Estimates:
+def estimate_frame(method: str, estimator: Estimator, batch: RgbdBatch, group: Group, step: int, seed: int) -> Estimates:
     """Run a method on one frame of each scene.
 
     Args:

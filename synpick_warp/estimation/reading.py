@@ -19,12 +19,12 @@ from synpick_warp.estimation.decoder import DecodeViews
 from synpick_warp.estimation.decoder_pool import DecoderPool, open_pool
 from synpick_warp.estimation.decoding import DecodeJob
 from synpick_warp.estimation.scenes import Scene
-from synpick_warp.stages.pose.batch import ViewBatch
+from synpick_warp.stages.pose.batch import RgbdBatch
 
 AHEAD = 2
 """Steps that are decoded ahead of the one in use."""
 BYTES_PER_PIXEL = 6
-"""Of a view in a `ViewBatch`: colour, depth and label."""
+"""Of a view in a `RgbdBatch`: colour, depth and label."""
 DEPTHS = {"clean": "depth", "sensor": "depth_sensor"}
 """Choices of depth images, and the folders they are in."""
 MAX_VIEWS_PER_TASK = 8
@@ -73,7 +73,7 @@ class SceneReader:
         if self._own_pool is not None:
             self._own_pool.close()
 
-    def __iter__(self) -> Iterator[ViewBatch]:
+    def __iter__(self) -> Iterator[RgbdBatch]:
         """Batches of step 0, 1, ...; view v shows the step's frame of scene v, or is zero in all images if that scene has ended.
 
         Labels show the instances that are asked; others are 0, as is everything else that is no instance.
@@ -104,17 +104,17 @@ class SceneReader:
         for view in range(len(self.scenes)):
             self._fill(batch, view, step)
 
-    def _allocate(self) -> ViewBatch:
+    def _allocate(self) -> RgbdBatch:
         return _allocate(self._job)[0]
 
-    def _fill(self, batch: ViewBatch, view: int, step: int) -> None:
+    def _fill(self, batch: RgbdBatch, view: int, step: int) -> None:
         self._job.fill_view(batch, view, step)
 
 
 class _Source(Protocol):
     """What decodes."""
 
-    def open(self) -> list[ViewBatch]:
+    def open(self) -> list[RgbdBatch]:
         """Allocate the batches."""
         ...
 
@@ -140,7 +140,7 @@ class _Threads:
         # Threads decode whole images each; OpenCV's own would only compete with them.
         cv2.setNumThreads(1)
 
-    def open(self) -> list[ViewBatch]:
+    def open(self) -> list[RgbdBatch]:
         """See `_Source`."""
         self._batches = _allocate(self._job)
         return self._batches
@@ -165,7 +165,7 @@ class _Processes:
         self._job, self._pool = job, pool
         self._opening: list[Future[Any]] = []
 
-    def open(self) -> list[ViewBatch]:
+    def open(self) -> list[RgbdBatch]:
         """See `_Source`."""
         batches, self._opening = self._pool.open_job(self._job)
         return batches
@@ -188,6 +188,6 @@ class _Processes:
         """See `_Source`. The pool goes on; what it still decodes is left to it."""
 
 
-def _allocate(job: DecodeJob) -> list[ViewBatch]:
+def _allocate(job: DecodeJob) -> list[RgbdBatch]:
     """Batches of a job in memory of this process."""
     return job.new_batches(mmap.mmap(-1, job.memory_bytes()))

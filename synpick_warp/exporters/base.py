@@ -68,7 +68,7 @@ class Exporter(Protocol):
     """Whether views must be rendered; if no exporter needs them, none are."""
 
     needs_images: ClassVar[bool]
-    """Whether it reads all images of a batch; else only those for which neither a file nor run boundaries stand."""
+    """Whether it reads all images of a batch; else only those that neither encoded files nor run boundaries replace."""
     writes_depth: ClassVar[bool]
     """Whether it writes depth files, `FrameBatch.depth_idat`."""
 

@@ -13,14 +13,15 @@ from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.dataset.view_files import SceneFolder
 from synpick_warp.low_discrepancy import r2_points
+from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.statistics.records import EpisodeFacts
 
 MAX_EPISODES = 2000
 """Maximum number of episodes whose manifest entry is read; larger data sets are sampled at equal steps."""
 SURVEY_VIEWS = 48
 """Number of views whose brightness is measured."""
-_WEIGHTS = np.array((0.2126, 0.7152, 0.0722), np.float32)
-"""Luma of red, green and blue (Rec. 709)."""
+_WEIGHTS = LUMINANCE.astype(np.float32)
+"""Luma weights of red, green and blue (Rec. 709)."""
 
 
 @dataclass(frozen=True)

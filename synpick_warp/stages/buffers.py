@@ -37,7 +37,7 @@ class Snapshot:
     """Index of the episode's environment map."""
     light_yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
     """Environment yaw: rotation of the map counter-clockwise about +z."""
-    light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="stops")
+    light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="EV")
     """Exposure value relative to the automatic exposure [EV]."""
     follows: wp.array = device_array("world", dtype=wp.int32)
     """1: the `last_` arrays hold the previous frame of the same episode; 0: there is none."""

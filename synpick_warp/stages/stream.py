@@ -223,7 +223,7 @@ class _Launched:
     description: dict[str, Any]
     """Fields by `describe_views`."""
     finished: Callable[[], None] | None = None
-    """Called once the consumer has the batch behind it."""
+    """Called once the consumer is done with the batch."""
 
 
 class FrameStream:

@@ -132,7 +132,8 @@ class TickLoop:
         """Set the SMs of the solver, from the next tick on: the reserved ones, or all.
 
         Args:
-            stream: CUDA stream on the reserved SMs; None: all SMs, as also while more than SOLVER_WORLDS worlds per reserved SM are busy.
+            stream: CUDA stream on the reserved SMs; None: all SMs. These are also used while more than
+                SOLVER_WORLDS worlds per reserved SM are busy.
         """
         if stream is not None and self._busy_worlds > SOLVER_WORLDS * count_reserved(self.device, PHYSICS_SHARE):
             stream = None

@@ -12,9 +12,10 @@ import threading
 from types import FrameType
 from typing import Self
 
+from synpick_warp.system.descriptors import STANDARD_ERROR
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STOPPING = b"\nstopping after this tick; committed episodes stay, the same command resumes the bake; once more: stop at once\n"
-_STANDARD_ERROR = 2
 
 
 class StopRequest:
@@ -41,7 +42,7 @@ class StopRequest:
         self._restore()
         # os.write, not print: a signal handler can interrupt buffered output.
         with contextlib.suppress(OSError):
-            os.write(_STANDARD_ERROR, _STOPPING)
+            os.write(STANDARD_ERROR, _STOPPING)
 
     def _restore(self) -> None:
         for number, handler in self._before.items():

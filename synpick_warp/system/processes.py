@@ -76,7 +76,8 @@ def start_process(
     Args:
         program: Python code that imports and calls the main function. It is imported, not run as `__main__`, so that pickled messages
             name the module's own classes.
-        handles: File handles that it uses; sys.argv[1] is the number of its link's handle, the following those of these.
+        handles: File handles that it uses; sys.argv[1] is the number of its link's handle, the next arguments are the
+            numbers of these.
         inherited: File handles that it keeps open until it exits, such as one that holds a lock.
         environment: Environment variables that it has besides those of this process.
         has_threads: Whether its libraries start as many threads as those of this process.

@@ -20,7 +20,7 @@ from synpick_warp.cli.commands import main
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
 from synpick_warp.factory.assembly import make_renderer
-from synpick_warp.scenes.assets.appearance import read_texture
+from synpick_warp.scenes.assets.appearance import decode_texture
 from synpick_warp.scenes.catalog import load_catalog
 from synpick_warp.scenes.lights import MAX_RADIANCE
 from synpick_warp.scenes.types import Material
@@ -90,7 +90,7 @@ def test_textures_of_any_size_and_depth_are_looked_up_where_they_are(tmp_path, d
     largest = np.iinfo(dtype).max
     pixels = np.random.default_rng(1).integers(0, largest + 1, (*size, 3)).astype(dtype)
     assert cv2.imwrite(str(tmp_path / "t.png"), pixels)
-    seen = albedo(Material((1.0, 1.0, 1.0), read_texture(tmp_path / "t.png", "a.ply"), 0.0, 0.5), *size, device)
+    seen = albedo(Material((1.0, 1.0, 1.0), decode_texture((tmp_path / "t.png").read_bytes(), "t.png"), 0.0, 0.5), *size, device)
     middle = seen[PIXELS // 2 :: PIXELS, PIXELS // 2 :: PIXELS]
     assert middle.shape == pixels.shape
     assert np.abs(middle - pixels[..., ::-1] / largest * 255.0).max() <= 2.0

@@ -219,7 +219,7 @@ def test_a_stopped_bake_says_how_to_go_on(tmp_path, bakes, capsys):
 def test_output_folder_that_is_not_empty(tmp_path, bakes, capsys):
     (tmp_path / "mine.txt").write_text("precious")
     said = mistake(capsys, "bake", "--device", "cpu", "--out", str(tmp_path))
-    assert said == f"{tmp_path} is not empty; --out takes a new or an empty folder, or a data set to go on with"
+    assert said == f"{tmp_path} is not empty; --out takes a new or an empty folder, or a data set to resume"
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
     assert not bakes.calls
 

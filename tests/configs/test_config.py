@@ -18,6 +18,7 @@ from synpick_warp.configs.write import config_to_toml
 from synpick_warp.errors import ConfigError
 
 COUPLED = {
+    "bake.episodes",
     "pick.press_time",
     "bop.split",
     "bop.color_format",

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from synpick_warp.stages.pose.batch import Estimates, InstanceTable, ViewBatch
+from synpick_warp.stages.pose.batch import Estimates, InstanceTable, RgbdBatch
 
 
 @dataclass
@@ -24,7 +24,7 @@ class FakeEstimator:
         self.pose = np.zeros((len(self.table), 7), np.float32)
         self.pose[:, 6] = 1.0
 
-    def estimate(self, batch: ViewBatch) -> Estimates:
+    def estimate(self, batch: RgbdBatch) -> Estimates:
         """Centroid of the mask [px], as if it were metres."""
         self.labels.append(batch.label.copy())
         pose = self.pose.copy()
@@ -35,7 +35,7 @@ class FakeEstimator:
             pose[row, :3] = (columns.mean(), rows.mean(), batch.depth[view][rows, columns].mean()) if len(rows) else 0.0
         return self._answer(pose, valid)
 
-    def refine(self, batch: ViewBatch, pose: np.ndarray) -> Estimates:
+    def refine(self, batch: RgbdBatch, pose: np.ndarray) -> Estimates:
         self.labels.append(batch.label.copy())
         self.given.append(pose.copy())
         return self._answer(pose, np.ones(len(pose), bool))
@@ -44,7 +44,7 @@ class FakeEstimator:
         self.started.append(rows.copy())
         self.pose[rows] = pose[rows]
 
-    def track(self, batch: ViewBatch) -> Estimates:
+    def track(self, batch: RgbdBatch) -> Estimates:
         self.labels.append(batch.label.copy())
         self.pose[:, 0] += np.float32(self.step)
         return self._answer(self.pose.copy(), np.ones(len(self.pose), bool))

@@ -21,7 +21,7 @@ from synpick_warp.estimation.reading import SceneReader
 from synpick_warp.estimation.scenes import Scene, ScenePlan, read_scene
 from synpick_warp.exporters.bop.exporter import BopExporter
 from synpick_warp.exporters.bop.shards.exporter import ShardsExporter
-from synpick_warp.stages.pose.batch import ViewBatch
+from synpick_warp.stages.pose.batch import RgbdBatch
 from synpick_warp.system.processes import ProcessError
 from tests.estimation.probes import Divide, ListModules, Sleep, Stop
 from tests.harness.environment import checkout_environment
@@ -62,12 +62,12 @@ def pids(pool: DecoderPool) -> list[int]:
     return [worker.process.pid for worker in pool._workers]
 
 
-def collect(scenes: list[Scene], pool: DecoderPool | None, batches: list[ViewBatch]) -> None:
+def collect(scenes: list[Scene], pool: DecoderPool | None, batches: list[RgbdBatch]) -> None:
     with SceneReader(scenes, pool=pool) as reader:
         batches.extend(reader)
 
 
-def read_all(reader: SceneReader) -> list[ViewBatch]:
+def read_all(reader: SceneReader) -> list[RgbdBatch]:
     return [type(batch)(**{name: array.copy() for name, array in arrays(batch).items()}) for batch in reader]
 
 

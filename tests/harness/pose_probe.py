@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.arrays import allocate_struct
-from synpick_warp.kernels.pose.appearance import accumulate_samples_kernel, intensity_gradient, way_to_mask
+from synpick_warp.kernels.pose.appearance import accumulate_samples_kernel, intensity_gradient, silhouette_residual
 from synpick_warp.kernels.pose.lighting import CHANNELS
 from synpick_warp.kernels.pose.observation import Images, Observation, Targets
 from synpick_warp.kernels.pose.residuals import LANES, LossParameters, Models, jacobian, tukey_weight
@@ -67,7 +67,7 @@ def residual_kernel(
 @wp.kernel
 def view_samples_kernel(
     models: Models,
-    cost: LossParameters,
+    loss: LossParameters,
     images: Images,
     targets: Targets,
     observation: Observation,
@@ -84,7 +84,7 @@ def view_samples_kernel(
 ):
     """Evaluate `view_sample` for every model sample, with its silhouette offset (direction, distance), colour and gradient of red."""
     instance, k = wp.tid()
-    sample = view_sample(models, images, targets, observation, cost, instance, pose[instance], k)
+    sample = view_sample(models, images, targets, observation, loss, instance, pose[instance], k)
     state_out[instance, k] = sample.state
     position_out[instance, k] = sample.position
     normal_out[instance, k] = sample.normal
@@ -92,8 +92,8 @@ def view_samples_kernel(
     area_out[instance, k] = sample.area
     intrinsics = images.intrinsics[targets.view[instance]]
     if sample.area > 0.0:
-        way = way_to_mask(observation, instance, sample, intrinsics)
-        way_out[instance, k] = wp.vec4(way.direction[0], way.direction[1], way.direction[2], way.distance)
+        residual = silhouette_residual(observation, instance, sample, intrinsics)
+        way_out[instance, k] = wp.vec4(residual.direction[0], residual.direction[1], residual.direction[2], residual.distance)
     if sample.state == VISIBLE and has_color(observation, instance, sample.crop):
         colored_out[instance, k] = 1
         color, across, down = interpolate_color(observation, instance, sample.crop)
@@ -105,12 +105,12 @@ OUTPUTS = {"state": int, "position": wp.vec3, "normal": wp.vec3, "crop": wp.vec2
 OUTPUTS |= {"colored": int, "color": wp.vec3, "line": wp.vec3}
 
 
-def view_samples(models: PoseModels, cost: Any, observer: Observer, pose: np.ndarray) -> dict[str, np.ndarray]:
+def view_samples(models: PoseModels, loss: Any, observer: Observer, pose: np.ndarray) -> dict[str, np.ndarray]:
     """Outputs of `view_samples_kernel` by name (instance, sample, ...), for poses (N, 7)."""
     shape = (observer.instances, models.models.position.shape[1])
     outputs = {name: wp.zeros(shape, dtype=kind, device=observer.device) for name, kind in OUTPUTS.items()}
     poses = wp.array(np.atleast_2d(pose).astype(np.float32), dtype=wp.transform, device=observer.device)
-    inputs = [models.models, cost, observer.images, observer.targets, observer.observation, poses]
+    inputs = [models.models, loss, observer.images, observer.targets, observer.observation, poses]
     wp.launch(view_samples_kernel, dim=shape, inputs=inputs, outputs=list(outputs.values()), device=observer.device)
     return {name: array.numpy() for name, array in outputs.items()}
 
@@ -133,19 +133,19 @@ class Normals:
     def poses(self, pose: np.ndarray) -> wp.array:
         return wp.array(np.atleast_2d(pose).astype(np.float32), dtype=wp.transform, device=self.device)
 
-    def from_points(self, pose: np.ndarray, cost: Any) -> dict[str, np.ndarray]:
+    def from_points(self, pose: np.ndarray, loss: Any) -> dict[str, np.ndarray]:
         """Sums of the surface residuals, added over the lanes in float64."""
         observer = self.observer
-        inputs = [self.models.models, cost, observer.targets, observer.observation, self.poses(pose), 1]
+        inputs = [self.models.models, loss, observer.targets, observer.observation, self.poses(pose), 1]
         wp.launch(accumulate_points_kernel, dim=self._dim(), inputs=inputs, outputs=[self.sums], device=self.device)
         return self._read("hessian", "gradient", "points")
 
-    def from_samples(self, pose: np.ndarray, cost: Any) -> dict[str, np.ndarray]:
+    def from_samples(self, pose: np.ndarray, loss: Any) -> dict[str, np.ndarray]:
         """Sums of the silhouette and colour residuals alone."""
         observer = self.observer
         self.sums.hessian.zero_()
         self.sums.gradient.zero_()
-        inputs = [self.models.models, cost, observer.images, observer.targets, observer.observation, self.lighting, self.poses(pose), 1]
+        inputs = [self.models.models, loss, observer.images, observer.targets, observer.observation, self.lighting, self.poses(pose), 1]
         wp.launch(accumulate_samples_kernel, dim=self._dim(), inputs=inputs, outputs=[self.sums], device=self.device)
         return self._read("hessian", "gradient", "samples")
 

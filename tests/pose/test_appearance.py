@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from synpick_warp.stages.pose.models import build_models
-from synpick_warp.stages.pose.refine import CostScales, make_cost
+from synpick_warp.stages.pose.refine import LossScales, make_loss
 from tests.harness.pose_probe import Normals, step_limits, view_samples
 from tests.twins import pose as twin
 from tests.worlds.pose_views import FACING, as_material, model_of, observe, plate_view, pose_errors, smooth_texture, table_of
@@ -28,19 +28,19 @@ def moved(x: float, y: float) -> np.ndarray:
     return POSE + np.array([x, y, 0, 0, 0, 0, 0], np.float32)
 
 
-def descend(normals: Normals, pose: np.ndarray, cost, iterations: int) -> np.ndarray:
+def descend(normals: Normals, pose: np.ndarray, loss, iterations: int) -> np.ndarray:
     """Pose after steps on the samples' residuals alone; small damping keeps what they do not determine."""
     for _ in range(iterations):
-        normals.from_samples(pose, cost)
+        normals.from_samples(pose, loss)
         pose = normals.step(pose, step_limits(damping=1e-4))[0]
     return pose
 
 
-def descend_in_the_plane(normals: Normals, pose: np.ndarray, cost, iterations: int) -> np.ndarray:
+def descend_in_the_plane(normals: Normals, pose: np.ndarray, loss, iterations: int) -> np.ndarray:
     """Pose after steps along x, y and about z: depth and tilt, which the surface would hold, stay."""
     radius, free = float(normals.models.models.radius.numpy()[0]), [2, 3, 4]
     for _ in range(iterations):
-        sums, step = normals.from_samples(pose, cost), np.zeros(6)
+        sums, step = normals.from_samples(pose, loss), np.zeros(6)
         step[free] = np.linalg.solve(sums["hessian"][0][np.ix_(free, free)] + 1e-9 * np.eye(3), sums["gradient"][0][free])
         rotation, translation = twin.stepped(pose, step, radius)
         pose = np.concatenate([translation, rotation.as_quat()]).astype(np.float32)
@@ -50,10 +50,10 @@ def descend_in_the_plane(normals: Normals, pose: np.ndarray, cost, iterations: i
 def test_the_silhouette_alone_moves_a_plate_back(device):
     """By 5 mm along the diagonal, up to the deadband of 3/4 pixels and a pixel that no sample reaches into."""
     _, normals, _ = plate_scene(device, (0.04, 0.035), GREY)
-    cost = make_cost(CostScales(silhouette=1.0), 0.01, 1, 0.0)
-    pose = descend(normals, moved(0.004, -0.003), cost, 30)
+    loss = make_loss(LossScales(silhouette=1.0), 0.01, 1, 0.0)
+    pose = descend(normals, moved(0.004, -0.003), loss, 30)
     assert np.abs(pose[:2]).max() < 1.75 * PIXEL
-    sums = normals.from_samples(POSE, cost)
+    sums = normals.from_samples(POSE, loss)
     assert sums["samples"][0, 0] == 0.0
     assert (sums["gradient"] == 0.0).all()
 
@@ -61,9 +61,9 @@ def test_the_silhouette_alone_moves_a_plate_back(device):
 def test_the_silhouette_draws_as_its_residuals_say(device):
     """The gradient is Σ weight distance J, the Hessian Σ weight J Jᵀ, over the protruding samples, with Huber's weight."""
     observer, normals, models = plate_scene(device, (0.04, 0.035), GREY)
-    cost, pose = make_cost(CostScales(silhouette=0.7), 0.002, 1, 0.0), moved(0.006, 0.002)
-    found = {name: values[0] for name, values in view_samples(models, cost, observer, pose).items()}
-    sums = normals.from_samples(pose, cost)
+    loss, pose = make_loss(LossScales(silhouette=0.7), 0.002, 1, 0.0), moved(0.006, 0.002)
+    found = {name: values[0] for name, values in view_samples(models, loss, observer, pose).items()}
+    sums = normals.from_samples(pose, loss)
     out = (found["state"] == 2) & (found["way"][:, 3] > 0.0)
     direction, distance = found["way"][out, :3], found["way"][out, 3]
     radius = float(models.models.radius.numpy()[0])
@@ -81,8 +81,8 @@ def test_the_silhouette_draws_as_its_residuals_say(device):
 @pytest.mark.parametrize("offset", [(0.005, 0.0), (-0.003, 0.004), (0.0, -0.005)])
 def test_colour_alone_moves_a_textured_plate_back(device, offset):
     _, normals, _ = plate_scene(device, (0.1, 0.08))
-    cost = make_cost(CostScales(silhouette=0.0, color_cutoff=3.0), 0.01, 1, 0.005)
-    pose = descend_in_the_plane(normals, moved(*offset), cost, 15)
+    loss = make_loss(LossScales(silhouette=0.0, color_cutoff=3.0), 0.01, 1, 0.005)
+    pose = descend_in_the_plane(normals, moved(*offset), loss, 15)
     # A quarter of a pixel: the observed colours are means of pixels, those of the model are texels.
     assert np.abs(pose[:2]).max() < 0.25 * PIXEL
     assert pose_errors(pose[None], POSE[None])[1][0] < 0.2
@@ -90,8 +90,8 @@ def test_colour_alone_moves_a_textured_plate_back(device, offset):
 
 def test_without_texture_colour_moves_nothing_in_the_plane(device):
     _, normals, _ = plate_scene(device, (0.1, 0.08), texture=np.full((8, 8, 3), 0.4), wall=0.4)
-    cost = make_cost(CostScales(silhouette=0.0), 0.01, 1, 0.005)
-    pose = descend_in_the_plane(normals, moved(0.005, 0.0), cost, 5)
+    loss = make_loss(LossScales(silhouette=0.0), 0.01, 1, 0.005)
+    pose = descend_in_the_plane(normals, moved(0.005, 0.0), loss, 5)
     assert pose[:2] == pytest.approx([0.005, 0.0], abs=1e-4)
 
 
@@ -99,7 +99,7 @@ def test_the_derivative_of_colour_is_that_of_the_image(device):
     """Central differences of the interpolated red along the steps, where they stay between the same four pixels."""
     observer, _, models = plate_scene(device, (0.1, 0.08))
     pose = moved(0.001, 0.002)
-    found = {name: values[0] for name, values in view_samples(models, make_cost(CostScales(), 0.01, 1, 0.005), observer, pose).items()}
+    found = {name: values[0] for name, values in view_samples(models, make_loss(LossScales(), 0.01, 1, 0.005), observer, pose).items()}
     seen = observer.observation
     red = seen.color.numpy()[0, :, :, :1].astype(np.float64)
     corner, pitch = seen.corner.numpy()[0], float(seen.pitch.numpy()[0])
@@ -122,11 +122,11 @@ def test_the_derivative_of_colour_is_that_of_the_image(device):
 def test_colour_residuals_are_weighted_sums(device):
     """The cost is the mean of |error| / cutoff, truncated; the gradient draws against the error."""
     observer, normals, models = plate_scene(device, (0.1, 0.08))
-    scales, pose = CostScales(silhouette=0.0, color_cutoff=0.4), moved(0.003, 0.0)
-    cost = make_cost(scales, 0.01, 1, 0.005)
-    found = {name: values[0] for name, values in view_samples(models, cost, observer, pose).items()}
+    scales, pose = LossScales(silhouette=0.0, color_cutoff=0.4), moved(0.003, 0.0)
+    loss = make_loss(scales, 0.01, 1, 0.005)
+    found = {name: values[0] for name, values in view_samples(models, loss, observer, pose).items()}
     normals.even_light(0.9)
-    sums = normals.from_samples(pose, cost)
+    sums = normals.from_samples(pose, loss)
     used = found["colored"] > 0
     mean = float(observer.observation.intensity.numpy()[0])
     error = (found["color"][used] - 0.9 * models.models.color.numpy()[0][used]) / mean
@@ -139,7 +139,7 @@ def test_colour_residuals_are_weighted_sums(device):
     color = models.models.color.numpy()
     color[0, used, 1:] = found["color"][used, 1:] / 0.9
     models.models.color.assign(color)
-    alone = normals.from_samples(pose, cost)["gradient"][0]
+    alone = normals.from_samples(pose, loss)["gradient"][0]
     line = found["line"][used] * 0.005 / mean
     assert alone[3:] == pytest.approx(-red @ line, rel=2e-3, abs=1e-9)
 
@@ -147,6 +147,6 @@ def test_colour_residuals_are_weighted_sums(device):
 def test_every_second_sample_counts_twice(device):
     _, normals, _ = plate_scene(device, (0.1, 0.08))
     pose = moved(0.004, 0.002)
-    full, half = (normals.from_samples(pose, make_cost(CostScales(), 0.01, step, 0.005)) for step in (1, 2))
+    full, half = (normals.from_samples(pose, make_loss(LossScales(), 0.01, step, 0.005)) for step in (1, 2))
     assert half["samples"][0] == pytest.approx(full["samples"][0], rel=0.1)
     assert half["gradient"][0, 3:5] == pytest.approx(full["gradient"][0, 3:5], rel=0.2)

@@ -21,7 +21,7 @@ from synpick_warp.kernels.pose.hypotheses import (
     update_tracks_kernel,
 )
 from synpick_warp.stages.pose.models import SYMMETRIES, build_models
-from synpick_warp.stages.pose.refine import CostScales, make_cost
+from synpick_warp.stages.pose.refine import LossScales, make_loss
 from synpick_warp.stages.pose.symmetries import CORRELATION
 from synpick_warp.stages.pose.track import TRACK
 from tests.harness.pose_probe import view_samples
@@ -119,8 +119,8 @@ def test_turns_keep_the_centre(device):
 def correlate(device, observer, models, pose: np.ndarray):
     """Sums of one candidate per instance."""
     sums = allocate_struct(CORRELATION, {"candidate": len(pose), "lane": int(CORRELATION_LANES)}, device)
-    cost = make_cost(CostScales(), 0.01, 1, 1.0)
-    inputs = [models.models, models.symmetries, cost, observer.images, observer.targets, observer.observation, as_poses(pose, device), 1]
+    loss = make_loss(LossScales(), 0.01, 1, 1.0)
+    inputs = [models.models, models.symmetries, loss, observer.images, observer.targets, observer.observation, as_poses(pose, device), 1]
     wp.launch(correlate_symmetries_kernel, dim=(len(pose), int(CORRELATION_LANES)), inputs=inputs, outputs=[sums], device=device)
     return sums
 
@@ -143,7 +143,7 @@ def test_correlation_is_that_of_numpy(device, offset):
     observer = observe(plate_view(size, 0.5, focal, shape, texture), table_of((0, 0, 0)), device)
     models = build_models([model_of(sheet(*size), as_material(texture))], device)
     pose = np.array([[offset, 0.0, 0.5, *FACING]], np.float32)
-    found = view_samples(models, make_cost(CostScales(), 0.01, 1, 1.0), observer, pose)
+    found = view_samples(models, make_loss(LossScales(), 0.01, 1, 1.0), observer, pose)
     used = found["colored"][0] > 0
     expected = twin.correlation(found["color"][0][used], models.models.color.numpy()[0][used])
     _, mean = choose_turn(device, correlate(device, observer, models, pose), pose, float(NO_CORRELATION), 0.1, 1)

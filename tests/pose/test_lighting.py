@@ -8,7 +8,7 @@ from synpick_warp.arrays import allocate_struct
 from synpick_warp.kernels.pose.lighting import CHANNELS, LIGHT_RIDGE, accumulate_lighting_kernel, fit_lighting_kernel
 from synpick_warp.kernels.pose.residuals import LANES
 from synpick_warp.stages.pose.models import build_models
-from synpick_warp.stages.pose.refine import LIGHTING, CostScales, make_cost
+from synpick_warp.stages.pose.refine import LIGHTING, LossScales, make_loss
 from tests.harness.pose_probe import view_samples
 from tests.twins import pose as twin
 from tests.worlds.pose_views import drawn, model_of, observe, rays, table_of
@@ -31,8 +31,8 @@ class Ball:
         self.device = device
         self.observer = observe(drawn(label, depth, FOCAL, color), table_of((0, 0, 0)), device)
         self.models = build_models([model_of(ball(RADIUS, 4))], device)
-        self.cost = make_cost(CostScales(), 0.01, 1, 1.0)
-        found = view_samples(self.models, self.cost, self.observer, POSE)
+        self.loss = make_loss(LossScales(), 0.01, 1, 1.0)
+        found = view_samples(self.models, self.loss, self.observer, POSE)
         self.used = found["colored"][0] > 0
         self.normal, self.area = found["normal"][0][self.used].astype(np.float64), found["area"][0][self.used].astype(np.float64)
         self.intensity = found["color"][0][self.used].astype(np.float64)
@@ -51,7 +51,7 @@ class Ball:
         sizes = {"pose": 1, "lane": int(LANES), "channel": int(CHANNELS)}
         lighting = allocate_struct(LIGHTING, sizes, self.device)
         observer = self.observer
-        inputs = [self.models.models, self.cost, observer.images, observer.targets, observer.observation]
+        inputs = [self.models.models, self.loss, observer.images, observer.targets, observer.observation]
         inputs += [wp.array(POSE[None], dtype=wp.transform, device=self.device), 1]
         wp.launch(accumulate_lighting_kernel, dim=(1, int(LANES)), inputs=inputs, outputs=[lighting], device=self.device)
         wp.launch(fit_lighting_kernel, dim=1, outputs=[lighting], device=self.device)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
-from synpick_warp.stages.pose.batch import ViewBatch
+from synpick_warp.stages.pose.batch import RgbdBatch
 from tests.twins import pose as twin
 from tests.worlds.pose_views import COUNT, drawn, observe, table_of
 
@@ -16,13 +16,13 @@ TABLE = table_of((0, 0, 0), (1, 3, 0), (0, 6, 0), (1, 0, 0))
 """Two views with two instances each; further labels are nobody's."""
 
 
-def random_batch(seed: int, cell: int) -> ViewBatch:
+def random_batch(seed: int, cell: int) -> RgbdBatch:
     """Two views with labels 0 to 8 in blobs of `cell` px, noisy colours, and depth with holes."""
     random = np.random.default_rng(seed)
     labels = random.integers(0, 9, (2, HEIGHT // cell + 1, WIDTH // cell + 1))
     label = labels.repeat(cell, axis=1).repeat(cell, axis=2)[:, :HEIGHT, :WIDTH]
     depth = random.integers(50_000, 60_000, label.shape) * (random.uniform(size=label.shape) > 0.2)
-    return ViewBatch(
+    return RgbdBatch(
         color=random.integers(0, 256, (*label.shape, 3), dtype=np.uint8),
         depth=depth.astype(np.uint16),
         depth_scale=np.full(2, COUNT, np.float32),
@@ -31,15 +31,15 @@ def random_batch(seed: int, cell: int) -> ViewBatch:
     )
 
 
-def masks(batch: ViewBatch, table=TABLE) -> list[np.ndarray]:
+def masks(batch: RgbdBatch, table=TABLE) -> list[np.ndarray]:
     return [batch.label[view] == slot + 1 for view, slot in zip(table.view, table.slot, strict=True)]
 
 
-def linear(batch: ViewBatch) -> np.ndarray:
+def linear(batch: RgbdBatch) -> np.ndarray:
     return srgb_to_linear(batch.color / 255.0)
 
 
-def rectangle(height: int, width: int, rows: slice, columns: slice) -> ViewBatch:
+def rectangle(height: int, width: int, rows: slice, columns: slice) -> RgbdBatch:
     """A view with one rectangular mask before noisy colours."""
     label = np.zeros((height, width), np.uint8)
     label[rows, columns] = 1

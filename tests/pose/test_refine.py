@@ -6,7 +6,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.stages.pose.models import build_models
-from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule, make_cost
+from synpick_warp.stages.pose.refine import LossScales, Refiner, Schedule, make_loss
 from tests.twins.raycast import cast_mesh
 from tests.worlds.pose_views import (
     disturbed,
@@ -43,7 +43,7 @@ def scene(device):
 def refined(scene, start: np.ndarray, schedule: Schedule = SHAPE_ONLY, hypotheses: int = 1) -> np.ndarray:
     models, observer, _ = scene
     poses = wp.array(start, dtype=wp.transform, device=observer.device)
-    Refiner(models, observer, hypotheses, CostScales()).refine(poses, schedule)
+    Refiner(models, observer, hypotheses, LossScales()).refine(poses, schedule)
     return poses.numpy()
 
 
@@ -83,7 +83,7 @@ def test_a_strong_prior_holds(scene):
 @pytest.mark.parametrize("color", [False, True])
 def test_the_truth_costs_least(scene, color):
     models, observer, truth = scene
-    refiner = Refiner(models, observer, 1, CostScales())
+    refiner = Refiner(models, observer, 1, LossScales())
 
     def cost(poses: np.ndarray) -> np.ndarray:
         return refiner.score(wp.array(poses, dtype=wp.transform, device=observer.device), color=color).numpy().copy()
@@ -95,7 +95,7 @@ def test_the_truth_costs_least(scene, color):
 
 
 def test_costs_take_the_scales_over():
-    cost = make_cost(CostScales(truncation=0.02, margin=0.003, silhouette=0.25, color_cutoff=0.6, color_cost=0.1), 0.04, 3, 0.005)
-    values = [cost.truncation, cost.margin, cost.silhouette, cost.color_cutoff, cost.color_cost, cost.cutoff, cost.color]
+    loss = make_loss(LossScales(truncation=0.02, margin=0.003, silhouette=0.25, color_cutoff=0.6, color_cost=0.1), 0.04, 3, 0.005)
+    values = [loss.truncation, loss.margin, loss.silhouette, loss.color_cutoff, loss.color_cost, loss.cutoff, loss.color]
     assert values == pytest.approx([0.02, 0.003, 0.25, 0.6, 0.1, 0.04, 0.005])
-    assert cost.step == 3
+    assert loss.step == 3

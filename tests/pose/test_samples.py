@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from synpick_warp.kernels.pose.samples import HIDDEN, PROTRUDING, VISIBLE
 from synpick_warp.scenes.types import TriangleMesh
-from synpick_warp.stages.pose.batch import ViewBatch
+from synpick_warp.stages.pose.batch import RgbdBatch
 from synpick_warp.stages.pose.models import PoseModels, build_models
-from synpick_warp.stages.pose.refine import CostScales, make_cost
+from synpick_warp.stages.pose.refine import LossScales, make_loss
 from tests.harness.pose_probe import view_samples
 from tests.twins import pose as twin
 from tests.worlds.pose_views import FACING, drawn, model_of, observe, plate_view, pose_of, smooth_texture, table_of
@@ -17,19 +17,19 @@ from tests.worlds.toy_scene import box, sheet
 FOCAL, SHAPE, DISTANCE = 400.0, (120, 160), 0.6
 WIDTH, HEIGHT = 0.1, 0.08
 POSE = np.array([0.0, 0.0, DISTANCE, *FACING], np.float32)
-SCALES = CostScales()
+SCALES = LossScales()
 PIXEL = DISTANCE / FOCAL
 ONE = table_of((0, 0, 0))
 
 
-def states(batch: ViewBatch, mesh: TriangleMesh, pose: np.ndarray, device) -> tuple[dict[str, np.ndarray], PoseModels]:
+def states(batch: RgbdBatch, mesh: TriangleMesh, pose: np.ndarray, device) -> tuple[dict[str, np.ndarray], PoseModels]:
     """What is found of each sample of the one instance, and the model."""
     models = build_models([model_of(mesh)], device, samples=512)
-    found = view_samples(models, make_cost(SCALES, 0.01, 1, 1.0), observe(batch, ONE, device), pose)
+    found = view_samples(models, make_loss(SCALES, 0.01, 1, 1.0), observe(batch, ONE, device), pose)
     return {name: values[0] for name, values in found.items()}, models
 
 
-def plate(texture: np.ndarray | None = None) -> ViewBatch:
+def plate(texture: np.ndarray | None = None) -> RgbdBatch:
     """A sheet before a wall."""
     return plate_view((WIDTH, HEIGHT), DISTANCE, FOCAL, SHAPE, smooth_texture(1, 40, 50) if texture is None else texture)
 
@@ -40,8 +40,8 @@ def clear_of_edges(found: dict[str, np.ndarray]) -> np.ndarray:
     return (away > PIXEL).all(axis=1)
 
 
-def changed(batch: ViewBatch, **arrays: np.ndarray) -> ViewBatch:
-    return ViewBatch(**(vars(batch) | arrays))
+def changed(batch: RgbdBatch, **arrays: np.ndarray) -> RgbdBatch:
+    return RgbdBatch(**(vars(batch) | arrays))
 
 
 def moved(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> np.ndarray:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.kernels.pose.residuals import LANES
 from synpick_warp.kernels.pose.solve import UNSEEN, score_poses_kernel
 from synpick_warp.stages.pose.models import build_models
-from synpick_warp.stages.pose.refine import CostScales, make_cost
+from synpick_warp.stages.pose.refine import LossScales, make_loss
 from tests.harness.pose_probe import Normals, residual_kernel, solve_kernel, step_kernel, step_limits
 from tests.twins import pose as twin
 from tests.worlds.pose_views import drawn, model_of, observe, pose_errors, pose_of, table_of
@@ -182,8 +182,8 @@ def score(scene: Scene, device, points: tuple[float, float], samples: tuple[floa
         setattr(sums, name, wp.array(np.tile(np.array(values) / lanes, (6, lanes, 1)), dtype=kind, device=device))
     sums.hessian, sums.gradient = scene.normals.sums.hessian, scene.normals.sums.gradient
     out = wp.zeros(6, dtype=float, device=device)
-    cost = make_cost(CostScales(color_cost=0.3), 0.01, 1, color)
-    wp.launch(score_poses_kernel, dim=6, inputs=[cost, scene.observer.observation, sums, 2], outputs=[out], device=device)
+    loss = make_loss(LossScales(color_cost=0.3), 0.01, 1, color)
+    wp.launch(score_poses_kernel, dim=6, inputs=[loss, scene.observer.observation, sums, 2], outputs=[out], device=device)
     return out.numpy()
 
 

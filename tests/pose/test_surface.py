@@ -6,7 +6,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from synpick_warp.stages.pose.models import build_models
-from synpick_warp.stages.pose.refine import CostScales, Refiner, make_cost
+from synpick_warp.stages.pose.refine import LossScales, Refiner, make_loss
 from tests.harness.pose_probe import Normals, step_limits
 from tests.twins import pose as twin
 from tests.worlds.pose_views import drawn, model_of, observe, pose_of, table_of
@@ -48,8 +48,8 @@ class Points:
         return points.astype(np.float64)
 
     def sums(self, pose: np.ndarray = POSE, cutoff: float = FAR, truncation: float = FAR, step: int = 1) -> dict[str, np.ndarray]:
-        cost = make_cost(CostScales(truncation=truncation), cutoff, step, 0.0)
-        return {name: values[0] for name, values in self.normals.from_points(pose, cost).items()}
+        loss = make_loss(LossScales(truncation=truncation), cutoff, step, 0.0)
+        return {name: values[0] for name, values in self.normals.from_points(pose, loss).items()}
 
 
 def around(mesh, count: int, seed: int, spread: float = 0.01) -> tuple[np.ndarray, np.ndarray]:
@@ -178,9 +178,9 @@ def test_hypotheses_are_independent(device):
     other = POSE.copy()
     other[:3] += 0.01
     refined.assign(np.stack([other, POSE]))
-    pair = Refiner(points.normals.models, points.observer, 2, CostScales())
+    pair = Refiner(points.normals.models, points.observer, 2, LossScales())
     cost = pair.score(refined, color=False).numpy()
-    single = Refiner(points.normals.models, points.observer, 1, CostScales())
+    single = Refiner(points.normals.models, points.observer, 1, LossScales())
     assert cost[1] == single.score(points.normals.poses(POSE), color=False).numpy()[0]
     assert cost[0] > cost[1]
     assert alone["points"][1] == pytest.approx(100 * points.area, rel=1e-4)

@@ -12,7 +12,7 @@ from synpick_warp.errors import LightError
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
 from synpick_warp.scenes.lights import load_lights
-from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS, SOLAR_ANGULAR_RADIUS, draw_sun_disc, extract_sun, replace_sun
+from synpick_warp.scenes.sun import MAX_SUN_TANGENT, SOLAR_TANGENT, draw_sun_disc, extract_sun, replace_sun
 from synpick_warp.scenes.types import EnvironmentMap, Sun
 from synpick_warp.stages.render.light_tables import precompute_environment, sh_basis
 from tests.worlds import toy_scene
@@ -141,7 +141,7 @@ def test_the_real_set(real_lights):
     np.testing.assert_allclose(light.sun.irradiance / np.pi, 1.5 * srgb_to_linear(np.array((255, 214, 170)) / 255))
     table, alone = precompute_environment(light, None), precompute_environment(EnvironmentMap("kiara", light.radiance), None)
     # The glow around it is wide: no main light, all stays in the map, and facing it is as bright as the set says.
-    assert table.sun_radius > MAX_SUN_ANGULAR_RADIUS
+    assert table.sun_radius > MAX_SUN_TANGENT
     assert not table.sun_irradiance.any()
     assert table.sunless.tobytes() == table.radiance.tobytes()
     rest = replace_sun(alone.radiance.astype(np.float64), light.sun)[0]
@@ -201,7 +201,7 @@ def test_a_map_with_an_unclipped_sun_keeps_its_luminance():
 
 def test_a_sun_over_an_even_map_is_as_wide_as_the_sun():
     table = precompute_environment(EnvironmentMap("set", np.ones((64, 128, 3), np.float32), SUN), None)
-    assert table.sun_radius == pytest.approx(SOLAR_ANGULAR_RADIUS)
+    assert table.sun_radius == pytest.approx(SOLAR_TANGENT)
     np.testing.assert_allclose(sh_basis(SUN.direction) @ table.irradiance, np.pi, rtol=1e-3)
     assert 0.05 < precompute_environment(EnvironmentMap("set", clipped(SUN.direction), SUN), None).sun_radius < 0.09
 

@@ -15,7 +15,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.scenes.assets.appearance import read_texture
+from synpick_warp.scenes.assets.appearance import decode_texture
 from synpick_warp.scenes.assets.meshes import read_mesh
 
 CORNERS = ("0 0 0", "1 0 0", "0 1 0", "0 0 1")
@@ -41,7 +41,7 @@ def test_images_of_any_bit_depth_channels_and_size(tmp_path, channels, size, dty
     if channels == 4:
         pixels[..., 3] = 0
     assert cv2.imwrite(str(tmp_path / "t.png"), pixels)
-    texture = read_texture(tmp_path / "t.png", "a.ply")
+    texture = decode_texture((tmp_path / "t.png").read_bytes(), "t.png")
     assert texture.shape == (*size, 3)
     assert texture.dtype == np.uint8
     expected = pixels[..., 2::-1] if channels > 1 else np.repeat(pixels, 3, axis=2)

@@ -70,7 +70,7 @@ def test_draws_are_the_twins_and_keep_the_law(sizes, seed, first, arrangement, d
     worlds = arrangement_worlds(device, WORLDS, **sizes)
     worlds.begin(Phase.START, first + np.arange(WORLDS), arrangement)
     worlds.set(worlds.state.catalog_index, 99)
-    arrange.sample_objects(worlds.scene, worlds.state, seed)
+    arrange.sample_episodes(worlds.scene, worlds.state, seed)
     catalog_index, slot = worlds.state.catalog_index.numpy(), worlds.state.body_slot.numpy()
     for world, expected in enumerate(expected_arrangements(worlds, seed)):
         count = len(expected.entries)
@@ -107,7 +107,7 @@ def modes(built, device, mode: str, mix: tuple[float, float, float], episodes: n
     worlds.scene = dataclasses.replace(worlds.scene, modes=scene.modes)
     worlds.begin(Phase.START, episodes, arrangement)
     worlds.set(worlds.state.mode, 99)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     return worlds.state.mode.numpy()
 
 
@@ -148,7 +148,7 @@ def test_each_split_has_its_own_mode(built, device):
     scene = make_scene_data(dataclasses.replace(config, splits=splits), small_worlds.catalog(), built, 1, device)
     worlds.scene = dataclasses.replace(worlds.scene, modes=scene.modes)
     worlds.begin(Phase.START, episodes, 0)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     cycle = [Mode.PICK, Mode.TARGET, Mode.MOVE, Mode.PICK, Mode.TARGET]
     assert worlds.state.mode.numpy().tolist() == [Mode.MOVE, Mode.MOVE, *cycle, Mode.TARGET, Mode.TARGET]
 
@@ -170,7 +170,7 @@ def test_modes_are_drawn_apart_from_objects(device):
     for mix in ((1.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
         worlds = arrangement_worlds(device, WORLDS, mix=mix, drop={"move_repeats": 1, "pick_repeats": 1})
         worlds.begin(Phase.START, episodes)
-        arrange.sample_objects(worlds.scene, worlds.state, SEED)
+        arrange.sample_episodes(worlds.scene, worlds.state, SEED)
         objects.append((worlds.state.catalog_index.numpy(), worlds.state.light_yaw.numpy()))
     for pick, mixed in zip(*objects, strict=True):
         np.testing.assert_array_equal(pick, mixed)
@@ -179,7 +179,7 @@ def test_modes_are_drawn_apart_from_objects(device):
 def test_a_budget_for_everything_draws_everything_without_repeats(device):
     worlds = arrangement_worlds(device, WORLDS, drop={"volume": 10.0, "move_repeats": 0})
     worlds.begin(Phase.START)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     assert (np.sort(worlds.state.catalog_index.numpy(), axis=1)[:, -3:] == [0, 1, 2]).all()
     assert len(np.unique(worlds.state.catalog_index.numpy(), axis=0)) == 6
 
@@ -189,14 +189,14 @@ def test_the_budget_may_be_met_exactly(device):
         device, WORLDS, volume=np.array([0.25]), compound=np.array([0]), radius=np.array([0.1]), drop={"volume": 1.0}
     )
     worlds.begin(Phase.START)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     assert ((worlds.state.catalog_index.numpy() == 0).sum(axis=1) == 4).all()
 
 
 def test_an_object_that_never_fits_is_never_drawn(device):
     worlds = arrangement_worlds(device, WORLDS, drop={"volume": 0.25})
     worlds.begin(Phase.START)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     catalog_index = worlds.state.catalog_index.numpy()
     assert (catalog_index[:, 0] >= 0).all()
     assert not (catalog_index == 2).any()
@@ -206,7 +206,7 @@ def test_each_mode_has_its_own_rule_of_repeating(device):
     """One bake: episodes of picking without repeats, episodes of moving with them."""
     worlds = arrangement_worlds(device, worlds=200, mix=(1.0, 1.0, 1.0), drop={"volume": 10.0, "move_repeats": 1, "pick_repeats": 0})
     worlds.begin(Phase.START)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     moving = worlds.state.mode.numpy() == Mode.MOVE
     assert 0 < moving.sum() < 200
     count = (worlds.state.catalog_index.numpy() >= 0).sum(axis=1)
@@ -239,7 +239,7 @@ def test_counted_slots_hold_the_draws_of_all_modes(device, mix):
         drop={"volume": 1.2e-3, "move_repeats": 1, "pick_repeats": 0},
     )
     worlds.begin(Phase.START)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     over = (worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW).mean()
     assert over <= shortfall + 4 * np.sqrt(shortfall / episodes)
     assert (single, compound) == (2, 1) if mix[2] == 0.0 else over > 0.0
@@ -254,7 +254,7 @@ def test_worlds_at_work_keep_their_objects(device, phase):
     worlds.set(worlds.state.mode, 9)
     joints = worlds.physics.state.joint_q
     worlds.set(joints, 0.5)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     assert (worlds.state.catalog_index.numpy() == 2).all()
     assert (worlds.state.light.numpy() == 7).all()
@@ -270,7 +270,7 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
     sizes["drop"] |= {"spread": spread, "clearance": clearance}
     worlds = arrangement_worlds(device, WORLDS, **sizes)
     worlds.begin(Phase.START, episode + np.arange(WORLDS))
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     over = worlds.state.phase.numpy() == Phase.OVER
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     np.testing.assert_array_equal(worlds.state.phase.numpy(), np.where(over, Phase.OVER, Phase.SETTLE))
@@ -294,7 +294,7 @@ def test_objects_fall_from_a_column_within_the_opening(sizes, spread, clearance,
 def test_the_drop_uses_the_whole_spread(device):
     worlds = arrangement_worlds(device, worlds=500, radius=np.full(3, 0.05), drop={"spread": 1.0})
     worlds.begin(Phase.START)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     full = worlds.coordinates()[worlds.forces()[:, :, 2] == 0.0]
     np.testing.assert_allclose(full[:, :2].min(axis=0), [-0.2, -0.1], atol=5e-3)
@@ -307,7 +307,7 @@ def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device)
     worlds.set(worlds.physics.state.joint_qd, 1.0)
     worlds.set(worlds.physics.control.joint_f, 7.0)
     worlds.set(worlds.state.stuck, 5)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     state, catalog = worlds.state, worlds.scene.catalog
     variant = state.variant.numpy().reshape(WORLDS, -1)
@@ -334,7 +334,7 @@ def test_empty_slots_wait_without_weight_and_full_ones_get_their_variant(device)
 def test_a_world_without_room_for_what_was_drawn_has_no_objects(device):
     worlds = arrangement_worlds(device, WORLDS, compound_slots=0)
     worlds.begin(Phase.START)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     arrange.drop_objects(worlds.scene, worlds.state, worlds.physics, SEED)
     over = worlds.state.ending.numpy() == Ending.ARRANGEMENT_OVERFLOW
     assert over.any()

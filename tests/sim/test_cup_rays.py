@@ -86,7 +86,7 @@ class Cups(KernelWorlds):
 
     def cast(self) -> tuple[list[int], list[int]]:
         """Count of rays that hit and bit mask of engaged objects, of every world."""
-        self.suction.count_seal_rays(self.scene, self.state, self.attempts, self.seals, self.physics)
+        self.suction.engage(self.scene, self.state, self.attempts, self.seals, self.physics)
         return self.attempts.hits.numpy().tolist(), self.attempts.engaged_bits.numpy().tolist()
 
     def attached(self) -> list[list[int]]:

@@ -22,7 +22,7 @@ def made(device, worlds: int = 24, **drop) -> KernelWorlds:
 def test_lights_are_even_and_turn(device):
     worlds = made(device, worlds=2000)
     worlds.begin(Phase.START)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     counts = np.bincount(worlds.state.light.numpy(), minlength=5)
     assert counts.min() > 330
     assert len(counts) == 5
@@ -34,7 +34,7 @@ def test_exposures_are_even_within_their_spread_and_the_episodes_own(device):
     """Half a stop either way: mean 0 and deviation 0.5 / √3, within four standard errors; other worlds draw the same."""
     worlds = made(device, worlds=2000)
     worlds.begin(Phase.START)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     drawn = worlds.state.light_exposure.numpy()
     assert np.abs(drawn).max() <= 0.5
     assert drawn.mean() == pytest.approx(0.0, abs=4 * 0.5 / np.sqrt(3 * 2000))
@@ -43,11 +43,11 @@ def test_exposures_are_even_within_their_spread_and_the_episodes_own(device):
     np.testing.assert_allclose(drawn, [rng.uniform(key, 2) - 0.5 for key in keys], atol=1e-6)
     few = made(device, worlds=3)
     few.begin(Phase.START, np.array([1999, 7, 300]))
-    arrange.sample_objects(few.scene, few.state, SEED)
+    arrange.sample_episodes(few.scene, few.state, SEED)
     np.testing.assert_array_equal(few.state.light_exposure.numpy(), drawn[[1999, 7, 300]])
     wide = made(device, worlds=2000, exposure_spread=2.0)
     wide.begin(Phase.START)
-    arrange.sample_objects(wide.scene, wide.state, SEED)
+    arrange.sample_episodes(wide.scene, wide.state, SEED)
     np.testing.assert_allclose(wide.state.light_exposure.numpy(), 4.0 * drawn, rtol=1e-6)
     np.testing.assert_array_equal(wide.state.light_yaw.numpy(), worlds.state.light_yaw.numpy())
 
@@ -56,7 +56,7 @@ def test_exposures_are_even_within_their_spread_and_the_episodes_own(device):
 def test_what_is_not_to_be_drawn_is_zero(device, setting):
     worlds = made(device, **{setting: 0})
     worlds.begin(Phase.START)
-    arrange.sample_objects(worlds.scene, worlds.state, SEED)
+    arrange.sample_episodes(worlds.scene, worlds.state, SEED)
     drawn = {"random_yaw": worlds.state.light_yaw, "exposure_spread": worlds.state.light_exposure}
     for name, array in drawn.items():
         assert (array.numpy() == 0.0).all() == (name == setting)

@@ -63,7 +63,7 @@ def begin(worlds: KernelWorlds) -> None:
 
 
 def end(worlds: KernelWorlds) -> None:
-    gripper.end_attempts(worlds.scene, worlds.state, worlds.attempts, worlds.seals, worlds.plan, worlds.physics)
+    gripper.advance_tasks(worlds.scene, worlds.state, worlds.attempts, worlds.seals, worlds.plan, worlds.physics)
 
 
 def step(worlds: KernelWorlds, count: int = 1) -> None:

@@ -123,7 +123,6 @@ class KernelWorlds:
             gripper_dofs=GRIPPER_DOFS,
             shapes=SHAPES,
             finger_shape=10,
-            cup_shape=11,
         )
 
     def _catalog(self) -> Any:

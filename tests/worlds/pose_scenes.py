@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from synpick_warp.stages.pose.batch import InstanceTable, ObjectModel, ViewBatch
+from synpick_warp.stages.pose.batch import InstanceTable, ObjectModel, RgbdBatch
 from tests.worlds.pose_views import embedded, pose_of, rendered, table_of
 
 
@@ -17,21 +17,21 @@ class Scene:
     """Rendered frames of objects with known poses."""
 
     objects: tuple[ObjectModel, ...]
-    frames: tuple[ViewBatch, ...]
+    frames: tuple[RgbdBatch, ...]
     """Views of each frame."""
     table: InstanceTable
     pose: np.ndarray
     """True poses (frame, instance, 7) float32."""
 
 
-def select(batch: ViewBatch, views: slice | list[int]) -> ViewBatch:
+def select(batch: RgbdBatch, views: slice | list[int]) -> RgbdBatch:
     """Subset of the views of a batch."""
-    return ViewBatch(**{name: array[views] for name, array in vars(batch).items()})
+    return RgbdBatch(**{name: array[views] for name, array in vars(batch).items()})
 
 
-def without(batch: ViewBatch, slot: int) -> ViewBatch:
+def without(batch: RgbdBatch, slot: int) -> RgbdBatch:
     """Copy of a batch in which the mask of one slot is removed."""
-    return ViewBatch(**(vars(batch) | {"label": np.where(batch.label == slot + 1, 0, batch.label).astype(np.uint8)}))
+    return RgbdBatch(**(vars(batch) | {"label": np.where(batch.label == slot + 1, 0, batch.label).astype(np.uint8)}))
 
 
 def card(x: float) -> np.ndarray:

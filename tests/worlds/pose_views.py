@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.embedded.objects import procedural_objects
 from synpick_warp.scenes.types import Material, TriangleMesh
-from synpick_warp.stages.pose.batch import InstanceTable, ObjectModel, ViewBatch
+from synpick_warp.stages.pose.batch import InstanceTable, ObjectModel, RgbdBatch
 from synpick_warp.stages.pose.observe import Observer
 from tests.worlds import toy_scene
 
@@ -40,11 +40,11 @@ def rays(width: int, height: int, focal: float) -> tuple[np.ndarray, np.ndarray]
     return np.meshgrid((np.arange(width) + 0.5 - width / 2.0) / focal, (np.arange(height) + 0.5 - height / 2.0) / focal)
 
 
-def drawn(label: np.ndarray, depth: np.ndarray, focal: float, color: np.ndarray | None = None) -> ViewBatch:
+def drawn(label: np.ndarray, depth: np.ndarray, focal: float, color: np.ndarray | None = None) -> RgbdBatch:
     """Batch of one view from labels (H, W), depth (H, W) [m] (0: none) and linear RGB (H, W, 3), by default mid-grey."""
     height, width = label.shape
     linear = np.full((height, width, 3), 0.2) if color is None else color
-    return ViewBatch(
+    return RgbdBatch(
         color=np.rint(linear_to_srgb(linear) * 255.0).astype(np.uint8)[None],
         depth=np.rint(depth / COUNT).astype(np.uint16)[None],
         depth_scale=np.array([COUNT], np.float32),
@@ -53,9 +53,9 @@ def drawn(label: np.ndarray, depth: np.ndarray, focal: float, color: np.ndarray 
     )
 
 
-def joined(*batches: ViewBatch) -> ViewBatch:
+def joined(*batches: RgbdBatch) -> RgbdBatch:
     """The views of several batches in one."""
-    return ViewBatch(**{name: np.concatenate([getattr(batch, name) for batch in batches]) for name in vars(batches[0])})
+    return RgbdBatch(**{name: np.concatenate([getattr(batch, name) for batch in batches]) for name in vars(batches[0])})
 
 
 def table_of(*rows: tuple[int, int, int]) -> InstanceTable:
@@ -64,7 +64,7 @@ def table_of(*rows: tuple[int, int, int]) -> InstanceTable:
     return InstanceTable(view.copy(), slot.copy(), model.copy())
 
 
-def observe(batch: ViewBatch, table: InstanceTable, device: wp.Device, points: int = 256) -> Observer:
+def observe(batch: RgbdBatch, table: InstanceTable, device: wp.Device, points: int = 256) -> Observer:
     """Observer that has seen a batch."""
     views, height, width = batch.label.shape
     observer = Observer(table, views, height, width, points, device)
@@ -106,7 +106,7 @@ def as_material(texture: np.ndarray) -> Material:
 
 def plate_view(
     size: tuple[float, float], distance: float, focal: float, shape: tuple[int, int], texture: np.ndarray, wall: float = 0.3
-) -> ViewBatch:
+) -> RgbdBatch:
     """A textured sheet that faces the camera, centred on its axis, before an even wall; the texture's values are what the camera sees.
 
     Args:
@@ -134,7 +134,7 @@ def rendered(
     device: wp.Device,
     shape: tuple[int, int] = (180, 320),
     focal: float = 330.0,
-) -> ViewBatch:
+) -> RgbdBatch:
     """Views by the project's renderer under a sky with a direction, before a grey wall at WALL.
 
     Args:
@@ -157,7 +157,7 @@ def rendered(
     )
     images = toy_scene.render(scene, device)
     views = len(placed)
-    return ViewBatch(
+    return RgbdBatch(
         color=images.color,
         depth=images.depth,
         depth_scale=np.full(views, RENDERED_COUNT, np.float32),

@@ -204,7 +204,7 @@ def find_footprints_kernel(
     left = wp.max(column - 1, 0)
     bottom = wp.min(row, grid.height - 1)
     right = wp.min(column, grid.width - 1)
-    # Most pixels have no contrast, which costs a fifth of the other test.
+    # First the contrast: most footprints have none, and this test costs a fifth of the other.
     if has_contrast(radiance, view, top, left, bottom, right):
         if has_discontinuity(gbuffer, grid, cameras.intrinsics[views.camera[view]], view, top, left, bottom, right):
             chunk = tile_of(footprints, row, column) // CHUNK_TILES

@@ -95,13 +95,13 @@ def expand_masks_kernel(
     # In:
     instance: wp.array3d[wp.uint8],  # (view, row, column)
     amodal: wp.array3d[wp.uint32],  # (view, row, column)
-    hidden: bool,
+    is_amodal: bool,
     # Out:
     mask_out: wp.array4d[wp.bool],  # (view, instance, row, column)
 ):
-    """Expand the id image to visible masks, or with `hidden` the bit field to amodal masks: one image per instance."""
+    """Expand the id image to visible masks, or with `is_amodal` the bit field to amodal masks: one image per instance."""
     view, index, row, column = wp.tid()
-    if hidden:
+    if is_amodal:
         mask_out[view, index, row, column] = ((amodal[view, row, column] >> wp.uint32(index)) & wp.uint32(1)) != wp.uint32(0)
     else:
         mask_out[view, index, row, column] = int(instance[view, row, column]) == index + 1

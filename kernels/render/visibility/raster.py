@@ -63,18 +63,18 @@ def write_sample(
     column: int,
     triangle: Triangle,
     ray: wp.vec3,
-    name: wp.uint64,
+    low_half: wp.uint64,
     bit: wp.uint32,
 ):
     """Depth test by atomic min where a pixel's ray hits a triangle, and atomic or of the instance's amodal bit.
 
-    `name` is the lower half of the key, `bit` the instance's bit in the amodal image (0: none).
+    `low_half` is the lower half of the key, `bit` the instance's bit in the amodal image (0: none).
     """
     weights = ray_weights(triangle, ray)
     if weights[0] >= 0.0:
         depth = triangle.near + wp.dot(weights, wp.vec3(triangle.a[2], triangle.b[2], triangle.c[2]))
         if depth > 0.0:
-            key = (wp.uint64(wp.cast(depth, wp.uint32)) << DEPTH_BITS) | name
+            key = (wp.uint64(wp.cast(depth, wp.uint32)) << DEPTH_BITS) | low_half
             # Reading first, to skip atomics that change nothing, costs more: a thread waits for reads, but not for atomics without result.
             wp.atomic_min(visibility.nearest, view, row, column, key)
             if amodal and bit != wp.uint32(0):
@@ -82,8 +82,8 @@ def write_sample(
 
 
 @wp.func
-def sample_name(body: int, triangle: int) -> wp.uint64:
-    """Lower half of a visibility key."""
+def pack_low_half(body: int, triangle: int) -> wp.uint64:
+    """Lower half of a visibility key: body and triangle."""
     return wp.uint64((wp.uint32(body) << TRIANGLE_BITS) | wp.uint32(triangle))
 
 
@@ -104,7 +104,7 @@ def rasterize_footprint(
     pixels: wp.vec4i,
     triangle: Triangle,
     footprint: Footprint,
-    name: wp.uint64,
+    low_half: wp.uint64,
     bit: wp.uint32,
 ):
     """Scanline loop: `write_sample` for the pixels of a footprint within the box `pixels` (x_min, y_min, x_max, y_max, inclusive).
@@ -123,7 +123,7 @@ def rasterize_footprint(
         if column > last:
             break
         ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
-        write_sample(visibility, amodal, view, row, column, triangle, ray, name, bit)
+        write_sample(visibility, amodal, view, row, column, triangle, ray, low_half, bit)
         column += 1
 
 
@@ -211,8 +211,8 @@ def rasterize_triangles_kernel(
             if columns * rows > SMALL_PIXELS:
                 listed = list_blocks(visibility_inout, view, rank, k, pixels)
             if not listed:
-                name = sample_name(body, k)
-                rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, pixels, triangle, footprint, name, bit)
+                low_half = pack_low_half(body, k)
+                rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, pixels, triangle, footprint, low_half, bit)
 
 
 @wp.kernel
@@ -247,19 +247,19 @@ def rasterize_blocks_kernel(
         footprint = find_footprint(grid, intrinsics, triangle)
         if row <= footprint.pixels[3]:
             pixels = wp.vec4i(block[3], row, wp.min(block[3] + BLOCK_COLUMNS - 1, footprint.pixels[2]), row)
-            name = sample_name(body, block[1])
+            low_half = pack_low_half(body, block[1])
             bit = amodal_bit(body, views.instances)
-            rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, pixels, triangle, footprint, name, bit)
+            rasterize_footprint(visibility_inout, amodal_inout, intrinsics, view, pixels, triangle, footprint, low_half, bit)
 
 
 @wp.func
 def resolve_hit(meshes: Meshes, bodies: ViewBodies, view: int, instances: int, key: wp.uint64, ray: wp.vec3) -> Hit:
     """Hit of a visibility key: unpack segment, triangle and depth, and intersect the triangle again for barycentric weights."""
-    name = wp.uint32(key)
-    body = int(name >> TRIANGLE_BITS)
+    low_half = wp.uint32(key)
+    body = int(low_half >> TRIANGLE_BITS)
     hit = Hit()
     hit.segment = segment_of(body, instances)
-    hit.triangle = int(name & ((wp.uint32(1) << TRIANGLE_BITS) - wp.uint32(1)))
+    hit.triangle = int(low_half & ((wp.uint32(1) << TRIANGLE_BITS) - wp.uint32(1)))
     hit.depth = wp.cast(wp.uint32(key >> DEPTH_BITS), float)
     weights = ray_weights(camera_triangle(meshes, bodies, view, body, hit.triangle), ray)
     hit.barycentric = wp.vec2(weights[0], weights[1])

@@ -258,7 +258,7 @@ def read_depth(depth: np.ndarray, settings: ViewSettings) -> np.ndarray:
 
 
 def encode_masks(masks: Masks, height: int, width: int) -> tuple[bytes, bytes]:
-    """Encode an instance's amodal and visible mask as PNG. They are often equal, as nothing hides the instance; then once."""
+    """Encode an instance's amodal and visible mask as PNG. If nothing hides the instance they are equal, and are encoded once."""
     amodal = encode_mask_png(masks.amodal, height, width)
     return amodal, amodal if masks.amodal.count == masks.visible.count else encode_mask_png(masks.visible, height, width)
 

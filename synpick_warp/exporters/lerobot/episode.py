@@ -58,7 +58,7 @@ def frame_path(folder: Path, camera: int, frame: int) -> Path:
 
 
 def commit_episode(folder: Path, content: EpisodeContent, settings: EpisodeSettings) -> None:
-    """Task: join the videos of an episode and rename them and the part to their places, the part first: by it a resumed bake knows them."""
+    """Task: join the videos of an episode and rename part and videos to their places, the part first: by it a resumed bake finds them."""
     ticks = np.frombuffer(content.ticks, TICK)
     groups = range(-(-len(ticks) // GROUP))
     videos, levels = [], []

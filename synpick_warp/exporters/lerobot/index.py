@@ -253,5 +253,5 @@ configs:
 
 {len(totals.rows):,} episodes of {totals.frames:,} frames, simulated by synpick-warp, in LeRobot's format {VERSION}.
 State: cup pose in the tote's frame (x, y, z [m], quaternion x, y, z, w), whether the suction is on, whether an object hangs on the cup.
-Action: setpoint of the cup [m] and suction command. Tasks name the object that each attempt picks.
+Action: setpoint of the wrist [m] and suction command. Tasks name the object that each attempt picks.
 {splits}"""

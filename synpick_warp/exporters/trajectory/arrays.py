@@ -58,29 +58,29 @@ _POSE = "x, y, z [m], then the quaternion x, y, z, w."
 _COM = "Linear velocity of the centre of mass, in the world's axes."
 _SPIN = "Angular velocity, in the world's axes."
 _CONTACT = "Vector sum of the forces of all contacts on the body, in the world's axes, mean over the step; a seal's force is no contact."
-_SIZES = "Sum of the sizes of the forces of all contacts on the body, mean over the step: how much it is squeezed."
+_LOAD = "Sum of the magnitudes of all contact forces on the body, mean over the step: how much it is squeezed."
 
 TICKS = GroupSpec(
-    "One row a frame. An instance keeps its index through the episode. Time, poses and states are those that the frame's pictures show.",
+    "One row per frame. An instance keeps its index through the episode. Time, poses and states are those that the frame's pictures show.",
     {
         "time": ArraySpec(("tick",), "<f8", "s", "Simulated time since the episode's first frame."),
         "object_id": ArraySpec(("tick", "instance"), "<i4", "1", "obj_id of the instance; -1: it is not in the scene."),
         "pose": ArraySpec(("tick", "instance", "component"), "<f4", "m", f"Object to world: {_POSE}{_GONE}"),
         "fixture_pose": ArraySpec(("tick", "fixture", "component"), "<f4", "m", f"Tote, finger and cup to world: {_POSE}"),
         "fixture_visible": ArraySpec(("tick", "fixture"), "|b1", "1", "Whether it is in the pictures."),
-        "phase": ArraySpec(("tick",), "<i4", "1", "What the episode is at.", names(Phase)),
-        "task": ArraySpec(("tick",), "<i4", "1", "What the gripper is at when the frame is taken.", names(Task)),
+        "phase": ArraySpec(("tick",), "<i4", "1", "Phase of the episode.", names(Phase)),
+        "task": ArraySpec(("tick",), "<i4", "1", "Task of the gripper at the frame.", names(Task)),
         "attempt": ArraySpec(("tick",), "<i4", "1", "Number of the running attempt, or of the one that ended in this tick; -1: none yet."),
-        "outcome": ArraySpec(("tick",), "<i4", "1", "What came of the attempt that ended in this tick.", names(Outcome)),
+        "outcome": ArraySpec(("tick",), "<i4", "1", "Outcome of the attempt that ended in this tick.", names(Outcome)),
         "target": ArraySpec(("tick",), "<i4", "1", "Instance that the attempt was to pick; -1: none."),
         "hits": ArraySpec(("tick",), "<i4", "1", "Rays of the cup that hit an object when the suction of the attempt was switched on."),
         "engaged": ArraySpec(("tick", "instance"), "|b1", "1", "Whether one of them hit the instance."),
         "attached": ArraySpec(("tick", "instance"), "|b1", "1", "Whether the instance hangs on the cup, or was picked in this tick."),
-        "peak_force": ArraySpec(("tick",), "<f4", "N", "Largest load of any seal in any step of the tick."),
+        "peak_force": ArraySpec(("tick",), "<f4", "N", "Largest force of any seal in any step of the tick."),
     },
 )
 STEPS = GroupSpec(
-    "One row a step of physics. With S steps a tick, rows f S to f S + S - 1 are the steps that led to frame f; the last of them is the "
+    "One row per step of physics. With S steps per tick, rows f S to f S + S - 1 are the steps that led to frame f; the last one is the "
     "state that the frame shows, but for what is put elsewhere after it: a gripper that appears or goes home, objects that leave.",
     {
         "time": ArraySpec(("step",), "<f8", "s", "Simulated time at the step's end since the episode's first frame."),
@@ -88,7 +88,7 @@ STEPS = GroupSpec(
         "velocity": ArraySpec(("step", "instance", "axis"), "<f4", "m/s", f"{_COM}{_GONE}"),
         "angular_velocity": ArraySpec(("step", "instance", "axis"), "<f4", "rad/s", f"{_SPIN}{_GONE}"),
         "contact_force": ArraySpec(("step", "instance", "axis"), "<f4", "N", f"{_CONTACT}{_GONE}"),
-        "contact_load": ArraySpec(("step", "instance"), "<f4", "N", f"{_SIZES}{_GONE}"),
+        "contact_load": ArraySpec(("step", "instance"), "<f4", "N", f"{_LOAD}{_GONE}"),
         "seal_force": ArraySpec(
             ("step", "instance"), "<f4", "N", f"Tension and shear that the instance's seal bore; 0: none holds it.{_GONE}"
         ),
@@ -97,14 +97,17 @@ STEPS = GroupSpec(
         "gripper_velocity": ArraySpec(("step", "link", "axis"), "<f4", "m/s", _COM),
         "gripper_angular_velocity": ArraySpec(("step", "link", "axis"), "<f4", "rad/s", _SPIN),
         "gripper_contact_force": ArraySpec(("step", "link", "axis"), "<f4", "N", _CONTACT),
-        "gripper_contact_load": ArraySpec(("step", "link"), "<f4", "N", _SIZES),
+        "gripper_contact_load": ArraySpec(("step", "link"), "<f4", "N", _LOAD),
         "setpoint": ArraySpec(
-            ("step", "axis"), "<f4", "m", "Where the cup's tilt axis, the origin of finger and cup, was drawn to in the step. NaN: nowhere."
+            ("step", "axis"), "<f4", "m", "Setpoint of the wrist (the cup's tilt axis, origin of finger and cup) in the step. NaN: none."
         ),
         "impedance_force": ArraySpec(
-            ("step", "axis"), "<f4", "N", "Force on the gripper towards the goal, held for the step; its weight is borne besides."
+            ("step", "axis"),
+            "<f4",
+            "N",
+            "Impedance force on the gripper towards the setpoint, held for the step; without gravity compensation.",
         ),
-        "task": ArraySpec(("step",), "|i1", "1", "What the gripper was at.", names(Task)),
+        "task": ArraySpec(("step",), "|i1", "1", "Task of the gripper in the step.", names(Task)),
     },
 )
 ARRANGEMENT = GroupSpec(
@@ -117,16 +120,16 @@ ARRANGEMENT = GroupSpec(
 )
 _UNSEEN = "nothing was seen"
 ATTEMPTS = GroupSpec(
-    "One row an attempt to pick, as in attempts.jsonl.",
+    "One row per attempt to pick, as in attempts.jsonl.",
     {
-        "frame": ArraySpec(("attempt",), "<i4", "1", "Frame from which was chosen."),
+        "frame": ArraySpec(("attempt",), "<i4", "1", "Frame from which the target was chosen."),
         "end_frame": ArraySpec(("attempt",), "<i4", "1", "Frame at which it was judged."),
-        "outcome": ArraySpec(("attempt",), "<i4", "1", "What came of it.", names(Outcome)),
+        "outcome": ArraySpec(("attempt",), "<i4", "1", "Outcome of the attempt.", names(Outcome)),
         "target": ArraySpec(("attempt",), "<i4", "1", f"Instance that was chosen; -1: {_UNSEEN}."),
         "object_id": ArraySpec(("attempt",), "<i4", "1", f"Its obj_id; -1: {_UNSEEN}."),
         "point": ArraySpec(("attempt", "axis"), "<f8", "m", f"Where the cup's tip was to touch. NaN: {_UNSEEN}."),
         "normal": ArraySpec(("attempt", "axis"), "<f8", "1", f"Unit normal there, out of the object. NaN: {_UNSEEN}."),
-        "yaw": ArraySpec(("attempt",), "<f8", "rad", f"Turn of the finger about the vertical. NaN: {_UNSEEN}."),
+        "yaw": ArraySpec(("attempt",), "<f8", "rad", f"Yaw of the finger about the vertical. NaN: {_UNSEEN}."),
         "tilt": ArraySpec(("attempt",), "<f8", "rad", f"Tilt of the cup about the finger's y axis. NaN: {_UNSEEN}."),
         "rays": ArraySpec(("attempt",), "<i4", "1", "Rays of the cup."),
         "hits": ArraySpec(("attempt",), "<i4", "1", "Rays that hit an object when the suction was switched on."),
@@ -134,7 +137,7 @@ ATTEMPTS = GroupSpec(
         "engaged": ArraySpec(("attempt", "instance"), "|b1", "1", "Whether a ray hit the instance."),
         "picked": ArraySpec(("attempt", "instance"), "|b1", "1", "Whether the instance left the scene on the cup."),
         "peak_force": ArraySpec(
-            ("attempt", "lift_tick"), "<f8", "N", "Largest load of any seal in each tick since the suction came on. NaN: it is over."
+            ("attempt", "lift_tick"), "<f8", "N", "Largest force of any seal in each tick since the suction came on. NaN: it is over."
         ),
         "record": ArraySpec(("byte",), "|u1", "1", "The lines of attempts.jsonl, with what was seen of every object; JSON in UTF-8."),
     },
@@ -149,7 +152,7 @@ OBJECTS = GroupSpec(
         "mass": ArraySpec(("object",), "<f8", "kg", "Mass."),
         "center_of_mass": ArraySpec(("object", "axis"), "<f8", "m", "Centre of mass in the object's frame."),
         "inertia": ArraySpec(("object", "axis", "axis"), "<f8", "kg·m²", "Inertia about the centre of mass, in the object's axes."),
-        "diameter": ArraySpec(("object",), "<f8", "m", "Largest distance of two points."),
+        "diameter": ArraySpec(("object",), "<f8", "m", "Largest distance between two points of the surface."),
         "volume": ArraySpec(("object",), "<f8", "m³", "Volume of the collision shape."),
     },
 )
@@ -157,7 +160,7 @@ CAMERAS = GroupSpec(
     "The cameras, which do not move: x right, y down, z forward; the centre of pixel (row, column) is (column + 0.5, row + 0.5).",
     {
         "resolution": ArraySpec(("camera", "width_height"), "<i4", "px", "Width and height."),
-        "matrix": ArraySpec(("camera", "row", "column"), "<f8", "px", "K: camera to picture."),
+        "matrix": ArraySpec(("camera", "row", "column"), "<f8", "px", "K: camera to image."),
         "rotation": ArraySpec(("camera", "row", "column"), "<f8", "1", "World to camera."),
         "translation": ArraySpec(("camera", "axis"), "<f8", "m", "World to camera."),
     },

@@ -157,7 +157,7 @@ class TrajectoryExporter:
                 "name": self._context.lights[light].name,
                 "yaw": float(batch.light_yaw[world]),
                 "exposure": float(batch.light_exposure[world]),
-                "units": {"yaw": "rad", "exposure": "stops"},
+                "units": {"yaw": "rad", "exposure": "EV"},
             }
         }
         if "mode" in batch.tick:

@@ -10,7 +10,7 @@ import numpy as np
 from synpick_warp.exporters.usd.exr import encode_exr
 from synpick_warp.exporters.usd.types import StageLight
 from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
-from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS, draw_sun_disc, replace_sun, sun_fraction
+from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, replace_sun, sun_fraction
 from synpick_warp.scenes.types import EnvironmentMap
 
 
@@ -27,7 +27,7 @@ def make_stage_light(index: int, light: EnvironmentMap, exposure: float) -> Stag
         light: The map.
         exposure: Factor on the automatic exposure.
     """
-    radiance, irradiance, spread = separate_sun(light)
+    radiance, irradiance, radius_tangent = separate_sun(light)
     directions, solid = map_directions(len(radiance))
     upward = np.maximum(directions[..., 2], 0.0) * solid
     white = np.einsum("ij,ijc->c", upward, radiance)
@@ -39,7 +39,7 @@ def make_stage_light(index: int, light: EnvironmentMap, exposure: float) -> Stag
         white = white + max(z, 0.0) * irradiance
         sun = (float(irradiance[0]), float(irradiance[1]), float(irradiance[2]))
     factor = exposure * WHITE_VALUE * np.pi / max(float(white @ LUMINANCE), 1e-9)
-    angle = float(2.0 * np.degrees(np.arctan(spread)))
+    angle = float(2.0 * np.degrees(np.arctan(radius_tangent)))
     return StageLight(light.name, light_file(index), float(factor), float(azimuth), float(polar), sun, angle)
 
 
@@ -68,13 +68,13 @@ def separate_sun(light: EnvironmentMap) -> tuple[np.ndarray, np.ndarray, float]:
         return light.radiance, np.zeros(3), 0.0
     radiance = light.radiance.astype(np.float64)
     coarse = resize_map(radiance, BACKGROUND_ROWS)
-    _, direction, irradiance, spread = replace_sun(coarse, sun)
+    _, direction, irradiance, radius_tangent = replace_sun(coarse, sun)
     # The fraction of a coarse texel applies to all fine texels within it, so that the same light is removed.
     fraction = sun_fraction(coarse, direction).astype(np.float32)
     rows = len(radiance)
     method = cv2.INTER_AREA if rows <= BACKGROUND_ROWS else cv2.INTER_NEAREST
     fine = cv2.resize(fraction, (2 * rows, rows), interpolation=method).astype(np.float64)
     rest = radiance * (1.0 - fine)[..., None]
-    if spread > MAX_SUN_ANGULAR_RADIUS:
-        return rest + draw_sun_disc(fine > 0.0, direction, irradiance, spread), np.zeros(3), spread
-    return rest, irradiance, spread
+    if radius_tangent > MAX_SUN_TANGENT:
+        return rest + draw_sun_disc(fine > 0.0, direction, irradiance, radius_tangent), np.zeros(3), radius_tangent
+    return rest, irradiance, radius_tangent

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from synpick_warp.errors import DatasetError
-from synpick_warp.exporters.writing.files import PARTIAL, write_atomically
+from synpick_warp.exporters.writing.files import MANIFEST_FILE, PARTIAL, write_atomically
 from synpick_warp.inputs.paths import path_inside
 
 _LINE = re.compile(r"([0-9a-f]{64})  (.+)")
 """Line of a checksum list: digest and name."""
-_RESERVED = ("manifest.json", "manifest", "config.toml", ".partial")
+_RESERVED = (MANIFEST_FILE, "manifest", "config.toml", PARTIAL)
 """First parts of names that no list has: the data set's own records."""
 _WHOLE = 1 << 22
 """Largest file that is read at once [bytes]."""

@@ -32,7 +32,7 @@ def check_output_folder(out: Path) -> None:
         names = [] if (out / MANIFEST_FILE).exists() else [name for name in os.listdir(out) if name == PARTIAL or not name.startswith(".")]
         if names:
             reason = f": it has a folder {PARTIAL} of another program" if names == [PARTIAL] else ""
-            raise OutputError(f"{out} is not empty{reason}; {_ALLOWED}, or a data set to go on with")
+            raise OutputError(f"{out} is not empty{reason}; {_ALLOWED}, or a data set to resume")
         probe = out / f".{uuid.uuid4().hex}"
         probe.write_bytes(b"\0")
         probe.unlink()

@@ -86,7 +86,7 @@ class Perception:
         wp.capture_while(self._remaining, self.perceive_batch, snapshot=snapshot)
 
     def list_worlds(self) -> None:
-        """Build the worklist of worlds whose task is LOOK and reset the loop to its begin."""
+        """Build the worklist of worlds whose task is LOOK and reset the loop to its beginning."""
         wp.launch(
             worklist.list_worlds_kernel,
             dim=1,

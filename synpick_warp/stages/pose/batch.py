@@ -28,7 +28,7 @@ class ObjectModel:
 
 
 @dataclass(frozen=True, eq=False)
-class ViewBatch:
+class RgbdBatch:
     """RGB-D images of V views of equal size, with instance masks."""
 
     color: np.ndarray

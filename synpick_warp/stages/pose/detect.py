@@ -9,7 +9,7 @@ import warp as wp
 
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
-from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule, choose_poses
+from synpick_warp.stages.pose.refine import LossScales, Refiner, Schedule, choose_poses
 from synpick_warp.stages.pose.symmetries import SymmetrySearch
 from synpick_warp.stages.pose.templates import SearchSettings, TemplateSearch
 
@@ -38,7 +38,7 @@ class DetectSettings:
 class Detector:
     """Estimates poses from single views. `detect` only launches kernels."""
 
-    def __init__(self, models: PoseModels, templates: Any, observer: Observer, settings: DetectSettings, scales: CostScales) -> None:
+    def __init__(self, models: PoseModels, templates: Any, observer: Observer, settings: DetectSettings, scales: LossScales) -> None:
         """
         Args:
             models: The object models.
@@ -57,7 +57,7 @@ class Detector:
         self.best = wp.zeros(n, dtype=wp.transform, device=self.device)
         self.cost = wp.zeros(n, dtype=float, device=self.device)
         # Any correlation is below this mean, so that symmetries are always considered.
-        self.no_memory = wp.zeros(n, dtype=float, device=self.device)
+        self.unreached_mean = wp.zeros(n, dtype=float, device=self.device)
 
     def detect(self) -> None:
         """Estimate the poses of the observed views: `best` and `cost` of each instance."""
@@ -66,8 +66,8 @@ class Detector:
         self.many.refine(self.many_pose, settings.coarse)
         cost = self.many.score(self.many_pose, color=settings.color)
         choose_poses(self.many_pose, cost, settings.hypotheses, 0.0, [self.best, self.cost], self.device)
-        self.no_memory.fill_(1.0e3)
-        self.symmetries.propose(self.best, self.no_memory, settings.symmetry_gain, self.pair_pose, color=settings.color)
+        self.unreached_mean.fill_(1.0e3)
+        self.symmetries.propose(self.best, self.unreached_mean, settings.symmetry_gain, self.pair_pose, color=settings.color)
         self.pair.refine(self.pair_pose, settings.fine)
         cost = self.pair.score(self.pair_pose, color=settings.color)
         choose_poses(self.pair_pose, cost, self.symmetries.hypotheses, settings.symmetry_loyalty, [self.best, self.cost], self.device)

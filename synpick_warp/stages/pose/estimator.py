@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synpick_warp.stages.pose.batch import Estimates, InstanceTable, ObjectModel, ViewBatch
+from synpick_warp.stages.pose.batch import Estimates, InstanceTable, ObjectModel, RgbdBatch
 from synpick_warp.stages.pose.detect import Detector, DetectSettings
 from synpick_warp.stages.pose.models import PoseModels, build_models
 from synpick_warp.stages.pose.observe import Observer
-from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule
+from synpick_warp.stages.pose.refine import LossScales, Refiner, Schedule
 from synpick_warp.stages.pose.templates import render_templates
 from synpick_warp.stages.pose.track import Tracker, TrackSettings
 
@@ -24,7 +24,7 @@ APPROACH = Schedule(iterations=8, cutoffs=(0.03, 0.01), step=2, color=0.0)
 POLISH = Schedule(iterations=10, cutoffs=(0.01, 0.005), step=1, color=0.005)
 """Second refinement of a disturbed pose."""
 _NOISE_MARGIN, _NOISE_TRUNCATION, _NOISE_CUTOFF = 2.5, 1.5, 1.5
-"""Increase of `CostScales.margin`, of `CostScales.truncation`, and of the last cutoff of a schedule, per standard deviation of the depth:
+"""Increase of `LossScales.margin`, of `LossScales.truncation`, and of the last cutoff of a schedule, per standard deviation of the depth:
 nine of ten points then count as if there were no noise."""
 
 
@@ -56,7 +56,7 @@ class EstimatorModels:
         self.models: PoseModels = build_models(objects, device)
         self.detection = adapt(DetectSettings(), settings)
         self.tracking = replace(adapt(TrackSettings(), settings), min_points=settings.min_points)
-        noise, scales = settings.depth_noise, CostScales()
+        noise, scales = settings.depth_noise, LossScales()
         self.scales = replace(
             scales, margin=scales.margin + _NOISE_MARGIN * noise, truncation=scales.truncation + _NOISE_TRUNCATION * noise
         )
@@ -95,12 +95,12 @@ class PoseEstimator:
     def _tracker(self) -> Tracker:
         return Tracker(self.shared.models, self.observer, self.shared.tracking, self.shared.scales)
 
-    def estimate(self, batch: ViewBatch) -> Estimates:
+    def estimate(self, batch: RgbdBatch) -> Estimates:
         """Estimate poses from one frame."""
         detector = self._detector
         return self._run(batch, detector.detect, lambda: (detector.best, detector.cost))
 
-    def refine(self, batch: ViewBatch, pose: np.ndarray) -> Estimates:
+    def refine(self, batch: RgbdBatch, pose: np.ndarray) -> Estimates:
         """Refine poses (N, 7) float32 as in `Estimates`."""
         refiner, settings = self._refiner, self.shared.settings
         poses = wp.array(pose, dtype=wp.transform, device=self.device)
@@ -116,7 +116,7 @@ class PoseEstimator:
         """Set the poses (N, 7) float32 of the rows (N,) bool, in the frame that the next `track` is given; the others continue."""
         self._tracker.start(pose, rows)
 
-    def track(self, batch: ViewBatch) -> Estimates:
+    def track(self, batch: RgbdBatch) -> Estimates:
         """Estimate the poses of all instances that were started from their last poses; called for every frame in turn.
 
         An instance that shows too few points keeps its pose, and has no estimate. Where an estimate is rejected because it suddenly costs
@@ -126,7 +126,7 @@ class PoseEstimator:
         result = self._run(batch, tracker.track, lambda: (tracker.track_state.pose, tracker.cost))
         return replace(result, valid=result.valid & (tracker.track_state.frames.numpy() > 0))
 
-    def _run(self, batch: ViewBatch, launch: Callable[[], None], read: Callable[[], tuple[wp.array, wp.array]]) -> Estimates:
+    def _run(self, batch: RgbdBatch, launch: Callable[[], None], read: Callable[[], tuple[wp.array, wp.array]]) -> Estimates:
         """Observe a batch, estimate, and bring the result to the host."""
         begin = time.perf_counter()
         self.observer.observe(batch)

@@ -1,4 +1,7 @@
-"""Nearest-vertex search for ADD-S over many poses: exact, on the CPU or a GPU; see `kernels/pose/nearest`."""
+"""Exact nearest-vertex search for ADD-S over many poses: a hierarchical grid with a candidate list per leaf cell.
+
+Built here on the host; `kernels/pose/nearest` searches it on the CPU or a GPU.
+"""
 
 from __future__ import annotations
 

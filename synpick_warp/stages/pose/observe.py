@@ -22,7 +22,7 @@ from synpick_warp.kernels.pose.observation import (
 )
 from synpick_warp.kernels.pose.points import count_points_kernel, sample_points_kernel, summarize_points_kernel
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
-from synpick_warp.stages.pose.batch import InstanceTable, ViewBatch
+from synpick_warp.stages.pose.batch import InstanceTable, RgbdBatch
 
 LABELS = 256
 """Values of a label image."""
@@ -82,7 +82,7 @@ class Observer:
         sizes = {"instance": self.instances, "side": 4, "crop_row": crop, "crop_column": crop, "point": points}
         self.observation = allocate_struct(OBSERVATION, sizes, device)
 
-    def observe(self, batch: ViewBatch) -> None:
+    def observe(self, batch: RgbdBatch) -> None:
         """Upload a batch and compute its observation."""
         images, targets, observation, device = self.images, self.targets, self.observation, self.device
         images.color.assign(batch.color)

@@ -37,7 +37,7 @@ class Schedule:
 
 
 @dataclass(frozen=True)
-class CostScales:
+class LossScales:
     """Scales of the residuals that do not change in the course of a refinement."""
 
     truncation: float = 0.01
@@ -45,20 +45,23 @@ class CostScales:
     margin: float = 0.006
     """Depth by which a model sample may lie in front of another surface without protruding [m]; more than the depth's noise."""
     silhouette: float = 0.5
+    """Weight of silhouette residuals."""
     color_cutoff: float = 0.5
     """Colour residual that counts as an outlier, relative to the mean intensity."""
     color_cost: float = 0.3
+    """Weight of colours in the costs of hypotheses."""
     damping: float = 1e-4
+    """Weight of staying at the start (Levenberg-Marquardt), relative to the observation."""
     max_distance: float = 0.02
-    """Of a step [m]."""
+    """Longest translation of a step [m]."""
     max_angle: float = 0.25
-    """Of a step [rad]."""
+    """Largest rotation of a step [rad]."""
 
 
 class Refiner:
     """Refines and scores pose hypotheses. Owns its sums; only launches kernels."""
 
-    def __init__(self, models: PoseModels, observer: Observer, hypotheses: int, scales: CostScales) -> None:
+    def __init__(self, models: PoseModels, observer: Observer, hypotheses: int, scales: LossScales) -> None:
         """
         Args:
             models: The object models.
@@ -85,40 +88,40 @@ class Refiner:
         for iteration in range(schedule.iterations):
             cutoff = first * (last / first) ** (iteration / max(schedule.iterations - 1, 1))
             # The light changes slowly: fitting it every other step is enough.
-            self._accumulate(pose, make_cost(self.scales, cutoff, schedule.step, schedule.color), fit_light=iteration % 2 == 0)
+            self._accumulate(pose, make_loss(self.scales, cutoff, schedule.step, schedule.color), fit_light=iteration % 2 == 0)
             inputs = [self.models.models, limits, observer.targets, observer.observation, self.sums, self.prior, self.hypotheses]
             wp.launch(step_poses_kernel, dim=len(pose), inputs=inputs, outputs=[pose], device=self.device)
 
     def score(self, pose: wp.array, *, color: bool, step: int = 1) -> wp.array:
         """Costs of poses (pose) float32, valid until the next call: unexplained and protruding fraction of the visible area, and colour."""
-        cost = make_cost(self.scales, self.scales.truncation, step, 1.0 if color else 0.0)
-        self._accumulate(pose, cost, fit_light=True)
-        inputs = [cost, self.observer.observation, self.sums, self.hypotheses]
+        loss = make_loss(self.scales, self.scales.truncation, step, 1.0 if color else 0.0)
+        self._accumulate(pose, loss, fit_light=True)
+        inputs = [loss, self.observer.observation, self.sums, self.hypotheses]
         wp.launch(score_poses_kernel, dim=len(pose), inputs=inputs, outputs=[self.cost], device=self.device)
         return self.cost
 
-    def _accumulate(self, pose: wp.array, cost: Any, *, fit_light: bool) -> None:
+    def _accumulate(self, pose: wp.array, loss: Any, *, fit_light: bool) -> None:
         """Normal equations and costs of all residuals."""
         observer, models, device = self.observer, self.models.models, self.device
         images, targets, observation = observer.images, observer.targets, observer.observation
         dim, hypotheses = (len(pose), int(LANES)), self.hypotheses
-        inputs = [models, cost, targets, observation, pose, hypotheses]
+        inputs = [models, loss, targets, observation, pose, hypotheses]
         wp.launch(accumulate_points_kernel, dim=dim, inputs=inputs, outputs=[self.sums], device=device)
-        if cost.color > 0.0 and fit_light:
-            inputs = [models, cost, images, targets, observation, pose, hypotheses]
+        if loss.color > 0.0 and fit_light:
+            inputs = [models, loss, images, targets, observation, pose, hypotheses]
             wp.launch(accumulate_lighting_kernel, dim=dim, inputs=inputs, outputs=[self.lighting], device=device)
             wp.launch(fit_lighting_kernel, dim=len(pose), outputs=[self.lighting], device=device)
-        inputs = [models, cost, images, targets, observation, self.lighting, pose, hypotheses]
+        inputs = [models, loss, images, targets, observation, self.lighting, pose, hypotheses]
         wp.launch(accumulate_samples_kernel, dim=dim, inputs=inputs, outputs=[self.sums], device=device)
 
 
-def make_cost(scales: CostScales, cutoff: float, step: int, color: float) -> Any:
+def make_loss(scales: LossScales, cutoff: float, step: int, color: float) -> Any:
     """The struct `LossParameters`; see `Schedule` for the parameters that change in the course of a refinement."""
-    cost = LossParameters()
-    cost.cutoff, cost.step, cost.color = cutoff, step, color
+    loss = LossParameters()
+    loss.cutoff, loss.step, loss.color = cutoff, step, color
     for name in ("truncation", "margin", "silhouette", "color_cutoff", "color_cost"):
-        setattr(cost, name, getattr(scales, name))
-    return cost
+        setattr(loss, name, getattr(scales, name))
+    return loss
 
 
 def choose_poses(pose: wp.array, cost: wp.array, hypotheses: int, loyalty: float, out: list[wp.array], device: wp.Device) -> None:

@@ -14,7 +14,7 @@ from synpick_warp.kernels.pose.hypotheses import (
 )
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
-from synpick_warp.stages.pose.refine import CostScales, make_cost
+from synpick_warp.stages.pose.refine import LossScales, make_loss
 
 CORRELATION = struct_arrays(Correlation, "candidate", "lane")
 
@@ -28,7 +28,7 @@ class SymmetrySearch:
 
     hypotheses = 2
 
-    def __init__(self, models: PoseModels, observer: Observer, scales: CostScales) -> None:
+    def __init__(self, models: PoseModels, observer: Observer, scales: LossScales) -> None:
         """
         Args:
             models: The object models.
@@ -59,8 +59,8 @@ class SymmetrySearch:
         )
         if not color:
             gain = float("inf")
-        cost = make_cost(self.scales, self.scales.truncation, 1, 1.0)
-        inputs = [self.models.models, symmetries, cost, observer.images, targets, observer.observation, self.candidates, capacity]
+        loss = make_loss(self.scales, self.scales.truncation, 1, 1.0)
+        inputs = [self.models.models, symmetries, loss, observer.images, targets, observer.observation, self.candidates, capacity]
         dim = (candidates, int(CORRELATION_LANES))
         wp.launch(correlate_symmetries_kernel, dim=dim, inputs=inputs, outputs=[self.correlation], device=device)
         inputs = [symmetries, mean, targets, self.correlation, self.candidates, capacity, gain]

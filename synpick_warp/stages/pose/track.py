@@ -17,7 +17,7 @@ from synpick_warp.kernels.pose.hypotheses import (
 )
 from synpick_warp.stages.pose.models import PoseModels
 from synpick_warp.stages.pose.observe import Observer
-from synpick_warp.stages.pose.refine import CostScales, Refiner, Schedule, choose_poses
+from synpick_warp.stages.pose.refine import LossScales, Refiner, Schedule, choose_poses
 from synpick_warp.stages.pose.symmetries import SymmetrySearch
 
 TRACK = struct_arrays(Track, "instance", units={"pose": "m", "before": "m", "centroid": "m"})
@@ -52,7 +52,7 @@ class TrackSettings:
 class Tracker:
     """Tracks the instances of an observer. `track` only launches kernels."""
 
-    def __init__(self, models: PoseModels, observer: Observer, settings: TrackSettings, scales: CostScales) -> None:
+    def __init__(self, models: PoseModels, observer: Observer, settings: TrackSettings, scales: LossScales) -> None:
         """
         Args:
             models: The object models.

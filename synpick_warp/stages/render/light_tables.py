@@ -14,7 +14,7 @@ from synpick_warp.kernels.render.lighting.brdf import ALBEDO_COLUMNS, ALBEDO_ROW
 from synpick_warp.kernels.render.lighting.environment import PREFILTER_LEVELS
 from synpick_warp.kernels.render.lighting.sampling import EnvironmentCdf
 from synpick_warp.scenes.environment import BACKGROUND_ROWS, LUMINANCE, WHITE_VALUE, map_directions, resize_map
-from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS, draw_sun_disc, extract_sun, replace_sun
+from synpick_warp.scenes.sun import MAX_SUN_TANGENT, draw_sun_disc, extract_sun, replace_sun
 from synpick_warp.scenes.types import EnvironmentMap
 
 PREFILTER_ROWS = 32
@@ -106,7 +106,7 @@ def precompute_environment(light: EnvironmentMap, ground: np.ndarray | None) -> 
     sunless, direction, irradiance, radius = extract_sun(radiance) if light.sun is None else replace_sun(radiance, light.sun)
     if light.sun is not None:
         radiance = sunless + draw_sun_disc((sunless < radiance).any(axis=2), direction, irradiance, radius)
-    if radius > MAX_SUN_ANGULAR_RADIUS:
+    if radius > MAX_SUN_TANGENT:
         sunless, irradiance = radiance, np.zeros(3)
     upward = np.maximum(directions[..., 2], 0.0) * solid_angles
     upward_irradiance = (radiance * upward[..., None]).sum(axis=(0, 1))
@@ -129,8 +129,8 @@ def precompute_environment(light: EnvironmentMap, ground: np.ndarray | None) -> 
 def environment_cdf(radiance: np.ndarray, table: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Marginal and conditional CDF of a map's texels, weighted by luminance times solid angle; uniform where the map is black.
 
-    Low light has less weight, because most lit surfaces face up and totes have walls. With a table, light from below the horizon has
-    none, because the table blocks it.
+    Light from near the horizon has less weight, because most lit surfaces face up and totes have walls. With a table, light from below
+    the horizon has none, because the table blocks it.
 
     The map is looked up bilinearly, which spreads light half a texel beyond a lamp's edge. So a texel is weighted by the mean of the
     interpolated map over it: no direction with light has probability 0.

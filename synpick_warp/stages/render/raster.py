@@ -24,8 +24,8 @@ from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_views, set_up_views
 
 BLOCKS = 32768
-"""Capacity for blocks of large triangles per view. Thirteen objects of some hundred to some thousand triangles each, as the embedded ones,
-have 14,000 at full HD in front of a camera; dense meshes have a tenth. Triangles beyond the capacity are rasterized by single threads,
+"""Capacity for blocks of large triangles per view. Thirteen objects of hundreds to thousands of triangles, such as the embedded
+ones, that fill a full-HD view need 14,000; dense meshes need a tenth. Triangles beyond the capacity are rasterized by single threads,
 which is slow."""
 
 VISIBILITY_BUFFER = struct_arrays(VisibilityBuffer, "view", "row", "column", block=("view", "block"), blocks=("view",))

@@ -16,7 +16,7 @@ ROULETTE = 2
 
 
 def make_path_rules(render: Render, seed: int, samples: int, roulette: int) -> Any:
-    """The struct `PathRules` with light and BRDF sampling combined and without path regularization."""
+    """The struct `PathRules` with light and BRDF sampling combined by MIS (Veach and Guibas, 1995), and without path regularization."""
     rules = PathRules()
     rules.samples = samples
     rules.bounces = render.bounces

@@ -26,7 +26,7 @@ def assign_episodes(state: WorldState, episodes: wp.array, tries: int) -> None:
     )
 
 
-def sample_objects(scene: SceneData, state: WorldState, seed: int) -> None:
+def sample_episodes(scene: SceneData, state: WorldState, seed: int) -> None:
     """Sample mode, objects and light of starting episodes."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(

@@ -226,7 +226,7 @@ def find_unsupported(solver: Any) -> list[str]:
         "propagation_cached_response": bool(solver._propagation_cached_warps),
         "no articulation, or several kinds": len(solver._propagation_tree_sizes) != 1,
         "too many bodies for shared memory": solver._pgs_solve_propagation_colored_warp_kernel is None,
-        # Without limits the solver spares worlds without contacts in generalized coordinates a pass over the gripper.
+        # Without limits the solver skips the gripper's pass in worlds without contacts in generalized coordinates; the kernel does not.
         "neither joint limits nor speed limits": not any(solver._internal_row_phases()),
     }
     return [name for name, is_unsupported in unsupported.items() if is_unsupported]

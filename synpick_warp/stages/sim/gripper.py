@@ -134,8 +134,8 @@ def remove_lost(scene: SceneData, state: WorldState, attempts: AttemptState, sea
     )
 
 
-def end_attempts(scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, plan: Plan, physics: Physics) -> None:
-    """Judge lifts that are complete, remove picked objects, and place the grippers at home."""
+def advance_tasks(scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, plan: Plan, physics: Physics) -> None:
+    """Task transitions at the end of a tick: judge complete lifts, remove picked objects, send grippers home."""
     worlds, device = state.phase.shape[0], state.phase.device
     wp.launch(
         tasks.pack_attached_kernel,

@@ -21,7 +21,7 @@ from synpick_warp.stages.sim.fused_solver import KNOWN_NEWTON, choose_solver
 
 # Sentinel: default of `next` for an exhausted iterator.
 ENDED = object()
-# Contacts with a larger gap make no constraint rows [m]: only those that a hook has disabled have one, none that the pipeline finds.
+# Contacts with a larger gap get no constraint rows [m]. The collision pipeline finds none that far apart: a hook disables a contact so.
 CONTACT_GAP = 0.1
 # Distance to a joint limit from which its constraint row is active [rad].
 JOINT_LIMIT_GAP = 0.2
@@ -36,7 +36,7 @@ VELOCITY_LIMIT_FRACTION = 0.5
 NARROW_PHASE_BLOCK, NARROW_PHASE_BLOCKS = 32, 8
 # On an H200, models of one and two worlds round differently from those of 8, 64 and 512, which agree bit by bit.
 MIN_GPU_WORLDS = 8
-# Maximum worlds if `bake.worlds` is 0. On a GPU more worlds need memory and hide more of the latency of physics, which pictures hide as
+# Maximum worlds if `bake.worlds` is 0. On a GPU more worlds need memory and hide more of the latency of physics, which rendering hides as
 # well; on a CPU worlds are simulated one after the other, so that more of them gain nothing.
 MAX_GPU_WORLDS, MAX_CPU_WORLDS = 512, 4
 

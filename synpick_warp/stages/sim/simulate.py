@@ -24,7 +24,7 @@ from synpick_warp.stages.perception.perceive import Perception
 from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.sim import arrange, gripper
 from synpick_warp.stages.sim.physics import ENDED, Physics
-from synpick_warp.stages.sim.step_log import PhysicsRecord, Recorder
+from synpick_warp.stages.sim.step_log import PhysicsRecord, StepRecorder
 from synpick_warp.stages.sim.suction import Suction
 from synpick_warp.stages.sim.worlds import AttemptState, SealState, WorldState, WorldStatus, world_sizes
 from synpick_warp.stages.timing import scope
@@ -86,9 +86,9 @@ class Simulation:
         self.observation = allocate(Observation, sizes, device)
         self.plan = allocate(Plan, sizes, device)
         self.last = allocate(LastFrame, sizes, device)
-        self.recorder: Recorder | None = None
+        self.recorder: StepRecorder | None = None
         if records_physics:
-            self.recorder = Recorder(
+            self.recorder = StepRecorder(
                 config.trajectory, config.gripper, self.scene, self.state, self.attempts, self.seals, self.physics, sizes
             )
         physics = self.recorder.record if self.recorder is not None else None
@@ -145,7 +145,7 @@ class Simulation:
         """Start episodes in free worlds: objects are sampled and dropped."""
         state, scene, physics, seed = self.state, self.scene, self.physics, self.config.bake.seed
         arrange.assign_episodes(state, self.episodes, self.config.settle.tries)
-        arrange.sample_objects(scene, state, seed)
+        arrange.sample_episodes(scene, state, seed)
         arrange.drop_objects(scene, state, physics, seed)
         arrange.set_guides(scene, state, physics)
         gripper.set_shaft_collision(scene, state, physics)
@@ -163,8 +163,8 @@ class Simulation:
         gripper.begin_picking(scene, state, self.attempts, self.observation, self.plan, physics)
         gripper.remove_lost(scene, state, self.attempts, self.seals, physics)
         if self.suction is not None:
-            self.suction.count_seal_rays(scene, state, self.attempts, self.seals, physics)
-            gripper.end_attempts(scene, state, self.attempts, self.seals, self.plan, physics)
+            self.suction.engage(scene, state, self.attempts, self.seals, physics)
+            gripper.advance_tasks(scene, state, self.attempts, self.seals, self.plan, physics)
         gripper.park_removed(scene, state, self.attempts, physics)
         physics.refresh_poses()
         arrange.judge_episodes(scene, state, self.attempts, self.observation, physics)

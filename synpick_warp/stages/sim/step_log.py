@@ -73,7 +73,7 @@ def record_kinds(settings: Trajectory) -> tuple[type, ...]:
     return (StepArrays, DropArrays) if settings.steps else (DropArrays,)
 
 
-class Recorder:
+class StepRecorder:
     """Watcher that records the steps of a tick. Its launches never change, because `Physics.tick` captures them in a graph.
 
     Attributes:

@@ -33,7 +33,7 @@ class Suction:
         self._meshes = render_scene.keep
         self.surface = _surface_data(settings.surface == "mesh", catalog, render_scene.meshes.id, device)
 
-    def count_seal_rays(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
+    def engage(self, scene: SceneData, state: WorldState, attempts: AttemptState, seals: SealState, physics: Physics) -> None:
         """Switch suction on where task PRESS is complete: cast the rays and attach the engaged objects. Runs at the end of a tick."""
         task = [state.phase, attempts.task, attempts.steps]
         body_q, device = physics.state.body_q, state.phase.device

@@ -59,7 +59,7 @@ class WorldState:
     """Environment map of the episode."""
     light_yaw: wp.array = device_array("world", dtype=wp.float32, unit="rad")
     """Rotation of the map about +z, counter-clockwise."""
-    light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="stops")
+    light_exposure: wp.array = device_array("world", dtype=wp.float32, unit="EV")
     """Exposure relative to the automatic one."""
 
 

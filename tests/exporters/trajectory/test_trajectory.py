@@ -99,7 +99,7 @@ def test_episode_attributes_and_arrangement(store):
     attributes = dict(episode.attrs)
     light = attributes.pop("light")
     assert {name: light[name] for name in ("map", "yaw", "exposure")} == {"map": 0, "yaw": 2.0, "exposure": 0.25}
-    assert light["units"] == {"yaw": "rad", "exposure": "stops"}
+    assert light["units"] == {"yaw": "rad", "exposure": "EV"}
     assert attributes == {
         "episode": 4,
         "arrangement": 1,

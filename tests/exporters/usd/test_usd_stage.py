@@ -18,7 +18,7 @@ from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.embedded.skies import skies
 from synpick_warp.scenes.environment import map_directions, resize_map
-from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS
+from synpick_warp.scenes.sun import MAX_SUN_TANGENT
 from synpick_warp.scenes.types import Camera, EnvironmentMap, Sun
 from synpick_warp.stages.render import light_tables
 from tests.exporters.usd.test_exr import decode
@@ -277,7 +277,7 @@ def test_map_and_sun_are_separated_like_in_the_renderer(irradiance, rows, sharpn
     rest, beam, spread = separate_sun(light)
     table = light_tables.precompute_environment(light, None)
     assert spread == pytest.approx(table.sun_radius, rel=1e-4)
-    assert (spread > MAX_SUN_ANGULAR_RADIUS) == (not beam.any()) == (sharpness == 100.0)
+    assert (spread > MAX_SUN_TANGENT) == (not beam.any()) == (sharpness == 100.0)
     np.testing.assert_allclose(beam, table.sun_irradiance, rtol=1e-5)
     near = map_directions(256)[0] @ light.sun.direction > np.cos(np.radians(15.0))
     separated, expected = resize_map(rest, 256), table.sunless

@@ -13,7 +13,7 @@ from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.assets.appearance import linear_to_srgb
 from synpick_warp.scenes.environment import map_directions
-from synpick_warp.scenes.sun import MAX_SUN_ANGULAR_RADIUS
+from synpick_warp.scenes.sun import MAX_SUN_TANGENT
 from synpick_warp.scenes.types import Catalog, EnvironmentMap, Material
 from synpick_warp.stages.buffers import allocate_view_buffers
 from synpick_warp.stages.render.light_tables import measure_albedo, precompute_environment
@@ -107,7 +107,7 @@ def test_only_narrow_lamps_are_split_off_as_sun(degrees, split):
     light = lamp(0.7, np.radians(degrees), 200.0, 0.2)
     tables = precompute_environment(light, None)
     assert (tables.sun_irradiance.max() > 0.0) == split
-    assert (tables.sun_radius <= MAX_SUN_ANGULAR_RADIUS) == split
+    assert (tables.sun_radius <= MAX_SUN_TANGENT) == split
     assert (tables.sunless.max() < 10.0) == split
     # Split or not, no light is lost or counts twice.
     directions, solid_angles = map_directions(len(tables.sunless))

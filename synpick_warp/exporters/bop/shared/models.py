@@ -17,7 +17,7 @@ from synpick_warp.exporters.bop.view import MILLIMETERS
 from synpick_warp.exporters.writing.png import encode_png
 from synpick_warp.inputs.paths import path_inside
 from synpick_warp.layer_codec import layer_notes
-from synpick_warp.scenes.assets.appearance import decode_texture
+from synpick_warp.scenes.assets.appearance import decode_texture, linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.assets.models_info import read_entries
 from synpick_warp.scenes.assets.ply import read_ply_file, read_ply_texture
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, Material
@@ -146,19 +146,9 @@ def _tint_texture(material: Material) -> np.ndarray:
     assert material.texture is not None
     if all(value == 1.0 for value in material.color):
         return material.texture
-    levels = _to_linear(np.arange(256) / 255)[:, None] * _to_linear(np.asarray(material.color))
-    table = np.rint(255 * _to_srgb(levels)).astype(np.uint8)
+    levels = srgb_to_linear(np.arange(256) / 255)[:, None] * srgb_to_linear(np.asarray(material.color))
+    table = np.rint(255 * linear_to_srgb(levels)).astype(np.uint8)
     return np.stack([table[material.texture[..., channel], channel] for channel in range(3)], axis=-1)
-
-
-def _to_linear(value: np.ndarray) -> np.ndarray:
-    """sRGB to linear (IEC 61966-2-1)."""
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
-def _to_srgb(value: np.ndarray) -> np.ndarray:
-    """Linear to sRGB (IEC 61966-2-1)."""
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055)
 
 
 def _make_camera_file(camera: Camera, depth_scale: float) -> dict[str, Any]:
@@ -199,10 +189,10 @@ BOP challenge (scenewise). {_describe_scenes(config, count)} of {_describe_folde
 - Pictures have {camera.width} x {camera.height} pixels. The centre of pixel (row, column) is (column + 0.5, row + 0.5). Cameras have
   x right, y down, z forward.
 - `cam_R_w2c` and `cam_t_w2c` lead from the tote's frame (centre of its inner floor, z up) to the camera.
-- `light` in scene_camera.json tells of the episode's light: the map's name, its turn about the vertical [rad], the exposure [stops]
-  against the automatic one, and the direction to the sun or lamp that casts shadows, in the tote's frame; null: none stands out.
-  `effects`, if there, tells what the camera did to colour; `config.toml` has the ranges from which it was drawn.
-- `instance_id` in scene_gt.json is an object's number for the whole episode, the same for all cameras; a gt_id is but the place
+- `light` in scene_camera.json describes the episode's light: the map's name, its yaw [rad], the exposure relative to the automatic
+  one [EV], and the direction to the sun or lamp that casts shadows, in the tote's frame; null if none is dominant.
+  `effects`, if present, has the parameters of the camera effects on colour; `config.toml` has the ranges from which they were sampled.
+- `instance_id` in scene_gt.json is an object's number for the whole episode, the same for all cameras; a gt_id is only the position
   in an image's list.
 - `mask_visib` is exact: what the ray through the pixel's centre meets first. The masks of an image do not overlap.
 - `px_count_all` and `bbox_obj` count what lies outside of the picture too, up to one picture's size beyond each border.

@@ -51,7 +51,7 @@ def _kinds(config: Config) -> tuple[str, ...]:
 
 
 def scene_target_files(config: Config, folder: str) -> tuple[str, ...]:
-    """Files that list a split's targets, BOP19, BOP24, and MULTIVIEW with several sensors: those of its kind.
+    """Names of a split's target lists (BOP19, BOP24, and MULTIVIEW with several sensors), by the split's kind.
 
     Without splits, all scenes are in the lists named test, which the toolkit's scripts open for any split.
 
