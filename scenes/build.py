@@ -177,8 +177,7 @@ def build_model(config: Config, catalog: Catalog, device: wp.Device) -> BuiltMod
         world.add_shape_convex_hull(-1, mesh=_hull(piece), cfg=shape) for piece in guide_walls(config.tote, config.physics.guide_height)
     )
     gripper = _add_gripper(world, config.gripper, shape)
-    variant = np.zeros(len(catalog), dtype=np.int32)
-    empty = _add_slots(world, config.physics, catalog, shape, (single, compound), variant)
+    variant, empty = _add_slots(world, config.physics, catalog, shape, (single, compound))
     scene = newton.ModelBuilder(gravity=(0.0, 0.0, -config.physics.gravity))
     newton.solvers.SolverSteel.register_custom_attributes(scene)
     scene.replicate(world, copy_count=config.bake.worlds)
@@ -241,10 +240,13 @@ def _add_slots(
     catalog: Catalog,
     shape: newton.ModelBuilder.ShapeConfig,
     slots: tuple[int, int],
-    variant: np.ndarray,
-) -> tuple[int, int]:
-    """Add the body slots for objects; fills `variant` (entry) and returns the indices of the empty variants."""
-    empty = []
+) -> tuple[np.ndarray, tuple[int, int]]:
+    """Add the body slots for objects.
+
+    Returns:
+        Variant of each catalog entry (entry) int32, and the empty variants of single and compound slots.
+    """
+    variant, empty = np.zeros(len(catalog), np.int32), []
     damping = {
         "steel:rigid_body_angular_damping": physics.angular_damping,
         "steel:rigid_body_max_linear_velocity": physics.max_speed,
@@ -258,7 +260,7 @@ def _add_slots(
         for slot in range(count):
             body = world.add_body(mass=0.0, label=f"{'compound' if compound else 'single'}_{slot}", custom_attributes=damping)
             world.add_body_variants(body, variants, initial=len(entries), labels=[str(index) for index in entries] + ["empty"])
-    return empty[0], empty[1]
+    return variant, (empty[0], empty[1])
 
 
 def _variant(physics: Physics, entry: CatalogEntry | None, shape: newton.ModelBuilder.ShapeConfig) -> newton.ModelBuilder:

@@ -9,7 +9,7 @@ import numpy as np
 
 from synpick_warp.configs.schema import Gripper
 from synpick_warp.scenes.collision.hulls import simplify_hull
-from synpick_warp.scenes.embedded.meshes import join, lathe, make_mesh, solid
+from synpick_warp.scenes.modelling import join, lathe, make_mesh, solid
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Material
 
 SIDES = 40
@@ -17,8 +17,8 @@ SIDES = 40
 FINGER_TIP = 0.03
 """Maximum diameter of the shaft at the wrist axis [m]; at most that of its top."""
 COLLIDER_SIDES = 12
-"""Points per ring of the collision shapes: the cup's rings, two of these and one of SHOULDER_SIDES, have 32 vertices."""
-SHOULDER_SIDES = 8
+"""Points per ring of the collision shapes: the cup's rings, two of these and one of STEM_SIDES, have 32 vertices."""
+STEM_SIDES = 8
 """Points of the ring at the top of the cup's collision shape."""
 LIP = 0.06
 """Height of the cup's lip, as a fraction of the cup's length."""
@@ -49,7 +49,7 @@ def finger_fixture(gripper: Gripper) -> Fixture:
 def cup_fixture(gripper: Gripper) -> Fixture:
     """Build the visual mesh of the cup, a surface of revolution from the wrist axis down to the lip at z = -cup_length; hollow below."""
     radius, length = gripper.cup_width / 2, gripper.cup_length
-    shaft = HINGE * radius
+    stem = HINGE * radius
     profile = [(0.15 * radius, -0.84 * length), (0.55 * radius, -0.88 * length), (0.90 * radius, -length), (radius, -length)]
     profile += [(radius, -(1 - LIP) * length)]
     fold = 0.36 * length / FOLDS
@@ -57,8 +57,8 @@ def cup_fixture(gripper: Gripper) -> Fixture:
         base = -0.90 * length + index * fold
         bulge = (0.88 - 0.06 * index) * radius
         profile += [(0.62 * radius, base), (bulge, base + 0.4 * fold), (bulge, base + 0.6 * fold)]
-    profile += [(0.62 * radius, -0.54 * length), (0.62 * radius, -0.46 * length), (shaft, -0.44 * length), (shaft, 0.0)]
-    hinge = solid(lathe([(0.9 * shaft, -1.15 * shaft), (shaft, -1.05 * shaft), (shaft, 1.05 * shaft), (0.9 * shaft, 1.15 * shaft)], SIDES))
+    profile += [(0.62 * radius, -0.54 * length), (0.62 * radius, -0.46 * length), (stem, -0.44 * length), (stem, 0.0)]
+    hinge = solid(lathe([(0.9 * stem, -1.15 * stem), (stem, -1.05 * stem), (stem, 1.05 * stem), (0.9 * stem, 1.15 * stem)], SIDES))
     mesh = make_mesh(join(solid(lathe(profile, SIDES)), hinge.rotate("x", 90.0)), centered=False)
     return Fixture(mesh, Material(gripper.cup_color, None, gripper.metallic, gripper.roughness))
 
@@ -74,8 +74,8 @@ def cup_collider(gripper: Gripper) -> ConvexPiece:
     """Build the collision shape of the cup, without bellows: lip, and a cone up to the stem; at most 32 vertices."""
     radius, length = gripper.cup_width / 2, gripper.cup_length
     lip = lathe([(radius, -length), (radius, -(1 - LIP) * length)], COLLIDER_SIDES).reshape(-1, 3)
-    shaft = lathe([(HINGE * radius, 0.0)], SHOULDER_SIDES)[0]
-    points = np.concatenate([lip, shaft])
+    stem = lathe([(HINGE * radius, 0.0)], STEM_SIDES)[0]
+    points = np.concatenate([lip, stem])
     return simplify_hull(points, len(points))
 
 

@@ -1,4 +1,4 @@
-"""Suction test: rays cast from a ring on the suction cup's rim decide which objects it engages, and how strong the seals are."""
+"""Suction test: rays cast from a ring on the suction cup's lip decide which objects it engages, and how strong the seals are."""
 
 import warp as wp
 

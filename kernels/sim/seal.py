@@ -3,7 +3,7 @@
 Frames; `X_in_Y` is the pose of frame X in frame Y, so that `Z_in_Y = X_in_Y * Z_in_X`:
 
 - world: z up.
-- tcp: at the tool centre point (TCP), the centre of the cup's rim, with the cup's axes; +z points into the gripper, +y is the wrist axis.
+- tcp: at the tool centre point (TCP), the centre of the cup's lip, with the cup's axes; +z points into the gripper, +y is the wrist axis.
 - object: the object's body frame.
 - grip: fixed to the object; coincides with tcp while the seal is at rest. `object_in_tcp`, stored when the seal engages, equals
   `object_in_grip` ever after, hence `grip_in_world = object_in_world * inverse(object_in_tcp)`.

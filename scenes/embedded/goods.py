@@ -6,8 +6,8 @@ import numpy as np
 
 from synpick_warp.scenes.embedded import packs
 from synpick_warp.scenes.embedded import textures as paint
-from synpick_warp.scenes.embedded.meshes import ellipse
 from synpick_warp.scenes.embedded.packs import Label, Shape
+from synpick_warp.scenes.modelling import ellipse
 
 WHITE = (250, 250, 247)
 

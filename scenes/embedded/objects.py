@@ -9,8 +9,8 @@ import numpy as np
 
 from synpick_warp.scenes.collision.hulls import hull_size
 from synpick_warp.scenes.embedded import goods, tools, vessels
-from synpick_warp.scenes.embedded.meshes import make_mesh, rotation
 from synpick_warp.scenes.embedded.packs import Shape
+from synpick_warp.scenes.modelling import make_mesh, rotation
 from synpick_warp.scenes.types import Material, RawObject
 
 Matrix = tuple[float, ...]

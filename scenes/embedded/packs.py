@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from synpick_warp.scenes.embedded import textures as paint
-from synpick_warp.scenes.embedded.meshes import (
+from synpick_warp.scenes.embedded.textures import Color
+from synpick_warp.scenes.modelling import (
     BOX_FACES,
     Patch,
     at_height,
@@ -21,7 +22,6 @@ from synpick_warp.scenes.embedded.meshes import (
     rounded_rectangle,
     solid,
 )
-from synpick_warp.scenes.embedded.textures import Color
 
 SHEET = 1024
 """Width of a texture atlas [px]: about 3 px/mm, the resolution of the cameras at 2 m and full HD."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from synpick_warp.scenes.embedded.meshes import Rect
+from synpick_warp.scenes.modelling import Rect
 
 Color = tuple[int, int, int]
 Box = tuple[float, float, float, float]

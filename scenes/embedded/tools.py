@@ -6,7 +6,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from synpick_warp.scenes.embedded import textures as paint
-from synpick_warp.scenes.embedded.meshes import (
+from synpick_warp.scenes.embedded.packs import Shape
+from synpick_warp.scenes.modelling import (
     BOX_FACES,
     Patch,
     Rect,
@@ -21,7 +22,6 @@ from synpick_warp.scenes.embedded.meshes import (
     sweep,
     torus,
 )
-from synpick_warp.scenes.embedded.packs import Shape
 
 Points = list[tuple[float, float]]
 

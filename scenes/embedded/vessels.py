@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from synpick_warp.scenes.embedded import textures as paint
-from synpick_warp.scenes.embedded.meshes import Patch, Rect, cap, ellipse, join, lathe, loft, solid, sweep
 from synpick_warp.scenes.embedded.packs import Shape
+from synpick_warp.scenes.modelling import Patch, Rect, cap, ellipse, join, lathe, loft, solid, sweep
 
 SIDES = 48
 """Points per ring of a vessel."""

@@ -9,7 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, cKDTree
 
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
-from synpick_warp.scenes.embedded.meshes import (
+from synpick_warp.scenes.embedded.objects import procedural_objects
+from synpick_warp.scenes.embedded.textures import PADDING, blank, pack
+from synpick_warp.scenes.modelling import (
     BOX_FACES,
     NO_TEXTURE,
     at_height,
@@ -23,8 +25,6 @@ from synpick_warp.scenes.embedded.meshes import (
     sweep,
     torus,
 )
-from synpick_warp.scenes.embedded.objects import procedural_objects
-from synpick_warp.scenes.embedded.textures import PADDING, blank, pack
 from tests.twins.rays import edges_match
 
 TABLE = {

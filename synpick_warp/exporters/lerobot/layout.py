@@ -34,7 +34,7 @@ _SIZES = {"data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
 STATE = ("x", "y", "z", "qx", "qy", "qz", "qw", "suction", "attached")
 """Cup to world [m] and quaternion; 1 if the suction is on; 1 if an object hangs on the cup."""
 ACTION = ("x", "y", "z", "suction")
-"""Setpoint of the cup's tilt axis [m] and suction command of the tick that leads to the next frame."""
+"""Setpoint of the wrist (the cup's tilt axis) [m] and suction command of the tick that leads to the next frame."""
 
 
 class Feature(NamedTuple):
