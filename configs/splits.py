@@ -28,6 +28,8 @@ def choose_splits(config: Config, names: Sequence[str]) -> tuple[Split, ...]:
     Raises:
         ConfigError: An unknown split.
     """
+    if isinstance(names, str):
+        raise ConfigError(f'splits are {format_value(names)}; allowed: a list of names, such as ["train"]')
     if not names:
         return config.splits
     known = [split.name for split in config.splits]
@@ -60,8 +62,10 @@ def check_shard(shard: tuple[int, int], name: str = "shard") -> None:
     """Validate a shard (i, n); arguments as in `plan_shard`.
 
     Raises:
-        ConfigError: Not 0 <= i < n.
+        ConfigError: Not two whole numbers with 0 <= i < n.
     """
+    if not isinstance(shard, tuple | list) or len(shard) != 2 or not all(isinstance(part, int) for part in shard):
+        raise ConfigError(f"{name} is {shard!r}; allowed: (i, n) with i from 0 to n - 1, such as (0, 4)")
     index, count = shard
     if not 0 <= index < count:
         raise ConfigError(f"{name} is {index}/{count}; allowed: i/n with i from 0 to n - 1, such as 0/4")

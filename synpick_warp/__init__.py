@@ -50,7 +50,7 @@ def bake(
     *,
     shard: tuple[int, int] = (0, 1),
     splits: Sequence[str] = (),
-    devices: Sequence[str] = (),
+    devices: Sequence[str] | str = (),
     progress: Progress | None = None,
 ) -> BakeSummary:
     """Generate a data set: simulate, render and write it; or resume one that was interrupted. `synpick-warp bake` does the same.
@@ -61,7 +61,7 @@ def bake(
         settings: Full key, such as "bake.mode", -> value; they override a preset or file.
         shard: (i, n): only episodes with index % n == i.
         splits: Only episodes of these splits of the settings, such as ("train",) of the preset "synpick"; empty: all.
-        devices: Devices with a process each: GPUs such as ("cuda:0", "cuda:1"), or "cpu" once per process, or ("all",): every GPU, or
+        devices: Devices with a process each: GPUs such as ("cuda:0", "cuda:1"), or "cpu" once per process, or "all": every GPU, or
             without one a process per CPU core. The bytes are those of one device. Empty: `bake.device` alone.
         progress: Receives stages, counts and notes; None: silent. See `synpick_warp.progress`.
 
@@ -81,6 +81,8 @@ def bake(
         config = load_config(config, settings, splits=bool(splits))
     elif settings:
         raise TypeError("settings override a preset or a file; pass them to load_config, or use dataclasses.replace on the Config")
+    if isinstance(devices, str):
+        devices = tuple(name.strip() for name in devices.split(","))
     return run_bake(config, Path(out), progress if progress is not None else SilentProgress(), shard, splits, devices)
 
 
@@ -106,7 +108,7 @@ def stream(
 ) -> ViewStream:
     """Generate views for a consumer in this process: an iterator over batches whose arrays stay on the device, without files.
 
-        for batch in synpick_warp.stream("synpick", worlds=64, device="cuda:0", episodes=range(1000)):
+        for batch in synpick_warp.stream("synpick", mode="mixed", device="cuda:0", episodes=range(1000)):
             color = torch.from_dlpack(batch.color)      # (B, H, W, 3) uint8, no copy; valid until the next batch
 
     Views and values are those of a bake with the same settings, images before they are compressed. See `synpick_warp/online/README.md`.
@@ -118,7 +120,8 @@ def stream(
         resolution: Width and height of the images [px], instead of `cameras.resolution`.
         layers: Names of the layers to render, instead of `render.layers`.
         batch: Maximum views of a batch, instead of `render.views_per_batch`; a tick's last batch may have fewer.
-        episodes: How many, from 0 on, or a range of indices; None: those of the settings.
+        episodes: How many, from 0 on, or a range of indices; None: those of the settings, which are
+            `bake.episodes` (4 in the preset "synpick").
         shard: (i, n): only episodes with index % n == i, such as those of a training process.
         splits: Only episodes of these splits of the settings; empty: all.
         cameras: Indices of the cameras to render; None: all.
@@ -136,7 +139,7 @@ def stream(
     given = {"worlds": worlds, "device": device, "seed": seed, "mode": mode, "models": models, "lights": lights}
     given |= {"resolution": resolution, "layers": layers, "batch": batch}
     resolved = resolve_settings(config, settings or {}, given, bool(splits))
-    selection = Selection(None if cameras is None else tuple(cameras), stride)
+    selection = Selection(cameras, stride)
     progress = progress if progress is not None else SilentProgress()
     return open_stream(resolved, progress, episodes=episodes, shard=shard, splits=splits, selection=selection)
 

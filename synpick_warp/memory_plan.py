@@ -19,7 +19,7 @@ from synpick_warp.configs.check import format_value
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import may_pick
 from synpick_warp.configs.schema import FAST, Config
-from synpick_warp.errors import ConfigError
+from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
 from synpick_warp.scenes import build
 from synpick_warp.stages.buffers import LastFrame, LayerBuffers, Snapshot, ViewBuffers
@@ -164,8 +164,8 @@ def check_episodes(count: int, config: Config) -> None:
 
 
 def is_shortage(error: BaseException) -> bool:
-    """Whether an error says that memory ran out: Python's own, or that of Warp's allocators."""
-    return isinstance(error, MemoryError) or str(error).startswith("Failed to allocate")
+    """Whether an error says that memory ran out: Python's own, that of Warp's allocators, or CUDA's error 2 (graphs, modules)."""
+    return isinstance(error, MemoryError) or str(error).startswith("Failed to allocate") or "out of memory" in str(error).lower()
 
 
 @contextlib.contextmanager
@@ -177,8 +177,8 @@ def explain_shortage(config: Config) -> Iterator[None]:
     """
     try:
         yield
-    except (MemoryError, RuntimeError) as error:
-        if not is_shortage(error):
+    except Exception as error:  # Warp raises plain exceptions, too.
+        if isinstance(error, SynpickError) or not is_shortage(error):
             raise
         raise shortage_error(config, pick_device(config.bake.device)) from error
 

@@ -135,7 +135,15 @@ def test_episodes_that_the_memory_cannot_list_are_refused_before_they_are_listed
     )
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("Failed to allocate 1610612736 bytes on device 'cpu'")])
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        RuntimeError("Failed to allocate 1610612736 bytes on device 'cpu'"),
+        RuntimeError("Warp CUDA error 2: out of memory (in function wp_cuda_graph_create_exec)"),
+        Exception("Failed to load CUDA module: CUDA_ERROR_OUT_OF_MEMORY: out of memory"),
+    ],
+)
 def test_memory_that_runs_out_later_is_one_line_too(error, tmp_path, monkeypatch):
     """The plan is a lower bound, and other programs may take memory at any time."""
 

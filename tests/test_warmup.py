@@ -37,6 +37,13 @@ def test_a_warm_up_loads_the_kernels_of_all_stages(monkeypatch):
     assert result.seconds > 0.0
 
 
+def test_a_warm_up_compiles_what_only_a_stream_launches(monkeypatch):
+    compiled = []
+    monkeypatch.setattr(warmup, "compile_modules", lambda builds, report: compiled.extend(builds))
+    warmup.warm_up(settings(cameras__resolution=[32, 18]), SilentProgress())
+    assert [build.module.name for build in compiled] == ["synpick_warp.kernels.render.images.ground_truth"]
+
+
 def test_dry_launches_find_all_that_a_warm_up_loads(device):
     """What launches for real load afterwards has been found before, whatever the cache holds."""
     config = settings(bake__mode="pick", cameras__resolution=[32, 18], perception__resolution=[64, 36])

@@ -14,19 +14,49 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.load import COMMAND_LINE, load_config, parse_assignment
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C: 128 + SIGINT, as in shells."""
+
+
+def writable_file(text: str) -> Path:
+    """Type (for `add_argument`) of a file to write: its folder exists, and it is none itself, so that no measurement is lost at the end."""
+    path = Path(text)
+    if path.is_dir() or not path.parent.is_dir():
+        reason = f"{path} is a folder" if path.is_dir() else f"there is no folder {path.parent}"
+        raise argparse.ArgumentTypeError(f"{reason}; name a file in a folder that exists")
+    return path
+
+
+def positive_count(text: str) -> int:
+    """Type (for `add_argument`) of a positive number of things."""
+    if not text.isdecimal() or not 0 < int(text) <= INT32_MAX:
+        raise argparse.ArgumentTypeError(f"{text} is no count; allowed: 1 to {INT32_MAX}")
+    return int(text)
+
+
+def positive_seconds(text: str) -> float:
+    """Type (for `add_argument`) of a positive, finite time [s]."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0.0 < seconds < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is no time; allowed: a number of seconds above 0")
+    return seconds
+
+
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "device": {"default": "auto", "help": "cpu, cuda:N or auto (default: auto)"},
     "models": {"default": "", "help": "folder of BOP models (default: the embedded objects)"},
     "lights": {"default": "", "help": "folder of light maps (default: the embedded skies)"},
     "seed": {"type": int, "default": 0, "help": "seed of all random numbers (default: 0)"},
     "set": {"action": "append", "default": [], "metavar": "SECTION.KEY=VALUE", "help": "any other setting; may be repeated"},
-    "json": {"type": Path, "metavar": "FILE", "help": "also write the results to this file"},
+    "json": {"type": writable_file, "metavar": "FILE", "help": "also write the results to this file"},
 }
 """Options with the same meaning in every tool, as arguments of `add_argument`."""
 SETTINGS = {"device": "bake.device", "models": "bake.models", "lights": "bake.lights", "seed": "bake.seed"}

@@ -1,4 +1,7 @@
-"""Ahead-of-time compilation of all kernels that a bake launches, into Warp's kernel cache; collision shapes go into theirs on the way."""
+"""Ahead-of-time compilation of all kernels that a bake or stream launches, into Warp's kernel cache.
+
+Collision shapes go into their cache on the way.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,10 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.registry import load_exporter_classes
 from synpick_warp.factory.assembly import build_smallest
 from synpick_warp.factory.compilation import compile_launches, launch_all, sole_compiler
+from synpick_warp.kernels.render.images.ground_truth import gather_cameras_kernel
 from synpick_warp.progress import Progress
 from synpick_warp.system.device import pick_device
-from synpick_warp.system.kernels import list_binaries
+from synpick_warp.system.kernels import build_of, compile_modules, list_binaries
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,7 @@ class WarmUp:
 
 
 def warm_up(config: Config, progress: Progress) -> WarmUp:
-    """Compile the kernels of a bake with these settings, then run two ticks and one rendering in the fewest worlds of the device.
+    """Compile the kernels of a bake or stream with these settings, then run two ticks and one rendering in the fewest worlds of the device.
 
     Nothing is written but caches. Kernels depend on the settings only by which of them are used (mode, renderer, layers, formats).
 
@@ -46,4 +50,5 @@ def warm_up(config: Config, progress: Progress) -> WarmUp:
         stream = factory.stream if any(kind.needs_views for kind in kinds) else None
         compile_launches(factory.simulation, stream, progress)
         launch_all(factory.simulation, stream)
+        compile_modules([build_of(gather_cameras_kernel, device)], lambda *_: None)  # The one module that only the online stream needs.
     return WarmUp(len(list_binaries() - before), time.perf_counter() - started)

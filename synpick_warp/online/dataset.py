@@ -128,12 +128,14 @@ class StreamDataset(IterableDataset):
             if name not in FIELDS and name not in self.config.render.layers:
                 known = ", ".join((*FIELDS, *self.config.render.layers))
                 raise ConfigError(f"there is no field {name}; fields: {known}; others are layers that render.layers names")
+        if not isinstance(shuffle, int) or shuffle < 0:
+            raise ConfigError(f"shuffle is {shuffle!r}; allowed: a number of views, or 0")
         if shuffle and batched:
             raise ConfigError(f"shuffle is {shuffle}, but whole batches are not shuffled; set batched=False")
         self.fields, self.batched, self.shuffle, self.transform = tuple(fields), batched, shuffle, transform
         self.episodes = range(episodes) if isinstance(episodes, int) else episodes
         self.fresh, self.shard, self.splits = fresh, shard, tuple(splits)
-        self.selection = Selection(None if cameras is None else tuple(cameras), stride).resolve(self.config)
+        self.selection = Selection(cameras, stride).resolve(self.config)
         choose_episodes(self.config, self.episodes, shard, self.splits)
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # Workers that live through all epochs see it change.
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import check_shard, plan_episodes
 from synpick_warp.errors import ConfigError
+from synpick_warp.memory_plan import check_episodes
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,7 @@ class Selection:
     The other views keep their poses, depth and masks. With a stride above 1 their light is not averaged over frames (`render.history`).
     """
 
-    cameras: tuple[int, ...] | None = None
+    cameras: Sequence[int] | None = None
     """Indices of the cameras; None: all."""
     stride: int = 1
     """Every n-th frame of an episode, from the first on."""
@@ -30,11 +31,12 @@ class Selection:
             ConfigError: There is no such camera, or a value is out of range.
         """
         count = len(config.cameras.positions)
-        cameras = tuple(range(count) if self.cameras is None else self.cameras)
+        given = range(count) if self.cameras is None else self.cameras
+        cameras = tuple(given) if isinstance(given, Iterable) else ()
         if not cameras or len(set(cameras)) < len(cameras) or not set(cameras) <= set(range(count)):
-            raise ConfigError(f"cameras are {list(cameras)}; allowed: one or more of 0 to {count - 1}, each once")
-        if self.stride < 1:
-            raise ConfigError(f"stride is {self.stride}; allowed: at least 1")
+            raise ConfigError(f"cameras are {list(cameras) or given}; allowed: one or more of 0 to {count - 1}, each once")
+        if not isinstance(self.stride, int) or self.stride < 1:
+            raise ConfigError(f"stride is {self.stride!r}; allowed: a whole number from 1 on")
         return replace(self, cameras=cameras)
 
 
@@ -62,7 +64,9 @@ def choose_episodes(
     if splits or config.splits:
         raise ConfigError("episodes are given beside splits, which name their episodes; give one of both")
     chosen = range(episodes) if isinstance(episodes, int) else episodes
-    if not isinstance(chosen, range) or not chosen or min(chosen) < 0 or max(chosen) >= INT32_MAX:
+    # The ends of a range: min and max would go through all of it.
+    if not isinstance(chosen, range) or not chosen or min(chosen[0], chosen[-1]) < 0 or max(chosen[0], chosen[-1]) >= INT32_MAX:
         raise ConfigError(f"episodes are {episodes!r}; allowed: how many, or a range of indices from 0 to {INT32_MAX - 1}")
-    config = replace(config, bake=replace(config.bake, episodes=max(chosen) + 1))
+    config = replace(config, bake=replace(config.bake, episodes=max(chosen[0], chosen[-1]) + 1))
+    check_episodes(len(chosen), config)
     return config, [episode for episode in chosen if episode % count == index]

@@ -37,6 +37,8 @@ def resolve_settings(
         ConfigError: A setting is unknown or not allowed.
     """
     given = {ARGUMENTS[name]: _plain(value) for name, value in arguments.items() if value is not None}
+    if given.get("bake.worlds") == "auto":  # As the command line has it.
+        given["bake.worlds"] = 0
     overrides = dict(settings) | given
     if isinstance(config, Config):
         return override_config(config, overrides)

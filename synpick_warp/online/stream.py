@@ -1,6 +1,6 @@
 """Online generator: the views of a bake, batch by batch on the device, made as the consumer takes them.
 
-    for batch in synpick_warp.stream("synpick", worlds=64):
+    for batch in synpick_warp.stream("synpick", mode="mixed", episodes=range(10_000)):
         color = torch.from_dlpack(batch.color)
 
 It runs in the caller's process and starts no other (but CoACD's, while concave objects are decomposed for the first time).

@@ -22,7 +22,8 @@ from synpick_warp.system.cores import count_cores
 from synpick_warp.system.device import ALL, pick_device, pick_devices
 
 HEADROOM = 1.5
-"""Room for what a bake takes beyond its plan, which is a lower bound, as a multiple of it. tools/README.md has both measured."""
+"""Room for what a bake takes beyond its plan, which is a lower bound, as a multiple of it. tools/README.md has plans
+and memory used of bakes on a CPU."""
 RUNTIME_BYTES = 1 << 30
 """Room for what no plan counts: CUDA's context and kernels; a process's libraries and objects, 0.7 GiB [bytes]."""
 WRITER_BYTES = 100 << 20

@@ -69,6 +69,8 @@ def pick_devices(names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         if name in (ALL, "auto"):
             raise DeviceError(f"--devices names {name} beside others; {_DEVICES}" if len(names) > 1 else f"--devices is {name}; {_DEVICES}")
+        if name != "cpu" and not _CUDA.fullmatch(name):
+            raise DeviceError(f'--devices names "{name}"; {_DEVICES}')
     picked = [pick_device(name) for name in names]
     gpus = [device.alias for device in picked if device.is_cuda]
     if gpus and len(gpus) < len(picked):

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 import warp as wp
 
+import synpick_warp
 from synpick_warp.kernels.render.visibility.camera import Cameras
 from synpick_warp.stages.buffers import Snapshot, view_buffer_sizes
 from synpick_warp.stages.online.batches import GPU_RING, BatchRing, ViewBatch
 from synpick_warp.stages.online.exchange import DeviceArray, Gate
 from tests.harness.spin import SPINS, spin_kernel
+from tests.online.conftest import tiny
 
 BATCHES, VIEWS, ROOM = 12, 3, 2
 
@@ -90,3 +92,25 @@ def test_what_an_array_says_of_itself(device):
     gate.expire()
     with pytest.raises(BufferError, match="expired"):
         array.__dlpack__(stream=None)
+
+
+def test_jax_reads_every_batch_if_its_results_are_awaited():
+    """JAX computes after the call has returned, on a CPU, too; see the README of `synpick_warp.online`."""
+    jax = pytest.importorskip("jax", exc_type=ImportError)
+
+    @jax.jit
+    def add(image, matrix):
+        # Work before the image is read, during which the buffer must not change.
+        matrix = jax.lax.fori_loop(0, 40, lambda _, value: jax.numpy.tanh(value @ value), matrix)
+        image, matrix = jax.lax.optimization_barrier((image, matrix))
+        return image.astype(jax.numpy.float32).sum() + 0.0 * matrix.sum()
+
+    count, matrix = 0, jax.numpy.eye(600)
+    with synpick_warp.stream(tiny(bake__episodes=1)) as stream:
+        for batch in stream:
+            expected = batch.color.numpy().astype(np.float64).sum()
+            total = add(jax.numpy.from_dlpack(batch.color), matrix)
+            total.block_until_ready()
+            assert float(total) == pytest.approx(expected, rel=1e-5)
+            count += 1
+    assert count > 3

@@ -80,7 +80,7 @@ def test_a_lost_device_leaves_a_set_that_other_devices_finish_with_the_bytes_of_
         (["--devices", "cpu", "--device", "cpu"], "--device and --devices are both given"),
         (["--devices", "cpu,cpu", "--profile"], "--profile records the process of one device"),
         (["--devices", "cpu,cuda:99"], "cuda:99 was requested, but Warp finds "),
-        (["--devices", ""], 'bake.device is ""; allowed: '),
+        (["--devices", ""], '--devices names ""; allowed: '),
     ],
 )
 def test_wrong_options_are_one_line_and_leave_nothing(tmp_path, capsys, arguments, said):

@@ -188,7 +188,7 @@ def test_names_of_devices(machine):
         (["cuda:0", "all"], "--devices names all beside others; allowed: all, or GPUs such as cuda:0,cuda:1, or cpu once per process"),
         (["auto"], "--devices is auto; allowed: all, or GPUs such as cuda:0,cuda:1, or cpu once per process"),
         ([], "--devices names none; allowed: all, or GPUs such as cuda:0,cuda:1, or cpu once per process"),
-        (["gpu0"], 'bake.device is "gpu0"; allowed: cpu, cuda:N such as cuda:0, or auto'),
+        (["gpu0"], '--devices names "gpu0"; allowed: all, or GPUs such as cuda:0,cuda:1, or cpu once per process'),
     ],
 )
 def test_wrong_names_of_devices_are_one_line(machine, names, said):

@@ -10,9 +10,11 @@ import pytest
 import warp as wp
 
 from synpick_warp.arrays import allocate
+from synpick_warp.configs.load import load_config
 from synpick_warp.stages.buffers import Snapshot
 from tools.reports import render as render_report
 from tools.reports import render_checks, render_piles, render_sheet
+from tools.reports import sequence as render_sequence
 
 FEW_STEPS = (
     "--device",
@@ -125,3 +127,35 @@ def test_a_bad_size_or_setting_is_an_error(capsys):
     assert render_report.main(["--set", "render.bounces=0", "--scenes", "0"]) == 2
     assert render_report.main(["--sheet", "sheet.txt"]) == 2
     assert capsys.readouterr().err.count("reports.render: ") == 4
+
+
+def test_a_report_of_a_sequence_compares_its_frames_with_references(tmp_path, capsys):
+    """A bound of 35 dB does not hold for tiny images of few paths: exit code 1."""
+    file, sheet = tmp_path / "numbers.json", tmp_path / "sheet.png"
+    options = ["--mode", "move", "--frames", "3,0", "--size", "32x18", "--samples", "4", "--json", str(file), "--sheet", str(sheet)]
+    code = render_sequence.main([*options, *FEW_STEPS])
+    rows = {row["name"]: row for row in json.loads(file.read_text())["rows"]}
+    frames = [int(name.split(",")[0].removeprefix("frame ")) for name in rows if name.endswith("denoised against reference")]
+    assert frames == [0, 3]
+    mean = rows["denoised against reference, mean"]
+    assert mean["value"] == pytest.approx(
+        np.mean([row["value"] for name, row in rows.items() if name.endswith(": denoised against reference")])
+    )
+    assert (mean["holds"], code) == (mean["value"] >= 35.0, 1)
+    assert cv2.imread(str(sheet)).shape[1] == 3 * (32 * 20 + render_sheet.GAP)
+    capsys.readouterr()
+    assert render_sequence.main(["--frames", "100000", "--mode", "move", "--size", "32x18", *FEW_STEPS, "--set", "move.speed=9"]) == 2
+    assert "no episode is that long" in capsys.readouterr().err
+
+
+def test_histories_bring_frames_nearer_to_the_reference():
+    """What the report is for: with histories later frames have more paths than single frames have."""
+    fixed = {"cameras.resolution": [64, 36], "bake.mode": "move", "bake.episodes": 1, "bake.worlds": 1, "render.samples": 64}
+    quick = dict(part.split("=") for part in FEW_STEPS if "=" in part)
+    given = fixed | {"bake.device": "cpu"} | {key: json.loads(value) for key, value in quick.items()}
+    quality = {}
+    for history in (0, 16):
+        config = load_config("synpick", given | {"render.history": history})
+        ((_, pair),) = render_sequence.compare_frames(config, (12,))
+        quality[history] = pair.quality
+    assert quality[16] > quality[0] + 0.3

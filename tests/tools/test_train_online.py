@@ -8,7 +8,7 @@ from synpick_warp.factory import assembly
 from tests.online.conftest import TINY
 from tests.worlds.small_worlds import QUICK, catalog
 
-pytest.importorskip("torch", exc_type=ImportError)
+torch = pytest.importorskip("torch", exc_type=ImportError)
 train_online = pytest.importorskip("tools.examples.train_online", exc_type=ImportError)
 
 
@@ -19,7 +19,8 @@ def test_a_network_learns_from_the_stream(monkeypatch, capsys):
         part for key, value in given.items() if key not in ("bake.device", "bake.worlds") for part in ("--set", f"{key}={value}")
     ]
     small = ["--device", "cpu", "--worlds", "2", "--resolution", "48x27", "--batch", "3", "--width", "8", "--stride", "1"]
-    results = train_online.main([*small, *assignments, "--held-out", "6", "--views", "6,24,96"])
+    options = train_online.parse([*small, *assignments, "--held-out", "6", "--views", "6,24,96"])
+    results = train_online.run(options, torch.device("cpu"))
     assert all(0 <= value <= 1 for value in results)
     said = capsys.readouterr().out.splitlines()
     assert len(results) == 3
@@ -28,3 +29,28 @@ def test_a_network_learns_from_the_stream(monkeypatch, capsys):
     first, last = (float(word) for word in said[-1].split("cross entropy ")[1].split(",")[0].split(" to "))
     print(*said, sep="\n")
     assert last < 0.9 * first
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--device", "cuda:99"], "cuda:99 was requested"),
+        (["--device", "gpu"], 'bake.device is "gpu"'),
+        (["--resolution", "16x4"], "--resolution is 16x4; allowed: at least 8 px on each side"),
+        (["--models", "/nowhere"], "/nowhere"),
+        (["--set", "bake.world=3"], "did you mean worlds"),
+    ],
+)
+def test_a_mistake_is_one_line(capsys, arguments, said):
+    assert train_online.main(["--device", "cpu", *arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("train_online: ")
+    assert said in line
+
+
+@pytest.mark.parametrize("arguments", [["--views", "0"], ["--views", "abc"], ["--held-out", "0"], ["--stride", "0"], ["--width", "0"]])
+def test_numbers_are_positive(capsys, arguments):
+    with pytest.raises(SystemExit) as ended:
+        train_online.main(arguments)
+    assert ended.value.code == 2
+    assert "is no count; allowed: 1 to" in capsys.readouterr().err

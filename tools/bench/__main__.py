@@ -31,7 +31,6 @@ from rich.console import Console
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.cli.doctor import GIB, describe_machine
 from synpick_warp.codes import Status
-from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.exporters.registry import load_exporter_classes
@@ -55,7 +54,17 @@ from tools.bench.stream import measure_stream
 from tools.bench.trajectories import measure_trajectories
 from tools.bench.whole import WholeBake, measure_whole
 from tools.bench.write import measure_writing
-from tools.options import INTERRUPTED, configure, fail, make_names_parser, make_parser, write_json
+from tools.options import (
+    INTERRUPTED,
+    configure,
+    fail,
+    make_names_parser,
+    make_parser,
+    positive_count,
+    positive_seconds,
+    writable_file,
+    write_json,
+)
 
 DEFAULT_PARTS = ("physics", "perception", "render", "encode", "sensor", "write", "stream", "bake", "steady")
 PARTS = (*DEFAULT_PARTS, "pictures", "whole", "trajectories", "growth")
@@ -118,36 +127,29 @@ def _describe_setup(config: Config, options: argparse.Namespace) -> str:
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = make_parser(__doc__, "device", "models", "lights", "set", "json")
     worlds_help = f"worlds simulated in parallel (default: {WORLDS}; the part whole: as many as a bake of --episodes chooses)"
-    parser.add_argument("--worlds", type=_positive, help=worlds_help)
+    parser.add_argument("--worlds", type=positive_count, help=worlds_help)
     parser.add_argument("--resolution", default="1920x1080", help="WIDTHxHEIGHT [px] (default: 1920x1080)")
     more = ",".join(PARTS[len(DEFAULT_PARTS) :])
     parts_help = f"parts to measure, comma-separated (default: {','.join(DEFAULT_PARTS)}; and {more})"
     parser.add_argument("--parts", type=make_names_parser(PARTS, "part"), help=parts_help)
     peers_help = f"peers to measure beside ours, comma-separated, of {', '.join(PEERS)}; then no parts unless --parts names some"
     parser.add_argument("--compare", type=make_names_parser(PEERS, "peer"), default=(), metavar="PEERS", help=peers_help)
-    parser.add_argument(
-        "--episodes", type=_positive, default=WHOLE_EPISODES, help=f"episodes of the part whole (default: {WHOLE_EPISODES})"
-    )
+    parser.add_argument("--episodes", type=positive_count, help=f"episodes of the part whole (default: {WHOLE_EPISODES})")
     devices_help = "several devices of the part steady, as of bake: cuda:0,cuda:1 or all; --worlds is the number of each"
     parser.add_argument("--devices", default="", help=devices_help)
-    parser.add_argument("--seconds", type=float, default=2.0, help="minimum time of a measurement [s] (default: 2)")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="table of the part growth")
+    parser.add_argument("--seconds", type=positive_seconds, default=2.0, help="minimum time of a measurement [s] (default: 2)")
+    parser.add_argument("--markdown", type=writable_file, metavar="FILE", help="table of the part growth")
     options = parser.parse_args(arguments)
-    if options.markdown and not options.markdown.parent.is_dir():
-        parser.error(f"--markdown: there is no folder {options.markdown.parent}")
     if options.parts is None:
         options.parts = () if options.compare else DEFAULT_PARTS
     options.devices = tuple(name.strip() for name in options.devices.split(",")) if options.devices else ()
-    if options.devices and "steady" not in options.parts:
-        parser.error("--devices needs the part steady, the only one that uses several")
+    for name, part in (("devices", "steady"), ("markdown", "growth"), ("episodes", "whole")):
+        if getattr(options, name) and part not in options.parts:
+            parser.error(f"--{name} needs the part {part}, the only one that uses it")
+    if options.devices and options.device != parser.get_default("device"):
+        parser.error("--device and --devices are both given; name one device by --device, or several by --devices")
+    options.episodes = options.episodes or WHOLE_EPISODES
     return options
-
-
-def _positive(text: str) -> int:
-    """Type of an option: a positive number."""
-    if not text.isdecimal() or not 0 < int(text) <= INT32_MAX:
-        raise argparse.ArgumentTypeError(f"{text} is no count; allowed: 1 to {INT32_MAX}")
-    return int(text)
 
 
 def _to_record(row: Row) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from rich.table import Table
 import synpick_warp
 from synpick_warp.errors import SynpickError
 from tools.clients.base import CLIENTS, MISSING, PICTURE, PSNR, Sources
-from tools.options import fail, make_names_parser, write_json
+from tools.options import fail, make_names_parser, writable_file, write_json
 
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 900.0
@@ -147,7 +147,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--python", action="append", default=[], metavar="NAME=PATH", help="interpreter of a client; may be repeated")
     parser.add_argument("--bop-toolkit", default="", metavar="DIR", help="folder of a copy of the BOP toolkit")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the table to this file")
+    parser.add_argument("--json", type=writable_file, metavar="FILE", help="also write the table to this file")
     given = parser.parse_args(arguments)
     try:
         rows = list(interpreters(given.clients, given.python))

@@ -11,23 +11,31 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
+import sys
 import time
 
-import torch  # pyright: ignore[reportMissingImports]
-from torch import nn  # pyright: ignore[reportMissingImports]
-from torch.nn import functional  # pyright: ignore[reportMissingImports]
+try:
+    import torch  # pyright: ignore[reportMissingImports]
+    from torch import nn  # pyright: ignore[reportMissingImports]
+    from torch.nn import functional  # pyright: ignore[reportMissingImports]
+except ModuleNotFoundError as missing:
+    raise SystemExit(f"train_online: {missing.name} is not installed; pip install torch") from None
 
 import synpick_warp
 from synpick_warp.cli.commands import parse_resolution
 from synpick_warp.configs.schema import Config
+from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.online.dataset import FIELDS, StreamDataset
-from tools.options import configure, make_parser
+from synpick_warp.system.device import pick_device
+from tools.options import configure, fail, make_parser, positive_count
 
 TRAINING, HELD_OUT = range(100_000), range(100_000, 101_000)
 """Episodes to train on, and to measure on."""
 HELD_OUT_STRIDE = 20
 """Every so many frames of a held-out episode one is measured on: 1.3 s apart."""
 LEARNING_RATE = 2e-3
+MIN_SIDE = 8
+"""Least width and height of an image [px]: it is halved three times."""
 WARM_UP = 0.1
 """Fraction of the training in which the learning rate rises; afterwards it falls as a cosine."""
 
@@ -107,12 +115,29 @@ def mean_iou(network: Network, batches: list[dict[str, torch.Tensor]], classes: 
     return float((table.diagonal() / union.clamp(min=1))[occurs].mean())
 
 
-def main(arguments: list[str] | None = None) -> list[float]:
-    """Train and measure for each amount; returns the values of mIoU."""
-    options = _parse(arguments)
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    options = parse(arguments)
+    try:
+        device = pick_device(options.device)
+        run(options, torch.device(device.alias))
+    except SynpickError as error:
+        return fail("train_online", error)
+    return 0
+
+
+def run(options: argparse.Namespace, device: torch.device) -> list[float]:
+    """Train and measure for each amount; returns the values of mIoU.
+
+    Raises:
+        SynpickError: A setting is wrong, or models or lights cannot be used.
+    """
     fixed = {"bake.worlds": options.worlds, "cameras.resolution": parse_resolution(options.resolution)}
     config = configure(options, fixed, {"bake.mode": "mixed", "render.views_per_batch": options.batch})
-    device = torch.device(options.device)
+    if min(config.cameras.resolution) < MIN_SIDE:
+        raise ConfigError(
+            f"--resolution is {options.resolution}; allowed: at least {MIN_SIDE} px on each side, for the network's four levels"
+        )
     results = []
     # A stream of its own: work on CUDA's default stream would wait for all that the renderer has queued.
     with torch.cuda.stream(torch.cuda.Stream(device) if device.type == "cuda" else None):
@@ -128,19 +153,25 @@ def main(arguments: list[str] | None = None) -> list[float]:
     return results
 
 
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
+def parse(arguments: list[str] | None) -> argparse.Namespace:
+    """Parse the command line."""
     parser = make_parser(__doc__, "models", "lights", "seed", "set")
-    parser.add_argument("--device", default="cuda:0", help="cpu or cuda:N (default: cuda:0)")
-    parser.add_argument("--worlds", type=int, default=64, help="worlds simulated in parallel (default: 64)")
+    parser.add_argument("--device", default="auto", help="cpu, cuda:N or auto (default: auto)")
+    parser.add_argument("--worlds", type=positive_count, default=64, help="worlds simulated in parallel (default: 64)")
     parser.add_argument("--resolution", default="320x180", help="WIDTHxHEIGHT [px] (default: 320x180)")
-    parser.add_argument("--batch", type=int, default=24, help="views of a batch, at most (default: 24)")
-    parser.add_argument("--stride", type=int, default=3, help="every n-th frame is trained on (default: 3)")
-    parser.add_argument("--width", type=int, default=32, help="channels of the network's first level (default: 32)")
-    parser.add_argument("--held-out", type=int, default=600, help="views to measure on (default: 600)")
+    parser.add_argument("--batch", type=positive_count, default=24, help="views of a batch, at most (default: 24)")
+    parser.add_argument("--stride", type=positive_count, default=3, help="every n-th frame is trained on (default: 3)")
+    parser.add_argument("--width", type=positive_count, default=32, help="channels of the network's first level (default: 32)")
+    parser.add_argument("--held-out", type=positive_count, default=600, help="views to measure on (default: 600)")
     amounts = "views to train on, a network for each number, comma-separated (default: 2000,8000,32000)"
-    parser.add_argument("--views", type=lambda text: [int(part) for part in text.split(",")], default=[2000, 8000, 32000], help=amounts)
+    parser.add_argument("--views", type=_counts, default=[2000, 8000, 32000], help=amounts)
     return parser.parse_args(arguments)
 
 
+def _counts(text: str) -> list[int]:
+    """Type of an option: positive numbers joined by commas."""
+    return [positive_count(part) for part in text.split(",")]
+
+
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

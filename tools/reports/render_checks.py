@@ -18,6 +18,7 @@ from synpick_warp.scenes.environment import map_directions
 from synpick_warp.scenes.fixtures import make_fixtures
 from synpick_warp.scenes.types import Camera, Catalog, CatalogEntry, EnvironmentMap, Material, TriangleMesh
 from synpick_warp.stages.buffers import FIXTURES, Snapshot, allocate_view_buffers
+from synpick_warp.stages.render.renderer import Renderer
 from synpick_warp.stages.render.scene import build_render_scene
 from synpick_warp.stages.render.view_setup import make_views
 from tools.options import Row
@@ -50,16 +51,11 @@ class Shot:
 
 
 class Studio:
-    """Scene and renderer of single views."""
+    """Renderer of single views, with its buffers."""
 
-    def __init__(
-        self, config: Config, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...], device: Any
-    ) -> None:
-        fixtures = make_fixtures(config.tote, config.gripper)
-        scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
-        self.device = device
-        self.renderer = make_renderer(config, scene, config.arrangement.max_objects, 1)
-        self.out = allocate_view_buffers(1, scene.width, scene.height, config.arrangement.max_objects, device)
+    def __init__(self, renderer: Renderer) -> None:
+        self.renderer, self.device = renderer, renderer.scene.device
+        self.out = allocate_view_buffers(1, renderer.scene.width, renderer.scene.height, renderer.instances, self.device)
 
     def render(self, snapshot: Snapshot, world: int, camera: int) -> Shot:
         """Render one world by one camera."""
@@ -69,6 +65,13 @@ class Studio:
         color = self.out.color.numpy()[0].copy()
         seconds = time.perf_counter() - started
         return Shot(color, self.renderer.image.radiance.numpy()[0].copy(), self.out.instance.numpy()[0].copy(), seconds)
+
+
+def make_studio(config: Config, catalog: Catalog, cameras: tuple[Camera, ...], lights: tuple[EnvironmentMap, ...], device: Any) -> Studio:
+    """Build a scene and its renderer, without light histories."""
+    fixtures = make_fixtures(config.tote, config.gripper)
+    scene = build_render_scene(config.render, config.tote, catalog, fixtures, cameras, lights, device)
+    return Studio(make_renderer(config, scene, config.arrangement.max_objects, 1))
 
 
 def bounded_row(name: str, value: float, unit: str, bound: float) -> Row:
@@ -159,7 +162,7 @@ def _probe_studio(
     entries = tuple(
         CatalogEntry(1, "probe", mesh, material, (), 1.0, 1.0, 1.0, np.zeros(3), np.eye(3), 1.0, (), (), None) for material in white
     )
-    return Studio(config, Catalog(entries), cameras, (light,), device)
+    return make_studio(config, Catalog(entries), cameras, (light,), device)
 
 
 def _probe_snapshot(config: Config, worlds: int, device: Any) -> Snapshot:

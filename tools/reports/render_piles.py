@@ -20,7 +20,7 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.sim.physics import with_enough_worlds
 from synpick_warp.stages.sim.simulate import Simulation
 from tools.options import Row
-from tools.reports.render_checks import Shot, Studio, bounded_row, with_mode
+from tools.reports.render_checks import Shot, Studio, bounded_row, make_studio, with_mode
 
 MIN_PSNR = 32.0
 """Bound of the mean PSNR of denoised images against references [dB]."""
@@ -76,7 +76,7 @@ def compare_piles(
     configs = [with_mode(config, FAST), with_mode(config, REFERENCE)]
     if noise:
         configs.append(with_mode(config, REFERENCE, seed=config.bake.seed + 1))
-    denoised, reference, *second = (Studio(each, catalog, cameras, lights, device) for each in configs)
+    denoised, reference, *second = (make_studio(each, catalog, cameras, lights, device) for each in configs)
     piles = config.bake.worlds
     rows, pairs, static, displaced = [], [], [], []
     for index in range(max(piles, len(lights)) if every_light else piles):

@@ -2,7 +2,10 @@
 
 A slot is a set of buffers that is rendered into again and again. Its `Gate` keeps two orders on a GPU, neither of which blocks the host:
 a consumer's stream reads after the rendering of its batch (and not after whatever else was queued since), and the next rendering into the
-slot begins after everything that consumers' streams had been given until the batch expired. On the CPU both hold by themselves.
+slot begins after everything that consumers' streams had been given until the batch expired.
+
+On the CPU both hold by themselves for libraries that compute when they are called, such as PyTorch and NumPy. JAX computes later, on a CPU,
+too, and on streams of its own: its users must wait for their results before they request the next batch.
 """
 
 from __future__ import annotations

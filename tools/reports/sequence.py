@@ -1,0 +1,145 @@
+"""Report on image quality in episodes: PSNR of denoised frames, with light histories as in a bake, against path-traced references.
+
+Light histories (`render.history`) average the light of resting surfaces over the frames of an episode, so single frames, as in
+`tools.reports.render`, do not show the quality of a bake. Here every frame of camera 0 is denoised, from the first one on, and those of
+`--frames` are rendered once more as reference. Exits with 1 if a bound is violated, with 2 if nothing can be rendered.
+
+    python -m tools.reports.sequence --models DIR --lights DIR --size 640x360 --frames 0,8,30 --samples 256 --sheet sheet.png
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from rich.console import Console
+
+from synpick_warp.cli.doctor import describe_machine
+from synpick_warp.codes import Phase
+from synpick_warp.configs.schema import FAST, REFERENCE, Config
+from synpick_warp.errors import SynpickError
+from synpick_warp.factory.assembly import build_stages, make_renderer
+from synpick_warp.progress import SilentProgress
+from synpick_warp.scheduling.sizes import fit_to_device
+from synpick_warp.stages.stream import TickReader
+from synpick_warp.system.device import pick_device
+from tools.options import Row, configure, fail, make_parser, positive_count, print_machine, print_rows, writable_file, write_json
+from tools.reports.render_checks import Studio, bounded_row, with_mode
+from tools.reports.render_piles import MAX_BIAS, Pair
+from tools.reports.render_sheet import write_sheets
+
+MIN_PSNR = 35.0
+"""Bound of the mean PSNR over all compared frames [dB]."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    options = _parse(arguments)
+    console = Console(highlight=False)
+    started = time.perf_counter()
+    rows: list[Row] = []
+    pairs: list[Pair] = []
+    try:
+        config = _config(options)
+        device = pick_device(config.bake.device)
+        for frame, pair in compare_frames(config, options.frames):
+            pairs.append(pair)
+            rows.append(Row(f"frame {frame}, {pair.light}: denoised against reference", pair.quality, "dB"))
+            rows.append(Row(f"frame {frame}, {pair.light}: bias of mean radiance", pair.bias, "%"))
+            console.print(
+                f"{time.perf_counter() - started:6.0f} s  frame {frame:4}  {pair.light}: {pair.quality:.2f} dB, {pair.bias:+.2f} %"
+            )
+        if not pairs:
+            raise SynpickError(f"--frames are {options.frames}, but no episode is that long; name earlier ones")
+        for file in write_sheets(pairs, options.sheet) if options.sheet else ():
+            console.print(f"wrote {file}")
+    except SynpickError as error:
+        return fail("reports.sequence", error)
+    rows += _summarize(pairs)
+    machine = describe_machine(device)
+    print_machine(console, machine)
+    width, height = config.cameras.resolution
+    title = f"{config.bake.mode}, {width} x {height}, {config.render.samples} paths per pixel, {time.perf_counter() - started:.0f} s"
+    print_rows(console, "frames of episodes", title, rows)
+    write_json(options.json, {"machine": dict(machine), "samples": config.render.samples, "rows": [row.to_dict() for row in rows]})
+    return 0 if all(row.holds for row in rows) else 1
+
+
+def compare_frames(config: Config, frames: tuple[int, ...]) -> Iterator[tuple[int, Pair]]:
+    """Simulate episodes and render camera 0; yields (frame, denoised image and reference) for the given frames of each episode.
+
+    Args:
+        config: All settings; one episode per world.
+        frames: Indices of frames.
+    """
+    device = pick_device(config.bake.device)
+    config = fit_to_device(with_mode(config, FAST), device, config.bake.episodes)
+    stages = build_stages(config, device, SilentProgress(), range(config.bake.episodes))
+    histories = stages.simulation.layout.worlds * len(stages.cameras)
+    room = config.arrangement.max_objects
+    denoised = Studio(make_renderer(config, stages.renderer.scene, room, 1, histories))
+    reference = Studio(make_renderer(with_mode(config, REFERENCE), stages.renderer.scene, room, 1))
+    simulation, names = stages.simulation, stages.light_table.name
+    while True:
+        simulation.tick()
+        reader = TickReader(simulation.record)
+        reader.start()
+        report = reader.wait()
+        snapshot, shown = simulation.record.snapshot, report.column("frame")
+        for world in np.flatnonzero(report.column("live")).tolist():
+            if shown[world] <= max(frames):
+                shot = denoised.render(snapshot, world, 0)
+                if shown[world] in frames:
+                    light = str(names[int(snapshot.light.numpy()[world])])
+                    yield int(shown[world]), Pair(light, shot, reference.render(snapshot, world, 0), float(shot.radiance.mean()))
+        phase = report.column("phase")
+        if ((phase == Phase.IDLE) | ((phase == Phase.ACT) & (shown >= max(frames)))).all():
+            return
+
+
+def _summarize(pairs: list[Pair]) -> list[Row]:
+    mean = float(np.mean([pair.quality for pair in pairs]))
+    return [
+        Row("denoised against reference, mean", mean, "dB", f">= {MIN_PSNR:g}", mean >= MIN_PSNR),
+        Row("denoised against reference, min", min(pair.quality for pair in pairs), "dB"),
+        bounded_row("bias of mean radiance, mean", float(np.mean([pair.bias for pair in pairs])), "%", MAX_BIAS),
+    ]
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json")
+    parser.add_argument("--episodes", type=positive_count, default=1, help="episodes, each in a world of its own (default: 1)")
+    parser.add_argument("--mode", default="pick", help="bake.mode (default: pick)")
+    parser.add_argument("--frames", type=_frames, default=(0, 8, 30), help="frames to compare, comma-separated (default: 0,8,30)")
+    parser.add_argument("--size", default="480x270", help="WIDTHxHEIGHT of the images [px] (default: 480x270)")
+    parser.add_argument("--samples", type=positive_count, default=256, help="paths per pixel of the reference (default: 256)")
+    parser.add_argument("--sheet", type=writable_file, help="contact sheet: denoised, reference, and five times their difference")
+    return parser.parse_args(arguments)
+
+
+def _frames(text: str) -> tuple[int, ...]:
+    """Type of an option: frame indices joined by commas."""
+    parts = text.split(",")
+    if not all(part.isdecimal() for part in parts):
+        raise argparse.ArgumentTypeError(f"{text} are no frames; allowed: numbers from 0 on, such as 0,8,30")
+    return tuple(sorted({int(part) for part in parts}))
+
+
+def _config(options: argparse.Namespace) -> Config:
+    fixed = {
+        "bake.mode": options.mode,
+        "bake.episodes": options.episodes,
+        "bake.worlds": options.episodes,
+        "render.samples": options.samples,
+        "cameras.resolution": [int(part) if part.isdecimal() else part for part in options.size.split("x")],
+    }
+    config = configure(options, fixed)
+    return replace(config, cameras=replace(config.cameras, positions=config.cameras.positions[:1], ups=config.cameras.ups[:1]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
