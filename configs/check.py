@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import json
 import math
+import operator
 import typing
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -25,6 +26,16 @@ _SHOWN = 60
 
 class _MismatchError(Exception):
     """The value is not of the setting's type; the message, if any, says what is allowed."""
+
+
+def to_index(value: object) -> int | None:
+    """Convert an integer, also one of NumPy, to int; None: the value is none, or true or false."""
+    if isinstance(value, bool):
+        return None
+    try:
+        return operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        return None
 
 
 def check_value(key: str, value: object, item: dataclasses.Field[Any], annotation: Any, source: str) -> Any:

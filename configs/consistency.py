@@ -140,8 +140,9 @@ def _bop(config: Config) -> Iterator[Conflict]:
             rule = "BOP's toolkit reads jpg from splits that end in _pbr, and png from all others"
             yield "bop.color_format", f"{fitting} with the split {folder}: {rule}"
     if "shards" in config.bake.formats and scenes_end(config) > MAX_SHARD_SCENES:
-        key = f"splits.{config.splits[-1].name}.episodes" if config.splits else "bake.episodes"
         most = MAX_SHARD_SCENES // len(config.cameras.positions)
+        long = next((split.name for split in config.splits if split.first + split.episodes > most), "")
+        key = f"splits.{long}.episodes" if long else "bake.episodes"
         yield key, f"episode indices below {most} with the format shards, whose names hold no more scenes"
     far = max((math.dist(position, (0.0, 0.0, 0.0)) for position in config.cameras.positions), default=0.0)
     if bop.depth_scale * 1e-3 * DEPTH_COUNTS < far:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from synpick_warp.configs.check import format_value, suggest
+from synpick_warp.configs.check import format_value, suggest, to_index
 from synpick_warp.configs.schema import MULTISENSOR, Config, Split
 from synpick_warp.errors import ConfigError
 
@@ -28,7 +28,7 @@ def choose_splits(config: Config, names: Sequence[str]) -> tuple[Split, ...]:
     Raises:
         ConfigError: An unknown split.
     """
-    if isinstance(names, str):
+    if isinstance(names, str) or not isinstance(names, Sequence):
         raise ConfigError(f'splits are {format_value(names)}; allowed: a list of names, such as ["train"]')
     if not names:
         return config.splits
@@ -64,7 +64,7 @@ def check_shard(shard: tuple[int, int], name: str = "shard") -> None:
     Raises:
         ConfigError: Not two whole numbers with 0 <= i < n.
     """
-    if not isinstance(shard, tuple | list) or len(shard) != 2 or not all(isinstance(part, int) for part in shard):
+    if not isinstance(shard, tuple | list) or len(shard) != 2 or any(to_index(part) is None for part in shard):
         raise ConfigError(f"{name} is {shard!r}; allowed: (i, n) with i from 0 to n - 1, such as (0, 4)")
     index, count = shard
     if not 0 <= index < count:

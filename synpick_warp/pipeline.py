@@ -33,9 +33,11 @@ from synpick_warp.scheduling.meter import ThroughputMeter
 from synpick_warp.scheduling.sizes import advise_processes, count_writers, pick_processes
 from synpick_warp.scheduling.worker import BakeLink
 from synpick_warp.stages.buffers import Snapshot
+from synpick_warp.stages.launch import limit_threads
 from synpick_warp.stages.stream import TickReport, tick_batch
 from synpick_warp.stages.ticks import TickLoop
 from synpick_warp.stages.timing import scope
+from synpick_warp.system.cores import count_cores
 from synpick_warp.system.device import pick_devices
 from synpick_warp.system.interrupt import StopRequest
 
@@ -134,6 +136,8 @@ def generate_share(share: Share, handles: Sequence[int], link: BakeLink) -> Bake
         link: Receives reports, and requests to stop.
     """
     config, summary = share.config, BakeSummary(len(share.episodes))
+    if config.bake.device == "cpu":
+        limit_threads(max(1, count_cores() // share.processes))
     kinds = load_exporter_classes(config.bake.formats)
     with explain_shortage(config):
         factory = build_factory(config, link, share.episodes, *_needs(kinds), processes=share.processes)

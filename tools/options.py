@@ -39,14 +39,14 @@ def positive_count(text: str) -> int:
     return int(text)
 
 
-def positive_seconds(text: str) -> float:
-    """Type (for `add_argument`) of a positive, finite time [s]."""
+def finite_seconds(text: str) -> float:
+    """Type (for `add_argument`) of a finite time [s]; 0: as short as possible."""
     try:
         seconds = float(text)
     except ValueError:
-        seconds = 0.0
-    if not 0.0 < seconds < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is no time; allowed: a number of seconds above 0")
+        seconds = math.nan
+    if not 0.0 <= seconds < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is no time; allowed: a number of seconds from 0 on")
     return seconds
 
 

@@ -26,7 +26,7 @@ class SilhouetteResidual:
 
 @wp.func
 def silhouette_residual(observation: Observation, instance: int, sample: SampleView, intrinsics: wp.vec4) -> SilhouetteResidual:
-    """SilhouetteResidual from a sample to the nearest crop pixel of the mask, by the feature transform, less the deadband."""
+    """Shortest way of a sample back to the nearest crop pixel of the mask, by the feature transform, less the deadband."""
     column = wp.clamp(int(wp.round(sample.crop[0])), 0, CROP - 1)
     row = wp.clamp(int(wp.round(sample.crop[1])), 0, CROP - 1)
     target = observation.nearest[instance, row, column] + wp.vec2(float(column), float(row))

@@ -231,7 +231,7 @@ class CocoConverter(_SceneConverter):
         scenes = episode.scenes()
         staged = tuple((folder / f"{scene.scene:06d}", scene.scene) for scene in scenes)
         tasks = [(write_coco, (scene, self.content, place), place) for scene, (place, _) in zip(scenes, staged, strict=True)]
-        arguments = (staged, self.out)
+        arguments = (staged, self.out, episode.frames)
         self.submit_all(tasks, lambda: self.pool.submit(coco.commit_scenes, (), arguments, path=folder, on_done=on_committed))
 
 

@@ -1,6 +1,6 @@
 """Assembly of a bake's stages on a device: assets, worlds, renderer and encoders, from all settings.
 
-Besides the pipeline, the one module that passes the whole `Config` on; stages take what they need.
+Whoever assembles stages (bake, stream, warm-up) passes the whole `Config` on; stages take what they need.
 """
 
 from __future__ import annotations
@@ -115,6 +115,8 @@ def compile_if_cold(
         config, device, progress, records_physics, needs_images: As of `build_factory`.
         renders: Whether views are rendered.
     """
+    if is_cache_warm(device):
+        return
     with sole_compiler(progress):
         if is_cache_warm(device):
             return

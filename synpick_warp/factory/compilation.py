@@ -15,7 +15,10 @@ from synpick_warp.system.kernels import DryLaunches, build_of, compilation_lock,
 
 
 def is_cache_warm(device: wp.Device) -> bool:
-    """Whether the kernel cache is warm: it has a kernel that every bake launches. Other kernels may still be missing."""
+    """Whether the kernel cache is warm: it has a kernel that every bake launches, and that is compiled after all others.
+
+    Kernels that other settings need may still be missing.
+    """
     return build_of(take_snapshot_kernel, device).is_cached()
 
 
@@ -38,7 +41,8 @@ def compile_launches(simulation: Simulation, stream: FrameStream | None, progres
     with DryLaunches() as dry:
         launch_all(simulation, stream)
     simulation.clear_graphs()
-    return compile_modules(dry.builds, lambda ready, count: progress.stage(f"compiling kernels: {ready} of {count} modules"))
+    marker = build_of(take_snapshot_kernel, simulation.device)
+    return compile_modules(dry.builds, lambda ready, count: progress.stage(f"compiling kernels: {ready} of {count} modules"), marker)
 
 
 def launch_all(simulation: Simulation, stream: FrameStream | None) -> None:

@@ -43,9 +43,9 @@ def warm_up(config: Config, progress: Progress) -> WarmUp:
     started = time.perf_counter()
     kinds = load_exporter_classes(config.bake.formats)
     device = pick_device(config.bake.device)
-    before = list_binaries()
     needs = [any(getattr(kind, name) for kind in kinds) for name in ("needs_physics", "needs_images")]
     with sole_compiler(progress):
+        before = list_binaries()
         factory = build_smallest(config, device, progress, *needs)
         stream = factory.stream if any(kind.needs_views for kind in kinds) else None
         compile_launches(factory.simulation, stream, progress)

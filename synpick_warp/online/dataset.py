@@ -17,6 +17,7 @@ from typing import Any
 import torch  # pyright: ignore[reportMissingImports]
 from torch.utils.data import IterableDataset, get_worker_info  # pyright: ignore[reportMissingImports]
 
+from synpick_warp.configs.check import to_index
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.view import MILLIMETERS
 from synpick_warp.errors import ConfigError
@@ -128,7 +129,7 @@ class StreamDataset(IterableDataset):
             if name not in FIELDS and name not in self.config.render.layers:
                 known = ", ".join((*FIELDS, *self.config.render.layers))
                 raise ConfigError(f"there is no field {name}; fields: {known}; others are layers that render.layers names")
-        if not isinstance(shuffle, int) or shuffle < 0:
+        if (to_index(shuffle) or 0) < 0 or to_index(shuffle) is None:
             raise ConfigError(f"shuffle is {shuffle!r}; allowed: a number of views, or 0")
         if shuffle and batched:
             raise ConfigError(f"shuffle is {shuffle}, but whole batches are not shuffled; set batched=False")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
+from synpick_warp.configs.check import to_index
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
 from synpick_warp.configs.splits import check_shard, plan_episodes
@@ -32,12 +33,13 @@ class Selection:
         """
         count = len(config.cameras.positions)
         given = range(count) if self.cameras is None else self.cameras
-        cameras = tuple(given) if isinstance(given, Iterable) else ()
+        cameras = tuple(to_index(camera) for camera in given) if isinstance(given, Iterable) else ()
         if not cameras or len(set(cameras)) < len(cameras) or not set(cameras) <= set(range(count)):
-            raise ConfigError(f"cameras are {list(cameras) or given}; allowed: one or more of 0 to {count - 1}, each once")
-        if not isinstance(self.stride, int) or self.stride < 1:
+            raise ConfigError(f"cameras are {list(given) if cameras else given}; allowed: one or more of 0 to {count - 1}, each once")
+        stride = to_index(self.stride)
+        if stride is None or stride < 1:
             raise ConfigError(f"stride is {self.stride!r}; allowed: a whole number from 1 on")
-        return replace(self, cameras=cameras)
+        return replace(self, cameras=cameras, stride=stride)
 
 
 def choose_episodes(
@@ -68,5 +70,5 @@ def choose_episodes(
     if not isinstance(chosen, range) or not chosen or min(chosen[0], chosen[-1]) < 0 or max(chosen[0], chosen[-1]) >= INT32_MAX:
         raise ConfigError(f"episodes are {episodes!r}; allowed: how many, or a range of indices from 0 to {INT32_MAX - 1}")
     config = replace(config, bake=replace(config.bake, episodes=max(chosen[0], chosen[-1]) + 1))
-    check_episodes(len(chosen), config)
+    check_episodes(-(-len(chosen) // count), config)
     return config, [episode for episode in chosen if episode % count == index]

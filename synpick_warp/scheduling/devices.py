@@ -22,6 +22,8 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Self
 
+import warp as wp
+
 from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.digests import digest_inputs
 from synpick_warp.dataset.manifest import committed_episodes
@@ -38,6 +40,7 @@ from synpick_warp.scenes.lights import load_lights
 from synpick_warp.scenes.types import Catalog, EnvironmentMap
 from synpick_warp.scheduling.order import deal_episodes, deal_writers, order_longest_first
 from synpick_warp.scheduling.sizes import count_writers
+from synpick_warp.system.caches import KERNEL_VARIABLE
 from synpick_warp.system.descriptors import duplicate_above_streams, open_standard_descriptors
 from synpick_warp.system.device import describe_kinds, pick_device
 from synpick_warp.system.interrupt import StopRequest
@@ -199,10 +202,16 @@ def _start(name: str, program: str, lock: int) -> _Device:
         passed = duplicate_above_streams(lock)
         closing.callback(os.close, passed)
         try:
-            return _Device(name, start_process(program, (passed, held), has_threads=True), lifeline)
+            return _Device(name, start_process(program, (passed, held), environment=_environment(), has_threads=name != "cpu"), lifeline)
         except OSError:
             os.close(lifeline)
             raise
+
+
+def _environment() -> dict[str, str]:
+    """Variables of a device's process: it uses this process's kernel cache, also a temporary one. Empty before Warp has started."""
+    cache = wp.config.kernel_cache_dir
+    return {} if cache is None else {KERNEL_VARIABLE: os.path.dirname(cache)}
 
 
 def _wait_for_hangup(pipes: Sequence[int], timeout: float) -> None:

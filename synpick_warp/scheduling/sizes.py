@@ -87,7 +87,7 @@ def pick_processes(config: Config, names: Sequence[str], episodes: int) -> tuple
     """
     picked = pick_devices(names)
     if list(names) == [ALL] and picked == ("cpu",):
-        needed = sum(term.size for term in plan_memory(_with_least_sizes(config), pick_device("cpu")))
+        needed = sum(term.size for term in plan_memory(_with_least_sizes(without_pictures(config)), pick_device("cpu")))
         room = free_memory(None) // int(HEADROOM * needed + RUNTIME_BYTES)
         picked *= max(1, min(count_cores(), room))
     return picked[: max(1, episodes)]

@@ -13,7 +13,21 @@ from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.tuning import CPU_PIECE_PIXELS, CPU_PIECES, PIXEL_BLOCK
 from synpick_warp.system.cores import count_cores
 
-_cores = functools.cache(count_cores)
+_limit = 0
+"""Threads that `limit_threads` allows; 0: one per usable core."""
+
+
+def limit_threads(count: int) -> None:
+    """Limit the threads that render pixels on the CPU: several processes share its cores. No result depends on it."""
+    global _limit
+    _limit = count
+    _cores.cache_clear()
+    _pool.cache_clear()
+
+
+@functools.cache
+def _cores() -> int:
+    return _limit or count_cores()
 
 
 @functools.cache

@@ -54,16 +54,31 @@ def compilation_lock(wait: Callable[[], None]) -> Iterator[None]:
     Args:
         wait: Called before waiting for another process.
     """
-    with contextlib.ExitStack() as closing:
-        with contextlib.suppress(OSError):
-            handle = os.open(Path(wp.config.kernel_cache_dir or "", _LOCK_FILE), os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o666)
-            closing.callback(os.close, handle)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                wait()
-                fcntl.flock(handle, fcntl.LOCK_EX)
+    try:
+        handle = os.open(Path(wp.config.kernel_cache_dir or "", _LOCK_FILE), os.O_CREAT | os.O_RDONLY | os.O_CLOEXEC, 0o666)
+    except OSError:
         yield
+        return
+    try:
+        if not _lock(handle, fcntl.LOCK_NB):
+            wait()
+            _lock(handle)
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            fcntl.flock(handle, fcntl.LOCK_UN)  # Closing alone would leave it to children that were forked meanwhile.
+        os.close(handle)
+
+
+def _lock(handle: int, flags: int = 0) -> bool:
+    """Take a lock; False: another process has it, and `flags` says not to wait."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | flags)
+    except BlockingIOError:
+        return False
+    except OSError:
+        pass  # A file system without locks.
+    return True
 
 
 def build_of(kernel: Any, device: wp.Device) -> ModuleBuild:
@@ -96,11 +111,12 @@ class DryLaunches:
         wp.Module.load = self._load  # type: ignore[method-assign]
 
 
-def compile_modules(builds: Collection[ModuleBuild], report: Callable[[int, int], None]) -> int:
+def compile_modules(builds: Collection[ModuleBuild], report: Callable[[int, int], None], last: ModuleBuild | None = None) -> int:
     """Compile and load in parallel the modules that the kernel cache lacks, in a thread pool.
 
     Args:
         builds: Modules; those in the cache are loaded by their first launch.
+        last: One of them that is compiled after all others; None: any.
         report: Progress callback (ready, total), called in this thread from (0, total) on; not called if nothing is missing.
 
     Returns:
@@ -112,10 +128,14 @@ def compile_modules(builds: Collection[ModuleBuild], report: Callable[[int, int]
     with ThreadPoolExecutor(min(len(missing), count_cores(), MAX_COMPILERS), thread_name_prefix="compile") as pool:
         report(0, len(missing))
         try:
-            for ready, done in enumerate(as_completed([pool.submit(one.module.load, one.device, one.block) for one in missing]), 1):
+            first = [pool.submit(one.module.load, one.device, one.block) for one in missing if one != last]
+            for ready, done in enumerate(as_completed(first), 1):
                 done.result()
                 report(ready, len(missing))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+    if last is not None and last in missing:
+        last.module.load(last.device, last.block)
+        report(len(missing), len(missing))
     return len(missing)

@@ -97,7 +97,7 @@ def test_mistakes_are_told_before_the_first_epoch(short, monkeypatch):
     for wrong, message in (
         ({"fields": ("colour",)}, "there is no field colour; fields: rgb"),
         ({"fields": ("normals",)}, "others are layers that render.layers names"),
-            ({"shuffle": -5, "batched": False}, "shuffle is -5; allowed: a number of views"),
+        ({"shuffle": -5, "batched": False}, "shuffle is -5; allowed: a number of views"),
         ({"shuffle": 5}, "set batched=False"),
         ({"cameras": (7,)}, "cameras are"),
         ({"worlds": -1}, "bake.worlds is -1"),

@@ -27,6 +27,7 @@ from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
 from tools.bench.usage import Usage, measure_usage
 
 TINY = ("--worlds", "2", "--resolution", "32x18", *FEW_STEPS, *SMALL_IMAGES, *SHORT_EPISODES)
+ANY_DEVICE = tuple(part for part in TINY if part not in ("--device", "cpu"))
 SHARED = ("train", "deep/shared")
 
 
@@ -140,8 +141,27 @@ def test_descendants_of_the_benchmark_are_counted_and_other_processes_are_not():
         child.stdout.close()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--seconds", "inf"], "inf is no time"),
+        (["--seconds", "nan"], "nan is no time"),
+        (["--seconds", "-1"], "-1 is no time"),
+        (["--json", "/nowhere/x.json"], "there is no folder /nowhere"),
+        (["--json", "/tmp"], "/tmp is a folder"),
+        (["--parts", "steady", "--episodes", "7"], "--episodes needs the part whole"),
+        (["--parts", "steady", "--markdown", "x.md"], "--markdown needs the part growth"),
+        (["--parts", "steady", "--devices", "cpu,cpu"], "--device and --devices are both given"),
+    ],
+)
+def test_what_would_be_lost_or_ignored_is_refused_at_once(capsys, arguments, said):
+    with pytest.raises(SystemExit, match="2"):
+        bench.main([*TINY, *arguments])
+    assert said in capsys.readouterr().err.splitlines()[-1]
+
+
 def test_devices_that_do_not_exist_are_one_line(capsys):
-    assert bench.main([*TINY, "--parts", "steady", "--devices", "cuda:98,cuda:99"]) == 2
+    assert bench.main([*ANY_DEVICE, "--parts", "steady", "--devices", "cuda:98,cuda:99"]) == 2
     assert "cuda:98" in capsys.readouterr().err.splitlines()[-1]
 
 
@@ -295,4 +315,8 @@ def test_growth_is_a_table_of_all_factors(tmp_path, monkeypatch):
 def test_a_missing_folder_of_the_table_is_said_at_once(tmp_path, capsys):
     with pytest.raises(SystemExit, match="2"):
         bench.main([*TINY, "--parts", "growth", "--markdown", str(tmp_path / "none" / "table.md")])
-    assert capsys.readouterr().err.splitlines()[-1].endswith(f"--markdown: there is no folder {tmp_path / 'none'}")
+    assert (
+        capsys.readouterr()
+        .err.splitlines()[-1]
+        .endswith(f"--markdown: there is no folder {tmp_path / 'none'}; name a file in a folder that exists")
+    )

@@ -145,7 +145,7 @@ def test_a_report_of_a_sequence_compares_its_frames_with_references(tmp_path, ca
     assert cv2.imread(str(sheet)).shape[1] == 3 * (32 * 20 + render_sheet.GAP)
     capsys.readouterr()
     assert render_sequence.main(["--frames", "100000", "--mode", "move", "--size", "32x18", *FEW_STEPS, "--set", "move.speed=9"]) == 2
-    assert "no episode is that long" in capsys.readouterr().err
+    assert "no episode has frame 100000" in capsys.readouterr().err
 
 
 def test_histories_bring_frames_nearer_to_the_reference():

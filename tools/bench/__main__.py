@@ -58,10 +58,10 @@ from tools.options import (
     INTERRUPTED,
     configure,
     fail,
+    finite_seconds,
     make_names_parser,
     make_parser,
     positive_count,
-    positive_seconds,
     writable_file,
     write_json,
 )
@@ -137,15 +137,15 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--episodes", type=positive_count, help=f"episodes of the part whole (default: {WHOLE_EPISODES})")
     devices_help = "several devices of the part steady, as of bake: cuda:0,cuda:1 or all; --worlds is the number of each"
     parser.add_argument("--devices", default="", help=devices_help)
-    parser.add_argument("--seconds", type=positive_seconds, default=2.0, help="minimum time of a measurement [s] (default: 2)")
+    parser.add_argument("--seconds", type=finite_seconds, default=2.0, help="minimum time of a measurement [s] (default: 2)")
     parser.add_argument("--markdown", type=writable_file, metavar="FILE", help="table of the part growth")
     options = parser.parse_args(arguments)
     if options.parts is None:
         options.parts = () if options.compare else DEFAULT_PARTS
     options.devices = tuple(name.strip() for name in options.devices.split(",")) if options.devices else ()
-    for name, part in (("devices", "steady"), ("markdown", "growth"), ("episodes", "whole")):
+    for name, part, use in (("devices", "steady", "several"), ("markdown", "growth", "it"), ("episodes", "whole", "it")):
         if getattr(options, name) and part not in options.parts:
-            parser.error(f"--{name} needs the part {part}, the only one that uses it")
+            parser.error(f"--{name} needs the part {part}, the only one that uses {use}")
     if options.devices and options.device != parser.get_default("device"):
         parser.error("--device and --devices are both given; name one device by --device, or several by --devices")
     options.episodes = options.episodes or WHOLE_EPISODES

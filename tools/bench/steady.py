@@ -11,11 +11,13 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.schema import Config
 from synpick_warp.errors import DatasetError
 from synpick_warp.exporters.registry import load_exporter_classes, shared_files
 from synpick_warp.pipeline import run_bake
-from synpick_warp.system.device import pick_device, pick_devices
+from synpick_warp.scheduling.sizes import pick_processes
+from synpick_warp.system.device import pick_device
 from tools.bench.cleaner import Assignment, Cleaner
 from tools.bench.meter import LIVE_FRACTION, SteadyMeter, summarize_rates
 from tools.bench.physics import Row
@@ -53,12 +55,13 @@ def measure_steady(config: Config, min_seconds: float, devices: Sequence[str] = 
         min_seconds: Time to measure [s].
         devices: Devices with a process each, see `run_bake`; empty: `bake.device` alone.
     """
-    names = pick_devices(devices) if devices else (config.bake.device,)
-    config, device = plan_spare_episodes(config, len(names)), pick_device(names[0])
+    names = pick_processes(config, devices, INT32_MAX) if devices else ()
+    count = max(1, len(names))
+    config, device = plan_spare_episodes(config, count), pick_device(names[0] if names else config.bake.device)
     live_views = LIVE_FRACTION * config.bake.worlds * len(config.cameras.positions)
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out") as cleaner:
-        meter = SteadyMeter(min_seconds, Path(folder), live_views, config.bake.worlds, device, cleaner, devices=len(names))
-        summary = run_bake(config, Path(folder) / "out", meter, devices=devices)
+        meter = SteadyMeter(min_seconds, Path(folder), live_views, config.bake.worlds, device, cleaner, devices=count)
+        summary = run_bake(config, Path(folder) / "out", meter, devices=names)
     if len(meter.readings) > 1:
         yield from _summarize(config, meter)
     meter.raise_interruption(summary)

@@ -72,7 +72,9 @@ def hold_out(config: Config, views: int) -> tuple[list[dict[str, torch.Tensor]],
     batches, count = [], 0
     with synpick_warp.stream(config, episodes=HELD_OUT, stride=HELD_OUT_STRIDE) as stream:
         while count < views:
-            batch = next(stream)
+            batch = next(stream, None)
+            if batch is None:
+                raise ConfigError(f"--held-out is {views}, but {len(HELD_OUT)} episodes have {count} views; name fewer")
             batches.append({name: FIELDS[name](batch).clone() for name in ("rgb", "classes")})
             count += len(batch)
         return batches, 1 + max(stream.object_names)

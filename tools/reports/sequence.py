@@ -23,6 +23,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import build_stages, make_renderer
+from synpick_warp.memory_plan import check_memory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.stream import TickReader
@@ -43,18 +44,20 @@ def main(arguments: list[str] | None = None) -> int:
     started = time.perf_counter()
     rows: list[Row] = []
     pairs: list[Pair] = []
+    missing = set(options.frames)
     try:
         config = _config(options)
         device = pick_device(config.bake.device)
         for frame, pair in compare_frames(config, options.frames):
             pairs.append(pair)
+            missing.discard(frame)
             rows.append(Row(f"frame {frame}, {pair.light}: denoised against reference", pair.quality, "dB"))
             rows.append(Row(f"frame {frame}, {pair.light}: bias of mean radiance", pair.bias, "%"))
             console.print(
                 f"{time.perf_counter() - started:6.0f} s  frame {frame:4}  {pair.light}: {pair.quality:.2f} dB, {pair.bias:+.2f} %"
             )
-        if not pairs:
-            raise SynpickError(f"--frames are {options.frames}, but no episode is that long; name earlier ones")
+        if missing:
+            raise SynpickError(f"no episode has frame {min(missing)} of --frames; name earlier ones")
         for file in write_sheets(pairs, options.sheet) if options.sheet else ():
             console.print(f"wrote {file}")
     except SynpickError as error:
@@ -78,11 +81,10 @@ def compare_frames(config: Config, frames: tuple[int, ...]) -> Iterator[tuple[in
     """
     device = pick_device(config.bake.device)
     config = fit_to_device(with_mode(config, FAST), device, config.bake.episodes)
+    check_memory(config, device)
     stages = build_stages(config, device, SilentProgress(), range(config.bake.episodes))
-    histories = stages.simulation.layout.worlds * len(stages.cameras)
-    room = config.arrangement.max_objects
-    denoised = Studio(make_renderer(config, stages.renderer.scene, room, 1, histories))
-    reference = Studio(make_renderer(with_mode(config, REFERENCE), stages.renderer.scene, room, 1))
+    denoised = Studio(stages.renderer)
+    reference = Studio(make_renderer(with_mode(config, REFERENCE), stages.renderer.scene, config.arrangement.max_objects, 1))
     simulation, names = stages.simulation, stages.light_table.name
     while True:
         simulation.tick()

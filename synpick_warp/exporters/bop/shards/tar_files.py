@@ -49,6 +49,8 @@ _COPY_BYTES = 1 << 20
 
 def shard_name(scene: int, part: int) -> str:
     """Name of the shard that holds a scene's views from `MAX_SHARD_VIEWS · part` on."""
+    if scene >= MAX_SHARD_SCENES:
+        raise OutputError(f"scene {scene} is too many for the format shards, whose names hold {MAX_SHARD_SCENES}; bake fewer episodes")
     return f"shard-{scene + MAX_SHARD_SCENES * part:06d}.tar"
 
 
