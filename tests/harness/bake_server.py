@@ -99,10 +99,11 @@ def arguments(request: dict) -> list[str]:
 
 
 def _serve() -> None:
+    from synpick_warp import pipeline
     from synpick_warp.cli import commands
     from synpick_warp.factory import assembly
 
-    assembly.load_catalog = lambda config, report: catalog()
+    assembly.load_catalog = pipeline.load_catalog = lambda config, report: catalog()
     answer = os.dup(1)
     os.dup2(2, 1)
     with open(os.devnull, "w") as nowhere:

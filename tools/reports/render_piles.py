@@ -45,16 +45,24 @@ class Pair:
     reference: Shot
     mean: float
     """Mean radiance of the denoised image over `BIAS_SAMPLES` seeds."""
+    second: Shot | None = None
+    """Independent reference of the same view; with it, `quality` is free of the references' noise."""
 
     @property
     def quality(self) -> float:
-        """PSNR of the denoised image against the reference [dB]."""
-        return psnr(self.denoised.color, self.reference.color)
+        """PSNR of the denoised image against the reference [dB].
+
+        With a second reference the squared error is estimated by the product of the two differences, whose expectation has no noise.
+        """
+        second = self.second or self.reference
+        first, other = (shot.color.astype(np.float64) - self.denoised.color for shot in (self.reference, second))
+        return peak_ratio(float((first * other).mean()))
 
     @property
     def bias(self) -> float:
         """Relative bias of the denoised image's mean radiance [%]."""
-        return 100.0 * (self.mean / float(self.reference.radiance.mean()) - 1.0)
+        references = [self.reference, *([self.second] if self.second else [])]
+        return 100.0 * (self.mean / float(np.mean([shot.radiance.mean() for shot in references])) - 1.0)
 
 
 def compare_piles(
@@ -176,5 +184,9 @@ def settle_piles(config: Config, catalog: Catalog, lights: int, device: Any) -> 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
     """Peak signal-to-noise ratio (PSNR) of two 8-bit images [dB]."""
-    error = float(((a.astype(np.float64) - b) ** 2).mean())
+    return peak_ratio(float(((a.astype(np.float64) - b) ** 2).mean()))
+
+
+def peak_ratio(error: float) -> float:
+    """PSNR of a mean squared error of 8-bit images [dB]."""
     return 10.0 * float(np.log10(255.0**2 / max(error, 1e-9)))

@@ -2,7 +2,8 @@
 
 Light histories (`render.history`) average the light of resting surfaces over the frames of an episode, so single frames, as in
 `tools.reports.render`, do not show the quality of a bake. Here every frame of camera 0 is denoised, from the first one on, and those of
-`--frames` are rendered once more as reference. Exits with 1 if a bound is violated, with 2 if nothing can be rendered.
+`--frames` are rendered twice more as references, with half of `--samples` each: the product of the two differences estimates the error
+without the references' noise. Exits with 1 if a bound is violated, with 2 if nothing can be rendered.
 
     python -m tools.reports.sequence --models DIR --lights DIR --size 640x360 --frames 0,8,30 --samples 256 --sheet sheet.png
 """
@@ -84,7 +85,11 @@ def compare_frames(config: Config, frames: tuple[int, ...]) -> Iterator[tuple[in
     check_memory(config, device)
     stages = build_stages(config, device, SilentProgress(), range(config.bake.episodes))
     denoised = Studio(stages.renderer)
-    reference = Studio(make_renderer(with_mode(config, REFERENCE), stages.renderer.scene, config.arrangement.max_objects, 1))
+    room, half = config.arrangement.max_objects, replace(config, render=replace(config.render, samples=max(1, config.render.samples // 2)))
+    references = [
+        Studio(make_renderer(with_mode(half, REFERENCE, seed=config.bake.seed + offset), stages.renderer.scene, room, 1))
+        for offset in (0, 1)
+    ]
     simulation, names = stages.simulation, stages.light_table.name
     while True:
         simulation.tick()
@@ -97,7 +102,8 @@ def compare_frames(config: Config, frames: tuple[int, ...]) -> Iterator[tuple[in
                 shot = denoised.render(snapshot, world, 0)
                 if shown[world] in frames:
                     light = str(names[int(snapshot.light.numpy()[world])])
-                    yield int(shown[world]), Pair(light, shot, reference.render(snapshot, world, 0), float(shot.radiance.mean()))
+                    first, second = (each.render(snapshot, world, 0) for each in references)
+                    yield int(shown[world]), Pair(light, shot, first, float(shot.radiance.mean()), second)
         phase = report.column("phase")
         if ((phase == Phase.IDLE) | ((phase == Phase.ACT) & (shown >= max(frames)))).all():
             return
@@ -118,7 +124,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--mode", default="pick", help="bake.mode (default: pick)")
     parser.add_argument("--frames", type=_frames, default=(0, 8, 30), help="frames to compare, comma-separated (default: 0,8,30)")
     parser.add_argument("--size", default="480x270", help="WIDTHxHEIGHT of the images [px] (default: 480x270)")
-    parser.add_argument("--samples", type=positive_count, default=256, help="paths per pixel of the reference (default: 256)")
+    parser.add_argument("--samples", type=positive_count, default=256, help="paths per pixel of both references together (default: 256)")
     parser.add_argument("--sheet", type=writable_file, help="contact sheet: denoised, reference, and five times their difference")
     return parser.parse_args(arguments)
 

@@ -18,6 +18,9 @@ TEXEL_MASK = wp.constant((1 << 10) - 1)
 """Largest value of a texel's channel."""
 TEXEL_SCALE = wp.constant(1.0 / ((1 << 10) - 1) ** 2)
 """Scale of a squared channel to a linear value from 0 to 1."""
+TEXEL_WIDTH = wp.constant(0.57735)
+"""Width of a mip level's texels relative to the pixel's footprint: 1 / sqrt(3). A bilinear look-up of box-filtered texels has the variance
+1/6 + 1/12 = 1/4 texel², so at this width it blurs as much as the pixel's box (1/12 px²); texels of a pixel's width would blur more."""
 MIN_TILT = wp.constant(0.1)
 """Smallest cosine for a pixel's footprint on a surface seen edge-on."""
 
@@ -169,12 +172,12 @@ def sample_mip_level(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> w
 
 @wp.func
 def sample_base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
-    """Linear base colour: material times texture, trilinear between the two mip levels whose texels are about as wide as the footprint."""
+    """Linear base colour: material times texture, trilinear between the mip levels with texels nearest to TEXEL_WIDTH footprints."""
     color = surfaces.color[surface.row]
     size = surfaces.texture_size[surface.row]
     if size[0] == 0:
         return color
-    texels = surface.uv_footprint * wp.sqrt(float(size[0]) * float(size[1]))
+    texels = TEXEL_WIDTH * surface.uv_footprint * wp.sqrt(float(size[0]) * float(size[1]))
     last = surfaces.texture_levels[surface.row] - 1
     level = wp.clamp(wp.log2(wp.max(texels, 1.0e-6)), 0.0, float(last))
     lower = int(level)
