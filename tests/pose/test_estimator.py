@@ -18,8 +18,8 @@ EVERY = 2
 TOLERANCE = 0.5
 """Allowed difference of scores [points]: on a GPU rounding differs."""
 SCORES = {"single": (97.53, 99.76), "refine": (98.25, 99.66), "track": (99.75, 99.79)}
-"""AUC of ADD and ADD-S [points], measured on the CPU. A change of estimators or pictures that is meant stores them anew; those below 99 in ADD are
-turns that shape cannot tell: cartons from one side, and tins that were disturbed about their axis."""
+"""AUC of ADD and ADD-S [points], measured on the CPU. A change of estimators or pictures that is meant stores them anew; those below 99 in
+ADD are turns that shape cannot tell: cartons from one side, and tins that were disturbed about their axis."""
 
 
 @pytest.fixture(scope="module")
