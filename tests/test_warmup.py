@@ -69,6 +69,7 @@ def test_a_cold_start_says_how_many_modules_it_compiles(monkeypatch):
     monkeypatch.setattr(progress, "stage", stages.append, raising=False)
     config = settings(cameras__resolution=[32, 18])
     assembly.build_factory(config, progress, [0])
+    stages = [stage for stage in stages if not stage.startswith("waiting for another process")]  # Other tests may be compiling.
     assert stages[:3] == ["compiling kernels of the assets", *(f"compiling kernels: {ready} of 1 modules" for ready in (0, 1))]
     assert stages[3] == "loading objects and lights"
 
