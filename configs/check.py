@@ -29,7 +29,7 @@ class _MismatchError(Exception):
 
 
 def to_index(value: object) -> int | None:
-    """Convert an integer, also one of NumPy, to int; None: the value is none, or true or false."""
+    """Convert an integer, including NumPy's types, to int; None for booleans and all other types."""
     if isinstance(value, bool):
         return None
     try:

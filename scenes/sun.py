@@ -18,15 +18,15 @@ SUN_SEARCH_RADIUS = np.radians(15.0)
 SUN_CONTRAST = 4.0
 """The part of a texel's luminance above this multiple of the map's mean belongs to the sun."""
 MAX_SUN_TANGENT = np.tan(np.radians(4.0))
-"""Tangent of the largest angular radius of a sun with shadow rays of its own: penumbras of wider ones need none."""
+"""Tangent of the maximum angular radius of a sun that gets its own shadow rays. A larger sun stays in the map, which paths sample."""
 MIN_SUN_HEIGHT = 0.15
-"""Smallest z of the direction to the sun: a lower one does not reach a pile in a tote."""
+"""Minimum z of the direction to the sun; light from a lower sun does not reach the objects in a tote."""
 SOLAR_TANGENT = np.tan(np.radians(0.267))
 """Tangent of the real sun's angular radius: the minimum for an sIBL set's sun."""
 
 
 class ExtractedSun(NamedTuple):
-    """A map's dominant light, taken out of the map."""
+    """Dominant light of an environment map, and the map without it."""
 
     rest: np.ndarray
     """The map without it (rows, 2 rows, 3)."""

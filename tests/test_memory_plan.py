@@ -20,6 +20,7 @@ from synpick_warp.memory_plan import check_memory, describe_memory, plan_memory
 from synpick_warp.progress import SilentProgress
 from synpick_warp.system.free_memory import free_host_memory
 from tests.harness.fuzz import fuzz_examples
+from tests.harness.kernel_files import write
 from tests.worlds.small_worlds import settings
 
 GIB = 1024**3
@@ -217,13 +218,6 @@ def test_the_memory_table_has_the_terms_of_the_plan():
 
 
 # ---- free memory ----
-
-
-def write(root: Path, files: dict[str, str]) -> Path:
-    for name, text in files.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
-    return root
 
 
 MEMINFO = "MemTotal:       1000 kB\nMemAvailable:    800 kB\nSwapFree:        50 kB\n"

@@ -238,7 +238,7 @@ class OutputFolder:
                 folder.rmdir()
 
     def _remove_data_set(self) -> None:
-        """Delete a data set without episodes. Its manifest is deleted last, and stays if other files do, so that a bake can resume."""
+        """Delete a data set without episodes. The manifest goes last, and is kept if other files remain, so that a bake can resume."""
         self._complete = set()
         if self._exporters is not None:
             self._remove_incomplete(episodes_end(self.config))

@@ -1,4 +1,4 @@
-"""Assembly of a bake's stages on a device: assets, worlds, renderer and encoders, from all settings.
+"""Factory functions that build a bake's stages (worlds, renderer, encoders) and assets on a device from its settings.
 
 Whoever assembles stages (bake, stream, warm-up) passes the whole `Config` on; stages take what they need.
 """
@@ -37,7 +37,7 @@ from synpick_warp.system.garbage import collection_paused
 
 @dataclass(frozen=True, eq=False)
 class Factory:
-    """Stages and assets of a bake, on the device."""
+    """A bake's assets and stages on a device: simulation, rendering with copies to the host, and the attempt log."""
 
     catalog: Catalog
     cameras: tuple[Camera, ...]
@@ -49,10 +49,10 @@ class Factory:
 
 @dataclass(frozen=True, eq=False)
 class Stages:
-    """What makes pictures, on the device: assets, worlds and renderer; a bake's `Factory` without its way to the host."""
+    """Assets, simulation and renderer on a device, shared by bakes and online streams; `Factory` adds encoding and copies to the host."""
 
     config: Config
-    """The settings, with as many worlds as there are."""
+    """The settings; `bake.worlds` is the actual number."""
     catalog: Catalog
     cameras: tuple[Camera, ...]
     lights: tuple[EnvironmentMap, ...]
@@ -128,7 +128,7 @@ def compile_if_cold(
 
 
 def build_smallest(config: Config, device: wp.Device, progress: Progress, records_physics: bool, needs_images: bool) -> Factory:
-    """Build a minimal factory: the fewest worlds that the device simulates, one view a batch; arguments, errors as of `build_factory`."""
+    """Build a minimal factory, with as few worlds as the device allows. Other arguments and errors: `build_factory`."""
     config = replace(config, bake=replace(config.bake, worlds=1), render=replace(config.render, views_per_batch=1))
     config = fit_to_device(config, device, 1, count_writers(config))
     return _assemble(config, device, progress, [0], records_physics, needs_images)
@@ -143,7 +143,7 @@ def _assemble(
     needs_images: bool,
     longest_first: bool = False,
 ) -> Factory:
-    """Build the stages; arguments as of `build_factory`, for settings by `fit_to_device`."""
+    """Build a factory from settings whose sizes are resolved (see `fit_to_device`). Other arguments: `build_factory`."""
     stages = build_stages(config, device, progress, episodes, records_physics, longest_first)
     depth_files = any(kind.writes_depth for kind in load_exporter_classes(config.bake.formats))
     host = host_images(config, device, needs_images, depth_files)
@@ -162,7 +162,7 @@ def build_stages(
     records_physics: bool = False,
     longest_first: bool = False,
 ) -> Stages:
-    """Load assets and build worlds and renderer; arguments and errors as of `build_factory`, for settings by `fit_to_device`."""
+    """Load assets, and build worlds and renderer, from settings with resolved sizes. Other arguments and errors: `build_factory`."""
     progress.stage("loading objects and lights")
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)

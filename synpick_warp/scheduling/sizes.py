@@ -22,8 +22,7 @@ from synpick_warp.system.cores import count_cores
 from synpick_warp.system.device import ALL, pick_device, pick_devices
 
 HEADROOM = 1.5
-"""Room for what a bake takes beyond its plan, which is a lower bound, as a multiple of it. tools/README.md has plans
-and memory used of bakes on a CPU."""
+"""Safety factor on the memory plan, which is a lower bound. tools/README.md compares plans with the memory that bakes on a CPU used."""
 RUNTIME_BYTES = 1 << 30
 """Room for what no plan counts: CUDA's context and kernels; a process's libraries and objects, 0.7 GiB [bytes]."""
 WRITER_BYTES = 100 << 20
@@ -32,7 +31,7 @@ with bop and shards; the rest is headroom for formats with larger libraries."""
 WRITERS_FRACTION = 0.5
 """Fraction of the free host memory that writer processes may take if their number is chosen."""
 _OPEN_SIZES = ("render.views_per_batch", "perception.views", "bake.worlds")
-"""Settings that may be left open, besides the number of writers."""
+"""Settings of sizes that are chosen automatically if they are 0. (So is `bake.writers`, see `count_writers`.)"""
 
 
 def without_pictures(config: Config) -> Config:
@@ -94,7 +93,7 @@ def pick_processes(config: Config, names: Sequence[str], episodes: int) -> tuple
 
 
 def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str:
-    """Advice for a bake in one process on a machine without a GPU, if `ALL` would start more; else empty. Arguments of `pick_processes`."""
+    """Advice to use `ALL`, if a bake without a GPU has one process and could have more; else empty. Arguments: `pick_processes`."""
     if len(names) > 1 or pick_device(names[0]).is_cuda or pick_devices([ALL]) != ("cpu",):
         return ""
     processes = len(pick_processes(config, [ALL], episodes))

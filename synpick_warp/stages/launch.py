@@ -14,11 +14,11 @@ from synpick_warp.kernels.tuning import CPU_PIECE_PIXELS, CPU_PIECES, PIXEL_BLOC
 from synpick_warp.system.cores import count_cores
 
 _limit = 0
-"""Threads that `limit_threads` allows; 0: one per usable core."""
+"""Maximum number of threads that render pixels on the CPU, set by `limit_threads`; 0: one per usable core."""
 
 
 def limit_threads(count: int) -> None:
-    """Limit the threads that render pixels on the CPU: several processes share its cores. No result depends on it."""
+    """Set the number of threads that render pixels on the CPU, for processes that share its cores. Results do not depend on it."""
     global _limit
     _limit = count
     _cores.cache_clear()

@@ -22,6 +22,7 @@ from synpick_warp.system.cores import count_cores
 MAX_COMPILERS = 8
 """Maximum number of compiling threads: the longest module of a bake takes a quarter of all, so that more gain little."""
 _LOCK_FILE = ".synpick-warp.lock"
+"""Lock file in Warp's kernel cache; see `compilation_lock`."""
 BINARIES = ("*.cubin", "*.ptx", "*.o")
 """Compiled modules in Warp's kernel cache."""
 

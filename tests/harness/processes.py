@@ -24,7 +24,7 @@ def children(process: int) -> list[int]:
 
 
 def kill_after(process: int, seconds: float, writer: bool) -> None:
-    """Kill a bake's process after a time, or `writer`: its last child, if it has one. Returns early if the process ends before."""
+    """Kill a bake's process after a delay [s]; with `writer` its last child process, if any. Returns early if the bake ends."""
     end = time.monotonic() + seconds
     with contextlib.suppress(ProcessLookupError, FileNotFoundError):
         while time.monotonic() < end:

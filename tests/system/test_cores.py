@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -12,6 +11,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.system.cores import count_cores
 from tests.harness.fuzz import fuzz_examples
+from tests.harness.kernel_files import write
 
 MASK = 64
 """Cores of the affinity mask in these tests."""
@@ -20,13 +20,6 @@ MASK = 64
 @pytest.fixture(autouse=True)
 def mask(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(MASK)))
-
-
-def write(root: Path, files: dict[str, str]) -> Path:
-    for name, text in files.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
-    return root
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from synpick_warp.codes import Phase
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import build_stages, make_renderer
-from synpick_warp.memory_plan import check_memory
+from synpick_warp.memory_plan import check_memory, explain_shortage
 from synpick_warp.progress import SilentProgress
 from synpick_warp.scheduling.sizes import fit_to_device
 from synpick_warp.stages.stream import TickReader
@@ -83,7 +83,8 @@ def compare_frames(config: Config, frames: tuple[int, ...]) -> Iterator[tuple[in
     device = pick_device(config.bake.device)
     config = fit_to_device(with_mode(config, FAST), device, config.bake.episodes)
     check_memory(config, device)
-    stages = build_stages(config, device, SilentProgress(), range(config.bake.episodes))
+    with explain_shortage(config):
+        stages = build_stages(config, device, SilentProgress(), range(config.bake.episodes))
     denoised = Studio(stages.renderer)
     room, half = config.arrangement.max_objects, replace(config, render=replace(config.render, samples=max(1, config.render.samples // 2)))
     references = [

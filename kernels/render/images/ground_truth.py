@@ -99,7 +99,7 @@ def expand_masks_kernel(
     # Out:
     mask_out: wp.array4d[wp.bool],  # (view, instance, row, column)
 ):
-    """Expand the id image to visible masks, or with `is_amodal` the bit field to amodal masks: one image per instance."""
+    """Make one binary mask per instance: visible masks from the id image or, if `is_amodal`, amodal masks from the bit field."""
     view, index, row, column = wp.tid()
     if is_amodal:
         mask_out[view, index, row, column] = ((amodal[view, row, column] >> wp.uint32(index)) & wp.uint32(1)) != wp.uint32(0)

@@ -19,10 +19,11 @@ TEXEL_MASK = wp.constant((1 << 10) - 1)
 TEXEL_SCALE = wp.constant(1.0 / ((1 << 10) - 1) ** 2)
 """Scale of a squared channel to a linear value from 0 to 1."""
 TEXEL_WIDTH = wp.constant(0.57735)
-"""Width of a mip level's texels relative to the pixel's footprint: 1 / sqrt(3). A bilinear look-up of box-filtered texels has the variance
-1/6 + 1/12 = 1/4 texel², so at this width it blurs as much as the pixel's box (1/12 px²); texels of a pixel's width would blur more."""
+"""Texel width of the selected mip level, relative to the pixel's footprint: 1 / sqrt(3). The kernel of a bilinear look-up in box-filtered
+texels has a variance of 1/6 + 1/12 = 1/4 texel²; at this width that is the variance of a one-pixel box filter, 1/12 px². With texels one
+pixel wide, textures would be blurred."""
 MIN_TILT = wp.constant(0.1)
-"""Smallest cosine for a pixel's footprint on a surface seen edge-on."""
+"""Minimum cosine in the footprint of a pixel on a surface seen at a grazing angle."""
 
 
 @wp.struct
@@ -172,7 +173,7 @@ def sample_mip_level(surfaces: Surfaces, row: int, level: int, uv: wp.vec2) -> w
 
 @wp.func
 def sample_base_color(surfaces: Surfaces, surface: Surface) -> wp.vec3:
-    """Linear base colour: material times texture, trilinear between the mip levels with texels nearest to TEXEL_WIDTH footprints."""
+    """Linear base colour: material colour times texture, filtered trilinearly at the mip level given by TEXEL_WIDTH."""
     color = surfaces.color[surface.row]
     size = surfaces.texture_size[surface.row]
     if size[0] == 0:

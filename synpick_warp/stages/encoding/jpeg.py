@@ -1,6 +1,7 @@
-"""JPEG encoder on the device: baseline, 4:2:0, with restart intervals; the same files as libjpeg's, `synpick_warp.codecs.jpeg.encode_jpeg`.
+"""Baseline JPEG encoder on the device, with 4:2:0 chroma subsampling and restart intervals.
 
-Only the files are copied to the host: at quality 95 a tenth of the pixels.
+Its files equal libjpeg's (`synpick_warp.codecs.jpeg.encode_jpeg`) byte for byte. Only the files are copied to the host; at quality 95 they
+have a tenth of the image's size.
 """
 
 from __future__ import annotations

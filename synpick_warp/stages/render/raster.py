@@ -24,9 +24,9 @@ from synpick_warp.stages.render.scene import RenderScene
 from synpick_warp.stages.render.view_setup import GBUFFER, VIEW_BODIES, body_sizes, make_views, set_up_views
 
 BLOCKS = 32768
-"""Capacity for blocks of large triangles per view. Thirteen objects of hundreds to thousands of triangles, such as the embedded
-ones, that fill a full-HD view need 14,000; dense meshes need a tenth. Triangles beyond the capacity are rasterized by single threads,
-which is slow."""
+"""Capacity for pixel blocks of large triangles per view. A full-HD view filled by thirteen low-polygon objects (hundreds to thousands of
+triangles each, such as the embedded ones) needs 14,000 blocks, dense meshes a tenth of that. If the capacity is exceeded, the remaining
+triangles are rasterized by one thread each, which is slow."""
 
 VISIBILITY_BUFFER = struct_arrays(VisibilityBuffer, "view", "row", "column", block=("view", "block"), blocks=("view",))
 

@@ -16,7 +16,7 @@ ROULETTE = 2
 
 
 def make_path_rules(render: Render, seed: int, samples: int, roulette: int) -> Any:
-    """The struct `PathRules` with light and BRDF sampling combined by MIS (Veach and Guibas, 1995), and without path regularization."""
+    """Make the path tracer's parameters: multiple importance sampling (Veach and Guibas, 1995) and no path regularization."""
     rules = PathRules()
     rules.samples = samples
     rules.bounces = render.bounces
@@ -27,7 +27,7 @@ def make_path_rules(render: Render, seed: int, samples: int, roulette: int) -> A
 
 
 class ReferenceRenderer:
-    """Renders linear radiance by path tracing; `shade` only launches."""
+    """Path tracer for reference images in linear radiance. `shade` only launches kernels."""
 
     def __init__(self, render: Render, seed: int, scene: RenderScene) -> None:
         """
