@@ -17,6 +17,7 @@ from synpick_warp.configs.schema import Physics as PhysicsConfig
 from synpick_warp.configs.splits import plan_episodes
 from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
+from synpick_warp.stages.sim.broad_phase import replace_broad_phase
 from synpick_warp.stages.sim.fused_solver import KNOWN_NEWTON, choose_solver
 
 # Sentinel: default of `next` for an exhausted iterator.
@@ -259,7 +260,10 @@ def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.Collisi
         shape_pairs_max=physics.pairs_per_world * model.world_count,
         verify_buffers=False,
     )
-    if model.device.is_cuda and newton.__version__ == KNOWN_NEWTON:
+    if newton.__version__ != KNOWN_NEWTON:
+        return pipeline
+    replace_broad_phase(pipeline)
+    if model.device.is_cuda:
         narrow_phase = pipeline.narrow_phase
         narrow_phase.split_convex_block_dim = NARROW_PHASE_BLOCK
         blocks = max(NARROW_PHASE_BLOCKS * model.device.sm_count, model.world_count)

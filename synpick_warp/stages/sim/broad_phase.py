@@ -1,0 +1,119 @@
+"""Broad phase of collision detection for worlds of many empty slots, in place of Newton's."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import newton
+import numpy as np
+import warp as wp
+
+from synpick_warp.kernels.sim import broad_phase
+
+BLOCK = 128
+"""Threads per world that list overlapping bounding boxes; on a CPU one."""
+SEPARATION_THREADS = 128
+"""Threads per world that test separating axes, of some 130 pairs."""
+EMPTY = 1.0
+"""Bound of empty bounding boxes: their lower corner is at +EMPTY, their upper one at -EMPTY [m]."""
+
+
+class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
+    """Newton's broad phase over all pairs, without empty shapes and without pairs that a cached separating axis keeps apart.
+
+    The contacts are the same: a pair is left out only if its shapes are farther apart than their contact margins. Newton's broad phase is
+    asked once which pairs may collide at all. Only for models of identical worlds; see `replace_broad_phase`.
+    """
+
+    def __init__(self, pipeline: newton.CollisionPipeline) -> None:
+        model, device = pipeline.model, pipeline.device
+        worlds = model.world_count
+        shapes = broad_phase.ShapeData()
+        shapes.count = model.shape_count // worlds
+        shapes.box, shapes.hull = int(newton.GeoType.BOX), int(newton.GeoType.CONVEX_MESH)
+        shapes.kind, shapes.mesh, shapes.gap = model.shape_type, model.shape_source_ptr, model.shape_gap
+        shapes.collides = wp.array(find_colliding(pipeline, shapes.count), dtype=wp.uint8, device=device)
+        self._shapes, self._pipeline = shapes, pipeline
+        self._occupied = wp.zeros((worlds, shapes.count), dtype=wp.int32, device=device)
+        self._occupied_count = wp.zeros(worlds, dtype=wp.int32, device=device)
+        self._overlaps = wp.zeros(pipeline.broad_phase_shape_pairs.shape[0], dtype=wp.vec2i, device=device)
+        self._overlap_count = wp.zeros(1, dtype=wp.int32, device=device)
+        self._axes = wp.zeros((worlds, shapes.count * (shapes.count - 1) // 2), dtype=wp.uint32, device=device)
+
+    def launch(self, shape_lower: wp.array, shape_upper: wp.array, *arguments: Any, **options: Any) -> None:
+        """List the pairs that may have contacts in the pipeline's list, whose count is zero. Arguments as Newton passes them."""
+        pipeline, shapes = self._pipeline, self._shapes
+        device, worlds = pipeline.device, self._occupied.shape[0]
+        self._overlap_count.zero_()
+        wp.launch_tiled(
+            broad_phase.list_overlaps_kernel,
+            dim=[worlds],
+            inputs=[shapes, shape_lower, shape_upper],
+            outputs=[self._occupied, self._occupied_count, self._overlaps, self._overlap_count],
+            block_dim=BLOCK,
+            device=device,
+        )
+        threads = worlds * SEPARATION_THREADS if device.is_cuda else 1
+        wp.launch(
+            broad_phase.reject_separated_kernel,
+            dim=threads,
+            inputs=[
+                shapes,
+                threads,
+                self._axes,
+                pipeline.geom_transform,
+                pipeline.geom_data,
+                shape_lower,
+                shape_upper,
+                self._overlaps,
+                self._overlap_count,
+            ],
+            outputs=[pipeline.broad_phase_shape_pairs, pipeline.broad_phase_pair_count],
+            device=device,
+        )
+
+
+def replace_broad_phase(pipeline: newton.CollisionPipeline) -> None:
+    """Give a pipeline of identical worlds the broad phase above; another pipeline keeps Newton's."""
+    model = pipeline.model
+    worlds = model.shape_world.numpy()
+    identical = model.world_count > 0 and np.array_equal(worlds, np.repeat(np.arange(model.world_count), len(worlds) // model.world_count))
+    if identical and isinstance(pipeline.broad_phase, newton.geometry.BroadPhaseAllPairs):
+        pipeline.broad_phase = SeparatingBroadPhase(pipeline)
+
+
+def find_colliding(pipeline: newton.CollisionPipeline, count: int) -> np.ndarray:
+    """Collision filter of a world, for a lower and a higher index of its shapes (shape, shape) bool: True if the pair may collide.
+
+    Found by a run of Newton's broad phase on bounding boxes that all overlap in the first world, and are empty in the others.
+
+    Args:
+        pipeline: The pipeline, with Newton's broad phase.
+        count: Shapes of a world.
+    """
+    model, newtons = pipeline.model, cast(newton.geometry.BroadPhaseAllPairs, pipeline.broad_phase)
+    corner = np.full((model.shape_count, 3), EMPTY, np.float32)
+    corner[:count] = -EMPTY
+    lower, upper = (wp.array(corners, dtype=wp.vec3, device=pipeline.device) for corners in (corner, -corner))
+    pairs = wp.zeros(count * (count - 1) // 2, dtype=wp.vec2i, device=pipeline.device)
+    found = wp.zeros(1, dtype=wp.int32, device=pipeline.device)
+    newtons.launch(
+        lower,
+        upper,
+        None,
+        model.shape_collision_group,
+        model.shape_world,
+        model.shape_count,
+        pairs,
+        found,
+        shape_body=model.shape_body,
+        body_flags=model.body_flags,
+        include_static_kinematic_pairs=pipeline.include_static_kinematic_pairs,
+        device=pipeline.device,
+        filter_pairs=pipeline.shape_pairs_excluded,
+        num_filter_pairs=pipeline.shape_pairs_excluded_count,
+    )
+    listed = pairs.numpy()[: int(found.numpy()[0])]
+    colliding = np.zeros((count, count), bool)
+    colliding[tuple(listed.T)] = True
+    return colliding

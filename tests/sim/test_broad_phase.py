@@ -1,0 +1,182 @@
+"""Broad phase: the same contacts as with Newton's, from fewer pairs."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from synpick_warp.codes import Phase
+from synpick_warp.configs.schema import Config
+from synpick_warp.kernels.sim import broad_phase as kernels
+from synpick_warp.scenes import build
+from synpick_warp.stages.sim import broad_phase, physics
+from synpick_warp.stages.sim.simulate import Simulation
+from tests.worlds.small_worlds import CUBE, catalog, settings
+
+WORLDS, FRAMES, STEPS = 3, 4, 6
+TICKS = 30
+ARRAYS = ("shape0", "shape1", "point0", "point1", "normal")
+"""Arrays of contacts that are compared."""
+
+
+@wp.kernel
+def _pack_kernel(direction: wp.array[wp.vec3], packed: wp.array[wp.uint32], unpacked: wp.array[wp.vec3]):
+    index = wp.tid()
+    packed[index] = kernels.pack_direction(direction[index])
+    unpacked[index] = kernels.unpack_direction(packed[index])
+
+
+@given(st.lists(st.tuples(*[st.floats(-1.0, 1.0, width=32)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3), min_size=1, max_size=20))
+def test_packed_directions_are_right_to_16_bits(vectors):
+    directions = np.concatenate((vectors, np.vstack((np.eye(3), -np.eye(3)))))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    packed, unpacked = wp.zeros(len(directions), dtype=wp.uint32, device="cpu"), wp.zeros(len(directions), dtype=wp.vec3, device="cpu")
+    given_directions = wp.array(directions, dtype=wp.vec3, device="cpu")
+    wp.launch(_pack_kernel, dim=len(directions), inputs=[given_directions], outputs=[packed, unpacked], device="cpu")
+    assert (packed.numpy() != 0).all()
+    np.testing.assert_allclose(unpacked.numpy(), directions, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(unpacked.numpy(), axis=1), 1.0, atol=1e-6)
+
+
+def make_model(config: Config, device: wp.Device) -> build.BuiltModel:
+    """Worlds with boxes, cubes and angles, one in each slot."""
+    built = build.build_model(config, catalog(), device)
+    slots = built.layout.single_slots + built.layout.compound_slots
+    variant = np.full((config.bake.worlds, built.layout.bodies_per_world), -1, np.int32)
+    entries = [slot % 2 for slot in range(built.layout.single_slots)] + [2] * built.layout.compound_slots
+    variant[:, build.GRIPPER_BODIES : build.GRIPPER_BODIES + slots] = built.variant[entries]
+    built.model.select_body_variants(wp.array(variant.reshape(-1), dtype=wp.int32, device=device))
+    return built
+
+
+def make_newton_pipeline(monkeypatch: pytest.MonkeyPatch, config: Config, model: newton.Model) -> newton.CollisionPipeline:
+    """A pipeline with Newton's broad phase."""
+    with monkeypatch.context() as patch:
+        patch.setattr(physics, "KNOWN_NEWTON", "another")
+        pipeline = physics.make_pipeline(config.physics, model)
+    assert type(pipeline.broad_phase) is newton.geometry.BroadPhaseAllPairs
+    return pipeline
+
+
+def read_contacts(contacts: newton.Contacts) -> list[np.ndarray]:
+    """Sorted contacts, as the solver reads them."""
+    count = int(contacts.rigid_contact_count.numpy()[0])
+    return [getattr(contacts, f"rigid_contact_{name}").numpy()[:count] for name in ARRAYS]
+
+
+def test_contacts_of_moving_and_jumping_bodies_are_those_of_newton(device, monkeypatch):
+    """Bodies jump to random poses in the tote and then move by millimeters, so that cached axes are wrong, right and in between."""
+    config = settings(bake__worlds=WORLDS, arrangement__max_objects=6)
+    model = make_model(config, device).model
+    reference, found = make_newton_pipeline(monkeypatch, config, model), physics.make_pipeline(config.physics, model)
+    assert type(found.broad_phase) is broad_phase.SeparatingBroadPhase
+    known, ours = reference.contacts(), found.contacts()
+    state, random = model.state(), np.random.default_rng(3)
+    contacts, pairs = 0, np.zeros(2, int)
+    for _ in range(FRAMES):
+        poses = np.concatenate(
+            (random.uniform((-0.15, -0.1, 0.0), (0.15, 0.1, 0.12), (model.body_count, 3)), np.zeros((model.body_count, 4))), 1
+        )
+        poses[:, 3:] = random.normal(size=(model.body_count, 4))
+        for _ in range(STEPS):
+            poses += random.normal(scale=1e-3, size=poses.shape)
+            poses[:, 3:] /= np.linalg.norm(poses[:, 3:], axis=1, keepdims=True)
+            state.body_q.assign(poses.astype(np.float32))
+            reference.collide(state, known)
+            found.collide(state, ours)
+            for expected, value in zip(read_contacts(known), read_contacts(ours), strict=True):
+                np.testing.assert_array_equal(value, expected)
+            contacts += int(known.rigid_contact_count.numpy()[0])
+            pairs += [int(pipeline.broad_phase_pair_count.numpy()[0]) for pipeline in (reference, found)]
+    assert contacts > 100
+    assert pairs[1] < 0.8 * pairs[0]
+
+
+def test_piles_move_as_with_the_broad_phase_of_newton(device, monkeypatch):
+    """Piles fall, rest and are stirred, bit by bit the same; at rest most pairs without contacts are rejected."""
+    worlds = 8 if device.is_cuda else 2
+    config = settings(bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__deterministic=True)
+    found, phases, simulations = [], set(), []
+    for version in (physics.KNOWN_NEWTON, "another"):
+        monkeypatch.setattr(physics, "KNOWN_NEWTON", version)
+        simulation = Simulation(config, catalog(), 2, device)
+        simulations.append(simulation)
+        poses = []
+        for _ in range(TICKS):
+            simulation.tick()
+            poses.append(simulation.physics.state.joint_q.numpy())
+            phases |= set(simulation.state.phase.numpy().tolist())
+        found.append(poses)
+    np.testing.assert_array_equal(*found)
+    assert Phase.ACT in phases
+    ours, newtons = (int(simulation.physics.pipeline.broad_phase_pair_count.numpy()[0]) for simulation in simulations)
+    contacts = read_contacts(simulations[0].physics.contacts)
+    touching = len(set(zip(*(shapes.tolist() for shapes in contacts[:2]), strict=True)))
+    assert touching <= ours
+    assert ours - touching <= 0.5 * (newtons - touching)
+
+
+@pytest.mark.parametrize(("gap", "kept"), [(1e-3, True), (5e-3, False)])
+def test_boxes_with_overlapping_bounds_are_rejected_beyond_their_contact_margins(device, gap, kept):
+    """Two cubes, turned by 45 degrees about z, have parallel sides `gap` apart; all other bodies are far away."""
+    built = build.build_model(settings(bake__worlds=1, arrangement__max_objects=2), catalog(CUBE), device)
+    cubes = np.arange(build.GRIPPER_BODIES, build.GRIPPER_BODIES + 2)
+    variant = np.full(built.model.body_count, -1, np.int32)
+    variant[cubes] = built.variant[0]
+    built.model.select_body_variants(wp.array(variant, dtype=wp.int32, device=device))
+    poses = np.zeros((len(variant), 7), np.float32)
+    poses[:, :3] = 10.0 * np.arange(1, len(poses) + 1)[:, None]
+    poses[:, 6] = 1.0
+    normal = np.array([1.0, 1.0, 0.0]) / np.sqrt(2.0)
+    for body, distance in zip(cubes, (0.0, CUBE[0][0] + gap), strict=True):
+        poses[body] = (*(5.0 + distance * normal), 0.0, 0.0, np.sin(np.pi / 8), np.cos(np.pi / 8))
+    state = built.model.state()
+    state.body_q.assign(poses)
+    pipeline = physics.make_pipeline(settings().physics, built.model)
+    pipeline.collide(state, pipeline.contacts())
+    assert int(pipeline.broad_phase._overlap_count.numpy()[0]) == 1  # pyright: ignore[reportAttributeAccessIssue]
+    assert int(pipeline.broad_phase_pair_count.numpy()[0]) == int(kept)
+
+
+def test_pairs_that_may_collide_are_those_of_newton(device, monkeypatch):
+    """Shapes of a body, and static ones among themselves, are left out; all others of a world may collide."""
+    config = settings(bake__worlds=WORLDS, arrangement__max_objects=3)
+    model = make_model(config, device).model
+    count = model.shape_count // WORLDS
+    colliding = broad_phase.find_colliding(make_newton_pipeline(monkeypatch, config, model), count)
+    body = model.shape_body.numpy()[:count]
+    lower, higher = np.triu_indices(count, 1)
+    expected = np.zeros_like(colliding)
+    expected[lower, higher] = (body[lower] != body[higher]) & ((body[lower] >= 0) | (body[higher] >= 0))
+    wrong = np.argwhere(expected != colliding)
+    excluded = {tuple(pair) for pair in np.sort(np.array(sorted(model.shape_collision_filter_pairs)), axis=1) if max(pair) < count}
+    assert {tuple(pair) for pair in wrong} <= excluded
+    assert colliding.sum() > 0.5 * len(lower)
+
+
+def test_a_lost_pair_shows_in_the_count(device):
+    """Overlaps beyond the capacity make the count of pairs exceed it, which `flag_lost_pairs` reads."""
+    config = settings(bake__worlds=1, arrangement__max_objects=6, physics__pairs_per_world=16)
+    model = make_model(config, device).model
+    pipeline, state = physics.make_pipeline(config.physics, model), model.state()
+    poses = np.zeros((model.body_count, 7), np.float32)
+    poses[:, 6] = 1.0
+    poses[:, 2] = 10.0
+    state.body_q.assign(poses)
+    pipeline.collide(state, pipeline.contacts())
+    assert int(pipeline.broad_phase_pair_count.numpy()[0]) > pipeline.broad_phase_shape_pairs.shape[0] == 16
+
+
+def test_worlds_that_differ_keep_the_broad_phase_of_newton():
+    for worlds in ([0, 0, 1], [-1, 0, 1], [1, 0]):
+        newtons = object.__new__(newton.geometry.BroadPhaseAllPairs)
+        model = SimpleNamespace(shape_world=wp.array(worlds, dtype=wp.int32, device="cpu"), world_count=2)
+        pipeline = SimpleNamespace(model=model, broad_phase=newtons)
+        broad_phase.replace_broad_phase(pipeline)  # pyright: ignore[reportArgumentType]
+        assert pipeline.broad_phase is newtons
