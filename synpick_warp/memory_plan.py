@@ -18,7 +18,7 @@ from synpick_warp.arrays import memory_table
 from synpick_warp.configs.check import format_value
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.modes import may_pick
-from synpick_warp.configs.schema import FAST, Config
+from synpick_warp.configs.schema import REFERENCE, Config
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.exporters.registry import load_exporter_classes, slot_bytes
 from synpick_warp.scenes import build
@@ -276,7 +276,7 @@ def _images(config: Config, device: wp.Device, written: bool = True) -> Iterator
         groups += [(BODY_MOTIONS, views, 1)]
     if has_lens_filter(config.effects):
         groups += [(LensArrays, views, 1)]
-    if config.render.mode == FAST:
+    if config.render.mode != REFERENCE:
         histories = config.bake.worlds * len(config.cameras.positions)
         scratch = views | scratch_sizes(config.render, width, height, histories)
         groups += [(kind, scratch, copies) for kind, copies in DENOISED_SCRATCH]

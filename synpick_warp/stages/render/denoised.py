@@ -1,4 +1,7 @@
-"""Denoised renderer: coarse path pass, variance-guided denoiser, sun shadows, deferred shading and anti-aliasing."""
+"""Denoised renderer: coarse path pass, variance-guided denoiser, sun shadows, deferred shading and anti-aliasing.
+
+Mode direct leaves out the first two: its environment light is unoccluded, without ambient occlusion and indirect light.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
-from synpick_warp.configs.schema import Render
+from synpick_warp.configs.schema import DIRECT, Render
 from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, find_footprints_kernel, resolve_footprints_kernel
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, reuse_histories_kernel, trace_coarse_paths_kernel
@@ -93,6 +96,11 @@ def coarse_size(render: Render, width: int, histories: int = 0) -> int:
     return render.coarse_pixel or max(1, width // columns)
 
 
+def accumulates(render: Render, histories: int) -> bool:
+    """Whether light is averaged over frames; `histories` as in `DenoisedRenderer`."""
+    return bool(histories and render.history) and render.mode != DIRECT
+
+
 def paths_per_coarse_pixel(render: Render, width: int, histories: int = 0) -> int:
     """Number of paths per coarse pixel in images of `width` px: 1 if coarse pixels are narrower because of histories."""
     size = coarse_size(render, width, histories)
@@ -105,11 +113,11 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
     size = coarse_size(render, width, histories)
     shadow = max(1, size // 2)
     chunks = -(-footprint_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
-    columns, rows = -(-width // size), -(-height // size)
+    columns, rows = (0, 0) if render.mode == DIRECT else (-(-width // size), -(-height // size))
     return {
         "cell_row": rows,
         "cell_column": columns,
-        "region": interleaved_threads(columns, rows) // int(REGION_PIXELS) if histories and render.history else 0,
+        "region": interleaved_threads(columns, rows) // int(REGION_PIXELS) if accumulates(render, histories) else 0,
         "rank": int(REGION_PIXELS),
         "path_kind": 2,
         "shadow_row": -(-height // shadow),
@@ -121,7 +129,7 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
 
 def history_sizes(render: Render, width: int, height: int, histories: int) -> dict[str, int]:
     """Extents of the dimensions of `LIGHT_HISTORY`, for `histories` worlds times cameras with images of `width` x `height` px."""
-    return scratch_sizes(render, width, height, histories) | {"world_camera": histories if render.history else 0}
+    return scratch_sizes(render, width, height, histories) | {"world_camera": histories if accumulates(render, histories) else 0}
 
 
 def build_coarse_grid(image: Any, size: int, window: int) -> Any:
@@ -152,7 +160,7 @@ class DenoisedRenderer:
         """Allocate scratch.
 
         Args:
-            render: Render settings: `coarse_pixel`, `coarse_paths`, `bounces`, `history` and `antialias`.
+            render: Render settings: `mode` fast or direct, `coarse_pixel`, `coarse_paths`, `bounces`, `history` and `antialias`.
             seed: Seed of the data set.
             scene: Constant data.
             instances: Instance capacity of a world.
@@ -162,14 +170,17 @@ class DenoisedRenderer:
         size = coarse_size(render, scene.width, histories)
         sizes = {"view": views} | scratch_sizes(render, scene.width, scene.height, histories)
         self.scene = scene
+        self.traces_paths = render.mode != DIRECT
         self.coarse = build_coarse_grid(scene.grid, size, 1)
+        if not self.traces_paths:
+            self.coarse.size = 0  # Shading finds no coarse pixels.
         self.shadow_grid = build_coarse_grid(scene.grid, max(1, size // 2), SHADOW_WINDOW)
         self.rules = make_path_rules(render, seed, paths_per_coarse_pixel(render, scene.width, histories), ROULETTE)
         self.rules.min_roughness = MIN_ROUGHNESS
         self.firefly_clamp = FIREFLY_CLAMP
         self.variance_scale = SINGLE_PATH_VARIANCE_SCALE if self.rules.samples == 1 else 1.0
         self.history = allocate_struct(LIGHT_HISTORY, history_sizes(render, scene.width, scene.height, histories), scene.device)
-        self.history.cameras, self.history.max_paths = scene.camera_count, render.history if histories else 0
+        self.history.cameras, self.history.max_paths = scene.camera_count, render.history if accumulates(render, histories) else 0
         self.history.frame.fill_(int(NEVER))
         self.moving = allocate_struct(MOVING_BODIES, {"view": views, "body": instances + len(FIXTURES)}, scene.device)
         self.guide = allocate_struct(GUIDE, sizes, scene.device)
@@ -192,11 +203,12 @@ class DenoisedRenderer:
             image: The struct `ShadedImage`; written.
         """
         device = self.scene.device
-        with scope("trace coarse paths", device):
-            self.find_moving_bodies(snapshot, views)
-            self.trace_coarse_paths(snapshot, bodies, gbuffer, views)
-        with scope("denoise", device):
-            self.denoise(views)
+        if self.traces_paths:
+            with scope("trace coarse paths", device):
+                self.find_moving_bodies(snapshot, views)
+                self.trace_coarse_paths(snapshot, bodies, gbuffer, views)
+            with scope("denoise", device):
+                self.denoise(views)
         with scope("sun shadows", device):
             self.trace_shadows(snapshot, bodies, gbuffer, views)
         with scope("shade pixels", device):

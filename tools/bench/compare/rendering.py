@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 import numpy as np
 import warp as wp
 
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import DIRECT, Config
 from synpick_warp.factory.assembly import Factory, make_renderer
 from synpick_warp.scenes.cameras import make_cameras
 from synpick_warp.scenes.fixtures import make_fixtures
@@ -66,7 +66,12 @@ def _measure_size(config: Config, factory: Factory, worlds: int, min_seconds: fl
     context = theirs.make_context(color=True)
     seconds = time_view(functools.partial(ours.render)), time_view(functools.partial(theirs.render, context))
     everything = "color by light maps with indirect light and anti-aliasing, depth, ids, amodal bits, counts, boxes"
-    yield from _pair(size, pixels, everything, "color by one light with shadows, depth, ids", seconds)
+    theirs_colored = "color by one light with shadows, depth, ids"
+    yield from _pair(size, pixels, everything, theirs_colored, seconds)
+    direct = OurViews(replace(config, render=replace(config.render, mode=DIRECT)), factory, cameras, snapshot, worlds)
+    seconds = time_view(functools.partial(direct.render)), seconds[1]
+    unblocked = "render.mode=direct: color by light maps with sun shadows and anti-aliasing, depth, ids, amodal bits, counts, boxes"
+    yield from _pair(size, pixels, unblocked, theirs_colored, seconds)
 
 
 def _pair(size: str, pixels: int, ours: str, theirs: str, seconds: tuple[float, float]) -> Iterator[Row]:

@@ -1,0 +1,68 @@
+"""Mode direct: environment light that nothing blocks, and sun shadows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from synpick_warp.configs.schema import DIRECT, FAST, REFERENCE
+from synpick_warp.stages.render.denoised import history_sizes, scratch_sizes
+from tests.render.lighting.test_denoised import HALF, WHITE, clutter, lamp, psnr, render_objects, settings, surface
+from tests.worlds.toy_scene import UPRIGHT, ball, box, camera, even_light, sheet
+
+SKY = 0.3
+
+
+@pytest.mark.parametrize(("metallic", "roughness"), [(0.0, 0.7), (1.0, 0.25), (1.0, 1.0)])
+def test_white_furnace(device, metallic, roughness):
+    view = camera(128, 96, 500.0, (0.0, 0.0, 2.0))
+    objects = (ball(0.1, 4), surface(WHITE, metallic, roughness))
+    picture = render_objects(device, objects, lights=(even_light(2.0),), view=view, config=settings(DIRECT))
+    np.testing.assert_allclose(picture.radiance[0][picture.instance[0] == 1].mean(axis=0), 2.0, rtol=0.01)
+
+
+def test_walls_do_not_darken_a_floor(device):
+    """The floor between two high walls has the radiance of an open one; in mode fast it is darker."""
+    floor = (sheet(0.6, 0.5), surface(HALF))
+    walls = [(box(0.02, 0.4, 0.3), surface((0.1,) * 3), (x, 0.0, 0.15, *UPRIGHT)) for x in (-0.1, 0.1)]
+    view = camera(64, 48, 600.0, (0.0, 0.0, 2.0))
+    direct, alone, fast = (
+        picture.radiance[0][picture.instance[0] == 1].mean()
+        for picture in (
+            render_objects(device, floor, *walls, view=view, config=settings(DIRECT)),
+            render_objects(device, floor, view=view, config=settings(DIRECT)),
+            render_objects(device, floor, *walls, view=view, config=settings(FAST, coarse_paths=16)),
+        )
+    )
+    np.testing.assert_allclose(direct, alone, rtol=1e-5)
+    assert fast < 0.8 * direct
+
+
+def test_sunlight_and_shadows_are_those_of_the_reference(device):
+    """Under a lamp without sky, and one bounce: a box on a plane and its shadow."""
+    light = lamp(0.7, np.radians(1.5), 300.0)
+    objects = [(sheet(0.6, 0.5), surface(HALF)), (box(0.1, 0.1, 0.1), surface(HALF), (0.0, 0.0, 0.05, *UPRIGHT))]
+    direct, reference = (
+        render_objects(device, *objects, lights=(light,), config=config).radiance[0]
+        for config in (settings(DIRECT), settings(REFERENCE, samples=64, bounces=1))
+    )
+    shadow = reference.mean(axis=2) < 0.2 * np.median(reference)
+    assert 0.01 < shadow.mean() < 0.3
+    assert psnr(direct, reference) > 30.0
+
+
+def test_annotations_are_those_of_the_other_modes(device):
+    view = camera(160, 120, 300.0, (0.0, 0.0, 1.0))
+    direct, fast = (render_objects(device, *clutter(), view=view, config=settings(mode)) for mode in (DIRECT, FAST))
+    for name in ("depth", "instance", "amodal", "pixels", "boxes"):
+        np.testing.assert_array_equal(getattr(direct, name), getattr(fast, name))
+    assert psnr(direct.radiance, fast.radiance) > 20.0
+
+
+def test_no_memory_for_paths_and_histories():
+    direct, fast = (settings(mode).render for mode in (DIRECT, FAST))
+    of_direct, of_fast = (scratch_sizes(render, 1920, 1080, 12) for render in (direct, fast))
+    assert {key for key, size in of_direct.items() if size != of_fast[key]} == {"cell_row", "cell_column", "region"}
+    assert of_direct["cell_row"] == of_direct["cell_column"] == of_direct["region"] == 0
+    assert history_sizes(direct, 1920, 1080, 12)["world_camera"] == 0
+    assert history_sizes(fast, 1920, 1080, 12)["world_camera"] == 12
