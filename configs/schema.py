@@ -22,8 +22,8 @@ CYCLE = "cycle"
 """Round robin: episode i has the mode MODES[i % 3], so every three episodes in a row have one of each."""
 FAST = "fast"
 REFERENCE = "reference"
-DIRECT = "direct"
-RENDER_MODES = (FAST, REFERENCE, DIRECT)
+UNOCCLUDED = "unoccluded"
+RENDER_MODES = (FAST, REFERENCE, UNOCCLUDED)
 """Colour renderers."""
 LAYERS = tuple(LAYER_TABLE)
 """Annotation layers (AOVs) that a view can have besides colour, depth and masks; see `synpick_warp.layers`."""
@@ -242,8 +242,8 @@ class Render:
     mode: str = setting(
         FAST,
         "",
-        "Colour renderer: fast (few paths per coarse pixel, denoised), reference (path tracing, slow) or direct (environment light as if "
-        "nothing blocked it, and sun shadows: for small images of many worlds); depth and masks are equal.",
+        "Colour renderer: fast (few paths per coarse pixel, denoised), reference (path tracing, slow) or unoccluded "
+        "(unoccluded environment light and sun shadows: for small images of many worlds); depth and masks are equal.",
         choices=RENDER_MODES,
     )
     samples: int = setting(64, "", "Mode reference: paths per pixel; powers of two are stratified best.", low=1, high=65536)
@@ -260,7 +260,8 @@ class Render:
     coarse_pixel: int = setting(
         0,
         "px",
-        "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history`.",
+        "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history`. "
+        "Modes fast and unoccluded: a sun shadow ray is traced every half of it.",
         low=0,
         high=64,
     )
@@ -278,7 +279,7 @@ class Render:
         low=0,
         high=255,
     )
-    antialias: bool = setting(True, "", "Modes fast and direct: anti-alias the edges of surfaces; mode reference always does.")
+    antialias: bool = setting(True, "", "Modes fast and unoccluded: anti-alias the edges of surfaces; mode reference always does.")
     tone: str = setting(
         "shoulder",
         "",

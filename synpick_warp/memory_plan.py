@@ -56,7 +56,7 @@ EPISODE_BYTES = 100
 # worlds, 150 MB, are within the headroom. Contacts and pairs have at least those of `newton.Contacts` and their sorter.
 _NEWTON = (
     ("Newton's contacts", "contacts_per_world", 900, 250),
-    ("Newton's shape pairs", "pairs_per_world", 16, 8),
+    ("Newton's shape pairs", "pairs_per_world", 24, 16),
     ("Newton's contact rows", "rows_per_world", 160, 269),
     ("Newton's gripper rows", "gripper_rows_per_world", 640, 40),
 )

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from synpick_warp import memory_plan, pipeline
 from synpick_warp.configs.fields import INT32_MAX
 from synpick_warp.configs.load import load_config, sections, settings_of
-from synpick_warp.configs.schema import Config
+from synpick_warp.configs.schema import FAST, REFERENCE, UNOCCLUDED, Config
 from synpick_warp.errors import ConfigError, SynpickError
 from synpick_warp.factory import assembly
 from synpick_warp.memory_plan import check_memory, describe_memory, plan_memory
@@ -208,6 +208,15 @@ def test_the_plan_is_below_what_a_small_bake_allocates(device):
     assert physics.layout.worlds == 4
     planned = sum(term.size for term in plan_memory(config, wp.get_device("cpu")) if term.name.startswith("Newton"))
     assert sum(sizes) / 2 < planned <= sum(sizes)
+
+
+def test_without_paths_images_need_less():
+    """Mode unoccluded has G-buffer and shadows, but neither coarse pixels nor histories; mode reference has not even those."""
+    sizes = {}
+    for mode in (FAST, UNOCCLUDED, REFERENCE):
+        terms = plan_memory(settings(render__mode=mode), CPU)
+        sizes[mode] = sum(term.size for term in terms if "image" in term.name or "light" in term.name)
+    assert sizes[REFERENCE] < sizes[UNOCCLUDED] < sizes[FAST]
 
 
 def test_the_memory_table_has_the_terms_of_the_plan():

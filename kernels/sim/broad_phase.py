@@ -35,7 +35,7 @@ class ShapeData:
     mesh: wp.array[wp.uint64]
     """Mesh of a hull."""
     gap: wp.array[float]
-    """Contact margin outside the shape's surface: two shapes have contacts up to the sum of theirs [m]."""
+    """Contact gap: two shapes have contacts up to the sum of their gaps and margins [m]."""
     collides: wp.array2d[wp.uint8]
     """1: the pair may collide, for a lower and a higher index of shapes in a world."""
 
@@ -84,7 +84,7 @@ def list_overlaps_kernel(
     pair_out: wp.array[wp.vec2i],  # (overlap)
     pair_count_inout: wp.array[int],  # (1)
 ):
-    """List the pairs of each world whose bounding boxes, enlarged by the contact margins, overlap: a block of threads per world.
+    """List the pairs of each world whose bounding boxes, enlarged by gaps and margins, overlap: a block of threads per world.
 
     The block first lists the shapes that are not empty, and then tests pairs of these. The order of pairs is arbitrary.
     """
@@ -187,7 +187,7 @@ def reject_separated_kernel(
     axis_inout: wp.array2d[wp.uint32],  # (world, pair of shapes)
     # In:
     pose: wp.array[wp.transform],  # (shape) [m]
-    geometry: wp.array[wp.vec4],  # (shape) [m]: scale of a hull or half the sides of a box, and thickness of its margin
+    geometry: wp.array[wp.vec4],  # (shape) [m]: scale of a hull or half the sides of a box, and margin
     lower: wp.array[wp.vec3],  # (shape) [m]
     upper: wp.array[wp.vec3],  # (shape) [m]
     overlap: wp.array[wp.vec2i],  # (overlap)
@@ -196,18 +196,14 @@ def reject_separated_kernel(
     pair_out: wp.array[wp.vec2i],  # (pair)
     pair_count_inout: wp.array[int],  # (1)
 ):
-    """Copy the pairs of shapes that may have contacts: those that the cached axis does not separate by more than their contact margins.
+    """Copy the pairs of shapes that may have contacts: those that the cached axis does not separate by more than their gaps and margins.
 
     The axis of a pair is a unit vector in the frame of its first shape, kept from substep to substep: shapes that have moved little are
     still separated by it. The first one joins the centers of the bounding boxes; one that fails is improved for the next substep. Whatever
-    the axis, only pairs that can have no contact are rejected. A count of overlaps beyond the capacity is passed on, so that the loss
-    shows.
+    the axis, only pairs that can have no contact are rejected.
     """
     thread = wp.tid()
-    listed = wp.min(overlap_count[0], overlap.shape[0])
-    if thread == 0 and overlap_count[0] > listed:
-        wp.atomic_add(pair_count_inout, 0, overlap_count[0])
-    for index in range(thread, listed, threads):
+    for index in range(thread, wp.min(overlap_count[0], overlap.shape[0]), threads):
         a = overlap[index][0]
         b = overlap[index][1]
         world = a // shapes.count

@@ -185,13 +185,14 @@ def flag_lost_pairs_kernel(
     # Scene:
     capacity: int,
     # State:
+    overlap_count: wp.array[int],  # (one)
     pair_count: wp.array[int],  # (one)
     # Out:
     overflow_out: wp.array[wp.bool],  # (world)
 ):
-    """Flag all worlds if the broad phase found more shape pairs than its capacity: pairs of any world may be lost."""
+    """Flag all worlds if the broad phase found more overlaps or shape pairs than its capacity: pairs of any world may be lost."""
     world = wp.tid()
-    if pair_count[0] > capacity:
+    if wp.max(overlap_count[0], pair_count[0]) > capacity:
         overflow_out[world] = True
 
 

@@ -195,9 +195,11 @@ def test_splits_name_their_episodes():
 
 
 def held_by(stream) -> tuple[weakref.ref, ...]:
-    """What takes memory: worlds, renderer, ring."""
+    """What takes memory: worlds, their collision pipeline and model, renderer, ring."""
     producer = stream._batches.gi_frame.f_locals["producer"]
-    return tuple(weakref.ref(part) for part in (producer, producer.ring, producer.stages.simulation, producer.stages.renderer))
+    simulation = producer.stages.simulation
+    parts = (producer, producer.ring, simulation, simulation.physics.pipeline, simulation.physics.model, producer.stages.renderer)
+    return tuple(weakref.ref(part) for part in parts)
 
 
 @pytest.mark.parametrize("end", ["break", "error", "close", "before the first"])
@@ -206,7 +208,7 @@ def test_nothing_is_left_of_a_stream(end):
     gc.disable()
     try:
         refs = leave(end)
-        assert [ref() for ref in refs] == [None] * 4
+        assert [ref() for ref in refs] == [None] * len(refs)
     finally:
         gc.enable()
 
@@ -226,7 +228,7 @@ def test_worlds_are_freed_where_a_traceback_holds_the_frames(monkeypatch):
     gc.collect()
     gc.disable()
     try:
-        assert [ref() for ref in leave("break")] == [None] * 4
+        assert [ref() for ref in leave("break")] == [None] * 6
     finally:
         gc.enable()
 

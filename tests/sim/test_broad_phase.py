@@ -140,7 +140,7 @@ def test_boxes_with_overlapping_bounds_are_rejected_beyond_their_contact_margins
     state.body_q.assign(poses)
     pipeline = physics.make_pipeline(settings().physics, built.model)
     pipeline.collide(state, pipeline.contacts())
-    assert int(pipeline.broad_phase._overlap_count.numpy()[0]) == 1  # pyright: ignore[reportAttributeAccessIssue]
+    assert int(pipeline.broad_phase.overlap_count.numpy()[0]) == 1  # pyright: ignore[reportAttributeAccessIssue]
     assert int(pipeline.broad_phase_pair_count.numpy()[0]) == int(kept)
 
 
@@ -160,8 +160,8 @@ def test_pairs_that_may_collide_are_those_of_newton(device, monkeypatch):
     assert colliding.sum() > 0.5 * len(lower)
 
 
-def test_a_lost_pair_shows_in_the_count(device):
-    """Overlaps beyond the capacity make the count of pairs exceed it, which `flag_lost_pairs` reads."""
+def test_pairs_up_to_the_capacity_keep_their_contacts(device):
+    """Of the pairs of bodies in one place only those are lost for which there is no room, and the count of overlaps tells."""
     config = settings(bake__worlds=1, arrangement__max_objects=6, physics__pairs_per_world=16)
     model = make_model(config, device).model
     pipeline, state = physics.make_pipeline(config.physics, model), model.state()
@@ -169,14 +169,29 @@ def test_a_lost_pair_shows_in_the_count(device):
     poses[:, 6] = 1.0
     poses[:, 2] = 10.0
     state.body_q.assign(poses)
-    pipeline.collide(state, pipeline.contacts())
-    assert int(pipeline.broad_phase_pair_count.numpy()[0]) > pipeline.broad_phase_shape_pairs.shape[0] == 16
+    contacts = pipeline.contacts()
+    pipeline.collide(state, contacts)
+    assert int(pipeline.broad_phase.overlap_count.numpy()[0]) > 16  # pyright: ignore[reportAttributeAccessIssue]
+    assert int(pipeline.broad_phase_pair_count.numpy()[0]) == pipeline.broad_phase_shape_pairs.shape[0] == 16
+    touching = read_contacts(contacts)[:2]
+    assert len(set(zip(*(shapes.tolist() for shapes in touching), strict=True))) > 4
 
 
-def test_worlds_that_differ_keep_the_broad_phase_of_newton():
-    for worlds in ([0, 0, 1], [-1, 0, 1], [1, 0]):
-        newtons = object.__new__(newton.geometry.BroadPhaseAllPairs)
-        model = SimpleNamespace(shape_world=wp.array(worlds, dtype=wp.int32, device="cpu"), world_count=2)
-        pipeline = SimpleNamespace(model=model, broad_phase=newtons)
-        broad_phase.replace_broad_phase(pipeline)  # pyright: ignore[reportArgumentType]
-        assert pipeline.broad_phase is newtons
+@pytest.mark.parametrize(
+    ("world", "body", "group"),
+    [
+        ((0, 0, 1), (0, 1, 2), (1, 1, 1)),
+        ((-1, 0, 0, 1), (-1, 0, 1, 2), (1, 1, 1, 1)),
+        ((1, 0), (1, 0), (1, 1)),
+        ((0, 0, 1, 1), (0, 1, 2, 2), (1, 1, 1, 1)),
+        ((0, 0, 1, 1), (0, 1, 2, 3), (1, 1, 1, 2)),
+    ],
+)
+def test_worlds_that_differ_keep_the_broad_phase_of_newton(world, body, group):
+    model = SimpleNamespace(world_count=2, shape_count=len(world), body_count=4)
+    for name, values in (("shape_world", world), ("shape_body", body), ("shape_collision_group", group)):
+        setattr(model, name, wp.array(values, dtype=wp.int32, device="cpu"))
+    newtons = object.__new__(newton.geometry.BroadPhaseAllPairs)
+    pipeline = SimpleNamespace(model=model, broad_phase=newtons)
+    broad_phase.replace_broad_phase(pipeline)  # pyright: ignore[reportArgumentType]
+    assert pipeline.broad_phase is newtons

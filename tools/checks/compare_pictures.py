@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.table import Table
 
 from synpick_warp.arrays import allocate
-from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, Config
+from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, UNOCCLUDED, Config
 from synpick_warp.errors import SynpickError
 from synpick_warp.factory.assembly import make_renderer
 from synpick_warp.scenes.cameras import make_cameras
@@ -65,10 +65,10 @@ TOLERANCES = {
     "scene_flow": Tolerance(2e-5, 0.1, "m"),
     "depth_sensor": Tolerance(1.0, 0.5, "counts"),
 }
-"""Tolerances of all outputs but color, which are the same in both modes."""
+"""Tolerances of all outputs but color, which are the same in all modes."""
 TABLES = ("pixels", "boxes", "effects")
 """Outputs that are not images."""
-COLORS = {FAST: Tolerance(2.0, 1.0, "grey"), REFERENCE: Tolerance(4.0, 2.0, "grey")}
+COLORS = {FAST: Tolerance(2.0, 1.0, "grey"), UNOCCLUDED: Tolerance(2.0, 1.0, "grey"), REFERENCE: Tolerance(4.0, 2.0, "grey")}
 """Tolerances of color, by mode. Where rounding changes a sampled path, its pixel changes; denoising spreads that over neighbours."""
 
 
@@ -178,7 +178,7 @@ def compare_devices(config: Config, devices: list[Any], console: Console) -> lis
     cameras = make_cameras(config.cameras)
     fixtures = make_fixtures(config.tote, config.gripper)
     differences = []
-    for mode in (FAST, REFERENCE):
+    for mode in COLORS:
         mode_config = with_mode(config, mode)
         outputs = []
         for device in devices:

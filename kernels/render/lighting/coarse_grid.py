@@ -19,7 +19,7 @@ class CoarseGrid:
     """Grid of coarse pixels over an image; the pixel in the middle of each represents it."""
 
     size: int
-    """Width of a coarse pixel [px]."""
+    """Width of a coarse pixel [px]; 0 in mode unoccluded, which has none."""
     window: int
     """Width of the shadow filter [coarse pixels], a power of two. Any window of this width holds each of window² sample points once,
     so that the filtered noise shows no pattern."""

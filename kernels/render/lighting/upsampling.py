@@ -90,8 +90,8 @@ def upsampling_weight(record: RatioRecord, coarse: CoarseGrid, plane: Plane, row
 
 
 @wp.func
-def unblocked_ratios() -> Ratios:
-    """Visibility ratios of a surface that nothing shadows, without indirect light."""
+def unoccluded_ratios() -> Ratios:
+    """Visibility ratios of an unoccluded surface, without indirect light."""
     result = Ratios()
     result.diffuse = wp.vec3(1.0, 1.0, 1.0)
     result.specular = wp.vec3(1.0, 1.0, 1.0)
@@ -103,10 +103,10 @@ def upsample_ratios(ratios: RatioImages, coarse: CoarseGrid, view: int, row: int
     """Joint bilateral upsampling: visibility ratios at a pixel from those of the four nearest coarse pixels on its surface.
 
     If all four are on other surfaces, the ring around them is searched too, because light changes less along a surface than between
-    surfaces. `plane` is the pixel's tangent plane. A grid whose coarse pixels have size 0 holds none: nothing blocks the light.
+    surfaces. `plane` is the pixel's tangent plane. Without coarse pixels all light is unoccluded.
     """
     if coarse.size == 0:
-        return unblocked_ratios()
+        return unoccluded_ratios()
     y = coarse_coordinate(coarse, row)
     x = coarse_coordinate(coarse, column)
     top = int(wp.floor(y))
@@ -139,7 +139,7 @@ def upsample_ratios(ratios: RatioImages, coarse: CoarseGrid, view: int, row: int
                     total += 1.0
     if total <= 0.0:
         # Only background around the pixel.
-        return unblocked_ratios()
+        return unoccluded_ratios()
     scale = 1.0 / total
     result.diffuse *= scale
     result.specular *= scale

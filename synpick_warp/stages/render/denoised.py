@@ -1,6 +1,6 @@
 """Denoised renderer: coarse path pass, variance-guided denoiser, sun shadows, deferred shading and anti-aliasing.
 
-Mode direct leaves out the first two: its environment light is unoccluded, without ambient occlusion and indirect light.
+Mode unoccluded leaves out the first two: no ambient occlusion, no indirect light.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
-from synpick_warp.configs.schema import DIRECT, Render
+from synpick_warp.configs.schema import UNOCCLUDED, Render
 from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, find_footprints_kernel, resolve_footprints_kernel
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, reuse_histories_kernel, trace_coarse_paths_kernel
@@ -92,13 +92,13 @@ DENOISED_SCRATCH = ((GUIDE, 1), (PATH_LISTS, 1), (COARSE_LIGHT, 2), (RATIO_IMAGE
 
 def coarse_size(render: Render, width: int, histories: int = 0) -> int:
     """Width of a coarse pixel [px] in images of `width` px; `histories` as in `DenoisedRenderer`."""
-    columns = MIN_HISTORY_COLUMNS if histories and render.history else MIN_COARSE_COLUMNS
+    columns = MIN_HISTORY_COLUMNS if accumulates(render, histories) else MIN_COARSE_COLUMNS
     return render.coarse_pixel or max(1, width // columns)
 
 
 def accumulates(render: Render, histories: int) -> bool:
     """Whether light is averaged over frames; `histories` as in `DenoisedRenderer`."""
-    return bool(histories and render.history) and render.mode != DIRECT
+    return bool(histories and render.history) and render.mode != UNOCCLUDED
 
 
 def paths_per_coarse_pixel(render: Render, width: int, histories: int = 0) -> int:
@@ -113,7 +113,7 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
     size = coarse_size(render, width, histories)
     shadow = max(1, size // 2)
     chunks = -(-footprint_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
-    columns, rows = (0, 0) if render.mode == DIRECT else (-(-width // size), -(-height // size))
+    columns, rows = (0, 0) if render.mode == UNOCCLUDED else (-(-width // size), -(-height // size))
     return {
         "cell_row": rows,
         "cell_column": columns,
@@ -154,13 +154,14 @@ def interleaved_threads(columns: int, rows: int) -> int:
 
 
 class DenoisedRenderer:
-    """Renders linear radiance from few paths per coarse pixel and a denoiser. Owns its scratch; `shade` only launches."""
+    """Renders linear radiance from few paths per coarse pixel and a denoiser; in mode unoccluded from unoccluded light and sun shadows.
+    Owns its scratch; `shade` only launches."""
 
     def __init__(self, render: Render, seed: int, scene: RenderScene, instances: int, views: int, histories: int = 0) -> None:
         """Allocate scratch.
 
         Args:
-            render: Render settings: `mode` fast or direct, `coarse_pixel`, `coarse_paths`, `bounces`, `history` and `antialias`.
+            render: Render settings: `mode` fast or unoccluded, `coarse_pixel`, `coarse_paths`, `bounces`, `history` and `antialias`.
             seed: Seed of the data set.
             scene: Constant data.
             instances: Instance capacity of a world.
@@ -170,10 +171,10 @@ class DenoisedRenderer:
         size = coarse_size(render, scene.width, histories)
         sizes = {"view": views} | scratch_sizes(render, scene.width, scene.height, histories)
         self.scene = scene
-        self.traces_paths = render.mode != DIRECT
+        self.traces_paths = render.mode != UNOCCLUDED
         self.coarse = build_coarse_grid(scene.grid, size, 1)
         if not self.traces_paths:
-            self.coarse.size = 0  # Shading finds no coarse pixels.
+            self.coarse.size = 0
         self.shadow_grid = build_coarse_grid(scene.grid, max(1, size // 2), SHADOW_WINDOW)
         self.rules = make_path_rules(render, seed, paths_per_coarse_pixel(render, scene.width, histories), ROULETTE)
         self.rules.min_roughness = MIN_ROUGHNESS

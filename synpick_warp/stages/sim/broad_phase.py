@@ -21,11 +21,16 @@ EMPTY = 1.0
 class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
     """Newton's broad phase over all pairs, without empty shapes and without pairs that a cached separating axis keeps apart.
 
-    The contacts are the same: a pair is left out only if its shapes are farther apart than their contact margins. Newton's broad phase is
-    asked once which pairs may collide at all. Only for models of identical worlds; see `replace_broad_phase`.
+    The contacts are the same: a pair is left out only if its shapes are farther apart than their gaps and margins. Newton's broad phase is
+    asked once which pairs may collide at all; collision groups and body flags must not change later. Only for models of identical worlds;
+    see `replace_broad_phase`.
+
+    Attributes:
+        overlap_count: Number of pairs whose bounding boxes overlap (one) int32. Those beyond the capacity for pairs are lost.
     """
 
     def __init__(self, pipeline: newton.CollisionPipeline) -> None:
+        # The pipeline itself is not kept: a cycle of references would keep its arrays until a garbage collection.
         model, device = pipeline.model, pipeline.device
         worlds = model.world_count
         shapes = broad_phase.ShapeData()
@@ -33,53 +38,63 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
         shapes.box, shapes.hull = int(newton.GeoType.BOX), int(newton.GeoType.CONVEX_MESH)
         shapes.kind, shapes.mesh, shapes.gap = model.shape_type, model.shape_source_ptr, model.shape_gap
         shapes.collides = wp.array(find_colliding(pipeline, shapes.count), dtype=wp.uint8, device=device)
-        self._shapes, self._pipeline = shapes, pipeline
+        self._shapes, self._poses, self._geometry = shapes, pipeline.geom_transform, pipeline.geom_data
         self._occupied = wp.zeros((worlds, shapes.count), dtype=wp.int32, device=device)
         self._occupied_count = wp.zeros(worlds, dtype=wp.int32, device=device)
         self._overlaps = wp.zeros(pipeline.broad_phase_shape_pairs.shape[0], dtype=wp.vec2i, device=device)
-        self._overlap_count = wp.zeros(1, dtype=wp.int32, device=device)
+        self.overlap_count = wp.zeros(1, dtype=wp.int32, device=device)
         self._axes = wp.zeros((worlds, shapes.count * (shapes.count - 1) // 2), dtype=wp.uint32, device=device)
 
-    def launch(self, shape_lower: wp.array, shape_upper: wp.array, *arguments: Any, **options: Any) -> None:
-        """List the pairs that may have contacts in the pipeline's list, whose count is zero. Arguments as Newton passes them."""
-        pipeline, shapes = self._pipeline, self._shapes
-        device, worlds = pipeline.device, self._occupied.shape[0]
-        self._overlap_count.zero_()
+    def launch(  # pyright: ignore[reportIncompatibleMethodOverride]  # Newton passes further arguments by keyword.
+        self,
+        shape_lower: wp.array,
+        shape_upper: wp.array,
+        shape_gap: wp.array | None,
+        shape_collision_group: wp.array,
+        shape_world: wp.array,
+        shape_count: int,
+        candidate_pair: wp.array,
+        candidate_pair_count: wp.array,
+        **options: Any,
+    ) -> None:
+        """List the pairs that may have contacts; arguments as of Newton's method. The count must be zero, bounding boxes enlarged by the
+        shapes' gaps and margins."""
+        shapes, device, worlds = self._shapes, candidate_pair.device, self._occupied.shape[0]
+        self.overlap_count.zero_()
         wp.launch_tiled(
             broad_phase.list_overlaps_kernel,
             dim=[worlds],
             inputs=[shapes, shape_lower, shape_upper],
-            outputs=[self._occupied, self._occupied_count, self._overlaps, self._overlap_count],
-            block_dim=BLOCK,
+            outputs=[self._occupied, self._occupied_count, self._overlaps, self.overlap_count],
+            block_dim=BLOCK if device.is_cuda else 1,
             device=device,
         )
         threads = worlds * SEPARATION_THREADS if device.is_cuda else 1
+        inputs = [shapes, threads, self._axes, self._poses, self._geometry, shape_lower, shape_upper, self._overlaps, self.overlap_count]
         wp.launch(
             broad_phase.reject_separated_kernel,
             dim=threads,
-            inputs=[
-                shapes,
-                threads,
-                self._axes,
-                pipeline.geom_transform,
-                pipeline.geom_data,
-                shape_lower,
-                shape_upper,
-                self._overlaps,
-                self._overlap_count,
-            ],
-            outputs=[pipeline.broad_phase_shape_pairs, pipeline.broad_phase_pair_count],
+            inputs=inputs,
+            outputs=[candidate_pair, candidate_pair_count],
+            block_dim=BLOCK,
             device=device,
         )
 
 
 def replace_broad_phase(pipeline: newton.CollisionPipeline) -> None:
     """Give a pipeline of identical worlds the broad phase above; another pipeline keeps Newton's."""
-    model = pipeline.model
-    worlds = model.shape_world.numpy()
-    identical = model.world_count > 0 and np.array_equal(worlds, np.repeat(np.arange(model.world_count), len(worlds) // model.world_count))
-    if identical and isinstance(pipeline.broad_phase, newton.geometry.BroadPhaseAllPairs):
+    if isinstance(pipeline.broad_phase, newton.geometry.BroadPhaseAllPairs) and has_identical_worlds(pipeline.model):
         pipeline.broad_phase = SeparatingBroadPhase(pipeline)
+
+
+def has_identical_worlds(model: newton.Model) -> bool:
+    """Whether all shapes belong to worlds, in their order, and those of each world to the same bodies and collision groups."""
+    worlds = model.world_count
+    if not worlds or model.shape_count % worlds:
+        return False
+    world, body, group = (array.numpy().reshape(worlds, -1) for array in (model.shape_world, model.shape_body, model.shape_collision_group))
+    local = np.where(body < 0, -1, body - np.arange(worlds)[:, None] * (model.body_count // worlds))
+    return bool((world == np.arange(worlds)[:, None]).all() and (local == local[0]).all() and (group == group[0]).all())
 
 
 def find_colliding(pipeline: newton.CollisionPipeline, count: int) -> np.ndarray:

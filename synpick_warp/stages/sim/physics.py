@@ -203,10 +203,12 @@ class Physics:
 
     def flag_lost_pairs(self) -> None:
         """Flag worlds whose broad-phase pairs overflowed: Newton drops these pairs silently, while its solver flags contacts and rows."""
+        pairs, found = self.pipeline.broad_phase_shape_pairs, self.pipeline.broad_phase_pair_count
+        overlaps = getattr(self.pipeline.broad_phase, "overlap_count", found)
         wp.launch(
             rest.flag_lost_pairs_kernel,
             dim=self.layout.worlds,
-            inputs=[self.pipeline.broad_phase_shape_pairs.shape[0], self.pipeline.broad_phase_pair_count],
+            inputs=[pairs.shape[0], overlaps, found],
             outputs=[self.solver.constraint_overflow],
             device=self.device,
         )
