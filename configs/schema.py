@@ -268,7 +268,8 @@ class Render:
     coarse_paths: int = setting(
         0,
         "",
-        "Mode fast: paths per coarse pixel, best a power of two; 0: 2, or 1 with over 480 per row or where `history` narrows them.",
+        "Mode fast: paths per coarse pixel; 0: 2, or 1 with over 480 per row or where `history` narrows them, "
+        "16 in first frames of small images.",
         low=0,
         high=1024,
     )

@@ -18,6 +18,7 @@ from synpick_warp.stages.perception.plan import CYCLES, VoteArrays
 from synpick_warp.stages.render.annotate import BORDER_BOXES
 from synpick_warp.stages.render.denoised import (
     COARSE_LIGHT,
+    FIRST_FRAME_PATHS,
     GUIDE,
     LIGHT_HISTORY,
     MOVING_BODIES,
@@ -25,6 +26,7 @@ from synpick_warp.stages.render.denoised import (
     RATIO_IMAGES,
     FootprintLists,
     ShadowArrays,
+    first_frame_paths,
     paths_per_coarse_pixel,
     scratch_sizes,
 )
@@ -190,9 +192,18 @@ def test_histories_narrow_coarse_pixels(cell, width, histories, columns, paths):
     render = settings(render__coarse_pixel=cell).render
     assert scratch_sizes(render, width, 6, histories)["cell_column"] == columns
     assert paths_per_coarse_pixel(render, width, histories) == paths
+    first = FIRST_FRAME_PATHS if columns == width else paths
+    assert first_frame_paths(render, width, histories) == first
     # Without accumulation they are those of single views.
     alone = settings(render__coarse_pixel=cell, render__history=0).render
     assert scratch_sizes(alone, width, 6, histories) == scratch_sizes(render, width, 6)
+    assert first_frame_paths(alone, width, histories) == paths_per_coarse_pixel(render, width)
+
+
+def test_first_frames_trace_no_more_paths_than_a_history_counts():
+    assert first_frame_paths(settings(render__history=6).render, 320, 3) == 6
+    assert first_frame_paths(settings(render__coarse_paths=5).render, 320, 3) == 5
+    assert first_frame_paths(settings().render, 320) == 2
 
 
 def test_the_path_traced_reference_has_no_coarse_grid():

@@ -11,7 +11,7 @@ from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, clamp_index, in_image, tile_of, tile_pixel
-from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal
+from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, triangle_normal
 from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -42,6 +42,9 @@ MIN_CHANNEL = wp.constant(0.1)
 """Contrast is relative to a channel's value, but at least to this fraction of the brightest channel: dark channels are hardly visible."""
 DISTANCE_WEIGHT = wp.constant(0.1)
 """Cost of a source pixel per pixel of its distance to the sample, in units of plane distance [widths of a pixel]."""
+NORMAL_WEIGHT = wp.constant(1.0)
+"""Cost of a source pixel per unit of 1 - cosine of the angle between its normal and the sample's, in the same units. A pixel whose centre
+lies on a crease is on both planes: without this term it would be the source of samples on either side."""
 
 
 @wp.struct
@@ -254,11 +257,22 @@ def filter_body_mask(bodies: ViewBodies, view: int, tile: int, visible: wp.uint6
 
 @wp.func
 def select_source(
-    gbuffer: GBuffer, grid: ImageGrid, view: int, row: int, column: int, own: int, offset: wp.vec2, hit: Hit, plane: Plane
+    meshes: Meshes,
+    gbuffer: GBuffer,
+    grid: ImageGrid,
+    view: int,
+    row: int,
+    column: int,
+    mesh: int,
+    own: int,
+    offset: wp.vec2,
+    hit: Hit,
+    plane: Plane,
 ) -> int:
-    """Corner of a footprint that shows the surface of a coverage ray's hit best: same body, least plane distance, then nearest.
+    """Corner of a footprint that shows the surface of a coverage ray's hit best: same body, near its plane, alike in normal, and near.
 
     Args:
+        mesh: Row of `Meshes` of the body that the ray hit; -1: it hit none.
         own: Corner whose pixel owns the sample; the result if no corner shows the body.
         offset: The sample [px from that pixel's centre].
         plane: Tangent plane of the hit, as seen from that pixel.
@@ -275,6 +289,9 @@ def select_source(
                 cost = DISTANCE_WEIGHT * wp.length(wp.vec2(float(right) - offset[0], float(down) - offset[1]))
                 if hit.segment != Segment.NOTHING:
                     cost += plane_distance(plane, down, right, gbuffer.depth[view, r, c]) / plane.width
+                if mesh >= 0:
+                    other = triangle_normal(meshes, mesh, gbuffer.triangle[view, r, c])
+                    cost += NORMAL_WEIGHT * (1.0 - wp.dot(triangle_normal(meshes, mesh, hit.triangle), other))
                 if cost < min_cost:
                     min_cost = cost
                     best = corner
@@ -333,5 +350,8 @@ def resolve_footprints_kernel(
                 normal = wp.transpose(cameras.to_world[camera]) * face_normal(meshes, bodies, view, hit, views.instances)
             plane = tangent_plane(intrinsics, r, c, wp.uint8(hit.segment), hit.depth, normal)
             plane.height = hit.depth * wp.dot(normal, ray)
-            best = select_source(gbuffer, grid, view, row, column, own, offset, hit, plane)
+            mesh = int(-1)
+            if hit.segment != Segment.NOTHING and hit.segment != Segment.TABLE:
+                mesh = bodies.mesh[view, body_of(hit.segment, views.instances)]
+            best = select_source(meshes, gbuffer, grid, view, row, column, mesh, own, offset, hit, plane)
             wp.atomic_or(resolve_inout, view, r, c, wp.uint32(best ^ own) << wp.uint32(SOURCE_BITS * sample))

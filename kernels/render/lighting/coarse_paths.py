@@ -159,12 +159,26 @@ def first_path_index(samples: int, row: int, column: int, number: int, accumulat
     """Sobol' index of a coarse pixel's first path, in the sequence of its tile of SEQUENCE_PERIOD² coarse pixels.
 
     Without accumulation each frame has the first `samples` points of every coarse pixel. With it, `number`, see `path_number`, selects
-    another point of the coarse pixel.
+    another point of the coarse pixel; `samples` is then the largest number that a history begins with.
     """
     index = morton_index(SEQUENCE_PERIOD, row, column)
     if accumulates:
         return index + SEQUENCE_PERIOD * SEQUENCE_PERIOD * (samples + number)
     return index * samples
+
+
+@wp.func
+def new_paths(rules: PathRules, history: LightHistory, slot: int, known: int) -> int:
+    """Number of paths that a coarse pixel traces, with `known` usable paths in its history.
+
+    The first frame of an episode traces more than later ones: there all histories begin at once, and most of them last.
+    """
+    if known > 0:
+        return 1
+    if history.max_paths > 0:
+        if history.frame[slot] == 0:
+            return rules.first_samples
+    return rules.samples
 
 
 @wp.func
@@ -310,8 +324,8 @@ def trace_coarse_paths_kernel(
 ):
     """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
-    With a history only those in `lists` do. A coarse pixel without a usable history traces `rules.samples` paths; with one it traces a
-    single path and blends it in. The sun's direct light is left out, see `shadows`.
+    With a history only those in `lists` do. A coarse pixel without a usable history traces several paths, see `new_paths`; with one it
+    traces a single path and blends it in. The sun's direct light is left out, see `shadows`.
     """
     index = wp.tid() + first
     known, bits = int(0), int(0)
@@ -333,8 +347,8 @@ def trace_coarse_paths_kernel(
     unoccluded = unoccluded_light(scene.lights, context.light, context.yaw, vertex.brdf)
     slot = world * history_inout.cameras + camera
     frame = history_frame(history_inout, slot, known)
-    samples = wp.where(known > 0, 1, rules.samples)
-    number = first_path_index(rules.samples, row, column, path_number(frame, bits), known > 0)
+    samples = new_paths(rules, history_inout, slot, known)
+    number = first_path_index(wp.where(known > 0, rules.first_samples, samples), row, column, path_number(frame, bits), known > 0)
     paths = average_paths(scene, bodies, rules, context, number, samples, vertex, surface.width, unoccluded, firefly_clamp)
     exposure = scene.lights.exposure[context.light]
     mean = accumulate(history_inout, slot, row, column, surface.hit.segment, scale_light(paths, exposure), known, samples)

@@ -61,6 +61,8 @@ class PathRules:
 
     samples: int
     """Paths per pixel, or per coarse pixel."""
+    first_samples: int
+    """Paths per coarse pixel in the first frame of an episode, if histories accumulate; at least `samples`."""
     bounces: int
     """Largest number of surfaces at which a path scatters."""
     roulette: int

@@ -18,7 +18,7 @@ ROULETTE = 2
 def make_path_rules(render: Render, seed: int, samples: int, roulette: int) -> Any:
     """Make the path tracer's parameters: multiple importance sampling (Veach and Guibas, 1995) and no path regularization."""
     rules = PathRules()
-    rules.samples = samples
+    rules.samples = rules.first_samples = samples
     rules.bounces = render.bounces
     rules.roulette = roulette
     rules.strategy = int(COMBINED)

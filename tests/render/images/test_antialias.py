@@ -115,11 +115,12 @@ def test_self_occlusion_is_resolved_by_depth(device):
     assert (inside.any(axis=-1) & resolved).sum() > 30
 
 
-def test_a_crease_resolves_both_faces_by_coverage(device):
-    """A box with one edge towards the camera: one face to the left of it, another to the right."""
-    rotated_box = (box(0.1, 0.3, 0.1), rotated_pose(0.003, 0.0, 0.0, np.pi / 4, axis=1), (0.9, 0.9, 0.9))
+@pytest.mark.parametrize("x", [0.003, 0.00483])
+def test_a_crease_resolves_both_faces_by_coverage(device, x):
+    """A box with one edge towards the camera: one face to the left of it, another to the right; also an edge at the centres of pixels."""
+    rotated_box = (box(0.1, 0.3, 0.1), rotated_pose(x, 0.0, 0.0, np.pi / 4, axis=1), (0.9, 0.9, 0.9))
     picture = render_image(device, rotated_box, lights=(sun((0.7, 0.0, 0.7)),))
-    ridge = VIEW.matrix[0, 2] + 0.003 / (2.0 - 0.1 / np.sqrt(2.0)) * VIEW.matrix[0, 0]
+    ridge = VIEW.matrix[0, 2] + x / (2.0 - 0.1 / np.sqrt(2.0)) * VIEW.matrix[0, 0]
     column = int(ridge)
     source = source_pixels(picture)[10:30, column]
     assert (picture.resolve[0, 10:30, column] != 0).all()
