@@ -261,15 +261,15 @@ class Render:
         0,
         "px",
         "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history`. "
-        "Modes fast and unoccluded: a sun shadow ray is traced every half of it.",
+        "Modes fast and unoccluded: sun shadow rays are spaced half of it, at least 1 px.",
         low=0,
         high=64,
     )
     coarse_paths: int = setting(
         0,
         "",
-        "Mode fast: paths per coarse pixel; 0: 2, or 1 with over 480 per row or where `history` narrows them, "
-        "16 in first frames of small images.",
+        "Mode fast: paths per coarse pixel, best a power of two; 0: 2, or 1 with over 480 per row or where `history` narrows them, "
+        "and up to 16 in an episode's first frame with `history` if images are narrower than 960 px.",
         low=0,
         high=1024,
     )

@@ -1,22 +1,22 @@
-"""Broad phase of collision detection: pairs of shapes whose bounding boxes overlap and for which no separating axis is known.
+"""Broad phase of collision detection: pairs of shapes whose bounding boxes overlap and that no cached axis separates.
 
 Newton's broad phase tests all pairs of a world's collision shapes, most of which are empty slots for objects, and its narrow phase runs
-MPR and GJK on two and a half times as many pairs as have contacts. Here empty shapes are left out first, and a cached separating axis
-rejects most pairs without contacts.
+MPR and GJK on two and a half times as many pairs as have contacts. Here empty shapes are left out first, and separating axes, cached
+between substeps, reject most pairs without contacts.
 """
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-# Distance by which separated shapes must exceed the one at which contacts are generated [m]. It covers rounding at coordinates of meters.
+# Safety margin beyond the distance at which contacts are generated, before a pair is rejected [m]: covers rounding at meters.
 SEPARATION_MARGIN = wp.constant(1.0e-5)
-# Separation up to which Newton's MPR inflates shapes and reports an overlap [m].
+# Distance up to which Newton's MPR may report separated shapes as overlapping, because it inflates them [m].
 MPR_INFLATION = wp.constant(2.0e-4)
 # Step of an axis along the subgradient of the separation. In real piles 64 of 134 pairs per world are left with 0.15, 52.5 of which have
 # contacts; 66 with 0.3, 65 with 0.08, and 109 by reflections alone.
 AXIS_STEP = wp.constant(0.15)
-# Steps of each component of a direction packed into 16 bits.
+# Steps per unit of each octahedral coordinate, -1 to 1, of a packed direction.
 DIRECTION_STEPS = wp.constant(32767.0)
 
 
@@ -31,7 +31,7 @@ class ShapeData:
     hull: int
     """Newton's type of convex hulls."""
     kind: wp.array[int]
-    """Type of shape; others than boxes and hulls are never rejected."""
+    """Type of shape; pairs with other types than boxes and hulls are never rejected."""
     mesh: wp.array[wp.uint64]
     """Mesh of a hull."""
     gap: wp.array[float]
@@ -65,7 +65,7 @@ def boxes_overlap(lower: wp.array[wp.vec3], upper: wp.array[wp.vec3], a: int, b:
 
 @wp.func
 def append_pair(pair: wp.vec2i, pair_inout: wp.array[wp.vec2i], count_inout: wp.array[int]):
-    """Append to a list; counts pairs beyond its capacity, too."""
+    """Append to a list; the count keeps growing beyond its capacity."""
     index = wp.atomic_add(count_inout, 0, 1)
     if index < pair_inout.shape[0]:
         pair_inout[index] = pair
@@ -163,8 +163,9 @@ def unpack_direction(packed: wp.uint32) -> wp.vec3:
 def improve_axis(axis: wp.vec3, between: wp.vec3) -> wp.vec3:
     """Next candidate for a separating axis, after one that does not separate two shapes, or not far enough.
 
-    If their projections on it overlap, it is reflected at the difference of the support points (Chung and Wang 1996), which finds an axis
-    of positive separation. From there, a small step along that difference, a subgradient of the separation, enlarges it.
+    If their projections overlap, the axis is reflected in the plane perpendicular to the difference of the support points (Chung and Wang
+    1996): repeated over substeps, this finds a separating axis if there is one. If they are separated by too little, it takes a small step
+    along that difference, a subgradient of the separation. Without a difference it stays.
 
     Args:
         axis: The axis, a unit vector.
@@ -186,8 +187,8 @@ def reject_separated_kernel(
     # State:
     axis_inout: wp.array2d[wp.uint32],  # (world, pair of shapes)
     # In:
-    pose: wp.array[wp.transform],  # (shape) [m]
-    geometry: wp.array[wp.vec4],  # (shape) [m]: scale of a hull or half the sides of a box, and margin
+    pose: wp.array[wp.transform],  # (shape) shape to world [m]
+    geometry: wp.array[wp.vec4],  # (shape) [m]: scale of a hull or half extents of a box, and margin
     lower: wp.array[wp.vec3],  # (shape) [m]
     upper: wp.array[wp.vec3],  # (shape) [m]
     overlap: wp.array[wp.vec2i],  # (overlap)
@@ -196,11 +197,11 @@ def reject_separated_kernel(
     pair_out: wp.array[wp.vec2i],  # (pair)
     pair_count_inout: wp.array[int],  # (1)
 ):
-    """Copy the pairs of shapes that may have contacts: those that the cached axis does not separate by more than their gaps and margins.
+    """Copy the pairs of shapes that may have contacts: those that their axis does not separate by more than their gaps and margins.
 
-    The axis of a pair is a unit vector in the frame of its first shape, kept from substep to substep: shapes that have moved little are
-    still separated by it. The first one joins the centers of the bounding boxes; one that fails is improved for the next substep. Whatever
-    the axis, only pairs that can have no contact are rejected.
+    The axis of a pair is a unit vector in the frame of its first shape, kept from substep to substep: it still separates shapes that have
+    moved little since it did. A new pair starts with the axis between the centers of the bounding boxes; an axis that does not separate is
+    improved for the next substep. Whatever the axis, only pairs that can have no contact are rejected.
     """
     thread = wp.tid()
     for index in range(thread, wp.min(overlap_count[0], overlap.shape[0]), threads):

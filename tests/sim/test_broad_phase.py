@@ -33,7 +33,7 @@ def _pack_kernel(direction: wp.array[wp.vec3], packed: wp.array[wp.uint32], unpa
 
 
 @given(st.lists(st.tuples(*[st.floats(-1.0, 1.0, width=32)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-3), min_size=1, max_size=20))
-def test_packed_directions_are_right_to_16_bits(vectors):
+def test_packed_directions_are_right_within_a_ten_thousandth(vectors):
     directions = np.concatenate((vectors, np.vstack((np.eye(3), -np.eye(3)))))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     packed, unpacked = wp.zeros(len(directions), dtype=wp.uint32, device="cpu"), wp.zeros(len(directions), dtype=wp.vec3, device="cpu")
@@ -65,13 +65,13 @@ def make_newton_pipeline(monkeypatch: pytest.MonkeyPatch, config: Config, model:
 
 
 def read_contacts(contacts: newton.Contacts) -> list[np.ndarray]:
-    """Sorted contacts, as the solver reads them."""
+    """Contacts in the order in which the pipeline sorts them for the solver."""
     count = int(contacts.rigid_contact_count.numpy()[0])
     return [getattr(contacts, f"rigid_contact_{name}").numpy()[:count] for name in ARRAYS]
 
 
 def test_contacts_of_moving_and_jumping_bodies_are_those_of_newton(device, monkeypatch):
-    """Bodies jump to random poses in the tote and then move by millimeters, so that cached axes are wrong, right and in between."""
+    """Bodies jump to random poses in the tote and then move by millimeters, so that cached axes are stale, valid and nearly valid."""
     config = settings(bake__worlds=WORLDS, arrangement__max_objects=6)
     model = make_model(config, device).model
     reference, found = make_newton_pipeline(monkeypatch, config, model), physics.make_pipeline(config.physics, model)
@@ -99,7 +99,7 @@ def test_contacts_of_moving_and_jumping_bodies_are_those_of_newton(device, monke
 
 
 def test_piles_move_as_with_the_broad_phase_of_newton(device, monkeypatch):
-    """Piles fall, rest and are stirred, bit by bit the same; at rest most pairs without contacts are rejected."""
+    """Piles fall, rest and are stirred, bit by bit the same; in the end at least half the pairs without contacts are rejected."""
     worlds = 8 if device.is_cuda else 2
     config = settings(bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__deterministic=True)
     found, phases, simulations = [], set(), []
@@ -124,7 +124,7 @@ def test_piles_move_as_with_the_broad_phase_of_newton(device, monkeypatch):
 
 @pytest.mark.parametrize(("gap", "kept"), [(1e-3, True), (5e-3, False)])
 def test_boxes_with_overlapping_bounds_are_rejected_beyond_their_contact_margins(device, gap, kept):
-    """Two cubes, turned by 45 degrees about z, have parallel sides `gap` apart; all other bodies are far away."""
+    """Two cubes, turned by 45 degrees about z, have faces at a distance `gap`; all other bodies are far away."""
     built = build.build_model(settings(bake__worlds=1, arrangement__max_objects=2), catalog(CUBE), device)
     cubes = np.arange(build.GRIPPER_BODIES, build.GRIPPER_BODIES + 2)
     variant = np.full(built.model.body_count, -1, np.int32)
@@ -144,8 +144,8 @@ def test_boxes_with_overlapping_bounds_are_rejected_beyond_their_contact_margins
     assert int(pipeline.broad_phase_pair_count.numpy()[0]) == int(kept)
 
 
-def test_pairs_that_may_collide_are_those_of_newton(device, monkeypatch):
-    """Shapes of a body, and static ones among themselves, are left out; all others of a world may collide."""
+def test_newton_lets_all_pairs_collide_but_static_ones_and_those_of_a_body(device, monkeypatch):
+    """Pairs of shapes of one body, and of static shapes, never collide; all others may, except those that are filtered explicitly."""
     config = settings(bake__worlds=WORLDS, arrangement__max_objects=3)
     model = make_model(config, device).model
     count = model.shape_count // WORLDS
@@ -161,7 +161,7 @@ def test_pairs_that_may_collide_are_those_of_newton(device, monkeypatch):
 
 
 def test_pairs_up_to_the_capacity_keep_their_contacts(device):
-    """Of the pairs of bodies in one place only those are lost for which there is no room, and the count of overlaps tells."""
+    """If overlaps exceed the capacity, only the excess is lost, and `overlap_count` shows it."""
     config = settings(bake__worlds=1, arrangement__max_objects=6, physics__pairs_per_world=16)
     model = make_model(config, device).model
     pipeline, state = physics.make_pipeline(config.physics, model), model.state()

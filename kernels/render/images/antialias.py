@@ -43,8 +43,8 @@ MIN_CHANNEL = wp.constant(0.1)
 DISTANCE_WEIGHT = wp.constant(0.1)
 """Cost of a source pixel per pixel of its distance to the sample, in units of plane distance [widths of a pixel]."""
 NORMAL_WEIGHT = wp.constant(1.0)
-"""Cost of a source pixel per unit of 1 - cosine of the angle between its normal and the sample's, in the same units. A pixel whose centre
-lies on a crease is on both planes: without this term it would be the source of samples on either side."""
+"""Weight of the difference of normals, 1 - cosine, in a source pixel's cost [widths of a pixel]. Without it, a pixel centred on a crease,
+which lies on both planes, would lend its colour to samples of the other face."""
 
 
 @wp.struct
@@ -269,10 +269,10 @@ def select_source(
     hit: Hit,
     plane: Plane,
 ) -> int:
-    """Corner of a footprint that shows the surface of a coverage ray's hit best: same body, near its plane, alike in normal, and near.
+    """Corner of a footprint that matches a coverage ray's hit best: same body, least sum of plane distance, normal difference and distance.
 
     Args:
-        mesh: Row of `Meshes` of the body that the ray hit; -1: it hit none.
+        mesh: Row of `Meshes` of the body that the ray hit; -1: background or table, whose normals are not compared.
         own: Corner whose pixel owns the sample; the result if no corner shows the body.
         offset: The sample [px from that pixel's centre].
         plane: Tangent plane of the hit, as seen from that pixel.

@@ -155,14 +155,14 @@ def average_paths(
 
 
 @wp.func
-def first_path_index(samples: int, row: int, column: int, number: int, accumulates: bool) -> int:
+def first_path_index(samples: int, row: int, column: int, number: int, has_history: bool) -> int:
     """Sobol' index of a coarse pixel's first path, in the sequence of its tile of SEQUENCE_PERIOD² coarse pixels.
 
-    Without accumulation each frame has the first `samples` points of every coarse pixel. With it, `number`, see `path_number`, selects
-    another point of the coarse pixel; `samples` is then the largest number that a history begins with.
+    A coarse pixel without a history takes its first `samples` points. One with a history takes a point, which `number` selects, see
+    `path_number`, behind the `samples` points with which a history may have begun.
     """
     index = morton_index(SEQUENCE_PERIOD, row, column)
-    if accumulates:
+    if has_history:
         return index + SEQUENCE_PERIOD * SEQUENCE_PERIOD * (samples + number)
     return index * samples
 
@@ -171,7 +171,8 @@ def first_path_index(samples: int, row: int, column: int, number: int, accumulat
 def new_paths(rules: PathRules, history: LightHistory, slot: int, known: int) -> int:
     """Number of paths that a coarse pixel traces, with `known` usable paths in its history.
 
-    The first frame of an episode traces more than later ones: there all histories begin at once, and most of them last.
+    One with a usable history; otherwise `rules.samples`, in the first frame of an episode `rules.first_samples`, since all histories begin
+    there and most persist.
     """
     if known > 0:
         return 1
@@ -324,8 +325,8 @@ def trace_coarse_paths_kernel(
 ):
     """Trace paths from the middle pixel of each coarse pixel: their mean light and the unoccluded light, and the guide image.
 
-    With a history only those in `lists` do. A coarse pixel without a usable history traces several paths, see `new_paths`; with one it
-    traces a single path and blends it in. The sun's direct light is left out, see `shadows`.
+    With a history only those in `lists` do, as many paths as `new_paths` says; the path of a coarse pixel with a usable history is
+    blended into it. The sun's direct light is left out, see `shadows`.
     """
     index = wp.tid() + first
     known, bits = int(0), int(0)

@@ -45,13 +45,14 @@ MAX_COLUMNS_TWO_PATHS = 480
 """Default number of paths: two per coarse pixel if an image's width has at most this many, else one. At 640x360, where coarse pixels are
 pixels, ten piles have a PSNR of 32.5 dB with one path and 33.6 dB with two, in 1.5 times the time."""
 FIRST_FRAME_PATHS = 16
-"""Default number of paths per coarse pixel in the first frame of an episode, where all histories begin, if coarse pixels are pixels: a
-whole history of default length. It is one frame of hundreds, and those after it trace fewer paths; in frame 8 it is worth 1.0 to 1.5 dB."""
+"""Default number of paths per coarse pixel in the first frame of an episode, where all histories begin, if coarse pixels are pixels (images
+narrower than 960 px): a whole history of default length. It is one frame of hundreds, and those after it trace fewer paths; in frame 8 it
+is worth 1.0 to 1.5 dB."""
 SINGLE_PATH_VARIANCE_SCALE = 2.0
 """Variance multiplier at one path per coarse pixel, where the sample variance underestimates bright small sources: few paths hit them, and
 those that do would look like a change of the light (on ten piles, 1 is 0.2 dB worse; 1.5 and 3 are nearly as good)."""
 SHADOW_WINDOW = 4
-"""Width of the shadow filter [coarse pixels]: 16 rays estimate the visible fraction of a lamp."""
+"""Width of the shadow filter [pixels of the shadow grid]: 16 rays estimate the visible fraction of the sun."""
 MIN_ROUGHNESS = 0.3
 """Path regularization: smallest roughness after the first surface (Kaplanyan and Dachsbacher, 2013). Caustics blur instead of sparkling."""
 FIREFLY_CLAMP = 32.0
@@ -165,8 +166,8 @@ def interleaved_threads(columns: int, rows: int) -> int:
 
 
 class DenoisedRenderer:
-    """Renders linear radiance from few paths per coarse pixel and a denoiser; in mode unoccluded from unoccluded light and sun shadows.
-    Owns its scratch; `shade` only launches."""
+    """Renders linear radiance from a few paths per coarse pixel and a denoiser; in mode unoccluded from unoccluded light and sun shadows.
+    Allocates its scratch once; `shade` only launches kernels."""
 
     def __init__(self, render: Render, seed: int, scene: RenderScene, instances: int, views: int, histories: int = 0) -> None:
         """Allocate scratch.

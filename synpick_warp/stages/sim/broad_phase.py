@@ -13,17 +13,17 @@ from synpick_warp.kernels.sim import broad_phase
 BLOCK = 128
 """Threads per world that list overlapping bounding boxes; on a CPU one."""
 SEPARATION_THREADS = 128
-"""Threads per world that test separating axes, of some 130 pairs."""
+"""Threads per world that test separating axes; a world has some 130 overlaps. All threads share the overlaps of all worlds."""
 EMPTY = 1.0
 """Bound of empty bounding boxes: their lower corner is at +EMPTY, their upper one at -EMPTY [m]."""
 
 
 class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
-    """Newton's broad phase over all pairs, without empty shapes and without pairs that a cached separating axis keeps apart.
+    """Newton's broad phase over all pairs, without empty shapes and without pairs that a cached axis separates.
 
     The contacts are the same: a pair is left out only if its shapes are farther apart than their gaps and margins. Newton's broad phase is
-    asked once which pairs may collide at all; collision groups and body flags must not change later. Only for models of identical worlds;
-    see `replace_broad_phase`.
+    run once to find which pairs may collide at all; collision groups and body flags must not change later. Only for models of identical
+    worlds; see `replace_broad_phase`.
 
     Attributes:
         overlap_count: Number of pairs whose bounding boxes overlap (one) int32. Those beyond the capacity for pairs are lost.
@@ -57,8 +57,8 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
         candidate_pair_count: wp.array,
         **options: Any,
     ) -> None:
-        """List the pairs that may have contacts; arguments as of Newton's method. The count must be zero, bounding boxes enlarged by the
-        shapes' gaps and margins."""
+        """List the pairs that may have contacts; arguments as in Newton's `launch`. The count must be zero, and the bounding boxes already
+        enlarged by the shapes' gaps and margins."""
         shapes, device, worlds = self._shapes, candidate_pair.device, self._occupied.shape[0]
         self.overlap_count.zero_()
         wp.launch_tiled(
@@ -82,13 +82,16 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
 
 
 def replace_broad_phase(pipeline: newton.CollisionPipeline) -> None:
-    """Give a pipeline of identical worlds the broad phase above; another pipeline keeps Newton's."""
+    """Give a pipeline of identical worlds with Newton's all-pairs broad phase the one above; another pipeline keeps its own."""
     if isinstance(pipeline.broad_phase, newton.geometry.BroadPhaseAllPairs) and has_identical_worlds(pipeline.model):
         pipeline.broad_phase = SeparatingBroadPhase(pipeline)
 
 
 def has_identical_worlds(model: newton.Model) -> bool:
-    """Whether all shapes belong to worlds, in their order, and those of each world to the same bodies and collision groups."""
+    """Whether shapes are stored world by world, with the same local bodies and collision groups in every world.
+
+    Body flags and excluded pairs are assumed to be the same, too.
+    """
     worlds = model.world_count
     if not worlds or model.shape_count % worlds:
         return False
