@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE
+from synpick_warp.configs.schema import FAST, LAYERS, REFERENCE, RENDER_MODES
 from synpick_warp.stages.buffers import ViewBuffers
 from tools.checks import compare_pictures as tool
 
@@ -36,7 +36,7 @@ def values(difference) -> tuple[float, ...]:
 
 def test_every_output_has_a_tolerance():
     assert {item.name for item in fields(ViewBuffers)} | set(LAYERS) == {*tool.TOLERANCES, "color"}
-    assert set(tool.COLORS) == {FAST, REFERENCE}
+    assert set(tool.COLORS) == set(RENDER_MODES)
 
 
 def test_equal_outputs_do_not_differ():
@@ -94,9 +94,7 @@ def test_a_device_equals_itself(tmp_path):
     options = ["--devices", "cpu,cpu", "--scenes", "1", "--size", "16x9", "--samples", "2", "--json", str(file), *FEW_STEPS]
     assert tool.main(options) == 0
     rows = json.loads(file.read_text())["rows"]
-    assert {(row["mode"], row["output"]) for row in rows} == {
-        (mode, name) for mode in (FAST, REFERENCE) for name in (*tool.TOLERANCES, "color")
-    }
+    assert {(row["mode"], row["output"]) for row in rows} == {(mode, name) for mode in RENDER_MODES for name in (*tool.TOLERANCES, "color")}
     assert all(row["differing"] == 0.0 for row in rows)
 
 
