@@ -46,7 +46,7 @@ class ShapeData:
 #endif
 """)
 def synchronize_block():
-    """Barrier of the threads of a block: each sees what the others have written to memory."""
+    """Block-wide barrier, after which each thread sees what the others have written to memory."""
     ...
 
 
@@ -84,9 +84,9 @@ def list_overlaps_kernel(
     pair_out: wp.array[wp.vec2i],  # (overlap)
     pair_count_inout: wp.array[int],  # (1)
 ):
-    """List the pairs of each world whose bounding boxes, enlarged by gaps and margins, overlap: a block of threads per world.
+    """Find the pairs of shapes of each world whose bounding boxes, enlarged by gaps and margins, overlap; one block of threads per world.
 
-    The block first lists the shapes that are not empty, and then tests pairs of these. The order of pairs is arbitrary.
+    The block first compacts the shapes that are not empty, then tests all pairs of them. Pairs are listed in arbitrary order.
     """
     world, lane = wp.tid()
     first = world * shapes.count

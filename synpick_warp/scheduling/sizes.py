@@ -93,7 +93,10 @@ def pick_processes(config: Config, names: Sequence[str], episodes: int) -> tuple
 
 
 def advise_processes(config: Config, names: Sequence[str], episodes: int) -> str:
-    """Advice to use `ALL`, if a bake without a GPU has one process and could have more; else empty. Arguments: `pick_processes`."""
+    """Hint to pass `--devices all`, for a bake on a CPU with one process where memory and cores allow several; otherwise empty.
+
+    Arguments as in `pick_processes`.
+    """
     if len(names) > 1 or pick_device(names[0]).is_cuda or pick_devices([ALL]) != ("cpu",):
         return ""
     processes = len(pick_processes(config, [ALL], episodes))

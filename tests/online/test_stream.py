@@ -195,7 +195,7 @@ def test_splits_name_their_episodes():
 
 
 def held_by(stream) -> tuple[weakref.ref, ...]:
-    """What takes memory: worlds, their collision pipeline and model, renderer, ring."""
+    """Weak references to the parts of a stream that hold memory: worlds, their collision pipeline and model, renderer, ring."""
     producer = stream._batches.gi_frame.f_locals["producer"]
     simulation = producer.stages.simulation
     parts = (producer, producer.ring, simulation, simulation.physics.pipeline, simulation.physics.model, producer.stages.renderer)

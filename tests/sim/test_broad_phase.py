@@ -99,7 +99,7 @@ def test_contacts_of_moving_and_jumping_bodies_are_those_of_newton(device, monke
 
 
 def test_piles_move_as_with_the_broad_phase_of_newton(device, monkeypatch):
-    """Piles fall, rest and are stirred, bit by bit the same; in the end at least half the pairs without contacts are rejected."""
+    """Piles that fall, rest and are stirred have bitwise identical trajectories; at least half the pairs without contacts are rejected."""
     worlds = 8 if device.is_cuda else 2
     config = settings(bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__deterministic=True)
     found, phases, simulations = [], set(), []

@@ -158,3 +158,6 @@ def test_all_peers_are_measured_and_both_renderers_agree(short, mujoco, tmp_path
     agreement = {row["name"]: row["value"] for row in rows if "depth within" in row["name"]}
     assert len(agreement) == 2
     assert min(agreement.values()) >= 99.0
+    rates = {row["name"]: row["value"] for row in rows if "render.mode unoccluded" in row["name"]}
+    assert sum("over MuJoCo Warp" in name for name in rates) == 2
+    assert min(rates.values()) > 0.0

@@ -23,7 +23,7 @@ TEXEL_WIDTH = wp.constant(0.57735)
 texels has a variance of 1/6 + 1/12 = 1/4 texel²; at this width that is the variance of a one-pixel box filter, 1/12 px². With texels one
 pixel wide, textures would be blurred."""
 MIN_TILT = wp.constant(0.1)
-"""Minimum cosine in the footprint of a pixel on a surface seen at a grazing angle."""
+"""Lower bound of the cosine between surface normal and view direction, which limits a pixel's footprint at grazing angles."""
 
 
 @wp.struct

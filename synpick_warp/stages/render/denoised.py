@@ -45,9 +45,9 @@ MAX_COLUMNS_TWO_PATHS = 480
 """Default number of paths: two per coarse pixel if an image's width has at most this many, else one. At 640x360, where coarse pixels are
 pixels, ten piles have a PSNR of 32.5 dB with one path and 33.6 dB with two, in 1.5 times the time."""
 FIRST_FRAME_PATHS = 16
-"""Default number of paths per coarse pixel in the first frame of an episode, where all histories begin, if coarse pixels are pixels (images
-narrower than 960 px): a whole history of default length. It is one frame of hundreds, and those after it trace fewer paths; in frame 8 it
-is worth 1.0 to 1.5 dB."""
+"""Default number of paths per pixel in the first frame of an episode, in images narrower than 960 px, whose coarse pixels are 1 px wide. It
+fills all histories to their default length in one frame of hundreds, and the frames after it trace fewer paths; frame 8 gains 1.0 to 1.5 dB
+in PSNR (tools/README.md, "Pictures")."""
 SINGLE_PATH_VARIANCE_SCALE = 2.0
 """Variance multiplier at one path per coarse pixel, where the sample variance underestimates bright small sources: few paths hit them, and
 those that do would look like a change of the light (on ten piles, 1 is 0.2 dB worse; 1.5 and 3 are nearly as good)."""
@@ -100,9 +100,14 @@ def coarse_size(render: Render, width: int, histories: int = 0) -> int:
     return render.coarse_pixel or max(1, width // columns)
 
 
+def traces_paths(render: Render) -> bool:
+    """Whether coarse paths are traced; otherwise all environment light is unoccluded."""
+    return render.mode != UNOCCLUDED
+
+
 def accumulates(render: Render, histories: int) -> bool:
-    """Whether light is averaged over frames; `histories` as in `DenoisedRenderer`."""
-    return bool(histories and render.history) and render.mode != UNOCCLUDED
+    """Whether light is averaged over frames (temporal accumulation); `histories` as in `DenoisedRenderer`."""
+    return bool(histories and render.history) and traces_paths(render)
 
 
 def paths_per_coarse_pixel(render: Render, width: int, histories: int = 0) -> int:
@@ -115,7 +120,7 @@ def paths_per_coarse_pixel(render: Render, width: int, histories: int = 0) -> in
 def first_frame_paths(render: Render, width: int, histories: int = 0) -> int:
     """Number of paths per coarse pixel in the first frame of an episode, where all histories begin; more than later in small images."""
     paths = paths_per_coarse_pixel(render, width, histories)
-    if render.coarse_paths or not histories or coarse_size(render, width, histories) > 1:
+    if render.coarse_paths or not accumulates(render, histories) or coarse_size(render, width, histories) > 1:
         return paths
     return max(paths, min(FIRST_FRAME_PATHS, render.history))
 
@@ -125,7 +130,7 @@ def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -
     size = coarse_size(render, width, histories)
     shadow = max(1, size // 2)
     chunks = -(-footprint_grid(width, height).tiles // int(CHUNK_TILES)) if render.antialias else 0
-    columns, rows = (0, 0) if render.mode == UNOCCLUDED else (-(-width // size), -(-height // size))
+    columns, rows = (-(-width // size), -(-height // size)) if traces_paths(render) else (0, 0)
     return {
         "cell_row": rows,
         "cell_column": columns,
@@ -183,7 +188,7 @@ class DenoisedRenderer:
         size = coarse_size(render, scene.width, histories)
         sizes = {"view": views} | scratch_sizes(render, scene.width, scene.height, histories)
         self.scene = scene
-        self.traces_paths = render.mode != UNOCCLUDED
+        self.traces_paths = traces_paths(render)
         self.coarse = build_coarse_grid(scene.grid, size, 1)
         if not self.traces_paths:
             self.coarse.size = 0

@@ -19,14 +19,14 @@ EMPTY = 1.0
 
 
 class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
-    """Newton's broad phase over all pairs, without empty shapes and without pairs that a cached axis separates.
+    """All-pairs broad phase that skips empty shapes and rejects pairs by cached separating axes; a drop-in replacement for Newton's.
 
-    The contacts are the same: a pair is left out only if its shapes are farther apart than their gaps and margins. Newton's broad phase is
-    run once to find which pairs may collide at all; collision groups and body flags must not change later. Only for models of identical
+    Contacts are the same: a pair is rejected only if its shapes are farther apart than their gaps and margins. Newton's broad phase runs
+    once, to find which pairs may collide at all; collision groups and body flags must not change later. Only for models of identical
     worlds; see `replace_broad_phase`.
 
     Attributes:
-        overlap_count: Number of pairs whose bounding boxes overlap (one) int32. Those beyond the capacity for pairs are lost.
+        overlap_count: Number of pairs whose bounding boxes overlap (one) int32; those beyond the capacity for pairs are dropped.
     """
 
     def __init__(self, pipeline: newton.CollisionPipeline) -> None:
@@ -57,8 +57,14 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
         candidate_pair_count: wp.array,
         **options: Any,
     ) -> None:
-        """List the pairs that may have contacts; arguments as in Newton's `launch`. The count must be zero, and the bounding boxes already
-        enlarged by the shapes' gaps and margins."""
+        """Write the candidate pairs of the narrow phase.
+
+        Args:
+            shape_lower, shape_upper: Bounding boxes, already enlarged by the shapes' gaps and margins (shape) [m].
+            shape_gap, shape_collision_group, shape_world, shape_count, options: Ignored; arguments of Newton's `launch`.
+            candidate_pair: Receives the indices of the two shapes of each pair (pair) vec2i.
+            candidate_pair_count: Receives their number; must be zero (one) int32.
+        """
         shapes, device, worlds = self._shapes, candidate_pair.device, self._occupied.shape[0]
         self.overlap_count.zero_()
         wp.launch_tiled(
@@ -82,7 +88,7 @@ class SeparatingBroadPhase(newton.geometry.BroadPhaseAllPairs):
 
 
 def replace_broad_phase(pipeline: newton.CollisionPipeline) -> None:
-    """Give a pipeline of identical worlds with Newton's all-pairs broad phase the one above; another pipeline keeps its own."""
+    """Replace Newton's all-pairs broad phase in a pipeline of identical worlds; any other pipeline keeps its own."""
     if isinstance(pipeline.broad_phase, newton.geometry.BroadPhaseAllPairs) and has_identical_worlds(pipeline.model):
         pipeline.broad_phase = SeparatingBroadPhase(pipeline)
 
