@@ -1,7 +1,7 @@
 """Videos in H.264: closed groups of pictures, encoded apart by any writer process, and joined to MP4 files without encoding again.
 
 A group has its own encoder of one thread, and colour is converted in fixed-point arithmetic, so bytes do not depend on the number of
-threads, processes or worlds. Of AV1 and H.264 at equal quality, H.264 takes a quarter of the time (exporters/README.md).
+threads, processes or worlds, nor on the CPU. Of AV1 and H.264 at equal quality, H.264 takes a quarter of the time (exporters/README.md).
 """
 
 from __future__ import annotations
@@ -20,9 +20,16 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.lerobot.layout import PIXEL_FORMAT
 
 GROUP = 8
-"""Frames of a group: a reader decodes at most so many for one; a quarter of the size of single pictures."""
-_OPTIONS = {"preset": "veryfast", "crf": "18", "bf": "0", "g": str(GROUP)}
-"""x264: constant quality 18 (visually lossless by its authors), no B-frames, so that frames are decoded in their order."""
+"""Frames of a group: a reader decodes at most this number for one; a quarter of the size of single pictures."""
+_OPTIONS = {
+    "preset": "veryfast",
+    "crf": "20",  # Constant quality; as 18 with the macroblock tree, which shifts it (36.8 dB, exporters/README.md).
+    "bf": "0",  # No B-frames, so that frames are decoded in their order.
+    "g": str(GROUP),
+    "mbtree": "0",  # Its AVX-512 kernel reads past the last macroblock's data: bytes depend on what freed memory held (x264 165).
+    "x264-params": "cpu-independent=1",  # The same algorithms on every CPU, not the fastest of each.
+}
+"""Options of x264."""
 _ENCODER = "libx264"
 _STRIDE = 4
 """Every fourth pixel of every fourth row counts in the statistics of colours."""
