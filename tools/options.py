@@ -50,16 +50,22 @@ def finite_seconds(text: str) -> float:
     return seconds
 
 
+def image_resolution(text: str) -> list[int | str]:
+    """Type (for `add_argument`) of WIDTHxHEIGHT; what is no number is left to the check of `cameras.resolution`."""
+    return [int(part) if part.isdecimal() else part for part in text.split("x")]
+
+
 OPTIONS: Mapping[str, Mapping[str, Any]] = {
     "device": {"default": "auto", "help": "cpu, cuda:N or auto (default: auto)"},
     "models": {"default": "", "help": "folder of BOP models (default: the embedded objects)"},
     "lights": {"default": "", "help": "folder of light maps (default: the embedded skies)"},
     "seed": {"type": int, "default": 0, "help": "seed of all random numbers (default: 0)"},
+    "size": {"type": image_resolution, "help": "WIDTHxHEIGHT of the images [px] (default: %(default)s)"},
     "set": {"action": "append", "default": [], "metavar": "SECTION.KEY=VALUE", "help": "any other setting; may be repeated"},
     "json": {"type": writable_file, "metavar": "FILE", "help": "also write the results to this file"},
 }
 """Options with the same meaning in every tool, as arguments of `add_argument`."""
-SETTINGS = {"device": "bake.device", "models": "bake.models", "lights": "bake.lights", "seed": "bake.seed"}
+SETTINGS = {"device": "bake.device", "models": "bake.models", "lights": "bake.lights", "seed": "bake.seed", "size": "cameras.resolution"}
 """Setting that each shared option overrides."""
 
 

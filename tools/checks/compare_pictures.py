@@ -138,17 +138,18 @@ def main(arguments: list[str] | None = None) -> int:
         differences = compare_devices(config, devices, console)
     except SynpickError as error:
         return fail("compare_pictures", error)
-    _print(console, differences, f"{names[0]} and {names[1]}, {options.scenes} piles, {options.size}, {options.samples} paths")
+    size = "{}x{}".format(*config.cameras.resolution)
+    _print(console, differences, f"{names[0]} and {names[1]}, {options.scenes} piles, {size}, {options.samples} paths")
     rows = [dataclasses.asdict(row) | {"holds": row.holds} for row in differences]
-    write_json(options.json, {"devices": names, "size": options.size, "rows": rows})
+    write_json(options.json, {"devices": names, "size": size, "rows": rows})
     return 0 if all(row.holds for row in differences) else 1
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = make_parser(__doc__, "models", "lights", "seed", "set", "json")
+    parser = make_parser(__doc__, "models", "lights", "seed", "set", "json", "size")
+    parser.set_defaults(size="160x90")
     parser.add_argument("--devices", default="cpu,cuda:0", help="two devices, comma-separated (default: cpu,cuda:0)")
     parser.add_argument("--scenes", type=int, default=3, help="piles to render by all cameras (default: 3)")
-    parser.add_argument("--size", default="160x90", help="WIDTHxHEIGHT of the images [px] (default: 160x90)")
     parser.add_argument("--samples", type=int, default=8, help="paths per pixel of the reference (default: 8)")
     return parser.parse_args(arguments)
 
@@ -161,7 +162,6 @@ def _config(options: argparse.Namespace, device: str) -> Config:
         "bake.device": device,
         "render.samples": options.samples,
         "render.layers": list(LAYERS),
-        "cameras.resolution": [int(part) if part.isdecimal() else part for part in options.size.split("x")],
     }
     return configure(options, fixed)
 

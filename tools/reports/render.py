@@ -68,9 +68,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json")
+    parser = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json", "size")
+    parser.set_defaults(size="240x135")
     parser.add_argument("--scenes", type=int, default=2, help="piles to compare (default: 2; 0: none)")
-    parser.add_argument("--size", default="240x135", help="WIDTHxHEIGHT of their images [px] (default: 240x135)")
     parser.add_argument("--samples", type=int, default=64, help="paths per pixel of the reference (default: 64)")
     parser.add_argument("--out", type=Path, help="folder for images: denoised, reference, and five times their difference")
     parser.add_argument("--sheet", type=Path, help="contact sheet of piles under every light map, PNG or JPEG")
@@ -84,7 +84,6 @@ def _config(options: argparse.Namespace) -> Config:
         "bake.episodes": max(1, options.scenes),
         "bake.worlds": max(1, options.scenes),
         "render.samples": options.samples,
-        "cameras.resolution": [int(part) if part.isdecimal() else part for part in options.size.split("x")],
     }
     return configure(options, fixed)
 

@@ -120,11 +120,11 @@ def _summarize(pairs: list[Pair]) -> list[Row]:
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json")
+    parser = make_parser(__doc__, "models", "lights", "device", "seed", "set", "json", "size")
+    parser.set_defaults(size="480x270")
     parser.add_argument("--episodes", type=positive_count, default=1, help="episodes, each in a world of its own (default: 1)")
     parser.add_argument("--mode", default="pick", help="bake.mode (default: pick)")
     parser.add_argument("--frames", type=_frames, default=(0, 8, 30), help="frames to compare, comma-separated (default: 0,8,30)")
-    parser.add_argument("--size", default="480x270", help="WIDTHxHEIGHT of the images [px] (default: 480x270)")
     parser.add_argument("--samples", type=positive_count, default=256, help="paths per pixel of both references together (default: 256)")
     parser.add_argument("--sheet", type=writable_file, help="contact sheet: denoised, reference, and five times their difference")
     return parser.parse_args(arguments)
@@ -144,7 +144,6 @@ def _config(options: argparse.Namespace) -> Config:
         "bake.episodes": options.episodes,
         "bake.worlds": options.episodes,
         "render.samples": options.samples,
-        "cameras.resolution": [int(part) if part.isdecimal() else part for part in options.size.split("x")],
     }
     config = configure(options, fixed)
     return replace(config, cameras=replace(config.cameras, positions=config.cameras.positions[:1], ups=config.cameras.ups[:1]))
