@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Self
 
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.processes import send
+from synpick_warp.system.threads import LINK
 
 if TYPE_CHECKING:
     from synpick_warp.episodes import BakeSummary
@@ -40,7 +41,7 @@ class BakeLink:
     def listen(self) -> None:
         """Start the thread, and take SIGTERM, which a job scheduler may send to every process, as a request to stop."""
         signal.signal(signal.SIGTERM, self._stop)
-        threading.Thread(target=self._listen, daemon=True).start()
+        threading.Thread(target=self._listen, name=LINK, daemon=True).start()
 
     def __enter__(self) -> Self:
         return self

@@ -12,6 +12,7 @@ import warp as wp
 from synpick_warp.kernels.render.visibility.camera import TILE_PIXELS
 from synpick_warp.kernels.tuning import CPU_PIECE_PIXELS, CPU_PIECES, PIXEL_BLOCK
 from synpick_warp.system.cores import count_cores
+from synpick_warp.system.threads import PIXELS
 
 _limit = 0
 """Maximum number of threads that render pixels on the CPU, set by `limit_threads`; 0: one per usable core."""
@@ -32,7 +33,7 @@ def _cores() -> int:
 
 @functools.cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_cores(), thread_name_prefix="pixels")
+    return ThreadPoolExecutor(_cores(), thread_name_prefix=PIXELS)
 
 
 # Threads do not survive a fork: a child process creates its own pool.

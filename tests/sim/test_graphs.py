@@ -1,4 +1,4 @@
-"""CUDA graphs of the physics: ticks that replay them are the same, bit by bit, as ticks whose kernels are launched one by one."""
+"""Graphs of the physics: ticks that replay them are the same, bit by bit, as ticks whose kernels are launched one by one."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.scenes import build
+from synpick_warp.stages.sim import physics as physics_module
 from synpick_warp.system.green_contexts import SmPartition
 from tests.worlds.cubes import place_cubes
 from tests.worlds.small_worlds import settings
@@ -43,19 +44,30 @@ def fall(
             physics.clear_graphs()
             physics._period = lambda watcher: steps * substeps  # type: ignore[method-assign]
         physics.tick(lambda current: None)
+        assert physics._graphs or not replays
         found.append(physics.state.joint_q.numpy().copy())
     return found
 
 
 @pytest.mark.parametrize(("steps", "substeps"), [(12, 1), (12, 2), (12, 3), (9, 1)])
 def test_replayed_ticks_are_those_of_single_launches(device, steps, substeps):
-    if not device.is_cuda:
-        pytest.skip("the CPU has no graphs")
     replayed, launched = fall(device, True, steps, substeps), fall(device, False, steps, substeps)
     np.testing.assert_array_equal(replayed, launched)
     heights = np.array(launched).reshape(TICKS, WORLDS, -1)[:, :, build.GRIPPER_DOFS + 2]
     assert (np.diff(heights[:2], axis=0) < 0.0).all()
     assert heights[-1].min() > 0.02
+
+
+def test_on_a_cpu_nothing_is_captured_while_another_thread_may_launch_kernels(monkeypatch):
+    def capture(*_: object) -> list[wp.Graph]:
+        raise AssertionError("captured")
+
+    monkeypatch.setattr(physics_module, "is_only_launcher", lambda: False)
+    monkeypatch.setattr(physics_module.Physics, "_capture", capture)
+    cpu = wp.get_device("cpu")
+    launched = fall(cpu, False, 12, 2)
+    monkeypatch.undo()
+    np.testing.assert_array_equal(fall(cpu, True, 12, 2), launched)
 
 
 @pytest.mark.parametrize("period", [1, 2])

@@ -22,6 +22,7 @@ from synpick_warp.exporters.writing.worker import Failure, TaskMessage, run_task
 from synpick_warp.system.descriptors import open_standard_descriptors
 from synpick_warp.system.processes import END_TIMEOUT, WorkerProcess, send, start_process
 from synpick_warp.system.shared_memory import SharedArray, allocate_shared_memory, shared_bytes
+from synpick_warp.system.threads import COPIES
 
 _WORKER = "from synpick_warp.exporters.writing.worker import main; main()"
 """Program of a writer process."""
@@ -86,7 +87,7 @@ class WriterPool:
         self._failure: SynpickError | None = None
         self._ended = False
         self._receiving = False
-        self._copy_threads = ThreadPoolExecutor(max(1, processes // PROCESSES_PER_COPY_THREAD))
+        self._copy_threads = ThreadPoolExecutor(max(1, processes // PROCESSES_PER_COPY_THREAD), COPIES)
         self._copies_inline = processes < 2 * PROCESSES_PER_COPY_THREAD
         try:
             handle, self._memory = allocate_shared_memory(slots * self._slot_bytes)

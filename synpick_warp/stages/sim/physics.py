@@ -19,6 +19,7 @@ from synpick_warp.kernels.sim import gripper, rest
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim.broad_phase import replace_broad_phase
 from synpick_warp.stages.sim.fused_solver import KNOWN_NEWTON, choose_solver
+from synpick_warp.system.threads import is_only_launcher
 
 # Sentinel: default of `next` for an exhausted iterator.
 ENDED = object()
@@ -151,9 +152,10 @@ class Physics:
     ) -> Iterator[None]:
         """Advance all worlds by one tick, `steps_per_tick` x `substeps` substeps: a generator that yields after each substep.
 
-        On a GPU the first period of the first tick (see `_period`) runs eagerly: it loads the kernels and triggers Newton's late
-        allocations, all on the current stream. Then a CUDA graph for each of its substeps is captured, and these graphs are launched for
-        all further ones. Each `solver_stream` has graphs of its own.
+        The first period of the first tick (see `_period`) runs eagerly: it loads the kernels and triggers Newton's late allocations, all
+        on the current stream. Then a graph of each of its substeps is captured, and these graphs are launched for all further ones: a CUDA
+        graph, or on the CPU a list of launches that Warp replays in C++, without the 30 us that each takes in Python. Each `solver_stream`
+        has graphs of its own.
 
         Hooks and watcher run for captures only, so they must launch the same kernels on the same arrays in every tick, hooks in every step.
 
@@ -163,11 +165,12 @@ class Physics:
             watcher: Launches kernels that record the steps.
         """
         eager, stream, period = 0, self.solver_stream, self._period(watcher)
+        if stream not in self._graphs and not _may_capture(self.device):
+            yield from self._run_substeps(before_step, after_collide, watcher)
+            return
         if not self._graphs:
             eager = period
             yield from itertools.islice(self._run_substeps(before_step, after_collide, watcher), period)
-            if not self.device.is_cuda:
-                return
         if stream not in self._graphs:
             self._graphs[stream] = self._capture(itertools.islice(self._run_substeps(before_step, after_collide, watcher, stream), period))
         for graph in self._graphs[stream][eager:]:
@@ -177,14 +180,14 @@ class Physics:
     def _period(self, watcher: Watcher | None) -> int:
         """Period of the launches [substeps]: the fewest whole steps after which the two states have swapped back.
 
-        A whole tick on the CPU, with a watcher, whose launches differ between steps, or if a tick has no whole number of periods.
+        A whole tick with a watcher, whose launches differ between steps, or if a tick has no whole number of periods.
         """
         count = self.settings.steps_per_tick * self.settings.substeps
         period = math.lcm(2, self.settings.substeps)
-        return period if watcher is None and self.device.is_cuda and count % period == 0 else count
+        return period if watcher is None and count % period == 0 else count
 
     def _capture(self, substeps: Iterator[None]) -> list[wp.Graph]:
-        """Capture a CUDA graph for each substep of a period; returns them repeated for all substeps of a tick.
+        """Capture a graph of each substep of a period; returns them repeated for all substeps of a tick.
 
         A single graph of a whole tick could not be enqueued in parts, and CUDA would spread it over 66 streams.
         """
@@ -248,6 +251,15 @@ class Physics:
             if ends_step and step + 1 == physics.steps_per_tick and current is not self.state:
                 self.state.assign(current)
             yield
+
+
+def _may_capture(device: wp.Device) -> bool:
+    """Whether physics is captured in graphs on a device.
+
+    On the CPU only for the known version of Newton, and while no other thread may launch kernels: Warp's recorder also collects the arrays
+    of launches in other threads, without a lock.
+    """
+    return device.is_cuda or (newton.__version__ == KNOWN_NEWTON and is_only_launcher())
 
 
 def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.CollisionPipeline:

@@ -1,0 +1,22 @@
+"""Threads of this process, told apart by whether they may launch kernels at any time."""
+
+from __future__ import annotations
+
+import threading
+
+PIXELS, COPIES, LINK = "pixels", "copies", "bake link"
+"""Names of this package's threads: those that launch kernels while the caller waits, and those that launch none."""
+_HARMLESS = (PIXELS, COPIES, LINK, "zarr_")
+"""Beginnings of the names of threads that launch no kernels of their own accord; zarr's are those of its event loop."""
+_HARMLESS_PACKAGES = ("rich", "tqdm")
+"""Packages whose classes of threads draw progress bars."""
+
+
+def is_only_launcher() -> bool:
+    """Whether no other thread may launch kernels meanwhile: all others are this package's, zarr's, or draw progress bars."""
+    return all(
+        thread is threading.current_thread()
+        or thread.name.startswith(_HARMLESS)
+        or type(thread).__module__.partition(".")[0] in _HARMLESS_PACKAGES
+        for thread in threading.enumerate()
+    )
