@@ -6,14 +6,14 @@ import threading
 
 PIXELS, COPIES, LINK = "pixels", "copies", "bake link"
 """Names of this package's threads: those that launch kernels while the caller waits, and those that launch none."""
-_HARMLESS = (PIXELS, COPIES, LINK, "zarr_")
-"""Beginnings of the names of threads that launch no kernels of their own accord; zarr's are those of its event loop."""
+_HARMLESS = (PIXELS, COPIES, LINK, "zarr_", "QueueFeederThread")
+"""Beginnings of the names of threads that launch no kernels of their own accord: ours, zarr's event loop, multiprocessing's queues."""
 _HARMLESS_PACKAGES = ("rich", "tqdm")
 """Packages whose classes of threads draw progress bars."""
 
 
 def is_only_launcher() -> bool:
-    """Whether no other thread may launch kernels meanwhile: all others are this package's, zarr's, or draw progress bars."""
+    """Whether no other thread may launch kernels meanwhile: all others have harmless names or draw progress bars."""
     return all(
         thread is threading.current_thread()
         or thread.name.startswith(_HARMLESS)

@@ -15,6 +15,7 @@ import warp as wp
 
 from synpick_warp.codes import Phase, Task
 from synpick_warp.factory.assembly import Factory
+from synpick_warp.stages.sim.physics import may_capture
 from synpick_warp.stages.sim.simulate import Simulation
 from synpick_warp.stages.stream import TickReader
 
@@ -194,9 +195,9 @@ def _measure_tick_parts(simulation: Simulation, tick: Callable[[], None], min_se
 
 
 def _capture_graph(function: Callable[[], object], device: wp.Device) -> Callable[[], object]:
-    """Capture the function's launches as a CUDA graph, to leave launch overhead out; on the CPU, return the function itself."""
+    """Capture the function's launches as a graph, to leave launch overhead out, where a bake captures them, too."""
     function()
-    if not device.is_cuda:
+    if not may_capture(device):
         return function
     with wp.ScopedCapture(device=device) as capture:
         function()

@@ -165,7 +165,7 @@ class Physics:
             watcher: Launches kernels that record the steps.
         """
         eager, stream, period = 0, self.solver_stream, self._period(watcher)
-        if stream not in self._graphs and not _may_capture(self.device):
+        if stream not in self._graphs and not may_capture(self.device):
             yield from self._run_substeps(before_step, after_collide, watcher)
             return
         if not self._graphs:
@@ -253,7 +253,7 @@ class Physics:
             yield
 
 
-def _may_capture(device: wp.Device) -> bool:
+def may_capture(device: wp.Device) -> bool:
     """Whether physics is captured in graphs on a device.
 
     On the CPU only for the known version of Newton, and while no other thread may launch kernels: Warp's recorder also collects the arrays

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.configs.schema import Config
-from synpick_warp.stages.sim.physics import make_pipeline, make_solver
+from synpick_warp.stages.sim.physics import make_pipeline, make_solver, may_capture
 from synpick_warp.system.cores import count_cores
 from tools.bench.compare.piles import Pile, build_piles
 
@@ -79,7 +79,7 @@ class NewtonEngine:
         # The first steps run eagerly: they load kernels and trigger late allocations.
         self.start(pile)
         self._advance(WARM_STEPS)
-        if device.is_cuda:
+        if may_capture(device):
             with wp.ScopedCapture(device=device) as capture:
                 self._advance(GRAPH_STEPS)
             self._graph = capture.graph
