@@ -12,13 +12,14 @@ from tests.worlds.small_worlds import catalog
 
 
 def test_the_solver_runs_on_the_reserved_multiprocessors_while_there_are_views(tmp_path, monkeypatch):
-    """On a CPU: `confine` is replaced to provide a marker as stream, which the solver ignores there."""
+    """On a CPU: `confine` is replaced to provide a marker as stream, which is removed before physics sees it."""
     monkeypatch.setattr(assembly, "load_catalog", lambda config, report: catalog())
     monkeypatch.setattr(RenderStreams, "confine", lambda self, share: setattr(self, "solver", "reserved"))
     tick_parts, given = Physics.tick_parts, []
 
     def spy(self, *arguments):
         given.append(self.solver_stream)
+        self.solver_stream = None
         return tick_parts(self, *arguments)
 
     monkeypatch.setattr(Physics, "tick_parts", spy)
