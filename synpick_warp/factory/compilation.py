@@ -48,7 +48,7 @@ def compile_launches(simulation: Simulation, stream: FrameStream | None, progres
 def launch_all(simulation: Simulation, stream: FrameStream | None) -> None:
     """Launch every kernel of simulation, perception, renderer and encoders once."""
     record = simulation.record
-    for _ in range(2):  # On a GPU the first tick launches kernels one by one and captures graphs; the second launches the graphs.
+    for _ in range(2):  # The first tick launches kernels one by one and captures graphs; the second launches the graphs.
         simulation.tick()
     if simulation.perception is not None:
         simulation.perception.load_kernels(record.snapshot)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import threading
 
 PIXELS, COPIES, LINK = "pixels", "copies", "bake link"
 """Names of this package's threads: those that launch kernels while the caller waits, and those that launch none."""
-_HARMLESS = (PIXELS, COPIES, LINK, "zarr_", "QueueFeederThread")
-"""Beginnings of the names of threads that launch no kernels of their own accord: ours, zarr's event loop, multiprocessing's queues."""
+_HARMLESS = re.compile(rf"({PIXELS}|{COPIES})_\d+|{LINK}|zarr_(io|pool_\d+)|QueueFeederThread")
+"""Names of threads that launch no kernels of their own accord: ours, zarr's event loop, multiprocessing's queues."""
 _HARMLESS_PACKAGES = ("rich", "tqdm")
 """Packages whose classes of threads draw progress bars."""
 
@@ -16,7 +17,7 @@ def is_only_launcher() -> bool:
     """Whether no other thread may launch kernels meanwhile: all others have harmless names or draw progress bars."""
     return all(
         thread is threading.current_thread()
-        or thread.name.startswith(_HARMLESS)
+        or _HARMLESS.fullmatch(thread.name)
         or type(thread).__module__.partition(".")[0] in _HARMLESS_PACKAGES
         for thread in threading.enumerate()
     )

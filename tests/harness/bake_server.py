@@ -154,8 +154,12 @@ def _prepare(request: dict) -> None:
 
 
 def _fill_allocations(value: int) -> None:
-    """Fill memory with a byte, not zero, when it is allocated (glibc's M_PERTURB), here and in the writers; other C libraries ignore it."""
+    """Fill memory with a byte, not zero, when it is allocated (glibc's M_PERTURB), here and in the writers; other C libraries ignore it.
+
+    Blocks of up to 1 kB that glibc's thread cache recycles keep their bytes here; the writers have no such cache.
+    """
     perturb = value ^ 0xFF
+    os.environ["GLIBC_TUNABLES"] = "glibc.malloc.tcache_count=0"
     os.environ["MALLOC_PERTURB_"] = str(perturb)
     with contextlib.suppress(AttributeError):
         ctypes.CDLL(None).mallopt(_PERTURB, perturb)

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import ctypes
+from collections import defaultdict
 from collections.abc import Sequence
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
+from warp._src.apic.capture import APICapture
 
+from synpick_warp.codes import Task
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import physics as physics_module
+from synpick_warp.stages.sim.step_log import record_arrays
 from synpick_warp.system.green_contexts import SmPartition
 from tests.worlds.cubes import place_cubes
-from tests.worlds.small_worlds import settings
+from tests.worlds.sights import SHORT, picking
+from tests.worlds.small_worlds import BOX, CUBE, catalog, report, settings
 
 WORLDS, TICKS = 8, 5
+COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__substeps": 1, "physics__iterations": 6}
+LAST_TICK = 60
 
 
 def fall(
@@ -70,6 +79,50 @@ def test_on_a_cpu_nothing_is_captured_while_another_thread_may_launch_kernels(mo
     np.testing.assert_array_equal(fall(cpu, True, 12, 2), launched)
 
 
+@pytest.mark.parametrize("recorded", [True, False])
+def test_episodes_captured_from_a_later_tick_on_are_those_of_single_launches(monkeypatch, recorded):
+    """Two worlds that pick, up to a lift, on a CPU: new objects, perception, yaws and seals between and within graphs.
+
+    Within a graph, Warp finds a CPU kernel by module and key: kernels of one key with different functions would replace each other.
+    """
+    cpu, functions = wp.get_device("cpu"), defaultdict(set)
+    build_launch_info = APICapture.build_launch_info
+
+    def spy(self: APICapture, kernel: wp.Kernel, module_exec: Any, hooks: Any, *arguments: Any, **options: Any) -> Any:
+        functions[kernel.key, module_exec.module_hash].add(ctypes.cast(hooks.forward, ctypes.c_void_p).value)
+        return build_launch_info(self, kernel, module_exec, hooks, *arguments, **options)
+
+    monkeypatch.setattr(APICapture, "build_launch_info", spy)
+
+    def run(first: int) -> tuple[list[dict[str, np.ndarray]], bool]:
+        """Reports and step records of all ticks, with graphs from the tick `first` on, and whether anything was captured."""
+        config = settings(bake__worlds=2, bake__episodes=2, arrangement__max_objects=2, **COARSE, **SHORT)
+        simulation = picking(config, catalog(BOX, CUBE), cpu, records_physics=recorded)
+        found, tasks = [], set()
+        for tick in range(LAST_TICK):
+            monkeypatch.setattr(physics_module, "is_only_launcher", lambda tick=tick: tick >= first)
+            simulation.tick()
+            row = report(simulation.record)
+            state = simulation.physics.state
+            arrays = {"status": row.status, "measures": row.measures, "body_q": state.body_q.numpy(), "body_qd": state.body_qd.numpy()}
+            steps = record_arrays(simulation.record.physics) if recorded else []
+            arrays |= {f"step record {index}": array.numpy() for index, array in enumerate(steps)}
+            found.append({name: values.copy() for name, values in arrays.items()})
+            tasks.update(row.column("task").tolist())
+        assert {Task.LOOK, Task.PRESS, Task.LIFT} <= tasks
+        return found, bool(simulation.physics._graphs)
+
+    launched, captured = run(LAST_TICK)
+    assert not captured
+    replayed, captured = run(3)
+    assert captured
+    assert len(functions) > 50
+    assert {len(each) for each in functions.values()} == {1}
+    for one, other in zip(launched, replayed, strict=True):
+        for name, values in one.items():
+            np.testing.assert_array_equal(other[name], values, err_msg=name)
+
+
 @pytest.mark.parametrize("period", [1, 2])
 def test_a_solver_on_few_multiprocessors_takes_the_same_steps(device, period):
     """Its stream changes after each tick, or is that of the reserved multiprocessors from the first one on."""
@@ -86,7 +139,7 @@ def test_each_solver_stream_is_captured_once_and_only_the_first_period_is_eager(
     calls: list[object] = []
     monkeypatch.setattr(physics, "device", SimpleNamespace(is_cuda=True))
     monkeypatch.setattr(physics, "_run_substeps", lambda *hooks: (calls.append(("run", *hooks[3:])) for _ in range(4)))
-    monkeypatch.setattr(physics, "_capture", lambda substeps: calls.append(("capture", len(list(substeps)))) or [f"graph{len(calls)}"] * 4)
+    monkeypatch.setattr(physics, "_capture", lambda substeps: calls.append(("capture", len(list(substeps)))) or [f"graph{len(calls)}"] * 2)
     monkeypatch.setattr(wp, "capture_launch", calls.append)
 
     def tick(stream: str | None) -> list[object]:

@@ -6,9 +6,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 import rich.progress
+import zarr
 
+from synpick_warp.dataset.stored_array import open_stored_array
 from synpick_warp.system import threads
 
 
@@ -25,12 +28,20 @@ def waiting_thread(name: str) -> Iterator[None]:
 
 
 @pytest.mark.parametrize(
-    ("name", "only"), [("pixels_0", True), ("copies_3", True), ("bake link", True), ("zarr_io", True), ("loader", False)]
+    ("name", "only"),
+    [("pixels_0", True), ("copies_3", True), ("bake link", True), ("zarr_io", True), ("copies_worker", False), ("loader", False)],
 )
 def test_unknown_threads_may_launch_kernels(name, only):
     assert threads.is_only_launcher()
     with waiting_thread(name):
         assert threads.is_only_launcher() == only
+    assert threads.is_only_launcher()
+
+
+def test_reading_a_zarr_array_starts_harmless_threads(tmp_path):
+    zarr.save_array(tmp_path / "array", np.arange(10_000, dtype=np.float32))
+    assert open_stored_array(tmp_path / "array")[5] == 5.0
+    assert any(thread.name.startswith("zarr_") for thread in threading.enumerate())
     assert threads.is_only_launcher()
 
 

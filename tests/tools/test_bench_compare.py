@@ -9,6 +9,7 @@ import warnings
 
 import numpy as np
 import pytest
+import warp as wp
 
 from synpick_warp.arrays import allocate
 from synpick_warp.configs.schema import Config
@@ -147,6 +148,19 @@ def test_mujoco_falls_and_rests(cone, mujoco):
 def test_mujoco_warp_falls_and_rests(device, mujoco):
     config = Config()
     check_engine(engines.make_mujoco_warp(config, boxes(config), 2, device, "pyramidal", 16), config, boxes(config))
+
+
+@pytest.mark.parametrize("cone", engines.CONES)
+def test_mujoco_warp_in_graphs_takes_the_steps_of_single_launches(cone, mujoco, monkeypatch):
+    """On a CPU, where Warp might replay another kernel of the same key."""
+    config, found = Config(), []
+    for captures in (False, True):
+        monkeypatch.setattr(engines, "may_capture", lambda device, captures=captures: captures)
+        engine = engines.make_mujoco_warp(config, boxes(config), 2, wp.get_device("cpu"), cone, 16)
+        engine.start(boxes(config))
+        engine.run(4 * engines.GRAPH_STEPS)
+        found.append(engine.bodies())
+    np.testing.assert_array_equal(*found)
 
 
 def test_all_peers_are_measured_and_both_renderers_agree(short, mujoco, tmp_path):

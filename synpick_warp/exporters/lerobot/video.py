@@ -23,11 +23,12 @@ GROUP = 8
 """Frames of a group: a reader decodes at most this number for one; a quarter of the size of single pictures."""
 _OPTIONS = {
     "preset": "veryfast",
-    "crf": "20",  # Constant quality; as 18 with the macroblock tree, which shifts it (36.8 dB, exporters/README.md).
+    "crf": "18",  # Constant quality; visually lossless by x264's authors.
     "bf": "0",  # No B-frames, so that frames are decoded in their order.
     "g": str(GROUP),
-    "mbtree": "0",  # Its AVX-512 kernel reads past the last macroblock's data: bytes depend on what freed memory held (x264 165).
-    "x264-params": "cpu-independent=1",  # The same algorithms on every CPU, not the fastest of each.
+    # The same algorithms on every CPU. By default those with AVX-512 read past the end of the macroblock tree's data (x264 165): bytes then
+    # depend on what freed memory held.
+    "x264-params": "cpu-independent=1",
 }
 """Options of x264."""
 _ENCODER = "libx264"

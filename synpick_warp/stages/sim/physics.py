@@ -68,7 +68,7 @@ def with_enough_worlds(config: Config, device: wp.Device, episodes: int | None =
 
 
 class Watcher(Protocol):
-    """Observer of the steps of a tick. On a GPU its launches are captured in graphs, as those of the hooks of `Physics.tick`."""
+    """Observer of the steps of a tick. Its launches are captured in graphs, as those of the hooks of `Physics.tick`."""
 
     def begin_step(self) -> None:
         """Called before a step."""
@@ -150,7 +150,7 @@ class Physics:
     def tick_parts(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
     ) -> Iterator[None]:
-        """Advance all worlds by one tick, `steps_per_tick` x `substeps` substeps: a generator that yields after each substep.
+        """Advance all worlds by one tick, `steps_per_tick` x `substeps` substeps: a generator that yields after each substep, or graph.
 
         The first period of the first tick (see `_period`) runs eagerly: it loads the kernels and triggers Newton's late allocations, all
         on the current stream. Then a graph of each of its substeps is captured, and these graphs are launched for all further ones: a CUDA
@@ -158,22 +158,25 @@ class Physics:
         has graphs of its own.
 
         Hooks and watcher run for captures only, so they must launch the same kernels on the same arrays in every tick, hooks in every step.
+        On the CPU, Warp finds a captured kernel by its key: closures and overloads of one name in a module would replace each other.
 
         Args:
             before_step: Launches kernels that write the control's forces from a state; runs before each step.
             after_collide: Launches kernels that edit `contacts` before the solver reads them.
             watcher: Launches kernels that record the steps.
         """
-        eager, stream, period = 0, self.solver_stream, self._period(watcher)
-        if stream not in self._graphs and not may_capture(self.device):
-            yield from self._run_substeps(before_step, after_collide, watcher)
-            return
+        stream, period = self.solver_stream, self._period(watcher)
+        periods = self.settings.steps_per_tick * self.settings.substeps // period
+        eager = self._run_substeps(before_step, after_collide, watcher)
         if not self._graphs:
-            eager = period
-            yield from itertools.islice(self._run_substeps(before_step, after_collide, watcher), period)
+            yield from itertools.islice(eager, period)
+            periods -= 1
         if stream not in self._graphs:
+            if not may_capture(self.device):
+                yield from eager
+                return
             self._graphs[stream] = self._capture(itertools.islice(self._run_substeps(before_step, after_collide, watcher, stream), period))
-        for graph in self._graphs[stream][eager:]:
+        for graph in self._graphs[stream] * periods:
             wp.capture_launch(graph)
             yield
 
@@ -187,18 +190,21 @@ class Physics:
         return period if watcher is None and count % period == 0 else count
 
     def _capture(self, substeps: Iterator[None]) -> list[wp.Graph]:
-        """Capture a graph of each substep of a period; returns them repeated for all substeps of a tick.
+        """Capture a period: a CUDA graph of each substep, or on the CPU one graph of all, as each copies the arrays that it fills.
 
-        A single graph of a whole tick could not be enqueued in parts, and CUDA would spread it over 66 streams.
+        A single CUDA graph of a whole tick could not be enqueued in parts, and CUDA would spread it over 66 streams.
         """
         graphs: list[wp.Graph] = []
         busy = True
         while busy:
+            captured = 0
             with wp.ScopedCapture(device=self.device) as capture:
-                busy = next(substeps, ENDED) is not ENDED
+                for _ in substeps if not self.device.is_cuda else itertools.islice(substeps, 1):
+                    captured += 1
+            busy = captured > 0
             if busy:
                 graphs.append(capture.graph)
-        return graphs * (self.settings.steps_per_tick * self.settings.substeps // len(graphs))
+        return graphs
 
     def clear_graphs(self) -> None:
         """Drop the captured graphs; the next tick begins eagerly, and captures them anew."""

@@ -19,7 +19,7 @@ from tools.bench.compare.piles import Pile, build_piles
 WARM_STEPS = 2
 """Steps before the first measurement."""
 GRAPH_STEPS = 10
-"""Steps in a captured CUDA graph."""
+"""Steps in a captured graph."""
 CONES = {"pyramidal": 10, "elliptic": 20}
 """MuJoCo's friction cones -> maximum iterations of its solver (Newton's method, not the library Newton)."""
 CONTACT_ROOM, MIN_CONTACTS = 2.0, 64
@@ -53,7 +53,7 @@ class Engine(Protocol):
 
 
 class NewtonEngine:
-    """Engine behind Newton's solver interface. On a GPU its steps are captured as a CUDA graph."""
+    """Engine behind Newton's solver interface. Its steps are captured as a graph, where a bake captures them."""
 
     def __init__(
         self,
