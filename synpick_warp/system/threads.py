@@ -6,9 +6,9 @@ import re
 import threading
 
 PIXELS, COPIES, LINK = "pixels", "copies", "bake link"
-"""Names of this package's threads: those that launch kernels while the caller waits, and those that launch none."""
+"""Names of this package's threads: PIXELS launch kernels only while the caller waits, the others launch none."""
 _HARMLESS = re.compile(rf"({PIXELS}|{COPIES})_\d+|{LINK}|zarr_(io|pool_\d+)|QueueFeederThread")
-"""Names of threads that launch no kernels of their own accord: ours, zarr's event loop, multiprocessing's queues."""
+"""Names of threads that launch no kernels of their own accord: ours, zarr's loop and pool, multiprocessing's queues."""
 _HARMLESS_PACKAGES = ("rich", "tqdm")
 """Packages whose classes of threads draw progress bars."""
 

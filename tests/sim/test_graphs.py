@@ -24,7 +24,7 @@ from tests.worlds.small_worlds import BOX, CUBE, catalog, report, settings
 
 WORLDS, TICKS = 8, 5
 COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__substeps": 1, "physics__iterations": 6}
-LAST_TICK = 60
+MAX_TICKS = 60
 
 
 def fall(
@@ -81,7 +81,7 @@ def test_on_a_cpu_nothing_is_captured_while_another_thread_may_launch_kernels(mo
 
 @pytest.mark.parametrize("recorded", [True, False])
 def test_episodes_captured_from_a_later_tick_on_are_those_of_single_launches(monkeypatch, recorded):
-    """Two worlds that pick, up to a lift, on a CPU: new objects, perception, yaws and seals between and within graphs.
+    """Two worlds that pick, up to a lift, on a CPU: new objects, perception, yaws and seals, launched inside and outside graphs.
 
     Within a graph, Warp finds a CPU kernel by module and key: kernels of one key with different functions would replace each other.
     """
@@ -95,11 +95,11 @@ def test_episodes_captured_from_a_later_tick_on_are_those_of_single_launches(mon
     monkeypatch.setattr(APICapture, "build_launch_info", spy)
 
     def run(first: int) -> tuple[list[dict[str, np.ndarray]], bool]:
-        """Reports and step records of all ticks, with graphs from the tick `first` on, and whether anything was captured."""
+        """Reports, body states and step records, with graphs from tick `first` on, and whether any was captured."""
         config = settings(bake__worlds=2, bake__episodes=2, arrangement__max_objects=2, **COARSE, **SHORT)
         simulation = picking(config, catalog(BOX, CUBE), cpu, records_physics=recorded)
         found, tasks = [], set()
-        for tick in range(LAST_TICK):
+        for tick in range(MAX_TICKS):
             monkeypatch.setattr(physics_module, "is_only_launcher", lambda tick=tick: tick >= first)
             simulation.tick()
             row = report(simulation.record)
@@ -112,7 +112,7 @@ def test_episodes_captured_from_a_later_tick_on_are_those_of_single_launches(mon
         assert {Task.LOOK, Task.PRESS, Task.LIFT} <= tasks
         return found, bool(simulation.physics._graphs)
 
-    launched, captured = run(LAST_TICK)
+    launched, captured = run(MAX_TICKS)
     assert not captured
     replayed, captured = run(3)
     assert captured
@@ -123,13 +123,13 @@ def test_episodes_captured_from_a_later_tick_on_are_those_of_single_launches(mon
             np.testing.assert_array_equal(other[name], values, err_msg=name)
 
 
-@pytest.mark.parametrize("period", [1, 2])
-def test_a_solver_on_few_multiprocessors_takes_the_same_steps(device, period):
-    """Its stream changes after each tick, or is that of the reserved multiprocessors from the first one on."""
+@pytest.mark.parametrize("streams", [1, 2])
+def test_a_solver_on_few_multiprocessors_takes_the_same_steps(device, streams):
+    """All ticks request the stream of the reserved multiprocessors, or every second one does."""
     if not device.is_cuda:
         pytest.skip("a CPU has no multiprocessors")
     stream = SmPartition(device, 8).make_stream(on_reserved=True)
-    confined = fall(device, True, 12, 2, (None, stream)[-period:])
+    confined = fall(device, True, 12, 2, (None, stream)[-streams:])
     np.testing.assert_array_equal(confined, fall(device, True, 12, 2))
 
 

@@ -20,7 +20,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.lerobot.layout import PIXEL_FORMAT
 
 GROUP = 8
-"""Frames of a group: a reader decodes at most this number for one; a quarter of the size of single pictures."""
+"""Frames per group, hence the most that are decoded to read one; files are a quarter of the size of intra-only ones."""
 _OPTIONS = {
     "preset": "veryfast",
     "crf": "18",  # Constant quality; visually lossless by x264's authors.
@@ -50,7 +50,7 @@ def count_levels(color: np.ndarray) -> np.ndarray:
 
 
 def write_frame(color: np.ndarray, path: Path) -> None:
-    """Task: spool a view's planes and histogram until its group is complete."""
+    """Task: spool a frame's histogram and planes for its group."""
     with path.open("wb") as file:
         file.write(count_levels(color).tobytes())
         file.write(split_planes(color).tobytes())

@@ -99,7 +99,7 @@ class Physics:
         self._other = self.model.state()
         self.control = self.model.control()
         self.solver_stream: wp.Stream | None = None
-        """CUDA stream for the solver's kernels, which takes effect with the next tick; None: the current stream. It may be confined to few
+        """CUDA stream for the captured kernels of the solver, from the next tick on; None: the current stream. It may be confined to few
         multiprocessors, since these kernels are short and small, while those of collision detection need many."""
         self._graphs: dict[wp.Stream | None, list[wp.Graph]] = {}
         self._observables = self.solver.observables({self.solver.ObservableKind.CONTACT_F}, contacts=self.contacts)
@@ -143,7 +143,7 @@ class Physics:
     def tick(
         self, before_step: Callable[[newton.State], None], after_collide: Callable[[], None] | None = None, watcher: Watcher | None = None
     ) -> None:
-        """Advance all worlds by one tick; arguments as of `tick_parts`."""
+        """Advance all worlds by one tick; arguments as in `tick_parts`."""
         for _ in self.tick_parts(before_step, after_collide, watcher):
             pass
 
@@ -152,12 +152,11 @@ class Physics:
     ) -> Iterator[None]:
         """Advance all worlds by one tick, `steps_per_tick` x `substeps` substeps: a generator that yields after each substep, or graph.
 
-        The first period of the first tick (see `_period`) runs eagerly: it loads the kernels and triggers Newton's late allocations, all
-        on the current stream. Then a graph of each of its substeps is captured, and these graphs are launched for all further ones: a CUDA
-        graph, or on the CPU a list of launches that Warp replays in C++, without the 30 us that each takes in Python. Each `solver_stream`
-        has graphs of its own.
+        While there are no graphs, a tick's first period (see `_period`) runs eagerly on the current stream: it loads kernels and triggers
+        Newton's late allocations. Then a period is captured and replayed: a CUDA graph per substep, or on the CPU one list of launches that
+        Warp replays in C++, which saves the 30 us of each launch in Python. Each `solver_stream` has graphs of its own.
 
-        Hooks and watcher run for captures only, so they must launch the same kernels on the same arrays in every tick, hooks in every step.
+        Replays skip hooks and watcher, so they must launch the same kernels on the same arrays in every tick, hooks in every step.
         On the CPU, Warp finds a captured kernel by its key: closures and overloads of one name in a module would replace each other.
 
         Args:
@@ -190,7 +189,7 @@ class Physics:
         return period if watcher is None and count % period == 0 else count
 
     def _capture(self, substeps: Iterator[None]) -> list[wp.Graph]:
-        """Capture a period: a CUDA graph of each substep, or on the CPU one graph of all, as each copies the arrays that it fills.
+        """Capture a period: a CUDA graph of each substep, or on the CPU one for all, as each CPU graph keeps copies of filled arrays.
 
         A single CUDA graph of a whole tick could not be enqueued in parts, and CUDA would spread it over 66 streams.
         """
@@ -211,7 +210,7 @@ class Physics:
         self._graphs = {}
 
     def flag_lost_pairs(self) -> None:
-        """Flag worlds whose broad-phase pairs overflowed: Newton drops these pairs silently, while its solver flags contacts and rows."""
+        """Flag worlds that lost broad-phase pairs: Newton drops these silently, while its solver flags overflows of contacts and rows."""
         pairs, found = self.pipeline.broad_phase_shape_pairs, self.pipeline.broad_phase_pair_count
         overlaps = getattr(self.pipeline.broad_phase, "overlap_count", found)
         wp.launch(
@@ -232,7 +231,7 @@ class Physics:
         """Enqueue a tick; yields after each substep. The last one leaves its result in `state`.
 
         Args:
-            before_step, after_collide, watcher: As of `tick_parts`.
+            before_step, after_collide, watcher: As in `tick_parts`.
             solver_stream: As the attribute.
         """
         current, following = self.state, self._other
