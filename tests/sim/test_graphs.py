@@ -27,6 +27,12 @@ COARSE = {"physics__step": 4e-3, "physics__steps_per_tick": 16, "physics__subste
 MAX_TICKS = 60
 
 
+@pytest.fixture(autouse=True)
+def only_launcher(monkeypatch):
+    """Whatever threads other tests have left, none launches kernels."""
+    monkeypatch.setattr(physics_module, "is_only_launcher", lambda: True)
+
+
 def fall(
     device: wp.Device, replays: bool, steps: int, substeps: int, solver_streams: Sequence[wp.Stream | None] = (None,)
 ) -> list[np.ndarray]:
@@ -71,11 +77,11 @@ def test_on_a_cpu_nothing_is_captured_while_another_thread_may_launch_kernels(mo
     def capture(*_: object) -> list[wp.Graph]:
         raise AssertionError("captured")
 
-    monkeypatch.setattr(physics_module, "is_only_launcher", lambda: False)
-    monkeypatch.setattr(physics_module.Physics, "_capture", capture)
     cpu = wp.get_device("cpu")
-    launched = fall(cpu, False, 12, 2)
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr(physics_module, "is_only_launcher", lambda: False)
+        patch.setattr(physics_module.Physics, "_capture", capture)
+        launched = fall(cpu, False, 12, 2)
     np.testing.assert_array_equal(fall(cpu, True, 12, 2), launched)
 
 

@@ -15,6 +15,14 @@ from synpick_warp.dataset.stored_array import open_stored_array
 from synpick_warp.system import threads
 
 
+@pytest.fixture(autouse=True)
+def no_older_threads(monkeypatch):
+    """Hide threads that other tests have left."""
+    current, enumerate_all = threading.current_thread(), threading.enumerate
+    older = {thread for thread in enumerate_all() if thread is not current and not thread.name.startswith("zarr_")}
+    monkeypatch.setattr(threading, "enumerate", lambda: [thread for thread in enumerate_all() if thread not in older])
+
+
 @contextmanager
 def waiting_thread(name: str) -> Iterator[None]:
     end = threading.Event()
