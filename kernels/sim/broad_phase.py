@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 # Safety margin beyond the distance at which contacts are generated, before a pair is rejected [m]: covers rounding at meters.
 SEPARATION_MARGIN = wp.constant(1.0e-5)
-# Distance up to which Newton's MPR may report separated shapes as overlapping, because it inflates them [m].
+# Inflation of shapes in Newton's MPR [m]: shapes closer than this may be reported as overlapping.
 MPR_INFLATION = wp.constant(2.0e-4)
 # Step of an axis along the subgradient of the separation. In real piles 64 of 134 pairs per world are left with 0.15, 52.5 of which have
 # contacts; 66 with 0.3, 65 with 0.08, and 109 by reflections alone.
@@ -197,7 +197,7 @@ def reject_separated_kernel(
     pair_out: wp.array[wp.vec2i],  # (pair)
     pair_count_inout: wp.array[int],  # (1)
 ):
-    """Copy the pairs of shapes that may have contacts: those that their axis does not separate by more than their gaps and margins.
+    """Filter the overlaps to candidate pairs: those whose cached axis does not separate the shapes by more than their gaps and margins.
 
     The axis of a pair is a unit vector in the frame of its first shape, kept from substep to substep: it still separates shapes that have
     moved little since it did. A new pair starts with the axis between the centers of the bounding boxes; an axis that does not separate is

@@ -14,9 +14,9 @@ import zarr
 
 from synpick_warp.dataset.annotations import ADVICE
 from synpick_warp.errors import DatasetError
+from synpick_warp.system.threads import ZARR_THREADS
 
-# As in the writers (exporters/trajectory/store.py). Zarr's pool then has names of its own, by which `is_only_launcher` knows its threads.
-zarr.config.set({"async.concurrency": 1, "threading.max_workers": 1})
+zarr.config.set(ZARR_THREADS)
 
 _SELECTIONS = (
     "get_basic_selection",

@@ -161,7 +161,7 @@ def test_newton_lets_all_pairs_collide_but_static_ones_and_those_of_a_body(devic
 
 
 def test_pairs_up_to_the_capacity_keep_their_contacts(device):
-    """If overlaps exceed the capacity, only the excess is lost, and `overlap_count` shows it."""
+    """Overlaps beyond the capacity are dropped, the others kept; `overlap_count` includes both."""
     config = settings(bake__worlds=1, arrangement__max_objects=6, physics__pairs_per_world=16)
     model = make_model(config, device).model
     pipeline, state = physics.make_pipeline(config.physics, model), model.state()

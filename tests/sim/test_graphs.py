@@ -1,4 +1,4 @@
-"""Graphs of the physics: ticks that replay them are the same, bit by bit, as ticks whose kernels are launched one by one."""
+"""Graph capture of physics: replayed ticks equal eager ones, whose kernels are launched one by one, bit by bit."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MAX_TICKS = 60
 
 @pytest.fixture(autouse=True)
 def only_launcher(monkeypatch):
-    """Whatever threads other tests have left, none launches kernels."""
+    """Ignore the threads left by other tests, none of which launches kernels."""
     monkeypatch.setattr(physics_module, "is_only_launcher", lambda: True)
 
 
@@ -87,7 +87,9 @@ def test_on_a_cpu_nothing_is_captured_while_another_thread_may_launch_kernels(mo
 
 @pytest.mark.parametrize("recorded", [True, False])
 def test_episodes_captured_from_a_later_tick_on_are_those_of_single_launches(monkeypatch, recorded):
-    """Two worlds that pick, up to a lift, on a CPU: new objects, perception, yaws and seals, launched inside and outside graphs.
+    """Compare eager and replayed ticks on the CPU in two worlds of mode pick, until objects are lifted.
+
+    Between ticks objects are loaded, grasps planned and yaws set; within ticks seals attach objects.
 
     Within a graph, Warp finds a CPU kernel by module and key: kernels of one key with different functions would replace each other.
     """

@@ -1,4 +1,4 @@
-"""Videos in H.264: closed groups of pictures, encoded apart by any writer process, and joined to MP4 files without encoding again.
+"""H.264 videos: closed groups of pictures (GOPs), encoded independently by any writer process and remuxed into MP4 files.
 
 A group has its own encoder of one thread, and colour is converted in fixed-point arithmetic, so bytes do not depend on the number of
 threads, processes or worlds, nor on the CPU. Of AV1 and H.264 at equal quality, H.264 takes a quarter of the time (exporters/README.md).
@@ -20,7 +20,7 @@ from synpick_warp.errors import OutputError
 from synpick_warp.exporters.lerobot.layout import PIXEL_FORMAT
 
 GROUP = 8
-"""Frames per group, hence the most that are decoded to read one; files are a quarter of the size of intra-only ones."""
+"""Length of a group of pictures [frames]: random access decodes at most one group. A quarter of the size of intra frames only."""
 _OPTIONS = {
     "preset": "veryfast",
     "crf": "18",  # Constant quality; visually lossless by x264's authors.
@@ -33,18 +33,18 @@ _OPTIONS = {
 """Options of x264."""
 _ENCODER = "libx264"
 _STRIDE = 4
-"""Every fourth pixel of every fourth row counts in the statistics of colours."""
+"""Sampling stride of colour statistics, in rows and columns [px]."""
 LEVELS = 256
-"""Levels of a colour channel."""
+"""Levels of an 8-bit colour channel."""
 
 
 def split_planes(color: np.ndarray) -> np.ndarray:
-    """Convert RGB (H, W, 3) uint8 to the planes Y, U, V of 4:2:0, BT.601, limited range (3 H / 2, W) uint8. H and W are even."""
+    """Convert RGB (H, W, 3) uint8 to planar YUV 4:2:0 (I420), BT.601, limited range (3 H / 2, W) uint8. H and W are even."""
     return cv2.cvtColor(color, cv2.COLOR_RGB2YUV_I420)
 
 
 def count_levels(color: np.ndarray) -> np.ndarray:
-    """Histogram of each channel over a grid of pixels (3, LEVELS) int64."""
+    """Histogram of each colour channel, over every _STRIDE-th row and column (3, LEVELS) int64."""
     sample = color[::_STRIDE, ::_STRIDE]
     return np.stack([np.bincount(sample[..., channel].ravel(), minlength=LEVELS) for channel in range(3)])
 
@@ -71,7 +71,7 @@ def write_spooled_group(frames: Sequence[Path], size: tuple[int, int], rate: Fra
 
 
 def write_group(planes: Sequence[np.ndarray], levels: np.ndarray, rate: Fraction, path: Path) -> None:
-    """Encode a group of pictures: a file with histogram, number of packets, their sizes, and the packets, one a frame."""
+    """Encode a group of pictures to a file: histogram, number of packets, their sizes, and the packets, one per frame."""
     encoder = av.CodecContext.create(_ENCODER, "w")
     _configure(encoder, planes[0].shape[1], planes[0].shape[0] * 2 // 3, rate)
     packets = []
@@ -91,7 +91,7 @@ def write_group(planes: Sequence[np.ndarray], levels: np.ndarray, rate: Fraction
 
 
 def join_groups(groups: Sequence[Path], size: tuple[int, int], rate: Fraction, path: Path) -> np.ndarray:
-    """Join groups to an MP4 file; returns the histogram of all frames (3, LEVELS) int64."""
+    """Remux encoded groups into an MP4 file; returns the histogram of all frames (3, LEVELS) int64."""
     levels = np.zeros((3, LEVELS), np.int64)
     with av.open(str(path), "w", format="mp4") as container:
         stream = container.add_stream(_ENCODER, rate=rate)
@@ -121,7 +121,7 @@ def _split_packets(data: bytes) -> Iterator[bytes]:
 
 
 def _configure(context: av.VideoCodecContext, width: int, height: int, rate: Fraction) -> None:
-    """Set up an encoder; the same for every group and for the file, whose header holds the parameter sets of all."""
+    """Configure an encoder: the same for every group and for the file, whose header holds the parameter sets that all groups share."""
     context.width, context.height, context.pix_fmt = width, height, PIXEL_FORMAT
     context.framerate, context.time_base = rate, 1 / rate
     context.options = dict(_OPTIONS)

@@ -14,9 +14,9 @@ from zarr.codecs import ZstdCodec
 from synpick_warp.configs.schema import Physics, Trajectory
 from synpick_warp.exporters.trajectory.arrays import CAMERAS, CONSTANT_GROUPS, EPISODES, FORMAT, LABELS, OBJECTS, ArraySpec, GroupSpec
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap
+from synpick_warp.system.threads import ZARR_THREADS
 
-# The writer processes are the parallelism.
-zarr.config.set({"async.concurrency": 1, "threading.max_workers": 1})
+zarr.config.set(ZARR_THREADS)
 
 
 def add_group(parent: zarr.Group, name: str, doc: GroupSpec, attributes: Mapping[str, Any] | None = None) -> zarr.Group:

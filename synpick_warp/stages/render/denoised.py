@@ -106,7 +106,7 @@ def traces_paths(render: Render) -> bool:
 
 
 def accumulates(render: Render, histories: int) -> bool:
-    """Whether light is averaged over frames (temporal accumulation); `histories` as in `DenoisedRenderer`."""
+    """Whether light is accumulated over frames (temporal accumulation); `histories` as in `DenoisedRenderer`."""
     return bool(histories and render.history) and traces_paths(render)
 
 

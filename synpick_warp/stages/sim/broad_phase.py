@@ -13,7 +13,7 @@ from synpick_warp.kernels.sim import broad_phase
 BLOCK = 128
 """Threads per world that list overlapping bounding boxes; on a CPU one."""
 SEPARATION_THREADS = 128
-"""Threads per world that test separating axes; a world has some 130 overlaps. All threads share the overlaps of all worlds."""
+"""Threads per world that test separating axes, about one per overlap (130 per world in real piles); a grid-stride loop over all worlds'."""
 EMPTY = 1.0
 """Bound of empty bounding boxes: their lower corner is at +EMPTY, their upper one at -EMPTY [m]."""
 

@@ -193,17 +193,14 @@ class Physics:
 
         A single CUDA graph of a whole tick could not be enqueued in parts, and CUDA would spread it over 66 streams.
         """
+        each = 1 if self.device.is_cuda else None
         graphs: list[wp.Graph] = []
-        busy = True
-        while busy:
-            captured = 0
+        while True:
             with wp.ScopedCapture(device=self.device) as capture:
-                for _ in substeps if not self.device.is_cuda else itertools.islice(substeps, 1):
-                    captured += 1
-            busy = captured > 0
-            if busy:
-                graphs.append(capture.graph)
-        return graphs
+                count = sum(1 for _ in itertools.islice(substeps, each))
+            if not count:
+                return graphs
+            graphs.append(capture.graph)
 
     def clear_graphs(self) -> None:
         """Drop the captured graphs; the next tick begins eagerly, and captures them anew."""
