@@ -20,6 +20,7 @@ from synpick_warp.cli.report import write_page
 from synpick_warp.cli.statistics import show_statistics
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
 from synpick_warp.cli.validate import validate
+from synpick_warp.cli.verify import EXIT_INCOMPLETE, verify
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config
@@ -29,7 +30,6 @@ from synpick_warp.errors import CatalogError, ConfigError, LightError, SynpickEr
 from synpick_warp.system.garbage import collection_paused
 
 NAME = "synpick-warp"
-EXIT_INCOMPLETE = 1
 EXIT_MISTAKE = 2
 EXIT_INTERRUPTED = 130
 """128 + SIGINT, the shell convention."""
@@ -143,24 +143,6 @@ def bake(
     trace = profile_out or out.with_name(f"{out.name}-profile.json")
     check_trace_file(trace, out)
     return _bake_profiled(resolved, out, part, names, trace)
-
-
-@app.command
-def verify(folder: Annotated[Path, Parameter(name="DIR", help="A data set.")], /) -> int:
-    """Verify the SHA-256 checksum of every file of a data set.
-
-    Exit codes: 0, all match; 1, a file is damaged or missing (it is named), or the bake is not finished; 2, the folder is not a data set.
-    """
-    from synpick_warp.dataset.verify import verify as check
-
-    verdict = check(folder)
-    if verdict.problem:
-        print(verdict.problem)
-        return EXIT_INCOMPLETE
-    print(f"{verdict.files:,} files of {verdict.episodes:,} episodes match their checksums")
-    if not verdict.finished:
-        print("the data set is not finished: the command that started it resumes it")
-    return 0 if verdict.finished else EXIT_INCOMPLETE
 
 
 @app.command
@@ -281,6 +263,7 @@ app.command(estimate)
 app.command(convert)
 app.command(show_statistics, name="stats")
 app.command(validate)
+app.command(verify)
 app.command(write_page, name="report")
 
 

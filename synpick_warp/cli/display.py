@@ -1,4 +1,4 @@
-"""Progress display of a bake and of an estimation, and a bake's summary: a live line on a terminal, plain lines elsewhere."""
+"""Progress display of a bake and of a pass over a data set, and a bake's summary: a live line on a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class PlainProgress:
 
 
 class ViewCounter:
-    """Progress of an estimation: a live bar on a terminal, plain lines elsewhere."""
+    """Progress of a pass over a data set: a live bar on a terminal, plain lines elsewhere."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.options import WholeNumber
+from synpick_warp.cli.options import MAX_THREADS, WholeNumber
 from synpick_warp.configs.check import escape, format_value
 from synpick_warp.errors import ConfigError, OutputError
 
@@ -162,7 +162,7 @@ def make_options(method: str, depth: str, masks: str, visib_min: float, seed: in
             raise ConfigError(f"{option} is {format_value(value)}; allowed: {', '.join(allowed)}")
     if not 0.0 <= visib_min <= 1.0:
         raise ConfigError(f"--visib-min is {visib_min:g}; allowed: 0 to 1")
-    for option, number, most in (("--seed", seed, _MAX_SEED), ("--batch", batch, 4096), ("--threads", threads, 1024)):
+    for option, number, most in (("--seed", seed, _MAX_SEED), ("--batch", batch, 4096), ("--threads", threads, MAX_THREADS)):
         if not 0 <= number <= most:
             raise ConfigError(f"{option} is {number}; allowed: 0 to {most}")
     given = {"threads": threads} if threads else {}

@@ -13,6 +13,8 @@ from synpick_warp.errors import ConfigError
 
 MAX_DIGITS = 100
 """Most digits of a whole number; which of them are allowed is checked by the setting, with its range in the message."""
+MAX_THREADS = 1024
+"""Largest number of processes or threads of an option."""
 MAX_LINE = 2000
 """Longest message [characters]: names of files and keys may be of any length."""
 _WHOLE = re.compile(rf"[+-]?[0-9]{{1,{MAX_DIGITS}}}")

@@ -10,12 +10,11 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from synpick_warp.cli.options import WholeNumber
+from synpick_warp.cli.options import MAX_THREADS, WholeNumber
 from synpick_warp.configs.check import escape
 from synpick_warp.errors import ConfigError, DatasetError
 
 MAX_DEPTH_VIEWS = 100_000
-MAX_THREADS = 1024
 MEBIBYTE = 2**20
 """Bytes."""
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.options import WholeNumber, one_line
+from synpick_warp.cli.options import MAX_THREADS, WholeNumber, one_line
 from synpick_warp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 EXIT_VIOLATIONS = 1
 _MAX_SAMPLE = 10**9
-_MAX_THREADS = 1024
 
 
 def validate(
@@ -79,8 +78,8 @@ def _make_options(sample: int | None, threads: int, *, poses: bool, fast: bool) 
         raise ConfigError("--poses renders every view; drop it, or --sample")
     if sample is not None and not 0 <= sample <= _MAX_SAMPLE:
         raise ConfigError(f"--sample is {sample}; allowed: 0 to {_MAX_SAMPLE}")
-    if not 0 <= threads <= _MAX_THREADS:
-        raise ConfigError(f"--threads is {threads}; allowed: 0 to {_MAX_THREADS}")
+    if not 0 <= threads <= MAX_THREADS:
+        raise ConfigError(f"--threads is {threads}; allowed: 0 to {MAX_THREADS}")
     given = {"threads": threads} if threads else {}
     return Options(None if poses else DEFAULT_SAMPLE if sample is None else sample, not fast, **given)
 

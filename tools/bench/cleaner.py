@@ -1,7 +1,7 @@
 """Background verification of a running bake: verifies each committed episode as `synpick-warp verify` does, then deletes its files.
 
-One process; it ends with the benchmark. Files of episodes without a manifest entry, which are still written, are left alone, and so are
-manifest entries.
+A quarter of the CPU cores have a process each, which end with the benchmark; episodes are dealt to them by index. Files of episodes without
+a manifest entry, which are still written, are left alone, and so are manifest entries.
 """
 
 from __future__ import annotations
@@ -11,19 +11,24 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import dataclass, replace
+from functools import reduce
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from synpick_warp.dataset.manifest import committed_episodes, episode_entry, read_checksums
-from synpick_warp.dataset.verify import check_files
+from synpick_warp.dataset.verify import FileList, check_files
 from synpick_warp.errors import SynpickError
-from synpick_warp.system.processes import END_TIMEOUT, send, start_process
+from synpick_warp.system.cores import count_cores
+from synpick_warp.system.processes import END_TIMEOUT, WorkerProcess, send, start_process
 
 INTERVAL = 0.5
 """Time between two searches for committed episodes [s]."""
+CORES_PER_PROCESS = 4
+"""CPU cores of a machine for each process: a full-HD view with all masks takes a process some 2 ms, and the writers 4 to 5 ms."""
 _PROGRAM = "from tools.bench.cleaner import main; main()"
 
 
@@ -37,11 +42,13 @@ class Assignment:
     """Folders that episodes share, relative to it, which stay."""
     suffixes: tuple[str, ...] = ()
     """Suffixes of the files that are deleted; empty: all."""
+    share: tuple[int, int] = (0, 1)
+    """(i, n): only episodes with index % n == i."""
 
 
 @dataclass(frozen=True)
 class Tally:
-    """Totals of a cleaner."""
+    """Totals of a cleaner, or of one of its processes."""
 
     episodes: int = 0
     """Verified episodes."""
@@ -52,37 +59,59 @@ class Tally:
     problem: str = ""
     """First file that is missing or damaged, and how; the cleaner ends with it. Empty: none."""
 
+    def plus(self, other: Tally) -> Tally:
+        """Return the sum of two totals, with the first problem."""
+        return Tally(self.episodes + other.episodes, self.files + other.files, self.deleted + other.deleted, self.problem or other.problem)
+
 
 class Cleaner:
-    """Handle of a cleaner's process; a context manager that ends it."""
+    """Handle of the cleaner's processes; a context manager that ends them."""
 
-    def __init__(self, assignment: Assignment) -> None:
-        self.tally = Tally()
-        self._worker = start_process(_PROGRAM)
-        send(self._worker.link, assignment)
+    def __init__(self, assignment: Assignment, processes: int | None = None) -> None:
+        """Start the processes; `processes` is their number, None: by CORES_PER_PROCESS."""
+        count = processes or max(1, count_cores() // CORES_PER_PROCESS)
+        self._workers = [start_process(_PROGRAM) for _ in range(count)]
+        self._tallies = [Tally() for _ in self._workers]
+        for index, worker in enumerate(self._workers):
+            send(worker.link, replace(assignment, share=(index, count)))
 
     @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._worker.process.pid
+    def pids(self) -> list[int]:
+        """Process ids."""
+        return [worker.process.pid for worker in self._workers]
 
     def poll(self) -> Tally:
-        """Latest totals; a process that died is a problem."""
-        with contextlib.suppress(EOFError, OSError):
-            while not self.tally.problem and self._worker.link.poll():
-                self.tally = self._worker.link.recv()
-        if not self.tally.problem and self._worker.process.poll() is not None:
-            self.tally = replace(self.tally, problem=f"the process that verifies scenes {self._worker.describe_end('bake.worlds')[0]}")
-        return self.tally
+        """Latest totals of all processes; one that died is a problem."""
+        self._tallies = [_poll(worker, tally) for worker, tally in zip(self._workers, self._tallies, strict=True)]
+        return reduce(Tally.plus, self._tallies)
+
+    def finish(self, episodes: int) -> Tally:
+        """Wait until `episodes` episodes are verified, or a problem is found; returns the totals."""
+        while (tally := self.poll()).episodes < episodes and not tally.problem:
+            time.sleep(INTERVAL)
+        return tally
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        with contextlib.suppress(OSError, subprocess.TimeoutExpired):
-            send(self._worker.link, None)
-            self._worker.process.wait(END_TIMEOUT)
-        self._worker.kill()
+        for worker in self._workers:
+            with contextlib.suppress(OSError):
+                send(worker.link, None)
+        for worker in self._workers:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                worker.process.wait(END_TIMEOUT)
+            worker.kill()
+
+
+def _poll(worker: WorkerProcess, tally: Tally) -> Tally:
+    """Latest totals of a process, those before being `tally`."""
+    with contextlib.suppress(EOFError, OSError):
+        while not tally.problem and worker.link.poll():
+            tally = worker.link.recv()
+    if not tally.problem and worker.process.poll() is not None:
+        tally = replace(tally, problem=f"a process that verifies scenes {worker.describe_end('bake.worlds')[0]}")
+    return tally
 
 
 def main() -> None:
@@ -93,7 +122,8 @@ def main() -> None:
         assignment: Assignment = link.recv()
         tally, done = Tally(), set[int]()
         while not tally.problem and not link.poll(INTERVAL):
-            for episode in sorted(set(committed_episodes(assignment.out)) - done):
+            index, count = assignment.share
+            for episode in sorted(each for each in committed_episodes(assignment.out) if each % count == index and each not in done):
                 tally = clean_episode(assignment, episode, tally)
                 done.add(episode)
                 send(link, tally)
@@ -108,9 +138,8 @@ def clean_episode(assignment: Assignment, episode: int, tally: Tally) -> Tally:
         known = read_checksums(out, episode_entry(episode))
     except SynpickError as error:
         return replace(tally, problem=str(error))
-    for name, problem in check_files(out, known):
-        if problem:
-            return replace(tally, problem=f"{out / name} {problem}")
+    if problem := check_files(out, FileList(known, 0)).problem:
+        return replace(tally, problem=problem)
     deleted = 0
     for name in known:
         if not assignment.suffixes or name.endswith(assignment.suffixes):

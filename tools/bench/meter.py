@@ -46,9 +46,9 @@ class Reading:
     writers: Usage
     """Of the writers; with several devices, of the devices' processes as well."""
     cleaner: Usage
-    """Of the process that verifies and deletes."""
+    """Of the processes that verify and delete."""
     tally: Tally
-    """Its totals."""
+    """Their totals."""
     disk: int
     """Bytes in use on the file system."""
     device: int
@@ -79,7 +79,7 @@ class SteadyMeter(SilentProgress):
             steady_count: Steady-state threshold: views, or frames, of a device's tick.
             worlds: Worlds of a device.
             device: First device of the bake.
-            cleaner: Process that verifies and deletes; None: there is none.
+            cleaner: Processes that verify and delete; None: there are none.
             counter: Function that returns the number of frames so far; None: views are counted.
             devices: Devices of the bake, with a process each if there are several.
         """
@@ -124,7 +124,8 @@ class SteadyMeter(SilentProgress):
 
     def _read(self, count: int, episodes: int, tally: Tally) -> Reading:
         now, disk, usages = time.perf_counter(), shutil.disk_usage(self.folder).used, measure_usage()
-        main, cleaner = usages.pop(os.getpid(), Usage()), usages.pop(self.cleaner.pid, Usage()) if self.cleaner else Usage()
+        main, pids = usages.pop(os.getpid(), Usage()), self.cleaner.pids if self.cleaner else ()
+        cleaner = reduce(Usage.plus, [usages.pop(pid, Usage()) for pid in pids], Usage())
         device = self.device.total_memory - self.device.free_memory if self.device.is_cuda else 0
         return Reading(now, count, episodes, main, reduce(Usage.plus, usages.values(), Usage()), cleaner, tally, disk, device)
 

@@ -1,6 +1,6 @@
 """Steady-state benchmark of a bake: views per second to disk while nearly all worlds are live, and CPU time of a view by kind of process.
 
-A background process verifies finished episodes and deletes their files, so that the disk does not fill.
+Background processes verify finished episodes and delete their files, so that the disk does not fill.
 """
 
 from __future__ import annotations
@@ -72,7 +72,8 @@ def _summarize(config: Config, meter: SteadyMeter) -> Iterator[Row]:
     yield from summarize_rates("steady", "view", meter)
     first, last = meter.readings[0], meter.readings[-1]
     verified, deleted = last.tally.episodes - first.tally.episodes, last.tally.deleted - first.tally.deleted
-    yield Row("steady", "BOP scenes (episode x camera) verified and deleted", verified * len(config.cameras.positions), "")
+    yield Row("steady", "episodes that ended", last.episodes - first.episodes, "")
+    yield Row("steady", "episodes of which all files are verified and deleted", verified, "")
     yield Row("steady", "files of these", last.tally.files - first.tally.files, "")
     yield Row("steady", "errors found in them", int(bool(last.tally.problem)), "")
     yield Row("steady", "size of a view on disk", 1e-6 * (last.disk + deleted - first.disk) / max(1, last.count - first.count), "MB")

@@ -1,13 +1,14 @@
 """Benchmark of a whole bake: its mean rate from start to exit, and where the time goes.
 
-Images are deleted once verified, since those of 150 episodes may not fit on the disk; other files are kept, because the bake reads some of
-them at its end.
+Episodes are verified while the bake runs, and their images deleted, since those of 150 episodes may not fit on the disk; other files are
+kept, because the bake reads some of them at its end.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import itertools
+import shutil
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from synpick_warp.configs.schema import Config
+from synpick_warp.dataset.manifest import committed_episodes
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
 from tools.bench.meter import LIVE_FRACTION
@@ -57,10 +59,11 @@ class Stretch(NamedTuple):
 
 
 class _Trace(SilentProgress):
-    """Progress observer that records a point after each tick, and when each stage begins."""
+    """Progress observer that records a point after each tick, when each stage begins, and the largest size on disk."""
 
-    def __init__(self) -> None:
-        self.started = time.perf_counter()
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.started, self.disk = folder, time.perf_counter(), 0
+        self._initial_disk = shutil.disk_usage(folder).used
         self.points: list[TracePoint] = []
         self.stages: list[tuple[str, float]] = []
 
@@ -72,6 +75,7 @@ class _Trace(SilentProgress):
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
         """Record a point."""
+        self.disk = max(self.disk, shutil.disk_usage(self.folder).used - self._initial_disk)
         self.points.append(TracePoint(time.perf_counter() - self.started, views, worlds_active, episodes_done))
 
 
@@ -85,15 +89,21 @@ def measure_whole(config: Config, bake: WholeBake, steady_rate: float, traces: d
         traces: Receives the columns of `describe_trace` under the key "whole".
     """
     config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, episodes=bake.episodes, worlds=bake.worlds))
-    with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out", PICTURES):
-        trace = _Trace()
+    with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out", PICTURES) as cleaner:
+        trace = _Trace(Path(folder))
         summary = run_bake(config, Path(folder) / "out", trace)
         whole = Stretch(time.perf_counter() - trace.started, summary.views)
+        tally = cleaner.finish(len(committed_episodes(Path(folder) / "out")))
+        verified = time.perf_counter() - trace.started
     cameras = len(config.cameras.positions)
     traces["whole"] = describe_trace(trace.points, cameras)
     yield from summarize(trace.points, cameras, whole, steady_rate)
     for text, seconds in trace.stages:
         yield Row("whole", f"begin of: {text}", seconds, "s")
+    yield Row("whole", "episodes of which all files are verified", tally.episodes, "")
+    yield Row("whole", "files of these", tally.files, "")
+    yield Row("whole", "start to the last verified file", verified, "s")
+    yield Row("whole", "largest size on disk", 1e-9 * trace.disk, "GB")
     if summary.stopped:
         raise KeyboardInterrupt
 

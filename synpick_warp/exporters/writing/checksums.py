@@ -43,7 +43,7 @@ def open_regular(path: Path | str) -> int:
     return handle
 
 
-def checksum(path: Path) -> str:
+def checksum(path: Path | str) -> str:
     """SHA-256 of a regular file, in hexadecimal. Raises as `open_regular`."""
     return _hash_file(path)[0]
 

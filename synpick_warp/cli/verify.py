@@ -1,0 +1,42 @@
+"""Command `verify`: checksums of a data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from synpick_warp.cli.options import MAX_THREADS, WholeNumber
+from synpick_warp.errors import ConfigError
+
+EXIT_INCOMPLETE = 1
+
+
+def verify(
+    folder: Annotated[Path, Parameter(name="DIR", help="A data set.")],
+    /,
+    *,
+    threads: Annotated[WholeNumber, Parameter(help="Maximum number of processes; 0: one per core.")] = 0,
+) -> int:
+    """Verify the SHA-256 checksum of every file of a data set.
+
+    Exit codes: 0, all match; 1, a file is damaged or missing (it is named), or the bake is not finished; 2, the folder is not a data set.
+    """
+    if not 0 <= threads <= MAX_THREADS:
+        raise ConfigError(f"--threads is {threads}; allowed: 0 to {MAX_THREADS}")
+    from rich.console import Console
+
+    from synpick_warp.cli.display import ViewCounter
+    from synpick_warp.dataset.verify import verify as check
+    from synpick_warp.system.cores import count_cores
+
+    with ViewCounter(Console(stderr=True, highlight=False)) as counter:
+        verdict = check(folder, threads or count_cores(), counter.report)
+    if verdict.problem:
+        print(verdict.problem)
+        return EXIT_INCOMPLETE
+    print(f"{verdict.files:,} files of {verdict.episodes:,} episodes match their checksums")
+    if not verdict.finished:
+        print("the data set is not finished: the command that started it resumes it")
+    return 0 if verdict.finished else EXIT_INCOMPLETE

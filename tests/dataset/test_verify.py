@@ -1,0 +1,112 @@
+"""Checksum verification in several processes: the same verdict as in one, whatever is damaged."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from synpick_warp.cli.commands import main
+from synpick_warp.configs.write import config_to_toml
+from synpick_warp.dataset import manifest, verify
+from synpick_warp.exporters.writing.checksums import write_manifest_entry
+from synpick_warp.system import ordered_pool
+from synpick_warp.system.processes import ProcessError
+from tests.harness.entries import episode_content
+from tests.worlds.small_worlds import settings
+
+EPISODES, FILES = 4, 7
+THREADS = [1, 3]
+
+
+@pytest.fixture
+def out(tmp_path, monkeypatch) -> Path:
+    """A data set of EPISODES episodes of FILES files, which is verified in parts of two files by as many processes as are allowed."""
+    monkeypatch.setattr(verify, "_PART", 2)
+    monkeypatch.setattr(verify, "_FILES_PER_PROCESS", 1)
+    (tmp_path / manifest.MANIFEST_FILE).write_bytes(manifest.encode_manifest(manifest.make_manifest(settings())))
+    (tmp_path / manifest.CONFIG_FILE).write_text(config_to_toml(settings()))
+    (tmp_path / "manifest").mkdir()
+    write_files(tmp_path, manifest.CONSTANTS, ["models/obj_000001.ply"], {})
+    for episode in range(EPISODES):
+        write_files(tmp_path, manifest.episode_entry(episode), [name(episode, each) for each in range(FILES)], episode_content(episode))
+    return tmp_path
+
+
+def name(episode: int, file: int) -> str:
+    return f"train/{episode:06d}/rgb/{file:06d}.jpg"
+
+
+def write_files(out: Path, entry: Path, names: list[str], content: dict) -> None:
+    for each in names:
+        (out / each).parent.mkdir(parents=True, exist_ok=True)
+        (out / each).write_text(each)
+    write_manifest_entry(out, entry, [Path(each) for each in names], content)
+
+
+@pytest.mark.parametrize("threads", THREADS)
+def test_all_files_are_counted(out, threads):
+    seen = []
+    verdict = verify.verify(out, threads, lambda *progress: seen.append(progress))
+    assert verdict == ("", EPISODES, 1 + EPISODES * FILES, False)
+    assert [unit for unit, _, _ in seen] == ["parts"] * len(seen)
+    assert [done for _, done, _ in seen] == sorted(done for _, done, _ in seen)
+    assert seen[-1] == ("parts", 1 + EPISODES, 1 + EPISODES)
+
+
+@pytest.mark.parametrize("threads", THREADS)
+def test_of_several_damaged_files_the_first_is_named(out, threads):
+    (out / name(3, 0)).unlink()
+    (out / name(1, 6)).write_text("other")
+    (out / name(2, 1)).unlink()
+    verdict = verify.verify(out, threads)
+    assert verdict.problem == f"{out / name(1, 6)} has changed since it was written: its checksum differs"
+    assert verdict.files == 1 + 2 * FILES
+
+
+@pytest.mark.parametrize("threads", THREADS)
+def test_a_damaged_list_is_said_after_the_files_before_it(out, threads):
+    (out / "manifest/000002.sha256").write_text("")
+    (out / name(3, 0)).unlink()
+    verdict = verify.verify(out, threads)
+    assert verdict.problem.startswith(f"{out / 'manifest/000002.sha256'} does not match")
+    assert verdict.files == 1 + 2 * FILES
+    (out / name(1, 2)).unlink()
+    assert verify.verify(out, threads).problem == f"{out / name(1, 2)} is missing"
+
+
+@pytest.mark.parametrize("threads", THREADS)
+def test_a_link_is_no_file_of_a_data_set(out, threads):
+    file = out / name(0, 1)
+    file.rename(file.with_suffix(".moved"))
+    file.symlink_to(file.with_suffix(".moved"))
+    assert "symbolic link" in verify.verify(out, threads).problem
+
+
+def test_few_files_are_read_by_the_calling_process(out, monkeypatch):
+    monkeypatch.undo()
+    monkeypatch.setattr(verify, "map_ordered", None)
+    assert verify.verify(out, 8).files == 1 + EPISODES * FILES
+
+
+def test_a_process_that_dies_is_one_line(out, monkeypatch, capsys):
+    start = ordered_pool.start_process
+
+    def start_and_kill(code: str):
+        worker = start(code)
+        os.kill(worker.process.pid, signal.SIGKILL)
+        return worker
+
+    monkeypatch.setattr(ordered_pool, "start_process", start_and_kill)
+    with pytest.raises(ProcessError, match="a process that verifies was ended by SIGKILL; if memory ran out, set --threads"):
+        verify.verify(out, 2)
+    assert main(["verify", str(out), "--threads", "2"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("threads", ["-1", "1025", "x"])
+def test_other_numbers_of_processes_are_refused(out, capsys, threads):
+    assert main(["verify", str(out), "--threads", threads]) == 2
+    assert "--threads is" in capsys.readouterr().err
