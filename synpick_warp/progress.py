@@ -1,9 +1,13 @@
-"""Progress reporting: the observer interface of a bake, and a silent observer."""
+"""Progress reporting: the observer interface of a bake, a silent observer, and the callback of a pass over a data set."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import TracebackType
 from typing import Protocol, Self
+
+Report = Callable[[str, int, int], None]
+"""Progress of a pass over a data set: receives the unit ("views"), the number done and the total."""
 
 
 class Progress(Protocol):

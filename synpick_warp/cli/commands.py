@@ -15,12 +15,21 @@ from synpick_warp import __version__
 from synpick_warp.cli.convert import convert
 from synpick_warp.cli.estimate import estimate
 from synpick_warp.cli.evaluate import evaluate
-from synpick_warp.cli.options import Count, WholeNumber, one_line, parse_devices, parse_resolution, parse_shard, parse_splits
+from synpick_warp.cli.options import (
+    EXIT_INCOMPLETE,
+    Count,
+    WholeNumber,
+    one_line,
+    parse_devices,
+    parse_resolution,
+    parse_shard,
+    parse_splits,
+)
 from synpick_warp.cli.report import write_page
 from synpick_warp.cli.statistics import show_statistics
 from synpick_warp.cli.streams import SafeStreams, StreamError, describe_fault
 from synpick_warp.cli.validate import validate
-from synpick_warp.cli.verify import EXIT_INCOMPLETE, verify
+from synpick_warp.cli.verify import verify
 from synpick_warp.configs.check import describe_allowed
 from synpick_warp.configs.load import COMMAND_LINE, DEFAULT_PRESET, load_config, parse_assignment, preset_names, sections, settings_of
 from synpick_warp.configs.schema import Config

@@ -130,7 +130,7 @@ class ViewCounter:
         self._bar.stop()
 
     def report(self, unit: str, done: int, total: int) -> None:
-        """See `estimation.run.Report`."""
+        """See `progress.Report`."""
         self._bar.update(self._task, description=unit, completed=done, total=total)
         now = time.monotonic()
         if not self._console.is_terminal and now - self._printed_at >= PLAIN_INTERVAL:

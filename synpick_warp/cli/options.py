@@ -1,4 +1,4 @@
-"""Option parsers: whole numbers, resolutions, shards; and the one line in which a mistake is reported."""
+"""What commands share: option parsers, limits of options, an exit code, and the one line in which a mistake is reported."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from cyclopts import Parameter, Token
 from synpick_warp.configs.check import escape, format_value
 from synpick_warp.errors import ConfigError
 
+EXIT_INCOMPLETE = 1
+"""Exit code of a command whose data set is not complete, or damaged."""
 MAX_DIGITS = 100
 """Most digits of a whole number; which of them are allowed is checked by the setting, with its range in the message."""
 MAX_THREADS = 1024

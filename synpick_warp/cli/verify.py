@@ -7,10 +7,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.options import MAX_THREADS, WholeNumber
+from synpick_warp.cli.options import EXIT_INCOMPLETE, MAX_THREADS, WholeNumber
 from synpick_warp.errors import ConfigError
-
-EXIT_INCOMPLETE = 1
 
 
 def verify(
@@ -29,10 +27,9 @@ def verify(
 
     from synpick_warp.cli.display import ViewCounter
     from synpick_warp.dataset.verify import verify as check
-    from synpick_warp.system.cores import count_cores
 
     with ViewCounter(Console(stderr=True, highlight=False)) as counter:
-        verdict = check(folder, threads or count_cores(), counter.report)
+        verdict = check(folder, threads or None, counter.report)
     if verdict.problem:
         print(verdict.problem)
         return EXIT_INCOMPLETE

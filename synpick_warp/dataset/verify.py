@@ -1,12 +1,13 @@
 """Checksum verification of a data set: every file against the SHA-256 in its manifest entry, up to the first mismatch.
 
-Data sets of many files are read by several processes. The result does not depend on their number.
+Large data sets are read by several processes. The result does not depend on their number.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -24,17 +25,17 @@ from synpick_warp.dataset.manifest import (
 )
 from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.checksums import checksum
+from synpick_warp.progress import Report
+from synpick_warp.system.cores import count_cores
 from synpick_warp.system.ordered_pool import WorkerProgram, map_ordered
 from synpick_warp.system.processes import serve
 
-Report = Callable[[str, int, int], None]
-"""Progress: unit, number done, total."""
-_PART = 256
-"""Files of a task: with fewer, the messages to processes take longer than small files."""
-_FILES_PER_PROCESS = 10_000
-"""Minimum number of files per process: starting one takes 0.2 s, in which this one checks some 10,000 small files."""
-_LINE = 100
-"""Typical length of a line of a checksum list [bytes]."""
+_FILES_PER_PROCESS, _BYTES_PER_PROCESS = 10_000, 1 << 28
+"""Minimum work of a process: that many files, or so many bytes. Starting a process takes the time in which this one checks either."""
+_ENTRIES_PER_PROCESS = 4
+"""With at least that many manifest entries per process, the files of an entry are one task; with fewer they are split."""
+_PARTS_PER_PROCESS = 4
+"""Tasks per process into which the files of a split entry are divided."""
 _PROGRAM = "from synpick_warp.dataset.verify import main; main()"
 
 
@@ -51,15 +52,12 @@ class Verdict(NamedTuple):
     """Whether the bake finished."""
 
 
-class FileList(NamedTuple):
-    """Task: files to check, or a problem that was found before."""
+class CheckPart(NamedTuple):
+    """Task: part of the files of a manifest entry, in order."""
 
-    checksums: dict[str, str]
-    """SHA-256 by path, relative to the data set."""
-    entries: int
-    """Number of manifest entries whose files are listed to the end by this task and those before."""
-    problem: str = ""
-    """Why the list of the next entry cannot be read; empty: it can."""
+    entry: Path
+    part: int = 0
+    parts: int = 1
 
 
 class Checked(NamedTuple):
@@ -67,20 +65,18 @@ class Checked(NamedTuple):
 
     files: int
     """Number of files that were checked."""
-    entries: int
-    """As of the task."""
     problem: str
     """First problem; empty: none."""
 
 
-def verify(folder: Path, threads: int = 1, report: Report = lambda unit, done, total: None) -> Verdict:
+def verify(folder: Path, threads: int | None = None, report: Report = lambda unit, done, total: None) -> Verdict:
     """Compare every file of a data set with its checksum from the time of writing; stops at the first mismatch.
 
     Order: settings, constants, episodes by index, indices.
 
     Args:
         folder: The data set.
-        threads: Maximum number of processes.
+        threads: Maximum number of processes; None: one per core.
         report: Called with the progress.
 
     Raises:
@@ -95,12 +91,13 @@ def verify(folder: Path, threads: int = 1, report: Report = lambda unit, done, t
         read_settings(folder, manifest)
         indices = read_entry(folder, INDICES)
         finished = indices is not None and indices["episodes"] == episodes
-        entries = [CONSTANTS, *map(episode_entry, episodes), *([INDICES] if indices else [])]
-        for checked in _check_entries(folder, entries if episodes or indices else [], threads):
+        entries = [CONSTANTS, *map(episode_entry, episodes), *([INDICES] if indices else [])] if episodes or indices else []
+        total, size = _count_files(folder, entries)
+        for checked in _check_entries(folder, entries, min(threads or count_cores(), _useful_processes(total, size))):
             files += checked.files
             if checked.problem:
                 return Verdict(checked.problem, len(episodes), files, finished)
-            report("parts", checked.entries, len(entries))
+            report("files", files, total)
     except (ConfigError, DatasetError) as error:
         return Verdict(str(error), len(episodes), files, finished)
     missing = sorted(set(indices["episodes"]) - set(episodes)) if indices else []
@@ -108,44 +105,55 @@ def verify(folder: Path, threads: int = 1, report: Report = lambda unit, done, t
     return Verdict(problem, len(episodes), files, finished)
 
 
-def _check_entries(folder: Path, entries: Sequence[Path], threads: int) -> Iterator[Checked]:
-    """Check the files of manifest entries in tasks of up to _PART files; results come in order."""
-    tasks = _list_files(folder, entries)
-    processes = min(threads, _estimate_files(folder, entries) // _FILES_PER_PROCESS)
+def _count_files(folder: Path, entries: Sequence[Path]) -> tuple[int, int]:
+    """Number and size [bytes] of the files of all entries. Damaged entries count as none; their own check reports them."""
+    files = size = 0
+    for entry in entries:
+        try:
+            content = read_entry(folder, entry)
+        except DatasetError:
+            continue
+        if content is not None:
+            files, size = files + content["files"], size + content["bytes"]
+    return files, size
+
+
+def _useful_processes(files: int, size: int) -> int:
+    """Number of processes beyond which starting one more takes longer than it saves, at least 1."""
+    return max(1, files // _FILES_PER_PROCESS, size // _BYTES_PER_PROCESS)
+
+
+def _check_entries(folder: Path, entries: Sequence[Path], processes: int) -> Iterator[Checked]:
+    """Check the files of manifest entries; results come in order."""
+    parts = 1 if processes == 1 or len(entries) >= _ENTRIES_PER_PROCESS * processes else _PARTS_PER_PROCESS * processes
+    tasks = (CheckPart(entry, part, parts) for entry in entries for part in range(parts))
     if processes > 1:
         yield from map_ordered(WorkerProgram(_PROGRAM, folder, "verifies"), tasks, processes)
     else:
-        yield from (check_files(folder, task) for task in tasks)
+        yield from (check_part(folder, task) for task in tasks)
 
 
-def _estimate_files(folder: Path, entries: Sequence[Path]) -> int:
-    """Approximate number of files, from the sizes of the checksum lists."""
-    lists = [folder / f"{entry}.sha256" for entry in entries]
-    return sum(path.stat().st_size for path in lists if path.exists()) // _LINE
+def check_part(folder: Path, task: CheckPart, read: Callable[[Path, Path], dict[str, str]] = read_checksums) -> Checked:
+    """Check a part of the files of a manifest entry, in order, up to the first problem; `read` reads the entry's list."""
+    try:
+        known = read(folder, task.entry)
+    except DatasetError as error:
+        return Checked(0, str(error))
+    first, end = (len(known) * (task.part + step) // task.parts for step in (0, 1))
+    return check_files(folder, dict(islice(known.items(), first, end)))
 
 
-def _list_files(folder: Path, entries: Sequence[Path]) -> Iterator[FileList]:
-    """Tasks of the entries, in order; ends at an entry that cannot be read."""
-    for number, entry in enumerate(entries):
-        try:
-            items = iter(read_checksums(folder, entry).items())
-        except DatasetError as error:
-            yield FileList({}, number, str(error))
-            return
-        part = dict(islice(items, _PART))
-        while following := dict(islice(items, _PART)):
-            yield FileList(part, number)
-            part = following
-        yield FileList(part, number + 1)
+def check_files(folder: Path, known: Mapping[str, str]) -> Checked:
+    """Compare files with their checksums, in order, up to the first problem.
 
-
-def check_files(folder: Path, files: FileList) -> Checked:
-    """Compare files with their checksums, in order, up to the first problem."""
-    for number, (name, expected) in enumerate(files.checksums.items(), 1):
-        path = f"{folder}/{name}"  # Joining paths as strings takes a fifth less time for a small file.
-        if problem := _check_file(path, expected):
-            return Checked(number, files.entries, f"{path} {problem}")
-    return Checked(len(files.checksums), files.entries, files.problem)
+    Args:
+        folder: The data set.
+        known: SHA-256 by path, relative to the data set.
+    """
+    for number, (name, expected) in enumerate(known.items(), 1):
+        if problem := _check_file(f"{folder}/{name}", expected):  # Joining paths as strings takes a fifth less time for a small file.
+            return Checked(number, f"{folder / name} {problem}")
+    return Checked(len(known), "")
 
 
 def _check_file(path: str, expected: str) -> str:
@@ -161,10 +169,11 @@ def _check_file(path: str, expected: str) -> str:
 def main() -> None:
     """Main function of a process: serves tasks from the socket with handle argv[1]; the first message is the data set's folder."""
     folders: list[Path] = []
+    read_once = lru_cache(maxsize=1)(read_checksums)  # An entry's parts come one after the other.
 
-    def answer(message: Path | FileList) -> Checked | None:
-        if isinstance(message, FileList):
-            return check_files(folders[0], message)
+    def answer(message: Path | CheckPart) -> Checked | None:
+        if isinstance(message, CheckPart):
+            return check_part(folders[0], message, read_once)
         folders.append(message)
         return None
 

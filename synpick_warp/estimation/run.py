@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,6 +17,7 @@ from synpick_warp.estimation.reading import AHEAD, BYTES_PER_PIXEL, DEPTHS, Scen
 from synpick_warp.estimation.scenes import Scene, ScenePlan, group_scenes, read_scene
 from synpick_warp.evaluation.poses import PoseTable
 from synpick_warp.evaluation.targets import Target, TargetList, count_targets
+from synpick_warp.progress import Report
 from synpick_warp.stages.pose.batch import Estimates
 from synpick_warp.system.cores import count_cores
 from synpick_warp.system.free_memory import free_host_memory
@@ -25,8 +26,6 @@ MAX_VIEWS = 128
 """Views that are estimated at a time, if their number is left open: enough to fill a GPU."""
 MEMORY_FRACTION = 0.25
 """Of the host's free memory for images, if the number of views is left open."""
-Report = Callable[[str, int, int], None]
-"""Called with the kind of what is counted, such as "views", the number that is done, and the number of all."""
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from synpick_warp.dataset.reading import DataSet
 from synpick_warp.dataset.view import View
 from synpick_warp.errors import DatasetError, OutputError
 from synpick_warp.exporters.writing.files import output_error
+from synpick_warp.progress import Report
 from synpick_warp.report.album import Album
 from synpick_warp.report.charts import Source, make_charts
 from synpick_warp.report.explained import choose_attempts, make_attempt
@@ -41,8 +42,6 @@ DEFAULT_NAME = "report.html"
 FRAMES = 12
 """Sampled frames on the page."""
 MAX_FRAMES = 200
-Report = Callable[[str, int, int], None]
-"""Progress: unit, done, total."""
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,11 @@ from typing import NamedTuple, NoReturn
 
 from synpick_warp.dataset.reading import DataSet
 from synpick_warp.errors import DatasetError, SynpickError
+from synpick_warp.progress import Report
 from synpick_warp.statistics.partial import Partial
 from synpick_warp.system.descriptors import open_standard_descriptors
 from synpick_warp.system.processes import ProcessError, WorkerProcess, send, serve, start_process
 
-Report = Callable[[str, int, int], None]
-"""Progress: unit, done, total."""
 VIEWS_PER_PROCESS = 5000
 """Minimum number of views per process: starting one takes the time in which this one counts some 5,000 views."""
 _PROGRAM = "from synpick_warp.statistics.collect import main; main()"

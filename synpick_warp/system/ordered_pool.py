@@ -35,7 +35,11 @@ def map_ordered(program: WorkerProgram, tasks: Iterable[Any], processes: int) ->
     open_standard_descriptors()
     workers: list[WorkerProcess] = []
     try:
-        workers.extend(_start(program) for _ in range(processes))
+        for _ in range(processes):
+            workers.append(_start(program))
+            _send(workers[-1], program.setup, program)
+        for worker in workers:
+            _receive(worker, program)
         idle = list(workers)
         queue, done, running = iter(enumerate(tasks)), {}, {}
         turn, exhausted = 0, False
@@ -47,18 +51,12 @@ def map_ordered(program: WorkerProgram, tasks: Iterable[Any], processes: int) ->
                     break
                 worker = idle.pop()
                 running[worker.link] = worker, item[0]
-                try:
-                    send(worker.link, item[1])
-                except OSError:
-                    _fail(worker, program)
+                _send(worker, item[1], program)
             if not running:
                 return
             for link in wait(list(running)):
                 worker, index = running.pop(link)  # pyright: ignore[reportArgumentType]
-                try:
-                    done[index] = worker.link.recv()
-                except (EOFError, OSError):
-                    _fail(worker, program)
+                done[index] = _receive(worker, program)
                 idle.append(worker)
             while turn in done:
                 yield done.pop(turn)
@@ -69,17 +67,24 @@ def map_ordered(program: WorkerProgram, tasks: Iterable[Any], processes: int) ->
 
 
 def _start(program: WorkerProgram) -> WorkerProcess:
-    """Start a process, and wait until it has answered the setup."""
     try:
-        worker = start_process(program.code)
+        return start_process(program.code)
     except OSError as error:
         raise ProcessError(f"cannot start a process: {error}; set --threads lower") from error
+
+
+def _send(worker: WorkerProcess, message: object, program: WorkerProgram) -> None:
     try:
-        send(worker.link, program.setup)
-        worker.link.recv()
+        send(worker.link, message)
+    except OSError:
+        _fail(worker, program)
+
+
+def _receive(worker: WorkerProcess, program: WorkerProgram) -> Any:
+    try:
+        return worker.link.recv()
     except (EOFError, OSError):
         _fail(worker, program)
-    return worker
 
 
 def _fail(worker: WorkerProcess, program: WorkerProgram) -> NoReturn:

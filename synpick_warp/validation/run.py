@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from synpick_warp.dataset.manifest import read_manifest, read_settings
 from synpick_warp.errors import DatasetError, SynpickError
+from synpick_warp.progress import Report
 from synpick_warp.system.cores import count_cores
 from synpick_warp.validation.keyed import KeyedFolder
 from synpick_warp.validation.layout import Layout, SceneRef
@@ -27,8 +28,6 @@ PART = 100
 """Views of a task."""
 VIEWS_PER_PROCESS = 100
 """Minimum number of views per process: starting one takes a second."""
-Report = Callable[[str, int, int], None]
-"""Progress: unit, number done, total."""
 
 
 @dataclass(frozen=True)

@@ -18,13 +18,14 @@ from tests.harness.entries import episode_content
 from tests.worlds.small_worlds import settings
 
 EPISODES, FILES = 4, 7
+TOTAL = 1 + EPISODES * FILES
+"""With the one file that all episodes share."""
 THREADS = [1, 3]
 
 
 @pytest.fixture
 def out(tmp_path, monkeypatch) -> Path:
-    """A data set of EPISODES episodes of FILES files, which is verified in parts of two files by as many processes as are allowed."""
-    monkeypatch.setattr(verify, "_PART", 2)
+    """A data set of EPISODES episodes of FILES files, which is verified by as many processes as are allowed."""
     monkeypatch.setattr(verify, "_FILES_PER_PROCESS", 1)
     (tmp_path / manifest.MANIFEST_FILE).write_bytes(manifest.encode_manifest(manifest.make_manifest(settings())))
     (tmp_path / manifest.CONFIG_FILE).write_text(config_to_toml(settings()))
@@ -50,10 +51,24 @@ def write_files(out: Path, entry: Path, names: list[str], content: dict) -> None
 def test_all_files_are_counted(out, threads):
     seen = []
     verdict = verify.verify(out, threads, lambda *progress: seen.append(progress))
-    assert verdict == ("", EPISODES, 1 + EPISODES * FILES, False)
-    assert [unit for unit, _, _ in seen] == ["parts"] * len(seen)
-    assert [done for _, done, _ in seen] == sorted(done for _, done, _ in seen)
-    assert seen[-1] == ("parts", 1 + EPISODES, 1 + EPISODES)
+    assert verdict == ("", EPISODES, TOTAL, False)
+    assert {(unit, total) for unit, _, total in seen} == {("files", TOTAL)}
+    done = [done for _, done, _ in seen]
+    assert done == sorted(done)
+    assert set(done) >= {1 + episode * FILES for episode in range(1 + EPISODES)}
+
+
+@pytest.mark.parametrize("split", [False, True])
+def test_several_processes_share_the_entries_or_their_parts(out, monkeypatch, split):
+    tasks = []
+    monkeypatch.setattr(verify, "_ENTRIES_PER_PROCESS", 100 if split else 1)
+    monkeypatch.setattr(verify, "map_ordered", lambda program, given, processes: tasks.extend(given) or [])
+    verify.verify(out, 2)
+    parts = 2 * verify._PARTS_PER_PROCESS if split else 1
+    assert len(tasks) == (1 + EPISODES) * parts
+    names = [verify.check_part(out, task).files for task in tasks]
+    assert sum(names) == TOTAL
+    assert max(names) == (1 if split else FILES)
 
 
 @pytest.mark.parametrize("threads", THREADS)
@@ -67,11 +82,16 @@ def test_of_several_damaged_files_the_first_is_named(out, threads):
 
 
 @pytest.mark.parametrize("threads", THREADS)
-def test_a_damaged_list_is_said_after_the_files_before_it(out, threads):
-    (out / "manifest/000002.sha256").write_text("")
+@pytest.mark.parametrize("damage", ["list", "no list", "entry"])
+def test_a_damaged_list_is_said_after_the_files_before_it(out, threads, damage):
+    path = out / f"manifest/000002.{'json' if damage == 'entry' else 'sha256'}"
+    if damage == "no list":
+        path.unlink()
+    else:
+        path.write_text("")
     (out / name(3, 0)).unlink()
     verdict = verify.verify(out, threads)
-    assert verdict.problem.startswith(f"{out / 'manifest/000002.sha256'} does not match")
+    assert str(path) in verdict.problem
     assert verdict.files == 1 + 2 * FILES
     (out / name(1, 2)).unlink()
     assert verify.verify(out, threads).problem == f"{out / name(1, 2)} is missing"
@@ -85,25 +105,33 @@ def test_a_link_is_no_file_of_a_data_set(out, threads):
     assert "symbolic link" in verify.verify(out, threads).problem
 
 
-def test_few_files_are_read_by_the_calling_process(out, monkeypatch):
+def test_few_small_files_are_read_by_the_calling_process(out, monkeypatch):
     monkeypatch.undo()
     monkeypatch.setattr(verify, "map_ordered", None)
-    assert verify.verify(out, 8).files == 1 + EPISODES * FILES
+    assert verify.verify(out, 8).files == TOTAL
 
 
-def test_a_process_that_dies_is_one_line(out, monkeypatch, capsys):
-    start = ordered_pool.start_process
+def test_few_large_files_are_read_by_several_processes():
+    assert verify._useful_processes(20, 1 << 30) == 4
+    assert verify._useful_processes(40_000, 0) == 4
+    assert verify._useful_processes(0, 0) == 1
 
-    def start_and_kill(code: str):
-        worker = start(code)
-        os.kill(worker.process.pid, signal.SIGKILL)
-        return worker
 
-    monkeypatch.setattr(ordered_pool, "start_process", start_and_kill)
+@pytest.mark.parametrize("moment", ["before the data set", "with a task"])
+def test_a_process_that_dies_is_one_line(out, monkeypatch, capfd, moment):
+    tell = ordered_pool._send
+
+    def tell_and_kill(worker, message, program):
+        if isinstance(message, Path) == (moment == "before the data set"):
+            os.kill(worker.process.pid, signal.SIGKILL)
+            worker.process.wait()
+        tell(worker, message, program)
+
+    monkeypatch.setattr(ordered_pool, "_send", tell_and_kill)
     with pytest.raises(ProcessError, match="a process that verifies was ended by SIGKILL; if memory ran out, set --threads"):
         verify.verify(out, 2)
     assert main(["verify", str(out), "--threads", "2"]) == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert len(capfd.readouterr().err.splitlines()) == 1
 
 
 @pytest.mark.parametrize("threads", ["-1", "1025", "x"])

@@ -103,12 +103,19 @@ def test_a_process_that_dies_is_a_problem(tmp_path):
         assert cleaner.finish(1).problem == "a process that verifies scenes was ended by SIGKILL"
 
 
-def test_the_cleaner_finishes_what_is_committed(tmp_path):
-    for episode in range(5):
-        write_episode(tmp_path, episode)
+def test_the_processes_of_a_cleaner_share_what_is_committed(tmp_path):
+    files = [file for episode in range(5) for file in write_episode(tmp_path, episode)]
+    size = sum(file.stat().st_blocks * 512 for file in files)
     with Cleaner(Assignment(tmp_path, SHARED), 2) as cleaner:
-        assert cleaner.finish(5) == Tally(5, 10, cleaner.poll().deleted)
-    assert not list(tmp_path.rglob("*.jpg"))
+        assert cleaner.finish(5) == Tally(5, 10, size)
+        assert [tally.episodes for tally in cleaner._tallies] == [3, 2]
+    assert not any(file.exists() for file in files)
+
+
+def test_a_file_that_cannot_be_deleted_is_a_problem(tmp_path, monkeypatch):
+    image, _ = write_episode(tmp_path, 1)
+    monkeypatch.setattr(Path, "unlink", mock.Mock(side_effect=PermissionError(13, "Permission denied", str(image))))
+    assert clean_episode(Assignment(tmp_path, SHARED), 1, Tally()).problem == f"{image} cannot be deleted: Permission denied"
 
 
 def test_slices_are_between_readings_and_the_rest_is_left_out():
@@ -175,9 +182,10 @@ def test_devices_that_do_not_exist_are_one_line(capsys):
     assert "cuda:98" in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_damage_ends_a_steady_bake_with_one_line(monkeypatch, capsys):
+@pytest.mark.parametrize("part", ["steady", "whole"])
+def test_damage_ends_a_bake_with_one_line(monkeypatch, capsys, part):
     monkeypatch.setattr(steady.Cleaner, "poll", lambda self: Tally(problem="a file is missing"))
-    assert bench.main([*TINY, "--parts", "steady", "--seconds", "60"]) == 2
+    assert bench.main([*TINY, "--parts", part, "--seconds", "60"]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == "bench: a file is missing"
 
 
@@ -256,6 +264,7 @@ def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
     assert rows["episodes of which all files are verified"] == 2
     assert rows["files of these"] > 4 * rows["views"]
     assert rows["start to the last verified file"] >= rows["start to exit"]
+    assert "largest size on disk, after a tick" in rows
 
 
 @pytest.mark.parametrize(

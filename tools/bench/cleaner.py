@@ -1,7 +1,7 @@
 """Background verification of a running bake: verifies each committed episode as `synpick-warp verify` does, then deletes its files.
 
-A quarter of the CPU cores have a process each, which end with the benchmark; episodes are dealt to them by index. Files of episodes without
-a manifest entry, which are still written, are left alone, and so are manifest entries.
+Several processes, which end with the benchmark; episodes are dealt to them by index. Files of episodes without a manifest entry, which are
+still written, are left alone, and so are manifest entries.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import Self
 
 from synpick_warp.dataset.manifest import committed_episodes, episode_entry, read_checksums
-from synpick_warp.dataset.verify import FileList, check_files
+from synpick_warp.dataset.verify import check_files
 from synpick_warp.errors import SynpickError
 from synpick_warp.system.cores import count_cores
 from synpick_warp.system.processes import END_TIMEOUT, WorkerProcess, send, start_process
@@ -28,7 +28,8 @@ from synpick_warp.system.processes import END_TIMEOUT, WorkerProcess, send, star
 INTERVAL = 0.5
 """Time between two searches for committed episodes [s]."""
 CORES_PER_PROCESS = 4
-"""CPU cores of a machine for each process: a full-HD view with all masks takes a process some 2 ms, and the writers 4 to 5 ms."""
+"""CPU cores of a machine for each process, rounded down, at least one process: to check and delete a full-HD view with all masks takes less
+time than to write it."""
 _PROGRAM = "from tools.bench.cleaner import main; main()"
 
 
@@ -68,7 +69,7 @@ class Cleaner:
     """Handle of the cleaner's processes; a context manager that ends them."""
 
     def __init__(self, assignment: Assignment, processes: int | None = None) -> None:
-        """Start the processes; `processes` is their number, None: by CORES_PER_PROCESS."""
+        """Start `processes` processes; None: a number by CORES_PER_PROCESS."""
         count = processes or max(1, count_cores() // CORES_PER_PROCESS)
         self._workers = [start_process(_PROGRAM) for _ in range(count)]
         self._tallies = [Tally() for _ in self._workers]
@@ -98,9 +99,10 @@ class Cleaner:
         for worker in self._workers:
             with contextlib.suppress(OSError):
                 send(worker.link, None)
+        deadline = time.monotonic() + END_TIMEOUT
         for worker in self._workers:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                worker.process.wait(END_TIMEOUT)
+                worker.process.wait(max(0.0, deadline - time.monotonic()))
             worker.kill()
 
 
@@ -138,13 +140,16 @@ def clean_episode(assignment: Assignment, episode: int, tally: Tally) -> Tally:
         known = read_checksums(out, episode_entry(episode))
     except SynpickError as error:
         return replace(tally, problem=str(error))
-    if problem := check_files(out, FileList(known, 0)).problem:
+    if problem := check_files(out, known).problem:
         return replace(tally, problem=problem)
     deleted = 0
-    for name in known:
-        if not assignment.suffixes or name.endswith(assignment.suffixes):
-            deleted += (out / name).lstat().st_blocks * 512  # st_blocks counts units of 512 bytes, whatever the file system's.
-            (out / name).unlink()
+    try:
+        for name in known:
+            if not assignment.suffixes or name.endswith(assignment.suffixes):
+                deleted += (out / name).lstat().st_blocks * 512  # st_blocks counts units of 512 bytes, whatever the file system's.
+                (out / name).unlink()
+    except OSError as error:
+        return replace(tally, problem=f"{error.filename} cannot be deleted: {error.strerror}")
     _remove_empty_folders(out, known, assignment.folders)
     return replace(tally, episodes=tally.episodes + 1, files=tally.files + len(known), deleted=tally.deleted + deleted)
 

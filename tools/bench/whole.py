@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import os
 import shutil
+import signal
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -19,6 +21,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.dataset.manifest import committed_episodes
 from synpick_warp.pipeline import run_bake
 from synpick_warp.progress import SilentProgress
+from tools.bench.cleaner import Cleaner
 from tools.bench.meter import LIVE_FRACTION
 from tools.bench.physics import Row
 from tools.bench.steady import clean_up_behind
@@ -59,10 +62,14 @@ class Stretch(NamedTuple):
 
 
 class _Trace(SilentProgress):
-    """Progress observer that records a point after each tick, when each stage begins, and the largest size on disk."""
+    """Progress observer that records a point after each tick, when each stage begins, and the largest size on disk after a tick.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder, self.started, self.disk = folder, time.perf_counter(), 0
+    Stops the bake by SIGINT when verification finds a problem.
+    """
+
+    def __init__(self, folder: Path, cleaner: Cleaner) -> None:
+        self.folder, self.cleaner, self.started, self.disk = folder, cleaner, time.perf_counter(), 0
+        self._is_stopped = False
         self._initial_disk = shutil.disk_usage(folder).used
         self.points: list[TracePoint] = []
         self.stages: list[tuple[str, float]] = []
@@ -75,6 +82,9 @@ class _Trace(SilentProgress):
         self, *, episodes_done: int, episodes: int, worlds_active: int, views: int, views_per_s: float, seconds_left: float | None
     ) -> None:
         """Record a point."""
+        if self.cleaner.poll().problem and not self._is_stopped:
+            self._is_stopped = True
+            os.kill(os.getpid(), signal.SIGINT)
         self.disk = max(self.disk, shutil.disk_usage(self.folder).used - self._initial_disk)
         self.points.append(TracePoint(time.perf_counter() - self.started, views, worlds_active, episodes_done))
 
@@ -90,7 +100,7 @@ def measure_whole(config: Config, bake: WholeBake, steady_rate: float, traces: d
     """
     config = dataclasses.replace(config, bake=dataclasses.replace(config.bake, episodes=bake.episodes, worlds=bake.worlds))
     with tempfile.TemporaryDirectory() as folder, clean_up_behind(config, Path(folder) / "out", PICTURES) as cleaner:
-        trace = _Trace(Path(folder))
+        trace = _Trace(Path(folder), cleaner)
         summary = run_bake(config, Path(folder) / "out", trace)
         whole = Stretch(time.perf_counter() - trace.started, summary.views)
         tally = cleaner.finish(len(committed_episodes(Path(folder) / "out")))
@@ -103,7 +113,7 @@ def measure_whole(config: Config, bake: WholeBake, steady_rate: float, traces: d
     yield Row("whole", "episodes of which all files are verified", tally.episodes, "")
     yield Row("whole", "files of these", tally.files, "")
     yield Row("whole", "start to the last verified file", verified, "s")
-    yield Row("whole", "largest size on disk", 1e-9 * trace.disk, "GB")
+    yield Row("whole", "largest size on disk, after a tick", 1e-9 * trace.disk, "GB")
     if summary.stopped:
         raise KeyboardInterrupt
 
