@@ -159,6 +159,32 @@ def test_a_report_of_a_sequence_compares_its_frames_with_references(tmp_path, ca
     assert "no episode has frame 100000" in capsys.readouterr().err
 
 
+def test_references_are_kept_for_other_settings_of_the_denoiser(tmp_path, monkeypatch, capsys):
+    def run(*options: str) -> tuple[dict[str, float], int]:
+        """Values, and the number of references that were rendered."""
+        file, rendered = tmp_path / "numbers.json", []
+        original = render_sequence._render_both
+        monkeypatch.setattr(render_sequence, "_render_both", lambda *given: rendered.append(1) or original(*given))
+        common = ["--mode", "move", "--frames", "0,3", "--size", "32x18", "--references", str(kept), "--json", str(file)]
+        render_sequence.main([*common, *FEW_STEPS, *options])
+        monkeypatch.setattr(render_sequence, "_render_both", original)
+        return {row["name"]: row["value"] for row in json.loads(file.read_text())["rows"]}, len(rendered)
+
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    few = ["--samples", "4"]
+    first = run(*few)
+    assert first[1] == 2
+    assert run(*few) == (first[0], 0)
+    coarser, rendered = run(*few, "--set", "render.coarse_pixel=4")
+    assert (coarser == first[0], rendered) == (False, 0)
+    assert run("--samples", "8")[1] == run(*few, "--seed", "5")[1] == 2
+    assert len(list(kept.iterdir())) == 6
+    with pytest.raises(SystemExit, match="2"):
+        run("--references", str(tmp_path / "none"))
+    assert "there is no folder" in capsys.readouterr().err
+
+
 def test_histories_bring_frames_nearer_to_the_reference():
     """With histories later frames have more paths than single frames have; references of few paths suffice, as their noise cancels."""
     fixed = {"cameras.resolution": [64, 36], "bake.mode": "move", "bake.episodes": 1, "bake.worlds": 1, "render.samples": 64}

@@ -1,0 +1,80 @@
+"""Cache of reference images on disk, which take most of a report's time: after a change of the denoiser they need not be rendered again."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synpick_warp.configs.schema import Config
+from synpick_warp.stages.buffers import Snapshot
+from tools.reports.render_checks import Shot
+
+DENOISER_SETTINGS = ("coarse_pixel", "coarse_paths", "history", "mode")
+"""Settings of `render` that no reference depends on."""
+_ARRAYS = ("color", "radiance", "instance")
+"""Arrays of a `Shot` that are stored."""
+
+
+def writable_folder(text: str) -> Path:
+    """Type (for `add_argument`) of a folder that exists."""
+    path = Path(text)
+    if not path.is_dir():
+        raise argparse.ArgumentTypeError(f"there is no folder {path}; create it first")
+    return path
+
+
+class ReferenceStore:
+    """Pairs of references, one file each, named by a digest of the settings and of the world's state.
+
+    The digest does not cover code: empty the folder after a change of the reference renderer.
+    """
+
+    def __init__(self, folder: Path | None, config: Config) -> None:
+        """
+        Args:
+            folder: Where the files are; None: nothing is stored.
+            config: Settings of the references.
+        """
+        self._folder = folder
+        content: dict[str, Any] = dataclasses.asdict(config)
+        for name in DENOISER_SETTINGS:
+            del content["render"][name]
+        self._settings = repr(content).encode()
+
+    def get(self, snapshot: Snapshot, world: int, render: Callable[[], tuple[Shot, Shot]]) -> tuple[Shot, Shot]:
+        """Read the references of a world, or render and store them.
+
+        Args:
+            snapshot: State of the worlds.
+            world: Index of the world.
+            render: Renders both references.
+        """
+        if self._folder is None:
+            return render()
+        path = self._folder / f"{self._digest(snapshot, world)}.npz"
+        if path.exists():
+            return _read(path)
+        shots = render()
+        arrays = {f"{name}{index}": getattr(shot, name) for index, shot in enumerate(shots) for name in _ARRAYS}
+        part = path.with_suffix(".part.npz")
+        np.savez(part, **arrays)
+        part.replace(path)
+        return shots
+
+    def _digest(self, snapshot: Snapshot, world: int) -> str:
+        state = hashlib.sha256(self._settings)
+        for item in dataclasses.fields(snapshot):
+            state.update(getattr(snapshot, item.name).numpy()[world].tobytes())
+        return state.hexdigest()[:32]
+
+
+def _read(path: Path) -> tuple[Shot, Shot]:
+    with np.load(path) as content:
+        first, second = (Shot(*(content[f"{name}{index}"] for name in _ARRAYS), seconds=0.0) for index in (0, 1))
+    return first, second
