@@ -11,7 +11,7 @@ from synpick_warp.system.descriptors import open_standard_descriptors
 from synpick_warp.system.processes import ProcessError, WorkerProcess, send, start_process
 
 _AHEAD = 8
-"""Tasks per process that may be done before their turn: results wait in memory."""
+"""No task is started while this many results per process wait in memory for their turn."""
 
 
 @dataclass(frozen=True)

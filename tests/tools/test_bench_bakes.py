@@ -100,7 +100,7 @@ def test_a_process_that_dies_is_a_problem(tmp_path):
     with Cleaner(Assignment(tmp_path, SHARED), 2) as cleaner:
         os.kill(cleaner.pids[1], signal.SIGKILL)
         wait_for(lambda: cleaner.poll().problem)
-        assert cleaner.finish(1).problem == "a process that verifies scenes was ended by SIGKILL"
+        assert cleaner.finish(1).problem == "a process that verifies episodes was ended by SIGKILL"
 
 
 def test_the_processes_of_a_cleaner_share_what_is_committed(tmp_path):
@@ -263,7 +263,7 @@ def test_a_whole_bake_is_traced_from_start_to_exit(tmp_path):
     assert trace["seconds"] == sorted(trace["seconds"])
     assert rows["episodes of which all files are verified"] == 2
     assert rows["files of these"] > 4 * rows["views"]
-    assert rows["start to the last verified file"] >= rows["start to exit"]
+    assert rows["start until all episodes are verified, at least until exit"] >= rows["start to exit"]
     assert "largest size on disk, after a tick" in rows
 
 

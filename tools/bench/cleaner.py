@@ -1,7 +1,7 @@
-"""Background verification of a running bake: verifies each committed episode as `synpick-warp verify` does, then deletes its files.
+"""Background verification of a running bake: verifies each committed episode as `synpick-warp verify` does, then deletes files of it.
 
 Several processes, which end with the benchmark; episodes are dealt to them by index. Files of episodes without a manifest entry, which are
-still written, are left alone, and so are manifest entries.
+still being written, are left alone, and so are manifest entries.
 """
 
 from __future__ import annotations
@@ -108,11 +108,12 @@ class Cleaner:
 
 def _poll(worker: WorkerProcess, tally: Tally) -> Tally:
     """Latest totals of a process, those before being `tally`."""
+    has_ended = worker.process.poll() is not None  # Before the last messages are read, which say why.
     with contextlib.suppress(EOFError, OSError):
         while not tally.problem and worker.link.poll():
             tally = worker.link.recv()
-    if not tally.problem and worker.process.poll() is not None:
-        tally = replace(tally, problem=f"a process that verifies scenes {worker.describe_end('bake.worlds')[0]}")
+    if not tally.problem and has_ended:
+        tally = replace(tally, problem=f"a process that verifies episodes {worker.describe_end('bake.worlds')[0]}")
     return tally
 
 

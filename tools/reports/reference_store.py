@@ -1,4 +1,4 @@
-"""Cache of reference images on disk, which take most of a report's time: after a change of the denoiser they need not be rendered again."""
+"""Cache of reference images on disk. To render them takes most of a report's time; after a change of the denoiser they are still valid."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ARRAYS = ("color", "radiance", "instance")
 """Arrays of a `Shot` that are stored."""
 
 
-def writable_folder(text: str) -> Path:
+def existing_folder(text: str) -> Path:
     """Type (for `add_argument`) of a folder that exists."""
     path = Path(text)
     if not path.is_dir():
@@ -39,7 +39,7 @@ class ReferenceStore:
         """
         Args:
             folder: Where the files are; None: nothing is stored.
-            config: Settings of the references.
+            config: Settings of the references, the number of their paths included.
         """
         self._folder = folder
         content: dict[str, Any] = dataclasses.asdict(config)

@@ -35,7 +35,7 @@ from synpick_warp.stages.buffers import Snapshot
 from synpick_warp.stages.stream import TickReader
 from synpick_warp.system.device import pick_device
 from tools.options import Row, configure, fail, make_parser, positive_count, print_machine, print_rows, writable_file, write_json
-from tools.reports.reference_store import ReferenceStore, writable_folder
+from tools.reports.reference_store import ReferenceStore, existing_folder
 from tools.reports.render_checks import Shot, Studio, bounded_row, with_mode
 from tools.reports.render_piles import MAX_BIAS, Pair
 from tools.reports.render_sheet import write_sheets
@@ -140,7 +140,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--frames", type=_frames, default=(0, 8, 30), help="frames to compare, comma-separated (default: 0,8,30)")
     parser.add_argument("--samples", type=positive_count, default=256, help="paths per pixel of both references together (default: 256)")
     parser.add_argument("--sheet", type=writable_file, help="contact sheet: denoised, reference, and five times their difference")
-    parser.add_argument("--references", type=writable_folder, help="folder that keeps references, and has those of earlier runs")
+    parser.add_argument("--references", type=existing_folder, help="folder that keeps references, and has those of earlier runs")
     return parser.parse_args(arguments)
 
 
