@@ -7,8 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.options import WholeNumber
-from synpick_warp.errors import ConfigError
+from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
 
 
 def convert(
@@ -24,13 +23,12 @@ def convert(
     Sources: shards and bop need the other of the two; usd needs zarr; coco needs bop or shards; lerobot needs zarr, and bop or shards.
     Files are those that a bake would have written, but for LeRobot's videos from JPEG images. Exit codes: 0, converted; 2, an error.
     """
-    if not 0 <= processes <= 1024:
-        raise ConfigError(f"--processes is {processes}; allowed: 0 to 1024")
-    from synpick_warp.cli.display import ViewCounter, make_console
+    check_range("--processes", processes, 0, MAX_THREADS)
+    from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.conversion.run import convert as run_conversion
 
     names = [name.strip() for name in to.split(",")]
-    with ViewCounter(make_console()) as counter:
+    with CountProgress(make_console()) as counter:
         converted = run_conversion(folder, out, names, processes, counter.report)
     before = f" ({converted.resumed:,} of them before)" if converted.resumed else ""
     print(f"{converted.episodes:,} episodes converted to {', '.join(names)}{before}")

@@ -105,7 +105,7 @@ class PlainProgress:
         self._console.file.flush()
 
 
-class ViewCounter:
+class CountProgress:
     """Progress of a pass over a data set: a live bar on a terminal, plain lines elsewhere."""
 
     def __init__(self, console: Console) -> None:

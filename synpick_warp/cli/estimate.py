@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.options import MAX_THREADS, WholeNumber
+from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
 from synpick_warp.configs.check import escape, format_value
 from synpick_warp.errors import ConfigError, OutputError
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 DEFAULT_VISIBILITY = 0.1
 """As in `eval` and in BOP."""
 _MASKS = ("exact", "noisy")
+_MAX_BATCH = 4096
+"""Upper bound of --batch [views]."""
 _MAX_SEED = 2**63 - 1
 _MAX_INDEX = 2**31 - 1
 _RANGE = re.compile(r"\s*([0-9]{1,9})\s*(?:-\s*([0-9]{1,9})\s*)?")
@@ -83,7 +85,7 @@ def run_method(
     data: Path, selection: Selection, options: Options, device: str, out: Path, *, color: bool, split: str | None = None
 ) -> tuple[Run, Path | None]:
     """Estimate, and write the files; returns the run, and the file of targets if it was written."""
-    from synpick_warp.cli.display import ViewCounter, make_console
+    from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.dataset.reading import open_data_set
     from synpick_warp.estimation import factories
     from synpick_warp.estimation.decoder_pool import open_pool
@@ -101,7 +103,7 @@ def run_method(
         selection = replace(selection, targets=selection.targets.in_classic_layout(data_set.config))
     plans, complete = plan_scenes(data_set, selection)
     processes = open_pool(options.threads, sum(len(plan.frames) for plan in plans))
-    with processes or nullcontext() as pool, ViewCounter(make_console()) as counter:
+    with processes or nullcontext() as pool, CountProgress(make_console()) as counter:
         scenes = read_scenes(data_set, plans, options, selection.targets, counter.report, pool)
         wanted = sorted({int(object_id) for scene in scenes for object_id in scene.object_ids[scene.asked.any(axis=0)]})
         models = read_object_models(data_set.folder, wanted)
@@ -160,11 +162,10 @@ def make_options(method: str, depth: str, masks: str, visib_min: float, seed: in
     for option, value, allowed in (("--depth", depth, tuple(DEPTHS)), ("--masks", masks, _MASKS)):
         if value not in allowed:
             raise ConfigError(f"{option} is {format_value(value)}; allowed: {', '.join(allowed)}")
-    if not 0.0 <= visib_min <= 1.0:
-        raise ConfigError(f"--visib-min is {visib_min:g}; allowed: 0 to 1")
-    for option, number, most in (("--seed", seed, _MAX_SEED), ("--batch", batch, 4096), ("--threads", threads, MAX_THREADS)):
-        if not 0 <= number <= most:
-            raise ConfigError(f"{option} is {number}; allowed: 0 to {most}")
+    check_range("--visib-min", visib_min, 0, 1)
+    check_range("--seed", seed, 0, _MAX_SEED)
+    check_range("--batch", batch, 0, _MAX_BATCH)
+    check_range("--threads", threads, 0, MAX_THREADS)
     given = {"threads": threads} if threads else {}
     return Options(method, depth, masks == "noisy", visib_min, seed, batch, **given)
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.options import WholeNumber
+from synpick_warp.cli.options import WholeNumber, check_range
 from synpick_warp.configs.check import escape, format_value
 from synpick_warp.configs.schema import MULTISENSOR
 from synpick_warp.configs.splits import bop_folders, split_kind
@@ -236,8 +236,7 @@ def check_options(
     for option, value, allowed in (("--format", style, FORMATS), ("--convention", convention, CONVENTIONS)):
         if value not in allowed:
             raise ConfigError(f"{option} is {format_value(value)}; allowed: {', '.join(allowed)}")
-    if not 0.0 <= visib_min <= 1.0:
-        raise ConfigError(f"--visib-min is {visib_min:g}; allowed: 0 to 1")
+    check_range("--visib-min", visib_min, 0, 1)
     if not -1 <= top <= 2**31 - 1:
         raise ConfigError(f"--top is {top}; allowed: -1 for as many as instances, 0 for all, or a number of estimates")
     if not 0 <= vertices <= _MAX_VERTICES:

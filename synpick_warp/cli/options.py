@@ -1,4 +1,4 @@
-"""What commands share: option parsers, limits of options, an exit code, and the one line in which a mistake is reported."""
+"""Shared parts of the commands: option parsers, range checks, an exit code, and the formatting of error messages in one line."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from synpick_warp.configs.check import escape, format_value
 from synpick_warp.errors import ConfigError
 
 EXIT_INCOMPLETE = 1
-"""Exit code of a command whose data set is not complete, or damaged."""
+"""Exit code if a data set is incomplete or damaged."""
 MAX_DIGITS = 100
 """Most digits of a whole number; which of them are allowed is checked by the setting, with its range in the message."""
 MAX_THREADS = 1024
-"""Largest number of processes or threads of an option."""
+"""Upper bound of options such as --threads, in processes or threads."""
 MAX_LINE = 2000
 """Longest message [characters]: names of files and keys may be of any length."""
 _WHOLE = re.compile(rf"[+-]?[0-9]{{1,{MAX_DIGITS}}}")
@@ -52,6 +52,17 @@ def one_line(text: str) -> str:
     """Join the lines of a message, escape what does not print, such as terminal sequences in file names, and truncate."""
     line = escape(" ".join(text.split()))
     return line if len(line) <= MAX_LINE else f"{line[: MAX_LINE - 1]}…"
+
+
+def check_range(option: str, value: float, low: float, high: float) -> None:
+    """Check that the value of a numeric option lies in [low, high].
+
+    Raises:
+        ConfigError: It does not.
+    """
+    if not low <= value <= high:
+        shown = f"{value:g}" if isinstance(value, float) else value
+        raise ConfigError(f"{option} is {shown}; allowed: {low} to {high}")
 
 
 def parse_resolution(text: str) -> list[int]:

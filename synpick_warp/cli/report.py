@@ -8,9 +8,9 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from synpick_warp.cli.options import MAX_THREADS, WholeNumber
+from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
 from synpick_warp.configs.check import escape
-from synpick_warp.errors import ConfigError, DatasetError
+from synpick_warp.errors import DatasetError
 
 MEGABYTE = 1e6
 """Bytes."""
@@ -32,12 +32,11 @@ def write_page(
     """
     from synpick_warp.report.compose import DEFAULT_NAME, MAX_FRAMES, check_out, write_report
 
-    for option, number, least, most in (("--views", views, 1, MAX_FRAMES), ("--threads", threads, 0, MAX_THREADS)):
-        if not least <= number <= most:
-            raise ConfigError(f"{option} is {number}; allowed: {least} to {most}")
+    check_range("--views", views, 1, MAX_FRAMES)
+    check_range("--threads", threads, 0, MAX_THREADS)
     page = out or folder / DEFAULT_NAME
     check_out(page)
-    from synpick_warp.cli.display import ViewCounter
+    from synpick_warp.cli.display import CountProgress
     from synpick_warp.dataset.reading import open_data_set
 
     data_set = open_data_set(folder)
@@ -45,7 +44,7 @@ def write_page(
         raise DatasetError(f"{folder} has no config.toml; name the folder of a data set that synpick-warp baked")
     if split is not None:
         data_set = data_set.split(split)
-    with ViewCounter(Console(stderr=True, highlight=False, soft_wrap=True)) as counter:
+    with CountProgress(Console(stderr=True, highlight=False, soft_wrap=True)) as counter:
         write_report(data_set, page, frames=views, threads=threads, report=counter.report)
     print(f"report: {escape(str(page))} ({page.stat().st_size / MEGABYTE:.1f} MB)")
     return 0

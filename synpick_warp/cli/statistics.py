@@ -10,7 +10,7 @@ from typing import Annotated
 from cyclopts import Parameter
 from rich.console import Console
 
-from synpick_warp.cli.options import MAX_THREADS, WholeNumber
+from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range
 from synpick_warp.configs.check import escape
 from synpick_warp.errors import ConfigError, DatasetError
 
@@ -33,16 +33,15 @@ def show_statistics(
 
     Reads each annotation file once and holds only counts. Exit codes: 0; 2, the folder is not a data set, or a file of it is damaged.
     """
-    for option, number, most in (("--depth-views", depth_views, MAX_DEPTH_VIEWS), ("--threads", threads, MAX_THREADS)):
-        if not 0 <= number <= most:
-            raise ConfigError(f"{option} is {number}; allowed: 0 to {most}")
+    check_range("--depth-views", depth_views, 0, MAX_DEPTH_VIEWS)
+    check_range("--threads", threads, 0, MAX_THREADS)
     from synpick_warp.statistics.output import check_csv_folder, print_statistics, to_json, write_csv
 
     if csv is not None:
         check_csv_folder(csv)
         if csv.resolve().is_relative_to(folder.resolve()):
             raise ConfigError(f"--csv is {csv}, inside the data set {folder}; name a folder outside of it")
-    from synpick_warp.cli.display import ViewCounter, make_console
+    from synpick_warp.cli.display import CountProgress, make_console
     from synpick_warp.dataset.reading import open_data_set
     from synpick_warp.statistics.collect import collect
     from synpick_warp.statistics.compute import assemble
@@ -55,7 +54,7 @@ def show_statistics(
         data_set = data_set.split(split)
     started = time.perf_counter()
     notes = Console(stderr=True, highlight=False, soft_wrap=True)
-    with ViewCounter(notes) as counter:
+    with CountProgress(notes) as counter:
         collected = collect(data_set, depth_views, threads or count_cores(), counter.report)
     wall = max(time.perf_counter() - started, 1e-9)
     statistics = assemble(data_set, collected)

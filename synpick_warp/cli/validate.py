@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.options import MAX_THREADS, WholeNumber, one_line
+from synpick_warp.cli.options import MAX_THREADS, WholeNumber, check_range, one_line
 from synpick_warp.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -50,12 +50,12 @@ def validate(
         raise ConfigError(f"--limit is {limit}; allowed: 0 for all, or more")
     from rich.console import Console
 
-    from synpick_warp.cli.display import ViewCounter
+    from synpick_warp.cli.display import CountProgress
     from synpick_warp.validation.run import Summary
     from synpick_warp.validation.run import validate as check
 
     summary, counts = Summary(), Counter()
-    with ViewCounter(Console(stderr=True, highlight=False)) as counter:
+    with CountProgress(Console(stderr=True, highlight=False)) as counter:
         for violation in check(folder, options, summary, counter.report):
             counts[violation.rule] += 1
             if json or not limit or counts[violation.rule] <= limit:
@@ -76,10 +76,8 @@ def _make_options(sample: int | None, threads: int, *, poses: bool, fast: bool) 
         raise ConfigError("--fast reads no images, so it renders none; drop it, or --sample and --poses")
     if poses and sample is not None:
         raise ConfigError("--poses renders every view; drop it, or --sample")
-    if sample is not None and not 0 <= sample <= _MAX_SAMPLE:
-        raise ConfigError(f"--sample is {sample}; allowed: 0 to {_MAX_SAMPLE}")
-    if not 0 <= threads <= MAX_THREADS:
-        raise ConfigError(f"--threads is {threads}; allowed: 0 to {MAX_THREADS}")
+    check_range("--sample", sample or 0, 0, _MAX_SAMPLE)
+    check_range("--threads", threads, 0, MAX_THREADS)
     given = {"threads": threads} if threads else {}
     return Options(None if poses else DEFAULT_SAMPLE if sample is None else sample, not fast, **given)
 

@@ -7,8 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from synpick_warp.cli.options import EXIT_INCOMPLETE, MAX_THREADS, WholeNumber
-from synpick_warp.errors import ConfigError
+from synpick_warp.cli.options import EXIT_INCOMPLETE, MAX_THREADS, WholeNumber, check_range
 
 
 def verify(
@@ -21,14 +20,13 @@ def verify(
 
     Exit codes: 0, all match; 1, a file is damaged or missing (it is named), or the bake is not finished; 2, the folder is not a data set.
     """
-    if not 0 <= threads <= MAX_THREADS:
-        raise ConfigError(f"--threads is {threads}; allowed: 0 to {MAX_THREADS}")
+    check_range("--threads", threads, 0, MAX_THREADS)
     from rich.console import Console
 
-    from synpick_warp.cli.display import ViewCounter
+    from synpick_warp.cli.display import CountProgress
     from synpick_warp.dataset.verify import verify as check
 
-    with ViewCounter(Console(stderr=True, highlight=False)) as counter:
+    with CountProgress(Console(stderr=True, highlight=False)) as counter:
         verdict = check(folder, threads or None, counter.report)
     if verdict.problem:
         print(verdict.problem)

@@ -1,15 +1,13 @@
-"""Checksum verification of a data set: every file against the SHA-256 in its manifest entry, up to the first mismatch.
+"""Checksum verification of a data set: compares the SHA-256 of every file with its manifest entry, and stops at the first mismatch.
 
-Large data sets are read by several processes. The result does not depend on their number.
+Large data sets are verified by several processes; the result is the same for any number of them.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from itertools import islice
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -27,16 +25,15 @@ from synpick_warp.errors import ConfigError, DatasetError
 from synpick_warp.exporters.writing.checksums import checksum
 from synpick_warp.progress import Report
 from synpick_warp.system.cores import count_cores
-from synpick_warp.system.ordered_pool import WorkerProgram, map_ordered
-from synpick_warp.system.processes import serve
+from synpick_warp.system.ordered_pool import WorkerProgram, map_ordered, serve_tasks
 
 _FILES_PER_PROCESS, _BYTES_PER_PROCESS = 10_000, 1 << 28
-"""Minimum work of a process: that many files, or so many bytes. Starting a process takes some 0.2 s, in which the calling one checks
-either (a Xeon, files in memory)."""
+"""Minimum amount of work per worker process, in files and in bytes; one of the two suffices. On a Xeon with cached files either takes about
+0.2 s, which is also the start-up time of a process."""
 _ENTRIES_PER_PROCESS = 4
-"""With at least that many manifest entries per process, the files of an entry are one task; with fewer they are split."""
+"""Minimum number of manifest entries per process for which each entry is a single task; fewer entries are split for load balancing."""
 _PARTS_PER_PROCESS = 4
-"""Tasks per process into which the files of a split entry are divided."""
+"""Number of tasks per process into which an entry is split."""
 _PROGRAM = "from synpick_warp.dataset.verify import main; main()"
 
 
@@ -54,31 +51,33 @@ class Verdict(NamedTuple):
 
 
 class CheckPart(NamedTuple):
-    """Task: part of the files of a manifest entry, in order."""
+    """Task: check a contiguous part of the files that a manifest entry lists."""
 
     entry: Path
     part: int = 0
+    """Index of the part."""
     parts: int = 1
+    """Number of parts of the entry."""
 
 
 class Checked(NamedTuple):
     """Result of a task."""
 
     files: int
-    """Number of files that were checked, a damaged one included."""
+    """Number of checked files, including the damaged one."""
     problem: str
-    """First problem; empty: none."""
+    """Description of the first problem; empty: none."""
 
 
 def verify(folder: Path, threads: int | None = None, report: Report = lambda unit, done, total: None) -> Verdict:
-    """Compare every file of a data set with its checksum from the time of writing; stops at the first mismatch.
+    """Verify the checksum of every file of a data set, as recorded when it was written; stops at the first mismatch.
 
     Order: settings, constants, episodes by index, indices.
 
     Args:
         folder: The data set.
         threads: Maximum number of processes; None: one per core.
-        report: Called with the progress.
+        report: Receives the number of checked files.
 
     Raises:
         DatasetError: The folder is not a data set.
@@ -107,7 +106,7 @@ def verify(folder: Path, threads: int | None = None, report: Report = lambda uni
 
 
 def _count_files(folder: Path, entries: Sequence[Path]) -> tuple[int, int]:
-    """Number and size [bytes] of the files of all entries. Damaged entries count as none; their own check reports them."""
+    """Number and total size [bytes] of the files of all entries. Damaged entries are skipped here; `check_part` reports them."""
     files = size = 0
     for entry in entries:
         try:
@@ -120,12 +119,12 @@ def _count_files(folder: Path, entries: Sequence[Path]) -> tuple[int, int]:
 
 
 def _useful_processes(files: int, size: int) -> int:
-    """Number of processes beyond which starting one more takes longer than it saves, at least 1."""
+    """Number of processes beyond which another one would take longer to start than it saves; at least 1."""
     return max(1, files // _FILES_PER_PROCESS, size // _BYTES_PER_PROCESS)
 
 
 def _check_entries(folder: Path, entries: Sequence[Path], processes: int) -> Iterator[Checked]:
-    """Check the files of manifest entries; results come in order."""
+    """Check the files of manifest entries, in parallel if `processes` > 1; results are in the order of the files."""
     parts = 1 if processes == 1 or len(entries) >= _ENTRIES_PER_PROCESS * processes else _PARTS_PER_PROCESS * processes
     tasks = (CheckPart(entry, part, parts) for entry in entries for part in range(parts))
     if processes > 1:
@@ -135,7 +134,13 @@ def _check_entries(folder: Path, entries: Sequence[Path], processes: int) -> Ite
 
 
 def check_part(folder: Path, task: CheckPart, read: Callable[[Path, Path], dict[str, str]] = read_checksums) -> Checked:
-    """Check a part of the files of a manifest entry, in order, up to the first problem; `read` reads the entry's list."""
+    """Check a part of a manifest entry's files, up to the first problem.
+
+    Args:
+        folder: The data set.
+        task: The part.
+        read: Reads the checksum list of an entry.
+    """
     try:
         known = read(folder, task.entry)
     except DatasetError as error:
@@ -145,14 +150,14 @@ def check_part(folder: Path, task: CheckPart, read: Callable[[Path, Path], dict[
 
 
 def check_files(folder: Path, known: Mapping[str, str]) -> Checked:
-    """Compare files with their checksums, in order, up to the first problem.
+    """Check files in the given order, up to the first problem.
 
     Args:
         folder: The data set.
-        known: SHA-256 by path, relative to the data set.
+        known: Expected SHA-256 of each file, by path relative to the data set.
     """
     for number, (name, expected) in enumerate(known.items(), 1):
-        if problem := _check_file(f"{folder}/{name}", expected):  # Joining paths as strings takes a fifth less time for a small file.
+        if problem := _check_file(f"{folder}/{name}", expected):  # Faster than Path's operator by a fifth of a small file's time.
             return Checked(number, f"{folder / name} {problem}")
     return Checked(len(known), "")
 
@@ -168,14 +173,6 @@ def _check_file(path: str, expected: str) -> str:
 
 
 def main() -> None:
-    """Main function of a process: serves tasks from the socket with handle argv[1]; the first message is the data set's folder."""
-    folders: list[Path] = []
-    read_once = lru_cache(maxsize=1)(read_checksums)  # An entry's parts come one after the other.
-
-    def answer(message: Path | CheckPart) -> Checked | None:
-        if isinstance(message, CheckPart):
-            return check_part(folders[0], message, read_once)
-        folders.append(message)
-        return None
-
-    serve(Connection(int(sys.argv[1])), answer)
+    """Main function of a worker process: checks parts of the data set whose folder is the setup message."""
+    read_once = lru_cache(maxsize=1)(read_checksums)  # Successive parts are usually of the same entry.
+    serve_tasks(Path, lambda folder, task: check_part(folder, task, read_once))

@@ -1,33 +1,40 @@
-"""Process pool with ordered results: tasks go to whichever process is idle, results come in the order of the tasks."""
+"""Ordered parallel map over worker processes: each idle process takes the next task, and results are returned in the order of the tasks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from multiprocessing.connection import wait
-from typing import Any, NoReturn
+from multiprocessing.connection import Connection, wait
+from typing import Any, NoReturn, TypeVar
 
 from synpick_warp.system.descriptors import open_standard_descriptors
-from synpick_warp.system.processes import ProcessError, WorkerProcess, send, start_process
+from synpick_warp.system.processes import ProcessError, WorkerProcess, send, serve, start_process
 
 _AHEAD = 8
-"""No task is started while this many results per process wait in memory for their turn."""
+"""Size of the reorder buffer [results per process]: while it is full, no further task is started."""
+_State = TypeVar("_State")
 
 
 @dataclass(frozen=True)
 class WorkerProgram:
-    """Program of the pool's processes."""
+    """Program of the worker processes."""
 
     code: str
-    """Python code of a process, see `start_process`. It answers the setup, and then each task, with one message."""
+    """Python code that imports and calls a main function, which calls `serve_tasks`; see `start_process`."""
     setup: object
-    """First message to each process; its answer is dropped."""
+    """First message to each process, from which `serve_tasks` makes the state that all tasks share."""
     activity: str
-    """What the processes do, for messages: "validates"."""
+    """Verb for error messages: a process that "validates" was ended."""
 
 
 def map_ordered(program: WorkerProgram, tasks: Iterable[Any], processes: int) -> Iterator[Any]:
-    """Run tasks in `processes` processes; yields their answers in order. Tasks are taken from the iterable as processes become idle.
+    """Run tasks in worker processes; yields their results in the order of the tasks.
+
+    Args:
+        program: Program of the processes.
+        tasks: Messages to the processes, taken lazily as processes become idle.
+        processes: Number of processes.
 
     Raises:
         ProcessError: Processes cannot be started, or one died.
@@ -64,6 +71,24 @@ def map_ordered(program: WorkerProgram, tasks: Iterable[Any], processes: int) ->
     finally:
         for worker in workers:
             worker.kill()
+
+
+def serve_tasks(prepare: Callable[[Any], _State], run: Callable[[_State, Any], Any]) -> None:
+    """Main loop of a worker process of `map_ordered`, until the parent ends it.
+
+    Args:
+        prepare: Makes the state from the setup message.
+        run: Returns the result of a task; receives the state and the task.
+    """
+    states: list[_State] = []
+
+    def answer(message: Any) -> Any:
+        if states:
+            return run(states[0], message)
+        states.append(prepare(message))
+        return None
+
+    serve(Connection(int(sys.argv[1])), answer)
 
 
 def _start(program: WorkerProgram) -> WorkerProcess:

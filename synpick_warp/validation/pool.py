@@ -1,4 +1,4 @@
-"""Tasks of a validation, run in this process or in several; results come in the order of the tasks."""
+"""Execution of a validation's tasks in the calling process or in worker processes; results are in the order of the tasks."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from synpick_warp.cli import display
-from synpick_warp.cli.display import LiveProgress, PlainProgress, ViewCounter, print_summary
+from synpick_warp.cli.display import CountProgress, LiveProgress, PlainProgress, print_summary
 from synpick_warp.codes import Ending, Outcome
 from synpick_warp.episodes import BakeSummary, EpisodeRow
 from synpick_warp.progress import Progress, SilentProgress
@@ -103,7 +103,7 @@ def test_an_estimation_counts_views(terminal, monkeypatch):
     """A bar on a terminal, which is gone at the end; lines elsewhere."""
     monkeypatch.setattr(display, "PLAIN_INTERVAL", 0.0)
     console = Console(file=io.StringIO(), width=80, force_terminal=terminal)
-    with ViewCounter(console) as counter:
+    with CountProgress(console) as counter:
         counter.report("views", 128, 3600)
         counter.report("views", 3600, 3600)
     text = console.file.getvalue()  # type: ignore[attr-defined]

@@ -1,4 +1,4 @@
-"""Checksum verification in several processes: the same verdict as in one, whatever is damaged."""
+"""Tests of checksum verification: with any number of processes the verdict is the same."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from tests.worlds.small_worlds import settings
 
 EPISODES, FILES = 4, 7
 TOTAL = 1 + EPISODES * FILES
-"""With the one file that all episodes share."""
+"""Number of files, including the one that all episodes share."""
 THREADS = [1, 3]
 
 
 @pytest.fixture
 def out(tmp_path, monkeypatch) -> Path:
-    """A data set of EPISODES episodes of FILES files, which is verified by as many processes as are allowed."""
+    """Data set of EPISODES episodes with FILES files each; the minimum work per process is lowered, so that `verify` uses all `threads`."""
     monkeypatch.setattr(verify, "_FILES_PER_PROCESS", 1)
     (tmp_path / manifest.MANIFEST_FILE).write_bytes(manifest.encode_manifest(manifest.make_manifest(settings())))
     (tmp_path / manifest.CONFIG_FILE).write_text(config_to_toml(settings()))
