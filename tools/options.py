@@ -24,7 +24,7 @@ INTERRUPTED = 130
 
 
 def writable_file(text: str) -> Path:
-    """Type (for `add_argument`) of a file to write: its folder exists, and it is none itself, so that no measurement is lost at the end."""
+    """Argument type of an option (`add_argument(type=...)`): an output file in an existing folder, checked before measuring."""
     path = Path(text)
     if path.is_dir() or not path.parent.is_dir():
         reason = f"{path} is a folder" if path.is_dir() else f"there is no folder {path.parent}"
@@ -33,14 +33,14 @@ def writable_file(text: str) -> Path:
 
 
 def positive_count(text: str) -> int:
-    """Type (for `add_argument`) of a positive number of things."""
+    """Argument type of an option: a positive integer."""
     if not text.isdecimal() or not 0 < int(text) <= INT32_MAX:
         raise argparse.ArgumentTypeError(f"{text} is no count; allowed: 1 to {INT32_MAX}")
     return int(text)
 
 
 def finite_seconds(text: str) -> float:
-    """Type (for `add_argument`) of a finite time [s]; 0: as short as possible."""
+    """Argument type of an option: a finite, non-negative duration [s]."""
     try:
         seconds = float(text)
     except ValueError:
@@ -51,7 +51,7 @@ def finite_seconds(text: str) -> float:
 
 
 def image_resolution(text: str) -> list[int | str]:
-    """Type (for `add_argument`) of WIDTHxHEIGHT; what is no number is left to the check of `cameras.resolution`."""
+    """Argument type of an option: WIDTHxHEIGHT. Parts that are not numbers are reported by the check of `cameras.resolution`."""
     return [int(part) if part.isdecimal() else part for part in text.split("x")]
 
 

@@ -154,9 +154,13 @@ def _prepare(request: dict) -> None:
 
 
 def _fill_allocations(value: int) -> None:
-    """Fill memory with a byte, not zero, when it is allocated (glibc's M_PERTURB), here and in the writers; other C libraries ignore it.
+    """Make glibc initialize allocated memory with a byte (M_PERTURB), in this process and in the writers; other C libraries ignore it.
 
-    Blocks of up to 1 kB that glibc's thread cache recycles keep their bytes here; the writers have no such cache.
+    Exception: in this process, blocks of up to 1 kB that come from glibc's thread cache (tcache) keep their contents. The writers run
+    without that cache.
+
+    Args:
+        value: The byte; not 255, whose complement, 0, would turn M_PERTURB off.
     """
     perturb = value ^ 0xFF
     os.environ["GLIBC_TUNABLES"] = "glibc.malloc.tcache_count=0"

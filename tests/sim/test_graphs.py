@@ -1,4 +1,4 @@
-"""Graph capture of physics: replayed ticks equal eager ones, whose kernels are launched one by one, bit by bit."""
+"""Tests of graph capture in physics: replaying captured graphs gives bitwise the same ticks as launching each kernel."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MAX_TICKS = 60
 
 @pytest.fixture(autouse=True)
 def only_launcher(monkeypatch):
-    """Ignore the threads left by other tests, none of which launches kernels."""
+    """Exclude threads left over from other tests, which launch no kernels, from the check for other launchers."""
     monkeypatch.setattr(physics_module, "is_only_launcher", lambda: True)
 
 

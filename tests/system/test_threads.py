@@ -17,7 +17,7 @@ from synpick_warp.system import threads
 
 @pytest.fixture(autouse=True)
 def no_older_threads(monkeypatch):
-    """Exclude the threads left by other tests."""
+    """Exclude threads left over from other tests."""
     current, enumerate_all = threading.current_thread(), threading.enumerate
     older = {thread for thread in enumerate_all() if thread is not current and not thread.name.startswith("zarr_")}
     monkeypatch.setattr(threading, "enumerate", lambda: [thread for thread in enumerate_all() if thread not in older])

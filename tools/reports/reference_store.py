@@ -1,4 +1,4 @@
-"""Cache of reference images on disk. To render them takes most of a report's time; after a change of the denoiser they are still valid."""
+"""Disk cache of reference images, which remain valid when only the denoiser changes, and take most of a report's time to render."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from synpick_warp.stages.buffers import Snapshot
 from tools.reports.render_checks import Shot
 
 DENOISER_SETTINGS = ("coarse_pixel", "coarse_paths", "history", "mode")
-"""Settings of `render` that no reference depends on."""
+"""Settings of section `render` that do not affect references, and are left out of the cache key."""
 _ARRAYS = ("color", "radiance", "instance")
-"""Arrays of a `Shot` that are stored."""
+"""Arrays of a `Shot` that are stored; its rendering time is not."""
 
 
 def existing_folder(text: str) -> Path:
-    """Type (for `add_argument`) of a folder that exists."""
+    """Argument type of an option (`add_argument(type=...)`): the path of an existing folder."""
     path = Path(text)
     if not path.is_dir():
         raise argparse.ArgumentTypeError(f"there is no folder {path}; create it first")
@@ -30,16 +30,16 @@ def existing_folder(text: str) -> Path:
 
 
 class ReferenceStore:
-    """Pairs of references, one file each, named by a digest of the settings and of the world's state.
+    """Cache of pairs of references, one file per pair. The key is a hash of the settings and of the world's state.
 
-    The digest does not cover code: empty the folder after a change of the reference renderer.
+    The key does not cover the code: clear the folder after a change of the reference renderer.
     """
 
     def __init__(self, folder: Path | None, config: Config) -> None:
         """
         Args:
-            folder: Where the files are; None: nothing is stored.
-            config: Settings of the references, the number of their paths included.
+            folder: Folder of the files; None: no caching.
+            config: Settings of the references, including the number of paths.
         """
         self._folder = folder
         content: dict[str, Any] = dataclasses.asdict(config)
@@ -48,12 +48,12 @@ class ReferenceStore:
         self._settings = repr(content).encode()
 
     def get(self, snapshot: Snapshot, world: int, render: Callable[[], tuple[Shot, Shot]]) -> tuple[Shot, Shot]:
-        """Read the references of a world, or render and store them.
+        """Return the references of a world, from the cache or else from the renderer.
 
         Args:
             snapshot: State of the worlds.
             world: Index of the world.
-            render: Renders both references.
+            render: Renders both references on a cache miss.
         """
         if self._folder is None:
             return render()
@@ -71,7 +71,7 @@ class ReferenceStore:
         state = hashlib.sha256(self._settings)
         for item in dataclasses.fields(snapshot):
             state.update(getattr(snapshot, item.name).numpy()[world].tobytes())
-        return state.hexdigest()[:32]
+        return state.hexdigest()
 
 
 def _read(path: Path) -> tuple[Shot, Shot]:

@@ -7,7 +7,7 @@ without the references' noise. Exits with 1 if a bound is violated, with 2 if no
 
     python -m tools.reports.sequence --models DIR --lights DIR --size 640x360 --frames 0,8,30 --samples 256 --sheet sheet.png
 
-With `--references DIR` references are kept: a second run with other settings of the denoiser takes a tenth of the time.
+With `--references DIR` references are cached: another run with other settings of the denoiser takes a tenth of the time.
 """
 
 from __future__ import annotations
@@ -79,15 +79,15 @@ def main(arguments: list[str] | None = None) -> int:
     return 0 if all(row.holds for row in rows) else 1
 
 
-def compare_frames(config: Config, frames: tuple[int, ...], kept: Path | None = None) -> Iterator[tuple[int, Pair]]:
+def compare_frames(config: Config, frames: tuple[int, ...], cache: Path | None = None) -> Iterator[tuple[int, Pair]]:
     """Simulate episodes and render camera 0; yields (frame, denoised image and reference) for the given frames of each episode.
 
     Args:
         config: All settings; one episode per world.
         frames: Indices of frames.
-        kept: Folder that keeps references; None: none.
+        cache: Folder in which references are cached; None: no caching.
     """
-    store = ReferenceStore(kept, config)
+    store = ReferenceStore(cache, config)
     device = pick_device(config.bake.device)
     config = fit_to_device(with_mode(config, FAST), device, config.bake.episodes)
     check_memory(config, device)
@@ -140,7 +140,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--frames", type=_frames, default=(0, 8, 30), help="frames to compare, comma-separated (default: 0,8,30)")
     parser.add_argument("--samples", type=positive_count, default=256, help="paths per pixel of both references together (default: 256)")
     parser.add_argument("--sheet", type=writable_file, help="contact sheet: denoised, reference, and five times their difference")
-    parser.add_argument("--references", type=existing_folder, help="folder that keeps references, and has those of earlier runs")
+    parser.add_argument("--references", type=existing_folder, help="folder in which references are cached between runs")
     return parser.parse_args(arguments)
 
 

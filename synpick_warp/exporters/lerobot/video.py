@@ -39,7 +39,14 @@ LEVELS = 256
 
 
 def split_planes(color: np.ndarray) -> np.ndarray:
-    """Convert RGB (H, W, 3) uint8 to planar YUV 4:2:0 (I420), BT.601, limited range (3 H / 2, W) uint8. H and W are even."""
+    """Convert an RGB image to planar YUV 4:2:0 (I420; BT.601, limited range).
+
+    Args:
+        color: Image (H, W, 3) uint8; H and W are even.
+
+    Returns:
+        Planes Y, U and V, one after the other (3 H / 2, W) uint8.
+    """
     return cv2.cvtColor(color, cv2.COLOR_RGB2YUV_I420)
 
 

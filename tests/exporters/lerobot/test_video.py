@@ -1,4 +1,4 @@
-"""H.264 encoding is deterministic: bytes depend neither on the contents of freed memory nor on the instruction set of the CPU."""
+"""Tests of deterministic H.264 encoding: the output depends neither on the contents of freed memory nor on the CPU's instruction set."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import pytest
 from synpick_warp.exporters.lerobot import video
 
 CHUNK = 100_000
-"""Size of an allocation [bytes], below glibc's mmap threshold (128 KiB): larger allocations are mapped, and contain zeros."""
+"""Allocation size [bytes], below glibc's mmap threshold of 128 KiB: larger blocks are newly mapped, zero-filled pages."""
 
 
 def moving_noise(width: int, height: int) -> list[np.ndarray]:
-    """YUV planes of the frames of a group: a crop window that moves across a blurred noise image."""
+    """Synthetic video: YUV planes of a group of pictures, from a crop window that moves across a blurred noise image."""
     noise = np.random.default_rng(0).integers(0, 256, (height + 40, width + 40, 3), dtype=np.uint8)
     picture = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 4), None, 0, 255, cv2.NORM_MINMAX)
     windows = [picture[2 * step : 2 * step + height, 3 * step : 3 * step + width] for step in range(video.GROUP)]
@@ -29,14 +29,14 @@ def encode(planes: list[np.ndarray], path: Path) -> bytes:
 
 
 def fill_free_memory(value: int) -> bytes:
-    """Allocate 10 MB, fill them with a byte value, and free all but the last chunk, which keeps the freed memory in the heap."""
+    """Fill 10 MB of the heap with a byte value and free it, except the last chunk, which prevents the heap from shrinking."""
     chunks = [bytes([value]) * CHUNK for _ in range(100)]
     return chunks.pop()
 
 
 @pytest.mark.parametrize(("width", "height"), [(96, 72), (224, 224), (320, 240), (480, 270)])
 def test_bytes_do_not_depend_on_freed_memory(tmp_path, width, height):
-    """At these sizes x264's macroblock tree reads out of bounds with AVX-512, unless `cpu-independent` is set."""
+    """Regression test: at these sizes x264's macroblock tree with AVX-512 reads out of bounds, unless `cpu-independent` is set."""
     planes = moving_noise(width, height)
     found = set()
     for value in (0, 255, 128):
