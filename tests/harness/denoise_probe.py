@@ -11,16 +11,15 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     interleaved_pixel,
     morton_index,
     pack_surface,
-    read_record,
     surface_depth,
     surface_normal,
     surface_segment,
-    write_record,
 )
 from synpick_warp.kernels.render.lighting.color import MIN_RADIANCE
 from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, shrink, smooth_ratios_kernel
 from synpick_warp.kernels.render.lighting.sampling import scrambled_point, sobol_point
 from synpick_warp.kernels.render.visibility.camera import in_image
+from synpick_warp.kernels.render.visibility.records import read_record, write_record
 from synpick_warp.scenes.environment import LUMINANCE
 from synpick_warp.scenes.types import Camera
 from synpick_warp.stages.render.denoised import COARSE_LIGHT, GUIDE, RATIO_IMAGES, build_coarse_grid

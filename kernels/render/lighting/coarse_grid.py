@@ -43,42 +43,6 @@ def flat_index(grid: ImageGrid, view: int, row: int, column: int) -> int:
     return (view * grid.height + row) * grid.width + column
 
 
-@wp.func_native("""
-    struct alignas(16) Aligned { float x, y, z, w; };
-    const Aligned record = reinterpret_cast<const Aligned*>(records.data)[index];
-    return wp::vec4(record.x, record.y, record.z, record.w);
-""")
-def read_record(records: wp.array3d[wp.vec4], index: int) -> wp.vec4:
-    """Read the element of a contiguous array at a `flat_index` by one load: Warp's own look-up assumes no alignment, and takes four."""
-    ...
-
-
-@wp.func_native("""
-    struct alignas(16) Aligned { float x, y, z, w; };
-    const Aligned aligned = { record[0], record[1], record[2], record[3] };
-    reinterpret_cast<Aligned*>(records.data)[index] = aligned;
-""")
-def write_record(records: wp.array3d[wp.vec4], index: int, record: wp.vec4):
-    """Write the element of a contiguous array at a `flat_index` by one store."""
-    ...
-
-
-@wp.func_native("""
-    return words.data[index];
-""")
-def read_word(words: wp.array3d[wp.uint64], index: int) -> wp.uint64:
-    """Read the element of a contiguous array at a `flat_index`."""
-    ...
-
-
-@wp.func_native("""
-    words.data[index] = word;
-""")
-def write_word(words: wp.array3d[wp.uint64], index: int, word: wp.uint64):
-    """Write the element of a contiguous array at a `flat_index`."""
-    ...
-
-
 @wp.func
 def pack_surface(segment: int, depth: float, normal: wp.vec3) -> wp.vec4:
     """Pack a surface: x and y of its shading normal in camera space, planar depth [m], and segmentation id.

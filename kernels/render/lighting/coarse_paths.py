@@ -17,8 +17,6 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     middle_pixel,
     morton_index,
     pack_surface,
-    write_record,
-    write_word,
 )
 from synpick_warp.kernels.render.lighting.color import MAX_HALF, MIN_RADIANCE, luminance, pack_half3
 from synpick_warp.kernels.render.lighting.history import (
@@ -47,6 +45,7 @@ from synpick_warp.kernels.render.lighting.path_tracing import (
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, ViewBodies, read_hit
+from synpick_warp.kernels.render.visibility.records import write_record, write_word
 from synpick_warp.kernels.rng import stream_key
 from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS, RAY_REGISTERS
 

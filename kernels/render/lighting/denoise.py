@@ -13,13 +13,9 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     Guide,
     flat_index,
     middle_pixel,
-    read_record,
-    read_word,
     surface_depth,
     surface_normal,
     surface_segment,
-    write_record,
-    write_word,
 )
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, pack_light, unpack_half2
 from synpick_warp.kernels.render.lighting.color import luminance, pack_half3, unpack_half3
@@ -27,6 +23,7 @@ from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_dis
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, clamp_index, in_image, tile_pixel
+from synpick_warp.kernels.render.visibility.records import read_record, read_word, write_record, write_word
 from synpick_warp.kernels.tuning import CHOICE_REGISTERS, FILTER_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})

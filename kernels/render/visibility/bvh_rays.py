@@ -8,6 +8,9 @@ import warp as wp
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.visibility.camera import Cameras
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, Hit, Interior, Meshes, Table, ViewBodies, segment_of
+from synpick_warp.kernels.render.visibility.ray_bodies import first_ray_record, read_ray_body
+from synpick_warp.kernels.render.visibility.records import read_record
+from synpick_warp.kernels.render.visibility.wide_bvh import query_any_hit, query_closest_hit
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,9 +61,8 @@ def body_ray_start(bodies: ViewBodies, view: int, body: int, ray: wp.vec3) -> wp
 @wp.func
 def hits_body(meshes: Meshes, bodies: ViewBodies, view: int, body: int, ray: wp.vec3) -> bool:
     """Any-hit query of a camera ray against one body."""
-    return wp.mesh_query_ray_anyhit(
-        meshes.id[bodies.mesh[view, body]], body_ray_start(bodies, view, body, ray), bodies.rotation[view, body] * ray, FAR
-    )
+    root = meshes.bvh.root[bodies.mesh[view, body]]
+    return query_any_hit(meshes.bvh, root, body_ray_start(bodies, view, body, ray), bodies.rotation[view, body] * ray, FAR)
 
 
 @wp.func
@@ -90,11 +92,11 @@ def trace_bodies(
             start = body_ray_start(bodies, view, body, ray)
             direction = bodies.rotation[view, body] * ray
             if body != instances or not stays_in_interior(meshes.interior, start, direction, reach):
-                query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, direction, reach)
-                if query.result:
-                    best.depth = near + query.t
-                    best.triangle = query.face
-                    best.barycentric = wp.vec2(query.u, query.v)
+                hit = query_closest_hit(meshes.bvh, meshes.bvh.root[bodies.mesh[view, body]], start, direction, reach)
+                if hit[0] >= 0.0:
+                    best.depth = near + hit[0]
+                    best.triangle = wp.cast(hit[3], int)
+                    best.barycentric = wp.vec2(hit[1], hit[2])
                     best.segment = segment_of(body, instances)
         left = left >> wp.uint64(1)
         rank += 1
@@ -134,20 +136,19 @@ def trace_ray(meshes: Meshes, table: Table, bodies: ViewBodies, view: int, insta
         best.segment = Segment.TABLE
         best.depth = -height / direction[2]
     for rank in range(bodies.present[view]):
-        body = bodies.order[view, rank]
-        sphere = bodies.sphere[view, body]
+        record = first_ray_record(bodies, view, rank)
+        sphere = read_record(bodies.ray_record, record)
         offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
         closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, best.depth) * direction
         if wp.dot(closest, closest) < sphere[3]:
-            rotation = bodies.world_rotation[view, body]
-            start = rotation * (origin - bodies.position[view, body])
-            local = rotation * direction
-            query = wp.mesh_query_ray(meshes.id[bodies.mesh[view, body]], start, local, best.depth)
-            if query.result:
-                best.depth = query.t
-                best.triangle = query.face
-                best.barycentric = wp.vec2(query.u, query.v)
-                best.segment = segment_of(body, instances)
+            instance = read_ray_body(bodies, record)
+            start = instance.rotation * (origin - instance.position)
+            hit = query_closest_hit(meshes.bvh, instance.root, start, instance.rotation * direction, best.depth)
+            if hit[0] >= 0.0:
+                best.depth = hit[0]
+                best.triangle = wp.cast(hit[3], int)
+                best.barycentric = wp.vec2(hit[1], hit[2])
+                best.segment = segment_of(instance.body, instances)
     return best
 
 
@@ -166,16 +167,15 @@ def is_blocked(
         if origin[2] + reach * direction[2] < table.height:
             return True
     present = bodies.present[view]
-    for index in range(present):
+    for turn in range(present):
         # Back to front, so that the tote comes first: low rays hit its walls.
-        body = bodies.order[view, present - 1 - index]
-        sphere = bodies.sphere[view, body]
+        record = first_ray_record(bodies, view, present - 1 - turn)
+        sphere = read_record(bodies.ray_record, record)
         offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
         closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, reach) * direction
         if wp.dot(closest, closest) < sphere[3]:
-            rotation = bodies.world_rotation[view, body]
-            start = rotation * (origin - bodies.position[view, body])
-            local = rotation * direction
-            if wp.mesh_query_ray_anyhit(meshes.id[bodies.mesh[view, body]], start, local, reach):
+            instance = read_ray_body(bodies, record)
+            start = instance.rotation * (origin - instance.position)
+            if query_any_hit(meshes.bvh, instance.root, start, instance.rotation * direction, reach):
                 return True
     return False

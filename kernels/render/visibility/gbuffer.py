@@ -3,6 +3,7 @@
 import warp as wp
 
 from synpick_warp.codes import Segment
+from synpick_warp.kernels.render.visibility.wide_bvh import WideBvh
 
 wp.set_module_options({"enable_backward": False})
 
@@ -37,7 +38,9 @@ class Meshes:
     """Triangle meshes and their BVHs, each in its own frame: the catalog's, then tote, gripper shaft, cup. Constant."""
 
     id: wp.array[wp.uint64]
-    """(mesh): Warp's mesh handle, which holds the BVH."""
+    """(mesh): Warp's mesh handle."""
+    bvh: WideBvh
+    """BVHs, which the renderer's rays traverse."""
     lower: wp.array[wp.vec3]
     upper: wp.array[wp.vec3]
     """(mesh): bounding box [m]."""
@@ -89,6 +92,8 @@ class ViewBodies:
     """(view, body): bounding sphere in the world: centre [m], squared radius [m²]; negative square: the body is absent."""
     order: wp.array2d[int]
     """(view, rank): present bodies, front to back by `near`, the tote last: after a near hit the others are seldom tested."""
+    ray_record: wp.array3d[wp.vec4]
+    """(view, rank, record): packed pose, bounding sphere and BVH of body `order[rank]`, see `visibility.ray_bodies`."""
     present: wp.array[int]
     """(view): number of present bodies."""
     uses_background: wp.array[int]

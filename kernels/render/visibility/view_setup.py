@@ -14,6 +14,7 @@ from synpick_warp.kernels.render.visibility.camera import (
     projected_box,
 )
 from synpick_warp.kernels.render.visibility.gbuffer import FAR, FIXTURES, Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.ray_bodies import write_ray_body
 
 wp.set_module_options({"enable_backward": False})
 
@@ -51,7 +52,7 @@ def set_up_views_kernel(
 ):
     """Transform each body of a view's world into the view's camera, x_camera = R (x_world - c), in float64, stored in float32.
 
-    Writes all of `ViewBodies` but `order`, `present` and `body_mask`; absent bodies (all, if the view is unused) get mesh -1.
+    Writes all of `ViewBodies` but `order`, `ray_record`, `present` and `body_mask`; absent bodies (all, if the view is unused) get mesh -1.
     """
     view, body = wp.tid()
     world = views.world[view]
@@ -106,12 +107,14 @@ def rank_depth(bodies: ViewBodies, view: int, body: int) -> float:
 
 @wp.kernel
 def sort_bodies_kernel(
+    # Scene:
+    meshes: Meshes,
     # Out:
     bodies_inout: ViewBodies,
 ):
     """Sort the present bodies of each view front to back, the tote last, by counting: a body's rank is the number of bodies before it.
 
-    Writes `order` and `present`.
+    Writes `order`, `ray_record` and `present`.
     """
     view, body = wp.tid()
     bodies = bodies_inout.mesh.shape[1]
@@ -127,6 +130,7 @@ def sort_bodies_kernel(
                 rank += 1
     if there:
         bodies_inout.order[view, rank] = body
+        write_ray_body(meshes, bodies_inout, view, rank, body)
     if body == 0:
         bodies_inout.present[view] = total
 

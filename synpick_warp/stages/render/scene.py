@@ -20,6 +20,7 @@ from synpick_warp.scenes.assets.appearance import linear_to_srgb, srgb_to_linear
 from synpick_warp.scenes.tote import TABLE_ROUGHNESS
 from synpick_warp.scenes.types import Camera, Catalog, EnvironmentMap, Fixture, Interior, Material, TriangleMesh
 from synpick_warp.stages.render.light_tables import build_environment_cdf, measure_albedo, precompute_environment
+from synpick_warp.stages.render.wide_bvh import build_wide_bvh
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +118,7 @@ def build_meshes(
     radius = [np.linalg.norm(shape.vertices.astype(np.float64) - c, axis=1).max() for shape, c in zip(shapes, center, strict=True)]
     meshes = Meshes()
     meshes.id = wp.array([mesh.id for mesh in keep], dtype=wp.uint64, device=device)
+    meshes.bvh = build_wide_bvh(shapes, device)
     meshes.lower = wp.array(lower, dtype=wp.vec3, device=device)
     meshes.upper = wp.array(upper, dtype=wp.vec3, device=device)
     meshes.center = wp.array(center, dtype=wp.vec3, device=device)

@@ -10,6 +10,7 @@ import warp as wp
 from synpick_warp.arrays import struct_arrays
 from synpick_warp.kernels.render.visibility.camera import Views
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies
+from synpick_warp.kernels.render.visibility.ray_bodies import RAY_RECORDS
 from synpick_warp.kernels.render.visibility.view_setup import bin_bodies_kernel, set_up_views_kernel, sort_bodies_kernel
 from synpick_warp.stages.buffers import FIXTURES, Snapshot
 from synpick_warp.stages.render.scene import RenderScene, build_grid
@@ -18,6 +19,7 @@ VIEW_BODIES = struct_arrays(
     ViewBodies,
     "view",
     "body",
+    ray_record=("view", "body", "record"),
     present=("view",),
     uses_background=("view",),
     body_mask=("view", "tile"),
@@ -48,7 +50,7 @@ def make_views(world: wp.array, camera: wp.array, count: int, instances: int) ->
 
 def body_sizes(instances: int, width: int, height: int) -> dict[str, int]:
     """Extents of the dimensions that `VIEW_BODIES` names beside the view, for images of `width` x `height` px."""
-    return {"body": instances + len(FIXTURES), "tile": build_grid(width, height).tiles}
+    return {"body": instances + len(FIXTURES), "tile": build_grid(width, height).tiles, "record": int(RAY_RECORDS)}
 
 
 def set_up_views(
@@ -74,6 +76,6 @@ def set_up_views(
     dim = (views.count, bodies.mesh.shape[1])
     inputs = [scene.meshes, cameras, grid, snapshot.catalog_index, snapshot.pose, snapshot.fixture_pose, fixture_visible, views]
     wp.launch(set_up_views_kernel, dim=dim, inputs=inputs, outputs=[bodies], device=scene.device)
-    wp.launch(sort_bodies_kernel, dim=dim, outputs=[bodies], device=scene.device)
+    wp.launch(sort_bodies_kernel, dim=dim, inputs=[scene.meshes], outputs=[bodies], device=scene.device)
     inputs = [scene.meshes, cameras, grid, views]
     wp.launch(bin_bodies_kernel, dim=(views.count, grid.tiles), inputs=inputs, outputs=[bodies], device=scene.device)

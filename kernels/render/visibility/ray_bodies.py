@@ -1,0 +1,59 @@
+"""Packed instances for ray queries: pose, bounding sphere and BVH of each body of a view, in the order in which rays test them."""
+
+import warp as wp
+
+from synpick_warp.kernels.render.visibility.gbuffer import Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.records import read_record
+
+wp.set_module_options({"enable_backward": False})
+
+RAY_RECORDS = wp.constant(5)
+"""Records of a body in `ViewBodies.ray_record`. 0: its bounding sphere. 1 to 3: a row of its rotation from the world, and a coordinate of
+its position. 4: root node of its BVH and its row of `ViewBodies`, both as bits; unused; unused."""
+
+
+@wp.struct
+class RayBody:
+    """Pose and BVH of a body."""
+
+    rotation: wp.mat33
+    """World to body frame."""
+    position: wp.vec3
+    """Body origin in the world [m]."""
+    root: int
+    """Root node of its BVH."""
+    body: int
+    """Row of `ViewBodies`."""
+
+
+@wp.func
+def first_ray_record(bodies: ViewBodies, view: int, rank: int) -> int:
+    """Flat index of a body's first record, its bounding sphere."""
+    return (view * bodies.order.shape[1] + rank) * RAY_RECORDS
+
+
+@wp.func
+def write_ray_body(meshes: Meshes, bodies_inout: ViewBodies, view: int, rank: int, body: int):
+    """Write the records of a body."""
+    rotation = bodies_inout.world_rotation[view, body]
+    position = bodies_inout.position[view, body]
+    root = meshes.bvh.root[bodies_inout.mesh[view, body]]
+    bodies_inout.ray_record[view, rank, 0] = bodies_inout.sphere[view, body]
+    for row in range(3):
+        bodies_inout.ray_record[view, rank, 1 + row] = wp.vec4(rotation[row, 0], rotation[row, 1], rotation[row, 2], position[row])
+    bodies_inout.ray_record[view, rank, 4] = wp.vec4(wp.cast(root, float), wp.cast(body, float), 0.0, 0.0)
+
+
+@wp.func
+def read_ray_body(bodies: ViewBodies, first: int) -> RayBody:
+    """Read the pose and BVH of a body by its `first_ray_record`."""
+    x = read_record(bodies.ray_record, first + 1)
+    y = read_record(bodies.ray_record, first + 2)
+    z = read_record(bodies.ray_record, first + 3)
+    rows = read_record(bodies.ray_record, first + 4)
+    result = RayBody()
+    result.rotation = wp.mat33(x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2])
+    result.position = wp.vec3(x[3], y[3], z[3])
+    result.root = wp.cast(rows[0], int)
+    result.body = wp.cast(rows[1], int)
+    return result

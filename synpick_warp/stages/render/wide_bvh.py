@@ -1,0 +1,190 @@
+"""Wide BVH builder: collapses Warp's binary BVHs to four children per node and quantizes their boxes; the ray queries are in `kernels`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.kernels.render.visibility.wide_bvh import LEAF, NODE_RECORDS, STACK_SIZE, WIDTH, WideBvh, read_binary_bvh_kernel
+from synpick_warp.scenes.types import TriangleMesh
+
+MARGIN = 1e-6
+"""Enlargement of boxes [m, and per metre of the mesh's coordinates], above float32's rounding in the slab test."""
+MAX_COORDINATE = 255
+"""Largest quantized coordinate."""
+MIN_EXPONENT = -20
+"""Binary exponent of the smallest quantization step, 1 um."""
+EXPONENT_BIAS = 127
+"""Offset of a float32's stored exponent."""
+ABSENT = -1
+"""Child that a node does not have."""
+
+
+@dataclass(frozen=True, eq=False)
+class BinaryBvh:
+    """Binary BVH of a mesh."""
+
+    lower: np.ndarray
+    upper: np.ndarray
+    """(node, 3) float64: box [m]."""
+    children: np.ndarray
+    """(node, 2) int32: children; of a leaf -1 - begin, -1 - end of its range of `triangle`."""
+    triangle: np.ndarray
+    """(triangle) int32: triangle indices in the order of leaves."""
+    root: int
+
+    @property
+    def leaf(self) -> np.ndarray:
+        """(node) bool: the node is a leaf."""
+        return self.children[:, 0] < 0
+
+    def has_single_leaves(self) -> bool:
+        """True if every leaf is one triangle."""
+        return bool((self.children[self.leaf, 0] - self.children[self.leaf, 1] == 1).all())
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Nodes of a wide BVH at one depth."""
+
+    child: np.ndarray
+    """(node, WIDTH) int64: the children, as nodes of the binary BVH; ABSENT: none."""
+    inner: np.ndarray
+    """(node, WIDTH) bool: the child is a node of the next level, whose order is that of these children."""
+
+    @property
+    def leaf(self) -> np.ndarray:
+        """(node, WIDTH) bool: the child is a triangle."""
+        return (self.child != ABSENT) & ~self.inner
+
+
+def build_wide_bvh(shapes: list[TriangleMesh], device: wp.Device) -> Any:
+    """Build the struct `WideBvh` of meshes on `device`: by Warp's builder on the CPU, so that it is the same for every device."""
+    nodes, triangles, roots = [], [], []
+    node_count = triangle_count = 0
+    for shape in shapes:
+        binary, levels = collapse_mesh(shape)
+        order = leaf_order(binary, levels)
+        nodes.append(encode_nodes(binary, levels, node_count, triangle_count))
+        triangles.append(encode_triangles(shape, order))
+        roots.append(node_count)
+        node_count += sum(len(level.child) for level in levels)
+        triangle_count += len(order)
+    result = WideBvh()
+    result.node = wp.array(np.concatenate(nodes), dtype=wp.vec4ui, device=device)
+    result.triangle = wp.array(np.concatenate(triangles), dtype=wp.vec4, device=device)
+    result.root = wp.array(roots, dtype=wp.int32, device=device)
+    return result
+
+
+def collapse_mesh(shape: TriangleMesh) -> tuple[BinaryBvh, list[Level]]:
+    """Binary and wide BVH of a mesh: split by the surface area heuristic, or at medians if that tree is too deep for a query's stack.
+
+    Raises:
+        CatalogError: Even the balanced tree is too deep.
+    """
+    for constructor in ("sah", "median"):
+        binary = build_binary_bvh(shape, constructor)
+        if binary.has_single_leaves():
+            levels = collapse(binary)
+            if needed_stack(levels) <= int(STACK_SIZE):
+                return binary, levels
+    raise CatalogError(f"a mesh of {len(shape.faces):,} triangles has a BVH too deep for a stack of {int(STACK_SIZE)}")
+
+
+def build_binary_bvh(shape: TriangleMesh, constructor: str) -> BinaryBvh:
+    """Warp's BVH of a mesh, built on the CPU."""
+    points = wp.array(shape.vertices, dtype=wp.vec3, device="cpu")
+    mesh = wp.Mesh(points, wp.array(shape.faces.reshape(-1), dtype=wp.int32, device="cpu"), bvh_constructor=constructor, bvh_leaf_size=1)
+    faces = len(shape.faces)
+    lower, upper = (wp.zeros(2 * faces, dtype=wp.vec3, device="cpu") for _ in range(2))
+    children, triangle, root = (wp.zeros(n, dtype=kind, device="cpu") for n, kind in ((2 * faces, wp.vec2i), (faces, int), (1, int)))
+    wp.launch(read_binary_bvh_kernel, dim=2 * faces, inputs=[mesh.id], outputs=[lower, upper, children, triangle, root], device="cpu")
+    low, high = (array.numpy().astype(np.float64) for array in (lower, upper))
+    return BinaryBvh(low, high, children.numpy().copy(), triangle.numpy().copy(), int(root.numpy()[0]))
+
+
+def collapse(binary: BinaryBvh) -> list[Level]:
+    """Wide BVH of a binary one, level by level: of a node's children the largest inner one is replaced by its own two children, until there
+    are WIDTH (Wald, Benthin and Boulos, 2008)."""
+    edges = binary.upper - binary.lower
+    area = edges[:, 0] * edges[:, 1] + edges[:, 1] * edges[:, 2] + edges[:, 2] * edges[:, 0]
+    weight = np.append(np.where(binary.leaf, -1.0, area), -1.0)  # The last entry is that of ABSENT.
+    levels: list[Level] = []
+    nodes = np.array([binary.root])
+    while len(nodes):
+        child = np.full((len(nodes), int(WIDTH)), ABSENT, np.int64)
+        child[:, 0] = nodes
+        rows = np.arange(len(nodes))
+        for slot in range(1, int(WIDTH)):
+            largest = weight[child].argmax(axis=1)
+            opened = child[rows, largest]
+            grows = weight[opened] >= 0.0
+            child[rows[grows], slot] = binary.children[opened[grows], 1]
+            child[rows[grows], largest[grows]] = binary.children[opened[grows], 0]
+        levels.append(Level(child, weight[child] >= 0.0))
+        nodes = child[levels[-1].inner]
+    return levels
+
+
+def needed_stack(levels: list[Level]) -> int:
+    """Largest number of children that a query can have on its stack."""
+    below = np.zeros(0, np.int64)
+    for level in reversed(levels):
+        more = np.zeros(level.child.shape, np.int64)
+        more[level.inner] = below - 1
+        below = (level.child != ABSENT).sum(axis=1) + more.max(axis=1)
+    return int(below[0])
+
+
+def leaf_order(binary: BinaryBvh, levels: list[Level]) -> np.ndarray:
+    """Triangle indices (triangle) in the order of the leaves."""
+    leaves = np.concatenate([level.child[level.leaf] for level in levels])
+    return binary.triangle[-1 - binary.children[leaves, 0]]
+
+
+def encode_nodes(binary: BinaryBvh, levels: list[Level], first_node: int, first_triangle: int) -> np.ndarray:
+    """Records of nodes (4 node, 4) uint32, as `WideBvh.node`; nodes and triangles of all meshes are numbered from the given ones on."""
+    child, inner, leaf = (np.concatenate([getattr(level, name) for level in levels]) for name in ("child", "inner", "leaf"))
+    origin, exponent, low, high = quantize_boxes(binary, child)
+    reference = np.full(child.shape, int(LEAF) + first_triangle)
+    reference[inner] = first_node + 1 + np.arange(inner.sum())
+    reference[leaf] += np.arange(leaf.sum())
+    words = np.zeros((len(child), 4 * int(NODE_RECORDS)), np.uint32)
+    words[:, :3] = origin.view(np.uint32)
+    words[:, 3] = ((exponent + EXPONENT_BIAS) << [0, 8, 16]).sum(axis=1)
+    words[:, 4:10] = np.ascontiguousarray(np.concatenate([low, high], axis=2).transpose(0, 2, 1)).view("<u4")[..., 0]
+    words[:, 10:14] = reference
+    return words.reshape(-1, 4)
+
+
+def quantize_boxes(binary: BinaryBvh, child: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Quantize the boxes of children (node, WIDTH), enlarged by MARGIN.
+
+    Returns:
+        Corner of each node's box (node, 3) float32 [m], binary exponents of the steps (node, 3), lower and upper corners of the children's
+        boxes (node, WIDTH, 3) uint8 [steps from the node's corner]. An absent child's lower corner is above its upper one: no ray hits it.
+    """
+    absent = (child == ABSENT)[..., None]
+    margin = MARGIN * (1.0 + np.abs(np.stack([binary.lower, binary.upper])).max(initial=0.0))
+    low = np.where(absent, np.inf, binary.lower[child] - margin)
+    high = np.where(absent, -np.inf, binary.upper[child] + margin)
+    origin = np.nextafter(low.min(axis=1).astype(np.float32), np.float32(-np.inf))
+    extent = high.max(axis=1) - origin
+    exponent = np.maximum(np.ceil(np.log2(extent / MAX_COORDINATE)), MIN_EXPONENT).astype(np.int64)
+    step = np.exp2(exponent)[:, None]
+    low = np.where(absent, MAX_COORDINATE, np.floor((low - origin[:, None]) / step))
+    high = np.where(absent, 0, np.ceil((high - origin[:, None]) / step))
+    return origin, exponent, low.astype(np.uint8), high.astype(np.uint8)
+
+
+def encode_triangles(shape: TriangleMesh, order: np.ndarray) -> np.ndarray:
+    """Records of triangles (3 triangle, 4) float32, as `WideBvh.triangle`, in `order`."""
+    records = np.zeros((len(order), 3, 4), np.float32)
+    records[..., :3] = shape.vertices[shape.faces[order]]
+    records[:, 0, 3] = order.astype(np.uint32).view(np.float32)
+    return records.reshape(-1, 4)

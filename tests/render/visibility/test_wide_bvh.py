@@ -1,0 +1,187 @@
+"""Wide BVH: its queries hit what Warp's queries hit, to the last bit; its boxes contain their triangles; no tree overflows the stack."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from synpick_warp.errors import CatalogError
+from synpick_warp.kernels.render.visibility.wide_bvh import LEAF, NODE_RECORDS, STACK_SIZE, WIDTH, query_any_hit, query_closest_hit
+from synpick_warp.scenes.types import TriangleMesh
+from synpick_warp.stages.render import wide_bvh
+from synpick_warp.stages.render.wide_bvh import (
+    ABSENT,
+    MAX_COORDINATE,
+    build_binary_bvh,
+    build_wide_bvh,
+    collapse,
+    collapse_mesh,
+    needed_stack,
+)
+from synpick_warp.system.device import pick_device
+from tests.harness.bvh_probe import query_mesh_kernel, query_wide_bvh_kernel
+from tests.harness.devices import default_device
+from tests.worlds.toy_scene import ball, box
+
+RAYS = 4096
+
+
+def soup(count: int, seed: int, size: float = 0.3) -> TriangleMesh:
+    """Random triangles, a tenth of them degenerate: two equal corners, or all three on a line along an axis."""
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-1.0, 1.0, (count, 1, 3)) + rng.uniform(-size, size, (count, 3, 3))
+    corners[5::20, 1] = corners[5::20, 0]
+    corners[15::20, 1:, 1:] = corners[15::20, :1, 1:]
+    return loose(corners)
+
+
+def loose(corners: np.ndarray) -> TriangleMesh:
+    """A mesh of loose triangles (F, 3, 3) [m]; its normals and texture coordinates don't matter here."""
+    zeros = np.zeros((3 * len(corners), 3), np.float32)
+    faces = np.arange(3 * len(corners), dtype=np.int32).reshape(-1, 3)
+    return TriangleMesh(corners.reshape(-1, 3).astype(np.float32), faces, zeros, zeros[:, :2])
+
+
+def staircase(levels: int) -> TriangleMesh:
+    """Triangles each half as large and half as far from the origin as the one before: a split by area cuts off one at a time."""
+    scale = 0.5 ** np.arange(levels)[:, None, None]
+    corners = np.array([[1.0, 0.0, 0.0], [1.2, 0.0, 0.0], [1.0, 0.2, 0.1]]) * scale
+    return loose(corners)
+
+
+def rays_at(mesh: TriangleMesh, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Start points and directions (RAYS, 3) float32 of rays from outside and inside a mesh's box; a quarter has zero components."""
+    rng = np.random.default_rng(seed)
+    lower, upper = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    middle, half = (lower + upper) / 2, (upper - lower) / 2 + 1e-3
+    start = middle + half * rng.normal(size=(RAYS, 3)) * rng.choice([0.3, 2.0, 20.0], (RAYS, 1))
+    direction = middle + half * rng.uniform(-1.0, 1.0, (RAYS, 3)) - start
+    direction[::8, rng.integers(3)] = 0.0
+    direction[4::8, :2] = 0.0
+    start[::16] = mesh.vertices[rng.integers(len(mesh.vertices), size=len(start[::16]))]
+    return start.astype(np.float32), (direction / np.linalg.norm(direction, axis=1, keepdims=True).clip(1e-9)).astype(np.float32)
+
+
+def run_queries(meshes: list[TriangleMesh], row: int, rays: tuple[np.ndarray, np.ndarray], reach: float, device: wp.Device, own: bool):
+    """Hits (ray, 3) of (t, u, v), triangles (ray) and blocked rays (ray), by the wide BVH (`own`) or by Warp's."""
+    start, direction = (wp.array(values, dtype=wp.vec3, device=device) for values in rays)
+    outputs = [wp.zeros(RAYS, dtype=kind, device=device) for kind in (wp.vec3, int, int)]
+    if own:
+        inputs = [build_wide_bvh(meshes, device), row, start, direction, reach]
+        wp.launch(query_wide_bvh_kernel, dim=RAYS, inputs=inputs, outputs=outputs, device=device)
+    else:
+        points = wp.array(meshes[row].vertices, dtype=wp.vec3, device=device)
+        mesh = wp.Mesh(points, wp.array(meshes[row].faces.reshape(-1), dtype=wp.int32, device=device))
+        wp.launch(query_mesh_kernel, dim=RAYS, inputs=[mesh.id, start, direction, reach], outputs=outputs, device=device)
+    return [output.numpy() for output in outputs]
+
+
+def check_queries(meshes: list[TriangleMesh], row: int, seed: int, reach: float) -> int:
+    """Compare both queries of a mesh; returns the number of hits."""
+    device = pick_device(default_device())
+    rays = rays_at(meshes[row], seed)
+    hit, face, blocked = run_queries(meshes, row, rays, reach, device, own=True)
+    expected_hit, expected_face, expected_blocked = run_queries(meshes, row, rays, reach, device, own=False)
+    assert np.array_equal(hit[:, 0], expected_hit[:, 0])
+    same = face == expected_face
+    assert np.array_equal(hit[same], expected_hit[same])
+    # Of triangles hit at the same distance, which share an edge or a corner, either is right.
+    start, direction = (values[face >= 0].astype(np.float64) for values in rays)
+    t, u, v = hit[face >= 0].astype(np.float64).T[..., None]
+    corners = meshes[row].vertices[meshes[row].faces[face[face >= 0]]].astype(np.float64)
+    point = u * corners[:, 0] + v * corners[:, 1] + (1.0 - u - v) * corners[:, 2]
+    assert (np.abs(start + t * direction - point) < 1e-5 * (1.0 + t)).all()
+    assert np.array_equal(blocked, expected_blocked)
+    assert np.array_equal(blocked == 1, hit[:, 0] >= 0.0)
+    return len(point)
+
+
+@pytest.mark.parametrize("reach", [0.5, 1e30])
+@pytest.mark.parametrize("mesh", [ball(0.1, 3), box(0.2, 0.1, 0.05), soup(1, 0), soup(3, 1), soup(600, 2), staircase(60)])
+def test_hits_are_those_of_warps_queries(mesh: TriangleMesh, reach: float):
+    assert check_queries([soup(7, 5), mesh, ball(0.3, 1)], 1, seed=3, reach=reach) > 0
+
+
+@settings(max_examples=20, deadline=None)
+@given(count=st.integers(1, 300), seed=st.integers(0, 1000), size=st.sampled_from([1e-4, 0.05, 1.0]))
+def test_hits_of_random_triangles_are_those_of_warps_queries(count: int, seed: int, size: float):
+    check_queries([soup(count, seed, size)], 0, seed, 1e30)
+
+
+def test_rays_from_afar_hit_a_small_mesh():
+    """Rounding in the slab test grows with the distance. 20 m off Warp's query misses one of the triangles that rays are aimed at."""
+    mesh = soup(200, 4, 0.01)
+    small = TriangleMesh(mesh.vertices * np.float32(0.05), mesh.faces, mesh.normals, mesh.uv)
+    rng = np.random.default_rng(0)
+    away = rng.normal(size=(RAYS, 3))
+    start = 20.0 * away / np.linalg.norm(away, axis=1, keepdims=True)
+    target = small.vertices[small.faces].mean(axis=1)[rng.integers(200, size=RAYS)]
+    direction = (target - start) / np.linalg.norm(target - start, axis=1, keepdims=True)
+    rays = start.astype(np.float32), direction.astype(np.float32)
+    device = pick_device(default_device())
+    own, warps = (run_queries([small], 0, rays, 1e30, device, own) for own in (True, False))
+    found = warps[1] >= 0
+    assert found.sum() > 0.9 * RAYS
+    assert np.array_equal(own[0][found, 0], warps[0][found, 0])
+    assert (own[1] >= 0).sum() >= found.sum()
+
+
+@pytest.mark.parametrize("mesh", [ball(0.1, 3), soup(1, 0), soup(500, 2), staircase(60)])
+def test_boxes_contain_their_triangles(mesh: TriangleMesh):
+    bvh = build_wide_bvh([soup(9, 1), mesh], wp.get_device("cpu"))
+    words, triangles = bvh.node.numpy().reshape(-1, 16), bvh.triangle.numpy().reshape(-1, 3, 4)
+    faces = triangles[:, 0, 3].copy().view(np.uint32)
+    seen: list[int] = []
+
+    def visit(node: int) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of a node's triangles, after a check that each child's box contains its own."""
+        record = words[node]
+        origin = record[:3].view(np.float32).astype(np.float64)
+        step = 2.0 ** ((record[3] >> np.array([0, 8, 16]) & 255).astype(float) - 127.0)
+        boxes = record[4:10].copy().view(np.uint8).reshape(6, int(WIDTH)).T
+        bounds = []
+        for child, quantized in zip(record[10:14], boxes, strict=True):
+            if quantized[0] == MAX_COORDINATE and quantized[3] == 0:
+                continue
+            if child & int(LEAF):
+                row = int(child) - int(LEAF)
+                seen.append(int(faces[row]))
+                assert np.array_equal(triangles[row, :, :3], mesh.vertices[mesh.faces[faces[row]]])
+                low, high = triangles[row, :, :3].min(axis=0), triangles[row, :, :3].max(axis=0)
+            else:
+                low, high = visit(int(child))
+            assert (origin + quantized[:3] * step <= low).all()
+            assert (origin + quantized[3:] * step >= high).all()
+            bounds.append((low, high))
+        return np.min([low for low, _ in bounds], axis=0), np.max([high for _, high in bounds], axis=0)
+
+    visit(int(bvh.root.numpy()[1]))
+    assert sorted(seen) == list(range(len(mesh.faces)))
+
+
+def test_nodes_of_a_regular_mesh_are_filled():
+    _, levels = collapse_mesh(ball(0.1, 4))
+    child = np.concatenate([level.child for level in levels])
+    assert (child != ABSENT).sum(axis=1).mean() > 2.8
+
+
+def test_a_tree_too_deep_for_the_stack_is_balanced(monkeypatch: pytest.MonkeyPatch):
+    mesh = staircase(60)
+    assert not build_binary_bvh(mesh, "sah").has_single_leaves() or needed_stack(collapse(build_binary_bvh(mesh, "sah"))) > 30
+    monkeypatch.setattr(wide_bvh, "STACK_SIZE", 20)
+    assert needed_stack(collapse_mesh(mesh)[1]) <= 20
+    monkeypatch.setattr(wide_bvh, "STACK_SIZE", 4)
+    with pytest.raises(CatalogError, match="60 triangles has a BVH too deep for a stack of 4"):
+        collapse_mesh(mesh)
+
+
+@pytest.mark.parametrize("query", [query_closest_hit, query_any_hit])
+def test_builder_and_queries_have_the_same_constants(query: wp.Function):
+    """The queries are C++, which Warp's constants don't reach."""
+    assert f"STACK_SIZE = {int(STACK_SIZE)};" in query.native_snippet
+    assert f"LEAF = {int(LEAF):#x}u" in query.native_snippet
+    assert f"entry)[{int(WIDTH)}]" in query.native_snippet
+    assert f"nodes + {int(NODE_RECORDS)} * current" in query.native_snippet
