@@ -45,7 +45,7 @@ NAMES = (
     "one world world_and_global instance body waypoint status measure fixture view row column count box side point kind subset tile "
     "image field boundary cell_row cell_column shadow_row shadow_column chunk chunk_footprint block "
     "world_camera view_instance one slot slot_word group depth_byte "
-    "sample_row sample_block quad interval lane byte region rank path_kind"
+    "sample_row sample_block quad interval lane byte region rank path_kind record"
 )
 WORLDS = MIN_GPU_WORLDS + 1
 SIZES = {name: 2 + number for number, name in enumerate(NAMES.split())}

@@ -4,7 +4,14 @@ import numpy as np
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, brdf_pdf, evaluate_brdf, evaluate_disc, make_brdf, sample_brdf
-from synpick_warp.kernels.render.lighting.sampling import EnvironmentCdf, environment_pdf, sample_environment, scrambled_point
+from synpick_warp.kernels.render.lighting.sampling import (
+    EnvironmentCdf,
+    environment_pdf,
+    invert_conditional,
+    invert_marginal,
+    sample_environment,
+    scrambled_point,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -84,6 +91,22 @@ def sample_environment_kernel(
     direction_out[i] = sample.direction
     sampled_pdf_out[i] = sample.pdf
     evaluated_pdf_out[i] = environment_pdf(cdf, 0, sample.direction)
+
+
+@wp.kernel
+def invert_cdf_kernel(
+    # In:
+    cdf: EnvironmentCdf,
+    row: int,
+    numbers: wp.array[float],  # (sample)
+    # Out:
+    row_out: wp.array[int],  # (sample)
+    column_out: wp.array[int],  # (sample)
+):
+    """Rows by the marginal CDF of map 0, and columns by the conditional CDF of one of its rows."""
+    i = wp.tid()
+    row_out[i] = invert_marginal(cdf, 0, numbers[i])
+    column_out[i] = invert_conditional(cdf, 0, row, numbers[i])
 
 
 @wp.kernel

@@ -4,6 +4,7 @@ import warp as wp
 
 from synpick_warp.kernels.render.lighting.color import unpack_half3
 from synpick_warp.kernels.render.visibility.camera import clamp_index
+from synpick_warp.kernels.render.visibility.records import read_record
 
 wp.set_module_options({"enable_backward": False})
 
@@ -22,9 +23,9 @@ class Lights:
 
     maps: int
     """Number of environment maps."""
-    radiance: wp.array3d[wp.vec3]
+    radiance: wp.array3d[wp.vec4]
     """(2 maps, row, column): first every map as it is, then every map without its sun. Row 0 is the zenith, column
-    u = azimuth / 2π + 0.5."""
+    u = azimuth / 2π + 0.5. The fourth number is 0: a texel of 16 bytes is read by one load."""
     prefiltered: wp.array4d[wp.uint64]
     """(map, level, row, column): radiance without the sun, convolved with GGX lobes of increasing roughness; times the map's exposure, and
     packed as by `pack_half3`."""
@@ -92,18 +93,29 @@ def bilinear(taps: BilinearTaps, upper_west: wp.vec3, upper_east: wp.vec3, lower
 
 
 @wp.func
+def read_texel(lights: Lights, index: int) -> wp.vec3:
+    """Radiance of a texel by its flat index in `Lights.radiance`."""
+    texel = read_record(lights.radiance, index)
+    return wp.vec3(texel[0], texel[1], texel[2])
+
+
+@wp.func
 def environment_radiance(lights: Lights, light: int, direction: wp.vec3) -> wp.vec3:
     """Radiance from a unit direction in the map's frame, bilinear.
 
     `light` is a row of `Lights.radiance`: the index of a map, or that plus `maps` for the map without its sun.
     """
-    taps = find_taps(direction, lights.radiance.shape[1], lights.radiance.shape[2])
+    rows = lights.radiance.shape[1]
+    columns = lights.radiance.shape[2]
+    taps = find_taps(direction, rows, columns)
+    upper = (light * rows + taps.upper) * columns
+    lower = (light * rows + taps.lower) * columns
     return bilinear(
         taps,
-        lights.radiance[light, taps.upper, taps.west],
-        lights.radiance[light, taps.upper, taps.east],
-        lights.radiance[light, taps.lower, taps.west],
-        lights.radiance[light, taps.lower, taps.east],
+        read_texel(lights, upper + taps.west),
+        read_texel(lights, upper + taps.east),
+        read_texel(lights, lower + taps.west),
+        read_texel(lights, lower + taps.east),
     )
 
 

@@ -3,7 +3,8 @@
 import warp as wp
 
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables
-from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies, triangle_normal
+from synpick_warp.kernels.render.visibility.gbuffer import FIXTURES, Meshes, ViewBodies
+from synpick_warp.kernels.render.visibility.records import read_flat_record
 
 wp.set_module_options({"enable_backward": False})
 
@@ -26,18 +27,18 @@ MIN_TILT = wp.constant(0.1)
 """Lower bound of the cosine between surface normal and view direction, which limits a pixel's footprint at grazing angles."""
 
 
+TRIANGLE_RECORDS = wp.constant(5)
+"""Records of a triangle in `Surfaces.triangle`."""
+
+
 @wp.struct
 class Surfaces:
     """Materials, textures and shading normals. Constant. Rows called mesh are those of `Meshes`, and a last one for the table."""
 
-    normal: wp.array[wp.vec3]
-    """(corner): vertex normals of the three corners of each triangle, in the order of `Meshes.corner`."""
-    uv: wp.array[wp.vec2]
-    """(corner): texture coordinates."""
-    uv_density: wp.array[float]
-    """(triangle): texture lengths per metre."""
-    normal_gradient: wp.array[float]
-    """(triangle): Frobenius norm of the interpolated normal's gradient along the triangle [rad/m]."""
+    triangle: wp.array[wp.vec4]
+    """(TRIANGLE_RECORDS x triangle), triangles as in `Meshes.corner`: 0 to 2: the vertex normals of corners a, b and c, each followed by u
+    of its texture coordinates. 3: v of a, b and c; texture lengths per metre. 4: the unit normal by the winding, as in
+    `Meshes.face_normal`; Frobenius norm of the interpolated normal's gradient along the triangle [rad/m]."""
     color: wp.array[wp.vec3]
     """(mesh): base colour, linear."""
     metallic: wp.array[float]
@@ -111,23 +112,25 @@ def interpolate_surface(
     to_world = wp.transpose(bodies.world_rotation[view, body])
     result = Surface()
     result.row = mesh
-    result.face_normal = face_forward(to_world * triangle_normal(meshes, mesh, triangle), view_direction)
-    triangle_index = meshes.first_triangle[mesh] + triangle
-    a = 3 * triangle_index
-    b = a + 1
-    c = a + 2
+    first = TRIANGLE_RECORDS * (meshes.first_triangle[mesh] + triangle)
+    a = read_flat_record(surfaces.triangle, first)
+    b = read_flat_record(surfaces.triangle, first + 1)
+    c = read_flat_record(surfaces.triangle, first + 2)
+    more = read_flat_record(surfaces.triangle, first + 3)
+    face = read_flat_record(surfaces.triangle, first + 4)
+    result.face_normal = face_forward(to_world * wp.vec3(face[0], face[1], face[2]), view_direction)
     u = barycentric[0]
     v = barycentric[1]
     w = 1.0 - u - v
-    smooth = to_world * (u * surfaces.normal[a] + v * surfaces.normal[b] + w * surfaces.normal[c])
+    smooth = to_world * (u * wp.vec3(a[0], a[1], a[2]) + v * wp.vec3(b[0], b[1], b[2]) + w * wp.vec3(c[0], c[1], c[2]))
     result.normal = result.face_normal
     if wp.length_sq(smooth) > 0.0:
         result.normal = wp.normalize(face_forward(smooth, result.face_normal))
-    result.uv = u * surfaces.uv[a] + v * surfaces.uv[b] + w * surfaces.uv[c]
+    result.uv = u * wp.vec2(a[3], more[0]) + v * wp.vec2(b[3], more[1]) + w * wp.vec2(c[3], more[2])
     # A footprint on a tilted surface is longer along one axis only; the root is its mean stretch.
     tilt = wp.sqrt(wp.max(wp.dot(result.face_normal, view_direction), MIN_TILT))
-    result.uv_footprint = pixel_width / tilt * surfaces.uv_density[triangle_index]
-    result.normal_spread = pixel_width / tilt * surfaces.normal_gradient[triangle_index]
+    result.uv_footprint = pixel_width / tilt * more[3]
+    result.normal_spread = pixel_width / tilt * face[3]
     return result
 
 

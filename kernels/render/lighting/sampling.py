@@ -18,6 +18,10 @@ class EnvironmentCdf:
     """Over rows: (map, row + 1), from 0 to 1."""
     conditional: wp.array3d[float]
     """Over the columns of each row: (map, row, column + 1), from 0 to 1."""
+    marginal_guide: wp.array2d[wp.uint16]
+    """(map, cell + 1): guide table (Chen and Asau, 1974) of N equal cells, N a power of two: the row found for u = cell / N."""
+    conditional_guide: wp.array3d[wp.uint16]
+    """(map, row, cell + 1): the column found likewise."""
 
 
 @wp.struct
@@ -129,9 +133,10 @@ def environment_pdf(cdf: EnvironmentCdf, light: int, direction: wp.vec3) -> floa
 
 @wp.func
 def invert_marginal(cdf: EnvironmentCdf, light: int, u: float) -> int:
-    """Invert the marginal CDF by bisection: the row r with marginal[r] <= u < marginal[r + 1]."""
-    low = int(0)
-    high = cdf.marginal.shape[1] - 1
+    """Invert the marginal CDF by bisection within a cell of its guide table: the row r with marginal[r] <= u < marginal[r + 1]."""
+    cell = int(u * float(cdf.marginal_guide.shape[1] - 1))
+    low = int(cdf.marginal_guide[light, cell])
+    high = int(cdf.marginal_guide[light, cell + 1]) + 1
     while high - low > 1:
         middle = (low + high) // 2
         if cdf.marginal[light, middle] <= u:
@@ -143,9 +148,10 @@ def invert_marginal(cdf: EnvironmentCdf, light: int, u: float) -> int:
 
 @wp.func
 def invert_conditional(cdf: EnvironmentCdf, light: int, row: int, u: float) -> int:
-    """Invert a row's conditional CDF by bisection: the column c with conditional[c] <= u < conditional[c + 1]."""
-    low = int(0)
-    high = cdf.conditional.shape[2] - 1
+    """Invert a row's conditional CDF likewise: the column c with conditional[c] <= u < conditional[c + 1]."""
+    cell = int(u * float(cdf.conditional_guide.shape[2] - 1))
+    low = int(cdf.conditional_guide[light, row, cell])
+    high = int(cdf.conditional_guide[light, row, cell + 1]) + 1
     while high - low > 1:
         middle = (low + high) // 2
         if cdf.conditional[light, row, middle] <= u:

@@ -26,6 +26,16 @@ def write_record(records: wp.array3d[wp.vec4], index: int, record: wp.vec4):
 
 
 @wp.func_native("""
+    struct alignas(16) Aligned { float x, y, z, w; };
+    const Aligned record = reinterpret_cast<const Aligned*>(records.data)[index];
+    return wp::vec4(record.x, record.y, record.z, record.w);
+""")
+def read_flat_record(records: wp.array[wp.vec4], index: int) -> wp.vec4:
+    """As `read_record`, of a one-dimensional array."""
+    ...
+
+
+@wp.func_native("""
     return words.data[index];
 """)
 def read_word(words: wp.array3d[wp.uint64], index: int) -> wp.uint64:

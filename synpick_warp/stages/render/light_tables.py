@@ -166,9 +166,24 @@ def build_environment_cdf(radiance: np.ndarray, device: wp.Device, table: bool =
     """The struct `EnvironmentCdf` of maps (map, rows, 2 rows, 3); `table`: whether a table hides them below the horizon."""
     marginals, conditionals = zip(*(environment_cdf(map_radiance, table) for map_radiance in radiance), strict=True)
     cdf = EnvironmentCdf()
-    cdf.marginal = wp.array(np.stack(marginals), dtype=wp.float32, device=device)
-    cdf.conditional = wp.array(np.stack(conditionals), dtype=wp.float32, device=device)
+    marginal, conditional = np.stack(marginals), np.stack(conditionals)
+    cdf.marginal = wp.array(marginal, dtype=wp.float32, device=device)
+    cdf.conditional = wp.array(conditional, dtype=wp.float32, device=device)
+    cdf.marginal_guide = wp.array(guide_table(marginal), dtype=wp.uint16, device=device)
+    cdf.conditional_guide = wp.array(guide_table(conditional), dtype=wp.uint16, device=device)
     return cdf
+
+
+def guide_table(cdf: np.ndarray) -> np.ndarray:
+    """Guide tables (..., N + 1) uint16 of CDFs (..., n + 1): the entry that inversion finds for u = 0, 1 / N, ... 1.
+
+    N is the power of two from n on, so that kernels find the cell of a float32 exactly.
+    """
+    entries = cdf.shape[-1] - 1
+    cells = 1 << (entries - 1).bit_length()
+    thresholds = np.arange(cells + 1) / cells
+    found = [np.searchsorted(row, thresholds, side="right") - 1 for row in cdf.reshape(-1, entries + 1)]
+    return np.minimum(found, entries - 1).astype(np.uint16).reshape(*cdf.shape[:-1], cells + 1)
 
 
 def measure_albedo(device: wp.Device) -> Any:

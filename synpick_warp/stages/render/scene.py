@@ -12,7 +12,7 @@ import warp as wp
 from synpick_warp.configs import schema
 from synpick_warp.kernels.render.lighting.color import MAX_HALF
 from synpick_warp.kernels.render.lighting.environment import Lights
-from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MASK, Surfaces
+from synpick_warp.kernels.render.lighting.materials import TEXEL_BITS, TEXEL_MASK, TRIANGLE_RECORDS, Surfaces
 from synpick_warp.kernels.render.lighting.path_tracing import PathScene
 from synpick_warp.kernels.render.visibility.camera import TILE_HEIGHT, TILE_PIXELS, TILE_WIDTH, Cameras, ImageGrid
 from synpick_warp.kernels.render.visibility.gbuffer import Meshes, Table
@@ -148,10 +148,7 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
             total += len(texels[-1])
     sizes = [(chain[0].shape[1], chain[0].shape[0]) if chain else (0, 0) for chain in chains]
     surfaces = Surfaces()
-    surfaces.normal = wp.array(np.concatenate([corner_values(s.normals, s) for s in shapes]), dtype=wp.vec3, device=device)
-    surfaces.uv = wp.array(np.concatenate([corner_values(s.uv, s) for s in shapes]), dtype=wp.vec2, device=device)
-    surfaces.uv_density = wp.array(np.concatenate([uv_density(s) for s in shapes]), dtype=wp.float32, device=device)
-    surfaces.normal_gradient = wp.array(np.concatenate([normal_gradient(s) for s in shapes]), dtype=wp.float32, device=device)
+    surfaces.triangle = wp.array(np.concatenate([pack_triangles(shape) for shape in shapes]), dtype=wp.vec4, device=device)
     surfaces.color = wp.array(srgb_to_linear(np.array([m.color for m in materials])), dtype=wp.vec3, device=device)
     surfaces.metallic = wp.array([m.metallic for m in materials], dtype=wp.float32, device=device)
     surfaces.roughness = wp.array([m.roughness for m in materials], dtype=wp.float32, device=device)
@@ -161,6 +158,16 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
     surfaces.texel = wp.array(np.concatenate(texels) if texels else np.zeros(1, np.uint32), dtype=wp.uint32, device=device)
     surfaces.albedo = measure_albedo(device)
     return surfaces
+
+
+def pack_triangles(mesh: TriangleMesh) -> np.ndarray:
+    """Records of triangles (TRIANGLE_RECORDS F, 4) float32: the layout of `Surfaces.triangle`."""
+    uv = mesh.uv[mesh.faces]
+    records = np.empty((len(mesh.faces), int(TRIANGLE_RECORDS), 4), np.float32)
+    records[:, :3, :3], records[:, :3, 3] = mesh.normals[mesh.faces], uv[..., 0]
+    records[:, 3, :3], records[:, 3, 3] = uv[..., 1], uv_density(mesh)
+    records[:, 4, :3], records[:, 4, 3] = face_normals(mesh), normal_gradient(mesh)
+    return records.reshape(-1, 4)
 
 
 def normal_gradient(mesh: TriangleMesh) -> np.ndarray:
@@ -209,7 +216,7 @@ def build_lights(maps: tuple[EnvironmentMap, ...], ground: np.ndarray | None, ex
     lights = Lights()
     lights.maps = len(tables)
     radiance = np.stack([t.radiance for t in tables] + [t.sunless for t in tables])
-    lights.radiance = wp.array(radiance, dtype=wp.vec3, device=device)
+    lights.radiance = wp.array(np.pad(radiance, [(0, 0)] * 3 + [(0, 1)]), dtype=wp.vec4, device=device)
     lights.prefiltered = wp.array(np.stack([pack_half3_array(exposure * t.exposure * t.prefiltered) for t in tables]), device=device)
     lights.irradiance = wp.array(np.stack([t.irradiance for t in tables]), dtype=wp.vec3, device=device)
     lights.sun_direction = wp.array(np.stack([t.sun_direction for t in tables]), dtype=wp.vec3, device=device)
@@ -251,7 +258,7 @@ def build_render_scene(
     paths.table = table
     paths.surfaces = build_surfaces(shapes, materials, device)
     paths.lights = build_lights(lights, ground, settings.exposure, device)
-    paths.cdf = build_environment_cdf(paths.lights.radiance.numpy(), device, settings.table)
+    paths.cdf = build_environment_cdf(paths.lights.radiance.numpy()[..., :3], device, settings.table)
     return RenderScene(
         meshes=meshes,
         surfaces=paths.surfaces,

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from synpick_warp.scenes.environment import map_directions
 from synpick_warp.stages.render.light_tables import build_environment_cdf, environment_cdf
-from tests.harness.brdf_probe import sample_environment_kernel, sample_point_kernel
+from tests.harness.brdf_probe import invert_cdf_kernel, sample_environment_kernel, sample_point_kernel
 from tests.harness.denoise_probe import scrambled_kernel, sobol_kernel
 from tests.harness.devices import default_device
 
@@ -73,6 +73,26 @@ def test_points_of_other_dimensions_and_keys_are_uncorrelated(device):
     other = np.abs(correlation[np.triu_indices(len(correlation), 1)])
     assert np.sqrt((other**2).mean()) < 1.5 / 16.0
     assert other.max() < 0.5
+
+
+@settings(max_examples=30, deadline=None)
+@given(rows=st.integers(2, 40), seed=st.integers(0, 1000), dark=st.floats(0.0, 1.0))
+def test_guide_tables_find_what_a_search_of_the_whole_cdf_finds(rows: int, seed: int, dark: float):
+    """Also for numbers next to an entry or a cell's end, in maps with lamps, black texels and black rows."""
+    rng = np.random.default_rng(seed)
+    radiance = rng.random((rows, 2 * rows, 3)) ** 8 * (rng.random((rows, 2 * rows, 1)) >= dark) * (rng.random((rows, 1, 1)) >= dark / 2)
+    device = wp.get_device(default_device())
+    cdf = build_environment_cdf(radiance[None].astype(np.float32), device)
+    marginal, conditional = (values.numpy()[0] for values in (cdf.marginal, cdf.conditional))
+    row = int(rng.integers(rows))
+    ends = np.concatenate([marginal, conditional[row], np.arange(128) / 128.0]).astype(np.float32)
+    numbers = np.concatenate([ends, np.nextafter(ends, np.float32(0.0)), np.nextafter(ends, np.float32(1.0)), rng.random(500, np.float32)])
+    numbers = numbers[(numbers >= 0.0) & (numbers < 1.0)]
+    found = [wp.empty(len(numbers), dtype=wp.int32, device=device) for _ in range(2)]
+    inputs = [cdf, row, wp.array(numbers, dtype=wp.float32, device=device)]
+    wp.launch(invert_cdf_kernel, dim=len(numbers), inputs=inputs, outputs=found, device=device)
+    for indices, entries in zip(found, (marginal, conditional[row]), strict=True):
+        np.testing.assert_array_equal(indices.numpy(), np.searchsorted(entries, numbers, side="right") - 1)
 
 
 def sample_environment(device, cdf, count):
