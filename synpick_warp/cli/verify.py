@@ -31,7 +31,8 @@ def verify(
     if verdict.problem:
         print(verdict.problem)
         return EXIT_INCOMPLETE
-    print(f"{verdict.files:,} files of {verdict.episodes:,} episodes match their checksums")
+    episodes = f"{verdict.episodes:,} episode{'' if verdict.episodes == 1 else 's'}"
+    print(f"{verdict.files:,} files of {episodes} match their checksums")
     if not verdict.finished:
         print("the data set is not finished: the command that started it resumes it")
     return 0 if verdict.finished else EXIT_INCOMPLETE

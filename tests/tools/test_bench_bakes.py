@@ -22,6 +22,7 @@ from tests.harness.entries import episode_content
 from tests.harness.processes import wait_for
 from tests.tools.test_tools import FEW_STEPS, SHORT_EPISODES, SMALL_IMAGES
 from tools.bench import __main__ as bench
+from tools.bench import cleaner as cleaner_module
 from tools.bench import growth, meter, physics, steady, whole
 from tools.bench.cleaner import Assignment, Cleaner, Tally, clean_episode
 from tools.bench.usage import Usage, measure_usage
@@ -101,6 +102,13 @@ def test_a_process_that_dies_is_a_problem(tmp_path):
         os.kill(cleaner.pids[1], signal.SIGKILL)
         wait_for(lambda: cleaner.poll().problem)
         assert cleaner.finish(1).problem == "a process that verifies episodes was ended by SIGKILL"
+
+
+def test_processes_that_make_no_progress_are_a_problem(tmp_path, monkeypatch):
+    monkeypatch.setattr(cleaner_module, "STALL_TIME", 2.0)
+    with Cleaner(Assignment(tmp_path, SHARED), 1) as cleaner:
+        write_episode(tmp_path, 0)
+        assert cleaner.finish(2) == Tally(1, 2, mock.ANY, "no episode was verified for 2 s; 1 are left")
 
 
 def test_the_processes_of_a_cleaner_share_what_is_committed(tmp_path):

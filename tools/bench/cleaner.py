@@ -27,6 +27,8 @@ from synpick_warp.system.processes import END_TIMEOUT, WorkerProcess, send, star
 
 INTERVAL = 0.5
 """Polling interval for committed episodes [s]."""
+STALL_TIME = 120.0
+"""Longest wait for the next verified episode [s]; the 60,000 files of an episode of 1,200 frames take a process some seconds."""
 CORES_PER_PROCESS = 4
 """Number of CPU cores per process; with fewer cores there is one process. Verifying and deleting a view takes less CPU time than writing
 it: on an H200's host with 16 cores, 4 processes kept up with 877 full-HD views/s with all masks."""
@@ -87,8 +89,16 @@ class Cleaner:
         return reduce(Tally.plus, self._tallies)
 
     def finish(self, episodes: int) -> Tally:
-        """Wait until `episodes` episodes have been verified or a problem has been found; returns the totals."""
+        """Wait until `episodes` episodes have been verified or a problem has been found; returns the totals.
+
+        That the processes verified no episode for STALL_TIME is a problem, too.
+        """
+        progress, deadline = -1, 0.0
         while (tally := self.poll()).episodes < episodes and not tally.problem:
+            if tally.episodes > progress:
+                progress, deadline = tally.episodes, time.monotonic() + STALL_TIME
+            elif time.monotonic() > deadline:
+                return replace(tally, problem=f"no episode was verified for {STALL_TIME:g} s; {episodes - progress} are left")
             time.sleep(INTERVAL)
         return tally
 
