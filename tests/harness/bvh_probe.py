@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from synpick_warp.kernels.perception.exact_hits import intersect_triangle
+from synpick_warp.kernels.render.visibility.gbuffer import FAR
 from synpick_warp.kernels.render.visibility.wide_bvh import WideBvh, query_any_hit, query_closest_hit
 
 wp.set_module_options({"enable_backward": False})
@@ -51,3 +53,49 @@ def query_mesh_kernel(
         hit_out[ray] = wp.vec3(query.t, query.u, query.v)
         face_out[ray] = query.face
     blocked_out[ray] = int(wp.mesh_query_ray_anyhit(mesh, start[ray], direction[ray], reach))
+
+
+@wp.kernel
+def hit_every_triangle_kernel(
+    # Scene:
+    corner: wp.array[wp.vec3],  # (3 x triangle) [m]
+    # In:
+    start: wp.array[wp.vec3],  # (ray)
+    direction: wp.array[wp.vec3],  # (ray)
+    # Out:
+    nearest_out: wp.array[float],  # (ray)
+):
+    """Distance of each ray's closest hit by a test of every triangle; -1: none."""
+    ray = wp.tid()
+    nearest = float(FAR)
+    for triangle in range(corner.shape[0] // 3):
+        first = 3 * triangle
+        hit = intersect_triangle(start[ray], direction[ray], corner[first], corner[first + 1], corner[first + 2])
+        if hit[0] >= 0.0 and hit[0] < nearest:
+            nearest = hit[0]
+    nearest_out[ray] = wp.where(nearest < FAR, nearest, -1.0)
+
+
+@wp.func_native(
+    query_closest_hit.native_snippet.replace("test_boxes(a, b, c, best, entry);", "test_boxes(a, b, c, best, entry), ++visits;")
+    .replace("Word stack[STACK_SIZE];", "Word stack[STACK_SIZE]; int visits = 0;")
+    .replace("best_u, best_v, as_float(face)", "best_u, best_v, (float)visits")
+)
+def count_visits(bvh: WideBvh, root: int, start: wp.vec3, direction: wp.vec3, reach: float) -> wp.vec4:
+    """The closest-hit query with the number of nodes it visited instead of the triangle."""
+
+
+@wp.kernel
+def count_visits_kernel(
+    # Scene:
+    bvh: WideBvh,
+    # In:
+    start: wp.array[wp.vec3],  # (ray)
+    direction: wp.array[wp.vec3],  # (ray)
+    # Out:
+    visits_out: wp.array[int],  # (ray)
+):
+    """Nodes that a closest-hit query of the first mesh visits."""
+    ray = wp.tid()
+    hit = count_visits(bvh, bvh.root[0], start[ray], direction[ray], 1.0e30)
+    visits_out[ray] = int(hit[3])

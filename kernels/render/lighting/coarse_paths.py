@@ -45,7 +45,7 @@ from synpick_warp.kernels.render.lighting.path_tracing import (
 from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, hit_position, in_image
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, ViewBodies, read_hit
-from synpick_warp.kernels.render.visibility.records import write_record, write_word
+from synpick_warp.kernels.render.visibility.records import write_record, write_uint64
 from synpick_warp.kernels.rng import stream_key
 from synpick_warp.kernels.tuning import COARSE_PATH_REGISTERS, RAY_REGISTERS
 
@@ -216,7 +216,7 @@ def store_light(out: CoarseLight, index: int, light: SplitRadiance, unoccluded: 
     specular = luminance_ratio(light.specular, unoccluded.specular)
     write_record(out.diffuse, index, pack_light(light.diffuse, unoccluded.diffuse, diffuse))
     write_record(out.specular, index, pack_light(light.specular, unoccluded.specular, specular))
-    write_word(out.indirect, index, pack_half3(light.indirect))
+    write_uint64(out.indirect, index, pack_half3(light.indirect))
 
 
 @wp.struct

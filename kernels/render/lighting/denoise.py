@@ -23,7 +23,7 @@ from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_dis
 from synpick_warp.kernels.render.lighting.unoccluded import visibility_ratio
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, RatioRecord, Ratios, add_ratios, pack_ratios
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, clamp_index, in_image, tile_pixel
-from synpick_warp.kernels.render.visibility.records import read_record, read_word, write_record, write_word
+from synpick_warp.kernels.render.visibility.records import read_record, read_uint64, write_record, write_uint64
 from synpick_warp.kernels.tuning import CHOICE_REGISTERS, FILTER_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -96,7 +96,7 @@ def read_light(light: CoarseLight, index: int) -> KernelSum:
     result.unoccluded_diffuse = wp.vec3(b[1], c[0], c[1])
     result.specular = wp.vec3(d[0], d[1], e[0])
     result.unoccluded_specular = wp.vec3(e[1], f[0], f[1])
-    result.indirect = unpack_half3(read_word(light.indirect, index))
+    result.indirect = unpack_half3(read_uint64(light.indirect, index))
     result.statistic = wp.vec2(diffuse[3], specular[3])
     result.weight = 1.0
     return result
@@ -183,7 +183,7 @@ def filter_blocks_kernel(
     specular = pack_light(scale * sums.specular, scale * sums.unoccluded_specular, wp.max(variance[1], 0.0))
     write_record(blocks_out.diffuse, index, diffuse)
     write_record(blocks_out.specular, index, specular)
-    write_word(blocks_out.indirect, index, pack_half3(scale * sums.indirect))
+    write_uint64(blocks_out.indirect, index, pack_half3(scale * sums.indirect))
 
 
 @wp.func

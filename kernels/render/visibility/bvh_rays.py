@@ -141,14 +141,14 @@ def trace_ray(meshes: Meshes, table: Table, bodies: ViewBodies, view: int, insta
         offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
         closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, best.depth) * direction
         if wp.dot(closest, closest) < sphere[3]:
-            instance = read_ray_body(bodies, record)
-            start = instance.rotation * (origin - instance.position)
-            hit = query_closest_hit(meshes.bvh, instance.root, start, instance.rotation * direction, best.depth)
+            body = read_ray_body(bodies, record)
+            start = body.rotation * (origin - body.position)
+            hit = query_closest_hit(meshes.bvh, body.root, start, body.rotation * direction, best.depth)
             if hit[0] >= 0.0:
                 best.depth = hit[0]
                 best.triangle = wp.cast(hit[3], int)
                 best.barycentric = wp.vec2(hit[1], hit[2])
-                best.segment = segment_of(instance.body, instances)
+                best.segment = segment_of(body.row, instances)
     return best
 
 
@@ -174,8 +174,8 @@ def is_blocked(
         offset = wp.vec3(sphere[0], sphere[1], sphere[2]) - origin
         closest = offset - wp.clamp(wp.dot(offset, direction), 0.0, reach) * direction
         if wp.dot(closest, closest) < sphere[3]:
-            instance = read_ray_body(bodies, record)
-            start = instance.rotation * (origin - instance.position)
-            if query_any_hit(meshes.bvh, instance.root, start, instance.rotation * direction, reach):
+            body = read_ray_body(bodies, record)
+            start = body.rotation * (origin - body.position)
+            if query_any_hit(meshes.bvh, body.root, start, body.rotation * direction, reach):
                 return True
     return False

@@ -1,4 +1,5 @@
-"""Packed instances for ray queries: pose, bounding sphere and BVH of each body of a view, in the order in which rays test them."""
+"""Packed bodies for ray queries (leaves of a top-level acceleration structure): pose, bounding sphere and BVH, in the order of
+`ViewBodies.order`."""
 
 import warp as wp
 
@@ -8,13 +9,13 @@ from synpick_warp.kernels.render.visibility.records import read_record
 wp.set_module_options({"enable_backward": False})
 
 RAY_RECORDS = wp.constant(5)
-"""Records of a body in `ViewBodies.ray_record`. 0: its bounding sphere. 1 to 3: a row of its rotation from the world, and a coordinate of
-its position. 4: root node of its BVH and its row of `ViewBodies`, both as bits; unused; unused."""
+"""Records of a body in `ViewBodies.ray_record`. 0: its bounding sphere, as in `ViewBodies.sphere`. 1 + i: row i of its rotation from world
+to body, and coordinate i of its position in the world. 4: root node of its BVH and its row of `ViewBodies`, both as bits; unused."""
 
 
 @wp.struct
 class RayBody:
-    """Pose and BVH of a body."""
+    """Pose and BVH of a body, unpacked."""
 
     rotation: wp.mat33
     """World to body frame."""
@@ -22,7 +23,7 @@ class RayBody:
     """Body origin in the world [m]."""
     root: int
     """Root node of its BVH."""
-    body: int
+    row: int
     """Row of `ViewBodies`."""
 
 
@@ -34,7 +35,7 @@ def first_ray_record(bodies: ViewBodies, view: int, rank: int) -> int:
 
 @wp.func
 def write_ray_body(meshes: Meshes, bodies_inout: ViewBodies, view: int, rank: int, body: int):
-    """Write the records of a body."""
+    """Pack a body: sphere, pose and BVH."""
     rotation = bodies_inout.world_rotation[view, body]
     position = bodies_inout.position[view, body]
     root = meshes.bvh.root[bodies_inout.mesh[view, body]]
@@ -46,7 +47,7 @@ def write_ray_body(meshes: Meshes, bodies_inout: ViewBodies, view: int, rank: in
 
 @wp.func
 def read_ray_body(bodies: ViewBodies, first: int) -> RayBody:
-    """Read the pose and BVH of a body by its `first_ray_record`."""
+    """Unpack the pose and BVH of a body by its `first_ray_record`; the sphere is read by itself."""
     x = read_record(bodies.ray_record, first + 1)
     y = read_record(bodies.ray_record, first + 2)
     z = read_record(bodies.ray_record, first + 3)
@@ -55,5 +56,5 @@ def read_ray_body(bodies: ViewBodies, first: int) -> RayBody:
     result.rotation = wp.mat33(x[0], x[1], x[2], y[0], y[1], y[2], z[0], z[1], z[2])
     result.position = wp.vec3(x[3], y[3], z[3])
     result.root = wp.cast(rows[0], int)
-    result.body = wp.cast(rows[1], int)
+    result.row = wp.cast(rows[1], int)
     return result

@@ -1,4 +1,7 @@
-"""Packed records: elements of contiguous arrays, addressed by flat indices and read or written by one memory access each."""
+"""Loads and stores of contiguous arrays by row-major indices, without a check: `wp.vec4` by one access of 16 bytes, and `wp.uint64`.
+
+The data of arrays of `wp.vec4` must be aligned to 16 bytes, as all that Warp allocates are.
+"""
 
 import warp as wp
 
@@ -11,7 +14,7 @@ wp.set_module_options({"enable_backward": False})
     return wp::vec4(record.x, record.y, record.z, record.w);
 """)
 def read_record(records: wp.array3d[wp.vec4], index: int) -> wp.vec4:
-    """Read the element of a contiguous array at a `flat_index` by one load: Warp's own look-up assumes no alignment, and takes four."""
+    """Load an element: Warp's own look-up assumes no alignment, and takes four loads."""
     ...
 
 
@@ -21,7 +24,7 @@ def read_record(records: wp.array3d[wp.vec4], index: int) -> wp.vec4:
     reinterpret_cast<Aligned*>(records.data)[index] = aligned;
 """)
 def write_record(records: wp.array3d[wp.vec4], index: int, record: wp.vec4):
-    """Write the element of a contiguous array at a `flat_index` by one store."""
+    """Store an element."""
     ...
 
 
@@ -38,14 +41,14 @@ def read_flat_record(records: wp.array[wp.vec4], index: int) -> wp.vec4:
 @wp.func_native("""
     return words.data[index];
 """)
-def read_word(words: wp.array3d[wp.uint64], index: int) -> wp.uint64:
-    """Read the element of a contiguous array at a `flat_index`."""
+def read_uint64(words: wp.array3d[wp.uint64], index: int) -> wp.uint64:
+    """Load an element."""
     ...
 
 
 @wp.func_native("""
     words.data[index] = word;
 """)
-def write_word(words: wp.array3d[wp.uint64], index: int, word: wp.uint64):
-    """Write the element of a contiguous array at a `flat_index`."""
+def write_uint64(words: wp.array3d[wp.uint64], index: int, word: wp.uint64):
+    """Store an element."""
     ...

@@ -1,9 +1,11 @@
-"""Wide BVH: ray queries against meshes by hierarchies with four children per node and quantized boxes (Ylitalo, Karras and Laine, 2017).
+"""Wide BVH (BVH4): ray queries against meshes by hierarchies with four children per node and quantized boxes, after the eight-wide ones of
+Ylitalo, Karras and Laine (2017).
 
-A node is one record of 64 bytes, so that a ray tests four boxes with one access to memory. It needs half as many accesses as in a binary
-BVH, each of which waits for the one before. A leaf is one triangle; its corners are stored in the order of the leaves. Hits are those of
-Warp's `wp.mesh_query_ray`, to the last bit; of triangles hit at the same distance, as along a shared edge, the two may return different
-ones. `stages.render.wide_bvh` builds the trees.
+A node is 64 bytes, so that a ray tests four boxes per memory access, and the chain of accesses that depend on each other is half as long
+as in a binary BVH. A leaf is one triangle; its corners are stored in the order of the leaves. Hits are those of testing every triangle with
+Warp's watertight test (Woop, Benthin and Wald, 2013), to the last bit. `wp.mesh_query_ray` loses a few of them, since its box test allows
+for no rounding. Of triangles hit at the same distance, as along a shared edge, either may be returned. `stages.render.wide_bvh` builds the
+trees.
 """
 
 import warp as wp
@@ -13,11 +15,12 @@ wp.set_module_options({"enable_backward": False})
 WIDTH = wp.constant(4)
 """Children of a node."""
 NODE_RECORDS = wp.constant(4)
-"""Records of four 32-bit words of a node."""
+"""Records of 16 bytes of a node."""
 LEAF = wp.constant(0x80000000)
-"""Bit of a child reference that marks a leaf. Its other bits are the row of the triangle, or else the index of the child's node."""
+"""Bit of a child reference that marks a leaf. Its other bits are the index of the triangle in `WideBvh.triangle`, or else that
+of the child's node."""
 STACK_SIZE = wp.constant(64)
-"""Children that a query can postpone."""
+"""Size of the traversal stack: the most children that a query can postpone."""
 
 
 @wp.struct
@@ -25,16 +28,17 @@ class WideBvh:
     """Wide BVHs of all meshes, each in its mesh's frame. Constant."""
 
     node: wp.array[wp.vec4ui]
-    """(4 x node): record 0: a corner (x, y, z) of the node's box as float32 [m]; the steps from which its children's boxes are measured, as
-    three exponents of float32, of 8 bits. Record 1: lower x, lower y, lower z, upper x of the children's boxes [steps from the corner],
-    8 bits per child. Record 2: upper y, upper z; references to children 0 and 1. Record 3: to children 2 and 3; unused."""
+    """(NODE_RECORDS x node): record 0: a corner (x, y, z) of the node's box as float32 [m]; per axis the exponent e, 8 bits, of the
+    quantization step 2^(e - 127) m. Record 1: lower x, lower y, lower z, upper x of the children's boxes [steps from the corner], 8 bits
+    per child. Record 2: upper y, upper z; references to children 0 and 1. Record 3: to children 2 and 3; unused. An absent child has
+    an inverted box, from 255 to 0, and refers to the mesh's first triangle."""
     triangle: wp.array[wp.vec4]
-    """(3 x triangle): corner [m]; the triangle's index within its mesh, as bits, in the first corner's record, 0 in the others."""
+    """(3 x triangle): a corner [m]; in the fourth number of the first corner the triangle's index within its mesh, as bits."""
     root: wp.array[int]
     """(mesh): index of the root node."""
 
 
-_PREPARE_RAY = """
+_TRAVERSAL = """
     typedef unsigned int Word;
     struct alignas(16) Words { Word x, y, z, w; };
     struct alignas(16) Floats { float x, y, z, w; };
@@ -53,12 +57,11 @@ _PREPARE_RAY = """
     auto smaller = [](float a, float b) { return a < b ? a : b; };
     auto larger = [](float a, float b) { return a < b ? b : a; };
 #endif
-    // A zero component is replaced, so that no zero is multiplied by infinity.
-    const float rx = 1.0f / (direction[0] == 0.0f ? 1.0e-20f : direction[0]);
-    const float ry = 1.0f / (direction[1] == 0.0f ? 1.0e-20f : direction[1]);
-    const float rz = 1.0f / (direction[2] == 0.0f ? 1.0e-20f : direction[2]);
-    // Slab test of a node's four boxes: the distance at which the ray enters each, with the child's number in its last two bits, or NO_HIT.
-    // The far end is enlarged against rounding (Ize, 2013).
+    // Smaller components are replaced: their reciprocals would be infinite, and zero times infinity is no number.
+    auto reciprocal = [](float d) { return 1.0f / (d > -1.0e-20f && d < 1.0e-20f ? (d < 0.0f ? -1.0e-20f : 1.0e-20f) : d); };
+    const float rx = reciprocal(direction[0]), ry = reciprocal(direction[1]), rz = reciprocal(direction[2]);
+    // Slab test of a node's boxes: the distance at which the ray enters each, with the child's number in its last two bits, or NO_HIT.
+    // The far end is enlarged by some 8 ulp (Ize, 2013) against rounding far from the boxes, as the builder's MARGIN is near them.
     auto test_boxes = [&](const Words& a, const Words& b, const Words& c, float reach, Word (&entry)[4]) {
         const float sx = as_float((a.w & 255u) << 23) * rx, ox = (as_float(a.x) - start[0]) * rx;
         const float sy = as_float((a.w >> 8 & 255u) << 23) * ry, oy = (as_float(a.y) - start[1]) * ry;
@@ -88,11 +91,11 @@ _PREPARE_RAY = """
     int size = 0;
     Word current = root;
 """
-"""C++: the ray's reciprocal direction, tests of boxes and triangles, and the stack; parameters as in `query_closest_hit`."""
+"""C++ that both queries begin with: reciprocal direction, tests of boxes and triangles, stack; parameters as in `query_closest_hit`."""
 
 
 @wp.func_native(
-    _PREPARE_RAY
+    _TRAVERSAL
     + """
     Word entry[4];
     auto order = [&](int i, int j) {
@@ -129,15 +132,15 @@ _PREPARE_RAY = """
 """
 )
 def query_closest_hit(bvh: WideBvh, root: int, start: wp.vec3, direction: wp.vec3, reach: float) -> wp.vec4:
-    """Closest hit of a ray with the mesh of a root node, nearer than `reach`: (t, u, v, triangle's index as bits); t < 0: none.
+    """Closest hit of a ray with the mesh of a root node: (t, u, v, triangle's index within the mesh as bits); t < 0: none.
 
-    u and v are the barycentric weights of the first and second corner. t and `reach` are in lengths of `direction`.
+    u and v are the barycentric weights of the first and second corner. Hits have 0 <= t < `reach`, both in units of |direction|.
     """
     ...
 
 
 @wp.func_native(
-    _PREPARE_RAY
+    _TRAVERSAL
     + """
     Word entry[4];
     while (true) {
@@ -164,7 +167,7 @@ def query_closest_hit(bvh: WideBvh, root: int, start: wp.vec3, direction: wp.vec
 """
 )
 def query_any_hit(bvh: WideBvh, root: int, start: wp.vec3, direction: wp.vec3, reach: float) -> bool:
-    """Any-hit query (shadow ray): True if a ray hits the mesh of a root node nearer than `reach`. Parameters as in `query_closest_hit`."""
+    """Any-hit query (occlusion): True if a ray hits the mesh of a root node. Parameters as in `query_closest_hit`."""
     ...
 
 
@@ -191,7 +194,7 @@ def read_binary_node(
     triangle_out: wp.array[int],
     root_out: wp.array[int],
 ):
-    """Read a node of the binary BVH of a `wp.Mesh`, for which Warp has no public function. Arrays as in `read_binary_bvh_kernel`."""
+    """Copy a node of the binary BVH of a `wp.Mesh`, for which Warp has no public function. Arrays as in `read_binary_bvh_kernel`."""
     ...
 
 
@@ -206,8 +209,8 @@ def read_binary_bvh_kernel(
     triangle_out: wp.array[int],  # (triangle)
     root_out: wp.array[int],  # (1)
 ):
-    """Read the binary BVH of a `wp.Mesh`: boxes and children of its nodes, triangles in the order of its leaves, index of its root.
+    """Copy the binary BVH of a `wp.Mesh`: boxes and children of its nodes, triangles in the order of its leaves, index of its root.
 
-    A leaf that holds the triangles [begin, end) of this order has children (-1 - begin, -1 - end). Entries without a node stay as they are.
+    A leaf of the triangles [begin, end) of this order has children (-1 - begin, -1 - end). Rows past the last node are not written.
     """
     read_binary_node(mesh, wp.tid(), lower_out, upper_out, children_out, triangle_out, root_out)

@@ -13,7 +13,7 @@ from synpick_warp.kernels.render.visibility.wide_bvh import LEAF, NODE_RECORDS, 
 from synpick_warp.scenes.types import TriangleMesh
 
 MARGIN = 1e-6
-"""Enlargement of boxes [m, and per metre of the mesh's coordinates], above float32's rounding in the slab test."""
+"""Enlargement of boxes against float32's rounding in the slab test: absolute [m], and again relative to the mesh's largest coordinate."""
 MAX_COORDINATE = 255
 """Largest quantized coordinate."""
 MIN_EXPONENT = -20
@@ -21,7 +21,7 @@ MIN_EXPONENT = -20
 EXPONENT_BIAS = 127
 """Offset of a float32's stored exponent."""
 ABSENT = -1
-"""Child that a node does not have."""
+"""Marks an empty slot of a node's children."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,19 +42,19 @@ class BinaryBvh:
         """(node) bool: the node is a leaf."""
         return self.children[:, 0] < 0
 
-    def has_single_leaves(self) -> bool:
+    def has_one_triangle_leaves(self) -> bool:
         """True if every leaf is one triangle."""
         return bool((self.children[self.leaf, 0] - self.children[self.leaf, 1] == 1).all())
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Nodes of a wide BVH at one depth."""
+    """Nodes of a wide BVH at one depth; levels are in breadth-first order."""
 
     child: np.ndarray
     """(node, WIDTH) int64: the children, as nodes of the binary BVH; ABSENT: none."""
     inner: np.ndarray
-    """(node, WIDTH) bool: the child is a node of the next level, whose order is that of these children."""
+    """(node, WIDTH) bool: the child is an inner node. The next level's nodes are these, in row-major order."""
 
     @property
     def leaf(self) -> np.ndarray:
@@ -67,7 +67,7 @@ def build_wide_bvh(shapes: list[TriangleMesh], device: wp.Device) -> Any:
     nodes, triangles, roots = [], [], []
     node_count = triangle_count = 0
     for shape in shapes:
-        binary, levels = collapse_mesh(shape)
+        binary, levels = build_levels(shape)
         order = leaf_order(binary, levels)
         nodes.append(encode_nodes(binary, levels, node_count, triangle_count))
         triangles.append(encode_triangles(shape, order))
@@ -81,15 +81,15 @@ def build_wide_bvh(shapes: list[TriangleMesh], device: wp.Device) -> Any:
     return result
 
 
-def collapse_mesh(shape: TriangleMesh) -> tuple[BinaryBvh, list[Level]]:
-    """Binary and wide BVH of a mesh: split by the surface area heuristic, or at medians if that tree is too deep for a query's stack.
+def build_levels(shape: TriangleMesh) -> tuple[BinaryBvh, list[Level]]:
+    """Build the binary and the wide BVH of a mesh: by the surface area heuristic, or by medians if that tree is too deep for the stack.
 
     Raises:
         CatalogError: Even the balanced tree is too deep.
     """
     for constructor in ("sah", "median"):
         binary = build_binary_bvh(shape, constructor)
-        if binary.has_single_leaves():
+        if binary.has_one_triangle_leaves():
             levels = collapse(binary)
             if needed_stack(levels) <= int(STACK_SIZE):
                 return binary, levels
@@ -109,8 +109,8 @@ def build_binary_bvh(shape: TriangleMesh, constructor: str) -> BinaryBvh:
 
 
 def collapse(binary: BinaryBvh) -> list[Level]:
-    """Wide BVH of a binary one, level by level: of a node's children the largest inner one is replaced by its own two children, until there
-    are WIDTH (Wald, Benthin and Boulos, 2008)."""
+    """Collapse a binary BVH into a wide one, level by level: a node's inner child of largest surface area is replaced by its own two
+    children, until there are WIDTH (Wald, Benthin and Boulos, 2008)."""
     edges = binary.upper - binary.lower
     area = edges[:, 0] * edges[:, 1] + edges[:, 1] * edges[:, 2] + edges[:, 2] * edges[:, 0]
     weight = np.append(np.where(binary.leaf, -1.0, area), -1.0)  # The last entry is that of ABSENT.
@@ -123,21 +123,21 @@ def collapse(binary: BinaryBvh) -> list[Level]:
         for slot in range(1, int(WIDTH)):
             largest = weight[child].argmax(axis=1)
             opened = child[rows, largest]
-            grows = weight[opened] >= 0.0
-            child[rows[grows], slot] = binary.children[opened[grows], 1]
-            child[rows[grows], largest[grows]] = binary.children[opened[grows], 0]
+            opens = weight[opened] >= 0.0
+            child[rows[opens], slot] = binary.children[opened[opens], 1]
+            child[rows[opens], largest[opens]] = binary.children[opened[opens], 0]
         levels.append(Level(child, weight[child] >= 0.0))
         nodes = child[levels[-1].inner]
     return levels
 
 
 def needed_stack(levels: list[Level]) -> int:
-    """Largest number of children that a query can have on its stack."""
+    """Worst-case size of the traversal stack, also for rays that enter the inverted boxes of absent children, by rounding from far away."""
     below = np.zeros(0, np.int64)
     for level in reversed(levels):
         more = np.zeros(level.child.shape, np.int64)
         more[level.inner] = below - 1
-        below = (level.child != ABSENT).sum(axis=1) + more.max(axis=1)
+        below = int(WIDTH) + more.max(axis=1)
     return int(below[0])
 
 
@@ -148,7 +148,7 @@ def leaf_order(binary: BinaryBvh, levels: list[Level]) -> np.ndarray:
 
 
 def encode_nodes(binary: BinaryBvh, levels: list[Level], first_node: int, first_triangle: int) -> np.ndarray:
-    """Records of nodes (4 node, 4) uint32, as `WideBvh.node`; nodes and triangles of all meshes are numbered from the given ones on."""
+    """Records of nodes (4 node, 4) uint32, as `WideBvh.node`; `first_node` and `first_triangle` are added to all indices."""
     child, inner, leaf = (np.concatenate([getattr(level, name) for level in levels]) for name in ("child", "inner", "leaf"))
     origin, exponent, low, high = quantize_boxes(binary, child)
     reference = np.full(child.shape, int(LEAF) + first_triangle)
@@ -167,7 +167,7 @@ def quantize_boxes(binary: BinaryBvh, child: np.ndarray) -> tuple[np.ndarray, np
 
     Returns:
         Corner of each node's box (node, 3) float32 [m], binary exponents of the steps (node, 3), lower and upper corners of the children's
-        boxes (node, WIDTH, 3) uint8 [steps from the node's corner]. An absent child's lower corner is above its upper one: no ray hits it.
+        boxes (node, WIDTH, 3) uint8 [steps from the node's corner]; those of absent children are inverted.
     """
     absent = (child == ABSENT)[..., None]
     margin = MARGIN * (1.0 + np.abs(np.stack([binary.lower, binary.upper])).max(initial=0.0))
@@ -176,6 +176,7 @@ def quantize_boxes(binary: BinaryBvh, child: np.ndarray) -> tuple[np.ndarray, np
     origin = np.nextafter(low.min(axis=1).astype(np.float32), np.float32(-np.inf))
     extent = high.max(axis=1) - origin
     exponent = np.maximum(np.ceil(np.log2(extent / MAX_COORDINATE)), MIN_EXPONENT).astype(np.int64)
+    exponent += extent > MAX_COORDINATE * np.exp2(exponent)  # The logarithm is rounded.
     step = np.exp2(exponent)[:, None]
     low = np.where(absent, MAX_COORDINATE, np.floor((low - origin[:, None]) / step))
     high = np.where(absent, 0, np.ceil((high - origin[:, None]) / step))

@@ -1,4 +1,4 @@
-"""Wide BVH: its queries hit what Warp's queries hit, to the last bit; its boxes contain their triangles; no tree overflows the stack."""
+"""Wide BVH: queries find what a test of every triangle finds, to the last bit; boxes contain triangles; no tree overflows the stack."""
 
 from __future__ import annotations
 
@@ -15,14 +15,12 @@ from synpick_warp.stages.render import wide_bvh
 from synpick_warp.stages.render.wide_bvh import (
     ABSENT,
     MAX_COORDINATE,
-    build_binary_bvh,
+    build_levels,
     build_wide_bvh,
-    collapse,
-    collapse_mesh,
     needed_stack,
 )
 from synpick_warp.system.device import pick_device
-from tests.harness.bvh_probe import query_mesh_kernel, query_wide_bvh_kernel
+from tests.harness.bvh_probe import count_visits_kernel, hit_every_triangle_kernel, query_mesh_kernel, query_wide_bvh_kernel
 from tests.harness.devices import default_device
 from tests.worlds.toy_scene import ball, box
 
@@ -163,19 +161,94 @@ def test_boxes_contain_their_triangles(mesh: TriangleMesh):
 
 
 def test_nodes_of_a_regular_mesh_are_filled():
-    _, levels = collapse_mesh(ball(0.1, 4))
+    _, levels = build_levels(ball(0.1, 4))
     child = np.concatenate([level.child for level in levels])
     assert (child != ABSENT).sum(axis=1).mean() > 2.8
 
 
+def stack_of(mesh: TriangleMesh) -> int:
+    """Worst-case stack of a mesh's wide BVH, by recursion over its records: all children but one wait while a query is below that one."""
+    words = build_wide_bvh([mesh], wp.get_device("cpu")).node.numpy().reshape(-1, 16)
+
+    def needed(node: int) -> int:
+        inner = [int(child) for child in words[node, 10:14] if not child & int(LEAF)]
+        return int(WIDTH) + max((needed(child) - 1 for child in inner), default=0)
+
+    return needed(0)
+
+
+@pytest.mark.parametrize("mesh", [soup(1, 0), soup(300, 2), ball(0.1, 3), staircase(60)])
+def test_the_needed_stack_is_that_of_a_recursion(mesh: TriangleMesh):
+    assert needed_stack(build_levels(mesh)[1]) == stack_of(mesh)
+
+
 def test_a_tree_too_deep_for_the_stack_is_balanced(monkeypatch: pytest.MonkeyPatch):
     mesh = staircase(60)
-    assert not build_binary_bvh(mesh, "sah").has_single_leaves() or needed_stack(collapse(build_binary_bvh(mesh, "sah"))) > 30
+    assert needed_stack(build_levels(mesh)[1]) > 50
     monkeypatch.setattr(wide_bvh, "STACK_SIZE", 20)
-    assert needed_stack(collapse_mesh(mesh)[1]) <= 20
+    assert needed_stack(build_levels(mesh)[1]) <= 20
     monkeypatch.setattr(wide_bvh, "STACK_SIZE", 4)
     with pytest.raises(CatalogError, match="60 triangles has a BVH too deep for a stack of 4"):
-        collapse_mesh(mesh)
+        build_levels(mesh)
+
+
+@pytest.mark.parametrize("tiny", [0.0, 1e-45, 1e-39, 1e-37, 1e-30, 1e-20, -1e-45, -1e-39, -1e-30])
+@pytest.mark.parametrize("extent", [0.1, 100.0])
+def test_rays_almost_along_an_axis_hit(tiny: float, extent: float):
+    mesh = soup(300, 1)
+    scaled = TriangleMesh(mesh.vertices * np.float32(extent), mesh.faces, mesh.normals, mesh.uv)
+    start, _ = rays_at(scaled, 0)
+    start[:, 2] = 3.0 * extent
+    direction = np.tile(np.array([tiny, -tiny, -1.0], np.float32), (RAYS, 1))
+    check_against_every_triangle(scaled, start, direction)
+
+
+@pytest.mark.parametrize(("half", "away", "slope"), [(1.0, 0.2, 1e-3), (0.3, 200.0, 3.0), (0.3, 0.5, 0.0)])
+def test_no_hit_is_lost_by_rounding_in_boxes(half: float, away: float, slope: float):
+    """A flat grid, whose boxes have no thickness: nearby the builder's MARGIN counts, far away the enlarged far end of the slab test."""
+    line = np.linspace(-half, half, 17)
+    x, y = np.meshgrid(line, line)
+    grid = np.stack([x, y, np.zeros_like(x)], axis=-1)
+    a, b, c, d = grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]
+    mesh = loose(np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(-1, 3, 3))
+    rng = np.random.default_rng(0)
+    target = np.concatenate([rng.uniform(-half, half, (RAYS, 2)), np.zeros((RAYS, 1))], axis=1)
+    target[::2, 0] = rng.choice(line, RAYS // 2)
+    direction = np.concatenate([slope * rng.normal(size=(RAYS, 2)), -np.ones((RAYS, 1))], axis=1)
+    start = target - away * direction
+    check_against_every_triangle(mesh, start.astype(np.float32), direction.astype(np.float32))
+
+
+def check_against_every_triangle(mesh: TriangleMesh, start: np.ndarray, direction: np.ndarray):
+    """Distances of hits equal the smallest of all triangles' own, by the test that leaves use; the any-hit query agrees."""
+    device = pick_device(default_device())
+    hit, _, blocked = run_queries([mesh], 0, (start, direction), 1e30, device, own=True)
+    rays = [wp.array(values, dtype=wp.vec3, device=device) for values in (start, direction)]
+    corners = wp.array(mesh.vertices[mesh.faces].reshape(-1, 3), dtype=wp.vec3, device=device)
+    nearest = wp.empty(len(start), dtype=float, device=device)
+    wp.launch(hit_every_triangle_kernel, dim=len(start), inputs=[corners, *rays], outputs=[nearest], device=device)
+    assert (hit[:, 0] >= 0.0).sum() > 0.1 * len(start)
+    np.testing.assert_array_equal(hit[:, 0], nearest.numpy())
+    np.testing.assert_array_equal(blocked == 1, nearest.numpy() >= 0.0)
+
+
+def test_a_box_of_just_more_than_the_largest_coordinate_is_quantized():
+    """Its extent is a few float64 steps above 255 steps, where the logarithm is rounded down."""
+    low, high, middle = np.float32([2.0376503e-06, 0.9960917, 1.0321041])
+    mesh = loose(np.array([[[low, -middle, 0.5], [high, middle, 0.5], [low, middle, 0.5]]]))
+    rng = np.random.default_rng(0)
+    start = np.concatenate([rng.uniform(0.0, 1.0, (RAYS, 2)), np.ones((RAYS, 1))], axis=1).astype(np.float32)
+    check_against_every_triangle(mesh, start, np.tile(np.float32([0.0, 0.0, -1.0]), (RAYS, 1)))
+
+
+def test_queries_visit_few_nodes():
+    """Nearest first, and none beyond a hit: most rays at a ball of 1,280 triangles visit about as many nodes as its tree has levels."""
+    mesh, device = ball(0.1, 3), pick_device(default_device())
+    start, direction = rays_at(mesh, 0)
+    rays = [wp.array(values, dtype=wp.vec3, device=device) for values in (start, direction)]
+    visits = wp.empty(RAYS, dtype=int, device=device)
+    wp.launch(count_visits_kernel, dim=RAYS, inputs=[build_wide_bvh([mesh], device), *rays], outputs=[visits], device=device)
+    assert 5.0 < visits.numpy().mean() < 9.6
 
 
 @pytest.mark.parametrize("query", [query_closest_hit, query_any_hit])
