@@ -7,12 +7,14 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-
-@wp.func_native("""
+_READ_RECORD = """
     struct alignas(16) Aligned { float x, y, z, w; };
     const Aligned record = reinterpret_cast<const Aligned*>(records.data)[index];
     return wp::vec4(record.x, record.y, record.z, record.w);
-""")
+"""
+
+
+@wp.func_native(_READ_RECORD)
 def read_record(records: wp.array3d[wp.vec4], index: int) -> wp.vec4:
     """Load an element: Warp's own look-up assumes no alignment, and takes four loads."""
     ...
@@ -28,11 +30,7 @@ def write_record(records: wp.array3d[wp.vec4], index: int, record: wp.vec4):
     ...
 
 
-@wp.func_native("""
-    struct alignas(16) Aligned { float x, y, z, w; };
-    const Aligned record = reinterpret_cast<const Aligned*>(records.data)[index];
-    return wp::vec4(record.x, record.y, record.z, record.w);
-""")
+@wp.func_native(_READ_RECORD)
 def read_flat_record(records: wp.array[wp.vec4], index: int) -> wp.vec4:
     """As `read_record`, of a one-dimensional array."""
     ...
