@@ -1,4 +1,4 @@
-"""Test kernels of ray queries: those of the wide BVH, and Warp's own, their reference."""
+"""Test kernels of ray queries: the wide BVH, its references (Warp's mesh queries, a test of every triangle), and a count of node visits."""
 
 import warp as wp
 
@@ -10,32 +10,13 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def query_wide_bvh_kernel(
+def query_kernel(
     # Scene:
     bvh: WideBvh,
-    # In:
-    mesh: int,
-    start: wp.array[wp.vec3],  # (ray)
-    direction: wp.array[wp.vec3],  # (ray)
-    reach: float,
-    # Out:
-    hit_out: wp.array[wp.vec3],  # (ray)
-    face_out: wp.array[int],  # (ray)
-    blocked_out: wp.array[int],  # (ray)
-):
-    """Query the wide BVH of a mesh: (t, u, v) and triangle of the closest hit, -1 for none, and whether there is any."""
-    ray = wp.tid()
-    hit = query_closest_hit(bvh, bvh.root[mesh], start[ray], direction[ray], reach)
-    hit_out[ray] = wp.vec3(hit[0], hit[1], hit[2])
-    face_out[ray] = wp.cast(hit[3], int)
-    blocked_out[ray] = int(query_any_hit(bvh, bvh.root[mesh], start[ray], direction[ray], reach))
-
-
-@wp.kernel
-def query_mesh_kernel(
-    # Scene:
     mesh: wp.uint64,
     # In:
+    row: int,
+    own: int,
     start: wp.array[wp.vec3],  # (ray)
     direction: wp.array[wp.vec3],  # (ray)
     reach: float,
@@ -44,8 +25,14 @@ def query_mesh_kernel(
     face_out: wp.array[int],  # (ray)
     blocked_out: wp.array[int],  # (ray)
 ):
-    """The same by Warp's queries of a mesh."""
+    """Closest-hit query (t, u, v; triangle, -1 if none) and any-hit query: of mesh `row` of `bvh` if `own` is 1, else of `mesh` by Warp."""
     ray = wp.tid()
+    if own == 1:
+        hit = query_closest_hit(bvh, bvh.root[row], start[ray], direction[ray], reach)
+        hit_out[ray] = wp.vec3(hit[0], hit[1], hit[2])
+        face_out[ray] = wp.cast(hit[3], int)
+        blocked_out[ray] = int(query_any_hit(bvh, bvh.root[row], start[ray], direction[ray], reach))
+        return
     hit_out[ray] = wp.vec3(-1.0, 0.0, 0.0)
     face_out[ray] = -1
     query = wp.mesh_query_ray(mesh, start[ray], direction[ray], reach)

@@ -25,7 +25,7 @@ class Lights:
     """Number of environment maps."""
     radiance: wp.array3d[wp.vec4]
     """(2 maps, row, column): first every map as it is, then every map without its sun. Row 0 is the zenith, column
-    u = azimuth / 2π + 0.5. The fourth number is 0: a texel of 16 bytes is read by one load."""
+    u = azimuth / 2π + 0.5. The fourth component is padding, so that `read_record` applies."""
     prefiltered: wp.array4d[wp.uint64]
     """(map, level, row, column): radiance without the sun, convolved with GGX lobes of increasing roughness; times the map's exposure, and
     packed as by `pack_half3`."""
@@ -94,7 +94,7 @@ def bilinear(taps: BilinearTaps, upper_west: wp.vec3, upper_east: wp.vec3, lower
 
 @wp.func
 def read_texel(lights: Lights, index: int) -> wp.vec3:
-    """Radiance of a texel by its flat index in `Lights.radiance`."""
+    """Radiance of the texel at a row-major index of `Lights.radiance`."""
     texel = read_record(lights.radiance, index)
     return wp.vec3(texel[0], texel[1], texel[2])
 

@@ -25,10 +25,8 @@ texels has a variance of 1/6 + 1/12 = 1/4 texel²; at this width that is the var
 pixel wide, textures would be blurred."""
 MIN_TILT = wp.constant(0.1)
 """Lower bound of the cosine between surface normal and view direction, which limits a pixel's footprint at grazing angles."""
-
-
 TRIANGLE_RECORDS = wp.constant(5)
-"""Records of a triangle in `Surfaces.triangle`."""
+"""Number of 16-byte records per triangle in `Surfaces.triangle`."""
 
 
 @wp.struct
@@ -36,9 +34,9 @@ class Surfaces:
     """Materials, textures and shading normals. Constant. Rows called mesh are those of `Meshes`, and a last one for the table."""
 
     triangle: wp.array[wp.vec4]
-    """(TRIANGLE_RECORDS x triangle), triangles as in `Meshes.corner`: 0 to 2: the vertex normals of corners a, b and c, each followed by u
-    of its texture coordinates. 3: v of a, b and c; texture lengths per metre. 4: the unit normal by the winding, as in
-    `Meshes.face_normal`; Frobenius norm of the interpolated normal's gradient along the triangle [rad/m]."""
+    """(TRIANGLE_RECORDS x triangle): shading data, triangles in the order of `Meshes.corner`. Records 0 to 2: vertex normal and texture
+    coordinate u of corners a, b, c. Record 3: texture coordinates v of a, b, c; texture density [texture widths per metre]. Record 4: face
+    normal, as in `Meshes.face_normal`; Frobenius norm of the gradient of the interpolated normal [rad/m]."""
     color: wp.array[wp.vec3]
     """(mesh): base colour, linear."""
     metallic: wp.array[float]

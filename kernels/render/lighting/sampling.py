@@ -19,9 +19,10 @@ class EnvironmentCdf:
     conditional: wp.array3d[float]
     """Over the columns of each row: (map, row, column + 1), from 0 to 1."""
     marginal_guide: wp.array2d[wp.uint16]
-    """(map, cell + 1): guide table (Chen and Asau, 1974) of N equal cells, N a power of two: the row found for u = cell / N."""
+    """(map, cell + 1): guide table (Chen and Asau, 1974) of the marginal CDF: its inverse at u = cell / N. The number of cells N is a power
+    of two."""
     conditional_guide: wp.array3d[wp.uint16]
-    """(map, row, cell + 1): the column found likewise."""
+    """(map, row, cell + 1): guide tables of the conditional CDFs."""
 
 
 @wp.struct
@@ -133,7 +134,7 @@ def environment_pdf(cdf: EnvironmentCdf, light: int, direction: wp.vec3) -> floa
 
 @wp.func
 def invert_marginal(cdf: EnvironmentCdf, light: int, u: float) -> int:
-    """Invert the marginal CDF by bisection within a cell of its guide table: the row r with marginal[r] <= u < marginal[r + 1]."""
+    """Invert the marginal CDF by bisection between entries of its guide table: the row r with marginal[r] <= u < marginal[r + 1]."""
     cell = int(u * float(cdf.marginal_guide.shape[1] - 1))
     low = int(cdf.marginal_guide[light, cell])
     high = int(cdf.marginal_guide[light, cell + 1]) + 1

@@ -1,5 +1,4 @@
-"""Packed bodies for ray queries (leaves of a top-level acceleration structure): pose, bounding sphere and BVH, in the order of
-`ViewBodies.order`."""
+"""Per-body records for world-space ray queries: bounding sphere, pose and BVH root, packed in the order of `ViewBodies.order`."""
 
 import warp as wp
 
@@ -9,8 +8,9 @@ from synpick_warp.kernels.render.visibility.records import read_record
 wp.set_module_options({"enable_backward": False})
 
 RAY_RECORDS = wp.constant(5)
-"""Records of a body in `ViewBodies.ray_record`. 0: its bounding sphere, as in `ViewBodies.sphere`. 1 + i: row i of its rotation from world
-to body, and coordinate i of its position in the world. 4: root node of its BVH and its row of `ViewBodies`, both as bits; unused."""
+"""Number of 16-byte records per body in `ViewBodies.ray_record`. Record 0: bounding sphere, as in `ViewBodies.sphere`. Records 1 to 3: one
+row of the world-to-body rotation, and x, y or z of the body's position in the world. Record 4: root node of its BVH and its row of
+`ViewBodies`, both as bits."""
 
 
 @wp.struct

@@ -1,6 +1,6 @@
-"""Loads and stores of contiguous arrays by row-major indices, without a check: `wp.vec4` by one access of 16 bytes, and `wp.uint64`.
+"""Vectorized memory access: unchecked loads and stores of `wp.vec4` and `wp.uint64` at row-major indices of contiguous arrays.
 
-The data of arrays of `wp.vec4` must be aligned to 16 bytes, as all that Warp allocates are.
+Arrays of `wp.vec4` must be 16-byte aligned; those that Warp allocates are.
 """
 
 import warp as wp
@@ -16,7 +16,7 @@ _READ_RECORD = """
 
 @wp.func_native(_READ_RECORD)
 def read_record(records: wp.array3d[wp.vec4], index: int) -> wp.vec4:
-    """Load an element: Warp's own look-up assumes no alignment, and takes four loads."""
+    """Load an element with one 16-byte instruction. Warp's indexing assumes 4-byte alignment and emits four."""
     ...
 
 
@@ -26,13 +26,13 @@ def read_record(records: wp.array3d[wp.vec4], index: int) -> wp.vec4:
     reinterpret_cast<Aligned*>(records.data)[index] = aligned;
 """)
 def write_record(records: wp.array3d[wp.vec4], index: int, record: wp.vec4):
-    """Store an element."""
+    """Store an element with one 16-byte instruction."""
     ...
 
 
 @wp.func_native(_READ_RECORD)
 def read_flat_record(records: wp.array[wp.vec4], index: int) -> wp.vec4:
-    """As `read_record`, of a one-dimensional array."""
+    """`read_record` for one-dimensional arrays."""
     ...
 
 

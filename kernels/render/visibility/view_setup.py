@@ -52,7 +52,7 @@ def set_up_views_kernel(
 ):
     """Transform each body of a view's world into the view's camera, x_camera = R (x_world - c), in float64, stored in float32.
 
-    Writes all of `ViewBodies` but `order`, `ray_record`, `present` and `body_mask`; absent bodies (all, if the view is unused) get mesh -1.
+    Fills `ViewBodies` except `order`, `ray_record`, `present` and `body_mask`. Absent bodies, and all bodies of unused views, get mesh -1.
     """
     view, body = wp.tid()
     world = views.world[view]

@@ -1,11 +1,13 @@
-"""Wide BVH (BVH4): ray queries against meshes by hierarchies with four children per node and quantized boxes, after the eight-wide ones of
-Ylitalo, Karras and Laine (2017).
+"""Wide BVH (BVH4): ray queries against meshes, with four children per node and quantized bounding boxes.
 
-A node is 64 bytes, so that a ray tests four boxes per memory access, and the chain of accesses that depend on each other is half as long
-as in a binary BVH. A leaf is one triangle; its corners are stored in the order of the leaves. Hits are those of testing every triangle with
-Warp's watertight test (Woop, Benthin and Wald, 2013), to the last bit. `wp.mesh_query_ray` loses a few of them, since its box test allows
-for no rounding. Of triangles hit at the same distance, as along a shared edge, either may be returned. `stages.render.wide_bvh` builds the
-trees.
+The layout follows the eight-wide BVH of Ylitalo, Karras and Laine (2017). A node takes 64 bytes. A ray tests four boxes per node, so its
+chain of dependent memory accesses is half as long as in a binary BVH. Each leaf is one triangle; triangles are stored in leaf order.
+
+The hits are exactly those of testing every triangle with Warp's watertight ray/triangle test (Woop, Benthin and Wald, 2013).
+`wp.mesh_query_ray` misses a few of them, because its slab test does not account for rounding. If several triangles are hit at the same
+distance, as along a shared edge, any of them may be returned.
+
+`stages.render.wide_bvh` builds the trees.
 """
 
 import warp as wp
@@ -13,14 +15,21 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 WIDTH = wp.constant(4)
-"""Children of a node."""
+"""Children per node."""
 NODE_RECORDS = wp.constant(4)
-"""Records of 16 bytes of a node."""
+"""Number of 16-byte records per node."""
 LEAF = wp.constant(0x80000000)
-"""Bit of a child reference that marks a leaf. Its other bits are the index of the triangle in `WideBvh.triangle`, or else that
-of the child's node."""
+"""Flag of a child reference that marks a leaf. The other bits are the triangle's index in `WideBvh.triangle`, or the index of the child
+node."""
 STACK_SIZE = wp.constant(64)
-"""Size of the traversal stack: the most children that a query can postpone."""
+"""Capacity of the traversal stack, in child references."""
+NO_HIT = wp.constant(0xFFFFFFFF)
+"""Sort key of a box that the ray misses, and triangle index of a query without a hit."""
+MIN_COMPONENT = wp.constant(1.0e-20)
+"""Smallest absolute component of a ray's direction in the slab test. Smaller ones would have an infinite reciprocal, which times zero is
+NaN."""
+FAR_SCALE = wp.constant(1.000001)
+"""Scale of the distance at which a ray leaves a box, some 8 ulp above 1: rounding never loses a box that the ray touches (Ize, 2013)."""
 
 
 @wp.struct
@@ -28,23 +37,29 @@ class WideBvh:
     """Wide BVHs of all meshes, each in its mesh's frame. Constant."""
 
     node: wp.array[wp.vec4ui]
-    """(NODE_RECORDS x node): record 0: a corner (x, y, z) of the node's box as float32 [m]; per axis the exponent e, 8 bits, of the
-    quantization step 2^(e - 127) m. Record 1: lower x, lower y, lower z, upper x of the children's boxes [steps from the corner], 8 bits
-    per child. Record 2: upper y, upper z; references to children 0 and 1. Record 3: to children 2 and 3; unused. An absent child has
-    an inverted box, from 255 to 0, and refers to the mesh's first triangle."""
+    """(NODE_RECORDS x node): record 0: origin of the quantization grid (x, y, z) as float32 [m], and per axis the 8-bit exponent e of its
+    step, 2^(e - 127) m. Record 1: lower x, y, z and upper x of the children's boxes, 8 bits per child [steps]. Record 2: upper y, upper z;
+    references to children 0 and 1. Record 3: references to children 2 and 3; two unused words. An absent child has an inverted box, from
+    255 to 0, and refers to the mesh's first triangle."""
     triangle: wp.array[wp.vec4]
-    """(3 x triangle): a corner [m]; in the fourth number of the first corner the triangle's index within its mesh, as bits."""
+    """(3 x triangle): corner position [m]. The fourth component of the first corner is the triangle's index within its mesh, as bits."""
     root: wp.array[int]
     """(mesh): index of the root node."""
 
 
-_TRAVERSAL = """
+_CONSTANTS = f"""
     typedef unsigned int Word;
+    constexpr Word LEAF = {int(LEAF)}u, NO_HIT = {int(NO_HIT)}u, RECORDS = {int(NODE_RECORDS)}u;
+    constexpr int WIDTH = {int(WIDTH)}, STACK_SIZE = {int(STACK_SIZE)};
+    constexpr float MIN_COMPONENT = {float(MIN_COMPONENT)}f, FAR_SCALE = {float(FAR_SCALE)}f;
+"""
+"""The constants above, in C++."""
+_TRAVERSAL = (
+    _CONSTANTS
+    + """
     struct alignas(16) Words { Word x, y, z, w; };
     struct alignas(16) Floats { float x, y, z, w; };
     union Bits { float real; Word word; };
-    constexpr Word LEAF = 0x80000000u, NO_HIT = 0xFFFFFFFFu;
-    constexpr int STACK_SIZE = 64;
     const Words* const nodes = reinterpret_cast<const Words*>(bvh.node.data);
     const Floats* const corners = reinterpret_cast<const Floats*>(bvh.triangle.data);
     auto as_float = [](Word word) { Bits bits; bits.word = word; return bits.real; };
@@ -57,12 +72,12 @@ _TRAVERSAL = """
     auto smaller = [](float a, float b) { return a < b ? a : b; };
     auto larger = [](float a, float b) { return a < b ? b : a; };
 #endif
-    // Smaller components are replaced: their reciprocals would be infinite, and zero times infinity is no number.
-    auto reciprocal = [](float d) { return 1.0f / (d > -1.0e-20f && d < 1.0e-20f ? (d < 0.0f ? -1.0e-20f : 1.0e-20f) : d); };
+    auto reciprocal = [](float d) {
+        return 1.0f / (d > -MIN_COMPONENT && d < MIN_COMPONENT ? (d < 0.0f ? -MIN_COMPONENT : MIN_COMPONENT) : d);
+    };
     const float rx = reciprocal(direction[0]), ry = reciprocal(direction[1]), rz = reciprocal(direction[2]);
-    // Slab test of a node's boxes: the distance at which the ray enters each, with the child's number in its last two bits, or NO_HIT.
-    // The far end is enlarged by some 8 ulp (Ize, 2013) against rounding far from the boxes, as the builder's MARGIN is near them.
-    auto test_boxes = [&](const Words& a, const Words& b, const Words& c, float reach, Word (&entry)[4]) {
+    // Slab test of a node's boxes. A child's sort key is its entry distance with the child's number in the two lowest bits, or NO_HIT.
+    auto test_boxes = [&](const Words& a, const Words& b, const Words& c, float reach, Word (&entry)[WIDTH]) {
         const float sx = as_float((a.w & 255u) << 23) * rx, ox = (as_float(a.x) - start[0]) * rx;
         const float sy = as_float((a.w >> 8 & 255u) << 23) * ry, oy = (as_float(a.y) - start[1]) * ry;
         const float sz = as_float((a.w >> 16 & 255u) << 23) * rz, oz = (as_float(a.z) - start[2]) * rz;
@@ -70,12 +85,12 @@ _TRAVERSAL = """
         const Word near_y = ry < 0.0f ? c.x : b.y, far_y = ry < 0.0f ? b.y : c.x;
         const Word near_z = rz < 0.0f ? c.y : b.z, far_z = rz < 0.0f ? b.z : c.y;
     #pragma unroll
-        for (int i = 0; i < 4; ++i) {
+        for (int i = 0; i < WIDTH; ++i) {
             const float near_xy = larger(byte(near_x, i) * sx + ox, byte(near_y, i) * sy + oy);
             const float far_xy = smaller(byte(far_x, i) * sx + ox, byte(far_y, i) * sy + oy);
             const float enter = larger(near_xy, larger(byte(near_z, i) * sz + oz, 0.0f));
             const float leave = smaller(far_xy, smaller(byte(far_z, i) * sz + oz, reach));
-            entry[i] = enter <= 1.000001f * leave ? (as_word(enter) & ~3u) | i : NO_HIT;
+            entry[i] = enter <= FAR_SCALE * leave ? (as_word(enter) & ~3u) | i : NO_HIT;
         }
     };
     float t, u, v;
@@ -91,13 +106,14 @@ _TRAVERSAL = """
     int size = 0;
     Word current = root;
 """
-"""C++ that both queries begin with: reciprocal direction, tests of boxes and triangles, stack; parameters as in `query_closest_hit`."""
+)
+"""Start of both queries, in C++: slab test, triangle test and traversal stack. Parameters are those of `query_closest_hit`."""
 
 
 @wp.func_native(
     _TRAVERSAL
     + """
-    Word entry[4];
+    Word entry[WIDTH];
     auto order = [&](int i, int j) {
         const Word low = entry[i] < entry[j] ? entry[i] : entry[j], high = entry[i] < entry[j] ? entry[j] : entry[i];
         entry[i] = low;
@@ -110,14 +126,14 @@ _TRAVERSAL = """
             if (test_triangle(current, best))
                 best = t, best_u = u, best_v = v, face = as_word(corners[3 * (current & ~LEAF)].w);
         } else {
-            const Words* const node = nodes + 4 * current;
+            const Words* const node = nodes + RECORDS * current;
             const Words a = node[0], b = node[1], c = node[2], d = node[3];
             test_boxes(a, b, c, best, entry);
-            // A sorting network of five comparisons: nearest first.
+            // Sorting network: nearest child first.
             order(0, 1), order(2, 3), order(0, 2), order(1, 3), order(1, 2);
             auto child = [&](Word number) { return number & 2u ? (number & 1u ? d.y : d.x) : (number & 1u ? c.w : c.z); };
     #pragma unroll
-            for (int i = 3; i > 0; --i)
+            for (int i = WIDTH - 1; i > 0; --i)
                 if (entry[i] != NO_HIT)
                     stack[size++] = child(entry[i]);
             if (entry[0] != NO_HIT) {
@@ -132,9 +148,10 @@ _TRAVERSAL = """
 """
 )
 def query_closest_hit(bvh: WideBvh, root: int, start: wp.vec3, direction: wp.vec3, reach: float) -> wp.vec4:
-    """Closest hit of a ray with the mesh of a root node: (t, u, v, triangle's index within the mesh as bits); t < 0: none.
+    """Closest-hit query of a ray against one mesh, given by its root node.
 
-    u and v are the barycentric weights of the first and second corner. Hits have 0 <= t < `reach`, both in units of |direction|.
+    Returns (t, u, v, i): distance in units of |direction|, 0 <= t < `reach`, or -1 if there is no hit; barycentric weights of the first and
+    second corner; triangle index within the mesh, as bits.
     """
     ...
 
@@ -142,13 +159,13 @@ def query_closest_hit(bvh: WideBvh, root: int, start: wp.vec3, direction: wp.vec
 @wp.func_native(
     _TRAVERSAL
     + """
-    Word entry[4];
+    Word entry[WIDTH];
     while (true) {
         if (current & LEAF) {
             if (test_triangle(current, reach))
                 return true;
         } else {
-            const Words* const node = nodes + 4 * current;
+            const Words* const node = nodes + RECORDS * current;
             const Words a = node[0], b = node[1], c = node[2], d = node[3];
             test_boxes(a, b, c, reach, entry);
             if (entry[0] != NO_HIT)
@@ -167,7 +184,7 @@ def query_closest_hit(bvh: WideBvh, root: int, start: wp.vec3, direction: wp.vec
 """
 )
 def query_any_hit(bvh: WideBvh, root: int, start: wp.vec3, direction: wp.vec3, reach: float) -> bool:
-    """Any-hit query (occlusion): True if a ray hits the mesh of a root node. Parameters as in `query_closest_hit`."""
+    """Any-hit query of a shadow ray against one mesh: True if it is hit. Parameters are those of `query_closest_hit`."""
     ...
 
 
@@ -194,7 +211,7 @@ def read_binary_node(
     triangle_out: wp.array[int],
     root_out: wp.array[int],
 ):
-    """Copy a node of the binary BVH of a `wp.Mesh`, for which Warp has no public function. Arrays as in `read_binary_bvh_kernel`."""
+    """Copy one node of the binary BVH of a `wp.Mesh`, which Warp's Python API does not expose. See `read_binary_bvh_kernel`."""
     ...
 
 
@@ -209,8 +226,8 @@ def read_binary_bvh_kernel(
     triangle_out: wp.array[int],  # (triangle)
     root_out: wp.array[int],  # (1)
 ):
-    """Copy the binary BVH of a `wp.Mesh`: boxes and children of its nodes, triangles in the order of its leaves, index of its root.
+    """Copy the binary BVH of a `wp.Mesh`: bounding boxes and child indices of its nodes, triangle indices in leaf order, root index.
 
-    A leaf of the triangles [begin, end) of this order has children (-1 - begin, -1 - end). Rows past the last node are not written.
+    A leaf stores its range [begin, end) of `triangle_out` as children (-1 - begin, -1 - end). Rows past the last node are not written.
     """
     read_binary_node(mesh, wp.tid(), lower_out, upper_out, children_out, triangle_out, root_out)

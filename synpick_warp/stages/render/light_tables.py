@@ -175,9 +175,9 @@ def build_environment_cdf(radiance: np.ndarray, device: wp.Device, table: bool =
 
 
 def guide_table(cdf: np.ndarray) -> np.ndarray:
-    """Guide tables (..., N + 1) uint16 of CDFs (..., n + 1): the entry that inversion finds for u = 0, 1 / N, ... 1.
+    """Guide tables (Chen and Asau, 1974) of CDFs (..., n + 1): their inverses at u = 0, 1 / N, ... 1, (..., N + 1) uint16.
 
-    N is the power of two from n on, so that kernels find the cell of a float32 exactly.
+    N is the smallest power of two that is at least n, so that kernels compute the cell of a float32 without rounding.
     """
     entries = cdf.shape[-1] - 1
     cells = 1 << (entries - 1).bit_length()

@@ -161,7 +161,7 @@ def build_surfaces(shapes: list[TriangleMesh], materials: list[Material], device
 
 
 def pack_triangles(mesh: TriangleMesh) -> np.ndarray:
-    """Records of triangles (TRIANGLE_RECORDS F, 4) float32: the layout of `Surfaces.triangle`."""
+    """Pack the shading data of a mesh's triangles into records (TRIANGLE_RECORDS F, 4) float32, as in `Surfaces.triangle`."""
     uv = mesh.uv[mesh.faces]
     records = np.empty((len(mesh.faces), int(TRIANGLE_RECORDS), 4), np.float32)
     records[:, :3, :3], records[:, :3, 3] = mesh.normals[mesh.faces], uv[..., 0]

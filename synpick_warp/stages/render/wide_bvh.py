@@ -1,4 +1,7 @@
-"""Wide BVH builder: collapses Warp's binary BVHs to four children per node and quantizes their boxes; the ray queries are in `kernels`."""
+"""Wide BVH construction: collapses Warp's binary BVHs to four children per node and quantizes their bounding boxes.
+
+`kernels.render.visibility.wide_bvh` has the data layout and the ray queries.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from synpick_warp.kernels.render.visibility.wide_bvh import LEAF, NODE_RECORDS, 
 from synpick_warp.scenes.types import TriangleMesh
 
 MARGIN = 1e-6
-"""Enlargement of boxes against float32's rounding in the slab test: absolute [m], and again relative to the mesh's largest coordinate."""
+"""Padding of bounding boxes against float32 rounding in the slab test: this in metres, plus this times the mesh's largest coordinate."""
 MAX_COORDINATE = 255
 """Largest quantized coordinate."""
 MIN_EXPONENT = -20
@@ -21,7 +24,7 @@ MIN_EXPONENT = -20
 EXPONENT_BIAS = 127
 """Offset of a float32's stored exponent."""
 ABSENT = -1
-"""Marks an empty slot of a node's children."""
+"""Child index of an empty slot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,14 +35,14 @@ class BinaryBvh:
     upper: np.ndarray
     """(node, 3) float64: box [m]."""
     children: np.ndarray
-    """(node, 2) int32: children; of a leaf -1 - begin, -1 - end of its range of `triangle`."""
+    """(node, 2) int32: child nodes. A leaf stores its range [begin, end) of `triangle` as (-1 - begin, -1 - end)."""
     triangle: np.ndarray
-    """(triangle) int32: triangle indices in the order of leaves."""
+    """(triangle) int32: triangle indices in leaf order."""
     root: int
 
     @property
     def leaf(self) -> np.ndarray:
-        """(node) bool: the node is a leaf."""
+        """Mask of leaves (node) bool."""
         return self.children[:, 0] < 0
 
     def has_one_triangle_leaves(self) -> bool:
@@ -52,18 +55,18 @@ class Level:
     """Nodes of a wide BVH at one depth; levels are in breadth-first order."""
 
     child: np.ndarray
-    """(node, WIDTH) int64: the children, as nodes of the binary BVH; ABSENT: none."""
+    """(node, WIDTH) int64: children, as nodes of the binary BVH, or ABSENT."""
     inner: np.ndarray
-    """(node, WIDTH) bool: the child is an inner node. The next level's nodes are these, in row-major order."""
+    """(node, WIDTH) bool: mask of children that are inner nodes. These are the nodes of the next level, in row-major order."""
 
     @property
     def leaf(self) -> np.ndarray:
-        """(node, WIDTH) bool: the child is a triangle."""
+        """Mask of children that are leaves (node, WIDTH) bool."""
         return (self.child != ABSENT) & ~self.inner
 
 
 def build_wide_bvh(shapes: list[TriangleMesh], device: wp.Device) -> Any:
-    """Build the struct `WideBvh` of meshes on `device`: by Warp's builder on the CPU, so that it is the same for every device."""
+    """Build the struct `WideBvh` of meshes on `device`. Warp's CPU builder is used for all devices, so that they have the same trees."""
     nodes, triangles, roots = [], [], []
     node_count = triangle_count = 0
     for shape in shapes:
@@ -132,7 +135,7 @@ def collapse(binary: BinaryBvh) -> list[Level]:
 
 
 def needed_stack(levels: list[Level]) -> int:
-    """Worst-case size of the traversal stack, also for rays that enter the inverted boxes of absent children, by rounding from far away."""
+    """Worst-case depth of the traversal stack. Absent children count, because rounding lets rays from afar enter inverted boxes."""
     below = np.zeros(0, np.int64)
     for level in reversed(levels):
         more = np.zeros(level.child.shape, np.int64)
@@ -142,7 +145,7 @@ def needed_stack(levels: list[Level]) -> int:
 
 
 def leaf_order(binary: BinaryBvh, levels: list[Level]) -> np.ndarray:
-    """Triangle indices (triangle) in the order of the leaves."""
+    """Triangle indices in leaf order (triangle) int32."""
     leaves = np.concatenate([level.child[level.leaf] for level in levels])
     return binary.triangle[-1 - binary.children[leaves, 0]]
 

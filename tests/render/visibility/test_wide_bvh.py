@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from synpick_warp.errors import CatalogError
-from synpick_warp.kernels.render.visibility.wide_bvh import LEAF, NODE_RECORDS, STACK_SIZE, WIDTH, query_any_hit, query_closest_hit
+from synpick_warp.kernels.render.visibility.wide_bvh import LEAF, WIDTH
 from synpick_warp.scenes.types import TriangleMesh
 from synpick_warp.stages.render import wide_bvh
 from synpick_warp.stages.render.wide_bvh import (
@@ -20,7 +20,7 @@ from synpick_warp.stages.render.wide_bvh import (
     needed_stack,
 )
 from synpick_warp.system.device import pick_device
-from tests.harness.bvh_probe import count_visits_kernel, hit_every_triangle_kernel, query_mesh_kernel, query_wide_bvh_kernel
+from tests.harness.bvh_probe import count_visits_kernel, hit_every_triangle_kernel, query_kernel
 from tests.harness.devices import default_device
 from tests.worlds.toy_scene import ball, box
 
@@ -28,7 +28,7 @@ RAYS = 4096
 
 
 def soup(count: int, seed: int, size: float = 0.3) -> TriangleMesh:
-    """Random triangles, a tenth of them degenerate: two equal corners, or all three on a line along an axis."""
+    """Random triangles, of which every tenth is degenerate: two coincident or three collinear corners."""
     rng = np.random.default_rng(seed)
     corners = rng.uniform(-1.0, 1.0, (count, 1, 3)) + rng.uniform(-size, size, (count, 3, 3))
     corners[5::20, 1] = corners[5::20, 0]
@@ -67,13 +67,10 @@ def run_queries(meshes: list[TriangleMesh], row: int, rays: tuple[np.ndarray, np
     """Hits (ray, 3) of (t, u, v), triangles (ray) and blocked rays (ray), by the wide BVH (`own`) or by Warp's."""
     start, direction = (wp.array(values, dtype=wp.vec3, device=device) for values in rays)
     outputs = [wp.zeros(RAYS, dtype=kind, device=device) for kind in (wp.vec3, int, int)]
-    if own:
-        inputs = [build_wide_bvh(meshes, device), row, start, direction, reach]
-        wp.launch(query_wide_bvh_kernel, dim=RAYS, inputs=inputs, outputs=outputs, device=device)
-    else:
-        points = wp.array(meshes[row].vertices, dtype=wp.vec3, device=device)
-        mesh = wp.Mesh(points, wp.array(meshes[row].faces.reshape(-1), dtype=wp.int32, device=device))
-        wp.launch(query_mesh_kernel, dim=RAYS, inputs=[mesh.id, start, direction, reach], outputs=outputs, device=device)
+    points = wp.array(meshes[row].vertices, dtype=wp.vec3, device=device)
+    mesh = wp.Mesh(points, wp.array(meshes[row].faces.reshape(-1), dtype=wp.int32, device=device))
+    inputs = [build_wide_bvh(meshes, device), mesh.id, row, int(own), start, direction, reach]
+    wp.launch(query_kernel, dim=RAYS, inputs=inputs, outputs=outputs, device=device)
     return [output.numpy() for output in outputs]
 
 
@@ -249,12 +246,3 @@ def test_queries_visit_few_nodes():
     visits = wp.empty(RAYS, dtype=int, device=device)
     wp.launch(count_visits_kernel, dim=RAYS, inputs=[build_wide_bvh([mesh], device), *rays], outputs=[visits], device=device)
     assert 5.0 < visits.numpy().mean() < 9.6
-
-
-@pytest.mark.parametrize("query", [query_closest_hit, query_any_hit])
-def test_builder_and_queries_have_the_same_constants(query: wp.Function):
-    """The queries are C++, which Warp's constants don't reach."""
-    assert f"STACK_SIZE = {int(STACK_SIZE)};" in query.native_snippet
-    assert f"LEAF = {int(LEAF):#x}u" in query.native_snippet
-    assert f"entry)[{int(WIDTH)}]" in query.native_snippet
-    assert f"nodes + {int(NODE_RECORDS)} * current" in query.native_snippet
