@@ -74,7 +74,13 @@ class Bake:
 class Objects:
     """How a mesh becomes a rigid body: collision shape, mass and material."""
 
-    hull_vertices: int = setting(64, "", "Maximum vertices of a convex hull; 64 keep 94.5 to 99.5 % of the volume.", low=8, high=256)
+    hull_vertices: int = setting(
+        64,
+        "",
+        "Maximum vertices of a convex hull. With 64, all but 5 % of the vertices of the real objects' hulls lie less than 2.1 mm outside.",
+        low=8,
+        high=256,
+    )
     piece_vertices: int = setting(32, "", "Maximum vertices of each piece of a convex decomposition.", low=8, high=256)
     pieces: int = setting(16, "", "Maximum pieces of a convex decomposition.", low=1, high=64)
     concavity: float = setting(0.05, "", "CoACD's concavity threshold; smaller values follow the surface more closely.", low=0.01, high=1.0)
@@ -210,21 +216,20 @@ class Physics:
     )
     gravity: float = setting(9.81, "m/s²", "Gravitational acceleration.", low=0.0)
     substeps: int = setting(
-        2, "", "Solver substeps per step; two substeps of 12 iterations calm a pile more than one of 48.", low=1, high=100
+        1,
+        "",
+        "Solver substeps per step, with collision detection in each; two take twice as long, and piles come to rest a little sooner.",
+        low=1,
+        high=100,
     )
     iterations: int = setting(16, "", "Projected Gauss-Seidel iterations per solver substep.", low=1, high=1000)
     friction: float = setting(0.5, "", "Coulomb friction coefficient of every shape.", low=0.0, high=10.0)
-    gap: float = setting(
-        2e-3,
-        "m",
-        "Contact margin of a shape: contacts are generated below twice this distance; 5 mm costs a third more and settles no better.",
-        low=0.0,
-    )
+    gap: float = setting(4e-3, "m", "Contact margin of a shape: contacts are generated below twice this distance.", low=0.0)
     angular_damping: float = setting(0.05, "1/s", "Angular damping of the objects (PhysX's default).", low=0.0)
     max_speed: float = setting(
         4.0,
         "m/s",
-        "Speed limit of the objects: 4 mm per solver substep are no more than the contact margin of two shapes, so nothing tunnels.",
+        "Speed limit of the objects: 8 mm per solver substep are no more than the contact margin of two shapes, so nothing tunnels.",
         above=0.0,
     )
     contacts_per_world: int = setting(512, "", "Contact capacity per world; about 140 contacts are usual.", low=16, high=INT32_MAX)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from synpick_warp.configs.schema import Gripper
-from synpick_warp.scenes.collision.hulls import simplify_hull
+from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.modelling import join, lathe, make_mesh, solid
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Material
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from synpick_warp.configs.schema import Tote
 from synpick_warp.errors import ConfigError
-from synpick_warp.scenes.collision.hulls import simplify_hull
+from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.modelling import Patch, join, loft, make_mesh, rounded_rectangle, solid, strips
 from synpick_warp.scenes.types import ConvexPiece, Fixture, Interior, Material
 

@@ -9,7 +9,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from synpick_warp.scenes.assets.meshes import merge_positions, signed_volume
-from synpick_warp.scenes.collision.hulls import hull_volume, simplify_hull
+from synpick_warp.scenes.collision.hulls import hull_volume
+from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
 
 # Pieces below this fraction of the total volume are slivers that only cost contacts.

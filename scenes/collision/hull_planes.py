@@ -9,8 +9,9 @@ from scipy.spatial import ConvexHull
 
 from synpick_warp.scenes.types import Catalog, ConvexPiece
 
-# Coplanar triangles are merged into one half-space if normal and offset [m] agree to this many decimals.
-_DECIMALS = 7
+# Coplanar triangles are merged into one half-space if normal and offset [m] agree to this many decimals. Vertices in single precision tilt
+# the triangles of a facet against each other by up to 1e-6.
+_DECIMALS = 5
 
 
 @dataclass(frozen=True, eq=False)

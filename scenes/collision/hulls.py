@@ -1,4 +1,4 @@
-"""Convex hulls: size and simplification; mass properties of convex polyhedra."""
+"""Convex hulls: volume and diameter; mass properties of convex polyhedra."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
-from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.types import ConvexPiece, HullSize
 
-# Smallest volume that another vertex must add, as a fraction of the full hull's.
-_MIN_GAIN = 1e-4
 # Points count as coplanar if their hull fills less than this fraction of the cube of their extent: 0.2 µm on a sheet of 0.2 m.
 _FLAT = 1e-6
 # Rows of the distance matrix that are computed at a time: fine round meshes have tens of thousands of hull vertices.
@@ -55,75 +52,6 @@ def _hull_of(points: np.ndarray) -> ConvexHull | None:
     except QhullError:
         return None
     return hull if hull.volume > _FLAT * np.ptp(points, axis=0).max() ** 3 else None
-
-
-def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
-    """Greedy convex hull simplification: select points whose convex hull has nearly the volume of the full hull.
-
-    Starting from `_extreme_points`, the point with the largest volume gain is added until there are `max_vertices`, or the gain falls
-    below `_MIN_GAIN`. The gain of a point p is the volume of the pyramids over the faces visible from it, Σ max(0, n·p + d) A / 3.
-
-    Args:
-        points: (N, 3) [m].
-        max_vertices: Maximum number of vertices, at least 6.
-
-    Raises:
-        CatalogError: The points are coplanar.
-    """
-    points = np.unique(points.astype(np.float32), axis=0).astype(np.float64)
-    try:
-        full = ConvexHull(points)
-    except QhullError as error:
-        raise CatalogError("all vertices lie in one plane; a body needs a volume") from error
-    candidates = points[full.vertices]
-    chosen = _extreme_points(candidates)
-    hull = ConvexHull(candidates[chosen])
-    while len(chosen) < max_vertices:
-        corners = hull.points[hull.simplices]
-        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2.0
-        gains = np.maximum(candidates @ hull.equations[:, :3].T + hull.equations[:, 3], 0.0) @ areas / 3.0
-        best = int(gains.argmax())
-        if gains[best] < _MIN_GAIN * full.volume or best in chosen:
-            break
-        chosen.append(best)
-        hull = ConvexHull(candidates[chosen])
-    return _to_piece(hull)
-
-
-def _extreme_points(points: np.ndarray) -> list[int]:
-    """Initial vertices, at most six: indices of four points that span a tetrahedron, then of extreme points along the axes."""
-    chosen = {int(index) for axis in range(3) for index in (points[:, axis].argmin(), points[:, axis].argmax())}
-    first = points[min(chosen)]
-    far = int(np.linalg.norm(points - first, axis=1).argmax())
-    line = points[far] - first
-    wide = int(np.linalg.norm(np.cross(points - first, line), axis=1).argmax())
-    high = int(np.abs((points - first) @ np.cross(line, points[wide] - first)).argmax())
-    spanning = [min(chosen), far, wide, high]
-    # The four span a tetrahedron; the extreme points along the axes alone may be coplanar.
-    return list(dict.fromkeys([*spanning, *sorted(chosen)]))[:6]
-
-
-def _to_piece(hull: ConvexHull) -> ConvexPiece:
-    """The hull's vertices and triangles. Outward orientation spreads over shared edges: normals of thin triangles are unreliable."""
-    faces = hull.simplices.copy()
-    corners = hull.points[faces]
-    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    start = int(np.linalg.norm(doubled, axis=1).argmax())
-    if doubled[start] @ hull.equations[start, :3] < 0.0:
-        faces[start] = faces[start, ::-1]
-    oriented, waiting = {start}, [start]
-    while waiting:
-        face = waiting.pop()
-        edges = {(int(faces[face, k]), int(faces[face, (k + 1) % 3])) for k in range(3)}
-        for neighbor in (int(n) for n in hull.neighbors[face]):
-            if neighbor in oriented:
-                continue
-            if any((int(faces[neighbor, k]), int(faces[neighbor, (k + 1) % 3])) in edges for k in range(3)):
-                faces[neighbor] = faces[neighbor, ::-1]
-            oriented.add(neighbor)
-            waiting.append(neighbor)
-    used, index = np.unique(faces, return_inverse=True)
-    return ConvexPiece(hull.points[used].astype(np.float32), index.reshape(-1, 3).astype(np.int32))
 
 
 def mass_properties(pieces: Sequence[ConvexPiece]) -> MassProperties:

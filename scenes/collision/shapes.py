@@ -14,16 +14,17 @@ import numpy as np
 from synpick_warp.errors import CatalogError
 from synpick_warp.inputs.files import check_regular_file
 from synpick_warp.scenes.collision.decomposition import ShapeRecipe
-from synpick_warp.scenes.collision.hulls import hull_volume, simplify_hull
+from synpick_warp.scenes.collision.hulls import hull_volume
 from synpick_warp.scenes.collision.parallel import decompose_all
+from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import ConvexPiece, TriangleMesh
 from synpick_warp.system.caches import USER_VARIABLE, user_cache
 
 MAX_CACHE_FILE = 2**26
 """Largest cache file [bytes]: 64 MiB; a decomposition has some 10 kB."""
-# Part of the cache's key, as is the text of ShapeRecipe. Raise it with any change to hulls.py or decomposition.py that gives other shapes
-# for the same input.
-_RECIPE = 1
+# Part of the cache's key, as is the text of ShapeRecipe. Raise it with any change to simplification.py or decomposition.py that gives other
+# shapes for the same input.
+_RECIPE = 2
 
 
 def default_cache_dir() -> Path:

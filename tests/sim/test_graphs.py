@@ -143,7 +143,7 @@ def test_a_solver_on_few_multiprocessors_takes_the_same_steps(device, streams):
 
 def test_each_solver_stream_is_captured_once_and_only_the_first_period_is_eager(monkeypatch):
     """Two ticks of 4 substeps on the current stream, two on another, one more on the first; then graphs are dropped."""
-    physics = place_cubes(settings(physics__steps_per_tick=4, physics__substeps=1), wp.get_device("cpu"), np.eye(7)[[6]])
+    physics = place_cubes(settings(physics__steps_per_tick=2, physics__substeps=2), wp.get_device("cpu"), np.eye(7)[[6]])
     calls: list[object] = []
     monkeypatch.setattr(physics, "device", SimpleNamespace(is_cuda=True))
     monkeypatch.setattr(physics, "_run_substeps", lambda *hooks: (calls.append(("run", *hooks[3:])) for _ in range(4)))

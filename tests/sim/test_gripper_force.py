@@ -22,8 +22,8 @@ DEEP = 1.0
 ABOVE = 0.005
 """How far above the floor the tip of a gripper starts whose setpoint moves down [m]."""
 
-SMOOTH, FOUND = 5, 50
-"""Steps over which single ones even out, 10 ms; steps after which all contacts of a standing gripper are found, 100 ms."""
+SMOOTH, FOUND = 5, 200
+"""Steps over which single ones even out, 10 ms; steps after which all contacts of a standing gripper are found, 400 ms."""
 
 
 @dataclass(frozen=True)
@@ -100,14 +100,14 @@ def test_the_step_responses_error_is_proportional_to_the_time_step(pulled, mode)
 def test_a_gripper_that_stands_on_the_floor_presses_with_no_more_than_the_limit(device, pulled, mode):
     """The setpoint is far below. What is bounded is the whole reaction of the floor, as the solver has it.
 
-    While it still finds the contacts, in the first tenth of a second, some of its steps of 1 ms are off by up to 6 N, for lack of
-    iterations; they even out within 10 ms.
+    While it still finds the contacts, in the first 0.4 s, some of its steps are off by up to 0.7 N on a CPU, for lack of iterations; they
+    even out within 10 ms.
     """
     found = pulled[mode]
     contact = np.linalg.norm(found.contact[:, :, STAND], axis=2)
     limit = found.section.force
     assert np.convolve(contact.mean(axis=1), np.full(SMOOTH, 1 / SMOOTH), "valid").max() < 1.01 * limit
-    assert contact.max() < limit + 6.0
+    assert contact.max() < limit + (6.0 if device.is_cuda else 1.0)
     # The GPU's solver sweeps contacts in another order and evens out more slowly.
     tolerance = 0.02 if device.is_cuda else 0.002
     assert contact[FOUND:].max() < (1.0 + tolerance) * limit

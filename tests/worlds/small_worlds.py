@@ -9,7 +9,8 @@ import trimesh
 
 from synpick_warp.configs.load import load_config
 from synpick_warp.configs.schema import Config
-from synpick_warp.scenes.collision.hulls import mass_properties, simplify_hull
+from synpick_warp.scenes.collision.hulls import mass_properties
+from synpick_warp.scenes.collision.simplification import simplify_hull
 from synpick_warp.scenes.types import Catalog, CatalogEntry, ConvexPiece, Material, TriangleMesh
 from synpick_warp.stages.sim.simulate import Simulation, TickRecord
 from synpick_warp.stages.stream import TickReader, TickReport

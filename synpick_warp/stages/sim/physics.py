@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, Protocol
@@ -180,13 +179,8 @@ class Physics:
             yield
 
     def _period(self, watcher: Watcher | None) -> int:
-        """Period of the launches [substeps]: the fewest whole steps after which the two states have swapped back.
-
-        A whole tick with a watcher, whose launches differ between steps, or if a tick has no whole number of periods.
-        """
-        count = self.settings.steps_per_tick * self.settings.substeps
-        period = math.lcm(2, self.settings.substeps)
-        return period if watcher is None and count % period == 0 else count
+        """Period of the launches [substeps]: a step, or with a watcher, whose launches differ between steps, a tick."""
+        return self.settings.substeps * (1 if watcher is None else self.settings.steps_per_tick)
 
     def _capture(self, substeps: Iterator[None]) -> list[wp.Graph]:
         """Capture a period: a CUDA graph of each substep, or on the CPU one for all, as each CPU graph keeps copies of filled arrays.
@@ -225,7 +219,7 @@ class Physics:
         watcher: Watcher | None,
         solver_stream: wp.Stream | None = None,
     ) -> Iterator[None]:
-        """Enqueue a tick; yields after each substep. The last one leaves its result in `state`.
+        """Enqueue a tick; yields after each substep. The last one of a step leaves its result in `state`, so that all steps are the same.
 
         Args:
             before_step, after_collide, watcher: As in `tick_parts`.
@@ -246,12 +240,13 @@ class Physics:
                 self.solver.step(current, following, self.control, self.contacts, physics.step / physics.substeps, observables=observables)
             current, following = following, current
             ends_step = substep + 1 == physics.substeps
+            if ends_step and current is not self.state:
+                self.state.assign(current)
+                current, following = self.state, self._other
             if watcher is not None:
                 watcher.after_solve(self._observables.contact_f)
                 if ends_step:
                     watcher.end_step(step, current)
-            if ends_step and step + 1 == physics.steps_per_tick and current is not self.state:
-                self.state.assign(current)
             yield
 
 
