@@ -6,7 +6,8 @@ Fields of the record dataclasses are the JSON keys.
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ DIGITS, PLACES = 6, 6
 """Significant digits and decimal places of the numbers in a record; more would be noise of single precision."""
 FORCE_PLACES = 4
 """Decimal places of a seal force [N]."""
+MASK_BITS = 32
+"""Bits of a mask of instances."""
 
 Vector = tuple[float, ...]
 
@@ -100,11 +103,12 @@ class AttemptRecord:
             ValueError: A number is not finite.
         """
         record: dict[str, Any] = {}
-        for key, value in asdict(self).items():
-            record[key] = value
-            if key == "outcome":
-                record |= {key: self.outcome.name.lower(), "sentence": self.outcome.sentence}
-        return json.dumps(record, allow_nan=False) + "\n"
+        for item in fields(self):
+            record[item.name] = getattr(self, item.name)
+            if item.name == "outcome":
+                record |= {item.name: self.outcome.name.lower(), "sentence": self.outcome.sentence}
+        # Not by `dataclasses.asdict`, which copies every number: it took most of the time of a line.
+        return json.dumps(record, allow_nan=False, default=vars) + "\n"
 
 
 @dataclass(frozen=True)
@@ -142,6 +146,10 @@ class _Running:
     """Peak seal force of each tick of the running lift [N]."""
 
 
+_OBSERVED = tuple(item.name for item in fields(InstanceObservation) if item.name not in ("instance", "object_id"))
+"""Arrays of `Observation` that an `InstanceObservation` holds a row of."""
+
+
 class AttemptLog:
     """State machine that turns the reports of all ticks into episode records."""
 
@@ -169,7 +177,7 @@ class AttemptLog:
         """
         ended = {}
         phase = report.column("phase")
-        for world in np.flatnonzero((phase == Phase.ACT) | (phase == Phase.OVER)).tolist():
+        for world in self._eventful_worlds(report).tolist():
             running = self._running.get(world)
             if running is None:
                 running = self._running[world] = _Running(_status(report, "episode", world), int((report.catalog_index[world] >= 0).sum()))
@@ -180,6 +188,14 @@ class AttemptLog:
                 running.forces = []
                 running.planned = self._begin_attempt(running.episode, report, world)
         return ended
+
+    def _eventful_worlds(self, report: TickReport) -> np.ndarray:
+        """Worlds of which a tick tells the log anything: an episode or attempt begins or ends, or the gripper lifts (world) int."""
+        phase, task = report.column("phase"), report.column("task")
+        running = np.zeros(len(phase), bool)
+        running[list(self._running)] = True
+        changes = ~running | (task == Task.LOOK) | (task == Task.LIFT) | (report.column("outcome") != Outcome.NONE)
+        return np.flatnonzero((phase == Phase.OVER) | ((phase == Phase.ACT) & changes))
 
     def _update_attempt(self, running: _Running, report: TickReport, world: int) -> None:
         """Record the peak force of a lift, and the end of an attempt."""
@@ -209,7 +225,7 @@ class AttemptLog:
         }
         grasp = dict.fromkeys(("target", "object_id", "point", "normal", "yaw", "tilt"))
         if target >= 0:
-            vectors = {name: _round_vector(getattr(report.plan, name)[world]) for name in ("point", "normal")}
+            vectors = {name: _round_vector(getattr(report.plan, name)[world].tolist()) for name in ("point", "normal")}
             angles = {name: _round(getattr(report.plan, name)[world]) for name in ("yaw", "tilt")}
             grasp = {"target": target, "object_id": self._object_id(report, world, target), **vectors, **angles}
         return record | grasp
@@ -239,29 +255,33 @@ class AttemptLog:
         present = np.flatnonzero(report.catalog_index[world] >= 0)
         votes = report.observation.votes[world][np.ix_(present, present)]
         lower, upper = np.nonzero(votes)
-        pairs = zip(present[lower].tolist(), present[upper].tolist(), _round_vector(votes[lower, upper]), strict=True)
-        instances = tuple(self._instance(report, world, instance) for instance in present.tolist())
+        pairs = zip(present[lower].tolist(), present[upper].tolist(), _round_vector(votes[lower, upper].tolist()), strict=True)
+        columns = {name: getattr(report.observation, name)[world, present] for name in _OBSERVED}
+        columns |= {"instance": present, "object_id": self.object_ids[report.catalog_index[world, present]]}
+        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+        instances = tuple(_instance(dict(zip(columns, row, strict=True))) for row in rows)
         return ObservationRecord(self.resolution, instances, tuple(pairs))
-
-    def _instance(self, report: TickReport, world: int, instance: int) -> InstanceObservation:
-        row = {name: values[world, instance] for name, values in vars(report.observation).items() if name != "overflow"}
-        return InstanceObservation(
-            instance=instance,
-            object_id=self._object_id(report, world, instance),
-            visible=int(row["visible"]),
-            visible_fraction=_round(row["visible_fraction"]),
-            pole=_round_vector(row["pole"]),
-            centroid=_round_vector(row["centroid"]),
-            midpoint=_round_vector(row["midpoint"]),
-            distances=_round_vector(row["distances"]),
-            grasp_pixel=tuple(row["grasp_pixel"].tolist()),
-            depth=_round(row["depth"]),
-            above=_instances(int(row["above"])),
-            ancestors=_instances(int(row["ancestors"])),
-        )
 
     def _object_id(self, report: TickReport, world: int, instance: int) -> int:
         return int(self.object_ids[report.catalog_index[world, instance]])
+
+
+def _instance(row: Mapping[str, Any]) -> InstanceObservation:
+    """Record of an instance from its values, as Python numbers and lists, by the names of `InstanceObservation`."""
+    return InstanceObservation(
+        instance=row["instance"],
+        object_id=row["object_id"],
+        visible=row["visible"],
+        visible_fraction=_round(row["visible_fraction"]),
+        pole=_round_vector(row["pole"]),
+        centroid=_round_vector(row["centroid"]),
+        midpoint=_round_vector(row["midpoint"]),
+        distances=_round_vector(row["distances"]),
+        grasp_pixel=tuple(row["grasp_pixel"]),
+        depth=_round(row["depth"]),
+        above=_instances(row["above"]),
+        ancestors=_instances(row["ancestors"]),
+    )
 
 
 def _status(report: TickReport, name: str, world: int) -> int:
@@ -270,8 +290,9 @@ def _status(report: TickReport, name: str, world: int) -> int:
 
 
 def _instances(bits: int) -> tuple[int, ...]:
-    """Unpack a mask of 32 bits, signed or not, to the indices of set bits."""
-    return tuple(instance for instance in range(32) if bits >> instance & 1)
+    """Unpack a mask of MASK_BITS bits, signed or not, to the indices of set bits."""
+    bits &= (1 << MASK_BITS) - 1
+    return tuple(instance for instance in range(bits.bit_length()) if bits >> instance & 1)
 
 
 def _round(value: float) -> float:
@@ -279,5 +300,5 @@ def _round(value: float) -> float:
     return round(float(f"{value:.{DIGITS}g}"), PLACES) + 0.0
 
 
-def _round_vector(values: np.ndarray) -> Vector:
-    return tuple(map(_round, values.tolist()))
+def _round_vector(values: Sequence[float]) -> Vector:
+    return tuple(map(_round, values))

@@ -7,6 +7,9 @@ Warp resolves members of an `IntEnum` in kernels, so device code, stages and exp
 from __future__ import annotations
 
 import enum
+import functools
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Self
 
 
@@ -193,9 +196,10 @@ class Effect(enum.IntEnum):
     JPEG_QUALITY = 8
 
 
-def column_names(kind: type[enum.IntEnum]) -> dict[str, enum.IntEnum]:
+@functools.cache
+def column_names(kind: type[enum.IntEnum]) -> Mapping[str, enum.IntEnum]:
     """Members of `Status` or `Measure` by their name in reports and data sets, in order of their values."""
-    return {member.name.lower(): member for member in sorted(kind)}
+    return MappingProxyType({member.name.lower(): member for member in sorted(kind)})
 
 
 def names(kind: type[enum.IntEnum]) -> tuple[str, ...]:

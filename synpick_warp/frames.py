@@ -5,8 +5,8 @@ A tick is one output frame of simulated time (`physics.steps_per_tick` physics s
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -94,6 +94,30 @@ class FrameBatch:
         return self.depth_idat[view, : self.depth_idat_size[view]]
 
 
+class SelectedRows(Mapping[str, np.ndarray]):
+    """Rows of named arrays, gathered anew by each read: what no exporter reads is never copied."""
+
+    def __init__(self, arrays: Mapping[str, np.ndarray], rows: np.ndarray) -> None:
+        """
+        Args:
+            arrays: Arrays by name; rows of an earlier selection are composed with these.
+            rows: Indices along the first dimension (row) int.
+        """
+        if isinstance(arrays, SelectedRows):
+            arrays, rows = arrays._arrays, arrays._rows[rows]
+        self._arrays, self._rows = arrays, rows
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Copy of the rows of an array."""
+        return self._arrays[name][self._rows]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._arrays)
+
+    def __len__(self) -> int:
+        return len(self._arrays)
+
+
 @dataclass(frozen=True, eq=False)
 class TickBatch:
     """Batch of one tick: the simulation frame of each of the `W` worlds that recorded one.
@@ -123,12 +147,20 @@ class TickBatch:
     light_exposure: np.ndarray
     """Exposure compensation of the episode, relative to the automatic exposure [EV] (W) float32."""
     tick: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Further arrays (W, ...) of the tick, by name; empty unless an exporter needs physics."""
+    """Further arrays (W, ...) of the tick, by name; empty unless an exporter needs physics. Read each once: a read may copy it."""
     steps: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Arrays (W, S, ...) of the physics steps that lead to the frame, by name; empty unless an exporter needs physics."""
+    """Arrays (W, S, ...) of the physics steps that lead to the frame, by name, likewise."""
 
     def __len__(self) -> int:
         return len(self.episode)
+
+    def select(self, rows: np.ndarray) -> TickBatch:
+        """Batch of the frames with these indices (row) int."""
+        values: dict[str, Any] = {}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            values[item.name] = SelectedRows(value, rows) if isinstance(value, Mapping) else value[rows]
+        return TickBatch(**values)
 
 
 @dataclass(frozen=True)

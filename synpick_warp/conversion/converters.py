@@ -283,7 +283,7 @@ class LerobotConverter(Converter):
     def convert(self, episode: SourceEpisode, on_committed: Done) -> None:
         """See base class."""
         from synpick_warp.exporters.lerobot.episode import commit_episode, group_path
-        from synpick_warp.exporters.lerobot.exporter import make_content, make_tick
+        from synpick_warp.exporters.lerobot.exporter import make_content, make_ticks
         from synpick_warp.exporters.lerobot.layout import part_path
         from synpick_warp.exporters.lerobot.video import GROUP
 
@@ -293,7 +293,7 @@ class LerobotConverter(Converter):
             for group in range(-(-episode.frames // GROUP)):
                 path = group_path(folder, camera, group)
                 tasks.append((write_video_group, (scene, group * GROUP, rate, path), path))
-        content = make_content(episode.end, b"".join(make_tick(batch, 0).tobytes() for batch in episode.ticks()))
+        content = make_content(episode.end, b"".join(make_ticks(batch).tobytes() for batch in episode.ticks()))
         place = self.out / part_path(episode.end.episode)
         arguments = (folder, content, self._settings)
         self.submit_all(tasks, lambda: self.pool.submit(commit_episode, (), arguments, path=place, on_done=on_committed))

@@ -16,6 +16,9 @@ class ThroughputMeter:
         self.summary, self.progress = summary, progress
         self.started: float | None = None
         self.cameras = len(config.cameras.positions)
+        self.counted = 0
+        """Episodes of the summary of which `delivered` and `frames` are the sums."""
+        self.delivered = self.frames = 0
 
     def show(self, active: int) -> None:
         """Report after a tick in which `active` worlds were busy. Time counts from the first view, when all kernels are compiled."""
@@ -23,12 +26,12 @@ class ThroughputMeter:
         if self.started is None and summary.views:
             self.started = now
         elapsed = now - self.started if self.started is not None else 0.0
-        done = [row for row in summary.episodes if row.ending.delivers]
+        self._count_delivered()
         left = None
-        if len(summary.episodes) > summary.resumed and elapsed > 0.0 and done and summary.views:
+        if len(summary.episodes) > summary.resumed and elapsed > 0.0 and self.delivered and summary.views:
             # Short episodes end first: running ones can already be longer than the mean of the ended ones.
             running = summary.views / self.cameras / (len(summary.episodes) - summary.resumed + active)
-            frames = max(sum(row.frames for row in done) / len(done), running)
+            frames = max(self.frames / self.delivered, running)
             fraction = summary.views / ((summary.total - summary.resumed) * self.cameras * frames)
             left = (1.0 / fraction - 1.0) * elapsed if fraction < 1.0 else None
         self.progress.update(
@@ -39,3 +42,11 @@ class ThroughputMeter:
             views_per_s=summary.views / elapsed if elapsed > 0.0 else 0.0,
             seconds_left=left,
         )
+
+    def _count_delivered(self) -> None:
+        """Add the episodes that ended since the last report: a tick's work does not grow with the episodes before."""
+        for row in self.summary.episodes[self.counted :]:
+            if row.ending.delivers:
+                self.delivered += 1
+                self.frames += row.frames
+        self.counted = len(self.summary.episodes)

@@ -14,7 +14,7 @@ import warp as wp
 from synpick_warp.arrays import allocate, memory_table
 from synpick_warp.codes import Measure, Status, column_names
 from synpick_warp.configs.schema import Config
-from synpick_warp.frames import FrameBatch, TickBatch
+from synpick_warp.frames import FrameBatch, SelectedRows, TickBatch
 from synpick_warp.stages.buffers import LayerBuffers, Snapshot, ViewBuffers, view_buffer_sizes
 from synpick_warp.stages.encoding.jpeg import Compressor
 from synpick_warp.stages.encoding.png import DepthBuffers, DepthEncoder, depth_sizes
@@ -162,7 +162,7 @@ def _reported_parts(record: TickRecord) -> list[tuple[Any, list[str]]]:
 
 
 def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> TickBatch:
-    """Select the frames of a tick, in order of worlds; without live worlds the batch is empty.
+    """Select the frames of a tick, in order of worlds; without live worlds the batch is empty. It is valid as long as the report.
 
     Args:
         report: Report of the tick.
@@ -177,8 +177,8 @@ def tick_batch(report: TickReport, object_ids: np.ndarray, tick_time: float) -> 
         time=frame * tick_time,
         object_id=np.append(object_ids, -1).astype(np.int32)[report.catalog_index[live]],
         pose=report.pose[live],
-        tick={name: values[live] for name, values in report.tick.items()},
-        steps={name: values[live] for name, values in report.steps.items()},
+        tick=SelectedRows(report.tick, live),
+        steps=SelectedRows(report.steps, live),
         **{name: getattr(report.snapshot, name)[live] for name in _SNAPSHOT},
     )
 

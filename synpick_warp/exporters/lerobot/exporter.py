@@ -131,10 +131,9 @@ class LerobotExporter:
 
     def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""
-        for world in range(len(batch)):
-            index = int(batch.episode[world])
+        for index, row in zip(batch.episode.tolist(), make_ticks(batch), strict=True):
             episode = self._episodes.get(index) or self._stage_episode(index)
-            episode.ticks += make_tick(batch, world).tobytes()
+            episode.ticks += row.tobytes()
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """See `Exporter`."""
@@ -237,14 +236,14 @@ def make_content(end: EpisodeEnd, ticks: bytes) -> EpisodeContent:
     )
 
 
-def make_tick(batch: TickBatch, world: int) -> np.ndarray:
-    """One world's tick, as a row of `TICK`."""
-    row = np.zeros((), TICK)
-    row["pose"] = batch.fixture_pose[world, _CUP]
-    row["setpoint"] = batch.steps["setpoint"][world, -1] if "setpoint" in batch.steps else np.nan
-    row["suction"] = "task" in batch.tick and int(batch.tick["task"][world]) == Task.LIFT
-    row["attached"] = "attached" in batch.tick and bool(np.any(batch.tick["attached"][world]))
-    return row
+def make_ticks(batch: TickBatch) -> np.ndarray:
+    """Rows of `TICK`, one per frame of a batch (frame)."""
+    rows = np.zeros(len(batch), TICK)
+    rows["pose"] = batch.fixture_pose[:, _CUP]
+    rows["setpoint"] = batch.steps["setpoint"][:, -1] if "setpoint" in batch.steps else np.nan
+    rows["suction"] = "task" in batch.tick and batch.tick["task"] == Task.LIFT
+    rows["attached"] = "attached" in batch.tick and np.any(batch.tick["attached"], axis=1)
+    return rows
 
 
 def video_rate(config: Config) -> Fraction:

@@ -15,12 +15,12 @@ import zarr
 from synpick_warp.codes import Outcome
 from synpick_warp.configs.schema import Trajectory
 from synpick_warp.exporters.trajectory.arrays import ARRANGEMENT, ATTEMPTS, EPISODE_GROUPS
-from synpick_warp.exporters.trajectory.spool import field_name, read_rows
+from synpick_warp.exporters.trajectory.spool import ROWS, field_name, read_rows
 from synpick_warp.exporters.trajectory.store import add_array, add_group, chunk_layout
 from synpick_warp.exporters.writing.files import sync_file, sync_folder
 
-GROUP, ROWS = "group", "rows"
-"""Names in an episode's staging folder: the group, and the spool file."""
+GROUP = "group"
+"""Name of the group in an episode's staging folder."""
 
 
 @dataclass(frozen=True)

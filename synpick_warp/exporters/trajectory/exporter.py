@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -15,11 +15,11 @@ from synpick_warp.codes import Ending, Mode
 from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.trajectory.arrays import EPISODES, STORE
-from synpick_warp.exporters.trajectory.episode import ROWS, EpisodeContent, EpisodeSettings, discard_episode, write_episode
-from synpick_warp.exporters.trajectory.spool import SPOOL_TICKS, batch_type, count_instances, fill_row, spool_bytes, write_rows
+from synpick_warp.exporters.trajectory.episode import EpisodeContent, EpisodeSettings, discard_episode, write_episode
+from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, Place, batch_type, count_instances, make_rows, spool_bytes, write_rows
 from synpick_warp.exporters.trajectory.store import constant_places, write_constants
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
-from synpick_warp.exporters.writing.pool import WriterPool
+from synpick_warp.exporters.writing.pool import WriterPool, WriteTask
 from synpick_warp.frames import EpisodeEnd, FrameBatch, TickBatch
 from synpick_warp.system.shared_memory import shared_bytes
 
@@ -33,8 +33,10 @@ class _Episode:
 
     folder: Path
     """Staging folder."""
-    rows: np.ndarray
-    """Ring buffer of SPOOL_TICKS ticks."""
+    name: str
+    """Its name."""
+    row: np.dtype
+    """Type of a row of its spool file."""
     initial: dict[str, Any]
     """Attributes known from its first tick."""
     object_id: np.ndarray
@@ -51,7 +53,8 @@ class _Episode:
 class TrajectoryExporter:
     """`Exporter` of zarr. Episode k becomes the group `episodes/k` of one store.
 
-    Ticks are spooled to a hidden file a few at a time, from which a writer process makes the group when the episode has ended.
+    Ticks are spooled to a hidden file, from which a writer process makes the group when the episode has ended. A task spools one tick of
+    many episodes, so that the bake's work grows with the arrays of a tick more than with its worlds.
     """
 
     needs_physics = True
@@ -75,7 +78,7 @@ class TrajectoryExporter:
 
     @staticmethod
     def slot_bytes(config: Config) -> int:
-        """See `Exporter`: some ticks of an episode."""
+        """See `Exporter`: a tick of some episodes."""
         size = spool_bytes(config.arrangement.max_objects, config.physics.steps_per_tick, config.trajectory.steps)
         return shared_bytes((size,))
 
@@ -107,13 +110,10 @@ class TrajectoryExporter:
 
     def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""
-        for world in range(len(batch)):
-            index = int(batch.episode[world])
-            episode = self._episodes.get(index) or self._stage_episode(index, batch, world)
-            fill_row(episode.rows[episode.count % SPOOL_TICKS], batch, world)
-            episode.count += 1
-            if episode.count % SPOOL_TICKS == 0:
-                self._spool(index, episode, SPOOL_TICKS)
+        episodes = [
+            self._episodes.get(index) or self._stage_episode(index, batch, world) for world, index in enumerate(batch.episode.tolist())
+        ]
+        self._context.pool.submit_all(self._spool(batch, episodes))
 
     def end_episode(self, end: EpisodeEnd, on_committed: Callable[[], None]) -> None:
         """See `Exporter`."""
@@ -121,10 +121,8 @@ class TrajectoryExporter:
         if episode is None:
             on_committed()
         else:
-            if episode.count % SPOOL_TICKS:
-                self._spool(end.episode, episode, episode.count % SPOOL_TICKS)
             episode.end, episode.on_committed = end, on_committed
-            self._commit_if_complete(end.episode, episode)
+            self._commit_if_complete(episode)
         self._context.pool.poll()
 
     def files(self, episode: int) -> list[Path]:
@@ -168,26 +166,39 @@ class TrajectoryExporter:
         object_id = batch.object_id[world, :instances].copy()
         if drop_pose is not None:
             drop_pose[object_id < 0] = np.nan
-        rows = np.zeros(SPOOL_TICKS, batch_type(batch, instances))
-        episode = self._episodes[index] = _Episode(folder, rows, initial, object_id, drop_pose)
+        row = batch_type(batch, instances, self._settings.steps_per_tick)
+        episode = self._episodes[index] = _Episode(folder, folder.name, row, initial, object_id, drop_pose)
         return episode
 
-    def _spool(self, index: int, episode: _Episode, count: int) -> None:
-        """Submit the last `count` rows to a writer."""
-        episode.pending += 1
-        self._context.pool.submit(
-            write_rows,
-            (episode.rows[:count].view(np.uint8),),
-            (episode.folder / ROWS, (episode.count - count) * episode.rows.itemsize),
-            path=episode.folder,
-            on_done=partial(self._task_done, index, episode),
-        )
+    def _spool(self, batch: TickBatch, episodes: Sequence[_Episode]) -> Iterator[WriteTask]:
+        """Tasks that spool a batch, each the frames of at most SPOOL_ROWS episodes whose rows have the same type.
 
-    def _task_done(self, index: int, episode: _Episode) -> None:
-        episode.pending -= 1
-        self._commit_if_complete(index, episode)
+        Args:
+            batch: The batch.
+            episodes: Episode of each of its frames.
+        """
+        groups: dict[int, list[int]] = {}
+        for frame, episode in enumerate(episodes):
+            groups.setdefault(len(episode.object_id), []).append(frame)
+        for instances, frames in groups.items():
+            for first in range(0, len(frames), SPOOL_ROWS):
+                part = frames[first : first + SPOOL_ROWS]
+                owners = [episodes[frame] for frame in part]
+                rows = make_rows(batch.select(np.array(part)), owners[0].row, instances)
+                places = [Place(episode.name, episode.count * rows.itemsize) for episode in owners]
+                for episode in owners:
+                    episode.count += 1
+                    episode.pending += 1
+                image = rows.view(np.uint8).reshape(len(rows), rows.itemsize)
+                done = partial(self._task_done, owners)
+                yield WriteTask(write_rows, (image,), (self._staging, places), self._staging, done)
 
-    def _commit_if_complete(self, index: int, episode: _Episode) -> None:
+    def _task_done(self, episodes: Sequence[_Episode]) -> None:
+        for episode in episodes:
+            episode.pending -= 1
+            self._commit_if_complete(episode)
+
+    def _commit_if_complete(self, episode: _Episode) -> None:
         end, pool = episode.end, self._context.pool
         if end is None or episode.pending:
             return
@@ -195,7 +206,7 @@ class TrajectoryExporter:
             pool.submit(discard_episode, (), (episode.folder,), path=episode.folder, on_done=episode.on_committed)
             return
         if episode.count != end.frames:
-            raise ValueError(f"episode {index} ended with {end.frames} frames, but {episode.count} came")
+            raise ValueError(f"episode {end.episode} ended with {end.frames} frames, but {episode.count} came")
         ending = Ending(end.ending)
         attributes = {
             "episode": end.episode,
@@ -208,8 +219,9 @@ class TrajectoryExporter:
             **episode.initial,
         }
         content = EpisodeContent(attributes, episode.object_id, episode.drop_pose, end.attempts)
-        arguments = (episode.folder, episode.rows.dtype, episode.count, self._place(index), content, self._settings)
-        pool.submit(write_episode, (), arguments, path=self._place(index), on_done=episode.on_committed)
+        place = self._place(end.episode)
+        arguments = (episode.folder, episode.row, episode.count, place, content, self._settings)
+        pool.submit(write_episode, (), arguments, path=place, on_done=episode.on_committed)
 
     def _place(self, episode: int) -> Path:
         return self._context.out / STORE / EPISODES / f"{episode:06d}"

@@ -1,17 +1,22 @@
-"""Spool of an episode's ticks: rows of one structured type, written to disk a few at a time, so that memory stays constant."""
+"""Spool of an episode's ticks on disk: rows of one structured type, of which writers receive those of many episodes at once."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, ArraySpec
 from synpick_warp.frames import TickBatch
 
-SPOOL_TICKS = 8
-"""Number of ticks of an episode handed to a writer at once: at most half a megabyte with 24 objects."""
+SPOOL_ROWS = 32
+"""Maximum number of rows of a task, one per episode: 2 MB with 24 objects."""
+ROWS = "rows"
+"""Name of the spool file in an episode's staging folder."""
 _OWN = ("object_id", "pose", "fixture_pose", "fixture_visible", "time")
 """Fields that every `TickBatch` has."""
 _TABLES = {"ticks": TICKS.arrays, "steps": STEPS.arrays}
@@ -24,11 +29,22 @@ def field_name(group: str, name: str) -> str:
     return f"{group}/{name}"
 
 
-def row_type(ticks: dict[str, ArraySpec], steps: dict[str, ArraySpec], instances: int, steps_per_tick: int) -> np.dtype:
-    """Structured type of a row: one tick's part of all arrays, in the order of their tables."""
+class Place(NamedTuple):
+    """Place of a row on disk."""
+
+    folder: str
+    """Name of the episode's staging folder."""
+    offset: int
+    """First byte in its spool file [B]."""
+
+
+@cache
+def row_type(ticks: tuple[str, ...], steps: tuple[str, ...], instances: int, steps_per_tick: int) -> np.dtype:
+    """Structured type of a row: one tick's part of these arrays of `TICKS` and `STEPS`."""
     fields = []
-    for group, quantities in (("ticks", ticks), ("steps", steps)):
-        for name, quantity in quantities.items():
+    for group, names in (("ticks", ticks), ("steps", steps)):
+        for name in names:
+            quantity = _TABLES[group][name]
             if field_name(group, name) != _COMPUTED:
                 shape = quantity.shape({"tick": 1, "step": steps_per_tick, "instance": instances})
                 fields.append((field_name(group, name), quantity.dtype, shape if group == "steps" else shape[1:]))
@@ -43,53 +59,76 @@ def spool_bytes(instances: int, steps_per_tick: int, has_steps: bool) -> int:
         steps_per_tick: Number of physics steps in a tick.
         has_steps: Whether steps are recorded.
     """
-    steps = dict(STEPS.arrays) if has_steps else {}
-    return SPOOL_TICKS * row_type(dict(TICKS.arrays), steps, instances, steps_per_tick).itemsize
+    steps = tuple(STEPS.arrays) if has_steps else ()
+    return SPOOL_ROWS * row_type(tuple(TICKS.arrays), steps, instances, steps_per_tick).itemsize
 
 
-def batch_type(batch: TickBatch, instances: int) -> np.dtype:
+def batch_type(batch: TickBatch, instances: int, steps_per_tick: int) -> np.dtype:
     """Structured type of rows that hold a batch's arrays.
+
+    Args:
+        batch: The batch.
+        instances: Number of instances of an episode.
+        steps_per_tick: Number of physics steps in a tick.
 
     Raises:
         ValueError: The batch has arrays that the schema lacks.
     """
-    ticks = {name: quantity for name, quantity in TICKS.arrays.items() if name in _OWN or name in batch.tick}
-    steps = {name: quantity for name, quantity in STEPS.arrays.items() if name in batch.steps}
+    ticks = tuple(name for name in TICKS.arrays if name in _OWN or name in batch.tick)
+    steps = tuple(name for name in STEPS.arrays if name in batch.steps)
     if len(steps) != len(batch.steps):
         raise ValueError(f"steps have {set(batch.steps) - set(steps)}, which nothing describes")
-    rows = next(iter(batch.steps.values())).shape[1] if batch.steps else 0
-    return row_type(ticks, steps, instances, rows)
+    return row_type(ticks, steps, instances, steps_per_tick)
 
 
-def fill_row(row: np.void, batch: TickBatch, world: int) -> None:
-    """Copy one world's tick into a row."""
-    for name in row.dtype.names or ():
+def make_rows(batch: TickBatch, row: np.dtype, instances: int) -> np.ndarray:
+    """Rows of the frames of a batch (frame).
+
+    Args:
+        batch: Frames of episodes that have the same number of instances.
+        row: Their type, by `batch_type`.
+        instances: That number; the capacity of a world may be larger.
+    """
+    rows = np.empty(len(batch), row)
+    for name in row.names or ():
         group, _, array = name.partition("/")
         if group == "steps":
-            values, axis = batch.steps[array][world], 1
+            values, axis = batch.steps[array], 2
         else:
-            values, axis = (getattr(batch, array) if array in _OWN else batch.tick[array])[world], 0
+            values, axis = getattr(batch, array) if array in _OWN else batch.tick[array], 1
         if _has_instances(_TABLES[group][array]):
-            values = values[:, : row[name].shape[1]] if axis else values[: row[name].shape[0]]
-        row[name] = values
+            values = values[(slice(None),) * axis + (slice(instances),)]
+        rows[name] = values
     # The buffer's content for an absent instance depends on the world's earlier episodes.
-    row["ticks/pose"][row["ticks/object_id"] < 0] = np.nan
+    rows["ticks/pose"][rows["ticks/object_id"] < 0] = np.nan
+    return rows
 
 
 def _has_instances(quantity: ArraySpec) -> bool:
     return quantity.dims[1:2] == ("instance",)
 
 
-def write_rows(rows: np.ndarray, path: Path, offset: int) -> None:
-    """Task: write rows, as bytes, to the spool file at a byte offset. Tasks may run in any order."""
+def write_rows(rows: np.ndarray, staging: Path, places: Sequence[Place]) -> None:
+    """Task: write rows to the spool files of their episodes. Tasks may run in any order.
+
+    Args:
+        rows: Rows as bytes (row, byte) uint8.
+        staging: Folder of the episodes' staging folders.
+        places: Place of each row.
+    """
+    for row, place in zip(rows, places, strict=True):
+        _write_row(row, os.path.join(staging, place.folder, ROWS), place.offset)
+
+
+def _write_row(row: np.ndarray, path: str, offset: int) -> None:
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o666)
     try:
-        rest = memoryview(rows.data)
+        rest = memoryview(row.data)
         while rest:
             written = os.pwrite(handle, rest, offset)
             offset, rest = offset + written, rest[written:]
     except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error
+        raise OSError(error.errno, error.strerror, path) from error
     finally:
         os.close(handle)
 

@@ -12,7 +12,7 @@ from synpick_warp.configs.schema import Config
 from synpick_warp.exporters.base import ExportContext, SharedFiles
 from synpick_warp.exporters.usd.episode import discard_episode, write_episode
 from synpick_warp.exporters.usd.lights import make_stage_light
-from synpick_warp.exporters.usd.spool import TickSpool
+from synpick_warp.exporters.usd.spool import TickSpool, tick_rows
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
 from synpick_warp.exporters.writing.files import PARTIAL, output_error
 from synpick_warp.exporters.writing.pool import WriterPool
@@ -75,11 +75,10 @@ class UsdExporter:
 
     def write_ticks(self, batch: TickBatch) -> None:
         """See `Exporter`."""
-        for world in range(len(batch)):
-            index = int(batch.episode[world])
+        for index, row in zip(batch.episode.tolist(), tick_rows(batch), strict=True):
             spool = self._spools.get(index) or self._stage_episode(index, batch.object_id.shape[1])
             try:
-                spool.add(batch, world)
+                spool.add(row)
             except OSError as error:
                 raise output_error(spool.path, error) from error
 

@@ -24,14 +24,12 @@ class TickSpool:
             instances: Instance capacity of a world.
         """
         self.path, self.instances = path, instances
-        self._rows = np.zeros(TICKS, tick_type(instances))
+        self._rows = np.zeros((TICKS, tick_type(instances).itemsize), np.uint8)
         self._count = 0
 
-    def add(self, batch: TickBatch, world: int) -> None:
-        """Append one world's tick. Raises OSError."""
-        row = self._rows[self._count]
-        for name in _FIELDS:
-            row[name] = getattr(batch, name)[world]
+    def add(self, row: np.ndarray) -> None:
+        """Append a row of `tick_rows`. Raises OSError."""
+        self._rows[self._count] = row
         self._count += 1
         if self._count == TICKS:
             self.flush()
@@ -57,6 +55,14 @@ def tick_type(instances: int) -> np.dtype:
             ("light_exposure", "<f4"),
         ]
     )
+
+
+def tick_rows(batch: TickBatch) -> np.ndarray:
+    """Rows of `tick_type`, as bytes, of all frames of a batch (frame, byte) uint8."""
+    rows = np.empty(len(batch), tick_type(batch.object_id.shape[1]))
+    for name in _FIELDS:
+        rows[name] = getattr(batch, name)
+    return rows.view(np.uint8).reshape(len(rows), rows.itemsize)
 
 
 def read_ticks(path: Path, instances: int) -> np.ndarray:

@@ -15,14 +15,14 @@ from synpick_warp.codes import Outcome
 from synpick_warp.exporters.trajectory import arrays as tables
 from synpick_warp.exporters.trajectory.episode import make_attempt_arrays
 from synpick_warp.exporters.trajectory.exporter import TrajectoryExporter
-from synpick_warp.exporters.trajectory.spool import SPOOL_TICKS, spool_bytes
+from synpick_warp.exporters.trajectory.spool import SPOOL_ROWS, spool_bytes
 from synpick_warp.exporters.trajectory.store import chunk_layout
-from tests.harness.exporter_contract import ExporterContract, digests, exporting
+from tests.harness.exporter_contract import ExporterContract, digests, exporting, finish
 from tests.worlds import box_views, trajectories
 from tests.worlds.trajectories import ATTEMPT, STEP_COUNT, UNSEEN, config, ends, ticks, write_set
 
 EPISODES = (0, 4)
-FRAMES = 2 * SPOOL_TICKS + 3
+FRAMES = 19
 INSTANCES = 4
 """1 + the largest instance index in box_views."""
 
@@ -84,6 +84,27 @@ def test_steps_equal_the_batches(store, episode):
         if tables.STEPS.arrays[name].dims[1:2] == ("instance",):
             memory = memory[:, :INSTANCES]
         np.testing.assert_array_equal(group[name][:], memory, err_msg=name)
+
+
+def test_more_episodes_than_a_task_takes_are_written_as_one_by_one(tmp_path):
+    """Each has the same frames whether its rows share tasks with others of more and fewer instances, or not."""
+    episodes = tuple(range(2 * SPOOL_ROWS + 3))
+
+    def written(groups: list[tuple[int, ...]]) -> dict[str, str]:
+        out = tmp_path / str(len(groups))
+        with exporting(TrajectoryExporter, out, config()) as exporter:
+            exporter.write_constants()
+            for group in groups:
+                for batch in ticks(group, 2):
+                    for world in np.flatnonzero(batch.episode % 3):
+                        batch.object_id[world, batch.episode[world] % 3 :] = -1
+                    exporter.write_ticks(batch)
+                for end in box_views.ends(group, 2):
+                    exporter.end_episode(end, lambda: None)
+            finish(exporter)
+        return digests(out)
+
+    assert written([episodes]) == written([(episode,) for episode in episodes])
 
 
 def test_step_times_are_ends_of_steps(store):

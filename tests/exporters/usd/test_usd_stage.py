@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from pxr import Gf, Usd, UsdGeom, UsdLux, UsdRender, UsdSemantics
 
 from synpick_warp.exporters.usd.lights import make_stage_light, separate_sun, write_light_maps
-from synpick_warp.exporters.usd.spool import TickSpool, read_ticks
+from synpick_warp.exporters.usd.spool import TickSpool, read_ticks, tick_rows
 from synpick_warp.exporters.usd.stage import CLIPPING, FIXTURES, make_episode_layer
 from synpick_warp.exporters.usd.types import EpisodeMetadata, EpisodeSettings
 from synpick_warp.scenes.cameras import make_cameras
@@ -34,7 +34,7 @@ def spool_ticks(folder, ticks=TICKS) -> np.ndarray:
     """The ticks as a writer process reads them."""
     spool = TickSpool(folder / "ticks", ticks[0].object_id.shape[1])
     for batch in ticks:
-        spool.add(batch, 0)
+        spool.add(tick_rows(batch)[0])
     spool.flush()
     return read_ticks(spool.path, spool.instances)
 
