@@ -43,6 +43,9 @@ from synpick_warp.system.interrupt import StopRequest
 
 _DEVICE_PROGRAM = "from synpick_warp.pipeline import generate_share; from synpick_warp.scheduling.worker import main; main(generate_share)"
 """Program of a device's process, where a bake uses several."""
+MAX_TICK_FRAMES = 256
+"""Maximum number of a tick's frames that are handed over before more physics is enqueued: some 30 ms of CPU time. The parts of physics in
+flight (`ticks.PARTS_IN_FLIGHT`) last for 0.1 s on an H200, and handing over the frames of 2,048 worlds takes longer."""
 
 
 def run_bake(
@@ -187,12 +190,14 @@ class _Run:
         self.summary.stopped = 0 if done else stop.number
 
     def _hand_over(self, report: TickReport, snapshot: Snapshot, ticks: TickLoop) -> None:
-        """Export a tick: write its frames, render its views, write finished views and episode ends; enqueue physics between batches."""
+        """Export a tick: write its frames, render its views, write views and episode ends; enqueue physics between parts of these."""
         physics = self.config.physics
         batch = tick_batch(report, self.factory.log.object_ids, physics.step * physics.steps_per_tick)
-        if len(batch):
+        for first in range(0, len(batch), MAX_TICK_FRAMES):
+            frames = np.arange(first, min(first + MAX_TICK_FRAMES, len(batch)))
             with scope("hand over ticks"):
-                self.exporters.write_ticks(batch)
+                self.exporters.write_ticks(batch.select(frames))
+            ticks.enqueue()
         records = self.factory.log.update(report)
         if self.exporters.needs_views:
             streams = self.factory.stream.streams
