@@ -12,7 +12,7 @@ from synpick_warp.errors import DeviceError
 from synpick_warp.system.green_contexts import SmPartition, count_reserved
 
 HIGH_PRIORITY = -1
-"""CUDA stream priority of physics: its 13,000 short kernels per tick depend on one another, and should not also wait for the renderer's."""
+"""CUDA stream priority of physics: its 6,600 short kernels per tick depend on one another, and should not also wait for the renderer's."""
 
 Streams = tuple[wp.Stream | None, wp.Stream | None, wp.Stream | None]
 """Streams (render, copy, solver), all None on a CPU. Render: None for the device's current stream. Copy: for encoding and for copies to the

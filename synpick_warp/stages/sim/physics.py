@@ -31,9 +31,9 @@ JOINT_LIMIT_GAP = 0.2
 VELOCITY_LIMIT_FRACTION = 0.5
 # Blocks of the narrow phase: one warp each, 8 for each multiprocessor of a GPU or one for each world, whichever is more. Newton has four
 # warps a block (one warp, if a hull has 256 or more vertices), 4 blocks a multiprocessor. A thread tests a pair of shapes for as long as it
-# takes, and a block holds the registers of all its threads until the last one is done. On an H200 a tick of 16, 64, 150 worlds takes 0.131,
-# 0.168, 0.201 instead of 0.141, 0.177, 0.208 s; 512 worlds 0.254 instead of 0.269, in a second run 0.261 and 0.260; 2,048 worlds 0.657 s in
-# 1,056 blocks, 0.599 in 2,112, 0.616 in Newton's.
+# takes, and a block holds the registers of all its threads until the last one is done. On an H200, with two substeps a step, a tick of 16,
+# 64, 150 worlds takes 0.131, 0.168, 0.201 instead of 0.141, 0.177, 0.208 s; 512 worlds 0.254 instead of 0.269, in a second run 0.261 and
+# 0.260; 2,048 worlds 0.657 s in 1,056 blocks, 0.599 in 2,112, 0.616 in Newton's.
 NARROW_PHASE_BLOCK, NARROW_PHASE_BLOCKS = 32, 8
 # On an H200, models of one and two worlds round differently from those of 8, 64 and 512, which agree bit by bit.
 MIN_GPU_WORLDS = 8
