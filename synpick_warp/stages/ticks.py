@@ -33,8 +33,8 @@ SAFE_LEAD = 512
 worlds become idle, rendering a tick gets faster but simulating one hardly does, so that the renderer needs a backlog."""
 SOLVER_WORLDS = 8
 """Maximum number of worlds per reserved SM for which the solver is restricted to these SMs. On an H200, with two substeps a step, a tick of
-64, 150, 512 worlds takes 0.178, 0.225, 0.458 s with the solver on 24 SMs, 0.168, 0.201, 0.254 s with it on all; beside a renderer 150 worlds
-gain."""
+64, 150, 512 worlds takes 0.178, 0.225, 0.458 s with the solver on 24 SMs, 0.168, 0.201, 0.254 s with it on all; beside a renderer 150
+worlds gain."""
 
 
 class TickLoop:
