@@ -55,8 +55,9 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
     """Simplify the convex hull of points to a polyhedron of few planar facets with nearly its volume.
 
     A hull of few vertices whose facets differ clearly is kept. Otherwise its triangles are clustered by their normals. From the clusters'
-    half-spaces, greedily those are chosen that cut off most, as long as there are no more than `max_vertices`; then they are moved inward
-    until the polyhedron has the hull's volume.
+    half-spaces, greedily those are chosen that cut off most, as long as there are no more than `max_vertices`; then they are moved inward,
+    by at most the mean gap between each and the hull, until the polyhedron has the hull's volume. With few vertices it stays larger: a
+    sphere of 64 keeps its volume, of 16 it has 1.3 and of 8, a cube, 1.9 times as much.
 
     Args:
         points: (N, 3) [m].
