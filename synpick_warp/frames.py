@@ -149,7 +149,7 @@ class TickBatch:
     tick: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Further arrays (W, ...) of the tick, by name; empty unless an exporter needs physics. Read each once: a read may copy it."""
     steps: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Arrays (W, S, ...) of the physics steps that lead to the frame, by name, likewise."""
+    """Arrays (W, S, ...) of the physics steps that lead to the frame, by name; see `tick`."""
 
     def __len__(self) -> int:
         return len(self.episode)

@@ -1,7 +1,8 @@
-"""Convex hull simplification: few vertices, and planar facets that differ clearly in direction.
+"""Convex hull simplification: few vertices, and planar facets whose normals differ by at least 4 degrees.
 
-Scanned models have flat sides made of triangles that differ by a degree. Collision detection takes such a side for a curved surface: it
-returns a single contact point, which jumps from step to step, and the object rattles. So the hull is approximated by few half-spaces.
+Scanned models have flat sides made of triangles whose normals differ by about a degree. Between two such sides, collision detection finds a
+single contact point, which jumps from step to step, and resting objects jitter. An intersection of few half-spaces has exactly planar
+sides, between which it finds several contacts.
 """
 
 from __future__ import annotations
@@ -15,27 +16,27 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.types import ConvexPiece
 
-# Fewest vertices that can be asked for: those of a polyhedron of six facets.
+# Smallest allowed `max_vertices`: a polyhedron of six facets has at most 8 vertices.
 MIN_VERTICES = 8
-# Vertices of the hull whose facets are clustered: enough to follow a scan within 0.2 mm.
+# Maximum vertices of the intermediate, fine hull, whose triangles are clustered.
 _FINE_VERTICES = 256
-# Smallest volume that another facet must cut off, and that another vertex of the fine hull must add, as a fraction of the full hull's.
+# Minimum volume that a further half-space cuts off, and that a further vertex of the fine hull adds, relative to the full hull's volume.
 _MIN_GAIN, _FINE_GAIN = 1e-4, 1e-5
-# Triangles whose normals differ by less from a cluster's belong to it [rad]: 3 degrees. Newton looks for the vertices of a supporting
-# facet in directions tilted by 2 degrees.
+# Radius of a cluster of normals [rad]: 3 degrees. Newton's contact manifold samples the vertices of a facet in directions tilted by 2
+# degrees from the contact normal, so that facets closer than this act as one.
 _CLUSTER_ANGLE = np.radians(3.0)
-# Smallest angle between the normals of two facets [rad].
+# Minimum angle between the normals of two facets [rad].
 _MIN_FACET_ANGLE = np.radians(4.0)
-# Facets replace the axes' directions among the first six half-spaces if they differ by less [rad]: with up to 35 degrees, the six still
-# enclose a bounded polyhedron.
+# The first six half-spaces face along the axes; a facet whose normal lies within this angle of an axis takes its place [rad]. Below 35
+# degrees six such half-spaces always enclose a bounded polyhedron.
 _FRAME_ANGLE = np.radians(30.0)
-# A half-space's mean gap is that to triangles whose normals differ by less from its own [rad].
+# The mean gap of a half-space is averaged over triangles whose normals lie within this angle of its own [rad].
 _FIT_ANGLE = np.radians(20.0)
-# Steps of the bisection for the hull's volume: offsets to 1/4096 of the mean gap.
+# Bisection steps of `_fit_volume`: the inward shift is found to 1/4096 of the mean gap.
 _FIT_STEPS = 12
-# Decimal places of vertices [m]: those of an intersection of half-spaces that lie at the same place become one.
+# Decimal places to which vertices are rounded [m], so that duplicates of a corner of an intersection become one vertex.
 _DECIMALS = 8
-# Triangles whose normals differ by less are coplanar [rad].
+# Maximum angle between the normals of coplanar triangles [rad].
 _COPLANAR_ANGLE = 1e-3
 
 
@@ -48,14 +49,14 @@ class _Facets:
     offset: np.ndarray
     """Offset d of the supporting plane (facet) [m]."""
     gap: np.ndarray
-    """Mean distance of the hull's surface below the plane (facet) [m]."""
+    """Mean distance between the plane and the hull's triangles within _FIT_ANGLE, 0 if there are none (facet) [m]."""
 
 
 def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
-    """Simplify the convex hull of points to a polyhedron of few planar facets with nearly its volume.
+    """Approximate the convex hull of points by an intersection of half-spaces, of the hull's volume if `max_vertices` allows it.
 
-    A hull of few vertices whose facets differ clearly is kept. Otherwise its triangles are clustered by their normals. From the clusters'
-    half-spaces, greedily those are chosen that cut off most, as long as there are no more than `max_vertices`; then they are moved inward,
+    A hull of no more vertices, whose facets already differ by _MIN_FACET_ANGLE, is kept. Otherwise its triangles are clustered by
+    their normals, and each cluster gives a half-space. Those that cut off most are chosen greedily, up to `max_vertices`, and moved inward,
     by at most the mean gap between each and the hull, until the polyhedron has the hull's volume. With few vertices it stays larger, since
     six half-spaces near the axes come first: a sphere of 16 has 1.3 times the volume, of 8 twice as much, and a thin rod along a diagonal
     of 8 hundreds of times. Where the intersection fails, the hull of greedily selected points is returned, inside the full one.

@@ -1,4 +1,4 @@
-"""Spool of an episode's ticks on disk: rows of one structured type, of which writers receive those of many episodes at once."""
+"""Spool files of trajectories: fixed-size records, one per tick of an episode. A write task has one tick of many episodes."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from synpick_warp.exporters.trajectory.arrays import STEPS, TICKS, ArraySpec
 from synpick_warp.frames import TickBatch
 
 SPOOL_ROWS = 32
-"""Maximum number of rows of a task, one per episode: 2 MB with 24 objects."""
+"""Maximum number of rows of a write task, each of another episode: about 2 MB with 24 instances."""
 ROWS = "rows"
 """Name of the spool file in an episode's staging folder."""
 _OWN = ("object_id", "pose", "fixture_pose", "fixture_visible", "time")
 """Fields that every `TickBatch` has."""
 _TABLES = {"ticks": TICKS.arrays, "steps": STEPS.arrays}
 _COMPUTED = "steps/time"
-"""Computed from the tick's time when the group is written."""
+"""Array that rows omit: it is computed from the tick's time when the group is written."""
 
 
 def field_name(group: str, name: str) -> str:
@@ -30,17 +30,17 @@ def field_name(group: str, name: str) -> str:
 
 
 class Place(NamedTuple):
-    """Place of a row on disk."""
+    """Location of a row on disk."""
 
     folder: str
     """Name of the episode's staging folder."""
     offset: int
-    """First byte in its spool file [B]."""
+    """Byte offset of the row in the episode's spool file."""
 
 
 @cache
 def row_type(ticks: tuple[str, ...], steps: tuple[str, ...], instances: int, steps_per_tick: int) -> np.dtype:
-    """Structured type of a row: one tick's part of these arrays of `TICKS` and `STEPS`."""
+    """Structured type of a row: one tick of the named arrays of `TICKS` and `STEPS`, in this order."""
     fields = []
     for group, names in (("ticks", ticks), ("steps", steps)):
         for name in names:
