@@ -111,6 +111,10 @@ class SelectedRows(Mapping[str, np.ndarray]):
         """Copy of the rows of an array."""
         return self._arrays[name][self._rows]
 
+    def __contains__(self, name: object) -> bool:
+        """Whether there is an array of that name; without this method `Mapping` would gather its rows to find out."""
+        return name in self._arrays
+
     def __iter__(self) -> Iterator[str]:
         return iter(self._arrays)
 
