@@ -264,6 +264,9 @@ def compose_iterations(
         # State:
         rows: JointRowData,
         contacts: ContactRowData,
+        # In:
+        order: wp.array[int],  # (rank)
+        # Out:
         twist_inout: wp.array2d[float],  # (body, 6) [m/s, rad/s]
         impulse_inout: wp.array2d[float],  # (body, 6) [N s, N m s]
         v_inout: wp.array[float],  # (dof) [m/s, rad/s]
@@ -273,9 +276,10 @@ def compose_iterations(
         An iteration sweeps joint limits, contacts in generalized coordinates, colored contacts, the response of the gripper to these, and
         speed limits; sweeps without rows are skipped. Velocities of free bodies exist twice: in `v`, generalized velocities, and as twists.
         They are copied between the two in every iteration if a sweep over `v` can change them, otherwise before the first and after the
-        last one.
+        last one. Blocks take the worlds in `order`.
         """
-        world, lane = wp.tid()
+        rank, lane = wp.tid()
+        world = order[rank]
         has_limits = settings.internal_rows != 0 and rows.world_constraint_count[world] > 0
         free_contacts = rows.mf_contact_rows_end[world]
         has_contacts = bodies.dense_contact_world_flag[world] != 0 or free_contacts > 0

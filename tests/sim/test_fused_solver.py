@@ -12,6 +12,7 @@ from newton._src.solvers.steel import solver_steel as steel
 from newton._src.solvers.steel.kernels import accumulate_propagation_warmstart_body_impulses_ordered
 
 from synpick_warp.codes import Phase
+from synpick_warp.kernels.sim import world_order
 from synpick_warp.kernels.sim.warm_start import apply_warm_start_kernel
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import fused_solver, physics
@@ -117,16 +118,39 @@ def test_warm_start_sums_impulses_as_newton_does(device):
     assert not np.array_equal(found[0], found[1])
 
 
-@pytest.mark.parametrize(("worlds", "packed", "max_speed"), [(8, 256, 0.3), (8, 256, 4.0), (24, 256, 4.0), (24, 0, 4.0)])
-def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, packed, max_speed):
+def test_worlds_with_the_most_colors_come_first(device):
+    """Random numbers of units per color, as the solver's offsets tell them: none, all bins, and more colors than bins."""
+    random = np.random.default_rng(5)
+    bins, entries = int(world_order.COLOR_BINS), 200
+    colors = np.r_[0, bins - 1, bins, entries - 1, random.integers(0, bins, 60)]
+    units = np.zeros((len(colors), entries), int)
+    for row, count in zip(units, colors, strict=True):
+        row[1 : count + 1] = random.integers(1, 9, count)
+    offsets = wp.array(units.cumsum(1).ravel(), dtype=int, device=device)
+    sizes = wp.zeros(bins, dtype=int, device=device)
+    of, places, order = (wp.empty(len(colors), dtype=int, device=device) for _ in range(3))
+    options = {"dim": len(colors), "device": device}
+    wp.launch(world_order.count_worlds_kernel, inputs=[offsets, entries], outputs=[sizes, of, places], **options)
+    wp.launch(world_order.order_worlds_kernel, inputs=[sizes, of, places], outputs=[order], **options)
+    found = order.numpy()
+    assert sorted(found) == list(range(len(colors)))
+    assert (np.diff(np.minimum(colors, bins - 1)[found]) <= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("worlds", "packed", "resident", "max_speed"),
+    [(8, 256, 8, 0.3), (8, 256, 8, 4.0), (24, 256, 8, 4.0), (24, 0, 8, 4.0), (24, 256, 0, 4.0)],
+)
+def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, packed, resident, max_speed):
     """Piles fall, rest and are stirred; at the lower speed limit, falling bodies have velocity limit rows. Newton packs rows of up to 16
-    worlds only, and its narrow phase uses larger blocks."""
+    worlds only, takes worlds in their order (they are sorted if none is resident), and its narrow phase uses larger blocks."""
     if not device.is_cuda:
         pytest.skip("on a CPU the solver's own launches run")
     config = settings(
         bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__max_speed=max_speed, physics__deterministic=True
     )
     monkeypatch.setattr(fused_solver, "PACKED_WORLDS", packed)
+    monkeypatch.setattr(fused_solver, "RESIDENT_WORLDS", resident)
     found, phases = {}, set()
     for version in (fused_solver.KNOWN_NEWTON, "another"):
         for module in (fused_solver, physics):

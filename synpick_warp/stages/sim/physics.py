@@ -29,12 +29,13 @@ JOINT_LIMIT_GAP = 0.2
 # Fraction of its speed limit from which a body has velocity limit rows. With rows for all bodies at all times, six each, every iteration
 # swept 162 idle rows a world one after the other, a third of the solver's time on a GPU.
 VELOCITY_LIMIT_FRACTION = 0.5
-# Blocks of the narrow phase: one warp each, 8 for each multiprocessor of a GPU or one for each world, whichever is more. Newton has four
+# Blocks of the narrow phase: one warp each, 8 for each multiprocessor of a GPU or 2 for each world, whichever is more. Newton has four
 # warps a block (one warp, if a hull has 256 or more vertices), 4 blocks a multiprocessor. A thread tests a pair of shapes for as long as it
-# takes, and a block holds the registers of all its threads until the last one is done. On an H200, with two substeps a step, a tick of 16,
-# 64, 150 worlds takes 0.131, 0.168, 0.201 instead of 0.141, 0.177, 0.208 s; 512 worlds 0.254 instead of 0.269, in a second run 0.261 and
-# 0.260; 2,048 worlds 0.657 s in 1,056 blocks, 0.599 in 2,112, 0.616 in Newton's.
-NARROW_PHASE_BLOCK, NARROW_PHASE_BLOCKS = 32, 8
+# takes, and a block holds the registers of all its threads until the last one is done. A world has some 60 pairs, about as many as its two
+# blocks have threads. On an H200, with two substeps a step, a tick of 16, 64, 150 worlds takes 0.131, 0.168, 0.201 instead of 0.141, 0.177,
+# 0.208 s; 512 worlds 0.254 instead of 0.269, in a second run 0.261 and 0.260. With one substep a tick of 2,048 worlds takes 0.313 s in one
+# block for each world, 0.301 in two, 0.299 in four.
+NARROW_PHASE_BLOCK, NARROW_PHASE_BLOCKS, NARROW_PHASE_WORLD_BLOCKS = 32, 8, 2
 # On an H200, models of one and two worlds round differently from those of 8, 64 and 512, which agree bit by bit.
 MIN_GPU_WORLDS = 8
 # Maximum worlds if `bake.worlds` is 0. On a GPU more worlds need memory and hide more of the latency of physics, which rendering hides as
@@ -277,7 +278,7 @@ def make_pipeline(physics: PhysicsConfig, model: newton.Model) -> newton.Collisi
     if model.device.is_cuda:
         narrow_phase = pipeline.narrow_phase
         narrow_phase.split_convex_block_dim = NARROW_PHASE_BLOCK
-        blocks = max(NARROW_PHASE_BLOCKS * model.device.sm_count, model.world_count)
+        blocks = max(NARROW_PHASE_BLOCKS * model.device.sm_count, NARROW_PHASE_WORLD_BLOCKS * model.world_count)
         narrow_phase.split_convex_total_num_threads = NARROW_PHASE_BLOCK * blocks
     return pipeline
 
