@@ -67,7 +67,10 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
 
     Raises:
         CatalogError: The points are coplanar.
+        ValueError: `max_vertices` is below MIN_VERTICES.
     """
+    if max_vertices < MIN_VERTICES:
+        raise ValueError(f"max_vertices is {max_vertices}, but must be at least {MIN_VERTICES}")
     points = np.unique(points.astype(np.float32), axis=0).astype(np.float64)
     try:
         full = ConvexHull(points)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -10,11 +11,23 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from synpick_warp.configs.schema import Objects
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.collision.hull_planes import hull_planes
 from synpick_warp.scenes.collision.hulls import hull_volume, mass_properties
-from synpick_warp.scenes.collision.simplification import simplify_hull
+from synpick_warp.scenes.collision.simplification import MIN_VERTICES, simplify_hull
 from tests.harness.pieces import assert_valid
+
+
+@pytest.mark.parametrize("limit", [0, 4, 7])
+def test_fewer_vertices_than_a_box_has_are_refused(limit):
+    with pytest.raises(ValueError, match=f"max_vertices is {limit}, but must be at least 8"):
+        simplify_hull(np.random.default_rng(0).random((50, 3)), limit)
+
+
+def test_the_settings_allow_no_fewer_vertices_either():
+    lows = {field.name: field.metadata["low"] for field in fields(Objects) if field.name in ("hull_vertices", "piece_vertices")}
+    assert lows == {"hull_vertices": MIN_VERTICES, "piece_vertices": MIN_VERTICES}
 
 
 def test_a_cube_keeps_its_eight_corners():
