@@ -24,7 +24,7 @@ MAX_CACHE_FILE = 2**26
 """Largest cache file [bytes]: 64 MiB; a decomposition has some 10 kB."""
 # Part of the cache's key, as is the text of ShapeRecipe. Raise it with any change to simplification.py or decomposition.py that gives other
 # shapes for the same input.
-_RECIPE = 2
+_RECIPE = 3
 
 
 def default_cache_dir() -> Path:

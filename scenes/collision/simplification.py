@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+from scipy.optimize import linprog, root_scalar
+from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from synpick_warp.errors import CatalogError
 from synpick_warp.scenes.types import ConvexPiece
@@ -20,71 +21,97 @@ from synpick_warp.scenes.types import ConvexPiece
 MIN_VERTICES = 8
 # Maximum vertices of the intermediate, fine hull, whose triangles are clustered.
 _FINE_VERTICES = 256
-# Minimum volume that a further half-space cuts off, and that a further vertex of the fine hull adds, relative to the full hull's volume.
-_MIN_GAIN, _FINE_GAIN = 1e-4, 1e-5
+# Minimum volume that a further vertex of a decimated hull adds, relative to the full hull's volume: of the fine hull, of the fallback.
+_FINE_GAIN, _COARSE_GAIN = 1e-5, 1e-4
+# Exponent of the height in `_gain`. With 1, pieces of the YCB-Video objects reach up to 4.8 mm beyond the full hulls; with 1.25 4.2 mm.
+_HEIGHT_EXPONENT = 1.25
+# Minimum gain of a half-space, as `_gain` defines it, relative to the full hull's volume, with its radius as the unit of length: 0.01 % of
+# the volume, cut off at a height of 1 % of the radius.
+_MIN_GAIN = 1e-4 * 0.01**_HEIGHT_EXPONENT
 # Radius of a cluster of normals [rad]: 3 degrees. Newton's contact manifold samples the vertices of a facet in directions tilted by 2
 # degrees from the contact normal, so that facets closer than this act as one.
 _CLUSTER_ANGLE = np.radians(3.0)
 # Minimum angle between the normals of two facets [rad].
 _MIN_FACET_ANGLE = np.radians(4.0)
-# The first six half-spaces face along the axes; a facet whose normal lies within this angle of an axis takes its place [rad]. Below 35
-# degrees six such half-spaces always enclose a bounded polyhedron.
+# The first six half-spaces face along the axes of a box; a facet whose normal lies within this angle of an axis takes its place [rad].
+# Below 35 degrees six such half-spaces always enclose a bounded polyhedron.
 _FRAME_ANGLE = np.radians(30.0)
+# Weight of a principal axis as the box's second axis, relative to the largest facet's area: below that of any facet that matters.
+_PRINCIPAL_WEIGHT = 1e-3
 # The mean gap of a half-space is averaged over triangles whose normals lie within this angle of its own [rad].
 _FIT_ANGLE = np.radians(20.0)
-# Bisection steps of `_fit_volume`: the inward shift is found to 1/4096 of the mean gap.
-_FIT_STEPS = 12
-# Decimal places to which vertices are rounded [m], so that duplicates of a corner of an intersection become one vertex.
-_DECIMALS = 8
+# Half-spaces selected beyond the allowed number before the least useful are eliminated: none, or as many as the box has, so that all may be
+# replaced. Of both results the smaller polyhedron is taken: round discs keep four sides with none, rounded tetrahedra four with six.
+_SPARE = (0, 6)
+# Tolerance of the root finding in `_fit_volume`, in mean gaps; scaling removes what is left.
+_FIT_TOLERANCE = 1e-3
+# Decimal places, relative to the radius, to which vertices of an intersection are rounded, so that duplicates become one vertex.
+_DECIMALS = 11
+# Distance below which vertices of a result are welded, relative to the largest coordinate: 16 times the rounding to single precision.
+_WELD = 1e-6
+# Minimum radius of the inscribed ball of an intersection that is not empty, relative to the hull's radius.
+_EMPTY = 1e-9
+# An intersection is unbounded if it has a vertex farther from the inner point than this, relative to the hull's radius.
+_FAR = 1e4
 # Maximum angle between the normals of coplanar triangles [rad].
 _COPLANAR_ANGLE = 1e-3
 
 
 @dataclass(frozen=True)
 class _Facets:
-    """Clusters of a hull's triangles as half-spaces n·x ≤ d, largest area first."""
+    """Clusters of a hull's triangles as half-spaces n·x ≤ d, relative to its centroid, largest area first."""
 
     normal: np.ndarray
     """Outward unit normal n (facet, 3)."""
     offset: np.ndarray
-    """Offset d of the supporting plane (facet) [m]."""
+    """Offset d of the supporting plane (facet)."""
     gap: np.ndarray
-    """Mean distance between the plane and the hull's triangles within _FIT_ANGLE, 0 if there are none (facet) [m]."""
+    """Mean distance between the plane and the hull's triangles within _FIT_ANGLE, 0 if there are none (facet)."""
+    axes: np.ndarray
+    """Principal axes of the hull's vertices in columns, each as long as their standard deviation along it (3, 3)."""
 
 
 def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
-    """Approximate the convex hull of points by an intersection of half-spaces, of the hull's volume if `max_vertices` allows it.
+    """Approximate the convex hull of points by an intersection of half-spaces, of the hull's volume.
 
-    A hull of no more vertices, whose facets already differ by _MIN_FACET_ANGLE, is kept. Otherwise its triangles are clustered by
-    their normals, and each cluster gives a half-space. Those that cut off most are chosen greedily, up to `max_vertices`, and moved inward,
-    by at most the mean gap between each and the hull, until the polyhedron has the hull's volume. With few vertices it stays larger, since
-    six half-spaces near the axes come first: a sphere of 16 has 1.3 times the volume, of 8 twice as much, and a thin rod along a diagonal
-    of 8 hundreds of times. Where the intersection fails, the hull of greedily selected points is returned, inside the full one.
+    A hull of no more vertices, whose facets already differ by _MIN_FACET_ANGLE, is kept. Otherwise its triangles are clustered by their
+    normals, and each cluster gives a half-space. Those that cut off most are selected greedily, and moved inward, by at most the mean gap
+    between each and the hull, until the polyhedron has the hull's volume. Where that is not far enough, since `max_vertices` is small, the
+    polyhedron is scaled about its centroid, which moves flat sides, too. Rotating or scaling the points rotates or scales the result up to
+    rounding, unless several half-spaces are equally good. Should Qhull fail on the half-spaces, which no hull thicker than a millionth of
+    its diameter has shown, the hull of greedily selected points is returned, inside the full one.
 
     Args:
         points: (N, 3) [m].
         max_vertices: Maximum number of vertices, at least MIN_VERTICES.
 
     Raises:
-        CatalogError: The points are coplanar.
+        CatalogError: The points are coplanar, or nearly so.
         ValueError: `max_vertices` is below MIN_VERTICES.
     """
     if max_vertices < MIN_VERTICES:
         raise ValueError(f"max_vertices is {max_vertices}, but must be at least {MIN_VERTICES}")
     points = np.unique(points.astype(np.float32), axis=0).astype(np.float64)
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, radius = (low + high) / 2.0, max(float(np.linalg.norm(high - low)) / 2.0, float(np.finfo(np.float32).tiny))
+    full = _hull_of((points - middle) / radius)
+    if len(full.vertices) <= max_vertices and _has_distinct_facets(full):
+        return _to_piece(points[full.vertices])
+    candidates = full.points[full.vertices]
     try:
-        full = ConvexHull(points)
+        vertices = _choose_facets(_decimate(candidates, _FINE_VERTICES, _FINE_GAIN * full.volume), max_vertices, full.volume)
+    except QhullError:
+        hull = _decimate(candidates, max_vertices, _COARSE_GAIN * full.volume)
+        vertices = hull.points[hull.vertices]
+    return _to_piece(vertices * radius + middle)
+
+
+def _hull_of(points: np.ndarray) -> ConvexHull:
+    """Convex hull of points (N, 3); CatalogError if they are coplanar."""
+    try:
+        return ConvexHull(points)
     except QhullError as error:
         raise CatalogError("all vertices lie in one plane; a body needs a volume") from error
-    if len(full.vertices) <= max_vertices and _has_distinct_facets(full):
-        return _to_piece(full)
-    candidates = points[full.vertices]
-    try:
-        polyhedron = _choose_facets(_decimate(candidates, _FINE_VERTICES, _FINE_GAIN * full.volume), max_vertices, full.volume)
-    except QhullError:
-        # The inner point lies outside a half-space that was moved inward, or the points are too flat.
-        return _to_piece(_decimate(candidates, max_vertices, _MIN_GAIN * full.volume))
-    return _to_piece(polyhedron)
 
 
 def _has_distinct_facets(hull: ConvexHull) -> bool:
@@ -94,62 +121,106 @@ def _has_distinct_facets(hull: ConvexHull) -> bool:
     return bool(((angle < _COPLANAR_ANGLE) | (angle > _MIN_FACET_ANGLE)).all())
 
 
-def _choose_facets(hull: ConvexHull, max_vertices: int, volume: float) -> ConvexHull:
-    """Greedy choice of half-spaces, whose intersection has at most `max_vertices`, and the given volume where that is possible."""
-    center = hull.points[hull.vertices].mean(axis=0)
-    facets, chosen = _cluster(hull)
+def _centroid(hull: ConvexHull) -> np.ndarray:
+    """Centroid of a hull: mean of the tetrahedra between its triangles and an inner point, weighted by volume."""
+    inner = hull.points[hull.vertices].mean(axis=0)
+    corners = hull.points[hull.simplices] - inner
+    volume = np.abs(np.linalg.det(corners))
+    return inner + volume @ corners.sum(axis=1) / (4.0 * volume.sum())
+
+
+def _choose_facets(hull: ConvexHull, max_vertices: int, volume: float) -> np.ndarray:
+    """Forward-backward greedy selection of half-spaces; vertices of their intersection, at most `max_vertices`, of the given volume."""
+    center = _centroid(hull)
+    facets, chosen = _cluster(hull, center)
+    # A polyhedron of F facets has at most 2 F - 4 vertices (Euler), wherever its half-spaces are moved.
+    max_facets = (max_vertices + 4) // 2
+    chosen = _select(facets, chosen, max_facets + max(_SPARE), _MIN_GAIN * volume)
+    choices = [_eliminate(facets, chosen[: max_facets + spare], max_facets, _MIN_GAIN * volume) for spare in _SPARE]
+    best = min(choices, key=lambda choice: choice[1].volume)
+    return center + _fit_volume(facets, best[0], volume)
+
+
+def _gain(larger: ConvexHull, smaller: ConvexHull, normal: np.ndarray, offset: float) -> float:
+    """Gain of a half-space that cuts one polyhedron out of another: the volume cut off times its height, so that spikes of little volume
+    go, too."""
+    height = float((larger.points @ normal).max() - offset)
+    return max(0.0, larger.volume - smaller.volume) * max(0.0, height) ** _HEIGHT_EXPONENT
+
+
+def _select(facets: _Facets, chosen: list[int], max_facets: int, min_gain: float) -> list[int]:
+    """Forward selection: add the half-space with the largest gain until there are `max_facets`, or none gains `min_gain`.
+
+    A gain only falls as others are cut off: lazy evaluation (Minoux, 1978) computes few of them anew.
+    """
+    chosen, current = list(chosen), _intersect(facets, chosen)
     gains = np.full(len(facets.normal), np.inf)
     gains[chosen] = -1.0
-    current = _intersect(facets, chosen, facets.offset, center)
-    while (best := _best_facet(facets, chosen, gains, current, center)) is not None:
-        index, polyhedron = best
-        gains[index] = -1.0
-        if len(polyhedron.vertices) > max_vertices:
-            continue
-        if current.volume - polyhedron.volume < _MIN_GAIN * volume:
-            break
-        chosen.append(index)
-        current = polyhedron
-    while len((fitted := _fit_volume(facets, chosen, volume, center)).vertices) > max_vertices:
-        chosen.pop()
-    return fitted
-
-
-def _best_facet(
-    facets: _Facets, chosen: list[int], gains: np.ndarray, current: ConvexHull, center: np.ndarray
-) -> tuple[int, ConvexHull] | None:
-    """The half-space with the largest gain, and the polyhedron with it; None if no candidate is left.
-
-    A gain is the volume cut off times its height, so that spikes of little volume go, too. It only falls as others are cut off: lazy
-    evaluation (Minoux, 1978) computes few of them anew.
-
-    Args:
-        gains: Upper bounds (facet), updated; negative for facets that are no candidates.
-    """
     fresh: dict[int, ConvexHull] = {}
-    while gains.max() >= 0.0:
+    while len(chosen) < max_facets and gains.max() >= min_gain:
         index = int(gains.argmax())
         if index in fresh:
-            return index, fresh[index]
-        fresh[index] = _intersect(facets, [*chosen, index], facets.offset, center)
-        height = float((current.points @ facets.normal[index]).max() - facets.offset[index])
-        gains[index] = max(0.0, current.volume - fresh[index].volume) * max(0.0, height)
-    return None
+            chosen.append(index)
+            gains[index], current, fresh = -1.0, fresh[index], {}
+            continue
+        fresh[index] = _intersect(facets, [*chosen, index])
+        gains[index] = _gain(current, fresh[index], facets.normal[index], facets.offset[index])
+    return chosen
 
 
-def _fit_volume(facets: _Facets, chosen: Sequence[int], volume: float, center: np.ndarray) -> ConvexHull:
-    """Move half-spaces inward, by a common fraction of their mean gaps, until the polyhedron has the given volume: bisection."""
-    low, high = 0.0, 1.0
-    for _ in range(_FIT_STEPS):
-        middle = 0.5 * (low + high)
-        larger = _intersect(facets, chosen, facets.offset - middle * facets.gap, center).volume > volume
-        low, high = (middle, high) if larger else (low, middle)
-    return _intersect(facets, chosen, facets.offset - low * facets.gap, center)
+def _eliminate(facets: _Facets, chosen: list[int], max_facets: int, min_gain: float) -> tuple[list[int], ConvexHull]:
+    """Backward elimination: remove the half-space with the least gain beside the others while there are more than `max_facets`, or it gains
+    less than `min_gain`.
+
+    A gain only grows as others are removed, hence lazy evaluation again. Of more than six half-spaces one can always be removed so that the
+    intersection stays bounded (Steinitz).
+    """
+    chosen, current = list(chosen), _intersect(facets, chosen)
+    gains = np.full(len(facets.normal), np.inf)
+    gains[chosen] = 0.0
+    fresh: dict[int, ConvexHull] = {}
+    while gains.min() < (np.inf if len(chosen) > max_facets else min_gain):
+        index = int(gains.argmin())
+        others = [other for other in chosen if other != index]
+        if index in fresh:
+            gains[index], chosen, current, fresh = np.inf, others, fresh[index], {}
+            continue
+        try:
+            fresh[index] = _intersect(facets, others)
+        except QhullError:  # unbounded
+            gains[index] = np.inf
+            continue
+        gains[index] = _gain(fresh[index], current, facets.normal[index], facets.offset[index])
+    return chosen, current
 
 
-def _cluster(hull: ConvexHull) -> tuple[_Facets, list[int]]:
+def _fit_volume(facets: _Facets, chosen: Sequence[int], volume: float) -> np.ndarray:
+    """Vertices of the intersection whose half-spaces are moved inward, by a common fraction of their mean gaps, to the given volume.
+
+    The cube root of the volume is concave in the shift (Brunn-Minkowski), which suits root finding. If the whole gaps are not
+    enough, the rest is scaling about the centroid.
+    """
+
+    def excess(shift: float) -> float:
+        try:
+            return float(np.cbrt(_intersect(facets, chosen, shift).volume) - np.cbrt(volume))
+        except QhullError:  # moved so far that it is empty
+            return -float(np.cbrt(volume))
+
+    if excess(0.0) <= 0.0:
+        shift = 0.0
+    elif excess(1.0) >= 0.0:
+        shift = 1.0
+    else:
+        shift = root_scalar(excess, method="brentq", bracket=(0.0, 1.0), xtol=_FIT_TOLERANCE).root
+    polyhedron = _intersect(facets, chosen, shift)
+    center = _centroid(polyhedron)
+    return center + (polyhedron.points[polyhedron.vertices] - center) * np.cbrt(volume / polyhedron.volume)
+
+
+def _cluster(hull: ConvexHull, center: np.ndarray) -> tuple[_Facets, list[int]]:
     """Cluster a hull's triangles by normals; returns the half-spaces, and the indices of six that enclose a bounded polyhedron."""
-    corners, normals = hull.points[hull.simplices], hull.equations[:, :3]
+    corners, normals = hull.points[hull.simplices] - center, hull.equations[:, :3]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2.0
     near = normals @ normals.T > np.cos(_CLUSTER_ANGLE)
     free, means = np.ones(len(normals), bool), []
@@ -159,41 +230,94 @@ def _cluster(hull: ConvexHull) -> tuple[_Facets, list[int]]:
         free &= ~members
         mean = area[members] @ normals[members]
         means.append((float(area[members].sum()), mean / np.linalg.norm(mean)))
-    # Larger clusters first: those too near to one of them are left out, and the axes are replaced by facets where there are any.
-    distinct: list[np.ndarray] = []
-    for _, mean in sorted(means, key=lambda cluster: -cluster[0]):
-        if all(mean @ other < np.cos(_MIN_FACET_ANGLE) for other in distinct):
-            distinct.append(mean)
-    frame: list[int] = []
-    for axis in np.concatenate([np.eye(3), -np.eye(3)]):
-        aligned = [index for index, normal in enumerate(distinct) if normal @ axis > np.cos(_FRAME_ANGLE)]
-        if not aligned:
-            distinct.append(axis)
-        frame.append(aligned[0] if aligned else len(distinct) - 1)
-    normal = np.stack(distinct)
-    offset = (normal @ hull.points[hull.vertices].T).max(axis=1)
+    # Larger clusters first: those too near to one of them are left out.
+    distinct: list[tuple[float, np.ndarray]] = []
+    for size, mean in sorted(means, key=lambda cluster: -cluster[0]):
+        if all(mean @ other < np.cos(_MIN_FACET_ANGLE) for _, other in distinct):
+            distinct.append((size, mean))
+    axes = _principal_axes(hull.points[hull.vertices])
+    normal, frame = _add_frame(np.array([size for size, _ in distinct]), np.stack([mean for _, mean in distinct]), axes)
+    offset = (normal @ (hull.points[hull.vertices] - center).T).max(axis=1)
     cosine = normals @ normal.T
     weight = np.where(cosine > np.cos(_FIT_ANGLE), area[:, None] * cosine, 0.0)
     mean_offset = np.einsum("tf,fi,ti->f", weight, normal, corners.mean(axis=1)) / np.maximum(weight.sum(axis=0), np.finfo(float).tiny)
     gap = np.where(weight.sum(axis=0) > 0.0, offset - mean_offset, 0.0)
-    return _Facets(normal, offset, gap), list(dict.fromkeys(frame))
+    return _Facets(normal, offset, gap, axes), frame
 
 
-def _intersect(facets: _Facets, chosen: Sequence[int], offset: np.ndarray, center: np.ndarray) -> ConvexHull:
-    """Hull of the vertices of an intersection of half-spaces with the given offsets (facet) around an inner point."""
-    half_spaces = np.concatenate([facets.normal[chosen], -offset[chosen, None]], axis=1)
-    vertices = HalfspaceIntersection(half_spaces, center).intersections
-    return ConvexHull(np.unique(vertices.round(_DECIMALS), axis=0))
+def _principal_axes(points: np.ndarray) -> np.ndarray:
+    """Eigenvectors of the covariance of points in columns, each as long as the square root of its eigenvalue (3, 3)."""
+    _, deviations, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    return axes.T * deviations / np.sqrt(len(points))
+
+
+def _add_frame(area: np.ndarray, normal: np.ndarray, principal: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """Add the sides of an enclosing box to normals (facet, 3), where no facet is near; returns all, and the indices of the six.
+
+    The box has one side along the largest facet; the facet of the largest area projected onto the plane across gives the second axis,
+    or a principal axis (3, 3) if all facets face the same way or back.
+    """
+    first = normal[int(area.argmax())]
+    vectors = np.concatenate([normal, (principal / np.linalg.norm(principal, axis=0)).T])
+    across = vectors - np.outer(vectors @ first, first)
+    weight = np.append(area, np.full(3, _PRINCIPAL_WEIGHT * area.max()))
+    second = across[int((weight * np.linalg.norm(across, axis=1)).argmax())]
+    second = second / np.linalg.norm(second)
+    axes = np.stack([first, second, np.cross(first, second)])
+    frame, added = [], []
+    for axis in np.concatenate([axes, -axes]):
+        score = area * (normal @ axis - np.cos(_FRAME_ANGLE))
+        if score.max() > 0.0:
+            frame.append(int(score.argmax()))
+        else:
+            frame.append(len(normal) + len(added))
+            added.append(axis)
+    return np.concatenate([normal, np.reshape(added, (-1, 3))]), list(dict.fromkeys(frame))
+
+
+def _intersect(facets: _Facets, chosen: Sequence[int], shift: float = 0.0) -> ConvexHull:
+    """Hull of the vertices of an intersection of half-spaces, each moved inward by `shift` gaps.
+
+    Computed in coordinates along the principal axes, in standard deviations: for flat hulls Qhull would merge dual points otherwise.
+
+    Raises:
+        QhullError: It is empty or unbounded.
+    """
+    normal, offset = facets.normal[chosen] @ facets.axes, facets.offset[chosen] - shift * facets.gap[chosen]
+    length = np.linalg.norm(normal, axis=1)
+    normal, offset = normal / length[:, None], offset / length
+    # The centroid lies inside of the supporting planes, but not of all planes that were moved inward.
+    inner = np.zeros(3) if shift == 0.0 else _chebyshev_center(normal, offset)
+    with np.errstate(divide="ignore"):  # A facet of the dual hull through the inner point is a vertex at infinity.
+        intersection = HalfspaceIntersection(np.column_stack([normal, -offset]), inner)
+    # A facet of the dual hull at distance b from the inner point is a vertex at distance 1/b from it.
+    if intersection.dual_equations[:, 3].max() > -1.0 / _FAR:
+        raise QhullError("the intersection is unbounded")
+    vertices = np.unique(intersection.intersections.round(_DECIMALS), axis=0)
+    return ConvexHull(vertices @ facets.axes.T)
+
+
+def _chebyshev_center(normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Centre of the largest ball inside an intersection of half-spaces: a linear program.
+
+    Raises:
+        QhullError: The intersection is empty.
+    """
+    constraints = np.column_stack([normal, np.ones(len(normal))])
+    result = linprog((0.0, 0.0, 0.0, -1.0), constraints, offset, bounds=[(None, None)] * 3 + [(0.0, None)])
+    if not result.success or result.x[3] < _EMPTY:
+        raise QhullError("the intersection is empty")
+    return result.x[:3]
 
 
 def _decimate(candidates: np.ndarray, max_vertices: int, min_gain: float) -> ConvexHull:
     """Greedy selection of points whose convex hull has nearly the volume of the full hull.
 
-    Starting from `_extreme_points`, the point with the largest volume gain is added until there are `max_vertices`, or the gain falls
+    Starting from `_spanning_points`, the point with the largest volume gain is added until there are `max_vertices`, or the gain falls
     below `min_gain` [m³]. The gain of a point p is the volume of the pyramids over the faces visible from it, Σ max(0, n·p + d) A / 3.
     """
-    chosen = _extreme_points(candidates)
-    hull = ConvexHull(candidates[chosen])
+    chosen = _spanning_points(candidates)
+    hull = _hull_of(candidates[chosen])
     while len(chosen) < max_vertices:
         corners = hull.points[hull.simplices]
         areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2.0
@@ -202,25 +326,28 @@ def _decimate(candidates: np.ndarray, max_vertices: int, min_gain: float) -> Con
         if gains[best] < min_gain or best in chosen:
             break
         chosen.append(best)
-        hull = ConvexHull(candidates[chosen])
+        hull = _hull_of(candidates[chosen])
     return hull
 
 
-def _extreme_points(points: np.ndarray) -> list[int]:
-    """Initial vertices, at most six: indices of four points that span a tetrahedron, then of extreme points along the axes."""
-    chosen = {int(index) for axis in range(3) for index in (points[:, axis].argmin(), points[:, axis].argmax())}
-    first = points[min(chosen)]
-    far = int(np.linalg.norm(points - first, axis=1).argmax())
-    line = points[far] - first
-    wide = int(np.linalg.norm(np.cross(points - first, line), axis=1).argmax())
-    high = int(np.abs((points - first) @ np.cross(line, points[wide] - first)).argmax())
-    spanning = [min(chosen), far, wide, high]
-    # The four span a tetrahedron; the extreme points along the axes alone may be coplanar.
-    return list(dict.fromkeys([*spanning, *sorted(chosen)]))[:6]
+def _spanning_points(points: np.ndarray) -> list[int]:
+    """Indices of four points that span a tetrahedron: each the farthest from the mean, from the first point, the line, the plane so far."""
+    start = int(np.linalg.norm(points - points.mean(axis=0), axis=1).argmax())
+    far = int(np.linalg.norm(points - points[start], axis=1).argmax())
+    line = points[far] - points[start]
+    wide = int(np.linalg.norm(np.cross(points - points[start], line), axis=1).argmax())
+    high = int(np.abs((points - points[start]) @ np.cross(line, points[wide] - points[start])).argmax())
+    return [start, far, wide, high]
 
 
-def _to_piece(hull: ConvexHull) -> ConvexPiece:
-    """The hull's vertices and triangles. Outward orientation spreads over shared edges: normals of thin triangles are unreliable."""
+def _to_piece(points: np.ndarray) -> ConvexPiece:
+    """Vertices and triangles of the hull of points in single precision, of which near ones are welded.
+
+    Outward orientation spreads over shared edges: normals of thin triangles are unreliable.
+    """
+    points = points.astype(np.float32).astype(np.float64)
+    near = KDTree(points).query_pairs(_WELD * np.abs(points).max(), output_type="ndarray")
+    hull = _hull_of(np.delete(points, near[:, 1], axis=0))
     faces = hull.simplices.copy()
     corners = hull.points[faces]
     doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
