@@ -77,7 +77,7 @@ class Objects:
     hull_vertices: int = setting(
         64,
         "",
-        "Maximum vertices of a convex hull. With 64, all but 5 % of the vertices of the real objects' hulls lie less than 2.1 mm outside.",
+        "Maximum vertices of a convex hull. With 64, all but 5 % of the vertices of the real objects' hulls lie less than 2.5 mm outside.",
         low=8,
         high=256,
     )
