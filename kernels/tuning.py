@@ -13,6 +13,8 @@ COARSE_PATH_REGISTERS = 56
 """Register limit of kernels that trace whole paths, which are fastest with slightly fewer."""
 SHADE_REGISTERS = 80
 """Register limit of the shading kernel, which waits for memory less than ray tracing does, and keeps more values live."""
+SAMPLE_SHADE_REGISTERS = 128
+"""The same where several points of a pixel are shaded: fewer spill more (from ptxas for sm_90, not timed)."""
 FILTER_REGISTERS = 80
 """Register limit of the denoiser's block filter: the smallest without spills, for the highest occupancy (from ptxas for sm_90; other limits
 were not timed)."""

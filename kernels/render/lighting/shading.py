@@ -1,4 +1,8 @@
-"""Deferred shading: radiance of each pixel from the G-buffer, denoised visibility ratios, indirect light and sun visibility."""
+"""Deferred shading: radiance of each pixel from the G-buffer, denoised visibility ratios, indirect light and sun visibility.
+
+`shade_kernel` shades the middle of each pixel. `shade_samples_kernel` supersamples: the denoised light is that of the pixel, textures and
+normals are those of several points of the surface.
+"""
 
 import warp as wp
 
@@ -6,7 +10,13 @@ from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.brdf import AlbedoTables, Brdf, evaluate_disc, make_brdf
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid
 from synpick_warp.kernels.render.lighting.environment import Lights, environment_radiance, rotate_z
-from synpick_warp.kernels.render.lighting.materials import interpolate_surface, make_table_surface, sample_base_color, widen_roughness
+from synpick_warp.kernels.render.lighting.materials import (
+    Surface,
+    interpolate_surface,
+    make_table_surface,
+    sample_base_color,
+    widen_roughness,
+)
 from synpick_warp.kernels.render.lighting.path_tracing import PathScene
 from synpick_warp.kernels.render.lighting.plane_distance import tangent_plane
 from synpick_warp.kernels.render.lighting.shadows import upsample_shadow
@@ -14,9 +24,36 @@ from synpick_warp.kernels.render.lighting.unoccluded import unoccluded_light
 from synpick_warp.kernels.render.lighting.upsampling import RatioImages, Ratios, upsample_ratios
 from synpick_warp.kernels.render.visibility.camera import Cameras, Views, camera_ray, in_image, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, ViewBodies, body_of
-from synpick_warp.kernels.tuning import SHADE_REGISTERS
+from synpick_warp.kernels.render.visibility.triangles import camera_triangle, edge_areas
+from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
+
+SAMPLE_COLUMNS = wp.constant(2)
+"""Supersampling: shaded points of a pixel along each axis."""
+MAX_EXTRAPOLATION = wp.constant(1.0)
+"""Supersampling: largest change of a barycentric weight between the middle of a pixel and a shaded point. Triangles may be narrower than
+pixels, and their normals and texture coordinates hold only near them."""
+
+
+@wp.struct
+class Sky:
+    """Environment of a world."""
+
+    light: int
+    """Index of the environment map."""
+    yaw: float
+    """Rotation of the map about +z, counter-clockwise [rad]."""
+
+
+@wp.struct
+class PixelLight:
+    """Light that reaches a pixel's surface, as a fraction of the unoccluded light."""
+
+    ratios: Ratios
+    """Denoised light of the environment and of other surfaces; `indirect` is not a ratio."""
+    sun: float
+    """Visibility of the sun."""
 
 
 @wp.func
@@ -31,6 +68,154 @@ def shade_surface(tables: AlbedoTables, lights: Lights, light: int, yaw: float, 
         reflected = evaluate_disc(tables, brdf, to_sun, lights.sun_radius[light])
         result += sun * wp.cw_mul(reflected, lights.sun_irradiance[light])
     return result
+
+
+@wp.func
+def gather_light(
+    scene: PathScene,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    shadow_grid: CoarseGrid,
+    sky: Sky,
+    gbuffer: GBuffer,
+    ratios: RatioImages,
+    sun_visibility: wp.array3d[wp.uint64],
+    camera: int,
+    view: int,
+    row: int,
+    column: int,
+    face_normal: wp.vec3,
+) -> PixelLight:
+    """Upsample the denoised light and the sun's visibility to a pixel whose surface has the geometric normal `face_normal`."""
+    segment = gbuffer.segment[view, row, column]
+    normal = wp.transpose(cameras.to_world[camera]) * face_normal
+    plane = tangent_plane(cameras.intrinsics[camera], row, column, segment, gbuffer.depth[view, row, column], normal)
+    result = PixelLight()
+    if wp.max(scene.lights.sun_irradiance[sky.light]) > 0.0:
+        if wp.dot(face_normal, rotate_z(scene.lights.sun_direction[sky.light], sky.yaw)) > 0.0:
+            result.sun = upsample_shadow(sun_visibility, shadow_grid, view, row, column, plane)
+    result.ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
+    result.ratios.indirect = result.ratios.indirect / scene.lights.exposure[sky.light]
+    return result
+
+
+@wp.func
+def shade_point(scene: PathScene, sky: Sky, surface: Surface, outgoing: wp.vec3, light: PixelLight) -> wp.vec3:
+    """Radiance of a point of a surface towards the camera, the direction `outgoing`."""
+    color = sample_base_color(scene.surfaces, surface)
+    metallic = scene.surfaces.metallic[surface.row]
+    roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
+    brdf = make_brdf(scene.surfaces.albedo, color, metallic, roughness, surface.normal, outgoing)
+    return shade_surface(scene.surfaces.albedo, scene.lights, sky.light, sky.yaw, brdf, light.ratios, light.sun)
+
+
+@wp.func
+def sample_offset(sample: int) -> wp.vec2:
+    """Offset of a shaded point from the middle of its pixel [px]: the middle of one of SAMPLE_COLUMNS x SAMPLE_COLUMNS squares."""
+    scale = 1.0 / float(SAMPLE_COLUMNS)
+    return wp.vec2((float(sample % SAMPLE_COLUMNS) + 0.5) * scale - 0.5, (float(sample // SAMPLE_COLUMNS) + 0.5) * scale - 0.5)
+
+
+@wp.func
+def move_weights(middle: wp.vec3, areas: wp.vec3) -> tuple[wp.vec3, float]:
+    """Move barycentric weights from a pixel's middle towards a shaded point, whose weights are `areas` over their sum.
+
+    Returns the weights and the fraction of the way that they moved: less than 1 if a weight would change by more than MAX_EXTRAPOLATION.
+    """
+    total = areas[0] + areas[1] + areas[2]
+    if total == 0.0:
+        return middle, 0.0
+    change = areas / total - middle
+    fraction = MAX_EXTRAPOLATION / wp.max(wp.max(wp.abs(change)), MAX_EXTRAPOLATION)
+    return middle + fraction * change, fraction
+
+
+@wp.func
+def world_sky(light: wp.array[int], light_yaw: wp.array[float], world: int) -> Sky:
+    """Environment of a world, from the arrays over all worlds."""
+    sky = Sky()
+    sky.light = light[world]
+    sky.yaw = light_yaw[world]
+    return sky
+
+
+@wp.func
+def shade_middle(
+    scene: PathScene,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    shadow_grid: CoarseGrid,
+    sky: Sky,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    ratios: RatioImages,
+    sun_visibility: wp.array3d[wp.uint64],
+    views: Views,
+    view: int,
+    row: int,
+    column: int,
+) -> wp.vec3:
+    """Radiance of a pixel, by the point in its middle; background pixels show the environment map."""
+    camera = views.camera[view]
+    intrinsics = cameras.intrinsics[camera]
+    outgoing = -wp.normalize(cameras.to_world[camera] * camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
+    segment = int(gbuffer.segment[view, row, column])
+    if segment == Segment.NOTHING:
+        return environment_radiance(scene.lights, sky.light, rotate_z(-outgoing, -sky.yaw))
+    surface = make_table_surface(scene.meshes, outgoing)
+    if segment != Segment.TABLE:
+        triangle = gbuffer.triangle[view, row, column]
+        barycentric = gbuffer.barycentric[view, row, column]
+        body = body_of(segment, views.instances)
+        width = gbuffer.depth[view, row, column] / intrinsics[0]
+        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
+    light = gather_light(
+        scene, cameras, coarse, shadow_grid, sky, gbuffer, ratios, sun_visibility, camera, view, row, column, surface.face_normal
+    )
+    return shade_point(scene, sky, surface, outgoing, light)
+
+
+@wp.func
+def shade_samples(
+    scene: PathScene,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    shadow_grid: CoarseGrid,
+    sky: Sky,
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    ratios: RatioImages,
+    sun_visibility: wp.array3d[wp.uint64],
+    views: Views,
+    view: int,
+    row: int,
+    column: int,
+) -> wp.vec3:
+    """Radiance of a pixel that shows a body: mean of SAMPLE_COLUMNS² points on the plane of its triangle, in the light of the pixel."""
+    camera = views.camera[view]
+    intrinsics = cameras.intrinsics[camera]
+    body = body_of(int(gbuffer.segment[view, row, column]), views.instances)
+    triangle = gbuffer.triangle[view, row, column]
+    barycentric = gbuffer.barycentric[view, row, column]
+    width = gbuffer.depth[view, row, column] / intrinsics[0]
+    outgoing = -wp.normalize(cameras.to_world[camera] * camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
+    surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
+    light = gather_light(
+        scene, cameras, coarse, shadow_grid, sky, gbuffer, ratios, sun_visibility, camera, view, row, column, surface.face_normal
+    )
+    corners = camera_triangle(scene.meshes, bodies, view, body, triangle)
+    middle = wp.vec3(barycentric[0], barycentric[1], 1.0 - barycentric[0] - barycentric[1])
+    total = wp.vec3(0.0)
+    for sample in range(SAMPLE_COLUMNS * SAMPLE_COLUMNS):
+        ray = camera_ray(intrinsics, row, column, sample_offset(sample))
+        weights, fraction = move_weights(middle, edge_areas(corners, ray))
+        point = wp.vec2(weights[0], weights[1])
+        outgoing = -wp.normalize(cameras.to_world[camera] * ray)
+        # The points share the pixel's area; where they come closer together, the footprints overlap.
+        share = 1.0 - fraction * (1.0 - 1.0 / float(SAMPLE_COLUMNS))
+        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, point, outgoing, share * width)
+        total += shade_point(scene, sky, surface, outgoing, light)
+    return total / float(SAMPLE_COLUMNS * SAMPLE_COLUMNS)
 
 
 @wp.kernel(cuda_max_registers=SHADE_REGISTERS)
@@ -55,36 +240,44 @@ def shade_kernel(
 ):
     """Shade each pixel with its own surface and the denoised light around it; background pixels show the environment map."""
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
+    if in_image(coarse.image, row, column):
+        sky = world_sky(light, light_yaw, views.world[view])
+        radiance_out[view, row, column] = shade_middle(
+            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column
+        )
+
+
+@wp.kernel(cuda_max_registers=SAMPLE_SHADE_REGISTERS)
+def shade_samples_kernel(
+    # Scene:
+    scene: PathScene,
+    cameras: Cameras,
+    coarse: CoarseGrid,
+    shadow_grid: CoarseGrid,
+    # State: worlds
+    light: wp.array[int],  # (world)
+    light_yaw: wp.array[float],  # (world) [rad]
+    # In:
+    bodies: ViewBodies,
+    gbuffer: GBuffer,
+    ratios: RatioImages,
+    sun_visibility: wp.array3d[wp.uint64],  # (view, shadow_row, shadow_column)
+    views: Views,
+    first: int,
+    # Out:
+    radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
+):
+    """Shade each pixel as `shade_kernel`, but bodies with several points a pixel (supersampling)."""
+    view, row, column = tile_pixel(coarse.image, wp.tid() + first)
     if not in_image(coarse.image, row, column):
         return
-    camera = views.camera[view]
-    which = light[views.world[view]]
-    yaw = light_yaw[views.world[view]]
-    intrinsics = cameras.intrinsics[camera]
-    ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
-    outgoing = -wp.normalize(cameras.to_world[camera] * ray)
+    sky = world_sky(light, light_yaw, views.world[view])
     segment = int(gbuffer.segment[view, row, column])
-    if segment == Segment.NOTHING:
-        radiance_out[view, row, column] = environment_radiance(scene.lights, which, rotate_z(-outgoing, -yaw))
-        return
-    depth = gbuffer.depth[view, row, column]
-    surface = make_table_surface(scene.meshes, outgoing)
-    if segment != Segment.TABLE:
-        triangle = gbuffer.triangle[view, row, column]
-        barycentric = gbuffer.barycentric[view, row, column]
-        body = body_of(segment, views.instances)
-        width = depth / intrinsics[0]
-        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
-    normal = wp.transpose(cameras.to_world[camera]) * surface.face_normal
-    plane = tangent_plane(intrinsics, row, column, gbuffer.segment[view, row, column], depth, normal)
-    sun = float(0.0)
-    if wp.max(scene.lights.sun_irradiance[which]) > 0.0:
-        if wp.dot(surface.face_normal, rotate_z(scene.lights.sun_direction[which], yaw)) > 0.0:
-            sun = upsample_shadow(sun_visibility, shadow_grid, view, row, column, plane)
-    pixel_ratios = upsample_ratios(ratios, coarse, view, row, column, plane)
-    pixel_ratios.indirect = pixel_ratios.indirect / scene.lights.exposure[which]
-    color = sample_base_color(scene.surfaces, surface)
-    metallic = scene.surfaces.metallic[surface.row]
-    roughness = widen_roughness(scene.surfaces.roughness[surface.row], surface.normal_spread)
-    brdf = make_brdf(scene.surfaces.albedo, color, metallic, roughness, surface.normal, outgoing)
-    radiance_out[view, row, column] = shade_surface(scene.surfaces.albedo, scene.lights, which, yaw, brdf, pixel_ratios, sun)
+    if segment == Segment.NOTHING or segment == Segment.TABLE:
+        radiance_out[view, row, column] = shade_middle(
+            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column
+        )
+    else:
+        radiance_out[view, row, column] = shade_samples(
+            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column
+        )

@@ -79,21 +79,25 @@ def cross(a: wp.vec2, b: wp.vec2) -> float:
 
 
 @wp.func
+def edge_areas(triangle: Triangle, ray: wp.vec3) -> wp.vec3:
+    """Barycentric weights of a, b, c, not yet divided by their sum, at the point where a camera ray meets a triangle's plane."""
+    a = beside_ray(triangle.a, triangle.near, ray)
+    b = beside_ray(triangle.b, triangle.near, ray)
+    c = beside_ray(triangle.c, triangle.near, ray)
+    return wp.vec3(cross(c, b), cross(a, c), cross(b, a))
+
+
+@wp.func
 def ray_weights(triangle: Triangle, ray: wp.vec3) -> wp.vec3:
     """Watertight ray/triangle intersection (Woop, Benthin and Wald, 2013): barycentric weights of a, b, c, edges included; -1: a miss.
 
     All rays start at the camera and have the optical axis as their dominant axis.
     """
-    a = beside_ray(triangle.a, triangle.near, ray)
-    b = beside_ray(triangle.b, triangle.near, ray)
-    c = beside_ray(triangle.c, triangle.near, ray)
-    u = cross(c, b)
-    v = cross(a, c)
-    w = cross(b, a)
-    total = u + v + w
-    if ((u < 0.0 or v < 0.0 or w < 0.0) and (u > 0.0 or v > 0.0 or w > 0.0)) or total == 0.0:
+    areas = edge_areas(triangle, ray)
+    total = areas[0] + areas[1] + areas[2]
+    if (wp.min(areas) < 0.0 and wp.max(areas) > 0.0) or total == 0.0:
         return wp.vec3(-1.0, -1.0, -1.0)
-    return wp.vec3(u / total, v / total, w / total)
+    return areas / total
 
 
 @wp.func

@@ -88,4 +88,7 @@ def test_subpixel_highlights_are_neither_lost_nor_sparkle(device, monkeypatch):
     assert steady.mean() == pytest.approx(truth, rel=0.12)
     assert np.abs(steady / truth - 1.0).max() < 0.35
     monkeypatch.setattr(scene, "normal_gradient", lambda mesh: np.zeros(len(mesh.faces), np.float32))
-    assert brightness_while_moving(device, light).mean() < 0.6 * truth
+    # Without it, most images lose the highlight, and it sparkles in the others.
+    sparkling = brightness_while_moving(device, light) / truth
+    assert np.median(sparkling) < 0.6
+    assert sparkling.max() > 1.5

@@ -1,0 +1,114 @@
+"""Supersampled shading of narrow images: where its points lie, when it is used, and that it comes nearer to a pixel's mean."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import warp as wp
+
+from synpick_warp.configs.schema import FAST, UNOCCLUDED, Config
+from synpick_warp.kernels.render.lighting.shading import MAX_EXTRAPOLATION, shade_kernel, shade_samples_kernel
+from synpick_warp.scenes.types import EnvironmentMap, Material
+from synpick_warp.stages.render import denoised
+from tests.harness.shading_probe import move_weights_kernel
+from tests.worlds.toy_scene import ToyScene, ball, camera, entry, render, sheet
+
+WIDTH, HEIGHT, FINE = 64, 48, 8
+"""Image size, and the number of pixels of a finer image along one of its pixels."""
+TILTED = (0.0, 0.0, 0.0, np.sin(0.5), 0.0, 0.0, np.cos(0.5))
+"""Pose of a body that is turned by 1 rad about the image's x axis."""
+STRIPES = EnvironmentMap(
+    "stripes", np.broadcast_to(np.where(np.arange(64) // 2 % 2, 1.5, 0.5)[:, None, None], (64, 128, 3)).astype(np.float32)
+)
+"""Sky with horizontal stripes, six degrees wide."""
+
+
+def view(scale: int = 1):
+    return camera(scale * WIDTH, scale * HEIGHT, scale * 200.0, (0.0, 0.0, 2.0))
+
+
+def render_config(**settings):
+    return replace(Config().render, **settings)
+
+
+def radiance_of(mesh, material, pose, device, scale=1) -> np.ndarray:
+    scene = ToyScene([entry(mesh, material)], [[(0, pose)]], (view(scale),), lights=(STRIPES,))
+    return render(scene, device).radiance[0]
+
+
+@pytest.mark.parametrize(
+    ("settings", "width", "histories", "expected"),
+    [
+        ({}, 320, 3, True),
+        ({}, 959, 3, True),
+        ({}, 960, 3, False),
+        ({}, 1920, 3, False),
+        ({"coarse_pixel": 1}, 1920, 3, True),
+        ({"coarse_pixel": 2}, 320, 3, False),
+        ({"mode": UNOCCLUDED}, 320, 0, False),
+        ({"mode": FAST}, 320, 0, True),
+    ],
+)
+def test_images_whose_coarse_pixels_are_pixels_are_supersampled(settings, width, histories, expected):
+    assert denoised.supersamples(render_config(**settings), width, histories) == expected
+
+
+def test_points_lie_on_the_plane_of_the_triangle(device):
+    """Against float64: random triangles before the camera, rays near their middles; some triangles are narrower than the offset."""
+    random = np.random.default_rng(6)
+    count = 400
+    size = 10.0 ** random.uniform(-4.0, -1.0, (count, 1, 1))
+    corners = np.array([0.1, -0.05, 1.0]) + random.normal(size=(count, 3, 3)) * size
+    middle = random.dirichlet((1.0, 1.0, 1.0), count)
+    point = np.einsum("nk,nkd->nd", middle, corners)
+    ray = point / point[:, 2:] + np.c_[random.uniform(-1e-3, 1e-3, (count, 2)), np.zeros(count)]
+    inputs = [wp.array(values.astype(np.float32), dtype=wp.vec3, device=device) for values in (corners, ray, middle)]
+    weights, fraction = wp.empty(count, dtype=wp.vec3, device=device), wp.empty(count, dtype=float, device=device)
+    wp.launch(move_weights_kernel, dim=count, inputs=inputs, outputs=[weights, fraction], device=device)
+    on_plane = np.linalg.solve(corners.transpose(0, 2, 1), ray[..., None])[..., 0]
+    change = on_plane / on_plane.sum(1, keepdims=True) - middle
+    largest = np.abs(change).max(1)
+    expected = np.minimum(1.0, float(MAX_EXTRAPOLATION) / largest)
+    facing = np.abs(np.linalg.det(corners)) > 1e-2 * size[:, 0, 0] ** 2
+    assert facing.sum() > count // 2
+    assert (expected[facing] < 1.0).any()
+    assert (expected[facing] == 1.0).any()
+    np.testing.assert_allclose(fraction.numpy()[facing], expected[facing], rtol=0.02)
+    np.testing.assert_allclose(weights.numpy()[facing], (middle + expected[:, None] * change)[facing], atol=0.02)
+
+
+def test_a_triangle_seen_edge_on_keeps_the_middle(device):
+    corners = wp.array(np.array([[(0, 0, 1), (0, 0, 2), (0, 0, 3)]], np.float32), dtype=wp.vec3, device=device)
+    ray, middle = (wp.array([wp.vec3(*values)], dtype=wp.vec3, device=device) for values in ((0.0, 0.0, 1.0), (0.2, 0.3, 0.5)))
+    weights, fraction = wp.empty(1, dtype=wp.vec3, device=device), wp.empty(1, dtype=float, device=device)
+    wp.launch(move_weights_kernel, dim=1, inputs=[corners, ray, middle], outputs=[weights, fraction], device=device)
+    np.testing.assert_allclose(weights.numpy()[0], (0.2, 0.3, 0.5), rtol=1e-6)
+    assert fraction.numpy()[0] == 0.0
+
+
+def test_a_plain_flat_surface_is_the_same_with_either_kernel(device, monkeypatch):
+    """Each point of a matt, evenly lit sheet has the same radiance."""
+    matt = Material(color=(0.5, 0.4, 0.3), texture=None, metallic=0.0, roughness=1.0)
+    found = radiance_of(sheet(0.4, 0.3), matt, TILTED, device)
+    monkeypatch.setattr(denoised, "supersamples", lambda *_: False)
+    np.testing.assert_allclose(found, radiance_of(sheet(0.4, 0.3), matt, TILTED, device), rtol=2e-3)
+
+
+@pytest.mark.parametrize("shape", ["texture", "normals"])
+def test_the_mean_of_a_pixel_is_approached(device, monkeypatch, shape):
+    """Against the mean of FINE² pixels of a finer image: a texture of squares 1.3 px wide, and a polished ball under a sky with stripes."""
+    random = np.random.default_rng(7)
+    if shape == "texture":
+        texture = np.repeat(np.repeat(random.integers(0, 255, (32, 32, 3)), 8, 0), 8, 1).astype(np.uint8)
+        body = sheet(0.4, 0.4), Material(color=(1.0, 1.0, 1.0), texture=texture, metallic=0.0, roughness=1.0), TILTED
+    else:
+        body = ball(0.1, 3), Material(color=(1.0, 1.0, 1.0), texture=None, metallic=1.0, roughness=0.1), TILTED
+    inner = np.s_[HEIGHT // 2 - 4 : HEIGHT // 2 + 4, WIDTH // 2 - 8 : WIDTH // 2 + 8]
+    mean = radiance_of(*body, device, FINE).reshape(HEIGHT, FINE, WIDTH, FINE, 3).mean((1, 3))[inner]
+    errors = []
+    for kernel in (shade_samples_kernel, shade_kernel):
+        monkeypatch.setattr(denoised, "shade_samples_kernel", kernel)
+        errors.append(np.sqrt(np.square(radiance_of(*body, device)[inner] - mean).mean()))
+    assert errors[0] < 0.7 * errors[1]
