@@ -123,11 +123,13 @@ def move_weights(middle: wp.vec3, areas: wp.vec3) -> tuple[wp.vec3, float]:
     Returns the weights and the fraction of the way that they moved: less than 1 if a weight would change by more than MAX_EXTRAPOLATION.
     """
     total = areas[0] + areas[1] + areas[2]
-    if total == 0.0:
+    limit = MAX_EXTRAPOLATION * wp.abs(total)
+    if limit == 0.0:
         return middle, 0.0
-    change = areas / total - middle
-    fraction = MAX_EXTRAPOLATION / wp.max(wp.max(wp.abs(change)), MAX_EXTRAPOLATION)
-    return middle + fraction * change, fraction
+    # All changes times the sum, which may be small: no quotient of these overflows.
+    change = areas - total * middle
+    reach = wp.max(wp.max(wp.abs(change)), limit)
+    return middle + (MAX_EXTRAPOLATION * wp.sign(total) / reach) * change, limit / reach
 
 
 @wp.func
