@@ -1,7 +1,8 @@
 """List scheduling of worlds on a GPU: those with the most contact colors start first (longest processing time first, Graham 1969).
 
-A GPU starts blocks in the order of their indices, and holds fewer worlds at a time than a large model has. If a world with many colors
-started late, its block would still run when all others have ended.
+Colors are the groups of the contact graph coloring. A world solves them one after another, so that their number estimates its run time.
+GPUs usually start blocks in the order of their indices, and run fewer worlds at a time than a large simulation has: a world with many
+colors that starts late runs on while the rest of the GPU idles. The order affects only speed.
 """
 
 import warp as wp
@@ -9,16 +10,17 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 COLOR_BINS = wp.constant(128)
-"""Bins of the counting sort, one for each number of colors; worlds with more share the last one. Of 2,048 piles of real objects half have
-at most 28 colors, one in a hundred 90, none more than 108."""
+"""Bins of the counting sort, one for each number of colors in descending order; worlds with COLOR_BINS - 1 colors or more share bin 0.
+2,048 piles of real objects have 28 colors in the median, 90 at the 99th percentile, at most 108."""
 
 
 @wp.func
 def count_colors(offsets: wp.array[int], first: int, entries: int) -> int:
-    """Number of colors of a world: the first entry that equals the last one, by binary search.
+    """Number of colors of a world: index of its first entry that equals the last one, by binary search.
 
     Args:
-        offsets: For each world and color the index of its first unit; the last entry of a world is its number of units.
+        offsets: For each world and color the index of the color's first unit (a contact with its friction), nondecreasing; the world's
+            further entries, also the last one, are its number of units.
         first: Index of the world's first entry.
         entries: Entries of a world.
     """
@@ -35,16 +37,16 @@ def count_colors(offsets: wp.array[int], first: int, entries: int) -> int:
 
 
 @wp.kernel
-def count_worlds_kernel(
+def bin_worlds_kernel(
     # In:
     color_offsets: wp.array[int],  # (world * entries)
     entries: int,
     # Out:
-    bin_size_inout: wp.array[int],  # (bin), from zero
+    bin_size_inout: wp.array[int],  # (bin), zero before the launch
     bin_out: wp.array[int],  # (world)
     place_out: wp.array[int],  # (world)
 ):
-    """Counting sort, first pass: bin of each world, its place in the bin, and the sizes of the bins. The most colors are in bin 0."""
+    """Counting sort, first pass: bin of each world, its place in the bin, and the sizes of the bins."""
     world = wp.tid()
     colors = wp.min(count_colors(color_offsets, world * entries, entries), COLOR_BINS - 1)
     bin = COLOR_BINS - 1 - colors

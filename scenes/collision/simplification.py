@@ -1,8 +1,8 @@
 """Convex hull simplification: few vertices, and planar facets whose normals differ by at least 4 degrees.
 
 Scanned models have flat sides made of triangles whose normals differ by about a degree. Between two such sides, collision detection finds a
-single contact point, which jumps from step to step, and resting objects jitter. An intersection of few half-spaces has exactly planar
-sides, between which it finds several contacts.
+single contact point, which jumps from step to step, and resting objects jitter. An intersection of few half-spaces has sides that are
+planar up to rounding, between which it finds several contacts.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ _HEIGHT_EXPONENT = 1.25
 # Minimum gain of a half-space, as `_gain` defines it, relative to the full hull's volume, with its radius as the unit of length: 0.01 % of
 # the volume, cut off at a height of 1 % of the radius.
 _MIN_GAIN = 1e-4 * 0.01**_HEIGHT_EXPONENT
-# Radius of a cluster of normals [rad]: 3 degrees. Newton's contact manifold samples the vertices of a facet in directions tilted by 2
-# degrees from the contact normal, so that facets closer than this act as one.
+# Radius of a cluster of normals [rad]: 3 degrees. The physics engine's contact manifold samples the vertices of a facet in directions
+# tilted by 2 degrees from the contact normal, so that facets closer than this act as one.
 _CLUSTER_ANGLE = np.radians(3.0)
 # Minimum angle between the normals of two facets [rad].
 _MIN_FACET_ANGLE = np.radians(4.0)
@@ -40,18 +40,19 @@ _FRAME_ANGLE = np.radians(30.0)
 _PRINCIPAL_WEIGHT = 1e-3
 # The mean gap of a half-space is averaged over triangles whose normals lie within this angle of its own [rad].
 _FIT_ANGLE = np.radians(20.0)
-# Half-spaces selected beyond the allowed number before the least useful are eliminated: none, or as many as the box has, so that all may be
-# replaced. Of both results the smaller polyhedron is taken: round discs keep four sides with none, rounded tetrahedra four with six.
+# Extra half-spaces selected before backward elimination. Both values are tried, and the smaller polyhedron is kept: that of round discs is
+# smaller with 0, that of rounded tetrahedra with 6, since every side of the box can then be replaced.
 _SPARE = (0, 6)
 # Tolerance of the root finding in `_fit_volume`, in mean gaps; scaling removes what is left.
 _FIT_TOLERANCE = 1e-3
-# Decimal places, relative to the radius, to which vertices of an intersection are rounded, so that duplicates become one vertex.
+# Decimal places to which vertices of an intersection are rounded [standard deviations], so that duplicates become one vertex.
 _DECIMALS = 11
-# Distance below which vertices of a result are welded, relative to the largest coordinate: 16 times the rounding to single precision.
+# Distance below which one of two vertices of a result is left out, relative to the largest coordinate: 16 times the rounding to single
+# precision.
 _WELD = 1e-6
-# Minimum radius of the inscribed ball of an intersection that is not empty, relative to the hull's radius.
+# Minimum radius of the inscribed ball of an intersection that is not empty [standard deviations].
 _EMPTY = 1e-9
-# An intersection is unbounded if it has a vertex farther from the inner point than this, relative to the hull's radius.
+# An intersection is unbounded if it has a vertex farther from the inner point than this [standard deviations].
 _FAR = 1e4
 # Maximum angle between the normals of coplanar triangles [rad].
 _COPLANAR_ANGLE = 1e-3
@@ -59,7 +60,7 @@ _COPLANAR_ANGLE = 1e-3
 
 @dataclass(frozen=True)
 class _Facets:
-    """Clusters of a hull's triangles as half-spaces n·x ≤ d, relative to its centroid, largest area first."""
+    """Half-spaces n·x ≤ d relative to a hull's centroid: of clusters of its triangles, largest area first, then of sides of a box."""
 
     normal: np.ndarray
     """Outward unit normal n (facet, 3)."""
@@ -76,10 +77,11 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
 
     A hull of no more vertices, whose facets already differ by _MIN_FACET_ANGLE, is kept. Otherwise its triangles are clustered by their
     normals, and each cluster gives a half-space. Those that cut off most are selected greedily, and moved inward, by at most the mean gap
-    between each and the hull, until the polyhedron has the hull's volume. Where that is not far enough, since `max_vertices` is small, the
-    polyhedron is scaled about its centroid, which moves flat sides, too. Rotating or scaling the points rotates or scales the result up to
-    rounding, unless several half-spaces are equally good. Should Qhull fail on the half-spaces, which no hull thicker than a millionth of
-    its diameter has shown, the hull of greedily selected points is returned, inside the full one.
+    between each and the hull, until the polyhedron has the hull's volume. Last, the polyhedron is scaled about its centroid to exactly this
+    volume, by little unless `max_vertices` is small; this also moves flat sides. Turned points give a turned result, except for the
+    half-spaces of the smallest gain: the threshold is relative to the axis-aligned bounding box. If Qhull fails on the half-spaces, which
+    no hull thicker than a millionth of its diameter has shown, the result is the hull of greedily selected points, with less volume and any
+    angles.
 
     Args:
         points: (N, 3) [m].
@@ -92,6 +94,7 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
     if max_vertices < MIN_VERTICES:
         raise ValueError(f"max_vertices is {max_vertices}, but must be at least {MIN_VERTICES}")
     points = np.unique(points.astype(np.float32), axis=0).astype(np.float64)
+    # The unit of length of all that follows, "radius": half the diagonal of the bounding box.
     low, high = points.min(axis=0), points.max(axis=0)
     middle, radius = (low + high) / 2.0, max(float(np.linalg.norm(high - low)) / 2.0, float(np.finfo(np.float32).tiny))
     full = _hull_of((points - middle) / radius)
@@ -191,14 +194,16 @@ def _eliminate(facets: _Facets, chosen: list[int], max_facets: int, min_gain: fl
             gains[index] = np.inf
             continue
         gains[index] = _gain(fresh[index], current, facets.normal[index], facets.offset[index])
+    if len(chosen) > max_facets:
+        raise QhullError("an intersection of fewer half-spaces could not be computed")
     return chosen, current
 
 
 def _fit_volume(facets: _Facets, chosen: Sequence[int], volume: float) -> np.ndarray:
     """Vertices of the intersection whose half-spaces are moved inward, by a common fraction of their mean gaps, to the given volume.
 
-    The cube root of the volume is concave in the shift (Brunn-Minkowski), which suits root finding. If the whole gaps are not
-    enough, the rest is scaling about the centroid.
+    The cube root of the volume is concave in the shift (Brunn-Minkowski), which suits root finding. Scaling about the centroid does the
+    rest.
     """
 
     def excess(shift: float) -> float:
@@ -246,7 +251,7 @@ def _cluster(hull: ConvexHull, center: np.ndarray) -> tuple[_Facets, list[int]]:
 
 
 def _principal_axes(points: np.ndarray) -> np.ndarray:
-    """Eigenvectors of the covariance of points in columns, each as long as the square root of its eigenvalue (3, 3)."""
+    """Principal axes of points (N, 3) in columns, each as long as the standard deviation along it (3, 3)."""
     _, deviations, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
     return axes.T * deviations / np.sqrt(len(points))
 
@@ -254,8 +259,8 @@ def _principal_axes(points: np.ndarray) -> np.ndarray:
 def _add_frame(area: np.ndarray, normal: np.ndarray, principal: np.ndarray) -> tuple[np.ndarray, list[int]]:
     """Add the sides of an enclosing box to normals (facet, 3), where no facet is near; returns all, and the indices of the six.
 
-    The box has one side along the largest facet; the facet of the largest area projected onto the plane across gives the second axis,
-    or a principal axis (3, 3) if all facets face the same way or back.
+    The first axis of the box is the normal of the largest facet. The second one is the perpendicular part of the normal that maximizes area
+    times sine of the angle to the first; principal axes (3, 3) compete with a small area, and win where all other facets are tiny.
     """
     first = normal[int(area.argmax())]
     vectors = np.concatenate([normal, (principal / np.linalg.norm(principal, axis=0)).T])
@@ -314,7 +319,8 @@ def _decimate(candidates: np.ndarray, max_vertices: int, min_gain: float) -> Con
     """Greedy selection of points whose convex hull has nearly the volume of the full hull.
 
     Starting from `_spanning_points`, the point with the largest volume gain is added until there are `max_vertices`, or the gain falls
-    below `min_gain` [m³]. The gain of a point p is the volume of the pyramids over the faces visible from it, Σ max(0, n·p + d) A / 3.
+    below `min_gain`, in the points' unit cubed. The gain of a point p is the volume of the pyramids over the faces visible from it, Σ
+    max(0, n·p + d) A / 3.
     """
     chosen = _spanning_points(candidates)
     hull = _hull_of(candidates[chosen])

@@ -130,7 +130,7 @@ def test_worlds_with_the_most_colors_come_first(device):
     sizes = wp.zeros(bins, dtype=int, device=device)
     of, places, order = (wp.empty(len(colors), dtype=int, device=device) for _ in range(3))
     options = {"dim": len(colors), "device": device}
-    wp.launch(world_order.count_worlds_kernel, inputs=[offsets, entries], outputs=[sizes, of, places], **options)
+    wp.launch(world_order.bin_worlds_kernel, inputs=[offsets, entries], outputs=[sizes, of, places], **options)
     wp.launch(world_order.order_worlds_kernel, inputs=[sizes, of, places], outputs=[order], **options)
     found = order.numpy()
     assert sorted(found) == list(range(len(colors)))

@@ -1,7 +1,7 @@
 """Deferred shading: radiance of each pixel from the G-buffer, denoised visibility ratios, indirect light and sun visibility.
 
-`shade_kernel` shades the middle of each pixel. `shade_samples_kernel` supersamples: the denoised light is that of the pixel, textures and
-normals are those of several points of the surface.
+`shade_kernel` shades the center of each pixel. `shade_samples_kernel` supersamples the shading of bodies: textures and normals of one
+triangle a pixel. The light is gathered once, and silhouettes are left to anti-aliasing.
 """
 
 import warp as wp
@@ -29,16 +29,16 @@ from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-SAMPLE_COLUMNS = wp.constant(2)
-"""Supersampling: shaded points of a pixel along each axis."""
-MAX_EXTRAPOLATION = wp.constant(1.0)
-"""Supersampling: largest change of a barycentric weight between the middle of a pixel and a shaded point. Triangles may be narrower than
-pixels, and their normals and texture coordinates hold only near them."""
+SAMPLES_PER_AXIS = wp.constant(2)
+"""Shading samples of a pixel along each axis."""
+MAX_WEIGHT_CHANGE = wp.constant(1.0)
+"""Maximum change of a barycentric weight between a pixel's center and a shading sample. Normals and texture coordinates extrapolated far
+from a triangle that is narrower than a pixel would be meaningless."""
 
 
 @wp.struct
 class Sky:
-    """Environment of a world."""
+    """Environment light of a world."""
 
     light: int
     """Index of the environment map."""
@@ -48,12 +48,12 @@ class Sky:
 
 @wp.struct
 class PixelLight:
-    """Light that reaches a pixel's surface, as a fraction of the unoccluded light."""
+    """Light at a pixel's surface."""
 
     ratios: Ratios
-    """Denoised light of the environment and of other surfaces; `indirect` is not a ratio."""
+    """Visibility ratios of the environment's diffuse and specular light, and indirect light, which is absolute."""
     sun: float
-    """Visibility of the sun."""
+    """Visible fraction of the sun."""
 
 
 @wp.func
@@ -111,25 +111,36 @@ def shade_point(scene: PathScene, sky: Sky, surface: Surface, outgoing: wp.vec3,
 
 @wp.func
 def sample_offset(sample: int) -> wp.vec2:
-    """Offset of a shaded point from the middle of its pixel [px]: the middle of one of SAMPLE_COLUMNS x SAMPLE_COLUMNS squares."""
-    scale = 1.0 / float(SAMPLE_COLUMNS)
-    return wp.vec2((float(sample % SAMPLE_COLUMNS) + 0.5) * scale - 0.5, (float(sample // SAMPLE_COLUMNS) + 0.5) * scale - 0.5)
+    """Offset of a shading sample from its pixel's center [px], on a regular grid."""
+    scale = 1.0 / float(SAMPLES_PER_AXIS)
+    return wp.vec2((float(sample % SAMPLES_PER_AXIS) + 0.5) * scale - 0.5, (float(sample // SAMPLES_PER_AXIS) + 0.5) * scale - 0.5)
 
 
 @wp.func
-def move_weights(middle: wp.vec3, areas: wp.vec3) -> tuple[wp.vec3, float]:
-    """Move barycentric weights from a pixel's middle towards a shaded point, whose weights are `areas` over their sum.
+def sum_of(values: wp.vec3) -> float:
+    """Sum of the components."""
+    return values[0] + values[1] + values[2]
 
-    Returns the weights and the fraction of the way that they moved: less than 1 if a weight would change by more than MAX_EXTRAPOLATION.
+
+@wp.func
+def move_weights(center: wp.vec3, orientation: float, areas: wp.vec3) -> tuple[wp.vec3, float]:
+    """Move barycentric weights from a pixel's center towards a shading sample, by at most MAX_WEIGHT_CHANGE.
+
+    Args:
+        center: Weights at the pixel's center.
+        orientation: Sign of the sum of `edge_areas` there, 1 or -1.
+        areas: `edge_areas` at the sample.
+
+    Returns the weights, and how far they moved as a fraction of the way: 0 if the sample's ray does not meet the triangle's plane.
     """
-    total = areas[0] + areas[1] + areas[2]
-    limit = MAX_EXTRAPOLATION * wp.abs(total)
-    if limit == 0.0:
-        return middle, 0.0
-    # All changes times the sum, which may be small: no quotient of these overflows.
-    change = areas - total * middle
+    # The sum may be small: all quantities are multiplied by it, so that no quotient overflows.
+    total = orientation * sum_of(areas)
+    if total <= 0.0:
+        return center, 0.0
+    change = orientation * areas - total * center
+    limit = MAX_WEIGHT_CHANGE * total
     reach = wp.max(wp.max(wp.abs(change)), limit)
-    return middle + (MAX_EXTRAPOLATION * wp.sign(total) / reach) * change, limit / reach
+    return center + (MAX_WEIGHT_CHANGE / reach) * change, limit / reach
 
 
 @wp.func
@@ -142,7 +153,7 @@ def world_sky(light: wp.array[int], light_yaw: wp.array[float], world: int) -> S
 
 
 @wp.func
-def shade_middle(
+def shade_center(
     scene: PathScene,
     cameras: Cameras,
     coarse: CoarseGrid,
@@ -157,7 +168,7 @@ def shade_middle(
     row: int,
     column: int,
 ) -> wp.vec3:
-    """Radiance of a pixel, by the point in its middle; background pixels show the environment map."""
+    """Radiance at a pixel's center; background pixels show the environment map."""
     camera = views.camera[view]
     intrinsics = cameras.intrinsics[camera]
     outgoing = -wp.normalize(cameras.to_world[camera] * camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
@@ -193,7 +204,7 @@ def shade_samples(
     row: int,
     column: int,
 ) -> wp.vec3:
-    """Radiance of a pixel that shows a body: mean of SAMPLE_COLUMNS² points on the plane of its triangle, in the light of the pixel."""
+    """Radiance of a pixel that shows a body: mean of SAMPLES_PER_AXIS² shading samples of its triangle, all in the light at its center."""
     camera = views.camera[view]
     intrinsics = cameras.intrinsics[camera]
     body = body_of(int(gbuffer.segment[view, row, column]), views.instances)
@@ -206,18 +217,19 @@ def shade_samples(
         scene, cameras, coarse, shadow_grid, sky, gbuffer, ratios, sun_visibility, camera, view, row, column, surface.face_normal
     )
     corners = camera_triangle(scene.meshes, bodies, view, body, triangle)
-    middle = wp.vec3(barycentric[0], barycentric[1], 1.0 - barycentric[0] - barycentric[1])
+    orientation = wp.sign(sum_of(edge_areas(corners, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))))
+    center = wp.vec3(barycentric[0], barycentric[1], 1.0 - barycentric[0] - barycentric[1])
     total = wp.vec3(0.0)
-    for sample in range(SAMPLE_COLUMNS * SAMPLE_COLUMNS):
+    for sample in range(SAMPLES_PER_AXIS * SAMPLES_PER_AXIS):
         ray = camera_ray(intrinsics, row, column, sample_offset(sample))
-        weights, fraction = move_weights(middle, edge_areas(corners, ray))
-        point = wp.vec2(weights[0], weights[1])
+        weights, moved = move_weights(center, orientation, edge_areas(corners, ray))
         outgoing = -wp.normalize(cameras.to_world[camera] * ray)
-        # The points share the pixel's area; where they come closer together, the footprints overlap.
-        share = 1.0 - fraction * (1.0 - 1.0 / float(SAMPLE_COLUMNS))
-        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, point, outgoing, share * width)
+        # A sample that stays at the center has the footprint of a whole pixel.
+        footprint_scale = 1.0 - moved * (1.0 - 1.0 / float(SAMPLES_PER_AXIS))
+        point = wp.vec2(weights[0], weights[1])
+        surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, point, outgoing, footprint_scale * width)
         total += shade_point(scene, sky, surface, outgoing, light)
-    return total / float(SAMPLE_COLUMNS * SAMPLE_COLUMNS)
+    return total / float(SAMPLES_PER_AXIS * SAMPLES_PER_AXIS)
 
 
 @wp.kernel(cuda_max_registers=SHADE_REGISTERS)
@@ -240,11 +252,11 @@ def shade_kernel(
     # Out:
     radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
-    """Shade each pixel with its own surface and the denoised light around it; background pixels show the environment map."""
+    """Shade each pixel at its center, in the upsampled denoised light; background pixels show the environment map."""
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
     if in_image(coarse.image, row, column):
         sky = world_sky(light, light_yaw, views.world[view])
-        radiance_out[view, row, column] = shade_middle(
+        radiance_out[view, row, column] = shade_center(
             scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column
         )
 
@@ -269,14 +281,14 @@ def shade_samples_kernel(
     # Out:
     radiance_out: wp.array3d[wp.vec3],  # (view, row, column)
 ):
-    """Shade each pixel as `shade_kernel`, but bodies with several points a pixel (supersampling)."""
+    """Shade each pixel as `shade_kernel`, but bodies with several shading samples a pixel."""
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
     if not in_image(coarse.image, row, column):
         return
     sky = world_sky(light, light_yaw, views.world[view])
     segment = int(gbuffer.segment[view, row, column])
     if segment == Segment.NOTHING or segment == Segment.TABLE:
-        radiance_out[view, row, column] = shade_middle(
+        radiance_out[view, row, column] = shade_center(
             scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column
         )
     else:

@@ -141,7 +141,7 @@ class FusedSteel(newton.solvers.SolverSteel):
             options: dict[str, Any] = {"dim": self._world_count, "device": self.model.device}
             sizes.zero_()
             inputs = [self._color_world_offsets, steel.PROPAGATION_COLOR_TAIL + 2]
-            wp.launch(world_order.count_worlds_kernel, inputs=inputs, outputs=[sizes, bins, places], **options)
+            wp.launch(world_order.bin_worlds_kernel, inputs=inputs, outputs=[sizes, bins, places], **options)
             wp.launch(world_order.order_worlds_kernel, inputs=[sizes, bins, places], outputs=[order], **options)
         return order
 

@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from synpick_warp.configs.schema import FAST, UNOCCLUDED, Config
-from synpick_warp.kernels.render.lighting.shading import MAX_EXTRAPOLATION, shade_kernel, shade_samples_kernel
+from synpick_warp.kernels.render.lighting.shading import MAX_WEIGHT_CHANGE, shade_kernel, shade_samples_kernel
 from synpick_warp.scenes.types import EnvironmentMap, Material
 from synpick_warp.stages.render import denoised
 from tests.harness.shading_probe import move_weights_kernel
@@ -64,13 +64,14 @@ def test_points_lie_on_the_plane_of_the_triangle(device):
     middle = random.dirichlet((1.0, 1.0, 1.0), count)
     point = np.einsum("nk,nkd->nd", middle, corners)
     ray = point / point[:, 2:] + np.c_[random.uniform(-1e-3, 1e-3, (count, 2)), np.zeros(count)]
-    inputs = [wp.array(values.astype(np.float32), dtype=wp.vec3, device=device) for values in (corners, ray, middle)]
+    arrays = (corners, ray, point / point[:, 2:], middle)
+    inputs = [wp.array(values.astype(np.float32), dtype=wp.vec3, device=device) for values in arrays]
     weights, fraction = wp.empty(count, dtype=wp.vec3, device=device), wp.empty(count, dtype=float, device=device)
     wp.launch(move_weights_kernel, dim=count, inputs=inputs, outputs=[weights, fraction], device=device)
     on_plane = np.linalg.solve(corners.transpose(0, 2, 1), ray[..., None])[..., 0]
     change = on_plane / on_plane.sum(1, keepdims=True) - middle
     largest = np.abs(change).max(1)
-    expected = np.minimum(1.0, float(MAX_EXTRAPOLATION) / largest)
+    expected = np.minimum(1.0, float(MAX_WEIGHT_CHANGE) / largest)
     facing = np.abs(np.linalg.det(corners)) > 1e-2 * size[:, 0, 0] ** 2
     assert facing.sum() > count // 2
     assert (expected[facing] < 1.0).any()
@@ -79,11 +80,18 @@ def test_points_lie_on_the_plane_of_the_triangle(device):
     np.testing.assert_allclose(weights.numpy()[facing], (middle + expected[:, None] * change)[facing], atol=0.02)
 
 
-def test_a_triangle_seen_edge_on_keeps_the_middle(device):
-    corners = wp.array(np.array([[(0, 0, 1), (0, 0, 2), (0, 0, 3)]], np.float32), dtype=wp.vec3, device=device)
-    ray, middle = (wp.array([wp.vec3(*values)], dtype=wp.vec3, device=device) for values in ((0.0, 0.0, 1.0), (0.2, 0.3, 0.5)))
+@pytest.mark.parametrize(
+    ("corners", "ray"),
+    [
+        pytest.param([(0, 0, 1), (0, 0, 2), (0, 0, 3)], (0.0, 0.0, 1.0), id="edge on"),
+        pytest.param([(0, 0, 1), (1, 0, 10), (0, 1, 1)], (0.12, 0.1, 1.0), id="beyond the horizon of the plane"),
+    ],
+)
+def test_a_ray_that_misses_the_plane_keeps_the_center(device, corners, ray):
+    arrays = [[corners], [ray], [(0.0, 0.0, 1.0)], [(0.2, 0.3, 0.5)]]
+    inputs = [wp.array(np.array(values, np.float32), dtype=wp.vec3, device=device) for values in arrays]
     weights, fraction = wp.empty(1, dtype=wp.vec3, device=device), wp.empty(1, dtype=float, device=device)
-    wp.launch(move_weights_kernel, dim=1, inputs=[corners, ray, middle], outputs=[weights, fraction], device=device)
+    wp.launch(move_weights_kernel, dim=1, inputs=inputs, outputs=[weights, fraction], device=device)
     np.testing.assert_allclose(weights.numpy()[0], (0.2, 0.3, 0.5), rtol=1e-6)
     assert fraction.numpy()[0] == 0.0
 
