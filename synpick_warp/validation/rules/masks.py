@@ -164,15 +164,30 @@ def check_amodal_box(view: ViewSubject) -> _Finding:
     for index, mask, info in _pairs(view, "mask"):
         if mask.box is None or info.bbox_obj == EMPTY:
             continue
-        box, tight = info.bbox_obj, bop_box(mask.box)
-        touched = _touched_sides(mask)
-        stated, seen = _sides(box), _sides(tight)
-        # What lies beyond a border may be wider than what is seen, but cannot move the side opposite to that border.
-        wrong = [side for side in range(4) if stated[side] < seen[side] or (touched <= {(side + 2) % 4} and stated[side] != seen[side])]
-        if wrong and not touched:
+        box, wrong = info.bbox_obj, wrong_sides(info.bbox_obj, mask)
+        if wrong and not _touched_sides(mask):
             yield _file(view), f"image {view.image}, instance {index}: bbox_obj is {_describe(box, mask.box)}"
         elif wrong:
             yield _file(view), f"image {view.image}, instance {index}: bbox_obj {box}, cut at the border, is not the box of {mask.file}"
+
+
+def wrong_sides(box: list[int], mask: Mask) -> list[int]:
+    """Sides, as in `_sides`, on which the box of a silhouette contradicts its mask, the part of it inside the image.
+
+    A silhouette that ends inside the image must agree on all sides. Of one that is cut, only the side opposite to the border is known, and
+    only if its box stays within the image on the others: around a corner of the image it may reach farther than inside.
+
+    Args:
+        box: Amodal box in BOP's convention.
+        mask: Mask that is not empty.
+    """
+    if mask.box is None:
+        return []
+    stated, seen, touched = _sides(box), _sides(bop_box(mask.box)), _touched_sides(mask)
+    image = _sides([0, 0, mask.size[0] - 1, mask.size[1] - 1])
+    beyond = {side for side in range(4) if touched and stated[side] > image[side]}
+    known = [side for side in range(4) if touched | beyond <= {(side + 2) % 4}]
+    return [side for side in range(4) if stated[side] < seen[side] or (side in known and stated[side] != seen[side])]
 
 
 def bop_box(box: tuple[int, int, int, int]) -> list[int]:
