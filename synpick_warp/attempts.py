@@ -107,7 +107,7 @@ class AttemptRecord:
             record[item.name] = getattr(self, item.name)
             if item.name == "outcome":
                 record |= {item.name: self.outcome.name.lower(), "sentence": self.outcome.sentence}
-        # Not by `dataclasses.asdict`, which copies every number: it took most of the time of a line.
+        # `dataclasses.asdict` would copy every number, which is slower than the serialization itself.
         return json.dumps(record, allow_nan=False, default=vars) + "\n"
 
 
@@ -190,7 +190,7 @@ class AttemptLog:
         return ended
 
     def _eventful_worlds(self, report: TickReport) -> np.ndarray:
-        """Worlds of which a tick tells the log anything: an episode or attempt begins or ends, or the gripper lifts (world) int."""
+        """Indices of the worlds with an event in a tick: an episode or attempt begins or ends, or the gripper is lifting (world) int."""
         phase, task = report.column("phase"), report.column("task")
         running = np.zeros(len(phase), bool)
         running[list(self._running)] = True

@@ -19,24 +19,25 @@ from synpick_warp.scenes.types import ConvexPiece
 
 # Smallest allowed `max_vertices`: a polyhedron of six facets has at most 8 vertices.
 MIN_VERTICES = 8
-# Maximum vertices of the intermediate, fine hull, whose triangles are clustered.
+# Maximum vertices of the fine hull, an intermediate result whose triangles are clustered.
 _FINE_VERTICES = 256
-# Minimum volume that a further vertex of a decimated hull adds, relative to the full hull's volume: of the fine hull, of the fallback.
+# Decimation ends when no vertex adds at least this volume, relative to the full hull's: for the fine hull, and for the fallback.
 _FINE_GAIN, _COARSE_GAIN = 1e-5, 1e-4
 # Exponent of the height in `_gain`. With 1, pieces of the YCB-Video objects reach up to 4.8 mm beyond the full hulls; with 1.25 4.2 mm.
 _HEIGHT_EXPONENT = 1.25
-# Minimum gain of a half-space, as `_gain` defines it, relative to the full hull's volume, with its radius as the unit of length: 0.01 % of
-# the volume, cut off at a height of 1 % of the radius.
+# Minimum `_gain` of a half-space, for a full hull of unit volume and unit radius: that of a half-space that cuts off 0.01 % of the volume
+# at a height of 1 % of the radius.
 _MIN_GAIN = 1e-4 * 0.01**_HEIGHT_EXPONENT
 # Radius of a cluster of normals [rad]: 3 degrees. The physics engine's contact manifold samples the vertices of a facet in directions
-# tilted by 2 degrees from the contact normal, so that facets closer than this act as one.
+# tilted by 2 degrees from the contact normal, so that it treats facets at a smaller angle as one.
 _CLUSTER_ANGLE = np.radians(3.0)
 # Minimum angle between the normals of two facets [rad].
 _MIN_FACET_ANGLE = np.radians(4.0)
-# The first six half-spaces face along the axes of a box; a facet whose normal lies within this angle of an axis takes its place [rad].
-# Below 35 degrees six such half-spaces always enclose a bounded polyhedron.
+# The selection starts from the six sides of an oriented box. A facet whose normal lies within this angle of a side's normal replaces the
+# side [rad]; below 35 degrees, the six half-spaces always enclose a bounded polyhedron.
 _FRAME_ANGLE = np.radians(30.0)
-# Weight of a principal axis as the box's second axis, relative to the largest facet's area: below that of any facet that matters.
+# Area assigned to a principal axis in the choice of the box's second axis, relative to the largest facet's: smaller than that of any facet
+# that should be preferred.
 _PRINCIPAL_WEIGHT = 1e-3
 # The mean gap of a half-space is averaged over triangles whose normals lie within this angle of its own [rad].
 _FIT_ANGLE = np.radians(20.0)
@@ -52,7 +53,7 @@ _DECIMALS = 11
 _WELD = 1e-6
 # Minimum radius of the inscribed ball of an intersection that is not empty [standard deviations].
 _EMPTY = 1e-9
-# An intersection is unbounded if it has a vertex farther from the inner point than this [standard deviations].
+# An intersection with a vertex farther than this from the inner point counts as unbounded [standard deviations].
 _FAR = 1e4
 # Maximum angle between the normals of coplanar triangles [rad].
 _COPLANAR_ANGLE = 1e-3
@@ -110,7 +111,11 @@ def simplify_hull(points: np.ndarray, max_vertices: int) -> ConvexPiece:
 
 
 def _hull_of(points: np.ndarray) -> ConvexHull:
-    """Convex hull of points (N, 3); CatalogError if they are coplanar."""
+    """Convex hull of points (N, 3).
+
+    Raises:
+        CatalogError: The points are coplanar.
+    """
     try:
         return ConvexHull(points)
     except QhullError as error:
@@ -145,8 +150,8 @@ def _choose_facets(hull: ConvexHull, max_vertices: int, volume: float) -> np.nda
 
 
 def _gain(larger: ConvexHull, smaller: ConvexHull, normal: np.ndarray, offset: float) -> float:
-    """Gain of a half-space that cuts one polyhedron out of another: the volume cut off times its height, so that spikes of little volume
-    go, too."""
+    """Gain of a half-space that reduces one polyhedron to another: the volume it cuts off, times a power of the height of what it cuts off,
+    so that it also removes spikes of little volume."""
     height = float((larger.points @ normal).max() - offset)
     return max(0.0, larger.volume - smaller.volume) * max(0.0, height) ** _HEIGHT_EXPONENT
 
@@ -303,7 +308,7 @@ def _intersect(facets: _Facets, chosen: Sequence[int], shift: float = 0.0) -> Co
 
 
 def _chebyshev_center(normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
-    """Centre of the largest ball inside an intersection of half-spaces: a linear program.
+    """Chebyshev center: the center of the largest ball inside an intersection of half-spaces, by linear programming.
 
     Raises:
         QhullError: The intersection is empty.
