@@ -61,40 +61,38 @@ class JointRowData:
 
 @wp.struct
 class ContactRowData:
-    """Constraint rows of contacts in the twists of bodies, and their graph coloring.
+    """Contacts of bodies, in the order of their graph coloring, and their constraint rows.
 
-    A unit is one contact: its normal row and its friction rows. Units are sorted by color; those of one color share no body, and are solved
-    in parallel. Counts are (world), row arrays (world, row), Jacobians J and responses M⁻¹Jᵀ (world, row, 6); arrays named `world_...` and
-    `propagation_unit_...` are flat over all worlds.
+    A contact has a normal row and friction rows. Contacts of one color share no body. Arrays are flat over all worlds, each of which has as
+    many places for contacts as for rows.
     """
 
-    propagation_constraint_count: wp.array[int]
-    propagation_body_a: wp.array2d[int]
-    propagation_body_b: wp.array2d[int]
-    propagation_MiJt_a: wp.array3d[float]
-    propagation_MiJt_b: wp.array3d[float]
-    propagation_J_a: wp.array3d[float]
-    propagation_J_b: wp.array3d[float]
-    propagation_eff_mass_inv: wp.array2d[float]
-    propagation_rhs: wp.array2d[float]
-    propagation_row_w: wp.array2d[float]
-    propagation_row_type: wp.array2d[int]
-    propagation_row_parent: wp.array2d[int]
-    propagation_row_mu: wp.array2d[float]
-    propagation_torsion_first: wp.array2d[int]
-    propagation_torsion_next: wp.array2d[int]
-    propagation_torsion_row_radius: wp.array2d[float]
-    compliance_gamma: wp.array2d[float]
-    world_row_order: wp.array[int]
-    world_color_offsets: wp.array[int]
-    propagation_body_list: wp.array2d[int]
-    propagation_body_count: wp.array[int]
-    propagation_body_local_slot: wp.array[int]
-    propagation_unit_meta: wp.array[int]
-    propagation_unit_friction_setup: wp.array[float]
-    propagation_unit_payload: wp.array[float]
-    propagation_ring_overflow: wp.array[int]
-    propagation_impulses: wp.array2d[float]
+    row_count: wp.array[int]
+    """Rows of each world (world)."""
+    row_parent: wp.array2d[int]
+    """Of a normal row, the next one of its friction patch (world, row)."""
+    rhs: wp.array2d[float]
+    """Right-hand sides (world, row) [m/s]."""
+    impulse: wp.array2d[float]
+    """Impulses (world, row) [N s]."""
+    color_offsets: wp.array[int]
+    """First contact of each color (world, color); see `compose_contact_sweep`."""
+    bodies: wp.array2d[int]
+    """Bodies with contacts (world, slot)."""
+    body_count: wp.array[int]
+    """Their number (world)."""
+    records: wp.array[int]
+    """Rows, bodies and friction patch of each contact (world, contact, `contact_sweep.RECORD`)."""
+    friction_operator: wp.array[float]
+    """Friction operator of each contact (world, contact, `contact_sweep.FRICTION_OPERATOR`)."""
+    rows: wp.array[float]
+    """Rows of each contact (world, contact, 3, `contact_sweep.ROW`)."""
+    patch_lists: wp.array[int]
+    """Rows of patches with more members than a record has (world, row)."""
+    is_free: wp.array[bool]
+    """Whether a body is free, not of the gripper (body)."""
+    overflow: wp.array[bool]
+    """Whether a world lost contacts (world)."""
 
 
 @wp.struct
@@ -191,35 +189,6 @@ def bind_row_sweep(function: wp.Function) -> wp.Function:
     return sweep_rows
 
 
-def bind_contact_sweep(function: wp.Function) -> wp.Function:
-    """Wrap the solver's Gauss-Seidel sweep over contact rows, color by color, which changes twists and gathers impulses on bodies."""
-
-    @wp.func
-    def sweep_contacts(
-        world: int,
-        worlds: int,
-        iteration: int,
-        settings: IterationSettings,
-        rows: ContactRowData,
-        twist_inout: wp.array2d[float],
-        impulse_inout: wp.array2d[float],
-    ):
-        """Sweep a world once over its contacts."""
-        function(
-            world, worlds, rows.propagation_constraint_count, rows.propagation_body_a, rows.propagation_body_b, rows.propagation_MiJt_a,
-            rows.propagation_MiJt_b, rows.propagation_J_a, rows.propagation_J_b, rows.propagation_eff_mass_inv, rows.propagation_rhs,
-            rows.propagation_row_w, rows.propagation_row_type, rows.propagation_row_parent, rows.propagation_row_mu,
-            rows.propagation_torsion_first, rows.propagation_torsion_next, rows.propagation_torsion_row_radius, rows.compliance_gamma,
-            rows.world_row_order, rows.world_color_offsets, rows.propagation_body_list, rows.propagation_body_count,
-            rows.propagation_body_local_slot, rows.propagation_unit_meta, rows.propagation_unit_friction_setup,
-            rows.propagation_unit_payload, rows.propagation_ring_overflow, settings.omega, settings.regularize,
-            settings.friction_start_iteration, iteration, rows.propagation_impulses, twist_inout, impulse_inout,
-        )  # fmt: skip
-        synchronize_warp()
-
-    return sweep_contacts
-
-
 def bind_tree_refresh(function: wp.Function) -> wp.Function:
     """Wrap the solver's forward pass over the gripper's joints: twists of its bodies from joint velocities."""
 
@@ -295,7 +264,8 @@ def compose_iterations(
             if step == 0 or has_contacts or has_velocity_limits:
                 load_free_twists(world, lane, bodies, v_inout, twist_inout)
             synchronize_warp()
-            sweep_contacts(world, bodies.free_bodies.shape[0], iteration, settings, contacts, twist_inout, impulse_inout)
+            sweep_contacts(world, iteration, settings, contacts, twist_inout, impulse_inout)
+            synchronize_warp()
             propagate(world, bodies, impulse_inout, twist_inout, v_inout)
             if step == last or has_contacts or has_velocity_limits:
                 store_free_twists(world, lane, bodies, twist_inout, impulse_inout, v_inout)

@@ -35,9 +35,7 @@ def test_the_kernel_of_the_iterations_compiles(tmp_path):
         ROWS, ROWS, DOFS, ARCHITECTURE, has_dense_velocity_limit_rows=False, shared_metadata=True, row_phases=True
     )
     refresh = steel._get_refresh_propagation_tree_body_qd_warp_kernel(4, 2, ARCHITECTURE)
-    contacts = steel._get_pgs_solve_propagation_colored_warp_kernel(
-        ROWS, steel.PROPAGATION_COLOR_TAIL + 2, BODIES, 1, ARCHITECTURE, packed=False
-    )
+    contacts = fused_solver.compose_contacts(ROWS, BODIES)
     propagate = steel._get_propagate_tree_impulses_revolute_kernel(4, 2, ARCHITECTURE, has_free_root=True)
     kernel = fused_solver.compose_kernel(joint_rows, refresh, contacts, propagate)
     wp.compile_aot_module(kernel.module, arch=ARCHITECTURE, module_dir=tmp_path, use_ptx=True)
@@ -137,11 +135,8 @@ def test_worlds_with_the_most_colors_come_first(device):
     assert (np.diff(np.minimum(colors, bins - 1)[found]) <= 0).all()
 
 
-@pytest.mark.parametrize(
-    ("worlds", "packed", "resident", "max_speed"),
-    [(8, 256, 8, 0.3), (8, 256, 8, 4.0), (24, 256, 8, 4.0), (24, 0, 8, 4.0), (24, 256, 0, 4.0)],
-)
-def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, packed, resident, max_speed):
+@pytest.mark.parametrize(("worlds", "resident", "max_speed"), [(8, 8, 0.3), (8, 8, 4.0), (24, 8, 4.0), (24, 0, 4.0)])
+def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, resident, max_speed):
     """Piles fall, rest and are stirred; at the lower speed limit, falling bodies have velocity limit rows. Newton packs rows of up to 16
     worlds only, takes worlds in their order (they are sorted if none is resident), and its narrow phase uses larger blocks."""
     if not device.is_cuda:
@@ -149,7 +144,6 @@ def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds,
     config = settings(
         bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__max_speed=max_speed, physics__deterministic=True
     )
-    monkeypatch.setattr(fused_solver, "PACKED_WORLDS", packed)
     monkeypatch.setattr(fused_solver, "RESIDENT_WORLDS", resident)
     found, phases = {}, set()
     for version in (fused_solver.KNOWN_NEWTON, "another"):

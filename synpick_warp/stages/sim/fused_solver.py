@@ -12,11 +12,8 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.sim import solver_iterations, warm_start, world_order
+from synpick_warp.kernels.sim import contact_sweep, solver_iterations, warm_start, world_order
 
-PACKED_WORLDS = 256
-"""Maximum number of worlds for which contact rows are packed into records of 384 bytes, 0.6 MB per world; SolverSteel packs up to 16.
-On an H200 a tick of 64 worlds takes 0.180 instead of 0.189 s, one of 512 worlds 0.272 instead of 0.274 s."""
 RESIDENT_WORLDS = 8
 """Worlds whose iterations a multiprocessor can run at a time: its 65,536 registers hold 8 warps with 255 a thread. Where there are more
 worlds, those with the most contact colors start first: on an H200 the iterations of a tick of 2,048 worlds take 97 instead of 130 ms. With
@@ -80,9 +77,9 @@ class FusedSteel(newton.solvers.SolverSteel):
         )
 
     def _init_colored_kernels(self, model: newton.Model) -> None:
-        """Choose the variant of the sweep over contacts: from packed records, also in more worlds than the solver would."""
+        """Have the rows of contacts packed into records of 384 bytes, 0.6 MB per world; SolverSteel packs those of up to 16 worlds."""
         super()._init_colored_kernels(model)
-        if self._color_unit_payload is None and self._world_count <= PACKED_WORLDS:
+        if self._color_unit_payload is None:
             words = self._world_count * self._propagation_max_constraints * steel.PROPAGATION_UNIT_PAYLOAD
             self._color_unit_payload = wp.zeros(words, dtype=wp.float32, device=model.device)
 
@@ -119,14 +116,7 @@ class FusedSteel(newton.solvers.SolverSteel):
     def _iterations_kernel(self) -> wp.Kernel:
         """Kernel of the iterations, made of the device functions of the solver's own kernels."""
         size = self._propagation_tree_sizes[0]
-        sweep_contacts = steel._get_pgs_solve_propagation_colored_warp_kernel(
-            self._propagation_max_constraints,
-            steel.PROPAGATION_COLOR_TAIL + 2,
-            self._max_propagation_bodies,
-            1,
-            self.model.device.arch,
-            packed=self._color_unit_payload is not None,
-        )
+        sweep_contacts = compose_contacts(self._propagation_max_constraints, self._max_propagation_bodies)
         return compose_kernel(
             self._pgs_solve_mf_gs_kernel_for_phase(),
             self._propagation_refresh_kernels[size],
@@ -158,37 +148,23 @@ class FusedSteel(newton.solvers.SolverSteel):
         return fill(solver_iterations.JointRowData(), self._mf_gs_inputs(rhs))
 
     def _contact_rows(self, rhs: wp.array) -> Any:
-        """Contact rows with their coloring."""
+        """Contacts with their coloring."""
         return fill(
             solver_iterations.ContactRowData(),
             [
                 self._propagation_constraint_count,
-                self._propagation_body_a,
-                self._propagation_body_b,
-                self._propagation_MiJt_a,
-                self._propagation_MiJt_b,
-                self._propagation_J_a,
-                self._propagation_J_b,
-                self._propagation_eff_mass_inv,
-                rhs,
-                self._propagation_row_w,
-                self._propagation_row_type,
                 self._propagation_row_parent,
-                self._propagation_row_mu,
-                self._propagation_torsion_first,
-                self._propagation_torsion_next,
-                self._propagation_torsion_row_radius,
-                self._compliance_off_gamma,
-                self._color_world_row_order,
+                rhs,
+                self._propagation_impulses,
                 self._color_world_offsets,
                 self._propagation_body_list,
                 self._propagation_body_count,
-                self._propagation_body_local_slot,
                 self._color_unit_meta,
                 self._color_unit_friction_setup,
-                self._color_unit_payload if self._color_unit_payload is not None else self._color_unit_friction_setup,
+                self._color_unit_payload,
                 self._color_ring_overflow,
-                self._propagation_impulses,
+                self._is_free,
+                self.constraint_overflow,
             ],
         )
 
@@ -215,6 +191,13 @@ class FusedSteel(newton.solvers.SolverSteel):
                 *self._free_bodies,
             ],
         )
+
+    @cached_property
+    def _is_free(self) -> wp.array:
+        """Whether a body is free, not of the gripper (body) bool."""
+        is_free = np.zeros(self.model.body_count, bool)
+        is_free[self._free_bodies[1].numpy()] = True
+        return wp.array(is_free, dtype=wp.bool, device=self.model.device)
 
     @cached_property
     def _free_bodies(self) -> tuple[wp.array, wp.array]:
@@ -263,14 +246,20 @@ def fill(struct: Any, values: Iterable[wp.array | None]) -> Any:
 
 
 @cache
-def compose_kernel(rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Kernel, propagation: wp.Kernel) -> wp.Kernel:
-    """Kernel of the iterations from kernels of the solver, each of which calls one device function."""
+def compose_kernel(rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, propagation: wp.Kernel) -> wp.Kernel:
+    """Kernel of the iterations from the sweep over contacts, and kernels of the solver, each of which calls one device function."""
     return solver_iterations.compose_iterations(
         solver_iterations.bind_row_sweep(device_function(rows)),
         solver_iterations.bind_tree_refresh(device_function(refresh)),
-        solver_iterations.bind_contact_sweep(device_function(contacts)),
+        contacts,
         solver_iterations.bind_propagation(device_function(propagation)),
     )
+
+
+@cache
+def compose_contacts(rows: int, bodies: int) -> wp.Function:
+    """Sweep over the contacts of a world with at most `rows` rows and `bodies` bodies."""
+    return contact_sweep.compose_contact_sweep(rows, bodies, steel.PROPAGATION_COLOR_TAIL + 2, steel.FRICTION_PAIR_CUDA)
 
 
 def device_function(kernel: wp.Kernel) -> wp.Function:

@@ -1,0 +1,298 @@
+"""Colored Gauss-Seidel sweep over the contacts of a world by one warp, which loads 32 contacts at a time into registers.
+
+Newton's SolverSteel loads the contacts of one color, solves them, and goes on with the next color. Piles have many colors of few contacts:
+an object of many convex pieces lies on the tote with 60 contacts, each of a color of its own, and most of the time is spent waiting for
+memory. Here each lane loads one of 32 contacts, consecutive in the order of colors, and the colors among them are solved one after the
+other. Meanwhile the next 32 are prefetched. The arithmetic is the solver's own source text, so results are bitwise identical.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from synpick_warp.kernels.sim.solver_iterations import ContactRowData, IterationSettings
+
+RECORD = 12
+"""Words of a contact's record: first row, slots of its bodies a and b in the world's list, number of listed patch members, up to 4 patch
+members, the member after them, number of rows, kind, list of the other members."""
+PATCH_MEMBERS = 4
+"""Members of a friction patch in the record of the contact that has its friction rows: normal rows of other contacts."""
+KIND = 10
+"""Word of the record with the kind: `WITH_FRICTION`, `NORMAL_ONLY`, or 0 for any other rows."""
+WITH_FRICTION = 1
+"""Kind of a contact with a normal row and two friction rows."""
+NORMAL_ONLY = 2
+"""Kind of a contact with a normal row, whose friction another contact of its patch has."""
+HAS_FRICTION = f"record[{KIND}] == {WITH_FRICTION}"
+"""CUDA expression for whether a contact has friction rows."""
+FRICTION_OPERATOR = 5
+"""Words of a contact's friction operator: a symmetric 2x2 matrix by its eigenvalues and an eigenvector."""
+SLOT = 8
+"""Words of a body's twist in shared memory, so that it is read at once."""
+ROW = 32
+"""Words of a packed row, a cache line: type, inverse effective mass, bodies, unused, weight, friction coefficient, parent, then Jacobians J_a
+and J_b and responses M⁻¹J_aᵀ and M⁻¹J_bᵀ of 6 each. A contact has 3 rows."""
+
+
+def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str) -> wp.Function:
+    """Create the sweep over the contacts of a world.
+
+    A world with contacts of other kinds than the two is flagged as lost.
+
+    Args:
+        rows, bodies: Capacities of a world.
+        offsets: Color offsets of a world. The last two are where contacts without a color begin, which are solved one by one, and the number
+            of contacts.
+        friction: CUDA source of the solver's function `friction_pair_solve`, the impulses of two friction rows within a circle.
+    """
+
+    @wp.func_native(_source(rows, bodies, offsets, friction))
+    def sweep_contacts(
+        world: int,
+        iteration: int,
+        settings: IterationSettings,
+        contacts: ContactRowData,
+        twist_inout: wp.array2d[float],
+        impulse_inout: wp.array2d[float],
+    ): ...
+
+    return sweep_contacts
+
+
+def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
+    """CUDA source of the sweep. A static body's twist is that of a slot behind the others, zero."""
+    return f"""
+#if defined(__CUDA_ARCH__)
+{friction}
+    const int lane = threadIdx.x & 31;
+    if (contacts.row_count.data[world] == 0) return;
+    const int first_row = world * {rows};
+    const int* color_offsets = &contacts.color_offsets.data[world * {offsets}];
+    const int uncolored = color_offsets[{offsets} - 2], count = color_offsets[{offsets} - 1];
+
+    __shared__ __align__(16) float twists[({bodies} + 1) * {SLOT}];
+    __shared__ float body_impulses[{bodies} * 6];
+    __shared__ bool is_free[{bodies} + 1];
+    const int slots = contacts.body_count.data[world];
+    for (int i = lane; i < slots * 6; i += 32) {{
+        const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * {bodies} + slot];
+        twists[slot * {SLOT} + component] = twist_inout.data[body * 6 + component];
+        body_impulses[i] = impulse_inout.data[body * 6 + component];
+        is_free[slot] = contacts.is_free.data[body];
+    }}
+    if (lane < {SLOT}) twists[{bodies} * {SLOT} + lane] = 0.0f;
+    is_free[{bodies}] = true;
+    __syncwarp();
+
+    int color = 0;
+    for (int first = 0; first < count; first += 32) {{
+        const int index = first + lane;
+{_LOAD}
+{_FIND_COLORS.replace("OFFSETS", str(offsets))}
+        for (int begin = 0; begin < 32;) {{
+            const int end = starts ? __ffs(starts) - 1 : 32;
+            if (record[{KIND}] != 0 && begin <= lane && lane < end) {{
+{_SOLVE.replace("BODIES", str(bodies))}
+            }}
+            __syncwarp();
+            starts &= starts - 1;
+            begin = end;
+        }}
+    }}
+
+    for (int i = lane; i < slots * 6; i += 32) {{
+        const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * {bodies} + slot];
+        twist_inout.data[body * 6 + component] = twists[slot * {SLOT} + component];
+        impulse_inout.data[body * 6 + component] = body_impulses[i];
+    }}
+#endif
+"""
+
+
+_LOAD = f"""
+        const int next = index + 32 < count ? index + 32 : lane;   // the next iteration begins with the first contacts
+        const float* next_rows = &contacts.rows.data[(size_t)(first_row + next) * {3 * ROW}];
+        int next_kind = 0;
+        if (next < count) {{
+            next_kind = __ldg(&contacts.records.data[(first_row + next) * {RECORD} + {KIND}]);
+            asm volatile("prefetch.global.L1 [%0];" :: "l"(next_rows));
+        }}
+        int record[{RECORD}] = {{0}};
+        if (index < count) {{
+            const int4* words = reinterpret_cast<const int4*>(&contacts.records.data[(first_row + index) * {RECORD}]);
+            #pragma unroll
+            for (int k = 0; k < {RECORD // 4}; ++k) {{
+                const int4 four = __ldg(&words[k]);
+                record[4 * k] = four.x; record[4 * k + 1] = four.y; record[4 * k + 2] = four.z; record[4 * k + 3] = four.w;
+            }}
+            if (record[{KIND}] == 0) contacts.overflow.data[world] = true;
+        }}
+        const int row0 = record[0];
+        float mass, weight, mu, Ja[3][6] = {{0}}, Jb[3][6] = {{0}}, Ma[3][6], Mb[3][6], rhs[3], old[3], friction_operator[{FRICTION_OPERATOR}];
+        #pragma unroll
+        for (int r = 0; r < 3; ++r) {{
+            if ({HAS_FRICTION} || (r == 0 && record[{KIND}] == {NORMAL_ONLY})) {{
+                const float* row = &contacts.rows.data[(size_t)(first_row + index) * {3 * ROW} + r * {ROW}];
+                float words[{ROW}];
+                #pragma unroll
+                for (int k = 0; k < {ROW // 4}; ++k) {{
+                    const float4 four = __ldg(&reinterpret_cast<const float4*>(row)[k]);
+                    words[4 * k] = four.x; words[4 * k + 1] = four.y; words[4 * k + 2] = four.z; words[4 * k + 3] = four.w;
+                }}
+                if (r == 0) {{
+                    mass = words[1];
+                    weight = words[5];
+                }} else if (r == 1) {{
+                    mu = words[6];
+                }}
+                #pragma unroll
+                for (int k = 0; k < 6; ++k) {{
+                    Ja[r][k] = words[8 + k]; Jb[r][k] = words[14 + k]; Ma[r][k] = words[20 + k]; Mb[r][k] = words[26 + k];
+                }}
+                rhs[r] = __ldg(&contacts.rhs.data[first_row + row0 + r]);
+                old[r] = contacts.impulse.data[first_row + row0 + r];
+            }}
+        }}
+        if ({HAS_FRICTION}) {{
+            #pragma unroll
+            for (int k = 0; k < {FRICTION_OPERATOR}; ++k)
+                friction_operator[k] = __ldg(&contacts.friction_operator.data[(first_row + index) * {FRICTION_OPERATOR} + k]);
+        }}
+        if (next_kind == {WITH_FRICTION}) {{
+            asm volatile("prefetch.global.L1 [%0];" :: "l"(next_rows + {ROW}));
+            asm volatile("prefetch.global.L1 [%0];" :: "l"(next_rows + {2 * ROW}));
+        }}"""
+"""Load the lane's contact, and prefetch the one 32 places further."""
+
+_FIND_COLORS = """
+        unsigned starts = index >= uncolored && index < count ? 1u << lane : 0u;   // bits of the lanes at which a color starts
+        for (unsigned inside = ~0u; inside == ~0u;) {
+            const int at = color + lane < OFFSETS - 1 ? color_offsets[color + lane] : count;
+            const bool is_inside = at < count && at < first + 32;
+            if (is_inside) starts |= 1u << (at - first);
+            inside = __ballot_sync(~0u, is_inside);
+            color += __popc(inside);
+        }
+        #pragma unroll
+        for (int distance = 16; distance > 0; distance /= 2) starts |= __shfl_xor_sync(~0u, starts, distance);
+        starts &= ~1u;"""
+"""Find where colors start among the 32 contacts; `color` is the first color that does not start before them."""
+
+
+
+def _dot(row: int) -> str:
+    """CUDA expression for J of a row times the twists, summed in pairs."""
+    terms = [f"Ja[{row}][{k}] * twist_a[{k}]" for k in range(6)] + [f"Jb[{row}][{k}] * twist_b[{k}]" for k in range(6)]
+    pairs = [f"({first} + {second})" for first, second in zip(terms[::2], terms[1::2], strict=True)]
+    return "((({} + {}) + ({} + {})) + ({} + {}))".format(*pairs)
+
+
+def _respond(row: int, impulse: str) -> str:
+    """CUDA statements that add the response to an impulse of a row to the twists."""
+    return f"""
+                    #pragma unroll
+                    for (int k = 0; k < 6; ++k) {{
+                        twist_a[k] += Ma[{row}][k] * {impulse};
+                        twist_b[k] += Mb[{row}][k] * {impulse};
+                    }}"""
+
+
+_LOAD_PATCH = f"""
+                float members[{PATCH_MEMBERS}];
+                #pragma unroll
+                for (int q = 0; q < {PATCH_MEMBERS}; ++q)
+                    members[q] = {HAS_FRICTION} && q < record[3] ? contacts.impulse.data[first_row + record[4 + q]] : 0.0f;"""
+"""Load the normal impulses of the patch's other contacts, which earlier colors may have changed."""
+
+_ADD_PATCH = f"""
+                    #pragma unroll
+                    for (int q = 0; q < {PATCH_MEMBERS}; ++q)
+                        if (q < record[3]) load += members[q];
+                    if (record[{4 + PATCH_MEMBERS}] >= 0 && record[{RECORD - 1}] >= 0) {{
+                        const int* list = &contacts.patch_lists.data[first_row + (record[{RECORD - 1}] & 0xFFFFF)];
+                        const int listed = record[{RECORD - 1}] >> 20;
+                        for (int begin = 0; begin < listed; begin += 8) {{
+                            float rest[8];
+                            #pragma unroll
+                            for (int q = 0; q < 8; ++q)
+                                rest[q] = begin + q < listed ? contacts.impulse.data[first_row + __ldg(&list[begin + q])] : 0.0f;
+                            #pragma unroll
+                            for (int q = 0; q < 8; ++q)
+                                if (begin + q < listed) load += rest[q];
+                        }}
+                    }} else {{
+                        for (int row = record[{4 + PATCH_MEMBERS}]; row >= 0 && row != row0; row = contacts.row_parent.data[first_row + row])
+                            load += contacts.impulse.data[first_row + row];
+                    }}"""
+"""Add the normal impulses of the patch's other contacts in its order: the first 4, then a list, or if that was full, link by link."""
+
+_SOLVE = f"""
+{_LOAD_PATCH}
+                const int slot_a = record[1] >= 0 ? record[1] : BODIES, slot_b = record[2] >= 0 ? record[2] : BODIES;
+                float4* const shared_a = reinterpret_cast<float4*>(&twists[slot_a * {SLOT}]);
+                float4* const shared_b = reinterpret_cast<float4*>(&twists[slot_b * {SLOT}]);
+                const float4 linear_a = shared_a[0], angular_a = shared_a[1], linear_b = shared_b[0], angular_b = shared_b[1];
+                float twist_a[6] = {{linear_a.x, linear_a.y, linear_a.z, linear_a.w, angular_a.x, angular_a.y}};
+                float twist_b[6] = {{linear_b.x, linear_b.y, linear_b.z, linear_b.w, angular_b.x, angular_b.y}};
+                float old0 = old[0], old1 = old[1], old2 = old[2], weight0 = weight;
+                // Keep the compiler from moving products of these out of the loop, which would round otherwise.
+                asm volatile("" : "+f"(old0), "+f"(old1), "+f"(old2), "+f"(weight0));
+                float* const impulse = &contacts.impulse.data[first_row + row0];
+                float load = old0, change0 = 0.0f, change1 = 0.0f, change2 = 0.0f;
+                if (mass > 0.0f) {{
+                    const float w = settings.regularize ? weight0 : 1.0f;
+                    float new0 = old0 + settings.omega * (-({_dot(0)} + rhs[0]) * mass * w - (1.0f - w) * old0);
+                    if (new0 < 0.0f) new0 = 0.0f;
+                    change0 = new0 - old0;
+                    impulse[0] = new0;
+                    load = new0;
+{_respond(0, "change0")}
+                }}
+                if ({HAS_FRICTION}) {{
+                  if (iteration < settings.friction_start_iteration) {{
+                    impulse[1] = 0.0f;
+                    impulse[2] = 0.0f;
+                  }} else {{
+{_ADD_PATCH}
+                    const float radius = fmaxf(mu * load, 0.0f);
+                    const float residual1 = {_dot(1)} + rhs[1];
+                    const float residual2 = {_dot(2)} + rhs[2];
+                    const float2 pair = friction_pair_solve(
+                        friction_operator[0], friction_operator[1], friction_operator[2], friction_operator[3], friction_operator[4],
+                        residual1, residual2, old1, old2, radius, settings.omega);
+                    const float magnitude = sqrtf(pair.x * pair.x + pair.y * pair.y);
+                    const float scale = magnitude > radius ? radius / magnitude : 1.0f;
+                    const float new1 = pair.x * scale;
+                    const float new2 = pair.y * scale;
+                    change1 = new1 - old1;
+                    change2 = new2 - old2;
+                    impulse[1] = new1;
+                    impulse[2] = new2;
+{_respond(2, "change2")}
+{_respond(1, "change1")}
+                  }}
+                }}
+                if (slot_a < BODIES) {{
+                    shared_a[0] = make_float4(twist_a[0], twist_a[1], twist_a[2], twist_a[3]);
+                    shared_a[1] = make_float4(twist_a[4], twist_a[5], 0.0f, 0.0f);
+                }}
+                if (slot_b < BODIES) {{
+                    shared_b[0] = make_float4(twist_b[0], twist_b[1], twist_b[2], twist_b[3]);
+                    shared_b[1] = make_float4(twist_b[4], twist_b[5], 0.0f, 0.0f);
+                }}
+                // Only the gripper's impulses are needed, by the propagation through its joints.
+                if (!is_free[slot_a]) {{
+                    #pragma unroll
+                    for (int k = 0; k < 6; ++k) {{
+                        float& sum = body_impulses[slot_a * 6 + k];
+                        sum = fmaf(Ja[1][k], change1, fmaf(Ja[2][k], change2, fmaf(Ja[0][k], change0, sum)));
+                    }}
+                }}
+                if (!is_free[slot_b]) {{
+                    #pragma unroll
+                    for (int k = 0; k < 6; ++k) {{
+                        float& sum = body_impulses[slot_b * 6 + k];
+                        sum = fmaf(Jb[1][k], change1, fmaf(Jb[2][k], change2, fmaf(Jb[0][k], change0, sum)));
+                    }}
+                }}"""
+"""Solve the lane's contact: its normal row, then its two friction rows together."""
