@@ -3,38 +3,27 @@
 Newton's SolverSteel loads the contacts of one color, solves them, and goes on with the next color. Piles have many colors of few contacts:
 an object of many convex pieces lies on the tote with 60 contacts, each of a color of its own, and most of the time is spent waiting for
 memory. Here each lane loads one of 32 contacts, consecutive in the order of colors, and the colors among them are solved one after the
-other. Meanwhile the next 32 are prefetched. The arithmetic is the solver's own source text, so results are bitwise identical.
+other. Meanwhile the next 32 are prefetched. The arithmetic is the solver's, and results are bitwise identical, but for the friction rows (`friction.py`): with
+the solver's search for their multiplier, most of the time was spent there.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
+from synpick_warp.kernels.sim.contact_rows import KIND, MASS, MU, NORMAL_ONLY, RECORD, ROW, WITH_FRICTION
+from synpick_warp.kernels.sim.friction import FRICTION_OPERATOR, SOLVE_FRICTION
 from synpick_warp.kernels.sim.solver_iterations import ContactRowData, IterationSettings
 
-RECORD = 12
-"""Words of a contact's record: first row, slots of its bodies a and b in the world's list, number of listed patch members, up to 4 patch
-members, the member after them, number of rows, kind, list of the other members."""
 PATCH_MEMBERS = 4
 """Members of a friction patch in the record of the contact that has its friction rows: normal rows of other contacts."""
-KIND = 10
-"""Word of the record with the kind: `WITH_FRICTION`, `NORMAL_ONLY`, or 0 for any other rows."""
-WITH_FRICTION = 1
-"""Kind of a contact with a normal row and two friction rows."""
-NORMAL_ONLY = 2
-"""Kind of a contact with a normal row, whose friction another contact of its patch has."""
 HAS_FRICTION = f"record[{KIND}] == {WITH_FRICTION}"
 """CUDA expression for whether a contact has friction rows."""
-FRICTION_OPERATOR = 5
-"""Words of a contact's friction operator: a symmetric 2x2 matrix by its eigenvalues and an eigenvector."""
 SLOT = 8
 """Words of a body's twist in shared memory, so that it is read at once."""
-ROW = 32
-"""Words of a packed row, a cache line: type, inverse effective mass, bodies, unused, weight, friction coefficient, parent, then Jacobians J_a
-and J_b and responses M⁻¹J_aᵀ and M⁻¹J_bᵀ of 6 each. A contact has 3 rows."""
 
 
-def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str) -> wp.Function:
+def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = SOLVE_FRICTION) -> wp.Function:
     """Create the sweep over the contacts of a world.
 
     A world with contacts of other kinds than the two is flagged as lost.
@@ -43,7 +32,7 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str) -
         rows, bodies: Capacities of a world.
         offsets: Color offsets of a world. The last two are where contacts without a color begin, which are solved one by one, and the number
             of contacts.
-        friction: CUDA source of the solver's function `friction_pair_solve`, the impulses of two friction rows within a circle.
+        friction: Source of the function `solve_friction`.
     """
 
     @wp.func_native(_source(rows, bodies, offsets, friction))
@@ -128,26 +117,22 @@ _LOAD = f"""
             if (record[{KIND}] == 0) contacts.overflow.data[world] = true;
         }}
         const int row0 = record[0];
-        float mass, weight, mu, Ja[3][6] = {{0}}, Jb[3][6] = {{0}}, Ma[3][6], Mb[3][6], rhs[3], old[3], friction_operator[{FRICTION_OPERATOR}];
+        float mass, mu, Ja[3][6] = {{0}}, Jb[3][6] = {{0}}, Ma[3][6], Mb[3][6], rhs[3], old[3], friction_operator[{FRICTION_OPERATOR}];
         #pragma unroll
         for (int r = 0; r < 3; ++r) {{
             if ({HAS_FRICTION} || (r == 0 && record[{KIND}] == {NORMAL_ONLY})) {{
                 const float* row = &contacts.rows.data[(size_t)(first_row + index) * {3 * ROW} + r * {ROW}];
-                float words[{ROW}];
+                float words[28];
                 #pragma unroll
-                for (int k = 0; k < {ROW // 4}; ++k) {{
+                for (int k = 0; k < 7; ++k) {{
                     const float4 four = __ldg(&reinterpret_cast<const float4*>(row)[k]);
                     words[4 * k] = four.x; words[4 * k + 1] = four.y; words[4 * k + 2] = four.z; words[4 * k + 3] = four.w;
                 }}
-                if (r == 0) {{
-                    mass = words[1];
-                    weight = words[5];
-                }} else if (r == 1) {{
-                    mu = words[6];
-                }}
+                if (r == 0) mass = words[{MASS}];
+                if (r == 1) mu = words[{MU}];
                 #pragma unroll
                 for (int k = 0; k < 6; ++k) {{
-                    Ja[r][k] = words[8 + k]; Jb[r][k] = words[14 + k]; Ma[r][k] = words[20 + k]; Mb[r][k] = words[26 + k];
+                    Ja[r][k] = words[k]; Jb[r][k] = words[6 + k]; Ma[r][k] = words[12 + k]; Mb[r][k] = words[18 + k];
                 }}
                 rhs[r] = __ldg(&contacts.rhs.data[first_row + row0 + r]);
                 old[r] = contacts.impulse.data[first_row + row0 + r];
@@ -177,7 +162,6 @@ _FIND_COLORS = """
         for (int distance = 16; distance > 0; distance /= 2) starts |= __shfl_xor_sync(~0u, starts, distance);
         starts &= ~1u;"""
 """Find where colors start among the 32 contacts; `color` is the first color that does not start before them."""
-
 
 
 def _dot(row: int) -> str:
@@ -234,14 +218,13 @@ _SOLVE = f"""
                 const float4 linear_a = shared_a[0], angular_a = shared_a[1], linear_b = shared_b[0], angular_b = shared_b[1];
                 float twist_a[6] = {{linear_a.x, linear_a.y, linear_a.z, linear_a.w, angular_a.x, angular_a.y}};
                 float twist_b[6] = {{linear_b.x, linear_b.y, linear_b.z, linear_b.w, angular_b.x, angular_b.y}};
-                float old0 = old[0], old1 = old[1], old2 = old[2], weight0 = weight;
-                // Keep the compiler from moving products of these out of the loop, which would round otherwise.
-                asm volatile("" : "+f"(old0), "+f"(old1), "+f"(old2), "+f"(weight0));
+                float old0 = old[0], old1 = old[1], old2 = old[2];
+                // Keeps the compiler from moving products of these out of the loop, where they would be rounded otherwise.
+                asm volatile("" : "+f"(old0), "+f"(old1), "+f"(old2));
                 float* const impulse = &contacts.impulse.data[first_row + row0];
                 float load = old0, change0 = 0.0f, change1 = 0.0f, change2 = 0.0f;
                 if (mass > 0.0f) {{
-                    const float w = settings.regularize ? weight0 : 1.0f;
-                    float new0 = old0 + settings.omega * (-({_dot(0)} + rhs[0]) * mass * w - (1.0f - w) * old0);
+                    float new0 = old0 + settings.omega * (-({_dot(0)} + rhs[0]) * mass);
                     if (new0 < 0.0f) new0 = 0.0f;
                     change0 = new0 - old0;
                     impulse[0] = new0;
@@ -257,13 +240,10 @@ _SOLVE = f"""
                     const float radius = fmaxf(mu * load, 0.0f);
                     const float residual1 = {_dot(1)} + rhs[1];
                     const float residual2 = {_dot(2)} + rhs[2];
-                    const float2 pair = friction_pair_solve(
+                    float new1, new2;
+                    solve_friction(
                         friction_operator[0], friction_operator[1], friction_operator[2], friction_operator[3], friction_operator[4],
-                        residual1, residual2, old1, old2, radius, settings.omega);
-                    const float magnitude = sqrtf(pair.x * pair.x + pair.y * pair.y);
-                    const float scale = magnitude > radius ? radius / magnitude : 1.0f;
-                    const float new1 = pair.x * scale;
-                    const float new2 = pair.y * scale;
+                        residual1, residual2, old1, old2, radius, settings.omega, new1, new2);
                     change1 = new1 - old1;
                     change2 = new2 - old2;
                     impulse[1] = new1;

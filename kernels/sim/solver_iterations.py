@@ -82,11 +82,11 @@ class ContactRowData:
     body_count: wp.array[int]
     """Their number (world)."""
     records: wp.array[int]
-    """Rows, bodies and friction patch of each contact (world, contact, `contact_sweep.RECORD`)."""
+    """Rows, bodies and friction patch of each contact (world, contact, `contact_rows.RECORD`)."""
     friction_operator: wp.array[float]
-    """Friction operator of each contact (world, contact, `contact_sweep.FRICTION_OPERATOR`)."""
-    rows: wp.array[float]
-    """Rows of each contact (world, contact, 3, `contact_sweep.ROW`)."""
+    """Friction operator of each contact (world, contact, `friction.FRICTION_OPERATOR`)."""
+    rows: wp.array3d[float]
+    """Rows of each contact (world, contact, 3 `contact_rows.ROW`)."""
     patch_lists: wp.array[int]
     """Rows of patches with more members than a record has (world, row)."""
     is_free: wp.array[bool]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache, partial
 from types import SimpleNamespace
 
 import newton
@@ -12,7 +13,7 @@ from newton._src.solvers.steel import solver_steel as steel
 from newton._src.solvers.steel.kernels import accumulate_propagation_warmstart_body_impulses_ordered
 
 from synpick_warp.codes import Phase
-from synpick_warp.kernels.sim import world_order
+from synpick_warp.kernels.sim import contact_sweep, world_order
 from synpick_warp.kernels.sim.warm_start import apply_warm_start_kernel
 from synpick_warp.scenes import build
 from synpick_warp.stages.sim import fused_solver, physics
@@ -23,6 +24,22 @@ from tests.worlds.small_worlds import catalog, settings
 TICKS = 30
 ARCHITECTURE, DOFS, BODIES, ROWS = 90, 16, 5, 96
 """Compile-time constants of the kernel under test: CUDA compute capability, and capacities of a small world."""
+NEWTONS_FRICTION = (
+    steel.FRICTION_PAIR_CUDA
+    + """
+    const auto solve_friction = [&](
+        float scale, float largest, float smallest, float axis0, float axis1,
+        float residual0, float residual1, float old0, float old1, float radius, float relaxation, float& new0, float& new1) {
+        const float2 pair = friction_pair_solve(
+            scale, largest, smallest, axis0, axis1, residual0, residual1, old0, old1, radius, relaxation);
+        const float magnitude = sqrtf(pair.x * pair.x + pair.y * pair.y);
+        const float shrink = magnitude > radius ? radius / magnitude : 1.0f;
+        new0 = pair.x * shrink;
+        new1 = pair.y * shrink;
+    };
+"""
+)
+"""The function of `friction.SOLVE_FRICTION` with the solver's arithmetic."""
 
 
 def test_the_installed_version_of_newton_is_fused():
@@ -50,6 +67,7 @@ def test_what_the_kernel_does_not_support_is_found():
         "_row_schedule": "interleaved",
         "_friction_mode": "fixed_normal",
         "_contact_compliance": False,
+        "_regularization_enabled": False,
         "_contact_torsion_enabled": False,
         "_has_drive_rows": False,
         "_enable_joint_velocity_limits": False,
@@ -58,7 +76,7 @@ def test_what_the_kernel_does_not_support_is_found():
         "_pgs_solve_propagation_colored_warp_kernel": "kernel",
         "_internal_row_phases": lambda: (True, False),
     }
-    others: list[object] = [False, "phased", "bisection", True, True, True, True, {4: 1}, [4, 7], None, lambda: (False, False)]
+    others: list[object] = [False, "phased", "bisection", True, True, True, True, True, {4: 1}, [4, 7], None, lambda: (False, False)]
     assert fused_solver.find_unsupported(SimpleNamespace(**known)) == []
     for name, value in zip(known, others, strict=True):
         assert len(fused_solver.find_unsupported(SimpleNamespace(**known | {name: value}))) == 1
@@ -137,14 +155,17 @@ def test_worlds_with_the_most_colors_come_first(device):
 
 @pytest.mark.parametrize(("worlds", "resident", "max_speed"), [(8, 8, 0.3), (8, 8, 4.0), (24, 8, 4.0), (24, 0, 4.0)])
 def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, resident, max_speed):
-    """Piles fall, rest and are stirred; at the lower speed limit, falling bodies have velocity limit rows. Newton packs rows of up to 16
-    worlds only, takes worlds in their order (they are sorted if none is resident), and its narrow phase uses larger blocks."""
+    """All but the friction rows is bitwise the same, so the solver's are compiled in. Piles fall, rest and are stirred; at the lower speed
+    limit, falling bodies have velocity limit rows. Newton does not load 32 contacts at a time, takes worlds in their order (they are sorted
+    if none is resident), and its narrow phase uses larger blocks."""
     if not device.is_cuda:
         pytest.skip("on a CPU the solver's own launches run")
     config = settings(
         bake__worlds=worlds, bake__episodes=worlds, bake__mode="move", physics__max_speed=max_speed, physics__deterministic=True
     )
     monkeypatch.setattr(fused_solver, "RESIDENT_WORLDS", resident)
+    compose = cache(partial(contact_sweep.compose_contact_sweep, offsets=fused_solver.OFFSETS, friction=NEWTONS_FRICTION))
+    monkeypatch.setattr(fused_solver, "compose_contacts", compose)
     found, phases = {}, set()
     for version in (fused_solver.KNOWN_NEWTON, "another"):
         for module in (fused_solver, physics):

@@ -12,7 +12,7 @@ import newton
 import numpy as np
 import warp as wp
 
-from synpick_warp.kernels.sim import contact_sweep, solver_iterations, warm_start, world_order
+from synpick_warp.kernels.sim import contact_rows, contact_sweep, solver_iterations, warm_start, world_order
 
 RESIDENT_WORLDS = 8
 """Worlds whose iterations a multiprocessor can run at a time: its 65,536 registers hold 8 warps with 255 a thread. Where there are more
@@ -24,6 +24,8 @@ Other versions are used as they are: the same results, slower."""
 
 steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
 """The solver's module, with the factories of its kernels."""
+OFFSETS = int(steel.PROPAGATION_COLOR_TAIL) + 2
+"""Color offsets of a world: of up to 512 colors, of contacts without a color, and the number of contacts."""
 
 
 class FusedSteel(newton.solvers.SolverSteel):
@@ -76,12 +78,30 @@ class FusedSteel(newton.solvers.SolverSteel):
             device=self.model.device,
         )
 
-    def _init_colored_kernels(self, model: newton.Model) -> None:
-        """Have the rows of contacts packed into records of 384 bytes, 0.6 MB per world; SolverSteel packs those of up to 16 worlds."""
-        super()._init_colored_kernels(model)
-        if self._color_unit_payload is None:
-            words = self._world_count * self._propagation_max_constraints * steel.PROPAGATION_UNIT_PAYLOAD
-            self._color_unit_payload = wp.zeros(words, dtype=wp.float32, device=model.device)
+    def _launch_gather_unit_meta(self) -> None:
+        """Gather the contacts of all worlds in the order of their colors, with their friction operators and rows."""
+        super()._launch_gather_unit_meta()
+        if not self._is_fusable:
+            return
+        inputs = [
+            OFFSETS,
+            self._color_world_offsets,
+            self._color_unit_meta,
+            self._propagation_J_a,
+            self._propagation_J_b,
+            self._propagation_MiJt_a,
+            self._propagation_MiJt_b,
+            self._propagation_eff_mass_inv,
+            self._propagation_row_mu,
+        ]
+        dim = (self._world_count, int(contact_rows.THREADS))
+        wp.launch(contact_rows.pack_rows_kernel, dim=dim, inputs=inputs, outputs=[self._packed_rows], device=self.model.device)
+
+    @cached_property
+    def _packed_rows(self) -> wp.array:
+        """Rows of contacts (world, contact, 3 `ROW`) float32: 384 bytes for each row that a world may have."""
+        shape = self._world_count, self._propagation_max_constraints, 3 * int(contact_rows.ROW)
+        return wp.zeros(shape, dtype=wp.float32, device=self.model.device)
 
     def _apply_propagation_warmstart_velocity(self) -> None:
         """Turn the impulses of the warm start into velocities, with a thread for each component of each body instead of each world."""
@@ -130,7 +150,7 @@ class FusedSteel(newton.solvers.SolverSteel):
         if self._world_count > RESIDENT_WORLDS * self.model.device.sm_count:
             options: dict[str, Any] = {"dim": self._world_count, "device": self.model.device}
             sizes.zero_()
-            inputs = [self._color_world_offsets, steel.PROPAGATION_COLOR_TAIL + 2]
+            inputs = [self._color_world_offsets, OFFSETS]
             wp.launch(world_order.bin_worlds_kernel, inputs=inputs, outputs=[sizes, bins, places], **options)
             wp.launch(world_order.order_worlds_kernel, inputs=[sizes, bins, places], outputs=[order], **options)
         return order
@@ -161,7 +181,7 @@ class FusedSteel(newton.solvers.SolverSteel):
                 self._propagation_body_count,
                 self._color_unit_meta,
                 self._color_unit_friction_setup,
-                self._color_unit_payload,
+                self._packed_rows,
                 self._color_ring_overflow,
                 self._is_free,
                 self.constraint_overflow,
@@ -226,6 +246,7 @@ def find_unsupported(solver: Any) -> list[str]:
         "row_schedule": solver._row_schedule != "interleaved",
         "friction_mode": solver._friction_mode != "fixed_normal",
         "contact_compliance": solver._contact_compliance,
+        "contact_regularization": solver._regularization_enabled,
         "contact torsion": solver._contact_torsion_enabled,
         "drive_mode": solver._has_drive_rows,
         "enable_joint_velocity_limits": solver._enable_joint_velocity_limits,
@@ -259,7 +280,7 @@ def compose_kernel(rows: wp.Kernel, refresh: wp.Kernel, contacts: wp.Function, p
 @cache
 def compose_contacts(rows: int, bodies: int) -> wp.Function:
     """Sweep over the contacts of a world with at most `rows` rows and `bodies` bodies."""
-    return contact_sweep.compose_contact_sweep(rows, bodies, steel.PROPAGATION_COLOR_TAIL + 2, steel.FRICTION_PAIR_CUDA)
+    return contact_sweep.compose_contact_sweep(rows, bodies, OFFSETS)
 
 
 def device_function(kernel: wp.Kernel) -> wp.Function:

@@ -1,0 +1,64 @@
+"""Packed rows of contacts: those of a contact side by side, for the sweep of the solver's iterations."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+RECORD = wp.constant(12)
+"""Words of a contact's record: first row, slots of its bodies a and b in the world's list, number of listed patch members, up to 4 patch
+members, the member after them, number of rows, kind, list of the other members."""
+KIND = wp.constant(10)
+"""Word of the record with the kind: `WITH_FRICTION`, `NORMAL_ONLY`, or 0 for any other rows."""
+WITH_FRICTION = wp.constant(1)
+"""Kind of a contact with a normal row and two friction rows."""
+NORMAL_ONLY = wp.constant(2)
+"""Kind of a contact with a normal row, whose friction another contact of its patch has."""
+ROW = wp.constant(32)
+"""Words of a packed row, a cache line: Jacobians J_a and J_b, responses M⁻¹J_aᵀ and M⁻¹J_bᵀ of 6 each, inverse effective mass and friction
+coefficient. A contact has 3 rows."""
+MASS, MU = wp.constant(24), wp.constant(25)
+"""Words of a packed row with the inverse effective mass and the friction coefficient."""
+THREADS = wp.constant(128)
+"""Threads that pack the rows of a world."""
+
+
+@wp.kernel(enable_backward=False)
+def pack_rows_kernel(
+    # Scene:
+    offsets: int,
+    # State:
+    color_offsets: wp.array[int],  # (world, offset)
+    records: wp.array[int],  # (world, contact, RECORD)
+    # In:
+    jacobian_a: wp.array3d[float],  # (world, row, 6)
+    jacobian_b: wp.array3d[float],
+    response_a: wp.array3d[float],  # M⁻¹Jᵀ (world, row, 6)
+    response_b: wp.array3d[float],
+    mass: wp.array2d[float],  # inverse effective mass (world, row) [1/kg]
+    mu: wp.array2d[float],  # friction coefficient (world, row)
+    # Out:
+    rows_out: wp.array3d[float],  # (world, contact, 3 ROW)
+):
+    """Copy the rows of contacts to where the sweep reads them, word by word, and no friction rows where there are none."""
+    world, thread = wp.tid()
+    count = color_offsets[world * offsets + offsets - 1]
+    for element in range(thread, count * 3 * ROW, THREADS):
+        contact = element // (3 * ROW)
+        word = element - contact * 3 * ROW
+        record = (world * mass.shape[1] + contact) * RECORD
+        which = word // ROW
+        column = word - which * ROW
+        if which == 0 or records[record + KIND] == WITH_FRICTION:
+            row = records[record] + which
+            if column < 6:
+                rows_out[world, contact, word] = jacobian_a[world, row, column]
+            elif column < 12:
+                rows_out[world, contact, word] = jacobian_b[world, row, column - 6]
+            elif column < 18:
+                rows_out[world, contact, word] = response_a[world, row, column - 12]
+            elif column < 24:
+                rows_out[world, contact, word] = response_b[world, row, column - 18]
+            elif column == MASS:
+                rows_out[world, contact, word] = mass[world, row]
+            elif column == MU:
+                rows_out[world, contact, word] = mu[world, row]

@@ -1,0 +1,120 @@
+"""Friction rows of a contact: Newton's method on the secular equation against its bisection in double precision."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from synpick_warp.kernels.sim.friction import solve_friction
+
+
+@wp.kernel(enable_backward=False)
+def solve_kernel(
+    scale: wp.array[float],
+    values: wp.array[wp.vec2],
+    axis: wp.array[wp.vec2],
+    residual: wp.array[wp.vec2],
+    old: wp.array[wp.vec2],
+    radius: wp.array[float],
+    relaxation: float,
+    found_out: wp.array[wp.vec2],
+):
+    """Solve the friction rows of one contact per thread."""
+    i = wp.tid()
+    found_out[i] = solve_friction(scale[i], values[i][0], values[i][1], axis[i], residual[i], old[i], radius[i], relaxation)
+
+
+def solve(matrices, residual, old, radius, device, relaxation: float = 1.0) -> np.ndarray:
+    """Impulses of contacts (contact, 2) for matrices (contact, 2, 2), residuals and old impulses (contact, 2) and radii (contact)."""
+    values, vectors = np.linalg.eigh(matrices)
+    scale = np.maximum(matrices[:, 0, 0], matrices[:, 1, 1])
+    arrays = (scale, values[:, ::-1] / scale[:, None], vectors[:, :, 1], residual, old, radius)
+    inputs = [wp.array(np.float32(a), dtype=wp.vec2 if a.ndim > 1 else float, device=device) for a in arrays]
+    found = wp.empty(len(scale), dtype=wp.vec2, device=device)
+    wp.launch(solve_kernel, dim=len(scale), inputs=[*inputs, relaxation], outputs=[found], device=device)
+    return found.numpy()
+
+
+def bisect(matrix: np.ndarray, residual: np.ndarray, old: np.ndarray, radius: float) -> np.ndarray:
+    """Minimum of ½ xᵀA x - bᵀx within a circle, with b = A old - residual, in double precision."""
+    b = matrix @ old - residual
+    free = np.linalg.solve(matrix, b)
+    if np.linalg.norm(free) <= radius:
+        return free
+    low, high = 0.0, np.linalg.norm(b) / radius
+    for _ in range(200):
+        middle = (low + high) / 2.0
+        outside = np.linalg.norm(np.linalg.solve(matrix + middle * np.eye(2), b)) > radius
+        low, high = (middle, high) if outside else (low, middle)
+    return np.linalg.solve(matrix + high * np.eye(2), b)
+
+
+def random_contacts(count: int, condition: float, seed: int = 1):
+    """Matrices with eigenvalues of 0.5 to 50 /kg up to a ratio of `condition`, residuals of up to 1 m/s, old impulses within the circles."""
+    random = np.random.default_rng(seed)
+    angle = random.uniform(0.0, np.pi, count)
+    vectors = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1).reshape(-1, 2, 2)
+    largest = np.exp(random.uniform(np.log(0.5), np.log(50.0), count))
+    values = np.stack([largest, largest / np.exp(random.uniform(0.0, np.log(condition), count))], -1)
+    matrices = np.einsum("nij,nj,nkj->nik", vectors, values, vectors)
+    radius = np.exp(random.uniform(np.log(1e-5), np.log(1e-2), count))
+    old = random.normal(size=(count, 2))
+    old *= (radius * random.random(count) / np.linalg.norm(old, axis=1))[:, None]
+    residual = random.normal(size=(count, 2)) * np.exp(random.uniform(np.log(1e-5), 0.0, count))[:, None]
+    return matrices, residual, old, radius
+
+
+@pytest.mark.parametrize("condition", [1.0, 5.0, 1000.0])
+def test_impulses_are_those_of_a_bisection(device, condition):
+    contacts = random_contacts(3000, condition)
+    found = solve(*contacts, device)
+    expected = np.array([bisect(*contact) for contact in zip(*contacts, strict=True)])
+    error = np.linalg.norm(found - expected, axis=1) / contacts[3]
+    slides = np.linalg.norm(expected, axis=1) > 0.999 * contacts[3]
+    assert 0.2 < slides.mean() < 0.95
+    assert np.quantile(error, 0.99) < 1e-5
+    assert error.max() < 1e-6 * max(100.0, 5.0 * condition)  # rounding moves an impulse along the circle by the ratio of eigenvalues
+
+
+def test_an_impulse_in_equilibrium_stays(device):
+    """Solved again with the residual of its own solution, a sliding impulse changes by rounding alone."""
+    matrices, residual, old, radius = random_contacts(2000, 20.0, seed=2)
+    first = solve(matrices, residual, old, radius, device).astype(float)
+    after = residual + np.einsum("nij,nj->ni", matrices, first - old)
+    second = solve(matrices, after, first, radius, device)
+    assert (np.linalg.norm(second - first, axis=1) / radius).max() < 2e-5
+
+
+def test_without_load_there_is_no_friction(device):
+    matrices, residual, old, _ = random_contacts(50, 5.0)
+    assert (solve(matrices, residual, old, np.zeros(50), device) == 0.0).all()
+    assert (solve(matrices, residual, old, np.full(50, -1.0), device) == 0.0).all()
+
+
+def test_a_contact_that_sticks_has_no_velocity_left(device):
+    """Analytic: residual 0 after the impulse; half of it with a relaxation of 0.5."""
+    matrices = np.tile(np.diag((2.0, 4.0)), (1, 1, 1))
+    residual, old, radius = np.array([[0.02, 0.04]]), np.array([[0.001, 0.002]]), np.array([1.0])
+    np.testing.assert_allclose(solve(matrices, residual, old, radius, device), [[0.001 - 0.01, 0.002 - 0.01]], rtol=1e-6)
+    np.testing.assert_allclose(solve(matrices, residual, old, radius, device, 0.5), [[0.001 - 0.005, 0.002 - 0.005]], rtol=1e-6)
+
+
+def test_isotropic_friction_opposes_the_velocity(device):
+    """Analytic: with equal eigenvalues and no old impulse, the impulse is -r times the direction of the residual."""
+    matrices, residual, radius = np.eye(2)[None] * 3.0, np.array([[0.6, -0.8]]), np.array([0.01])
+    np.testing.assert_allclose(solve(matrices, residual, np.zeros((1, 2)), radius, device), [[-0.006, 0.008]], rtol=1e-5)
+
+
+@given(st.lists(st.floats(-1.0, 1.0, width=32), min_size=4, max_size=4), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
+def test_impulses_stay_finite_within_the_circle(numbers, largest, ratio, radius):
+    """Also for matrices without one or both eigenvalues, as of a body that cannot move in a direction."""
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    matrix = turn @ np.diag((largest, largest * ratio)) @ turn.T
+    if largest < 1e-6:
+        matrix = np.diag((1e-6, 0.0))
+    found = solve(matrix[None], np.array([numbers[:2]]), np.array([numbers[2:]]), np.array([radius]), "cpu")
+    assert np.isfinite(found).all()
+    assert np.linalg.norm(found) <= radius * (1.0 + 1e-5)
