@@ -18,7 +18,7 @@ ROW = wp.constant(32)
 coefficient. A contact has 3 rows."""
 MASS, MU = wp.constant(24), wp.constant(25)
 """Words of a packed row with the inverse effective mass and the friction coefficient."""
-THREADS = wp.constant(128)
+THREADS = wp.constant(512)
 """Threads that pack the rows of a world."""
 
 
@@ -39,26 +39,29 @@ def pack_rows_kernel(
     # Out:
     rows_out: wp.array3d[float],  # (world, contact, 3 ROW)
 ):
-    """Copy the rows of contacts to where the sweep reads them, word by word, and no friction rows where there are none."""
+    """Copy the rows of contacts to where the sweep reads them, and no friction rows where there are none; a warp takes a contact at a time."""
     world, thread = wp.tid()
+    warp = thread // ROW
+    word = thread - warp * ROW
     count = color_offsets[world * offsets + offsets - 1]
-    for element in range(thread, count * 3 * ROW, THREADS):
-        contact = element // (3 * ROW)
-        word = element - contact * 3 * ROW
+    for contact in range(warp, count, THREADS // ROW):
         record = (world * mass.shape[1] + contact) * RECORD
-        which = word // ROW
-        column = word - which * ROW
-        if which == 0 or records[record + KIND] == WITH_FRICTION:
+        rows = 1
+        if records[record + KIND] == WITH_FRICTION:
+            rows = 3
+        for which in range(rows):
             row = records[record] + which
-            if column < 6:
-                rows_out[world, contact, word] = jacobian_a[world, row, column]
-            elif column < 12:
-                rows_out[world, contact, word] = jacobian_b[world, row, column - 6]
-            elif column < 18:
-                rows_out[world, contact, word] = response_a[world, row, column - 12]
-            elif column < 24:
-                rows_out[world, contact, word] = response_b[world, row, column - 18]
-            elif column == MASS:
-                rows_out[world, contact, word] = mass[world, row]
-            elif column == MU:
-                rows_out[world, contact, word] = mu[world, row]
+            value = float(0.0)
+            if word < 6:
+                value = jacobian_a[world, row, word]
+            elif word < 12:
+                value = jacobian_b[world, row, word - 6]
+            elif word < 18:
+                value = response_a[world, row, word - 12]
+            elif word < 24:
+                value = response_b[world, row, word - 18]
+            elif word == MASS:
+                value = mass[world, row]
+            elif word == MU:
+                value = mu[world, row]
+            rows_out[world, contact, which * ROW + word] = value

@@ -19,6 +19,8 @@ PATCH_MEMBERS = 4
 """Members of a friction patch in the record of the contact that has its friction rows: normal rows of other contacts."""
 HAS_FRICTION = f"record[{KIND}] == {WITH_FRICTION}"
 """CUDA expression for whether a contact has friction rows."""
+MAX_SHARED_ROWS = 3072
+"""Rows of a world up to which impulses and lists of patch members are held in shared memory: 24 of the 48 KB of a block."""
 SLOT = 8
 """Words of a body's twist in shared memory, so that it is read at once."""
 
@@ -50,6 +52,7 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
 
 def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
     """CUDA source of the sweep. A static body's twist is that of a slot behind the others, zero."""
+    is_shared = rows <= MAX_SHARED_ROWS
     return f"""
 #if defined(__CUDA_ARCH__)
 {friction}
@@ -62,6 +65,16 @@ def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
     __shared__ __align__(16) float twists[({bodies} + 1) * {SLOT}];
     __shared__ float body_impulses[{bodies} * 6];
     __shared__ bool is_free[{bodies} + 1];
+    const int row_count = min(contacts.row_count.data[world], {rows}), listed = min(contacts.patch_list_length.data[world], {rows});
+#if {int(is_shared)}
+    __shared__ float impulses[{rows}];
+    __shared__ int patch_list[{rows}];
+    for (int i = lane; i < row_count; i += 32) impulses[i] = contacts.impulse.data[first_row + i];
+    for (int i = lane; i < listed; i += 32) patch_list[i] = contacts.patch_lists.data[first_row + i];
+#else
+    float* const impulses = &contacts.impulse.data[first_row];
+    const int* const patch_list = &contacts.patch_lists.data[first_row];
+#endif
     const int slots = contacts.body_count.data[world];
     for (int i = lane; i < slots * 6; i += 32) {{
         const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * {bodies} + slot];
@@ -94,6 +107,9 @@ def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
         twist_inout.data[body * 6 + component] = twists[slot * {SLOT} + component];
         impulse_inout.data[body * 6 + component] = body_impulses[i];
     }}
+#if {int(is_shared)}
+    for (int i = lane; i < row_count; i += 32) contacts.impulse.data[first_row + i] = impulses[i];
+#endif
 #endif
 """
 
@@ -117,7 +133,7 @@ _LOAD = f"""
             if (record[{KIND}] == 0) contacts.overflow.data[world] = true;
         }}
         const int row0 = record[0];
-        float mass, mu, Ja[3][6] = {{0}}, Jb[3][6] = {{0}}, Ma[3][6], Mb[3][6], rhs[3], old[3], friction_operator[{FRICTION_OPERATOR}];
+        float mass, mu, Ja[3][6] = {{0}}, Jb[3][6] = {{0}}, Ma[3][6], Mb[3][6], rhs[3], friction_operator[{FRICTION_OPERATOR}];
         #pragma unroll
         for (int r = 0; r < 3; ++r) {{
             if ({HAS_FRICTION} || (r == 0 && record[{KIND}] == {NORMAL_ONLY})) {{
@@ -135,7 +151,6 @@ _LOAD = f"""
                     Ja[r][k] = words[k]; Jb[r][k] = words[6 + k]; Ma[r][k] = words[12 + k]; Mb[r][k] = words[18 + k];
                 }}
                 rhs[r] = __ldg(&contacts.rhs.data[first_row + row0 + r]);
-                old[r] = contacts.impulse.data[first_row + row0 + r];
             }}
         }}
         if ({HAS_FRICTION}) {{
@@ -185,7 +200,7 @@ _LOAD_PATCH = f"""
                 float members[{PATCH_MEMBERS}];
                 #pragma unroll
                 for (int q = 0; q < {PATCH_MEMBERS}; ++q)
-                    members[q] = {HAS_FRICTION} && q < record[3] ? contacts.impulse.data[first_row + record[4 + q]] : 0.0f;"""
+                    members[q] = {HAS_FRICTION} && q < record[3] ? impulses[record[4 + q]] : 0.0f;"""
 """Load the normal impulses of the patch's other contacts, which earlier colors may have changed."""
 
 _ADD_PATCH = f"""
@@ -193,20 +208,13 @@ _ADD_PATCH = f"""
                     for (int q = 0; q < {PATCH_MEMBERS}; ++q)
                         if (q < record[3]) load += members[q];
                     if (record[{4 + PATCH_MEMBERS}] >= 0 && record[{RECORD - 1}] >= 0) {{
-                        const int* list = &contacts.patch_lists.data[first_row + (record[{RECORD - 1}] & 0xFFFFF)];
-                        const int listed = record[{RECORD - 1}] >> 20;
-                        for (int begin = 0; begin < listed; begin += 8) {{
-                            float rest[8];
-                            #pragma unroll
-                            for (int q = 0; q < 8; ++q)
-                                rest[q] = begin + q < listed ? contacts.impulse.data[first_row + __ldg(&list[begin + q])] : 0.0f;
-                            #pragma unroll
-                            for (int q = 0; q < 8; ++q)
-                                if (begin + q < listed) load += rest[q];
-                        }}
+                        const int* const members_left = &patch_list[record[{RECORD - 1}] & 0xFFFFF];
+                        const int left = record[{RECORD - 1}] >> 20;
+                        #pragma unroll 8
+                        for (int q = 0; q < left; ++q) load += impulses[members_left[q]];
                     }} else {{
                         for (int row = record[{4 + PATCH_MEMBERS}]; row >= 0 && row != row0; row = contacts.row_parent.data[first_row + row])
-                            load += contacts.impulse.data[first_row + row];
+                            load += impulses[row];
                     }}"""
 """Add the normal impulses of the patch's other contacts in its order: the first 4, then a list, or if that was full, link by link."""
 
@@ -218,10 +226,8 @@ _SOLVE = f"""
                 const float4 linear_a = shared_a[0], angular_a = shared_a[1], linear_b = shared_b[0], angular_b = shared_b[1];
                 float twist_a[6] = {{linear_a.x, linear_a.y, linear_a.z, linear_a.w, angular_a.x, angular_a.y}};
                 float twist_b[6] = {{linear_b.x, linear_b.y, linear_b.z, linear_b.w, angular_b.x, angular_b.y}};
-                float old0 = old[0], old1 = old[1], old2 = old[2];
-                // Keeps the compiler from moving products of these out of the loop, where they would be rounded otherwise.
-                asm volatile("" : "+f"(old0), "+f"(old1), "+f"(old2));
-                float* const impulse = &contacts.impulse.data[first_row + row0];
+                float* const impulse = &impulses[row0];
+                const float old0 = impulse[0];
                 float load = old0, change0 = 0.0f, change1 = 0.0f, change2 = 0.0f;
                 if (mass > 0.0f) {{
                     float new0 = old0 + settings.omega * (-({_dot(0)} + rhs[0]) * mass);
@@ -238,6 +244,7 @@ _SOLVE = f"""
                   }} else {{
 {_ADD_PATCH}
                     const float radius = fmaxf(mu * load, 0.0f);
+                    const float old1 = impulse[1], old2 = impulse[2];
                     const float residual1 = {_dot(1)} + rhs[1];
                     const float residual2 = {_dot(2)} + rhs[2];
                     float new1, new2;

@@ -89,6 +89,8 @@ class ContactRowData:
     """Rows of each contact (world, contact, 3 `contact_rows.ROW`)."""
     patch_lists: wp.array[int]
     """Rows of patches with more members than a record has (world, row)."""
+    patch_list_length: wp.array[int]
+    """Their number (world)."""
     is_free: wp.array[bool]
     """Whether a body is free, not of the gripper (body)."""
     overflow: wp.array[bool]

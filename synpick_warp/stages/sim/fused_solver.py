@@ -183,6 +183,7 @@ class FusedSteel(newton.solvers.SolverSteel):
                 self._color_unit_friction_setup,
                 self._packed_rows,
                 self._color_ring_overflow,
+                self._color_ring_overflow_cursor,
                 self._is_free,
                 self.constraint_overflow,
             ],
