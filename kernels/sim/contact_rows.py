@@ -14,10 +14,10 @@ WITH_FRICTION = wp.constant(1)
 NORMAL_ONLY = wp.constant(2)
 """Kind of a contact with a normal row, whose friction another contact of its patch has."""
 ROW = wp.constant(32)
-"""Words of a packed row, a cache line: Jacobians J_a and J_b, responses M⁻¹J_aᵀ and M⁻¹J_bᵀ of 6 each, inverse effective mass and friction
-coefficient. A contact has 3 rows."""
+"""Words of a packed row, a cache line: Jacobians J_a and J_b, responses M⁻¹J_aᵀ and M⁻¹J_bᵀ of 6 each, effective mass 1 / (J M⁻¹Jᵀ) and
+friction coefficient. A contact has 3 rows."""
 MASS, MU = wp.constant(24), wp.constant(25)
-"""Words of a packed row with the inverse effective mass and the friction coefficient."""
+"""Words of a packed row with the effective mass and the friction coefficient."""
 THREADS = wp.constant(512)
 """Threads that pack the rows of a world."""
 
@@ -27,19 +27,19 @@ def pack_rows_kernel(
     # Scene:
     offsets: int,
     # State:
-    color_offsets: wp.array[int],  # (world, offset)
-    records: wp.array[int],  # (world, contact, RECORD)
+    color_offsets: wp.array[int],  # (world * offsets)
+    records: wp.array[int],  # (world * contacts * RECORD)
     # In:
     jacobian_a: wp.array3d[float],  # (world, row, 6)
-    jacobian_b: wp.array3d[float],
-    response_a: wp.array3d[float],  # M⁻¹Jᵀ (world, row, 6)
-    response_b: wp.array3d[float],
-    mass: wp.array2d[float],  # inverse effective mass (world, row) [1/kg]
-    mu: wp.array2d[float],  # friction coefficient (world, row)
+    jacobian_b: wp.array3d[float],  # (world, row, 6)
+    response_a: wp.array3d[float],  # (world, row, 6), M⁻¹Jᵀ
+    response_b: wp.array3d[float],  # (world, row, 6)
+    mass: wp.array2d[float],  # (world, row), effective mass 1 / (J M⁻¹Jᵀ) [kg]
+    mu: wp.array2d[float],  # (world, row), friction coefficient
     # Out:
     rows_out: wp.array3d[float],  # (world, contact, 3 ROW)
 ):
-    """Copy the rows of contacts to where the sweep reads them, and no friction rows where there are none; a warp takes a contact at a time."""
+    """Copy the rows of contacts to where the sweep reads them, a warp for each contact; only the normal row where there is no friction."""
     world, thread = wp.tid()
     warp = thread // ROW
     word = thread - warp * ROW

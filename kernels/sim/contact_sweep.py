@@ -1,13 +1,10 @@
 """Colored Gauss-Seidel sweep over the contacts of a world by one warp, which loads 32 contacts at a time into registers.
 
 Newton's SolverSteel loads the contacts of one color, solves them, and goes on with the next color. Piles have many colors of few contacts:
-an object of many convex pieces lies on the tote with 60 contacts, each of a color of its own, and most of the time is spent waiting for
-memory. Here each lane loads one of 32 contacts, consecutive in the order of colors, and the colors among them are solved one after the
-other. Meanwhile the next 32 are prefetched. The arithmetic is the solver's, and results are bitwise identical, but for the friction rows (`friction.py`): with
-the solver's search for their multiplier, most of the time was spent there.
+an object of many convex pieces lies on the tote with 60 contacts, each of a color of its own, and each color waits for memory. Here each
+lane loads one of 32 contacts, consecutive in the order of colors, and the colors among them are solved one after the other. Meanwhile the
+next 32 are prefetched. The arithmetic is the solver's, bit by bit, but for the friction rows (`friction`).
 """
-
-from __future__ import annotations
 
 import warp as wp
 
@@ -20,7 +17,9 @@ PATCH_MEMBERS = 4
 HAS_FRICTION = f"record[{KIND}] == {WITH_FRICTION}"
 """CUDA expression for whether a contact has friction rows."""
 MAX_SHARED_ROWS = 3072
-"""Rows of a world up to which impulses and lists of patch members are held in shared memory: 24 of the 48 KB of a block."""
+"""Maximum number of rows of a world: their impulses and the lists of patch members take 24 of the 48 KB of shared memory of a block."""
+SECTOR = 8
+"""Words that a prefetch brings to the L1 cache at least: 32 bytes."""
 SLOT = 8
 """Words of a body's twist in shared memory, so that it is read at once."""
 
@@ -32,8 +31,8 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
 
     Args:
         rows, bodies: Capacities of a world.
-        offsets: Color offsets of a world. The last two are where contacts without a color begin, which are solved one by one, and the number
-            of contacts.
+        offsets: Color offsets of a world. The last two are where contacts without a color begin (solved one by one), and the number of
+            contacts.
         friction: Source of the function `solve_friction`.
     """
 
@@ -52,10 +51,10 @@ def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = 
 
 def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
     """CUDA source of the sweep. A static body's twist is that of a slot behind the others, zero."""
-    is_shared = rows <= MAX_SHARED_ROWS
     return f"""
 #if defined(__CUDA_ARCH__)
 {friction}
+    const auto prefetch = [](const void* address) {{ asm volatile("prefetch.global.L1 [%0];" :: "l"(address)); }};
     const int lane = threadIdx.x & 31;
     if (contacts.row_count.data[world] == 0) return;
     const int first_row = world * {rows};
@@ -65,16 +64,17 @@ def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
     __shared__ __align__(16) float twists[({bodies} + 1) * {SLOT}];
     __shared__ float body_impulses[{bodies} * 6];
     __shared__ bool is_free[{bodies} + 1];
-    const int row_count = min(contacts.row_count.data[world], {rows}), listed = min(contacts.patch_list_length.data[world], {rows});
-#if {int(is_shared)}
     __shared__ float impulses[{rows}];
     __shared__ int patch_list[{rows}];
-    for (int i = lane; i < row_count; i += 32) impulses[i] = contacts.impulse.data[first_row + i];
-    for (int i = lane; i < listed; i += 32) patch_list[i] = contacts.patch_lists.data[first_row + i];
-#else
-    float* const impulses = &contacts.impulse.data[first_row];
-    const int* const patch_list = &contacts.patch_lists.data[first_row];
-#endif
+    __shared__ unsigned color_starts[({rows} + 31) / 32];
+    const bool begins = iteration == settings.iteration_offset, ends = iteration + 1 == settings.iteration_offset + settings.iterations;
+    const int row_count = min(contacts.row_count.data[world], {rows});
+    if (begins) {{
+        const int listed = min(contacts.patch_list_length.data[world], {rows});
+        for (int i = lane; i < row_count; i += 32) impulses[i] = contacts.impulse.data[first_row + i];
+        for (int i = lane; i < listed; i += 32) patch_list[i] = contacts.patch_lists.data[first_row + i];
+{_FIND_COLORS.replace("OFFSETS", str(offsets))}
+    }}
     const int slots = contacts.body_count.data[world];
     for (int i = lane; i < slots * 6; i += 32) {{
         const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * {bodies} + slot];
@@ -86,11 +86,10 @@ def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
     is_free[{bodies}] = true;
     __syncwarp();
 
-    int color = 0;
     for (int first = 0; first < count; first += 32) {{
         const int index = first + lane;
 {_LOAD}
-{_FIND_COLORS.replace("OFFSETS", str(offsets))}
+        unsigned starts = color_starts[first / 32];
         for (int begin = 0; begin < 32;) {{
             const int end = starts ? __ffs(starts) - 1 : 32;
             if (record[{KIND}] != 0 && begin <= lane && lane < end) {{
@@ -107,20 +106,33 @@ def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
         twist_inout.data[body * 6 + component] = twists[slot * {SLOT} + component];
         impulse_inout.data[body * 6 + component] = body_impulses[i];
     }}
-#if {int(is_shared)}
-    for (int i = lane; i < row_count; i += 32) contacts.impulse.data[first_row + i] = impulses[i];
-#endif
+    if (ends)
+        for (int i = lane; i < row_count; i += 32) contacts.impulse.data[first_row + i] = impulses[i];
 #endif
 """
 
 
 _LOAD = f"""
-        const int next = index + 32 < count ? index + 32 : lane;   // the next iteration begins with the first contacts
-        const float* next_rows = &contacts.rows.data[(size_t)(first_row + next) * {3 * ROW}];
-        int next_kind = 0;
+        // The next iteration begins with the first contacts again. The record of a contact is prefetched before its rows, which it tells.
+        const int padded = (count + 31) / 32 * 32;
+        const int next = index + 32 < padded ? index + 32 : lane;
+        const int after = next + 32 < padded ? next + 32 : lane;
+        if (after < count) {{
+            const int* after_record = &contacts.records.data[(first_row + after) * {RECORD}];
+            prefetch(after_record);
+            prefetch(after_record + {KIND});
+        }}
         if (next < count) {{
-            next_kind = __ldg(&contacts.records.data[(first_row + next) * {RECORD} + {KIND}]);
-            asm volatile("prefetch.global.L1 [%0];" :: "l"(next_rows));
+            const int* next_record = &contacts.records.data[(first_row + next) * {RECORD}];
+            const int next_row = __ldg(next_record), next_rows = __ldg(next_record + {KIND}) == {WITH_FRICTION} ? 3 : 1;
+            const float* packed = &contacts.rows.data[(size_t)(first_row + next) * {3 * ROW}];
+            for (int k = 0; k < next_rows * {ROW}; k += {SECTOR}) prefetch(packed + k);
+            prefetch(&contacts.rhs.data[first_row + next_row]);
+            if (next_rows == 3) {{
+                prefetch(&contacts.rhs.data[first_row + next_row + 2]);
+                prefetch(&contacts.friction_operator.data[(first_row + next) * {FRICTION_OPERATOR}]);
+                prefetch(&contacts.friction_operator.data[(first_row + next) * {FRICTION_OPERATOR} + 4]);
+            }}
         }}
         int record[{RECORD}] = {{0}};
         if (index < count) {{
@@ -157,26 +169,24 @@ _LOAD = f"""
             #pragma unroll
             for (int k = 0; k < {FRICTION_OPERATOR}; ++k)
                 friction_operator[k] = __ldg(&contacts.friction_operator.data[(first_row + index) * {FRICTION_OPERATOR} + k]);
-        }}
-        if (next_kind == {WITH_FRICTION}) {{
-            asm volatile("prefetch.global.L1 [%0];" :: "l"(next_rows + {ROW}));
-            asm volatile("prefetch.global.L1 [%0];" :: "l"(next_rows + {2 * ROW}));
         }}"""
 """Load the lane's contact, and prefetch the one 32 places further."""
 
 _FIND_COLORS = """
-        unsigned starts = index >= uncolored && index < count ? 1u << lane : 0u;   // bits of the lanes at which a color starts
-        for (unsigned inside = ~0u; inside == ~0u;) {
-            const int at = color + lane < OFFSETS - 1 ? color_offsets[color + lane] : count;
-            const bool is_inside = at < count && at < first + 32;
-            if (is_inside) starts |= 1u << (at - first);
-            inside = __ballot_sync(~0u, is_inside);
-            color += __popc(inside);
-        }
-        #pragma unroll
-        for (int distance = 16; distance > 0; distance /= 2) starts |= __shfl_xor_sync(~0u, starts, distance);
-        starts &= ~1u;"""
-"""Find where colors start among the 32 contacts; `color` is the first color that does not start before them."""
+        for (int first = 0, color = 0; first < count; first += 32) {
+            const int index = first + lane;
+            unsigned starts = index >= uncolored && index < count ? 1u << lane : 0u;
+            for (unsigned inside = ~0u; inside == ~0u;) {
+                const int at = color + lane < OFFSETS - 1 ? color_offsets[color + lane] : count;
+                const bool is_inside = at < count && at < first + 32;
+                if (is_inside) starts |= 1u << (at - first);
+                inside = __ballot_sync(~0u, is_inside);
+                color += __popc(inside);
+            }
+            for (int distance = 16; distance > 0; distance /= 2) starts |= __shfl_xor_sync(~0u, starts, distance);
+            if (lane == 0) color_starts[first / 32] = starts & ~1u;
+        }"""
+"""Find where colors start among each 32 contacts, as bits; `color` is the first color that does not start before them."""
 
 
 def _dot(row: int) -> str:
@@ -213,8 +223,8 @@ _ADD_PATCH = f"""
                         #pragma unroll 8
                         for (int q = 0; q < left; ++q) load += impulses[members_left[q]];
                     }} else {{
-                        for (int row = record[{4 + PATCH_MEMBERS}]; row >= 0 && row != row0; row = contacts.row_parent.data[first_row + row])
-                            load += impulses[row];
+                        const int* const following = &contacts.row_parent.data[first_row];
+                        for (int row = record[{4 + PATCH_MEMBERS}]; row >= 0 && row != row0; row = following[row]) load += impulses[row];
                     }}"""
 """Add the normal impulses of the patch's other contacts in its order: the first 4, then a list, or if that was full, link by link."""
 

@@ -1,9 +1,9 @@
 """Friction of a contact: the quadratic problem of two friction rows within a circle, solved by Newton's method on the secular equation.
 
 The impulse x minimizes ½ xᵀA x - bᵀx with |x| ≤ r, where A is the symmetric 2x2 matrix of responses and r the friction coefficient times
-the load. Unless the free minimum lies inside (the contact sticks), x = (A + αI)⁻¹ b with the multiplier α for which |x| = r: a trust-region
-subproblem (Moré and Sorensen 1983). SolverSteel brackets α for every contact in every iteration; here Newton's method on 1/|x(α)| starts from
-the multiplier of the impulse so far, which converged iterations hardly change.
+the load. Unless the free minimum is within the circle (the contact sticks), x = (A + αI)⁻¹ b with the multiplier α for which |x| = r: a
+trust-region subproblem (Moré and Sorensen 1983). SolverSteel brackets α for every sliding contact in every iteration. Here Newton's method
+for the root of 1/|x(α)| - 1/r starts from the multiplier of the impulse so far, which changes little once the iterations converge.
 """
 
 import warp as wp
@@ -11,14 +11,22 @@ import warp as wp
 FRICTION_OPERATOR = 5
 """Words of A, by eigenvalues: its largest diagonal entry, both eigenvalues divided by it (largest first), eigenvector of the largest."""
 MAX_ITERATIONS = 8
-"""Newton steps. They converge from below; a contact that starts to slide takes some 4, and the last impulse is on the circle in any case."""
-TOLERANCE = 1e-6
-"""Relative error of |x|, a few times the rounding of single precision."""
+"""Maximum number of Newton steps; from an arbitrary impulse 2 or 3 are needed. The last impulse is on the circle in any case."""
+TOLERANCE = 1e-5
+"""Relative error of |x|, whose direction is then as exact. From a solution Newton's method does not move."""
 
 SOLVE_FRICTION = f"""
 #if defined(__CUDA_ARCH__)
-    const auto reciprocal = [](float value) {{ return __fdividef(1.0f, value); }};
-    const auto reciprocal_root = [](float value) {{ return rsqrtf(value); }};
+    const auto reciprocal = [](float value) {{
+        float result;
+        asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(value));
+        return result;
+    }};
+    const auto reciprocal_root = [](float value) {{
+        float result;
+        asm("rsqrt.approx.ftz.f32 %0, %1;" : "=f"(result) : "f"(value));
+        return result;
+    }};
 #else
     const auto reciprocal = [](float value) {{ return 1.0f / value; }};
     const auto reciprocal_root = [](float value) {{ return 1.0f / wp::sqrt(value); }};
@@ -41,7 +49,8 @@ SOLVE_FRICTION = f"""
         if (!has_minimum || u * u + v * v > radius * radius) {{
             const float b_u = largest * old_u - residual_u, b_v = smallest * old_v - residual_v;
             const float inverse_radius = reciprocal(radius);
-            const float highest = wp::sqrt(b_u * b_u + b_v * b_v) * inverse_radius;
+            const float b_square = b_u * b_u + b_v * b_v;
+            const float highest = b_square * reciprocal_root(wp::max(b_square, 1e-37f)) * inverse_radius;
             const float lowest = wp::max(wp::max(highest - largest, wp::abs(b_v) * inverse_radius - smallest), 0.0f);
             float multiplier = -(residual_u * old_u + residual_v * old_v) * inverse_radius * inverse_radius;
             multiplier = wp::min(wp::max(multiplier, lowest), highest);

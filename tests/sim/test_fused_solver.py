@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import cache, partial
 from types import SimpleNamespace
 
@@ -73,10 +74,11 @@ def test_what_the_kernel_does_not_support_is_found():
         "_enable_joint_velocity_limits": False,
         "_propagation_cached_warps": {},
         "_propagation_tree_sizes": [4],
+        "_propagation_max_constraints": 1536,
         "_pgs_solve_propagation_colored_warp_kernel": "kernel",
         "_internal_row_phases": lambda: (True, False),
     }
-    others: list[object] = [False, "phased", "bisection", True, True, True, True, True, {4: 1}, [4, 7], None, lambda: (False, False)]
+    others: list[object] = [False, "phased", "bisection", True, True, True, True, True, {4: 1}, [4, 7], 4096, None, lambda: (False, False)]
     assert fused_solver.find_unsupported(SimpleNamespace(**known)) == []
     for name, value in zip(known, others, strict=True):
         assert len(fused_solver.find_unsupported(SimpleNamespace(**known | {name: value}))) == 1
@@ -103,6 +105,15 @@ def test_a_cpu_and_other_versions_run_the_solver_of_newton(monkeypatch):
     assert fused_solver.choose_solver(SimpleNamespace(is_cuda=False)) is newton.solvers.SolverSteel
     monkeypatch.setattr(newton, "__version__", "1.8.1")
     assert fused_solver.choose_solver(gpu) is newton.solvers.SolverSteel
+
+
+def test_warps_grow_smaller_patches_unless_the_kernels_are_loaded(monkeypatch):
+    patches = sys.modules[steel._FrictionPatchState.__module__]
+    for loaded, limit in (({"cpu": object()}, 32), ({}, fused_solver.PATCH_WARP_CONTACTS)):
+        monkeypatch.setattr(patches, "_FLOOD_MIN_CONTACTS", 32)
+        monkeypatch.setattr(patches._build.module, "execs", loaded)
+        fused_solver.share_patches()
+        assert limit == patches._FLOOD_MIN_CONTACTS
 
 
 def test_warm_start_sums_impulses_as_newton_does(device):
@@ -157,7 +168,7 @@ def test_worlds_with_the_most_colors_come_first(device):
 def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds, resident, max_speed):
     """All but the friction rows is bitwise the same, so the solver's are compiled in. Piles fall, rest and are stirred; at the lower speed
     limit, falling bodies have velocity limit rows. Newton does not load 32 contacts at a time, takes worlds in their order (they are sorted
-    if none is resident), and its narrow phase uses larger blocks."""
+    if none is resident), its narrow phase uses larger blocks, and each of its friction patches is grown by one thread here."""
     if not device.is_cuda:
         pytest.skip("on a CPU the solver's own launches run")
     config = settings(
@@ -171,6 +182,7 @@ def test_worlds_move_as_with_the_launches_of_newton(device, monkeypatch, worlds,
         for module in (fused_solver, physics):
             monkeypatch.setattr(module, "KNOWN_NEWTON", version)
         simulation = Simulation(config, catalog(), 2, device)
+        simulation.physics.solver._friction_patches.device_flood = version == fused_solver.KNOWN_NEWTON
         found[version] = []
         for _ in range(TICKS):
             simulation.tick()

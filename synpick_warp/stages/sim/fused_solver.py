@@ -14,13 +14,16 @@ import warp as wp
 
 from synpick_warp.kernels.sim import contact_rows, contact_sweep, solver_iterations, warm_start, world_order
 
-RESIDENT_WORLDS = 8
-"""Worlds whose iterations a multiprocessor can run at a time: its 65,536 registers hold 8 warps with 255 a thread. Where there are more
-worlds, those with the most contact colors start first: on an H200 the iterations of a tick of 2,048 worlds take 97 instead of 130 ms. With
-at most 128 registers all would be resident, but the spilled ones make it 188 ms."""
+RESIDENT_WORLDS = 10
+"""Worlds whose iterations a multiprocessor can run at a time: its 65,536 registers hold 10 warps with up to 200 a thread. Where there are
+more worlds, those with the most contact colors start first: on an H200 the iterations of a tick of 2,048 worlds took 97 instead of 130 ms,
+when 8 were resident, and take 42 ms now."""
+PATCH_WARP_CONTACTS = 8
+"""Number of contacts of two bodies above which a warp grows their friction patches, and not a thread; Newton's is 32. The patches are the
+same. On an H200 they take 35 instead of 44 ms of a tick of 2,048 worlds."""
 KNOWN_NEWTON = "1.8.0"
 """Version of Newton of which private parts are replaced or tuned on a GPU: the solver by `FusedSteel`, and the blocks of the narrow phase.
-Other versions are used as they are: the same results, slower."""
+Other versions are used as they are, slower."""
 
 steel: Any = sys.modules[newton.solvers.SolverSteel.__module__]
 """The solver's module, with the factories of its kernels."""
@@ -29,15 +32,21 @@ OFFSETS = int(steel.PROPAGATION_COLOR_TAIL) + 2
 
 
 class FusedSteel(newton.solvers.SolverSteel):
-    """SolverSteel whose projected Gauss-Seidel iterations run in one kernel, with one warp per world. Results are bitwise identical.
+    """SolverSteel whose projected Gauss-Seidel iterations run in one kernel, with one warp per world.
 
     SolverSteel launches ten kernels per iteration: with 16 iterations, 160 of the 364 launches of a substep. Each waits for the one before
     it, for microseconds on an idle GPU, and longer beside a renderer. `solver_iterations` calls the same device functions one after the
-    other. The warm start of the contacts has more threads.
+    other, but for the sweep over contacts, which loads 32 at a time (`contact_sweep`) and solves their friction rows by Newton's method
+    (`friction`). With the solver's own search for friction, results are bitwise identical. The warm start of the contacts has more threads.
 
     Supported are models of identical worlds, each with one articulation besides its free bodies, and the options that
     `physics.make_solver` sets. Others, such as piles without a gripper, run SolverSteel's own kernels.
     """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        """Prepare a solver for a model; arguments as in SolverSteel."""
+        share_patches()
+        super().__init__(*args, **kwargs)
 
     def _launch_propagation_solve(
         self,
@@ -216,9 +225,8 @@ class FusedSteel(newton.solvers.SolverSteel):
     @cached_property
     def _is_free(self) -> wp.array:
         """Whether a body is free, not of the gripper (body) bool."""
-        is_free = np.zeros(self.model.body_count, bool)
-        is_free[self._free_bodies[1].numpy()] = True
-        return wp.array(is_free, dtype=wp.bool, device=self.model.device)
+        free = self._free_bodies[1].numpy()
+        return wp.array(np.isin(np.arange(self.model.body_count), free), dtype=wp.bool, device=self.model.device)
 
     @cached_property
     def _free_bodies(self) -> tuple[wp.array, wp.array]:
@@ -240,6 +248,13 @@ def choose_solver(device: wp.Device) -> type[newton.solvers.SolverSteel]:
     return FusedSteel if device.is_cuda and newton.__version__ == KNOWN_NEWTON else newton.solvers.SolverSteel
 
 
+def share_patches() -> None:
+    """Have warps grow more of the friction patches. Newton's kernels contain the limit, so not if they have been loaded before."""
+    patches: Any = sys.modules[steel._FrictionPatchState.__module__]
+    if not patches._build.module.execs:
+        patches._FLOOD_MIN_CONTACTS = PATCH_WARP_CONTACTS
+
+
 def find_unsupported(solver: Any) -> list[str]:
     """Names of the options of a SolverSteel, and properties of its model, that the fused kernel does not support; empty: it can be used."""
     unsupported = {
@@ -253,6 +268,7 @@ def find_unsupported(solver: Any) -> list[str]:
         "enable_joint_velocity_limits": solver._enable_joint_velocity_limits,
         "propagation_cached_response": bool(solver._propagation_cached_warps),
         "no articulation, or several kinds": len(solver._propagation_tree_sizes) != 1,
+        "too many rows for shared memory": solver._propagation_max_constraints > contact_sweep.MAX_SHARED_ROWS,
         "too many bodies for shared memory": solver._pgs_solve_propagation_colored_warp_kernel is None,
         # Without limits the solver skips the gripper's pass in worlds without contacts in generalized coordinates; the kernel does not.
         "neither joint limits nor speed limits": not any(solver._internal_row_phases()),
