@@ -5,19 +5,27 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 RECORD = wp.constant(12)
-"""Words of a contact's record: first row, slots of its bodies a and b in the world's list, number of listed patch members, up to 4 patch
-members, the member after them, number of rows, kind, list of the other members."""
+"""Words of a contact's record. They are: its first row, `BODY_A`, `BODY_B`, `MEMBER_COUNT` and up to `PATCH_MEMBERS` members,
+`NEXT_MEMBER`, number of rows, `KIND`, `MEMBER_LIST`. Members are normal rows of other contacts of the friction patch whose friction this
+contact has."""
+BODY_A, BODY_B = 1, 2
+"""Words with a body's slot in the world's list of bodies, -1 for a static one."""
+MEMBER_COUNT, PATCH_MEMBERS, NEXT_MEMBER, MEMBER_LIST = 3, 4, 8, 11
+"""Number of members in the record, most of them, and words with the member after them, -1 if there is none, and with the list of these:
+count << 20 | position in the world's lists, or -1 where there was no room for it."""
 KIND = wp.constant(10)
-"""Word of the record with the kind: `WITH_FRICTION`, `NORMAL_ONLY`, or 0 for any other rows."""
+"""Word with the kind: `WITH_FRICTION`, `NORMAL_ONLY`, or 0 for any other rows."""
 WITH_FRICTION = wp.constant(1)
 """Kind of a contact with a normal row and two friction rows."""
 NORMAL_ONLY = wp.constant(2)
-"""Kind of a contact with a normal row, whose friction another contact of its patch has."""
+"""Kind of a contact with a normal row, whose friction is solved by another contact of its patch."""
 ROW = wp.constant(32)
 """Words of a packed row, a cache line: Jacobians J_a and J_b, responses M⁻¹J_aᵀ and M⁻¹J_bᵀ of 6 each, effective mass 1 / (J M⁻¹Jᵀ) and
 friction coefficient. A contact has 3 rows."""
 MASS, MU = wp.constant(24), wp.constant(25)
 """Words of a packed row with the effective mass and the friction coefficient."""
+WARP = wp.constant(32)
+"""Threads of a warp, one for each word of a row."""
 THREADS = wp.constant(512)
 """Threads that pack the rows of a world."""
 
@@ -41,10 +49,10 @@ def pack_rows_kernel(
 ):
     """Copy the rows of contacts to where the sweep reads them, a warp for each contact; only the normal row where there is no friction."""
     world, thread = wp.tid()
-    warp = thread // ROW
-    word = thread - warp * ROW
+    warp = thread // WARP
+    word = thread - warp * WARP
     count = color_offsets[world * offsets + offsets - 1]
-    for contact in range(warp, count, THREADS // ROW):
+    for contact in range(warp, count, THREADS // WARP):
         record = (world * mass.shape[1] + contact) * RECORD
         rows = 1
         if records[record + KIND] == WITH_FRICTION:

@@ -8,33 +8,52 @@ next 32 are prefetched. The arithmetic is the solver's, bit by bit, but for the 
 
 import warp as wp
 
-from synpick_warp.kernels.sim.contact_rows import KIND, MASS, MU, NORMAL_ONLY, RECORD, ROW, WITH_FRICTION
+from synpick_warp.kernels.sim.contact_rows import (
+    BODY_A,
+    BODY_B,
+    KIND,
+    MASS,
+    MEMBER_COUNT,
+    MEMBER_LIST,
+    MU,
+    NEXT_MEMBER,
+    NORMAL_ONLY,
+    PATCH_MEMBERS,
+    RECORD,
+    ROW,
+    WITH_FRICTION,
+)
 from synpick_warp.kernels.sim.friction import FRICTION_OPERATOR, SOLVE_FRICTION
 from synpick_warp.kernels.sim.solver_iterations import ContactRowData, IterationSettings
 
-PATCH_MEMBERS = 4
-"""Members of a friction patch in the record of the contact that has its friction rows: normal rows of other contacts."""
 HAS_FRICTION = f"record[{KIND}] == {WITH_FRICTION}"
 """CUDA expression for whether a contact has friction rows."""
 MAX_SHARED_ROWS = 3072
 """Maximum number of rows of a world: their impulses and the lists of patch members take 24 of the 48 KB of shared memory of a block."""
 SECTOR = 8
 """Words that a prefetch brings to the L1 cache at least: 32 bytes."""
-SLOT = 8
+TWIST_STRIDE = 8
 """Words of a body's twist in shared memory, so that it is read at once."""
 
 
 def compose_contact_sweep(rows: int, bodies: int, offsets: int, friction: str = SOLVE_FRICTION) -> wp.Function:
-    """Create the sweep over the contacts of a world.
+    """Create the sweep over the contacts of a world, for a GPU: all iterations of a solve in one launch, with a warp for each block.
 
-    A world with contacts of other kinds than the two is flagged as lost.
+    Impulses, patch lists and starts of colors stay in shared memory from the first iteration to the last, which writes the impulses. Two
+    contacts that share a body, or a patch, must have different colors. A contact of another kind than `WITH_FRICTION` and `NORMAL_ONLY` is
+    skipped, and its world flagged in `overflow`.
 
     Args:
         rows, bodies: Capacities of a world.
         offsets: Color offsets of a world. The last two are where contacts without a color begin (solved one by one), and the number of
             contacts.
         friction: Source of the function `solve_friction`.
+
+    Raises:
+        ValueError: `rows` exceeds `MAX_SHARED_ROWS`.
     """
+    if rows > MAX_SHARED_ROWS:
+        raise ValueError(f"{rows:,} contact rows of a world do not fit into shared memory; at most {MAX_SHARED_ROWS:,} do.")
 
     @wp.func_native(_source(rows, bodies, offsets, friction))
     def sweep_contacts(
@@ -61,31 +80,22 @@ def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
     const int* color_offsets = &contacts.color_offsets.data[world * {offsets}];
     const int uncolored = color_offsets[{offsets} - 2], count = color_offsets[{offsets} - 1];
 
-    __shared__ __align__(16) float twists[({bodies} + 1) * {SLOT}];
+    __shared__ __align__(16) float twists[({bodies} + 1) * {TWIST_STRIDE}];
     __shared__ float body_impulses[{bodies} * 6];
     __shared__ bool is_free[{bodies} + 1];
     __shared__ float impulses[{rows}];
     __shared__ int patch_list[{rows}];
     __shared__ unsigned color_starts[({rows} + 31) / 32];
     const bool begins = iteration == settings.iteration_offset, ends = iteration + 1 == settings.iteration_offset + settings.iterations;
-    const int row_count = min(contacts.row_count.data[world], {rows});
+    const int row_count = min(contacts.row_count.data[world], {rows}), slots = contacts.body_count.data[world];
     if (begins) {{
         const int listed = min(contacts.patch_list_length.data[world], {rows});
         for (int i = lane; i < row_count; i += 32) impulses[i] = contacts.impulse.data[first_row + i];
         for (int i = lane; i < listed; i += 32) patch_list[i] = contacts.patch_lists.data[first_row + i];
 {_FIND_COLORS.replace("OFFSETS", str(offsets))}
     }}
-    const int slots = contacts.body_count.data[world];
-    for (int i = lane; i < slots * 6; i += 32) {{
-        const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * {bodies} + slot];
-        twists[slot * {SLOT} + component] = twist_inout.data[body * 6 + component];
-        body_impulses[i] = impulse_inout.data[body * 6 + component];
-        is_free[slot] = contacts.is_free.data[body];
-    }}
-    if (lane < {SLOT}) twists[{bodies} * {SLOT} + lane] = 0.0f;
-    is_free[{bodies}] = true;
+{_LOAD_BODIES.replace("BODIES", str(bodies))}
     __syncwarp();
-
     for (int first = 0; first < count; first += 32) {{
         const int index = first + lane;
 {_LOAD}
@@ -100,17 +110,31 @@ def _source(rows: int, bodies: int, offsets: int, friction: str) -> str:
             begin = end;
         }}
     }}
-
-    for (int i = lane; i < slots * 6; i += 32) {{
-        const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * {bodies} + slot];
-        twist_inout.data[body * 6 + component] = twists[slot * {SLOT} + component];
-        impulse_inout.data[body * 6 + component] = body_impulses[i];
-    }}
+{_STORE_BODIES.replace("BODIES", str(bodies))}
     if (ends)
         for (int i = lane; i < row_count; i += 32) contacts.impulse.data[first_row + i] = impulses[i];
 #endif
 """
 
+
+_LOAD_BODIES = f"""
+    for (int i = lane; i < slots * 6; i += 32) {{
+        const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * BODIES + slot];
+        twists[slot * {TWIST_STRIDE} + component] = twist_inout.data[body * 6 + component];
+        body_impulses[i] = impulse_inout.data[body * 6 + component];
+        is_free[slot] = contacts.is_free.data[body];
+    }}
+    if (lane < {TWIST_STRIDE}) twists[BODIES * {TWIST_STRIDE} + lane] = 0.0f;
+    is_free[BODIES] = true;"""
+"""Load the twists of a world's bodies, the impulses on them, and which ones are free."""
+
+_STORE_BODIES = f"""
+    for (int i = lane; i < slots * 6; i += 32) {{
+        const int slot = i / 6, component = i - 6 * slot, body = contacts.bodies.data[world * BODIES + slot];
+        twist_inout.data[body * 6 + component] = twists[slot * {TWIST_STRIDE} + component];
+        impulse_inout.data[body * 6 + component] = body_impulses[i];
+    }}"""
+"""Store the twists of a world's bodies and the impulses on them."""
 
 _LOAD = f"""
         // The next iteration begins with the first contacts again. The record of a contact is prefetched before its rows, which it tells.
@@ -170,7 +194,7 @@ _LOAD = f"""
             for (int k = 0; k < {FRICTION_OPERATOR}; ++k)
                 friction_operator[k] = __ldg(&contacts.friction_operator.data[(first_row + index) * {FRICTION_OPERATOR} + k]);
         }}"""
-"""Load the lane's contact, and prefetch the one 32 places further."""
+"""Load the lane's contact; prefetch the one 32 places further, and the record of the one 64 places further."""
 
 _FIND_COLORS = """
         for (int first = 0, color = 0; first < count; first += 32) {
@@ -210,41 +234,42 @@ _LOAD_PATCH = f"""
                 float members[{PATCH_MEMBERS}];
                 #pragma unroll
                 for (int q = 0; q < {PATCH_MEMBERS}; ++q)
-                    members[q] = {HAS_FRICTION} && q < record[3] ? impulses[record[4 + q]] : 0.0f;"""
+                    members[q] = {HAS_FRICTION} && q < record[{MEMBER_COUNT}] ? impulses[record[{MEMBER_COUNT + 1} + q]] : 0.0f;"""
 """Load the normal impulses of the patch's other contacts, which earlier colors may have changed."""
 
 _ADD_PATCH = f"""
                     #pragma unroll
                     for (int q = 0; q < {PATCH_MEMBERS}; ++q)
-                        if (q < record[3]) load += members[q];
-                    if (record[{4 + PATCH_MEMBERS}] >= 0 && record[{RECORD - 1}] >= 0) {{
-                        const int* const members_left = &patch_list[record[{RECORD - 1}] & 0xFFFFF];
-                        const int left = record[{RECORD - 1}] >> 20;
+                        if (q < record[{MEMBER_COUNT}]) normal_sum += members[q];
+                    if (record[{NEXT_MEMBER}] >= 0 && record[{MEMBER_LIST}] >= 0) {{
+                        const int* const members_left = &patch_list[record[{MEMBER_LIST}] & 0xFFFFF];
+                        const int left = record[{MEMBER_LIST}] >> 20;
                         #pragma unroll 8
-                        for (int q = 0; q < left; ++q) load += impulses[members_left[q]];
+                        for (int q = 0; q < left; ++q) normal_sum += impulses[members_left[q]];
                     }} else {{
                         const int* const following = &contacts.row_parent.data[first_row];
-                        for (int row = record[{4 + PATCH_MEMBERS}]; row >= 0 && row != row0; row = following[row]) load += impulses[row];
+                        for (int row = record[{NEXT_MEMBER}]; row >= 0 && row != row0; row = following[row]) normal_sum += impulses[row];
                     }}"""
 """Add the normal impulses of the patch's other contacts in its order: the first 4, then a list, or if that was full, link by link."""
 
 _SOLVE = f"""
 {_LOAD_PATCH}
-                const int slot_a = record[1] >= 0 ? record[1] : BODIES, slot_b = record[2] >= 0 ? record[2] : BODIES;
-                float4* const shared_a = reinterpret_cast<float4*>(&twists[slot_a * {SLOT}]);
-                float4* const shared_b = reinterpret_cast<float4*>(&twists[slot_b * {SLOT}]);
+                const int slot_a = record[{BODY_A}] >= 0 ? record[{BODY_A}] : BODIES;
+                const int slot_b = record[{BODY_B}] >= 0 ? record[{BODY_B}] : BODIES;
+                float4* const shared_a = reinterpret_cast<float4*>(&twists[slot_a * {TWIST_STRIDE}]);
+                float4* const shared_b = reinterpret_cast<float4*>(&twists[slot_b * {TWIST_STRIDE}]);
                 const float4 linear_a = shared_a[0], angular_a = shared_a[1], linear_b = shared_b[0], angular_b = shared_b[1];
                 float twist_a[6] = {{linear_a.x, linear_a.y, linear_a.z, linear_a.w, angular_a.x, angular_a.y}};
                 float twist_b[6] = {{linear_b.x, linear_b.y, linear_b.z, linear_b.w, angular_b.x, angular_b.y}};
                 float* const impulse = &impulses[row0];
                 const float old0 = impulse[0];
-                float load = old0, change0 = 0.0f, change1 = 0.0f, change2 = 0.0f;
+                float normal_sum = old0, change0 = 0.0f, change1 = 0.0f, change2 = 0.0f;
                 if (mass > 0.0f) {{
                     float new0 = old0 + settings.omega * (-({_dot(0)} + rhs[0]) * mass);
                     if (new0 < 0.0f) new0 = 0.0f;
                     change0 = new0 - old0;
                     impulse[0] = new0;
-                    load = new0;
+                    normal_sum = new0;
 {_respond(0, "change0")}
                 }}
                 if ({HAS_FRICTION}) {{
@@ -253,7 +278,7 @@ _SOLVE = f"""
                     impulse[2] = 0.0f;
                   }} else {{
 {_ADD_PATCH}
-                    const float radius = fmaxf(mu * load, 0.0f);
+                    const float radius = fmaxf(mu * normal_sum, 0.0f);
                     const float old1 = impulse[1], old2 = impulse[2];
                     const float residual1 = {_dot(1)} + rhs[1];
                     const float residual2 = {_dot(2)} + rhs[2];
@@ -292,4 +317,4 @@ _SOLVE = f"""
                         sum = fmaf(Jb[1][k], change1, fmaf(Jb[2][k], change2, fmaf(Jb[0][k], change0, sum)));
                     }}
                 }}"""
-"""Solve the lane's contact: its normal row, then its two friction rows together."""
+"""Solve the lane's contact: its normal row, then its two friction rows together, whose responses are added in the order of the solver."""

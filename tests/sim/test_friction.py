@@ -1,4 +1,4 @@
-"""Friction rows of a contact: Newton's method on the secular equation against its bisection in double precision."""
+"""Friction rows of a contact: Newton's method on the secular equation against a bisection of it in double precision."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def solve_kernel(
 def solve(matrices, residual, old, radius, device, relaxation: float = 1.0) -> np.ndarray:
     """Impulses of contacts (contact, 2) for matrices (contact, 2, 2), residuals and old impulses (contact, 2) and radii (contact)."""
     values, vectors = np.linalg.eigh(matrices)
-    scale = np.maximum(matrices[:, 0, 0], matrices[:, 1, 1])
+    scale = np.maximum(np.maximum(matrices[:, 0, 0], matrices[:, 1, 1]), 1e-20)
     arrays = (scale, values[:, ::-1] / scale[:, None], vectors[:, :, 1], residual, old, radius)
     inputs = [wp.array(np.float32(a), dtype=wp.vec2 if a.ndim > 1 else float, device=device) for a in arrays]
     found = wp.empty(len(scale), dtype=wp.vec2, device=device)
@@ -53,7 +53,8 @@ def bisect(matrix: np.ndarray, residual: np.ndarray, old: np.ndarray, radius: fl
 
 
 def random_contacts(count: int, condition: float, seed: int = 1):
-    """Matrices of largest eigenvalues of 0.5 to 50 /kg and ratios up to `condition`, residuals up to 1 m/s, old impulses in the circles."""
+    """Matrices of largest eigenvalues of 0.5 to 50 /kg and ratios up to `condition`, residuals of scales 1e-5 to 1 m/s, old impulses
+    within the disks."""
     random = np.random.default_rng(seed)
     angle = random.uniform(0.0, np.pi, count)
     vectors = np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], -1).reshape(-1, 2, 2)
@@ -80,7 +81,7 @@ def test_impulses_are_those_of_a_bisection(device, condition):
 
 
 def test_an_impulse_in_equilibrium_stays(device):
-    """Solved again with the residual of its own solution, a sliding impulse changes by rounding alone."""
+    """Solved again with the residual of its own solution, an impulse changes by the tolerance at most."""
     matrices, residual, old, radius = random_contacts(2000, 20.0, seed=2)
     first = solve(matrices, residual, old, radius, device).astype(float)
     after = residual + np.einsum("nij,nj->ni", matrices, first - old)
@@ -108,13 +109,54 @@ def test_isotropic_friction_opposes_the_velocity(device):
     np.testing.assert_allclose(solve(matrices, residual, np.zeros((1, 2)), radius, device), [[-0.006, 0.008]], rtol=1e-5)
 
 
+def test_an_old_impulse_may_be_far_outside_the_disk(device):
+    """As after the load of a contact fell to a thousandth."""
+    matrices, residual, old, radius = random_contacts(2000, 20.0, seed=3)
+    old *= 1000.0
+    found = solve(matrices, residual, old, radius, device)
+    expected = np.array([bisect(*contact) for contact in zip(matrices, residual, old, radius, strict=True)])
+    assert (np.linalg.norm(found - expected, axis=1) / radius).max() < 1e-3
+
+
+def test_sliding_impulses_satisfy_the_optimality_conditions(device):
+    """A x - b = -α x with α >= 0, as Karush, Kuhn and Tucker say."""
+    matrices, residual, old, radius = random_contacts(2000, 20.0, seed=4)
+    found = solve(matrices, residual, old, radius, device).astype(float)
+    slides = np.linalg.norm(found, axis=1) > 0.99999 * radius
+    velocity = (residual + np.einsum("nij,nj->ni", matrices, found - old))[slides]
+    x = found[slides] / radius[slides, None]
+    size = np.linalg.norm(residual, axis=1) + np.linalg.norm(matrices, axis=(1, 2)) * radius
+    across = velocity[:, 0] * x[:, 1] - velocity[:, 1] * x[:, 0]
+    assert (np.abs(across) / size[slides]).max() < 1e-4
+    assert ((velocity * x).sum(1) / size[slides]).max() < 1e-5
+
+
+def test_over_relaxation_is_clipped_to_the_disk(device):
+    contacts = random_contacts(2000, 5.0, seed=5)
+    exact, relaxed = solve(*contacts, device).astype(float), solve(*contacts, device, 1.5)
+    expected = contacts[2] + 1.5 * (exact - contacts[2])
+    expected *= np.minimum(1.0, contacts[3] / np.linalg.norm(expected, axis=1))[:, None]
+    assert (np.linalg.norm(relaxed - expected, axis=1) / contacts[3]).max() < 1e-4
+
+
+def test_bodies_that_move_in_one_direction_or_none(device):
+    """Singular matrices, analytic: a row without response keeps its impulse within the disk, and a residual there pushes to its edge."""
+    matrices = np.array([np.diag((1.0, 0.0))] * 3 + [np.zeros((2, 2))])
+    residual = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 1.0], [0.3, 0.4]])
+    old = np.array([[0.5, 0.25], [0.5, 2.0], [0.6, 0.0], [0.1, 0.1]])
+    found = solve(matrices, residual, old, np.ones(4), device)
+    np.testing.assert_allclose(found[0], (0.5, 0.25), rtol=1e-6)
+    np.testing.assert_allclose(found[1], (0.5, np.sqrt(0.75)), rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(found[1:3], axis=1), 1.0, rtol=1e-5)
+    assert found[2][1] < 0.0
+    assert (found[3] == 0.0).all()
+
+
 @given(st.lists(st.floats(-1.0, 1.0, width=32), min_size=4, max_size=4), st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0))
 def test_impulses_stay_finite_within_the_circle(numbers, largest, ratio, radius):
-    """Also for matrices without one or both eigenvalues, as of a body that cannot move in a direction."""
+    """Also for matrices whose eigenvalues are zero, as of a body that cannot move in a direction."""
     turn = np.array([[0.6, -0.8], [0.8, 0.6]])
     matrix = turn @ np.diag((largest, largest * ratio)) @ turn.T
-    if largest < 1e-6:
-        matrix = np.diag((1e-6, 0.0))
     found = solve(matrix[None], np.array([numbers[:2]]), np.array([numbers[2:]]), np.array([radius]), "cpu")
     assert np.isfinite(found).all()
     assert np.linalg.norm(found) <= radius * (1.0 + 1e-5)

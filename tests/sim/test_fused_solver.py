@@ -61,6 +61,11 @@ def test_the_kernel_of_the_iterations_compiles(tmp_path):
     assert b"solver_iterations_kernel" in program.read_bytes()
 
 
+def test_more_rows_than_fit_into_shared_memory_are_refused():
+    with pytest.raises(ValueError, match="4,096 contact rows"):
+        fused_solver.compose_contacts(4096, BODIES)
+
+
 def test_what_the_kernel_does_not_support_is_found():
     """Each unsupported value of the private attributes that `FusedSteel` checks after construction is reported."""
     known = {
