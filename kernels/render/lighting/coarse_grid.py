@@ -96,11 +96,17 @@ def morton_index(period: int, row: int, column: int) -> int:
 
 @wp.func
 def coarse_coordinate(coarse: CoarseGrid, pixel: int) -> float:
-    """Row or column of a pixel in coarse pixels, for interpolation between filtered values.
+    """Row or column of a pixel in coarse pixels, for interpolation between values at their middle pixels."""
+    return float(pixel - coarse.size // 2) / float(coarse.size)
 
-    Filter kernels have an even width: the centre of coarse pixel i's kernel lies half a coarse pixel before its middle, at coordinate i.
+
+@wp.func
+def window_coordinate(coarse: CoarseGrid, pixel: int) -> float:
+    """Row or column of a pixel in coarse pixels, for interpolation between means over windows of even width.
+
+    The centre of coarse pixel i's window lies half a coarse pixel before its middle, at coordinate i.
     """
-    return float(pixel - coarse.size // 2) / float(coarse.size) + 0.5
+    return coarse_coordinate(coarse, pixel) + 0.5
 
 
 @wp.func

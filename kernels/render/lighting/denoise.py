@@ -1,7 +1,7 @@
 """Variance-guided denoiser: the widest of three kernels (16², 8², 4² coarse pixels) whose mean agrees with the narrower ones within noise.
 
-It filters visibility ratios (see `coarse_paths`) in three passes: joint bilateral means over blocks, choice of the kernel, smoothing.
-`upsampling` then interpolates them at full resolution.
+It filters visibility ratios (see `coarse_paths`) in three passes: joint bilateral means over blocks, choice of the kernel, and where coarse
+pixels are wider than pixels, smoothing. `upsampling` then interpolates them at full resolution.
 """
 
 import warp as wp
@@ -32,10 +32,15 @@ BLOCK = wp.constant(4)
 """Width of the narrow kernel, a block [coarse pixels]."""
 BLOCKS = wp.constant(4)
 """Width of the wide kernel [blocks]."""
-BLOCK_START = wp.constant(-int(BLOCK) // 2)
-"""Offset of the first coarse pixel of a block [coarse pixels]."""
+HALF_BLOCK = wp.constant(int(BLOCK) // 2)
+"""Largest offset of a block's coarse pixels [coarse pixels]. Those at this offset count half, since the next block has them, too: so blocks
+are centered on their coarse pixel, and tile the image."""
+BlockRow = wp.types.vector(length=2 * int(HALF_BLOCK) + 1, dtype=wp.float32)
+"""Weights of a row of a block."""
 BLOCKS_START = wp.constant(-(int(BLOCK) * (int(BLOCKS) - 1) // 2))
 """Offset of the first block of the wide kernel [coarse pixels]."""
+BORDER_VARIANCE = wp.constant(64.0 / 49.0)
+"""Ratio of the variances of a mean over BLOCK² samples and over a block, whose border counts half but is shared with its neighbours."""
 MEDIUM_BLOCKS = wp.constant(4.0)
 """Blocks of the medium kernel: 2 x 2."""
 SAME_BODY_WEIGHT = wp.constant(0.02)
@@ -134,6 +139,25 @@ def row_weights(guide: Guide, plane: Plane, grid: ImageGrid, view: int, row: int
     return weights
 
 
+@wp.func
+def block_row_weights(guide: Guide, plane: Plane, grid: ImageGrid, view: int, row: int, column: int, down: int) -> BlockRow:
+    """Weights of a row of the block around a coarse pixel, at offset `down`: bilateral, half at the block's border, 0 outside the image."""
+    weights = BlockRow()
+    r = row + down
+    if r < 0 or r >= grid.height:
+        return weights
+    share = wp.where(down == -HALF_BLOCK or down == HALF_BLOCK, 0.5, 1.0)
+    left = flat_index(grid, view, r, 0)
+    for j in range(2 * HALF_BLOCK + 1):
+        right = j - HALF_BLOCK
+        c = column + right
+        weight = share * bilateral_weight(read_record(guide.surface, left + clamp_index(c, grid.width)), plane, down, right, 1)
+        if right == -HALF_BLOCK or right == HALF_BLOCK:
+            weight *= 0.5
+        weights[j] = wp.where(c >= 0 and c < grid.width, weight, 0.0)
+    return weights
+
+
 @wp.kernel(cuda_max_registers=FILTER_REGISTERS)
 def filter_blocks_kernel(
     # Scene:
@@ -147,7 +171,7 @@ def filter_blocks_kernel(
     # Out:
     blocks_out: CoarseLight,
 ):
-    """Narrow filter: bilateral mean over the 4 x 4 block around each coarse pixel, and the variance of the mean visibility ratio.
+    """Narrow filter: bilateral mean over the block of 4 x 4 around each coarse pixel, and the variance of the mean visibility ratio.
 
     The variance of a mean is that of its samples over their effective number, (Σ w)² / Σ w². All members of `blocks_out` are written.
     """
@@ -163,11 +187,11 @@ def filter_blocks_kernel(
     square = wp.vec2(0.0, 0.0)
     squared_weight = float(0.0)
     # This loop is not unrolled, which saves registers and raises occupancy.
-    start = int(BLOCK_START)
-    for down in range(start, start + BLOCK):
-        weights = row_weights(guide, plane, coarse.grid, view, row, column, row + down, BLOCK_START, 1)
-        left = index + down * coarse.grid.width + BLOCK_START
-        for j in range(BLOCK):
+    end = int(HALF_BLOCK) + 1
+    for down in range(1 - end, end):
+        weights = block_row_weights(guide, plane, coarse.grid, view, row, column, down)
+        left = index + down * coarse.grid.width - HALF_BLOCK
+        for j in range(2 * HALF_BLOCK + 1):
             weight = weights[j]
             if weight > 0.0:
                 one = read_light(coarse_light, left + j)
@@ -207,7 +231,7 @@ def firefly_variance(wide: wp.vec3, narrow: wp.vec3, pooled: float, own: float) 
     their neighbours are mostly contact shadows, and keep the pooled variance.
     """
     if luminance(narrow) > luminance(wide):
-        return wp.max(pooled, own)
+        return wp.max(pooled, BORDER_VARIANCE * own)
     return pooled
 
 
@@ -266,6 +290,7 @@ def choose_widths_kernel(
     surface = read_record(guide.surface, index)
     segment = surface_segment(surface)
     if int(segment) == Segment.NOTHING:
+        ratios_out.record[view, row, column] = RatioRecord()
         return
     plane = coarse_plane(coarse, surface, cameras.intrinsics[views.camera[view]], row, column)
     # The two middle rows come first: their inner blocks are the medium kernel. The loops are not unrolled, see `filter_blocks_kernel`.

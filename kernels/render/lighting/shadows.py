@@ -7,9 +7,9 @@ from synpick_warp.kernels.render.lighting.coarse_grid import (
     MIN_WEIGHT,
     PLANE_TOLERANCE,
     CoarseGrid,
-    coarse_coordinate,
     middle_pixel,
     morton_index,
+    window_coordinate,
 )
 from synpick_warp.kernels.render.lighting.environment import Lights, rotate_z
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
@@ -184,8 +184,8 @@ def upsample_shadow(
     If all four are on other surfaces, the ring around them is searched too, as for visibility ratios: sunlight of another surface would
     show as bright pixels along the edge.
     """
-    y = coarse_coordinate(coarse, row)
-    x = coarse_coordinate(coarse, column)
+    y = window_coordinate(coarse, row)
+    x = window_coordinate(coarse, column)
     top = int(wp.floor(y))
     left = int(wp.floor(x))
     visible = float(0.0)
