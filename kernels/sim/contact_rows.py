@@ -5,14 +5,20 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 RECORD = wp.constant(12)
-"""Words of a contact's record. They are: its first row, `BODY_A`, `BODY_B`, `MEMBER_COUNT` and up to `PATCH_MEMBERS` members,
-`NEXT_MEMBER`, number of rows, `KIND`, `MEMBER_LIST`. Members are normal rows of other contacts of the friction patch whose friction this
-contact has."""
+"""Length of a contact's record [words]. Word 0 is the contact's first row, and word 9 its number of rows.
+
+A friction patch is a group of contacts of two bodies; one of them has the friction rows, bounded by the sum of the normal impulses of all.
+Its record lists the normal rows of the others, the members."""
 BODY_A, BODY_B = 1, 2
-"""Words with a body's slot in the world's list of bodies, -1 for a static one."""
-MEMBER_COUNT, PATCH_MEMBERS, NEXT_MEMBER, MEMBER_LIST = 3, 4, 8, 11
-"""Number of members in the record, most of them, and words with the member after them, -1 if there is none, and with the list of these:
-count << 20 | position in the world's lists, or -1 where there was no room for it."""
+"""Words with the index of a body in the world's list of bodies; -1: a static body."""
+MEMBER_COUNT = 3
+"""Word with the number of members that follow it."""
+PATCH_MEMBERS = 4
+"""Maximum number of members in a record."""
+NEXT_MEMBER = 8
+"""Word with the first member that is not in the record; -1: there is none."""
+MEMBER_LIST = 11
+"""Word with the list of the members that are not in the record: their number << 20 | offset in the world's lists; -1: it was full."""
 KIND = wp.constant(10)
 """Word with the kind: `WITH_FRICTION`, `NORMAL_ONLY`, or 0 for any other rows."""
 WITH_FRICTION = wp.constant(1)

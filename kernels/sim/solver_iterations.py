@@ -92,7 +92,7 @@ class ContactRowData:
     patch_list_length: wp.array[int]
     """Their number (world)."""
     is_free: wp.array[bool]
-    """Whether a body is free, not of the gripper (body)."""
+    """Mask of the free bodies; the others are links of the gripper (body)."""
     overflow: wp.array[bool]
     """Whether a world lost contacts (world)."""
 

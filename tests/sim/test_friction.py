@@ -28,7 +28,10 @@ def solve_kernel(
 
 
 def solve(matrices, residual, old, radius, device, relaxation: float = 1.0) -> np.ndarray:
-    """Impulses of contacts (contact, 2) for matrices (contact, 2, 2), residuals and old impulses (contact, 2) and radii (contact)."""
+    """Solve the friction rows of a batch of contacts; returns impulses (contact, 2).
+
+    Takes Delassus matrices (contact, 2, 2), residuals and old impulses (contact, 2), and radii of the disks (contact).
+    """
     values, vectors = np.linalg.eigh(matrices)
     scale = np.maximum(np.maximum(matrices[:, 0, 0], matrices[:, 1, 1]), 1e-20)
     arrays = (scale, values[:, ::-1] / scale[:, None], vectors[:, :, 1], residual, old, radius)
@@ -39,7 +42,7 @@ def solve(matrices, residual, old, radius, device, relaxation: float = 1.0) -> n
 
 
 def bisect(matrix: np.ndarray, residual: np.ndarray, old: np.ndarray, radius: float) -> np.ndarray:
-    """Minimum of ½ xᵀA x - bᵀx within a circle, with b = A old - residual, in double precision."""
+    """Minimizer of ½ xᵀA x - bᵀx within a disk, with b = A old - residual, by bisection in double precision."""
     b = matrix @ old - residual
     free = np.linalg.solve(matrix, b)
     if np.linalg.norm(free) <= radius:

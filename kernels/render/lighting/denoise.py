@@ -1,7 +1,7 @@
 """Variance-guided denoiser: the widest of three kernels (16², 8², 4² coarse pixels) whose mean agrees with the narrower ones within noise.
 
-It filters visibility ratios (see `coarse_paths`) in three passes: joint bilateral means over blocks, choice of the kernel, and where coarse
-pixels are wider than pixels, smoothing. `upsampling` then interpolates them at full resolution.
+It filters visibility ratios (see `coarse_paths`) in three passes: joint bilateral means over blocks, choice of the kernel, smoothing.
+`upsampling` then interpolates them at full resolution.
 """
 
 import warp as wp
@@ -290,7 +290,6 @@ def choose_widths_kernel(
     surface = read_record(guide.surface, index)
     segment = surface_segment(surface)
     if int(segment) == Segment.NOTHING:
-        ratios_out.record[view, row, column] = RatioRecord()
         return
     plane = coarse_plane(coarse, surface, cameras.intrinsics[views.camera[view]], row, column)
     # The two middle rows come first: their inner blocks are the medium kernel. The loops are not unrolled, see `filter_blocks_kernel`.

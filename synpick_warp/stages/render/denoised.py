@@ -275,11 +275,8 @@ class DenoisedRenderer:
         """Filter visibility ratios: block means, choice of the kernel's width, smoothing."""
         shared = [self.scene.cameras, self.coarse, self.guide]
         self._launch(filter_blocks_kernel, self.coarse.grid, views, [*shared, self.coarse_light, views], [self.blocks])
-        smooths = self.coarse.size > 1
-        chosen = self.chosen if smooths else self.ratios
-        self._launch(choose_widths_kernel, self.coarse.grid, views, [*shared, self.blocks, views, self.variance_scale], [chosen])
-        if smooths:
-            self._launch(smooth_ratios_kernel, self.coarse.grid, views, [*shared, self.chosen, views], [self.ratios])
+        self._launch(choose_widths_kernel, self.coarse.grid, views, [*shared, self.blocks, views, self.variance_scale], [self.chosen])
+        self._launch(smooth_ratios_kernel, self.coarse.grid, views, [*shared, self.chosen, views], [self.ratios])
 
     def trace_shadows(self, snapshot: Snapshot, bodies: Any, gbuffer: Any, views: Any) -> None:
         """Sun visibility of the shadow grid: shadow rays and filter."""

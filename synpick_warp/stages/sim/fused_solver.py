@@ -224,7 +224,7 @@ class FusedSteel(newton.solvers.SolverSteel):
 
     @cached_property
     def _is_free(self) -> wp.array:
-        """Whether a body is free, not of the gripper (body) bool."""
+        """Mask of the free bodies; the others are links of the gripper (body) bool."""
         free = self._free_bodies[1].numpy()
         return wp.array(np.isin(np.arange(self.model.body_count), free), dtype=wp.bool, device=self.model.device)
 

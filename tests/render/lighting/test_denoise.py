@@ -66,7 +66,7 @@ def test_constant_visibility_ratios_are_kept_up_to_the_border(width, height, see
     flat.assign("indirect", np.full((height, width), 0.3))
     result = flat.run()
     for name, expected in (("diffuse", 0.7), ("specular", 0.4), ("indirect", 0.3)):
-        np.testing.assert_allclose(result[name], expected, rtol=2.1 * HALF_ROUNDING)
+        np.testing.assert_allclose(result[name], expected, rtol=2.001 * HALF_ROUNDING)  # the bound itself occurs
 
 
 def test_steps_without_noise_stay_sharp_and_noise_is_averaged():

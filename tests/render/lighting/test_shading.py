@@ -157,15 +157,11 @@ def test_walls_occlude_the_ground_between_them(device):
 
 
 def test_denoised_plane_shows_no_sampling_pattern(device):
-    # Wide filter kernels make a plane beside a wall smooth: the remaining noise has no edges. Where coarse pixels are pixels, nothing hides
-    # the borders between kernel widths: up to five steps of 255, in few pixels; half of them differ by a quarter of a step at most.
+    # Wide filter kernels make a plane beside a wall smooth: the remaining noise has no edges. Two steps of 255 are hardly visible.
     toy = ToyScene([entry(sheet(1.0, 1.0)), entry(box(0.01, 2.0, 0.2))], [[(0, FLAT), (1, (0.25, 0.0, 0.1, *UPRIGHT))]], (VIEW,))
     toy.config = with_render(coarse_paths=8)
     lit = render(toy, device).radiance[0, 8:40, 8:40, 0]
-    steps = np.abs(np.diff(lit, axis=0))
-    assert steps.max() < 5.0 / 255.0
-    assert np.quantile(steps, 0.95) < 2.0 / 255.0
-    assert np.median(steps) < 0.25 / 255.0
+    assert np.abs(np.diff(lit, axis=0)).max() < 2.0 / 255.0
 
 
 def test_rendering_does_not_depend_on_the_number_of_threads(device, monkeypatch):
