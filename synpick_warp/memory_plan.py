@@ -52,12 +52,12 @@ EPISODE_BYTES = 100
 """Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: tracemalloc has 115 for two million."""
 # Newton's allocations for each item of a world's capacities [bytes]: name, setting, size on a CPU, size on a GPU. Measured on a CPU with
 # Newton 1.8 from the growth of all allocations of model, collision pipeline and solver: 932, 16, 180 and 688. On a GPU rows have other
-# arrays (solve mode "colored"), counted in Newton's source: 160 bytes of rows and 109 of their coloring, and 384 of our packed rows.
+# arrays (solve mode "colored"), counted in Newton's source: 160 bytes of rows and 109 of their coloring, and 128 of our packed rows.
 # Contacts and pairs have at least those of `newton.Contacts` and their sorter.
 _NEWTON = (
     ("Newton's contacts", "contacts_per_world", 900, 250),
     ("Newton's shape pairs", "pairs_per_world", 24, 16),
-    ("Newton's contact rows", "rows_per_world", 160, 653),
+    ("Newton's contact rows", "rows_per_world", 160, 397),
     ("Newton's gripper rows", "gripper_rows_per_world", 640, 40),
 )
 _VIEWS = ("cameras.resolution", "render.views_per_batch", "cameras.positions")

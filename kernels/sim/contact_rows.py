@@ -1,4 +1,4 @@
-"""Packed rows of contacts: those of a contact side by side, for the sweep of the solver's iterations."""
+"""Packed constraint rows: the numbers of a row side by side, for the sweep of the solver's iterations over contacts."""
 
 import warp as wp
 
@@ -27,7 +27,7 @@ NORMAL_ONLY = wp.constant(2)
 """Kind of a contact with a normal row, whose friction is solved by another contact of its patch."""
 ROW = wp.constant(32)
 """Words of a packed row, a cache line: Jacobians J_a and J_b, responses M⁻¹J_aᵀ and M⁻¹J_bᵀ of 6 each, effective mass 1 / (J M⁻¹Jᵀ) and
-friction coefficient. A contact has 3 rows."""
+friction coefficient."""
 MASS, MU = wp.constant(24), wp.constant(25)
 """Words of a packed row with the effective mass and the friction coefficient."""
 WARP = wp.constant(32)
@@ -51,9 +51,9 @@ def pack_rows_kernel(
     mass: wp.array2d[float],  # (world, row), effective mass 1 / (J M⁻¹Jᵀ) [kg]
     mu: wp.array2d[float],  # (world, row), friction coefficient
     # Out:
-    rows_out: wp.array3d[float],  # (world, contact, 3 ROW)
+    rows_out: wp.array3d[float],  # (world, row, ROW)
 ):
-    """Copy the rows of contacts to where the sweep reads them, a warp for each contact; only the normal row where there is no friction."""
+    """Pack the rows of contacts, a warp for each contact; only the normal row where there is no friction."""
     world, thread = wp.tid()
     warp = thread // WARP
     word = thread - warp * WARP
@@ -78,4 +78,4 @@ def pack_rows_kernel(
                 value = mass[world, row]
             elif word == MU:
                 value = mu[world, row]
-            rows_out[world, contact, which * ROW + word] = value
+            rows_out[world, row, word] = value

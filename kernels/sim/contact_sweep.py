@@ -149,7 +149,7 @@ _LOAD = f"""
         if (next < count) {{
             const int* next_record = &contacts.records.data[(first_row + next) * {RECORD}];
             const int next_row = __ldg(next_record), next_rows = __ldg(next_record + {KIND}) == {WITH_FRICTION} ? 3 : 1;
-            const float* packed = &contacts.rows.data[(size_t)(first_row + next) * {3 * ROW}];
+            const float* packed = &contacts.rows.data[(size_t)(first_row + next_row) * {ROW}];
             for (int k = 0; k < next_rows * {ROW}; k += {SECTOR}) prefetch(packed + k);
             prefetch(&contacts.rhs.data[first_row + next_row]);
             if (next_rows == 3) {{
@@ -173,7 +173,7 @@ _LOAD = f"""
         #pragma unroll
         for (int r = 0; r < 3; ++r) {{
             if ({HAS_FRICTION} || (r == 0 && record[{KIND}] == {NORMAL_ONLY})) {{
-                const float* row = &contacts.rows.data[(size_t)(first_row + index) * {3 * ROW} + r * {ROW}];
+                const float* row = &contacts.rows.data[(size_t)(first_row + row0 + r) * {ROW}];
                 float words[28];
                 #pragma unroll
                 for (int k = 0; k < 7; ++k) {{

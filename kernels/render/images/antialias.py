@@ -16,8 +16,8 @@ from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-SAMPLES = wp.constant(4)
-"""Coverage rays of a pixel, one in each quarter. Eight are nearer to the reference by 0.07 dB, and cost half as much again."""
+QUARTERS = wp.constant(4)
+"""Quarters of a pixel: upper left, upper right, lower left, lower right. Each lies in another footprint."""
 FOOTPRINT_PIXELS = wp.constant(4)
 """Pixels whose centres are a footprint's corners: upper left, upper right, lower left, lower right."""
 SOURCE_BITS = wp.constant(2)
@@ -56,25 +56,36 @@ class ShadedImage:
     resolve: wp.array3d[wp.uint32]
     """Resolve code (view, row, column). 0: the pixel's colour is its own radiance. Else it is the mean over its samples, each with
     SOURCE_BITS that select the pixel whose radiance it takes, see `source_offset`."""
+    samples: int
+    """Coverage rays of an anti-aliased pixel, a power of two from 4 to 16; each quarter has as many."""
 
 
 @wp.func
-def rook_offset(sample: int) -> wp.vec2:
-    """Four-rooks (rotated grid) sample pattern: (x, y) [px from the pixel's centre], by quarters: upper left, upper right, lower left,
-    lower right. No two share one of four rows or columns, so silhouettes of any direction are resolved.
+def sample_offset(sample: int, samples: int) -> wp.vec2:
+    """Hammersley point set with the first digit of y flipped: (x, y) of a coverage ray [px from the pixel's centre], sorted by quarters.
 
-    Computed, because a table with a variable index would lie in slow local memory.
+    Each of `samples` rows and columns has one. Four are the four-rooks pattern (rotated grid). Computed, because a table with a variable
+    index would lie in slow local memory.
     """
-    x = wp.where(sample // 2 == sample % 2, 0.125, 0.375)
-    y = 0.5 - x
-    return wp.vec2(wp.where(sample % 2 == 0, -x, x), wp.where(sample // 2 == 0, -y, y))
+    per_quarter = samples // QUARTERS
+    quarter = sample // per_quarter
+    index = (quarter % 2) * (samples // 2) + 2 * (sample % per_quarter) + 1 - quarter // 2
+    reversed = int(0)
+    bits = index
+    digit = samples // 2
+    while digit > 0:
+        reversed += digit * (bits & 1)
+        bits = bits >> 1
+        digit = digit >> 1
+    scale = 1.0 / float(samples)
+    return wp.vec2((float(index) + 0.5) * scale - 0.5, (float(reversed ^ (samples // 2)) + 0.5) * scale - 0.5)
 
 
 @wp.func
-def source_offset(resolve: wp.uint32, sample: int) -> wp.vec2i:
+def source_offset(resolve: wp.uint32, sample: int, quarter: int) -> wp.vec2i:
     """(rows, columns) from a pixel to the source of a sample's radiance: one of the four corners of the footprint it lies in."""
     source = int((resolve >> wp.uint32(SOURCE_BITS * sample)) & SOURCE_MASK)
-    return wp.vec2i((source // 2) * (2 * (sample // 2) - 1), (source % 2) * (2 * (sample % 2) - 1))
+    return wp.vec2i((source // 2) * (2 * (quarter // 2) - 1), (source % 2) * (2 * (quarter % 2) - 1))
 
 
 @wp.func
@@ -84,10 +95,11 @@ def resolve_radiance(image: ShadedImage, view: int, row: int, column: int) -> wp
     if resolve == wp.uint32(0):
         return image.radiance[view, row, column]
     total = wp.vec3(0.0, 0.0, 0.0)
-    for sample in range(SAMPLES):
-        step = source_offset(resolve, sample)
+    per_quarter = image.samples // QUARTERS
+    for sample in range(image.samples):
+        step = source_offset(resolve, sample, sample // per_quarter)
         total += image.radiance[view, row + step[0], column + step[1]]
-    return total / float(SAMPLES)
+    return total / float(image.samples)
 
 
 @wp.func
@@ -312,11 +324,12 @@ def resolve_footprints_kernel(
     footprint: wp.array3d[int],  # (view, chunk, chunk_footprint)
     count: wp.array2d[int],  # (view, chunk)
     views: Views,
+    samples: int,
     threads: int,
     # Out:
     resolve_inout: wp.array3d[wp.uint32],  # (view, row, column)
 ):
-    """Trace the coverage rays of the listed footprints, one per corner pixel, and select the source pixel of each sample.
+    """Trace the coverage rays of the listed footprints, a quarter of the `samples` of each corner pixel, and select their source pixels.
 
     `resolve_inout` receives the samples' source bits. The host does not read the counts, so a fixed number of `threads` strides over
     the samples of a chunk; neighbouring threads take samples of one footprint, whose rays meet the same bodies.
@@ -329,17 +342,17 @@ def resolve_footprints_kernel(
     chunk = int(place % chunks)
     camera = views.camera[view]
     intrinsics = cameras.intrinsics[camera]
-    for index in range(int(thread % wp.uint32(threads)), SAMPLES * count[view, chunk], threads):
-        cell = wp.uint32(footprint[view, chunk, int(wp.uint32(index) // wp.uint32(SAMPLES))])
+    for index in range(int(thread % wp.uint32(threads)), samples * count[view, chunk], threads):
+        cell = wp.uint32(footprint[view, chunk, int(wp.uint32(index) // wp.uint32(samples))])
         row = int(cell // wp.uint32(footprints.width))
         column = int(cell % wp.uint32(footprints.width))
-        own = int(wp.uint32(index) % wp.uint32(SAMPLES))
         # The footprint is in the lower right quarter of its upper left corner, and so on.
-        sample = SAMPLES - 1 - own
+        sample = samples - 1 - int(wp.uint32(index) % wp.uint32(samples))
+        own = QUARTERS - 1 - int(wp.uint32(sample) // (wp.uint32(samples) // wp.uint32(QUARTERS)))
         r = corner_row(row, own)
         c = corner_column(column, own)
         if in_image(grid, r, c):
-            offset = rook_offset(sample)
+            offset = sample_offset(sample, samples)
             ray = camera_ray(intrinsics, r, c, offset)
             visible = visible_bodies(gbuffer, grid, view, row, column, views.instances)
             body_mask = filter_body_mask(bodies, view, tile_of(grid, r, c), visible)

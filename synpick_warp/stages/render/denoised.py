@@ -12,7 +12,7 @@ import warp as wp
 
 from synpick_warp.arrays import allocate, allocate_struct, device_array, struct_arrays
 from synpick_warp.configs.schema import UNOCCLUDED, Render
-from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, SAMPLES, find_footprints_kernel, resolve_footprints_kernel
+from synpick_warp.kernels.render.images.antialias import CHUNK_TILES, find_footprints_kernel, resolve_footprints_kernel
 from synpick_warp.kernels.render.lighting.coarse_grid import CoarseGrid, Guide
 from synpick_warp.kernels.render.lighting.coarse_paths import CoarseLight, reuse_histories_kernel, trace_coarse_paths_kernel
 from synpick_warp.kernels.render.lighting.denoise import choose_widths_kernel, filter_blocks_kernel, smooth_ratios_kernel
@@ -61,6 +61,9 @@ surfaces is added to the limit. The light cut off is a bias: in eight episodes u
 and 31.15, 31.20, 31.17, 31.15 dB (tools/README.md, "Pictures")."""
 ROULETTE = 1
 """First bounce with Russian roulette: few paths are long, since many neighbours share them."""
+
+COVERAGE_RAYS, NARROW_COVERAGE_RAYS = 4, 16
+"""Coverage rays of an anti-aliased pixel; the second in narrow images, whose shading is supersampled."""
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
@@ -131,6 +134,11 @@ def supersamples(render: Render, width: int, histories: int = 0) -> bool:
     A pixel then covers much detail of textures and normals. Four samples gain 0.2 to 0.5 dB in PSNR (tools/README.md, "Pictures").
     """
     return traces_paths(render) and coarse_size(render, width, histories) == 1
+
+
+def coverage_rays(render: Render, width: int, histories: int = 0) -> int:
+    """Number of coverage rays of an anti-aliased pixel."""
+    return NARROW_COVERAGE_RAYS if supersamples(render, width, histories) else COVERAGE_RAYS
 
 
 def scratch_sizes(render: Render, width: int, height: int, histories: int = 0) -> dict[str, int]:
@@ -217,6 +225,7 @@ class DenoisedRenderer:
         self.shadows = allocate(ShadowArrays, sizes, scene.device)
         self.shade_kernel = shade_samples_kernel if supersamples(render, scene.width, histories) else shade_kernel
         self.antialias = render.antialias
+        self.coverage_rays = coverage_rays(render, scene.width, histories)
         self.footprints = footprint_grid(scene.width, scene.height)
         self.footprint_lists = allocate(FootprintLists, sizes, scene.device)
 
@@ -294,7 +303,8 @@ class DenoisedRenderer:
         self._launch(self.shade_kernel, scene.grid, views, inputs, [radiance])
 
     def resolve_footprints(self, bodies: Any, gbuffer: Any, views: Any, image: Any) -> None:
-        """Anti-alias by coverage rays: writes `resolve` of the struct `ShadedImage`."""
+        """Anti-alias by coverage rays: writes `resolve` and `samples` of the struct `ShadedImage`."""
+        image.samples = self.coverage_rays
         scene, lists = self.scene, self.footprint_lists
         lists.count.zero_()
         # Atomics of a launch on the CPU hold in one thread alone, so these are not cut into pieces.
@@ -302,9 +312,9 @@ class DenoisedRenderer:
         outputs = [image.resolve, lists.footprint, lists.count]
         footprints = views.count * self.footprints.tiles * int(TILE_PIXELS)
         wp.launch(find_footprints_kernel, dim=footprints, inputs=inputs, outputs=outputs, device=scene.device, block_dim=PIXEL_BLOCK)
-        threads = FOOTPRINT_THREADS if scene.device.is_cuda else int(SAMPLES)
+        threads = FOOTPRINT_THREADS if scene.device.is_cuda else COVERAGE_RAYS
         inputs = [scene.meshes, scene.table, scene.cameras, scene.grid, self.footprints, bodies, gbuffer, lists.footprint, lists.count]
-        inputs += [views, threads]
+        inputs += [views, image.samples, threads]
         samples = views.count * lists.count.shape[1] * threads
         wp.launch(
             resolve_footprints_kernel, dim=samples, inputs=inputs, outputs=[image.resolve], device=scene.device, block_dim=PIXEL_BLOCK

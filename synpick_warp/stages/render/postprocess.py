@@ -95,7 +95,7 @@ class PostProcessor:
             inputs = [scene.cameras, scene.grid, out.effects, views, image]
             self._launch(filter_lens_rows_kernel, views.count, inputs, self.filtered)
             filtered = ShadedImage()
-            filtered.radiance, filtered.resolve = self.filtered, image.resolve
+            filtered.radiance, filtered.resolve, filtered.samples = self.filtered, image.resolve, image.samples
             image = filtered
         inputs = [scene.cameras, scene.grid, scene.lights, snapshot.episode, snapshot.frame, snapshot.light, snapshot.light_exposure]
         inputs += [self.settings, out.effects, views, image]

@@ -108,8 +108,8 @@ class FusedSteel(newton.solvers.SolverSteel):
 
     @cached_property
     def _packed_rows(self) -> wp.array:
-        """Rows of contacts (world, contact, 3 `ROW`) float32: 384 bytes for each row that a world may have."""
-        shape = self._world_count, self._propagation_max_constraints, 3 * int(contact_rows.ROW)
+        """Packed rows of contacts (world, row, `ROW`) float32: 128 bytes for each row that a world may have."""
+        shape = self._world_count, self._propagation_max_constraints, int(contact_rows.ROW)
         return wp.zeros(shape, dtype=wp.float32, device=self.model.device)
 
     def _apply_propagation_warmstart_velocity(self) -> None:

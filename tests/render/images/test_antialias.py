@@ -6,18 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.configs.schema import FAST, REFERENCE, Config
-from synpick_warp.kernels.render.images import antialias
+from synpick_warp.kernels.render.images.antialias import sample_offset
 from synpick_warp.scenes.assets.appearance import srgb_to_linear
 from synpick_warp.scenes.types import Material, TriangleMesh
+from synpick_warp.stages.render.denoised import COVERAGE_RAYS, NARROW_COVERAGE_RAYS
 from tests.worlds.toy_scene import UPRIGHT, RenderedViews, ToyScene, box, camera, entry, even_light, render, sheet, sun
 
 VIEW = camera(48, 40, 200.0, (0.0, 0.0, 2.0))
-SAMPLES = int(antialias.SAMPLES)
-OFFSETS = np.array([(-1, -3), (3, -1), (-3, 1), (1, 3)]) / 8.0
-"""x, y [px from the pixel's centre]."""
 EMPTY = entry(sheet(0.1, 0.1))
 
 
@@ -39,37 +38,65 @@ def render_image(device, *bodies, view=VIEW, config=None, **more) -> RenderedVie
     return render(ToyScene(entries, [world], (view,), config=config or with_render(), **more), device)
 
 
-def source_pixels(picture: RenderedViews) -> np.ndarray:
-    """(row, column) of the pixel whose radiance each sample of each pixel takes (H, W, SAMPLES, 2)."""
+def sample_offsets(samples: int = NARROW_COVERAGE_RAYS) -> np.ndarray:
+    """x, y of each coverage ray [px from the pixel's centre] (samples, 2), sorted by quarters."""
+    columns = np.arange(samples)
+    digits = (columns[:, None] >> np.arange(samples.bit_length() - 1)) & 1
+    rows = (digits[:, ::-1] * (1 << np.arange(digits.shape[1]))).sum(axis=1) ^ (samples // 2)
+    x, y = ((place + 0.5) / samples - 0.5 for place in (columns, rows))
+    order = np.argsort(2 * (y > 0.0) + (x > 0.0), kind="stable")
+    return np.stack([x, y], axis=-1)[order]
+
+
+def source_pixels(picture: RenderedViews, samples: int = NARROW_COVERAGE_RAYS) -> np.ndarray:
+    """(row, column) of the pixel whose radiance each sample of each pixel takes (H, W, samples, 2)."""
     resolve = picture.resolve[0]
-    choice = (resolve[..., None] >> (2 * np.arange(SAMPLES, dtype=np.uint32))) & 3
-    towards = np.where(OFFSETS[:, ::-1] > 0.0, 1, -1)
+    choice = (resolve[..., None] >> (2 * np.arange(samples, dtype=np.uint32))) & 3
+    towards = np.where(sample_offsets(samples)[:, ::-1] > 0.0, 1, -1)
     step = np.stack([choice >> 1, choice & 1], axis=-1).astype(int) * towards
     return np.stack(np.mgrid[: resolve.shape[0], : resolve.shape[1]], axis=-1)[:, :, None] + step
 
 
-def sample_positions(view, pose, distance: float) -> np.ndarray:
-    """Intersection of each sample's ray with the plane z = 0, in the axes of a plate that lies there [m] (H, W, SAMPLES, 2)."""
+def sample_positions(view, pose, distance: float, samples: int = NARROW_COVERAGE_RAYS) -> np.ndarray:
+    """Intersection of each sample's ray with the plane z = 0, in the axes of a plate that lies there [m] (H, W, samples, 2)."""
     rows, columns = np.mgrid[: view.height, : view.width]
-    x = (columns[..., None] + 0.5 + OFFSETS[:, 0] - view.matrix[0, 2]) / view.matrix[0, 0] * distance
-    y = -(rows[..., None] + 0.5 + OFFSETS[:, 1] - view.matrix[1, 2]) / view.matrix[1, 1] * distance
+    offsets = sample_offsets(samples)
+    x = (columns[..., None] + 0.5 + offsets[:, 0] - view.matrix[0, 2]) / view.matrix[0, 0] * distance
+    y = -(rows[..., None] + 0.5 + offsets[:, 1] - view.matrix[1, 2]) / view.matrix[1, 1] * distance
     angle = 2.0 * np.arctan2(pose[5], pose[6])
     x, y = x - pose[0], y - pose[1]
     return np.stack([np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x], axis=-1)
 
 
-def test_samples_form_a_four_rooks_pattern():
+@wp.kernel
+def list_offsets(samples: int, offsets_out: wp.array[wp.vec2]):
+    sample = wp.tid()
+    offsets_out[sample] = sample_offset(sample, samples)
+
+
+@pytest.mark.parametrize("samples", [4, 8, 16])
+def test_samples_are_a_sorted_net(device, samples):
+    """Each row and column of samples has one, each quarter as many; four are the four-rooks pattern."""
+    offsets = wp.zeros(samples, dtype=wp.vec2, device=device)
+    wp.launch(list_offsets, dim=samples, inputs=[samples], outputs=[offsets], device=device)
+    found = offsets.numpy()
     for axis in range(2):
-        assert sorted(OFFSETS[:, axis] * 8) == [-3, -1, 1, 3]
+        np.testing.assert_allclose(np.sort(found[:, axis]), (np.arange(samples) + 0.5) / samples - 0.5, atol=1e-7)
+    np.testing.assert_array_equal(2 * (found[:, 1] > 0) + (found[:, 0] > 0), np.repeat(np.arange(4), samples // 4))
+    np.testing.assert_allclose(found, sample_offsets(samples), atol=1e-7)
+    if samples == 4:
+        np.testing.assert_array_equal(found * 8.0, [(-1, -3), (3, -1), (-3, 1), (1, 3)])
 
 
+@pytest.mark.parametrize("samples", [COVERAGE_RAYS, NARROW_COVERAGE_RAYS])
 @pytest.mark.parametrize("angle", [0.0, 0.1, 0.4, np.pi / 4, 1.3])
-def test_silhouette_pixels_resolve_by_coverage(device, angle):
+def test_silhouette_pixels_resolve_by_coverage(device, angle, samples):
     pose = rotated_pose(0.0123, -0.0071, 0.0, angle)
     width, height = 0.21, 0.13
-    picture = render_image(device, (sheet(width, height), pose, (0.9, 0.2, 0.2)))
-    inside = np.all(np.abs(sample_positions(VIEW, pose, 2.0)) <= (width / 2, height / 2), axis=-1)
-    source = source_pixels(picture)
+    config = with_render(coarse_pixel=2 if samples == COVERAGE_RAYS else 0)
+    picture = render_image(device, (sheet(width, height), pose, (0.9, 0.2, 0.2)), config=config)
+    inside = np.all(np.abs(sample_positions(VIEW, pose, 2.0, samples)) <= (width / 2, height / 2), axis=-1)
+    source = source_pixels(picture, samples)
     on_plate = picture.instance[0][source[..., 0], source[..., 1]] == 1
     resolved = picture.resolve[0] != 0
     np.testing.assert_array_equal(on_plate[resolved], inside[resolved])
@@ -124,7 +151,7 @@ def test_a_crease_resolves_both_faces_by_coverage(device, x):
     column = int(ridge)
     source = source_pixels(picture)[10:30, column]
     assert (picture.resolve[0, 10:30, column] != 0).all()
-    right = column + 0.5 + OFFSETS[:, 0] > ridge
+    right = column + 0.5 + sample_offsets()[:, 0] > ridge
     centre_is_right = column + 0.5 > ridge
     expected = np.where(right == centre_is_right, column, np.where(right, column + 1, column - 1))
     np.testing.assert_array_equal(source[..., 1], np.broadcast_to(expected, source[..., 1].shape))
@@ -144,18 +171,28 @@ def test_contrast_in_a_dark_channel_is_resolved(device, one, other):
     assert (render_image(device, *sheets).resolve[0, 5:35, 24] != 0).all()
 
 
-def test_pixels_at_the_image_border_are_resolved(device):
-    """A plate whose silhouette crosses all four image borders, where pixels are resolved by their own samples."""
+@pytest.mark.parametrize("samples", [COVERAGE_RAYS, NARROW_COVERAGE_RAYS])
+def test_pixels_at_the_image_border_are_resolved(device, samples):
+    """A plate whose silhouette crosses all four image borders. Footprints there have two corners; a sample of a surface that neither shows
+    keeps its pixel's radiance."""
     pose = rotated_pose(0.0, 0.0, 0.0, 0.25)
-    picture = render_image(device, (sheet(1.0, 0.34), pose, (0.9, 0.2, 0.2)))
-    inside = np.all(np.abs(sample_positions(VIEW, pose, 2.0)) <= (0.5, 0.17), axis=-1)
-    source = source_pixels(picture)
-    on_plate = picture.instance[0][source[..., 0], source[..., 1]] == 1
-    border = np.ones_like(picture.resolve[0], bool)
+    config = with_render(coarse_pixel=2 if samples == COVERAGE_RAYS else 0)
+    picture = render_image(device, (sheet(1.0, 0.34), pose, (0.9, 0.2, 0.2)), config=config)
+    inside = np.all(np.abs(sample_positions(VIEW, pose, 2.0, samples)) <= (0.5, 0.17), axis=-1)
+    source = source_pixels(picture, samples)
+    plate = picture.instance[0] == 1
+    border = np.ones_like(plate)
     border[1:-1, 1:-1] = False
     partly = border & (inside.any(axis=-1) != inside.all(axis=-1))
     assert all(side.any() for side in (partly[0], partly[-1], partly[:, 0], partly[:, -1]))
-    np.testing.assert_array_equal(on_plate[partly], inside[partly])
+    padded = np.pad(plate, 1, mode="edge")
+    down, right = (np.where(sample_offsets(samples)[:, axis] > 0.0, 1, -1) for axis in (1, 0))
+    rows, columns = (index[..., None] + 1 for index in np.mgrid[: plate.shape[0], : plate.shape[1]])
+    corners = [padded[rows + i * down, columns + j * right] for i in (0, 1) for j in (0, 1)]
+    shown = np.any(corners, axis=0) != np.all(corners, axis=0)
+    expected = np.where(shown, inside, plate[..., None])
+    np.testing.assert_array_equal(plate[source[..., 0], source[..., 1]][partly], expected[partly])
+    assert (expected != inside)[partly].mean() < 0.04
 
 
 def test_smooth_surfaces_and_the_background_are_not_resolved(device):
