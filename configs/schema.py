@@ -266,6 +266,8 @@ class Render:
         0,
         "px",
         "Mode fast: width of a coarse pixel, at whose centre paths start; 0: the widest with 384 per row, 480 with `history`. "
+        "At full HD with `history` 3 instead of 4 px are nearer to a path-traced reference by 1 dB and take 1.24 times as long, "
+        "2 px by 2.5 dB and 1.83 times. "
         "Modes fast and unoccluded: sun shadow rays are spaced half of it, at least 1 px.",
         low=0,
         high=64,
@@ -274,12 +276,12 @@ class Render:
         0,
         "",
         "Mode fast: paths per coarse pixel, best a power of two; 0: 2, or 1 with over 480 per row or where `history` narrows them, "
-        "and up to 16 in an episode's first frame with `history` if images are narrower than 960 px.",
+        "and up to 32 in an episode's first frame with `history`.",
         low=0,
         high=1024,
     )
     history: int = setting(
-        16,
+        32,
         "",
         "Mode fast: paths per coarse pixel that are averaged over the frames of an episode where nothing moves; 0: each frame by itself.",
         low=0,

@@ -192,8 +192,7 @@ def test_histories_narrow_coarse_pixels(cell, width, histories, columns, paths):
     render = settings(render__coarse_pixel=cell).render
     assert scratch_sizes(render, width, 6, histories)["cell_column"] == columns
     assert paths_per_coarse_pixel(render, width, histories) == paths
-    first = FIRST_FRAME_PATHS if columns == width else paths
-    assert first_frame_paths(render, width, histories) == first
+    assert first_frame_paths(render, width, histories) == (FIRST_FRAME_PATHS if histories else paths)
     # Without accumulation they are those of single views.
     alone = settings(render__coarse_pixel=cell, render__history=0).render
     assert scratch_sizes(alone, width, 6, histories) == scratch_sizes(render, width, 6)

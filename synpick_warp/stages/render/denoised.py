@@ -44,10 +44,10 @@ HD, 4 px and one path had 35.3 dB, 5 px and two paths 34.5 dB (mean of the frame
 MAX_COLUMNS_TWO_PATHS = 480
 """Default number of paths: two per coarse pixel if an image's width has at most this many, else one. At 640x360, where coarse pixels are
 pixels, ten piles have a PSNR of 32.5 dB with one path and 33.6 dB with two, in 1.5 times the time."""
-FIRST_FRAME_PATHS = 16
-"""Default number of paths per pixel in the first frame of an episode, in images narrower than 960 px, whose coarse pixels are 1 px wide. It
-fills all histories to their default length in one frame of hundreds, and the frames after it trace fewer paths; frame 8 gains 1.0 to 1.5 dB
-in PSNR (tools/README.md, "Pictures")."""
+FIRST_FRAME_PATHS = 32
+"""Default number of paths per coarse pixel in the first frame of an episode. It fills all histories to their default length in one frame of
+hundreds, and the frames after it trace fewer paths. Frame 8 gains 2 dB in PSNR at 480x270, 1.6 dB at full HD (tools/README.md,
+"Pictures")."""
 SINGLE_PATH_VARIANCE_SCALE = 2.0
 """Variance multiplier at one path per coarse pixel, where the sample variance underestimates bright small sources: few paths hit them, and
 those that do would look like a change of the light (on ten piles, 1 is 0.2 dB worse; 1.5 and 3 are nearly as good)."""
@@ -63,7 +63,8 @@ ROULETTE = 1
 """First bounce with Russian roulette: few paths are long, since many neighbours share them."""
 
 COVERAGE_RAYS, NARROW_COVERAGE_RAYS = 4, 16
-"""Coverage rays of an anti-aliased pixel; the second in narrow images, whose shading is supersampled."""
+"""Coverage rays of an anti-aliased pixel; the second in narrow images, whose shading is supersampled. On an H200 they cost 0.055 ms a view
+at 480x270 and gain 0.2 dB in PSNR."""
 
 GUIDE = struct_arrays(Guide, "view", "cell_row", "cell_column")
 COARSE_LIGHT = struct_arrays(CoarseLight, "view", "cell_row", "cell_column")
@@ -121,9 +122,9 @@ def paths_per_coarse_pixel(render: Render, width: int, histories: int = 0) -> in
 
 
 def first_frame_paths(render: Render, width: int, histories: int = 0) -> int:
-    """Number of paths per coarse pixel in the first frame of an episode, where all histories begin; more than later in small images."""
+    """Number of paths per coarse pixel in the first frame of an episode, where all histories begin; more than later."""
     paths = paths_per_coarse_pixel(render, width, histories)
-    if render.coarse_paths or not accumulates(render, histories) or coarse_size(render, width, histories) > 1:
+    if render.coarse_paths or not accumulates(render, histories):
         return paths
     return max(paths, min(FIRST_FRAME_PATHS, render.history))
 
