@@ -43,8 +43,8 @@ BORDER_GROUPS, BORDER_THREADS = 2112, 128
 """Groups and threads of one that share the pixels of boxes beyond the image: as many as an H200's 132 multiprocessors hold at once."""
 BORDER_CHUNK = 8192
 """Pixels that a group takes at a time: 64 rays a thread, few enough that groups end together, many enough that their atomics are rare."""
-FOOTPRINT_THREADS = 128
-"""Threads that share the list of anti-aliasing footprints of a chunk: it has some hundred samples."""
+FOOTPRINT_THREADS, CPU_FOOTPRINT_THREADS = 128, 4
+"""Number of threads that share a chunk's list of anti-aliasing footprints, on a GPU and on the CPU: a chunk has some hundred samples."""
 CPU_PIECES = 8
 """Pieces per CPU core of a launch over pixels, so that cores finish together although some tiles cost more."""
 CPU_PIECE_PIXELS = 8192

@@ -52,7 +52,7 @@ EPISODE_BYTES = 100
 """Lists and sets of episode indices of a bake at their peak, for each episode [bytes]: tracemalloc has 115 for two million."""
 # Newton's allocations for each item of a world's capacities [bytes]: name, setting, size on a CPU, size on a GPU. Measured on a CPU with
 # Newton 1.8 from the growth of all allocations of model, collision pipeline and solver: 932, 16, 180 and 688. On a GPU rows have other
-# arrays (solve mode "colored"), counted in Newton's source: 160 bytes of rows and 109 of their coloring, and 128 of our packed rows.
+# arrays (solve mode "colored"): by Newton's source 160 bytes per row and 109 for its graph coloring, plus 128 for our packed row.
 # Contacts and pairs have at least those of `newton.Contacts` and their sorter.
 _NEWTON = (
     ("Newton's contacts", "contacts_per_world", 900, 250),

@@ -1,39 +1,39 @@
-"""Packed constraint rows: the numbers of a row side by side, for the sweep of the solver's iterations over contacts."""
+"""Packing of contact constraint rows: gathers the Jacobians and responses of a row from separate arrays into one cache line."""
 
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
 RECORD = wp.constant(12)
-"""Length of a contact's record [words]. Word 0 is the contact's first row, and word 9 its number of rows.
+"""Length of a contact's record [words]. Word 0 holds the index of the contact's first row, and word 9 its number of rows.
 
 A friction patch is a group of contacts of two bodies; one of them has the friction rows, bounded by the sum of the normal impulses of all.
 Its record lists the normal rows of the others, the members."""
 BODY_A, BODY_B = 1, 2
-"""Words with the index of a body in the world's list of bodies; -1: a static body."""
+"""Words that hold the bodies of a contact, as indices into the world's list of bodies; -1: a static body."""
 MEMBER_COUNT = 3
-"""Word with the number of members that follow it."""
+"""Word that holds the number of members listed in the words after it."""
 PATCH_MEMBERS = 4
 """Maximum number of members in a record."""
 NEXT_MEMBER = 8
-"""Word with the first member that is not in the record; -1: there is none."""
+"""Word that holds the first member that does not fit into the record; -1: all members fit."""
 MEMBER_LIST = 11
-"""Word with the list of the members that are not in the record: their number << 20 | offset in the world's lists; -1: it was full."""
+"""Word that locates the list of the members that do not fit: their number << 20 | offset in the world's lists; -1: the lists were full."""
 KIND = wp.constant(10)
-"""Word with the kind: `WITH_FRICTION`, `NORMAL_ONLY`, or 0 for any other rows."""
+"""Word that holds the kind of the contact: `WITH_FRICTION`, `NORMAL_ONLY`, or 0 for anything else."""
 WITH_FRICTION = wp.constant(1)
 """Kind of a contact with a normal row and two friction rows."""
 NORMAL_ONLY = wp.constant(2)
 """Kind of a contact with a normal row, whose friction is solved by another contact of its patch."""
 ROW = wp.constant(32)
-"""Words of a packed row, a cache line: Jacobians J_a and J_b, responses M⁻¹J_aᵀ and M⁻¹J_bᵀ of 6 each, effective mass 1 / (J M⁻¹Jᵀ) and
-friction coefficient."""
+"""Length of a packed row [words], one cache line: Jacobians J_a and J_b and responses M⁻¹J_aᵀ and M⁻¹J_bᵀ (6 words each), effective mass
+1 / (J M⁻¹Jᵀ), friction coefficient, and padding."""
 MASS, MU = wp.constant(24), wp.constant(25)
-"""Words of a packed row with the effective mass and the friction coefficient."""
+"""Index of the word of a packed row that holds the effective mass, and of the one that holds the friction coefficient."""
 WARP = wp.constant(32)
-"""Threads of a warp, one for each word of a row."""
+"""Number of threads of a warp; each copies one word of a row."""
 THREADS = wp.constant(512)
-"""Threads that pack the rows of a world."""
+"""Number of threads that pack the rows of a world."""
 
 
 @wp.kernel(enable_backward=False)
@@ -53,7 +53,7 @@ def pack_rows_kernel(
     # Out:
     rows_out: wp.array3d[float],  # (world, row, ROW)
 ):
-    """Pack the rows of contacts, a warp for each contact; only the normal row where there is no friction."""
+    """Pack the constraint rows of contacts with one warp per contact: the normal row, and the friction rows of `WITH_FRICTION` contacts."""
     world, thread = wp.tid()
     warp = thread // WARP
     word = thread - warp * WARP

@@ -86,7 +86,7 @@ class ContactRowData:
     friction_operator: wp.array[float]
     """Friction operator of each contact (world, contact, `friction.FRICTION_OPERATOR`)."""
     rows: wp.array3d[float]
-    """Packed rows of contacts (world, row, `contact_rows.ROW`)."""
+    """Packed constraint rows (world, row, `contact_rows.ROW`), see `pack_rows_kernel`."""
     patch_lists: wp.array[int]
     """Rows of patches with more members than a record has (world, row)."""
     patch_list_length: wp.array[int]

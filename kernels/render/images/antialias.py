@@ -1,14 +1,15 @@
 """Morphological anti-aliasing by coverage rays: extra primary rays only where the G-buffer shows a discontinuity, without shading them.
 
 The unit is the AA footprint, the square between the centres of four neighbouring pixels. Where all four show one smooth surface, so does
-the whole footprint. Where they do not, a coverage ray of each pixel within the footprint finds the visible surface, and takes the radiance
-of whichever of the four pixels shows that surface; so a ray costs no shading. Textures are filtered already.
+the whole footprint. Where they do not, coverage rays within the footprint find the visible surface, and each takes the radiance of
+whichever of the four pixels shows that surface; so a ray costs no shading. Textures are filtered already.
 """
 
 import warp as wp
 
 from synpick_warp.codes import Segment
 from synpick_warp.kernels.render.lighting.plane_distance import Plane, plane_distance, tangent_plane
+from synpick_warp.kernels.render.lighting.sampling import UNIT, reverse_bits
 from synpick_warp.kernels.render.visibility.bvh_rays import hit_table, trace_bodies
 from synpick_warp.kernels.render.visibility.camera import Cameras, ImageGrid, Views, camera_ray, clamp_index, in_image, tile_of, tile_pixel
 from synpick_warp.kernels.render.visibility.gbuffer import GBuffer, Hit, Meshes, Table, ViewBodies, body_of, face_normal, triangle_normal
@@ -16,8 +17,8 @@ from synpick_warp.kernels.tuning import RAY_REGISTERS
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
-QUARTERS = wp.constant(4)
-"""Quarters of a pixel: upper left, upper right, lower left, lower right. Each lies in another footprint."""
+QUADRANTS = wp.constant(4)
+"""Quadrants of a pixel, in the order upper left, upper right, lower left, lower right. Each lies in a different footprint."""
 FOOTPRINT_PIXELS = wp.constant(4)
 """Pixels whose centres are a footprint's corners: upper left, upper right, lower left, lower right."""
 SOURCE_BITS = wp.constant(2)
@@ -57,35 +58,31 @@ class ShadedImage:
     """Resolve code (view, row, column). 0: the pixel's colour is its own radiance. Else it is the mean over its samples, each with
     SOURCE_BITS that select the pixel whose radiance it takes, see `source_offset`."""
     samples: int
-    """Coverage rays of an anti-aliased pixel, a power of two from 4 to 16; each quarter has as many."""
+    """Number of coverage samples per anti-aliased pixel: 4, 8 or 16, distributed equally over its quadrants."""
 
 
 @wp.func
 def sample_offset(sample: int, samples: int) -> wp.vec2:
-    """Hammersley point set with the first digit of y flipped: (x, y) of a coverage ray [px from the pixel's centre], sorted by quarters.
+    """Position (x, y) of a coverage sample [px from the pixel's centre]: a Hammersley point set, sorted by quadrant.
 
-    Each of `samples` rows and columns has one. Four are the four-rooks pattern (rotated grid). Computed, because a table with a variable
-    index would lie in slow local memory.
+    The point set is digit-scrambled: y is shifted by half a pixel, modulo 1. Each of the `samples` rows and columns of a pixel contains
+    exactly one sample, and 4 samples form the rotated grid (four rooks). Positions are computed, because a table with a variable index
+    would lie in slow local memory.
     """
-    per_quarter = samples // QUARTERS
-    quarter = sample // per_quarter
-    index = (quarter % 2) * (samples // 2) + 2 * (sample % per_quarter) + 1 - quarter // 2
-    reversed = int(0)
-    bits = index
-    digit = samples // 2
-    while digit > 0:
-        reversed += digit * (bits & 1)
-        bits = bits >> 1
-        digit = digit >> 1
-    scale = 1.0 / float(samples)
-    return wp.vec2((float(index) + 0.5) * scale - 0.5, (float(reversed ^ (samples // 2)) + 0.5) * scale - 0.5)
+    per_quadrant = samples // QUADRANTS
+    quadrant = sample // per_quadrant
+    index = (quadrant % 2) * (samples // 2) + 2 * (sample % per_quadrant) + 1 - quadrant // 2
+    # Radical inverse in base 2 (van der Corput, 1935), in [0, 1).
+    inverse = UNIT * float(reverse_bits(wp.uint32(index)) >> wp.uint32(8))
+    half_cell = 0.5 / float(samples)
+    return wp.vec2(float(2 * index + 1) * half_cell - 0.5, wp.where(inverse < 0.5, inverse, inverse - 1.0) + half_cell)
 
 
 @wp.func
-def source_offset(resolve: wp.uint32, sample: int, quarter: int) -> wp.vec2i:
-    """(rows, columns) from a pixel to the source of a sample's radiance: one of the four corners of the footprint it lies in."""
+def source_offset(resolve: wp.uint32, sample: int, quadrant: int) -> wp.vec2i:
+    """Offset (rows, columns) from a pixel to the pixel whose radiance a sample takes, one of the four corners of the sample's footprint."""
     source = int((resolve >> wp.uint32(SOURCE_BITS * sample)) & SOURCE_MASK)
-    return wp.vec2i((source // 2) * (2 * (quarter // 2) - 1), (source % 2) * (2 * (quarter % 2) - 1))
+    return wp.vec2i((source // 2) * (2 * (quadrant // 2) - 1), (source % 2) * (2 * (quadrant % 2) - 1))
 
 
 @wp.func
@@ -95,9 +92,9 @@ def resolve_radiance(image: ShadedImage, view: int, row: int, column: int) -> wp
     if resolve == wp.uint32(0):
         return image.radiance[view, row, column]
     total = wp.vec3(0.0, 0.0, 0.0)
-    per_quarter = image.samples // QUARTERS
+    per_quadrant = image.samples // QUADRANTS
     for sample in range(image.samples):
-        step = source_offset(resolve, sample, sample // per_quarter)
+        step = source_offset(resolve, sample, sample // per_quadrant)
         total += image.radiance[view, row + step[0], column + step[1]]
     return total / float(image.samples)
 
@@ -329,10 +326,11 @@ def resolve_footprints_kernel(
     # Out:
     resolve_inout: wp.array3d[wp.uint32],  # (view, row, column)
 ):
-    """Trace the coverage rays of the listed footprints, a quarter of the `samples` of each corner pixel, and select their source pixels.
+    """Trace a coverage ray for each sample in the listed footprints, and select the pixel whose radiance the sample takes.
 
-    `resolve_inout` receives the samples' source bits. The host does not read the counts, so a fixed number of `threads` strides over
-    the samples of a chunk; neighbouring threads take samples of one footprint, whose rays meet the same bodies.
+    A footprint contains one quadrant of each of its corner pixels, with a quarter of that pixel's `samples`. `resolve_inout` receives the
+    samples' source bits. The host does not read the counts, so a fixed number of `threads` strides over the samples of a chunk;
+    neighbouring threads take samples of one footprint, whose rays meet the same bodies.
     """
     # Unsigned: cheaper to divide.
     thread = wp.uint32(wp.tid())
@@ -346,9 +344,9 @@ def resolve_footprints_kernel(
         cell = wp.uint32(footprint[view, chunk, int(wp.uint32(index) // wp.uint32(samples))])
         row = int(cell // wp.uint32(footprints.width))
         column = int(cell % wp.uint32(footprints.width))
-        # The footprint is in the lower right quarter of its upper left corner, and so on.
+        # The footprint contains the lower right quadrant of its upper left corner pixel, and so on.
         sample = samples - 1 - int(wp.uint32(index) % wp.uint32(samples))
-        own = QUARTERS - 1 - int(wp.uint32(sample) // (wp.uint32(samples) // wp.uint32(QUARTERS)))
+        own = QUADRANTS - 1 - int(wp.uint32(sample) // (wp.uint32(samples) // wp.uint32(QUADRANTS)))
         r = corner_row(row, own)
         c = corner_column(column, own)
         if in_image(grid, r, c):

@@ -108,7 +108,7 @@ class FusedSteel(newton.solvers.SolverSteel):
 
     @cached_property
     def _packed_rows(self) -> wp.array:
-        """Packed rows of contacts (world, row, `ROW`) float32: 128 bytes for each row that a world may have."""
+        """Packed constraint rows (world, row, `ROW`) float32, 128 bytes each; allocated for the maximum number of rows of each world."""
         shape = self._world_count, self._propagation_max_constraints, int(contact_rows.ROW)
         return wp.zeros(shape, dtype=wp.float32, device=self.model.device)
 
