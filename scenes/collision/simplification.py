@@ -298,7 +298,7 @@ def _intersect(facets: _Facets, chosen: Sequence[int], shift: float = 0.0) -> Co
     normal, offset = normal / length[:, None], offset / length
     # The centroid lies inside of the supporting planes, but not of all planes that were moved inward.
     inner = np.zeros(3) if shift == 0.0 else _chebyshev_center(normal, offset)
-    with np.errstate(divide="ignore"):  # A facet of the dual hull through the inner point is a vertex at infinity.
+    with np.errstate(divide="ignore", invalid="ignore"):  # A facet of the dual hull through the inner point is a vertex at infinity.
         intersection = HalfspaceIntersection(np.column_stack([normal, -offset]), inner)
     # A facet of the dual hull at distance b from the inner point is a vertex at distance 1/b from it.
     if intersection.dual_equations[:, 3].max() > -1.0 / _FAR:

@@ -9,7 +9,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist, pdist
@@ -173,6 +173,7 @@ def test_a_cube_keeps_its_eight_corners():
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(4, 400), st.integers(8, 64), st.floats(1e-3, 1.0))
+@example(0, 4, 8, 1e-3)  # Half-spaces with a vertex at infinity in a plane through the inner point.
 def test_simplified_hulls_are_valid(seed, count, limit, flatness):
     points = np.random.default_rng(seed).normal(size=(count, 3)) * (0.1, 0.05, 0.1 * flatness)
     piece = simplify_hull(points, limit)
