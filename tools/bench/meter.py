@@ -169,6 +169,7 @@ def summarize_rates(part: str, unit: str, meter: SteadyMeter) -> Iterator[Row]:
     yield Row(part, "cores busy", sum(spent.values()) / seconds, "")
     for when, reading in (("at the beginning", first), ("at the end", last)):
         yield Row(part, f"resident memory of the main process, {when}", reading.main.resident / GIB, "GiB")
-        yield Row(part, f"resident memory of all {workers}, {when}", reading.writers.resident / GIB, "GiB")
+        yield Row(part, f"resident memory of all {workers}, shared memory in each, {when}", reading.writers.resident / GIB, "GiB")
+        yield Row(part, f"memory of all {workers} without shared memory, {when}", reading.writers.anonymous / GIB, "GiB")
     if meter.device.is_cuda:
         yield Row(part, "device memory in use by all processes, first device", last.device / GIB, "GiB")
